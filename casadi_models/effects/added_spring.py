@@ -1,0 +1,25 @@
+"""additional spring to ground."""
+
+from types import SimpleNamespace
+
+from ..effect import effect
+from ..parameter import signed
+from ..signals import Expression, LocalSignals
+
+
+@effect(
+    "added_spring",
+    title="additional spring to ground",
+    family="torque",
+    acts_on=("motor", "link"),
+    parameters=(
+        signed("added_spring", "N.m/rad", "stiffness of cables or seals that pull the joint to its zero"),
+    ),
+    absence="the residual grows with the position, at any speed",
+    excitation="full travel, better without gravity",
+    source="thesis eq. 4.17",
+    confused_with=("cyclic_torque", "motor_constant_error", "gravity"),
+    separate_by="a run without payload or with the axis horizontal, over the full travel",
+)
+def added_spring(s: LocalSignals, p: SimpleNamespace) -> Expression:
+    return p.added_spring * s.position

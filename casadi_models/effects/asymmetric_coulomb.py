@@ -1,0 +1,28 @@
+"""direction-dependent Coulomb friction."""
+
+from types import SimpleNamespace
+
+import casadi as ca
+
+from ..effect import effect
+from ..parameter import signed
+from ..signals import Expression, LocalSignals
+
+
+@effect(
+    "asymmetric_coulomb",
+    title="direction-dependent Coulomb friction",
+    family="friction",
+    acts_on=("motor", "link"),
+    parameters=(
+        signed("asymmetric_coulomb", "N.m", "half the difference of the Coulomb torques of the two directions"),
+    ),
+    absence="the residual is shifted by a constant",
+    excitation="both directions, constant speed",
+    source="A. Janot et al., EMPS benchmark, 2019",
+    confused_with=("current_offset", "cyclic_torque"),
+    needs=("coulomb",),
+    separate_by="a standstill with the brake closed: an offset stays, friction does not",
+)
+def asymmetric_coulomb(s: LocalSignals, p: SimpleNamespace) -> Expression:
+    return p.asymmetric_coulomb * ca.fabs(s.direction)

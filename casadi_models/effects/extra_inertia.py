@@ -1,0 +1,25 @@
+"""inertia that is not in the model (payload)."""
+
+from types import SimpleNamespace
+
+from ..effect import effect
+from ..parameter import signed
+from ..signals import Expression, LocalSignals
+
+
+@effect(
+    "extra_inertia",
+    title="inertia that is not in the model (payload)",
+    family="inertia",
+    acts_on=("motor", "link"),
+    parameters=(
+        signed("extra_inertia", "kg.m2", "inertia beyond the known one"),
+    ),
+    absence="the residual follows the acceleration",
+    excitation="fast motion, with the inertia of one side known",
+    source="thesis section 4.2",
+    confused_with=("motor_constant_error",),
+    separate_by="the catalogue inertia as a known value, or a run without payload",
+)
+def extra_inertia(s: LocalSignals, p: SimpleNamespace) -> Expression:
+    return p.extra_inertia * s.acceleration

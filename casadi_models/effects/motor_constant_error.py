@@ -1,0 +1,25 @@
+"""motor constant."""
+
+from types import SimpleNamespace
+
+from ..effect import effect
+from ..parameter import signed
+from ..signals import Expression, LocalSignals
+
+
+@effect(
+    "motor_constant_error",
+    title="motor constant",
+    family="sensor",
+    acts_on=("drive",),
+    parameters=(
+        signed("motor_constant_error", "1", "relative error of the motor constant: true torque = (1 + error) times the stated one"),
+    ),
+    absence="the residual of the motor follows the drive torque, its inertial part too",
+    excitation="fast motion and a gravity-free run",
+    source="thesis section 4.3.2",
+    confused_with=("torque_sensor_gain", "cyclic_torque", "added_spring"),
+    separate_by="a run without payload or with the axis horizontal",
+)
+def motor_constant_error(s: LocalSignals, p: SimpleNamespace) -> Expression:
+    return p.motor_constant_error * s.reading

@@ -1,0 +1,30 @@
+"""soft wind-up (lost motion)."""
+
+from types import SimpleNamespace
+
+import casadi as ca
+
+from ..effect import effect
+from ..parameter import amplitude, shape
+from ..signals import Expression, LocalSignals
+
+
+@effect(
+    "soft_windup",
+    title="soft wind-up (lost motion)",
+    family="transmission",
+    acts_on=("transmission",),
+    parameters=(
+        amplitude("soft_windup_torque", "N.m", "torque lost to the soft zone"),
+        shape("soft_windup_width", "rad", "torsion over which the soft zone is wound up", (0.02, 0.05, 0.1, 0.2, 0.4), "torsion",
+              start=1e-4, low=1e-12, high=10.0),
+    ),
+    absence="the transmission is softer near zero torque",
+    excitation="many slow crossings of zero torque",
+    source="field knowledge (lost motion below one minute of arc)",
+    confused_with=("backlash", "piecewise_stiffness"),
+    needs=("transmission_compliance",),
+    separate_by="slow crossings of zero torque",
+)
+def soft_windup(s: LocalSignals, p: SimpleNamespace) -> Expression:
+    return -p.soft_windup_torque * ca.tanh(s.torsion / p.soft_windup_width)

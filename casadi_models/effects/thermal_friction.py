@@ -1,0 +1,26 @@
+"""Friction that changes with temperature (the temperature signal counts from the start of the record)."""
+
+from types import SimpleNamespace
+
+from ..effect import effect
+from ..parameter import signed
+from ..signals import Expression, LocalSignals
+
+
+@effect(
+    "thermal_friction",
+    title="friction that changes with temperature",
+    family="friction",
+    acts_on=("motor", "link"),
+    parameters=(
+        signed("thermal_coulomb", "N.m/K", "change of the Coulomb torque with temperature"),
+        signed("thermal_viscous", "N.m.s/(rad.K)", "change of the viscous coefficient with temperature"),
+    ),
+    absence="the friction residual changes during the run while its shape stays",
+    excitation="a long run that repeats its first block at the end, with temperature recorded",
+    source="R. Bittencourt and P. Axelsson 2014; L. Simoni et al. 2015",
+    needs=("coulomb",),
+    separate_by="a long run that repeats its first block when warm",
+)
+def thermal_friction(s: LocalSignals, p: SimpleNamespace) -> Expression:
+    return (p.thermal_coulomb * s.direction + p.thermal_viscous * s.velocity) * s.temperature

@@ -1,0 +1,30 @@
+"""torque ripple (cogging) of the motor."""
+
+from types import SimpleNamespace
+
+import casadi as ca
+
+from ..effect import effect
+from ..parameter import shape, signed
+from ..signals import Expression, LocalSignals
+
+
+@effect(
+    "torque_ripple",
+    title="torque ripple (cogging) of the motor",
+    family="torque",
+    acts_on=("motor",),
+    parameters=(
+        signed("ripple_sine", "N.m", "sine part"),
+        signed("ripple_cosine", "N.m", "cosine part"),
+        shape("ripple_order", "1", "order per turn of the motor", (1.0, 2.0, 4.0, 6.0), "absolute", start=2.0, low=0.05, high=400.0),
+    ),
+    absence="a line in the motor residual only, at a fixed order of the motor turn",
+    excitation="slow constant speed",
+    source="C. Parlitz-type cogging models; field knowledge",
+    periodic=True,
+    confused_with=("kinematic_error",),
+    separate_by="a slow constant-speed run",
+)
+def torque_ripple(s: LocalSignals, p: SimpleNamespace) -> Expression:
+    return p.ripple_sine * ca.sin(p.ripple_order * s.motor_angle) + p.ripple_cosine * ca.cos(p.ripple_order * s.motor_angle)

@@ -1,0 +1,26 @@
+"""compliance of the torque sensor."""
+
+from types import SimpleNamespace
+
+from ..effect import effect
+from ..parameter import amplitude
+from ..signals import Expression, LocalSignals
+
+
+@effect(
+    "torque_sensor_compliance",
+    title="compliance of the torque sensor",
+    family="transmission",
+    acts_on=("torsion",),
+    parameters=(
+        amplitude("sensor_compliance", "rad/(N.m)", "twist of the sensor per torque"),
+    ),
+    absence="the transmission seems softer than its catalogue stiffness",
+    excitation="torque against torsion, with the catalogue stiffness known",
+    source="thesis section 2.5.3",
+    needs=("transmission_compliance",),
+    confused_with=("transmission_compliance",),
+    separate_by="the catalogue stiffness of the gear, or a position measured before the sensor",
+)
+def torque_sensor_compliance(s: LocalSignals, p: SimpleNamespace) -> Expression:
+    return p.sensor_compliance * s.torque

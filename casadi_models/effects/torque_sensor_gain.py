@@ -1,0 +1,25 @@
+"""gain of the torque sensor."""
+
+from types import SimpleNamespace
+
+from ..effect import effect
+from ..parameter import signed
+from ..signals import Expression, LocalSignals
+
+
+@effect(
+    "torque_sensor_gain",
+    title="gain of the torque sensor",
+    family="sensor",
+    acts_on=("torque_sensor",),
+    parameters=(
+        signed("torque_sensor_gain", "1", "relative error of the sensor: reading = (1 + error) times the true torque"),
+    ),
+    absence="all balances with the torque sensor fail in proportion to the torque",
+    excitation="a gravity-free run and known payload",
+    source="field knowledge",
+    confused_with=("motor_constant_error", "gravity"),
+    separate_by="a known payload, or a run without payload",
+)
+def torque_sensor_gain(s: LocalSignals, p: SimpleNamespace) -> Expression:
+    return -s.reading * p.torque_sensor_gain / (1 + p.torque_sensor_gain)

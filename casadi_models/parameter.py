@@ -1,0 +1,95 @@
+"""One quantity of the joint model: name, unit, start, bounds, meaning, side."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Final, Literal, final
+
+Side = Literal["motor", "gear", "link", "sensor", "none"]
+Scale = Literal["absolute", "velocity", "torsion", "position", "duration"]
+
+LINEAR_UNITS: Final = {
+    "N.m": "N",
+    "N.m.s/rad": "N.s/m",
+    "N.m.s2/rad2": "N.s2/m2",
+    "N.m.s3/rad3": "N.s3/m3",
+    "N.m/rad": "N/m",
+    "N.m/rad3": "N/m3",
+    "rad": "m",
+    "rad/s": "m/s",
+    "kg.m2": "kg",
+    "rad/(N.m)": "m/N",
+}
+"""Unit of the same parameter where the joint is a linear axis (`kind = "linear"`)."""
+
+
+@final
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter of the joint model.
+
+    Attributes
+    ----------
+    name : str
+        Name, the side said first where an effect can act on either side (``motor_viscous``).
+    unit : str
+        SI unit of value, bounds and start. Torques and angles are link-referred.
+    start : float
+        Value with which a simulation or a fit begins; 0 for an amplitude means "absent".
+    low, high : float
+        Physical bounds (inclusive).
+    meaning : str
+        One sentence for the reader of a report.
+    side : {"motor", "gear", "link", "sensor", "none"}
+        Side the value is referred to.
+    grid : tuple of float
+        Non-empty for a shape parameter (one that enters nonlinearly and is searched on a grid
+        first); the grid points, in units of `scale`.
+    scale : {"absolute", "velocity", "torsion", "position", "duration"}
+        What the grid is a fraction of: nothing, or the 99 % range of a signal of the record.
+    """
+
+    name: str
+    unit: str
+    start: float
+    low: float
+    high: float
+    meaning: str
+    side: Side = "link"
+    grid: tuple[float, ...] = ()
+    scale: Scale = "absolute"
+
+    def __post_init__(self) -> None:
+        if not self.low <= self.start <= self.high:
+            raise ValueError(f"parameter {self.name}: start {self.start} outside [{self.low}, {self.high}]")
+
+    @property
+    def is_shape(self) -> bool:
+        """True for a parameter that is searched on a grid (shape of a law, not its amplitude)."""
+        return bool(self.grid)
+
+    def renamed(self, name: str, side: Side) -> Parameter:
+        """The same parameter under another name and side (used when an effect is put in a place)."""
+        return replace(self, name=name, side=side)
+
+    def for_kind(self, kind: str) -> Parameter:
+        """The parameter with the units of a linear axis where `kind` is "linear"."""
+        return self if kind == "rotary" else replace(self, unit=LINEAR_UNITS.get(self.unit, self.unit))
+
+
+def amplitude(name: str, unit: str, meaning: str, *, low: float = 0.0, high: float = math.inf) -> Parameter:
+    """An amplitude: enters linearly, 0 means that the effect is absent."""
+    return Parameter(name, unit, 0.0, low, high, meaning)
+
+
+def signed(name: str, unit: str, meaning: str) -> Parameter:
+    """An amplitude that may have either sign."""
+    return Parameter(name, unit, 0.0, -math.inf, math.inf, meaning)
+
+
+def shape(
+    name: str, unit: str, meaning: str, grid: tuple[float, ...], scale: Scale, *, start: float, low: float, high: float
+) -> Parameter:
+    """A shape parameter: enters nonlinearly, searched on a grid of fractions of a signal's range."""
+    return Parameter(name, unit, start, low, high, meaning, grid=grid, scale=scale)

@@ -1,0 +1,115 @@
+"""Quantities that a law may use, all link-referred and in SI units."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Any, Final, final
+
+import casadi as ca
+
+Expression = Any
+"""A CasADi expression (SX or MX) or a number; CasADi carries no type hints."""
+
+SIGNAL_UNITS: Final = {
+    "time": "s",
+    "drive": "N.m",
+    "drive_rate": "N.m/s",
+    "motor_position": "rad",
+    "motor_velocity": "rad/s",
+    "motor_acceleration": "rad/s2",
+    "motor_jerk": "rad/s3",
+    "link_position": "rad",
+    "link_velocity": "rad/s",
+    "link_acceleration": "rad/s2",
+    "link_jerk": "rad/s3",
+    "torque": "N.m",
+    "torque_rate": "N.m/s",
+    "temperature": "K",
+}
+
+
+@final
+@dataclass(frozen=True)
+class Signals:
+    """Signals of the joint at one instant (symbols, numbers or arrays alike).
+
+    Motor quantities are divided by the gear ratio (link-referred); `drive` is the motor torque
+    times the gear ratio, n Km I; `torque` is what the gear puts into the link.
+    """
+
+    time: Expression
+    drive: Expression
+    drive_rate: Expression
+    motor_position: Expression
+    motor_velocity: Expression
+    motor_acceleration: Expression
+    motor_jerk: Expression
+    link_position: Expression
+    link_velocity: Expression
+    link_acceleration: Expression
+    link_jerk: Expression
+    torque: Expression
+    torque_rate: Expression
+    temperature: Expression
+
+    @staticmethod
+    def names() -> tuple[str, ...]:
+        """Names of the signals in the order of :meth:`vector`."""
+        return tuple(f.name for f in fields(Signals))
+
+    @staticmethod
+    def symbols() -> Signals:
+        """Fresh CasADi SX symbols for every signal."""
+        return Signals(**{name: ca.SX.sym(name) for name in Signals.names()})
+
+    def vector(self) -> Expression:
+        """All signals stacked to one column."""
+        return ca.vertcat(*(getattr(self, name) for name in Signals.names()))
+
+    def with_values(self, **values: Expression) -> Signals:
+        """A copy with some signals replaced."""
+        return replace(self, **values)
+
+
+@final
+@dataclass(frozen=True)
+class LocalSignals:
+    """What a law sees: the signals at the place where the effect acts.
+
+    Attributes
+    ----------
+    position, velocity, acceleration : expression
+        Of the side on which the effect acts [rad, rad/s, rad/s2]; of the torsion where the effect
+        acts on the transmission.
+    direction : expression
+        Smoothed sign of the velocity, tanh(velocity / smoothing).
+    torsion, torsion_rate : expression
+        Twist of the transmission, motor side minus link side, kinematic error taken off.
+    torque, load : expression
+        Torque that the gear puts into the link; load that presses the gear's teeth (the same where
+        it is measured or simulated, the gravity law where it is not).
+    reading, reading_rate : expression
+        The channel itself, for effects that act on a sensor or on the drive.
+    motor_angle : expression
+        Angle of the motor shaft itself (gear ratio times motor position) [rad].
+    time, temperature, memory : expression
+        Time [s], temperature [K], internal states of the effect.
+    gear_ratio, stiffness : expression
+        Signed ratio theta_motor/theta_link; linear stiffness of the transmission [N.m/rad].
+    """
+
+    position: Expression
+    velocity: Expression
+    acceleration: Expression
+    direction: Expression
+    torsion: Expression
+    torsion_rate: Expression
+    torque: Expression
+    load: Expression
+    reading: Expression
+    reading_rate: Expression
+    motor_angle: Expression
+    time: Expression
+    temperature: Expression
+    memory: tuple[Expression, ...]
+    gear_ratio: Expression
