@@ -19,10 +19,19 @@ from .parameter import Parameter, Side
 from .signals import Expression, LocalSignals
 
 Place = Literal[
-    "motor", "link", "transmission", "torsion", "drive", "torque_sensor", "motor_position_sensor", "link_position_sensor"
+    "motor",
+    "link",
+    "transmission",
+    "torsion",
+    "drive",
+    "torque_sensor",
+    "motor_position_sensor",
+    "link_position_sensor",
 ]
 Family = Literal["friction", "torque", "transmission", "sensor", "inertia"]
 Law = Callable[[LocalSignals, SimpleNamespace], Expression]
+Potential = Law
+Rate = Callable[[tuple[Expression, ...], LocalSignals, SimpleNamespace], tuple[Expression, ...]]
 Update = Callable[[tuple[Expression, ...], Expression, LocalSignals, SimpleNamespace], tuple[Expression, ...]]
 
 PLACE_SIDE: Final[dict[str, Side]] = {
@@ -64,7 +73,14 @@ class Effect:
     memory : callable or None
         ``memory(z, step, signals, parameters)``: the internal states after the driving coordinate
         (position, or torsion) has moved by `step`. Holds for any step, so that simulation,
-        identification and the continuous form share it.
+        identification and the continuous form share it. A memory that also runs with time reads the
+        duration of the step from ``signals.clock``.
+    rate : callable or None
+        ``rate(z, signals, parameters)``: the continuous form dz/dt that belongs to `memory`. Without
+        it the step form is differentiated over :data:`casadi_models.joint.MEMORY_STEP`.
+    potential : callable or None
+        ``potential(signals, parameters)``: energy stored by a law that depends on position or torsion
+        only, 0 at zero; its derivative is the law [J]. Without it the law is integrated numerically.
     states : int
         Number of internal states.
     absence, excitation : str
@@ -81,6 +97,9 @@ class Effect:
         True for a line at an order of the motor turn (own claim rule).
     separate_by : str
         The run that separates it from what it is confused with.
+    candidate : bool
+        False for another form of an effect of the library: used when it is named, not proposed by a
+        diagnosis.
     source : str
         Equation or paper.
     """
@@ -95,13 +114,22 @@ class Effect:
     excitation: str
     source: str
     memory: Update | None = None
+    rate: Rate | None = None
     states: int = 0
+    potential: Potential | None = None
     confused_with: tuple[str, ...] = ()
     needs: tuple[str, ...] = ()
     needs_load: bool = False
     dissipative: bool = False
     periodic: bool = False
     separate_by: str = ""
+    candidate: bool = True
+
+    def __post_init__(self) -> None:
+        if (self.memory is None) != (self.states == 0):
+            raise ValueError(f"effect {self.key!r}: states need a memory, and a memory needs states")
+        if self.rate is not None and self.memory is None:
+            raise ValueError(f"effect {self.key!r}: a rate needs its step form, memory")
 
     @property
     def amplitudes(self) -> tuple[Parameter, ...]:
@@ -172,13 +200,16 @@ def effect(
     excitation: str,
     source: str,
     memory: Update | None = None,
+    rate: Rate | None = None,
     states: int = 0,
+    potential: Potential | None = None,
     confused_with: tuple[str, ...] = (),
     needs: tuple[str, ...] = (),
     needs_load: bool = False,
     dissipative: bool = False,
     periodic: bool = False,
     separate_by: str = "",
+    candidate: bool = True,
 ) -> Callable[[Law], Law]:
     """Declare and register the decorated law as an effect (see :class:`Effect` for the arguments)."""
 
@@ -186,8 +217,9 @@ def effect(
         EFFECTS.add(
             Effect(
                 key=key, title=title, family=family, acts_on=acts_on, parameters=parameters, law=law, absence=absence,
-                excitation=excitation, source=source, memory=memory, states=states, confused_with=confused_with,
-                needs=needs, needs_load=needs_load, dissipative=dissipative, periodic=periodic, separate_by=separate_by,
+                excitation=excitation, source=source, memory=memory, rate=rate, states=states, potential=potential,
+                confused_with=confused_with, needs=needs, needs_load=needs_load, dissipative=dissipative,
+                periodic=periodic, separate_by=separate_by, candidate=candidate,
             )
         )  # fmt: skip
         return law

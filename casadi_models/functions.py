@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cached_property
 from typing import Any, Final, final
 
@@ -10,16 +9,17 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from .joint import MEMORY_STEP, Equations, JointModel, Term, inverse_dynamics
-from .signals import Expression, Signals
+from .energy import total_energy
+from .equations import Equations
+from .joint import MEMORY_STEP, JointModel, inverse_dynamics
+from .signals import Expression
+from .solve import affine_solution, carried_torque, rigid_solution
 
 INPUTS: Final = ("drive", "temperature", "time")
 """Inputs of the dynamics: n Km I [N.m], temperature [K], time [s]."""
 
 FloatArray = npt.NDArray[np.float64]
-
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
-_PANELS: Final = 8
+_GONE: Final = ("drive_rate", "torque_rate", "motor_jerk", "link_jerk")
 
 
 @final
@@ -28,15 +28,18 @@ class JointFunctions:
 
     States x: (q_m, v_m, q_l, v_l, memory...) for an elastic joint, (q, v, memory...) for a rigid
     one; all link-referred. Inputs u: :data:`INPUTS`. Parameters p in the order of
-    ``model.parameter_names``.
+    ``model.parameter_names``. States are true values; what the sensors add appears in
+    :attr:`outputs` only.
     """
 
     def __init__(self, model: JointModel) -> None:
         self._model = model
-        self._equations: Equations = model.equations
+        self._equations: Equations = model.true_equations
         mechanical = ("motor_position", "motor_velocity", "link_position", "link_velocity")
         self.state_names: tuple[str, ...] = mechanical if model.is_elastic else ("position", "velocity")
         self.memory_names: tuple[str, ...] = tuple(str(z) for z in ca.vertsplit(self._equations.memory))
+
+    # --- accelerations and torque ------------------------------------------------------------------------------------
 
     @cached_property
     def _symbols(self) -> tuple[Expression, Expression, Expression, Expression]:
@@ -46,75 +49,96 @@ class JointFunctions:
         return x, e.memory, u, e.parameters
 
     def _substituted(self, *expressions: Expression) -> list[Expression]:
-        """Expressions of the signals as expressions of (x, memory, u, p), without accelerations."""
+        """Expressions of the signals as expressions of (x, memory, u, p), accelerations and torque left."""
         x, _, u, _ = self._symbols
         s = self._equations.signals
         link = (x[2], x[3]) if self._model.is_elastic else (x[0], x[1])
-        old = [
-            s.motor_position, s.motor_velocity, s.link_position, s.link_velocity, s.drive, s.temperature, s.time,
-            s.drive_rate, s.torque_rate, s.motor_jerk, s.link_jerk,
-        ]  # fmt: skip
-        new = [x[0], x[1], *link, u[0], u[1], u[2], *[ca.SX(0)] * 4]
+        old = [s.motor_position, s.motor_velocity, s.link_position, s.link_velocity, s.drive, s.temperature, s.time]
+        new = [x[0], x[1], *link, u[0], u[1], u[2]]
+        old += [getattr(s, name) for name in _GONE]
+        new += [ca.SX(0)] * len(_GONE)
         return list(ca.substitute(list(expressions), old, new))
 
     @cached_property
-    def _accelerations(self) -> tuple[Expression, ...]:
-        """(motor, link) accelerations of an elastic joint or the one acceleration of a rigid one."""
-        e, model = self._equations, self._model
+    def _solution(self) -> tuple[tuple[Expression, ...], Expression]:
+        """Accelerations (motor and link, or the one of a rigid joint) and the torque into the link."""
+        e = self._equations
         s = e.signals
-        if model.is_elastic:
-            transmitted = e.transmitted
-            motor = e.drive - e.motor_resistance - transmitted * e.motor_lever
-            link = transmitted * e.link_lever - e.link_resistance
-            if model.load_from == "torque":
-                motor, link = ca.substitute([motor, link], [s.torque], [transmitted])
-            motor, link = self._substituted(motor, link)
-            motor = self._solve(motor, s.motor_acceleration, e.inertia["motor_inertia"])
-            link = self._solve(link, s.link_acceleration, e.inertia["link_inertia"])
-            return motor, link
-        resist = e.motor_resistance + e.link_resistance
+        if self._model.is_elastic:
+            torque = carried_torque(e)
+            motor = e.drive - e.motor_resistance - torque * e.motor_lever
+            link = torque * e.link_lever - e.link_resistance
+            motor, link = ca.substitute([motor, link], [s.torque], [torque])
+            motor, link, torque = self._substituted(motor, link, torque)
+            motor = affine_solution(motor, s.motor_acceleration, e.inertia["motor_inertia"])
+            link = affine_solution(link, s.link_acceleration, e.inertia["link_inertia"])
+            return (motor, link), torque
+        one = [s.link_acceleration], [s.motor_acceleration]
+        share = e.inertia.get("link_inertia", ca.SX(0))
+        right, carried = ca.substitute(
+            [e.drive - e.motor_resistance - e.link_resistance, share * s.link_acceleration + e.link_resistance], *one
+        )
+        right, carried = self._substituted(right, carried)
         inertia: Expression = sum(e.inertia.values())
-        (right,) = ca.substitute([e.drive - resist], [s.link_acceleration], [s.motor_acceleration])
-        (right,) = self._substituted(right)
-        (right,) = ca.substitute([right], [s.torque], [ca.SX(0)])
-        return (self._solve(right, s.motor_acceleration, inertia),)
+        acceleration, torque = rigid_solution(right, carried, inertia, s.motor_acceleration, s.torque)
+        return (acceleration,), torque
+
+    def _resolved(self, *expressions: Expression) -> list[Expression]:
+        """Expressions of the signals as expressions of (x, memory, u, p) alone."""
+        s = self._equations.signals
+        accelerations, torque = self._solution
+        old = [s.motor_acceleration, s.link_acceleration, s.torque]
+        return list(ca.substitute(self._substituted(*expressions), old, [*self._both(accelerations), torque]))
 
     @staticmethod
-    def _solve(right: Expression, acceleration: Expression, inertia: Expression) -> Expression:
-        """Acceleration from inertia * a = right(a), where right is affine in a."""
-        slope = ca.jacobian(right, acceleration)
-        (free,) = ca.substitute([right], [acceleration], [ca.SX(0)])
-        return free / (inertia - slope)
+    def _both(pair: tuple[Expression, ...]) -> tuple[Expression, Expression]:
+        return pair[0], pair[-1]
 
     def _mechanical_rates(self) -> Expression:
         x = self._symbols[0]
-        a = self._accelerations
+        a = self._solution[0]
         return ca.vertcat(x[1], a[0], x[3], a[1]) if self._model.is_elastic else ca.vertcat(x[1], a[0])
+
+    # --- internal states ---------------------------------------------------------------------------------------------
 
     @cached_property
     def _memory_coordinates(self) -> list[Expression]:
-        found = self._substituted(*(t[1] for t in self._equations.memory_terms))
-        return list(found)
+        return self._resolved(*(t[1] for t in self._equations.memory_terms))
 
-    def _moved_memory(self, steps: list[Expression]) -> Expression:
-        """All internal states after their coordinates have moved by `steps`."""
+    def _moved_memory(self, steps: list[Expression], duration: Expression) -> Expression:
+        """All internal states after their coordinates have moved by `steps` in the time `duration`."""
         out: list[Expression] = []
         for (term, _, z, view, values), step in zip(self._equations.memory_terms, steps, strict=True):
             if term.effect.memory is not None:
                 out.extend(term.effect.memory(z, step, view, values))
-        if not out:
+        return self._stacked(out, duration)
+
+    def _memory_rates(self, mechanical: Expression) -> Expression:
+        """Continuous form of the memory: the declared rate, or the step form over a very short time."""
+        x = self._symbols[0]
+        out: list[Expression] = []
+        terms = zip(self._equations.memory_terms, self._memory_coordinates, strict=True)
+        for (term, _, z, view, values), coordinate in terms:
+            if term.effect.rate is not None:
+                out.extend(term.effect.rate(z, view, values))
+            elif term.effect.memory is not None:
+                step = ca.jtimes(coordinate, x, mechanical) * MEMORY_STEP
+                moved = term.effect.memory(z, step, view, values)
+                out.extend((after - before) / MEMORY_STEP for after, before in zip(moved, z, strict=True))
+        return self._stacked(out, ca.SX(MEMORY_STEP))
+
+    def _stacked(self, states: list[Expression], duration: Expression) -> Expression:
+        if not states:
             return ca.SX(0, 1)
-        return ca.vertcat(*self._substituted(*out))
+        return ca.vertcat(*ca.substitute(self._resolved(*states), [self._equations.clock], [duration]))
+
+    # --- functions ---------------------------------------------------------------------------------------------------
 
     @cached_property
     def rates(self) -> Expression:
         """Symbolic dx/dt, memory included."""
-        x, z, _, _ = self._symbols
         mechanical = self._mechanical_rates()
-        if not self._equations.memory_terms:
-            return mechanical
-        speeds = [ca.jtimes(c, x, mechanical) * MEMORY_STEP for c in self._memory_coordinates]
-        return ca.vertcat(mechanical, (self._moved_memory(speeds) - z) / MEMORY_STEP)
+        return ca.vertcat(mechanical, self._memory_rates(mechanical))
 
     @cached_property
     def dynamics(self) -> Any:
@@ -132,46 +156,43 @@ class JointFunctions:
 
     @cached_property
     def step(self) -> Any:
-        """(x, u, p, h) -> x after one Runge-Kutta step of 4th order; memory moves with its coordinate."""
+        """(x, u, p, h) -> x after one Runge-Kutta step of 4th order; memory moves with its coordinate.
+
+        Without internal states the step is of 4th order. With them it is of the order of their step
+        form: 1 for bristles, 2 for an oscillator.
+        """
         x, z, u, p = self._symbols
         h = ca.SX.sym("h")
         rate = ca.Function("rate", [x, z, u, p], [self._mechanical_rates()])
-        where = ca.Function("where", [x, p], self._memory_coordinates or [ca.SX(0)])
+        where = ca.Function("where", [x, z, u, p], [ca.vertcat(*self._memory_coordinates)])
+        has_memory = bool(self._equations.memory_terms)
 
-        def coordinates(at: Expression) -> list[Expression]:
-            found = where(at, p)
-            return list(found) if isinstance(found, tuple | list) else [found]
+        def moved(at: Expression, duration: Expression) -> Expression:
+            steps = ca.vertsplit(where(at, z, u, p) - where(x, z, u, p))
+            return self._moved_memory(steps, duration)
 
-        def stage(at: Expression) -> Expression:
-            if not self._equations.memory_terms:
-                return rate(at, z, u, p)
-            moved = [b - a for a, b in zip(coordinates(x), coordinates(at), strict=True)]
-            return rate(at, self._moved_memory(moved), u, p)
+        def stage(at: Expression, duration: Expression) -> Expression:
+            return rate(at, moved(at, duration) if has_memory else z, u, p)
 
-        k1 = stage(x)
-        k2 = stage(x + h / 2 * k1)
-        k3 = stage(x + h / 2 * k2)
-        k4 = stage(x + h * k3)
+        k1 = rate(x, z, u, p)
+        k2 = stage(x + h / 2 * k1, h / 2)
+        k3 = stage(x + h / 2 * k2, h / 2)
+        k4 = stage(x + h * k3, h)
         new = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-        if self._equations.memory_terms:
-            moved = [b - a for a, b in zip(coordinates(x), coordinates(new), strict=True)]
-            new = ca.vertcat(new, self._moved_memory(moved))
+        if has_memory:
+            new = ca.vertcat(new, moved(new, h))
         return ca.Function("step", [ca.vertcat(x, z), u, p, h], [new], ["x", "u", "p", "h"], ["x_next"])
 
     @cached_property
     def outputs(self) -> Any:
-        """(x, u, p) -> readings (motor position, velocity, link position, velocity, torque), sensor errors included."""
+        """(x, u, p) -> readings (motor position, velocity, link position, velocity, torque), sensor errors included.
+
+        A delay is turned round to first order: the reading is the true value less the delay times its rate.
+        """
         x, z, u, p = self._symbols
-        e, s = self._equations, self._equations.signals
-        torque = e.transmitted if self._model.is_elastic else e.link_resistance
-        (true_torque,) = self._substituted(torque)
+        accelerations, true_torque = self._both(self._solution[0]), self._solution[1]
         motor = (x[0], x[1])
         link = (x[2], x[3]) if self._model.is_elastic else motor
-        accelerations = self._accelerations
-        accelerations = accelerations if len(accelerations) == 2 else (accelerations[0],) * 2
-        if not self._model.is_elastic:
-            inertia = e.inertia.get("link_inertia", ca.SX(0))
-            true_torque = true_torque + inertia * accelerations[0]
         torque_rate = ca.jtimes(true_torque, x, self._mechanical_rates())
         rows = [
             self._reading("motor_position_sensor", motor[0], motor[1]),
@@ -180,87 +201,62 @@ class JointFunctions:
             self._reading("link_position_sensor", link[1], accelerations[1], offset=False),
             self._reading("torque_sensor", true_torque, torque_rate),
         ]
-        out = ca.vertcat(*rows)
-        (out,) = ca.substitute([out], [s.motor_acceleration, s.link_acceleration], [ca.SX(0), ca.SX(0)])
-        return ca.Function("outputs", [ca.vertcat(x, z), u, p], [out], ["x", "u", "p"], ["y"])
+        return ca.Function("outputs", [ca.vertcat(x, z), u, p], [ca.vertcat(*rows)], ["x", "u", "p"], ["y"])
 
     def _reading(self, place: str, true: Expression, rate: Expression, *, offset: bool = True) -> Expression:
         """Reading from the true value: the affine law of the sensor turned round."""
-        s = self._equations.signals
-        corrected = {
-            "motor_position_sensor": (s.motor_position, s.motor_velocity),
-            "link_position_sensor": (s.link_position, s.link_velocity),
-            "torque_sensor": (s.torque, s.torque_rate),
+        e = self._model.equations
+        s = e.signals
+        found, channel, channel_rate = {
+            "motor_position_sensor": (e.true_motor_position, s.motor_position, s.motor_velocity),
+            "link_position_sensor": (e.true_link_position, s.link_position, s.link_velocity),
+            "torque_sensor": (e.torque, s.torque, s.torque_rate),
         }[place]
-        found = self._corrected(place)
-        gain, lag = ca.jacobian(found, corrected[0]), ca.jacobian(found, corrected[1])
-        (zero,) = ca.substitute([found], list(corrected), [ca.SX(0), ca.SX(0)])
+        gain, lag = ca.jacobian(found, channel), ca.jacobian(found, channel_rate)
+        (zero,) = ca.substitute([found], [channel, channel_rate], [ca.SX(0), ca.SX(0)])
         return (true - (zero if offset else 0) - lag * rate / gain) / gain
-
-    def _corrected(self, place: str) -> Expression:
-        e, s = self._equations, self._equations.signals
-        if place == "torque_sensor":
-            return e.torque
-        return e.true_motor_position if place == "motor_position_sensor" else e.true_link_position
 
     @cached_property
     def regressor(self) -> Any:
         """(x, a, u, p) -> (Y, rest): Y theta_linear + rest = inverse dynamics (drive, 0).
 
-        x as in :attr:`dynamics` (memory included), a the accelerations, one per degree of freedom.
+        x as in :attr:`dynamics` (memory included), a the accelerations, one per degree of freedom; with
+        sensor effects in the model, x and a are readings. The load of load-dependent laws is the one
+        that the model carries with p.
         """
         x, z, u, p = self._symbols
-        s = self._equations.signals
-        degrees = 2 if self._model.is_elastic else 1
-        a = ca.SX.sym("a", degrees)
-        right = inverse_dynamics(self._model)
-        if self._model.is_elastic and self._model.load_from == "torque":
-            (right,) = ca.substitute([right], [s.torque], [self._equations.transmitted])
-        (right,) = ca.substitute([right], [s.motor_acceleration, s.link_acceleration], [a[0], a[degrees - 1]])
-        (right,) = self._substituted(right)
+        e = self._model.equations
+        s = e.signals
+        elastic = self._model.is_elastic
+        a = ca.SX.sym("a", 2 if elastic else 1)
+        right = ca.vertcat(inverse_dynamics(self._model))
         names = self._model.parameter_names
         linear = [names.index(n) for n in self._model.linear_parameters]
-        matrix = ca.jacobian(right, p)[:, linear]
+        matrix: Expression = ca.jacobian(right, p)[:, linear]
+        rest: Expression
         (rest,) = ca.substitute([right], [ca.vertcat(*(p[i] for i in linear))], [ca.SX.zeros(len(linear), 1)])
+        load = carried_torque(e) if elastic else self._carried_rigidly(e)
+        reading = self._reading("torque_sensor", load, ca.SX(0))
+        matrix, rest = ca.substitute([matrix, rest], [s.torque], [reading])
+        matrix, rest = ca.substitute(
+            self._substituted(matrix, rest), [s.motor_acceleration, s.link_acceleration], [a[0], a[elastic]]
+        )
         full = ca.vertcat(x, z)
-        return ca.Function("regressor", [full, a, u, p], [ca.densify(matrix), ca.densify(rest)], ["x", "a", "u", "p"], ["Y", "rest"])
+        out = [ca.densify(matrix), ca.densify(rest)]
+        return ca.Function("regressor", [full, a, u, p], out, ["x", "a", "u", "p"], ["Y", "rest"])
+
+    @staticmethod
+    def _carried_rigidly(e: Equations) -> Expression:
+        """Torque into the link of a rigid joint whose acceleration is known."""
+        share = e.inertia.get("link_inertia", ca.SX(0))
+        return carried_torque(e, share * e.link_acceleration + e.link_resistance)
 
     @cached_property
     def energy(self) -> Any:
         """(x, p) -> kinetic energy plus the potential of springs and position-dependent torques [J]."""
         x, z, _, p = self._symbols
-        e, model = self._equations, self._model
-        link = x[2] if model.is_elastic else x[0]
-        torques = self._part(tuple(t for t in model.terms if t.effect.family == "torque"))
-        total = self._work(torques, torques.motor_resistance, x[0], "motor_position")
-        total = total + self._work(torques, torques.link_resistance, link, "link_position")
-        speeds = [x[1], x[3]] if model.is_elastic else [x[1]] * 2
-        if model.is_elastic:
-            springs = self._part(tuple(t for t in model.terms if t.place == "transmission" and not t.effect.dissipative))
-            (angle,) = self._substituted(e.torsion)
-            total = total + self._work(springs, springs.transmitted, angle, "motor_position")
-        shares = list(e.inertia.values())
-        for inertia, speed in zip(shares, speeds, strict=False):
-            total = total + inertia * speed**2 / 2
+        (total,) = self._resolved(total_energy(self._model))
         return ca.Function("energy", [ca.vertcat(x, z), p], [total], ["x", "p"], ["E"])
-
-    def _part(self, terms: tuple[Term, ...]) -> Equations:
-        """Equations of the same joint with some of its terms only."""
-        return replace(self._model, terms=terms, values={}).equations
-
-    def _work(self, part: Equations, torque: Expression, upto: Expression, coordinate: str) -> Expression:
-        """Integral of a torque along its coordinate from 0 (Gauss-Legendre panels), all other signals zero."""
-        names = [str(v) for v in ca.vertsplit(part.parameters)]
-        here = ca.vertcat(*(self._equations.parameters[self._model.parameter_names.index(n)] for n in names))
-        others = [getattr(part.signals, n) for n in Signals.names() if n != coordinate]
-        law = ca.substitute([torque], [part.parameters, *others], [here, *[ca.SX(0)] * len(others)])[0]
-        total: Expression = ca.SX(0)
-        for panel in range(_PANELS):
-            for node, weight in zip(_NODES, _WEIGHTS, strict=True):
-                share = (panel + (node + 1) / 2) / _PANELS
-                value = ca.substitute([law], [getattr(part.signals, coordinate)], [upto * share])[0]
-                total = total + weight / 2 / _PANELS * value
-        return total * upto
 
     def linearize(self, x: FloatArray | None = None, u: FloatArray | None = None) -> Any:
         """control.StateSpace of the joint about (x, u): input drive [N.m], outputs the mechanical states."""

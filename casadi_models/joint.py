@@ -12,120 +12,21 @@ A rigid model has one degree of freedom, q_m = q_l.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from types import MappingProxyType, SimpleNamespace
+from types import MappingProxyType
 from typing import Any, Final, final
 
-import casadi as ca
-
-from .effect import EFFECTS, Effect, Place
+from .effect import EFFECTS
+from .equations import Equations, Symbols, build_equations, inverse_dynamics, linear_set, time_derivative
 from .parameter import Parameter
-from .signals import Expression, LocalSignals, Signals
+from .term import INERTIAS, Term, smoothing
+
+__all__ = ["MEMORY_STEP", "Equations", "JointModel", "Term", "inverse_dynamics", "time_derivative"]
 
 MEMORY_STEP: Final = 1e-6
-"""Time over which the step form of a memory is differentiated to its continuous form [s]."""
-
-INERTIAS: Final = {
-    "motor_inertia": Parameter(
-        "motor_inertia", "kg.m2", 1.0, 1e-12, math.inf, "inertia of rotor and wave generator, times the ratio squared", "motor"
-    ),
-    "link_inertia": Parameter("link_inertia", "kg.m2", 1.0, 1e-12, math.inf, "inertia of the link with its payload", "link"),
-    "inertia": Parameter("inertia", "kg.m2", 1.0, 1e-12, math.inf, "inertia of motor and link together", "link"),
-}  # fmt: skip
-
-_RATES: Final = {
-    "motor_position": "motor_velocity",
-    "motor_velocity": "motor_acceleration",
-    "motor_acceleration": "motor_jerk",
-    "link_position": "link_velocity",
-    "link_velocity": "link_acceleration",
-    "link_acceleration": "link_jerk",
-    "torque": "torque_rate",
-    "drive": "drive_rate",
-}
-
-
-@final
-@dataclass(frozen=True)
-class Term:
-    """One effect in one place."""
-
-    effect: Effect
-    place: Place
-    instance: int = 1
-
-    @property
-    def label(self) -> str:
-        """``key``, ``key@place`` where the effect may act on several places, ``#2`` for a second one."""
-        label = f"{self.effect.key}@{self.place}" if len(self.effect.acts_on) > 1 else self.effect.key
-        return label if self.instance == 1 else f"{label}#{self.instance}"
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Parameter names in the model, in the order of the effect's parameters."""
-        tail = "" if self.instance == 1 else f"_{self.instance}"
-        return tuple(n + tail for n in self.effect.parameter_names(self.place))
-
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """Parameters with the names they have in the model."""
-        return tuple(p.renamed(n, p.side) for p, n in zip(self.effect.placed(self.place), self.names, strict=True))
-
-
-@final
-@dataclass(frozen=True)
-class Equations:
-    """Symbolic pieces of the joint on one set of signal symbols.
-
-    Attributes
-    ----------
-    signals : Signals
-        The symbols.
-    parameters, memory : expression
-        Columns of all parameters and of all internal states.
-    drive, motor_resistance, link_resistance : expression
-        Torque of the motor; torques that resist the motion of either side [N.m].
-    transmitted : expression
-        What the transmission laws say [N.m].
-    torque, true_motor_position, true_link_position : expression
-        What the sensors say, corrected [N.m, rad, rad].
-    torsion : expression
-        Twist of the transmission, kinematic error taken off [rad].
-    motor_lever, link_lever : expression
-        Share of the transmitted torque that motor and link feel (1 without kinematic error).
-    memory_coordinate : tuple of expression
-        Driving coordinate of each term with states, in order.
-    """
-
-    signals: Signals
-    parameters: Expression
-    memory: Expression
-    drive: Expression
-    motor_acceleration: Expression
-    link_acceleration: Expression
-    motor_resistance: Expression
-    link_resistance: Expression
-    transmitted: Expression
-    torque: Expression
-    torsion: Expression
-    true_motor_position: Expression
-    true_link_position: Expression
-    motor_lever: Expression
-    link_lever: Expression
-    inertia: Mapping[str, Expression]
-    memory_terms: tuple[tuple[Term, Expression, tuple[Expression, ...], LocalSignals, SimpleNamespace], ...]
-
-
-def smoothing(place: str) -> Parameter:
-    """Velocity over which sign(v) is smoothed to tanh(v/v0): a nuisance of every friction law."""
-    return Parameter(
-        f"{place}_smoothing_velocity", "rad/s", 1e-3, 1e-9, math.inf,
-        f"velocity over which {place}-side friction changes its sign (nuisance)", "motor" if place == "motor" else "link",
-        grid=(0.0003, 0.001, 0.003, 0.01, 0.03), scale="velocity",
-    )  # fmt: skip
+"""Time over which a memory without a rate of its own is differentiated to its continuous form [s]."""
 
 
 @final
@@ -150,6 +51,8 @@ class JointModel:
         thesis's approximation (2.58).
     load_from : {"torque", "gravity"}
         What presses the gear's teeth in load-dependent laws.
+    name : str
+        Name in reports.
     """
 
     gear_ratio: float = 1.0
@@ -176,8 +79,9 @@ class JointModel:
         Parameters
         ----------
         label : str
-            Effect key, ``key@place``, or ``key#2`` for a second one with its own parameters. A key alone goes to the effect's first place; viscous and
-            Coulomb friction go to motor and link alike.
+            Effect key, ``key@place``, or ``key#2`` for a second one with its own parameters. A key
+            alone goes to the effect's first place; viscous and Coulomb friction go to motor and link
+            alike.
 
         Raises
         ------
@@ -256,13 +160,22 @@ class JointModel:
 
     @cached_property
     def equations(self) -> Equations:
-        """The symbolic joint (built once per model)."""
-        return _build(self)
+        """The symbolic joint on readings: what the sensors add is taken off (built once per model)."""
+        return build_equations(self, self._symbols, sensors=True)
+
+    @cached_property
+    def true_equations(self) -> Equations:
+        """The symbolic joint on true signals, on the same symbols: what a simulation integrates."""
+        return build_equations(self, self._symbols, sensors=False)
+
+    @cached_property
+    def _symbols(self) -> Symbols:
+        return Symbols.of(self)
 
     @cached_property
     def linear_parameters(self) -> tuple[str, ...]:
         """Largest set of parameters that enter the equations of motion jointly linearly."""
-        return _linear_set(self)
+        return linear_set(self)
 
     @cached_property
     def functions(self) -> Any:
@@ -294,132 +207,3 @@ class JointModel:
     def linearize(self, x: Any = None, u: Any = None) -> Any:
         """State-space model (control.StateSpace) about a working point; rest at zero by default."""
         return self.functions.linearize(x, u)
-
-
-def time_derivative(expression: Expression, signals: Signals) -> Expression:
-    """Rate of an expression of the signals by the chain rule."""
-    total: Expression = ca.SX(0)
-    for name, rate in _RATES.items():
-        total = total + ca.jacobian(expression, getattr(signals, name)) * getattr(signals, rate)
-    return total
-
-
-def _build(model: JointModel) -> Equations:
-    raw = Signals.symbols()
-    symbols = {p.name: ca.SX.sym(p.name) for p in model.parameters}
-    memory: dict[Term, tuple[Expression, ...]] = {
-        t: tuple(ca.SX.sym(f"{t.label}_{i}") for i in range(t.effect.states)) for t in model.terms if t.effect.states
-    }
-
-    def values(term: Term) -> SimpleNamespace:
-        return SimpleNamespace(**{p.name: symbols[n] for p, n in zip(term.effect.parameters, term.names, strict=True)})
-
-    def local(term: Term, s: Signals, d: Expression, load: Expression, reading: tuple[Expression, Expression]) -> LocalSignals:
-        link = term.place in ("link", "link_position_sensor")
-        gear = term.place == "transmission"
-        rate = time_derivative(d, raw)
-        velocity = s.link_velocity if link else s.motor_velocity
-        smooth = symbols.get(f"{'link' if link else 'motor'}_smoothing_velocity")
-        return LocalSignals(
-            position=d if gear else (s.link_position if link else s.motor_position),
-            velocity=rate if gear else velocity,
-            acceleration=s.link_acceleration if link else s.motor_acceleration,
-            direction=ca.tanh(velocity / smooth) if smooth is not None else ca.sign(velocity),
-            torsion=d, torsion_rate=rate, torque=s.torque, load=load,
-            reading=reading[0], reading_rate=reading[1],
-            motor_angle=s.motor_position * model.gear_ratio,
-            time=s.time, temperature=s.temperature, memory=memory.get(term, ()), gear_ratio=ca.SX(model.gear_ratio),
-        )  # fmt: skip
-
-    nothing = ca.SX(0)
-
-    def total(place: str, s: Signals, d: Expression, load: Expression, reading: tuple[Expression, Expression]) -> Expression:
-        found: Expression = ca.SX(0)
-        for t in model.terms:
-            if t.place == place:
-                found = found + t.effect.law(local(t, s, d, load, reading), values(t))
-        return found
-
-    def corrected(place: str, *channels: str) -> dict[str, Expression]:
-        """True channel from its reading; the laws of sensors are affine, so rates follow by linearity."""
-        chain = [getattr(raw, c) for c in channels]
-        offset = total(place, raw, nothing, nothing, (ca.SX(0), ca.SX(0)))
-        out = {}
-        for i, c in enumerate(channels[:-1]):
-            change = total(place, raw, nothing, nothing, (chain[i], chain[i + 1]))
-            out[c] = chain[i] + (change if i == 0 else change - offset)
-        return out
-
-    s = raw.with_values(
-        **corrected("motor_position_sensor", "motor_position", "motor_velocity", "motor_acceleration", "motor_jerk"),
-        **corrected("link_position_sensor", "link_position", "link_velocity", "link_acceleration", "link_jerk"),
-        **corrected("torque_sensor", "torque", "torque_rate"),
-    )
-    drive = s.drive + total("drive", s, nothing, nothing, (s.drive, s.drive_rate))
-    twist = s.motor_position - s.link_position
-    error = total("torsion", s, twist, s.torque, (nothing, nothing))
-    torsion = twist - error
-    gravity: Expression = ca.SX(0)
-    for t in model.terms:
-        if t.place == "link" and t.effect.family == "torque":
-            gravity = gravity + t.effect.law(local(t, s, torsion, nothing, (nothing, nothing)), values(t))
-    load = s.torque if model.load_from == "torque" else gravity
-    none = (nothing, nothing)
-    lever = (1.0, 1.0)
-    if model.virtual_work and any(t.place == "torsion" for t in model.terms):
-        lever = (1 - ca.jacobian(error, raw.motor_position), 1 + ca.jacobian(error, raw.link_position))
-    terms = []
-    for t in model.terms:
-        if t.effect.memory is not None:
-            view = local(t, s, torsion, load, none)
-            terms.append((t, view.position, memory[t], view, values(t)))
-    return Equations(
-        signals=raw,
-        parameters=ca.vertcat(*symbols.values()),
-        memory=ca.vertcat(*(z for zs in memory.values() for z in zs)) if memory else ca.SX(0, 1),
-        drive=drive,
-        motor_acceleration=s.motor_acceleration,
-        link_acceleration=s.link_acceleration,
-        motor_resistance=total("motor", s, torsion, load, none),
-        link_resistance=total("link", s, torsion, load, none),
-        transmitted=total("transmission", s, torsion, load, none),
-        torque=s.torque,
-        torsion=torsion,
-        true_motor_position=s.motor_position,
-        true_link_position=s.link_position,
-        motor_lever=lever[0],
-        link_lever=lever[1],
-        inertia={n: symbols[n] for n in model.inertias},
-        memory_terms=tuple(terms),
-    )
-
-
-def inverse_dynamics(model: JointModel) -> Expression:
-    """Right-hand sides of the equations of motion, (drive, 0): what a regressor reproduces."""
-    e = model.equations
-    if model.is_elastic:
-        motor = e.inertia["motor_inertia"] * e.motor_acceleration + e.motor_resistance + e.transmitted * e.motor_lever
-        link = e.inertia["link_inertia"] * e.link_acceleration + e.link_resistance - e.transmitted * e.link_lever
-        return ca.vertcat(motor - (e.drive - e.signals.drive), link)
-    inertia = sum(e.inertia.values())
-    return inertia * e.motor_acceleration + e.motor_resistance + e.link_resistance - (e.drive - e.signals.drive)
-
-
-def _linear_set(model: JointModel) -> tuple[str, ...]:
-    """Greedy largest independent set of the graph whose edges are non-zero mutual Hessian entries."""
-    p = model.equations.parameters
-    right = inverse_dynamics(model)
-    names = model.parameter_names
-    edges: dict[int, set[int]] = {i: set() for i in range(len(names))}
-    for row in ca.vertsplit(ca.vertcat(right)):
-        sparsity = ca.hessian(row, p)[0].sparsity()
-        for i, j in zip(*sparsity.get_triplet(), strict=True):
-            edges[i].add(j)
-    present = set(ca.jacobian(right, p).sparsity().get_triplet()[1])
-    chosen = {i for i in edges if i in present and i not in edges[i]}
-    while True:
-        degree = {i: len(edges[i] & chosen) for i in chosen}
-        worst = max(degree, key=lambda i: (degree[i], i), default=None)
-        if worst is None or degree[worst] == 0:
-            return tuple(names[i] for i in sorted(chosen))
-        chosen.discard(worst)

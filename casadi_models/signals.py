@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields, replace
 from typing import Any, Final, final
 
@@ -94,8 +95,10 @@ class LocalSignals:
         Angle of the motor shaft itself (gear ratio times motor position) [rad].
     time, temperature, memory : expression
         Time [s], temperature [K], internal states of the effect.
-    gear_ratio, stiffness : expression
-        Signed ratio theta_motor/theta_link; linear stiffness of the transmission [N.m/rad].
+    gear_ratio : expression
+        Signed ratio theta_motor/theta_link.
+    clock : expression
+        Duration h > 0 of the step that a memory makes [s]; only a memory that runs with time uses it.
     """
 
     position: Expression
@@ -113,3 +116,4 @@ class LocalSignals:
     temperature: Expression
     memory: tuple[Expression, ...]
     gear_ratio: Expression
+    clock: Expression = math.nan

@@ -22,7 +22,9 @@ MODELS: Final[dict[str, tuple[str, ...]]] = {
     "hd1": (),
     "hd2": ("transmission_losses",),
     "hd3": ("transmission_compliance", "structural_damping"),
-    "hd4": ("transmission_compliance", "structural_damping", "kinematic_error", "kinematic_error#2", "kinematic_error#3"),
+    "hd4": (
+        "transmission_compliance", "structural_damping", "kinematic_error", "kinematic_error#2", "kinematic_error#3",
+    ),
     "irj1a": ("gravity",),
     "irj1b": ("gravity", "coulomb@motor"),
     "irj2a": ("transmission_compliance", "cubic_stiffness", "gravity"),
@@ -32,7 +34,7 @@ MODELS: Final[dict[str, tuple[str, ...]]] = {
     ),
     "irj_ts": (
         "transmission_compliance", "cubic_stiffness", "added_spring@motor", "viscous@motor", "coulomb@motor",
-        "stribeck@motor", "cyclic_torque@link", "gravity",
+        "smooth_stribeck@motor", "viscous@link", "cyclic_torque@link", "gravity",
     ),
 }  # fmt: skip
 """Effects of each model by name: the transmission ladder hd1 to hd4 and the identification ladder of 4.3.2."""

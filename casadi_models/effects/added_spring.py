@@ -1,4 +1,4 @@
-"""additional spring to ground."""
+"""Additional spring to ground."""
 
 from types import SimpleNamespace
 
@@ -7,19 +7,23 @@ from ..parameter import signed
 from ..signals import Expression, LocalSignals
 
 
+def _stored(s: LocalSignals, p: SimpleNamespace) -> Expression:
+    return p.added_spring * s.position**2 / 2
+
+
 @effect(
     "added_spring",
     title="additional spring to ground",
     family="torque",
     acts_on=("motor", "link"),
-    parameters=(
-        signed("added_spring", "N.m/rad", "stiffness of cables or seals that pull the joint to its zero"),
-    ),
+    parameters=(signed("added_spring", "N.m/rad", "stiffness of cables or seals that pull the joint to its zero"),),
     absence="the residual grows with the position, at any speed",
     excitation="full travel, better without gravity",
     source="thesis eq. 4.17",
+    potential=_stored,
     confused_with=("cyclic_torque", "motor_constant_error", "gravity"),
     separate_by="a run without payload or with the axis horizontal, over the full travel",
 )
 def added_spring(s: LocalSignals, p: SimpleNamespace) -> Expression:
+    """Torque of the spring."""
     return p.added_spring * s.position

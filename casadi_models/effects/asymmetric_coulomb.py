@@ -1,4 +1,4 @@
-"""direction-dependent Coulomb friction."""
+"""Direction-dependent Coulomb friction."""
 
 from types import SimpleNamespace
 
@@ -19,10 +19,11 @@ from ..signals import Expression, LocalSignals
     ),
     absence="the residual is shifted by a constant",
     excitation="both directions, constant speed",
-    source="A. Janot et al., EMPS benchmark, 2019",
+    source="offset of the EMPS model (A. Janot, M. Gautier, M. Brunot 2019)",
     confused_with=("current_offset", "cyclic_torque"),
     needs=("coulomb",),
     separate_by="a standstill with the brake closed: an offset stays, friction does not",
 )
 def asymmetric_coulomb(s: LocalSignals, p: SimpleNamespace) -> Expression:
+    """Same torque in both directions while moving."""
     return p.asymmetric_coulomb * ca.fabs(s.direction)

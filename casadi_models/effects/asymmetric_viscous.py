@@ -1,4 +1,4 @@
-"""direction-dependent viscous friction."""
+"""Direction-dependent viscous friction."""
 
 from types import SimpleNamespace
 
@@ -15,12 +15,15 @@ from ..signals import Expression, LocalSignals
     family="friction",
     acts_on=("motor", "link"),
     parameters=(
-        signed("asymmetric_viscous", "N.m.s/rad", "half the difference of the viscous coefficients of the two directions"),
+        signed(
+            "asymmetric_viscous", "N.m.s/rad", "half the difference of the viscous coefficients of the two directions"
+        ),
     ),
     absence="the slope of the residual against velocity differs between the directions",
     excitation="both directions at several speeds",
-    source="A. Janot et al., EMPS benchmark, 2019",
+    source="field knowledge",
     needs=("viscous",),
 )
 def asymmetric_viscous(s: LocalSignals, p: SimpleNamespace) -> Expression:
+    """Torque in proportion to the speed, same sign in both directions."""
     return p.asymmetric_viscous * ca.fabs(s.velocity)

@@ -1,4 +1,4 @@
-"""backlash."""
+"""Backlash."""
 
 from types import SimpleNamespace
 
@@ -9,6 +9,15 @@ from ..parameter import amplitude, shape
 from ..signals import Expression, LocalSignals
 
 
+def _inside(s: LocalSignals, p: SimpleNamespace) -> Expression:
+    return ca.fmin(ca.fmax(s.torsion, -p.backlash), p.backlash)
+
+
+def _stored(s: LocalSignals, p: SimpleNamespace) -> Expression:
+    inside = _inside(s, p)
+    return -p.backlash_stiffness_loss * (inside * s.torsion - inside**2 / 2)
+
+
 @effect(
     "backlash",
     title="backlash",
@@ -16,14 +25,18 @@ from ..signals import Expression, LocalSignals
     acts_on=("transmission",),
     parameters=(
         amplitude("backlash_stiffness_loss", "N.m/rad", "stiffness that is missing inside the gap"),
-        shape("backlash", "rad", "half the gap", (0.02, 0.05, 0.1, 0.2, 0.4), "torsion", start=1e-4, low=1e-12, high=10.0),
+        shape(
+            "backlash", "rad", "half the gap", (0.02, 0.05, 0.1, 0.2, 0.4), "torsion", start=1e-4, low=1e-12, high=10.0
+        ),
     ),
     absence="the transmission carries nothing near zero torque; knocks when it is crossed",
     excitation="torque reversals at low load",
-    source="R. Bittencourt; FloBaRoID (backlash catalogue figures)",
+    source="field knowledge",
+    potential=_stored,
     confused_with=("soft_windup", "piecewise_stiffness"),
     needs=("transmission_compliance",),
     separate_by="slow crossings of zero torque",
 )
 def backlash(s: LocalSignals, p: SimpleNamespace) -> Expression:
-    return -p.backlash_stiffness_loss * ca.fmin(ca.fmax(s.torsion, -p.backlash), p.backlash)
+    """What the stiffness carries too much inside the gap."""
+    return -p.backlash_stiffness_loss * _inside(s, p)

@@ -12,9 +12,7 @@ from ..signals import Expression, LocalSignals
     title="Coulomb friction",
     family="friction",
     acts_on=("motor", "link"),
-    parameters=(
-        amplitude("coulomb", "N.m", "Coulomb friction torque"),
-    ),
+    parameters=(amplitude("coulomb", "N.m", "Coulomb friction torque"),),
     absence="the residual steps at every reversal and is flat in between",
     excitation="reversals, at least two speeds",
     source="thesis eq. 2.72",
@@ -22,4 +20,5 @@ from ..signals import Expression, LocalSignals
     confused_with=("stribeck", "lugre"),
 )
 def coulomb(s: LocalSignals, p: SimpleNamespace) -> Expression:
+    """Constant torque against the motion."""
     return p.coulomb * s.direction

@@ -1,4 +1,4 @@
-"""cubic viscous friction."""
+"""Cubic viscous friction."""
 
 from types import SimpleNamespace
 
@@ -23,4 +23,5 @@ from ..signals import Expression, LocalSignals
     separate_by="a run at three or more constant speeds up to the highest",
 )
 def cubic_viscous(s: LocalSignals, p: SimpleNamespace) -> Expression:
+    """Torque of the cubic part."""
     return p.cubic_viscous * s.velocity**3

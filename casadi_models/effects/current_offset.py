@@ -1,4 +1,4 @@
-"""offset of the current."""
+"""Offset of the current."""
 
 from types import SimpleNamespace
 
@@ -12,9 +12,7 @@ from ..signals import Expression, LocalSignals
     title="offset of the current",
     family="sensor",
     acts_on=("drive",),
-    parameters=(
-        signed("current_offset", "N.m", "constant torque by an offset of the measured current"),
-    ),
+    parameters=(signed("current_offset", "N.m", "constant torque by an offset of the measured current"),),
     absence="the residual of the motor is shifted by a constant",
     excitation="both directions, constant speed; standstill",
     source="field knowledge",
@@ -22,4 +20,5 @@ from ..signals import Expression, LocalSignals
     separate_by="a standstill with the brake closed: an offset stays, friction does not",
 )
 def current_offset(s: LocalSignals, p: SimpleNamespace) -> Expression:
+    """Constant torque."""
     return p.current_offset

@@ -1,4 +1,4 @@
-"""friction that changes with position."""
+"""Friction that changes with position."""
 
 from types import SimpleNamespace
 
@@ -26,4 +26,5 @@ from ..signals import Expression, LocalSignals
     separate_by="a run with another payload",
 )
 def cyclic_friction(s: LocalSignals, p: SimpleNamespace) -> Expression:
+    """Friction whose size follows the position; it changes sign with the velocity."""
     return (p.cyclic_friction_sine * ca.sin(s.position) + p.cyclic_friction_cosine * ca.cos(s.position)) * s.direction

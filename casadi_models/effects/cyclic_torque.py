@@ -9,6 +9,10 @@ from ..parameter import signed
 from ..signals import Expression, LocalSignals
 
 
+def _stored(s: LocalSignals, p: SimpleNamespace) -> Expression:
+    return p.cyclic_torque_sine * (1 - ca.cos(s.position)) + p.cyclic_torque_cosine * ca.sin(s.position)
+
+
 @effect(
     "cyclic_torque",
     title="torque that is periodic in the position",
@@ -21,8 +25,10 @@ from ..signals import Expression, LocalSignals
     absence="the residual follows sine and cosine of the position and does not change sign at a reversal",
     excitation="a long stroke, better without gravity",
     source="thesis eq. 2.81",
+    potential=_stored,
     confused_with=("motor_constant_error", "added_spring", "gravity"),
     separate_by="a run without payload or with the axis horizontal",
 )
 def cyclic_torque(s: LocalSignals, p: SimpleNamespace) -> Expression:
+    """Torque of the position alone."""
     return p.cyclic_torque_sine * ca.sin(s.position) + p.cyclic_torque_cosine * ca.cos(s.position)

@@ -1,4 +1,4 @@
-"""inertia that is not in the model (payload)."""
+"""Inertia that is not in the model (payload)."""
 
 from types import SimpleNamespace
 
@@ -12,14 +12,13 @@ from ..signals import Expression, LocalSignals
     title="inertia that is not in the model (payload)",
     family="inertia",
     acts_on=("motor", "link"),
-    parameters=(
-        signed("extra_inertia", "kg.m2", "inertia beyond the known one"),
-    ),
+    parameters=(signed("extra_inertia", "kg.m2", "inertia beyond the known one"),),
     absence="the residual follows the acceleration",
     excitation="fast motion, with the inertia of one side known",
-    source="thesis section 4.2",
+    source="thesis table 4.2 (design against identified inertia)",
     confused_with=("motor_constant_error",),
     separate_by="the catalogue inertia as a known value, or a run without payload",
 )
 def extra_inertia(s: LocalSignals, p: SimpleNamespace) -> Expression:
+    """Torque that accelerates the extra inertia."""
     return p.extra_inertia * s.acceleration

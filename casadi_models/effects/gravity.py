@@ -1,4 +1,4 @@
-"""gravity of the link."""
+"""Gravity of the link."""
 
 from types import SimpleNamespace
 
@@ -9,19 +9,23 @@ from ..parameter import signed
 from ..signals import Expression, LocalSignals
 
 
+def _stored(s: LocalSignals, p: SimpleNamespace) -> Expression:
+    return -p.gravity_torque * (1 - ca.cos(s.position))
+
+
 @effect(
     "gravity",
     title="gravity of the link",
     family="torque",
     acts_on=("link",),
-    parameters=(
-        signed("gravity_torque", "N.m", "gravity torque at 90 degrees; positive: upright at zero"),
-    ),
+    parameters=(signed("gravity_torque", "N.m", "gravity torque at 90 degrees; positive: upright at zero"),),
     absence="the residual of the link follows the sine of its angle",
     excitation="a long slow swing",
     source="thesis eq. 2.82",
+    potential=_stored,
     confused_with=("cyclic_torque", "added_spring", "torque_sensor_gain"),
     separate_by="a run without payload or with the axis horizontal",
 )
 def gravity(s: LocalSignals, p: SimpleNamespace) -> Expression:
+    """Torque against a positive motion of the link."""
     return -p.gravity_torque * ca.sin(s.position)

@@ -1,4 +1,4 @@
-"""centre of mass off the zero line."""
+"""Centre of mass off the zero line."""
 
 from types import SimpleNamespace
 
@@ -7,6 +7,10 @@ import casadi as ca
 from ..effect import effect
 from ..parameter import signed
 from ..signals import Expression, LocalSignals
+
+
+def _stored(s: LocalSignals, p: SimpleNamespace) -> Expression:
+    return -p.gravity_cosine * ca.sin(s.position)
 
 
 @effect(
@@ -20,9 +24,11 @@ from ..signals import Expression, LocalSignals
     absence="the residual of the link follows the cosine of its angle",
     excitation="a long slow swing",
     source="field knowledge (unbalance phase)",
+    potential=_stored,
     needs=("gravity",),
     confused_with=("torque_sensor_offset", "asymmetric_coulomb", "cyclic_torque"),
     separate_by="a swing over more than a quarter turn to either side",
 )
 def gravity_phase(s: LocalSignals, p: SimpleNamespace) -> Expression:
+    """Torque against a positive motion of the link."""
     return -p.gravity_cosine * ca.cos(s.position)

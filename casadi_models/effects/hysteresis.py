@@ -1,4 +1,4 @@
-"""hysteresis of the transmission."""
+"""Hysteresis of the transmission."""
 
 from types import SimpleNamespace
 
@@ -9,12 +9,11 @@ from ..parameter import amplitude, shape
 from ..signals import Expression, LocalSignals
 
 
-def _stops(
-    z: tuple[Expression, ...], step: Expression, s: LocalSignals, p: SimpleNamespace
-) -> tuple[Expression, ...]:
+def _stops(z: tuple[Expression, ...], step: Expression, s: LocalSignals, p: SimpleNamespace) -> tuple[Expression, ...]:
     """Stop operators: each follows the torsion until it slips."""
     return tuple(
-        ca.fmin(ca.fmax(state + step / (width * p.hysteresis_width), -1), 1) for state, width in zip(z, (1, 3, 9), strict=True)
+        ca.fmin(ca.fmax(state + step / (width * p.hysteresis_width), -1), 1)
+        for state, width in zip(z, (1, 3, 9), strict=True)
     )
 
 
@@ -27,12 +26,20 @@ def _stops(
         amplitude("hysteresis_torque_1", "N.m", "half width of the loop, short element"),
         amplitude("hysteresis_torque_2", "N.m", "half width of the loop, middle element"),
         amplitude("hysteresis_torque_3", "N.m", "half width of the loop, long element"),
-        shape("hysteresis_width", "rad", "torsion over which the short element turns round; the others 3 and 9 times",
-              (0.01, 0.03, 0.1, 0.25), "torsion", start=1e-4, low=1e-12, high=10.0),
+        shape(
+            "hysteresis_width",
+            "rad",
+            "torsion over which the short element turns round; the others 3 and 9 times",
+            (0.01, 0.03, 0.1, 0.25),
+            "torsion",
+            start=1e-4,
+            low=1e-12,
+            high=10.0,
+        ),
     ),
     absence="the residual of the transmission is a closed loop against the torsion, at any speed",
     excitation="slow load cycles",
-    source="H. Taghirad and P. Belanger 1996; Maxwell-slip model (F. Al-Bender et al. 2005)",
+    source="H. Taghirad, P. Belanger 1996; Maxwell-slip elements (F. Al-Bender, V. Lampaert, J. Swevers 2005)",
     memory=_stops,
     states=3,
     dissipative=True,
@@ -41,4 +48,7 @@ def _stops(
     separate_by="slow load cycles at two speeds",
 )
 def hysteresis(s: LocalSignals, p: SimpleNamespace) -> Expression:
-    return p.hysteresis_torque_1 * s.memory[0] + p.hysteresis_torque_2 * s.memory[1] + p.hysteresis_torque_3 * s.memory[2]
+    """Sum of three elements that stick and slip."""
+    return (
+        p.hysteresis_torque_1 * s.memory[0] + p.hysteresis_torque_2 * s.memory[1] + p.hysteresis_torque_3 * s.memory[2]
+    )

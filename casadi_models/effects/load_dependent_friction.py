@@ -1,4 +1,4 @@
-"""load-dependent friction."""
+"""Load-dependent friction."""
 
 from types import SimpleNamespace
 
@@ -14,12 +14,10 @@ from ..signals import Expression, LocalSignals
     title="load-dependent friction",
     family="friction",
     acts_on=("motor", "link"),
-    parameters=(
-        amplitude("load_friction", "1", "share of the load that comes back as friction", high=1.0),
-    ),
+    parameters=(amplitude("load_friction", "1", "share of the load that comes back as friction", high=1.0),),
     absence="the friction band widens with the load",
     excitation="two payloads, or a long swing through gravity",
-    source="A. C. Bittencourt et al. 2010; M. Duclusaud et al., ICRA 2025",
+    source="A. C. Bittencourt et al. 2010; M. Duclusaud et al. 2025",
     dissipative=True,
     confused_with=("cyclic_friction", "coulomb", "gravity"),
     needs_load=True,
@@ -27,4 +25,5 @@ from ..signals import Expression, LocalSignals
     separate_by="a run with another payload",
 )
 def load_dependent_friction(s: LocalSignals, p: SimpleNamespace) -> Expression:
+    """Friction in proportion to the size of the load."""
     return p.load_friction * ca.sqrt(s.load**2 + 1e-6) * s.direction

@@ -1,4 +1,4 @@
-"""directional load-dependent friction with presliding."""
+"""Directional load-dependent friction with presliding."""
 
 from types import SimpleNamespace
 
@@ -16,6 +16,10 @@ def _bristle(
     return ((z[0] + moved) / (1 + ca.fabs(moved)),)
 
 
+def _rate(z: tuple[Expression, ...], s: LocalSignals, p: SimpleNamespace) -> tuple[Expression, ...]:
+    return ((s.velocity - ca.fabs(s.velocity) * z[0]) / p.load_presliding_distance,)
+
+
 @effect(
     "load_dependent_presliding",
     title="directional load-dependent friction with presliding",
@@ -24,13 +28,22 @@ def _bristle(
     parameters=(
         signed("load_friction_mean", "1", "share of the load that resists the motion"),
         signed("load_friction_difference", "1", "share of the load lost when driving more than when back-driven"),
-        shape("load_presliding_distance", "rad", "distance over which the friction turns round",
-              (0.0003, 0.001, 0.003, 0.01), "position", start=1e-3, low=1e-9, high=10.0),
+        shape(
+            "load_presliding_distance",
+            "rad",
+            "distance over which the friction turns round",
+            (0.0003, 0.001, 0.003, 0.01),
+            "position",
+            start=1e-3,
+            low=1e-9,
+            high=10.0,
+        ),
     ),
-    absence="the residual is a loop against distance whose width follows the load and differs between driving and back-driving",
+    absence="the residual is a loop against distance; its width follows the load and differs when back-driven",
     excitation="small reversals under two or more payloads",
-    source="torque-proportional loss of strain-wave gears with a bristle state",
+    source="MuJoCo issue 3528 (torque-proportional loss of strain-wave gears), 2026",
     memory=_bristle,
+    rate=_rate,
     states=1,
     needs_load=True,
     needs=("coulomb", "load_dependent_friction"),
@@ -38,6 +51,8 @@ def _bristle(
     separate_by="runs with another payload and small reversals",
 )
 def load_dependent_presliding(s: LocalSignals, p: SimpleNamespace) -> Expression:
+    """Friction in proportion to the load, turned round over a distance."""
     return (
-        p.load_friction_mean * ca.sqrt(s.load**2 + 1e-6) * s.memory[0] + p.load_friction_difference * s.load * s.memory[0] ** 2
+        p.load_friction_mean * ca.sqrt(s.load**2 + 1e-6) * s.memory[0]
+        + p.load_friction_difference * s.load * s.memory[0] ** 2
     )

@@ -1,4 +1,4 @@
-"""presliding (bristle) friction."""
+"""Presliding (bristle) friction."""
 
 from types import SimpleNamespace
 
@@ -16,6 +16,10 @@ def _bristle(
     return ((z[0] + moved) / (1 + ca.fabs(moved)),)
 
 
+def _rate(z: tuple[Expression, ...], s: LocalSignals, p: SimpleNamespace) -> tuple[Expression, ...]:
+    return ((s.velocity - ca.fabs(s.velocity) * z[0]) / p.presliding_distance,)
+
+
 @effect(
     "lugre",
     title="presliding (bristle) friction",
@@ -23,17 +27,27 @@ def _bristle(
     acts_on=("motor", "link"),
     parameters=(
         amplitude("presliding_torque", "N.m", "part of the Coulomb torque that builds up over the presliding distance"),
-        shape("presliding_distance", "rad", "distance over which the friction turns round after a reversal",
-              (0.0003, 0.001, 0.003, 0.01, 0.03), "position", start=1e-3, low=1e-9, high=10.0),
+        shape(
+            "presliding_distance",
+            "rad",
+            "distance over which the friction turns round after a reversal",
+            (0.0003, 0.001, 0.003, 0.01, 0.03),
+            "position",
+            start=1e-3,
+            low=1e-9,
+            high=10.0,
+        ),
     ),
     absence="after a reversal the residual is a loop against distance, not against speed",
     excitation="small slow reversals",
     source="P. Dahl 1968; C. Canudas de Wit et al. 1995",
     memory=_bristle,
+    rate=_rate,
     states=1,
     needs=("coulomb",),
     confused_with=("stribeck", "backlash", "hysteresis"),
     separate_by="small slow reversals at two speeds",
 )
 def lugre(s: LocalSignals, p: SimpleNamespace) -> Expression:
+    """Bristle torque in place of part of the Coulomb torque."""
     return p.presliding_torque * (s.memory[0] - s.direction)

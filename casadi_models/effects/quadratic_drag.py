@@ -1,4 +1,4 @@
-"""quadratic drag."""
+"""Quadratic drag."""
 
 from types import SimpleNamespace
 
@@ -14,9 +14,7 @@ from ..signals import Expression, LocalSignals
     title="quadratic drag",
     family="friction",
     acts_on=("motor", "link"),
-    parameters=(
-        signed("quadratic_drag", "N.m.s2/rad2", "coefficient of velocity times its magnitude"),
-    ),
+    parameters=(signed("quadratic_drag", "N.m.s2/rad2", "coefficient of velocity times its magnitude"),),
     absence="the residual bends against velocity, odd in it",
     excitation="at least three speeds, up to the highest",
     source="field knowledge (churning, windage)",
@@ -25,4 +23,5 @@ from ..signals import Expression, LocalSignals
     separate_by="a run at three or more constant speeds up to the highest",
 )
 def quadratic_drag(s: LocalSignals, p: SimpleNamespace) -> Expression:
+    """Torque with the squared speed against the motion."""
     return p.quadratic_drag * s.velocity * ca.fabs(s.velocity)

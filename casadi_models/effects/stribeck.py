@@ -16,8 +16,16 @@ from ..signals import Expression, LocalSignals
     acts_on=("motor", "link"),
     parameters=(
         amplitude("stribeck_extra", "N.m", "static friction above the Coulomb torque"),
-        shape("stribeck_velocity", "rad/s", "velocity at which the extra friction has fallen to 1/e",
-              (0.01, 0.02, 0.04, 0.08, 0.15, 0.3), "velocity", start=0.02, low=1e-6, high=1e3),
+        shape(
+            "stribeck_velocity",
+            "rad/s",
+            "velocity at which the extra friction has fallen to 1/e",
+            (0.01, 0.02, 0.04, 0.08, 0.15, 0.3),
+            "velocity",
+            start=0.02,
+            low=1e-6,
+            high=1e3,
+        ),
         shape("stribeck_exponent", "1", "exponent of the decay", (1.0, 2.0), "absolute", start=1.0, low=0.5, high=2.0),
     ),
     absence="the residual peaks at low speed on both sides of a reversal",
@@ -29,6 +37,9 @@ from ..signals import Expression, LocalSignals
     separate_by="slow constant-speed runs, and small slow reversals",
 )
 def stribeck(s: LocalSignals, p: SimpleNamespace) -> Expression:
+    """Extra friction at low speed."""
     return (
-        p.stribeck_extra * s.direction * ca.exp(-((s.velocity**2 / p.stribeck_velocity**2 + 1e-12) ** (p.stribeck_exponent / 2)))
+        p.stribeck_extra
+        * s.direction
+        * ca.exp(-((s.velocity**2 / p.stribeck_velocity**2 + 1e-12) ** (p.stribeck_exponent / 2)))
     )

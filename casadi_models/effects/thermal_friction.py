@@ -18,9 +18,10 @@ from ..signals import Expression, LocalSignals
     ),
     absence="the friction residual changes during the run while its shape stays",
     excitation="a long run that repeats its first block at the end, with temperature recorded",
-    source="R. Bittencourt and P. Axelsson 2014; L. Simoni et al. 2015",
+    source="A. C. Bittencourt, P. Axelsson 2014; L. Simoni et al. 2015",
     needs=("coulomb",),
     separate_by="a long run that repeats its first block when warm",
 )
 def thermal_friction(s: LocalSignals, p: SimpleNamespace) -> Expression:
+    """Change of friction since the start of the record."""
     return (p.thermal_coulomb * s.direction + p.thermal_viscous * s.velocity) * s.temperature

@@ -1,4 +1,4 @@
-"""compliance of the torque sensor."""
+"""Compliance of the torque sensor."""
 
 from types import SimpleNamespace
 
@@ -12,9 +12,7 @@ from ..signals import Expression, LocalSignals
     title="compliance of the torque sensor",
     family="transmission",
     acts_on=("torsion",),
-    parameters=(
-        amplitude("sensor_compliance", "rad/(N.m)", "twist of the sensor per torque"),
-    ),
+    parameters=(amplitude("sensor_compliance", "rad/(N.m)", "twist of the sensor per torque"),),
     absence="the transmission seems softer than its catalogue stiffness",
     excitation="torque against torsion, with the catalogue stiffness known",
     source="thesis section 2.5.3",
@@ -23,4 +21,5 @@ from ..signals import Expression, LocalSignals
     separate_by="the catalogue stiffness of the gear, or a position measured before the sensor",
 )
 def torque_sensor_compliance(s: LocalSignals, p: SimpleNamespace) -> Expression:
+    """Twist of the sensor."""
     return p.sensor_compliance * s.torque

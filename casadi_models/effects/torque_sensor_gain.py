@@ -1,4 +1,4 @@
-"""gain of the torque sensor."""
+"""Gain of the torque sensor."""
 
 from types import SimpleNamespace
 
@@ -22,4 +22,5 @@ from ..signals import Expression, LocalSignals
     separate_by="a known payload, or a run without payload",
 )
 def torque_sensor_gain(s: LocalSignals, p: SimpleNamespace) -> Expression:
+    """True torque minus reading."""
     return -s.reading * p.torque_sensor_gain / (1 + p.torque_sensor_gain)

@@ -1,4 +1,4 @@
-"""offset of the torque sensor."""
+"""Offset of the torque sensor."""
 
 from types import SimpleNamespace
 
@@ -12,9 +12,7 @@ from ..signals import Expression, LocalSignals
     title="offset of the torque sensor",
     family="sensor",
     acts_on=("torque_sensor",),
-    parameters=(
-        signed("torque_sensor_offset", "N.m", "reading at zero torque"),
-    ),
+    parameters=(signed("torque_sensor_offset", "N.m", "reading at zero torque"),),
     absence="all balances with the torque sensor are shifted by one constant",
     excitation="rest periods",
     source="field knowledge",
@@ -22,4 +20,5 @@ from ..signals import Expression, LocalSignals
     separate_by="a reading without load",
 )
 def torque_sensor_offset(s: LocalSignals, p: SimpleNamespace) -> Expression:
+    """True torque minus reading."""
     return -p.torque_sensor_offset

@@ -1,4 +1,4 @@
-"""losses of the transmission."""
+"""Losses of the transmission."""
 
 from types import SimpleNamespace
 
@@ -27,6 +27,7 @@ from ..signals import Expression, LocalSignals
     confused_with=("coulomb", "viscous", "cubic_viscous", "cyclic_friction"),
 )
 def transmission_losses(s: LocalSignals, p: SimpleNamespace) -> Expression:
+    """Constant, viscous, cubic and cyclic loss."""
     return (
         (p.loss_constant + p.loss_sine * ca.sin(s.position) + p.loss_cosine * ca.cos(s.position)) * s.direction
         + p.loss_viscous * s.velocity

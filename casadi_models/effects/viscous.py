@@ -1,4 +1,4 @@
-"""viscous friction."""
+"""Viscous friction."""
 
 from types import SimpleNamespace
 
@@ -12,9 +12,7 @@ from ..signals import Expression, LocalSignals
     title="viscous friction",
     family="friction",
     acts_on=("motor", "link"),
-    parameters=(
-        amplitude("viscous", "N.m.s/rad", "viscous friction coefficient"),
-    ),
+    parameters=(amplitude("viscous", "N.m.s/rad", "viscous friction coefficient"),),
     absence="the residual has a slope against velocity",
     excitation="at least two speeds",
     source="thesis eq. 2.71",
@@ -22,4 +20,5 @@ from ..signals import Expression, LocalSignals
     confused_with=("structural_damping", "channel_delay"),
 )
 def viscous(s: LocalSignals, p: SimpleNamespace) -> Expression:
+    """Torque in proportion to the velocity."""
     return p.viscous * s.velocity

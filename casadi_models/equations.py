@@ -1,0 +1,289 @@
+"""The symbolic joint: laws put in their places on one set of signals.
+
+:func:`build_equations` makes it in two forms that share all symbols: with the corrections of the
+sensors, where the signals are readings (regression, residuals), and without them, where the signals
+are the true ones (simulation).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Final, final
+
+import casadi as ca
+
+from .signals import Expression, LocalSignals, Signals
+from .term import Term
+
+if TYPE_CHECKING:
+    from .joint import JointModel
+
+MemoryTerm = tuple[Term, Expression, tuple[Expression, ...], LocalSignals, SimpleNamespace]
+"""Term with states: (term, driving coordinate, states, what the law sees, its parameters)."""
+
+_RATES: Final = {
+    "motor_position": "motor_velocity",
+    "motor_velocity": "motor_acceleration",
+    "motor_acceleration": "motor_jerk",
+    "link_position": "link_velocity",
+    "link_velocity": "link_acceleration",
+    "link_acceleration": "link_jerk",
+    "torque": "torque_rate",
+    "drive": "drive_rate",
+}
+_MOTOR_CHAIN: Final = ("motor_position", "motor_velocity", "motor_acceleration", "motor_jerk")
+_LINK_CHAIN: Final = ("link_position", "link_velocity", "link_acceleration", "link_jerk")
+
+
+@final
+@dataclass(frozen=True)
+class Equations:
+    """Symbolic pieces of the joint on one set of signal symbols.
+
+    Attributes
+    ----------
+    signals : Signals
+        The symbols.
+    parameters, memory, clock : expression
+        Columns of all parameters and of all internal states; duration of one step of the memory [s].
+    drive, motor_resistance, link_resistance : expression
+        Torque of the motor; torques that resist the motion of either side [N.m].
+    motor_acceleration, link_acceleration : expression
+        Accelerations, corrected [rad/s2].
+    transmitted : expression
+        What the transmission laws say [N.m].
+    torque, true_motor_position, true_link_position : expression
+        What the sensors say, corrected [N.m, rad, rad].
+    torsion : expression
+        Twist of the transmission, kinematic error taken off [rad].
+    motor_lever, link_lever : expression
+        Share of the transmitted torque that motor and link feel (1 without kinematic error).
+    inertia : mapping of str to expression
+        Inertias of the model by name [kg.m2].
+    memory_terms : tuple
+        One :data:`MemoryTerm` per term with states, in the order of `memory`.
+    """
+
+    signals: Signals
+    parameters: Expression
+    memory: Expression
+    clock: Expression
+    drive: Expression
+    motor_acceleration: Expression
+    link_acceleration: Expression
+    motor_resistance: Expression
+    link_resistance: Expression
+    transmitted: Expression
+    torque: Expression
+    torsion: Expression
+    true_motor_position: Expression
+    true_link_position: Expression
+    motor_lever: Expression
+    link_lever: Expression
+    inertia: Mapping[str, Expression]
+    memory_terms: tuple[MemoryTerm, ...]
+
+
+@final
+@dataclass(frozen=True)
+class Symbols:
+    """Symbols that all forms of one model's equations share."""
+
+    signals: Signals
+    parameters: Mapping[str, Expression]
+    memory: Mapping[Term, tuple[Expression, ...]]
+    clock: Expression
+
+    @staticmethod
+    def of(model: JointModel) -> Symbols:
+        """Fresh symbols for a model."""
+        return Symbols(
+            Signals.symbols(),
+            {p.name: ca.SX.sym(p.name) for p in model.parameters},
+            {
+                t: tuple(ca.SX.sym(f"{t.label}_{i}") for i in range(t.effect.states))
+                for t in model.terms if t.effect.states
+            },
+            ca.SX.sym("clock"),
+        )  # fmt: skip
+
+
+def _zero() -> Expression:
+    return ca.SX(0)
+
+
+@final
+@dataclass(frozen=True)
+class _View:
+    """What all laws of one place are evaluated on."""
+
+    signals: Signals
+    torsion: Expression
+    load: Expression
+    reading: Expression
+    reading_rate: Expression
+
+
+@final
+@dataclass(frozen=True)
+class _Builder:
+    """Laws of one model on its symbols."""
+
+    model: JointModel
+    symbols: Symbols
+
+    def local(self, term: Term, view: _View) -> LocalSignals:
+        """What the law of a term sees."""
+        s = view.signals
+        link = term.place in ("link", "link_position_sensor")
+        gear = term.place == "transmission"
+        # the approximation (2.58) lets the kinematic error wind up the stiffness only, not the damping
+        twist = view.torsion if self.model.virtual_work else s.motor_position - s.link_position
+        rate = time_derivative(twist, self.symbols.signals)
+        velocity = s.link_velocity if link else s.motor_velocity
+        smooth = self.symbols.parameters.get(f"{'link' if link else 'motor'}_smoothing_velocity")
+        return LocalSignals(
+            position=view.torsion if gear else (s.link_position if link else s.motor_position),
+            velocity=rate if gear else velocity,
+            acceleration=s.link_acceleration if link else s.motor_acceleration,
+            direction=ca.tanh(velocity / smooth) if smooth is not None else ca.sign(velocity),
+            torsion=view.torsion, torsion_rate=rate, torque=s.torque, load=view.load,
+            reading=view.reading, reading_rate=view.reading_rate,
+            motor_angle=s.motor_position * self.model.gear_ratio,
+            time=s.time, temperature=s.temperature, memory=self.symbols.memory.get(term, ()),
+            gear_ratio=ca.SX(self.model.gear_ratio), clock=self.symbols.clock,
+        )  # fmt: skip
+
+    def total(self, place: str, view: _View) -> Expression:
+        """Sum of the laws of one place."""
+        found = _zero()
+        for t in self.model.terms:
+            if t.place == place:
+                found = found + t.effect.law(self.local(t, view), t.bound(self.symbols.parameters))
+        return found
+
+    def corrected(self, place: str, *channels: str) -> dict[str, Expression]:
+        """True channels from their readings; the laws of sensors are affine, so rates follow by linearity."""
+        raw = self.symbols.signals
+        chain = [getattr(raw, c) for c in channels]
+        offset = self.total(place, _View(raw, _zero(), _zero(), _zero(), _zero()))
+        out = {}
+        for i, c in enumerate(channels[:-1]):
+            change = self.total(place, _View(raw, _zero(), _zero(), chain[i], chain[i + 1]))
+            out[c] = chain[i] + (change if i == 0 else change - offset)
+        return out
+
+    def true_signals(self) -> Signals:
+        """Signals with what the sensors add taken off."""
+        return self.symbols.signals.with_values(
+            **self.corrected("motor_position_sensor", *_MOTOR_CHAIN),
+            **self.corrected("link_position_sensor", *_LINK_CHAIN),
+            **self.corrected("torque_sensor", "torque", "torque_rate"),
+        )
+
+    def gravity(self, view: _View) -> Expression:
+        """Torques on the link that depend on its position only."""
+        found = _zero()
+        for t in self.model.terms:
+            if t.place == "link" and t.effect.family == "torque":
+                found = found + t.effect.law(self.local(t, view), t.bound(self.symbols.parameters))
+        return found
+
+    def levers(self, error: Expression) -> tuple[Expression, Expression]:
+        """Shares of the transmitted torque from the virtual work of the kinematic error."""
+        raw = self.symbols.signals
+        if not self.model.virtual_work or not any(t.place == "torsion" for t in self.model.terms):
+            return ca.SX(1), ca.SX(1)
+        return 1 - ca.jacobian(error, raw.motor_position), 1 + ca.jacobian(error, raw.link_position)
+
+
+def time_derivative(expression: Expression, signals: Signals) -> Expression:
+    """Rate of an expression of the signals by the chain rule."""
+    total = _zero()
+    for name, rate in _RATES.items():
+        total = total + ca.jacobian(expression, getattr(signals, name)) * getattr(signals, rate)
+    return total
+
+
+def build_equations(model: JointModel, symbols: Symbols, *, sensors: bool) -> Equations:
+    """Equations of a joint on given symbols.
+
+    Parameters
+    ----------
+    model : JointModel
+    symbols : Symbols
+    sensors : bool
+        True: the signals are readings, corrected by the sensor effects of the model. False: the
+        signals are the true ones.
+    """
+    builder = _Builder(model, symbols)
+    raw = symbols.signals
+    s = builder.true_signals() if sensors else raw
+    drive_view = _View(s, _zero(), _zero(), s.drive, s.drive_rate)
+    twist = s.motor_position - s.link_position
+    error = builder.total("torsion", _View(s, twist, s.torque, _zero(), _zero()))
+    torsion = twist - error
+    unloaded = _View(s, torsion, _zero(), _zero(), _zero())
+    load = s.torque if model.load_from == "torque" else builder.gravity(unloaded)
+    view = _View(s, torsion, load, _zero(), _zero())
+    motor_lever, link_lever = builder.levers(error)
+    terms: list[MemoryTerm] = []
+    for t in model.terms:
+        if t.effect.memory is not None:
+            local = builder.local(t, view)
+            terms.append((t, local.position, symbols.memory[t], local, t.bound(symbols.parameters)))
+    states = [z for zs in symbols.memory.values() for z in zs]
+    return Equations(
+        signals=raw,
+        parameters=ca.vertcat(*symbols.parameters.values()),
+        memory=ca.vertcat(*states) if states else ca.SX(0, 1),
+        clock=symbols.clock,
+        drive=s.drive + builder.total("drive", drive_view),
+        motor_acceleration=s.motor_acceleration,
+        link_acceleration=s.link_acceleration,
+        motor_resistance=builder.total("motor", view),
+        link_resistance=builder.total("link", view),
+        transmitted=builder.total("transmission", view),
+        torque=s.torque,
+        torsion=torsion,
+        true_motor_position=s.motor_position,
+        true_link_position=s.link_position,
+        motor_lever=motor_lever,
+        link_lever=link_lever,
+        inertia={n: symbols.parameters[n] for n in model.inertias},
+        memory_terms=tuple(terms),
+    )
+
+
+def inverse_dynamics(model: JointModel) -> Expression:
+    """Right-hand sides of the equations of motion, (drive, 0): what a regressor reproduces."""
+    e = model.equations
+    if model.is_elastic:
+        motor = e.inertia["motor_inertia"] * e.motor_acceleration + e.motor_resistance + e.transmitted * e.motor_lever
+        link = e.inertia["link_inertia"] * e.link_acceleration + e.link_resistance - e.transmitted * e.link_lever
+        return ca.vertcat(motor - (e.drive - e.signals.drive), link)
+    inertia = sum(e.inertia.values())
+    resistance = e.motor_resistance + e.link_resistance
+    return inertia * e.motor_acceleration + resistance - (e.drive - e.signals.drive)
+
+
+def linear_set(model: JointModel) -> tuple[str, ...]:
+    """Greedy largest independent set of the graph whose edges are non-zero mutual Hessian entries."""
+    p = model.equations.parameters
+    right = inverse_dynamics(model)
+    names = model.parameter_names
+    edges: dict[int, set[int]] = {i: set() for i in range(len(names))}
+    for row in ca.vertsplit(ca.vertcat(right)):
+        sparsity = ca.hessian(row, p)[0].sparsity()
+        for i, j in zip(*sparsity.get_triplet(), strict=True):
+            edges[i].add(j)
+    present = set(ca.jacobian(right, p).sparsity().get_triplet()[1])
+    chosen = {i for i in edges if i in present and i not in edges[i]}
+    while True:
+        degree = {i: len(edges[i] & chosen) for i in chosen}
+        worst = max(degree, key=lambda i: (degree[i], i), default=None)
+        if worst is None or degree[worst] == 0:
+            return tuple(names[i] for i in sorted(chosen))
+        chosen.discard(worst)

@@ -1,0 +1,71 @@
+"""Accelerations and carried torque where the laws refer to them: affine, or by a few Newton steps."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import casadi as ca
+
+from .equations import Equations
+from .signals import Expression
+
+NEWTON_STEPS: Final = 8
+"""Steps of the unrolled Newton iteration; it converges quadratically and is exact after one where the law is affine."""
+
+
+def affine_solution(right: Expression, acceleration: Expression, inertia: Expression) -> Expression:
+    """Acceleration from inertia * a = right(a), where right is affine in a."""
+    slope = ca.jacobian(right, acceleration)
+    (free,) = ca.substitute([right], [acceleration], [ca.SX(0)])
+    return free / (inertia - slope)
+
+
+def carried_torque(e: Equations, carried: Expression | None = None) -> Expression:
+    """Torque into the link in terms of positions, velocities, memory and parameters.
+
+    Where the law of the carried torque refers to the torque itself (compliance of the torque sensor in
+    series, load-dependent friction on the link), T = f(T) is solved by Newton steps from T = 0.
+
+    Parameters
+    ----------
+    e : Equations
+    carried : expression, optional
+        f(T); what the transmission carries by default.
+    """
+    law = e.transmitted if carried is None else carried
+    torque = e.signals.torque
+    if not ca.depends_on(law, torque):
+        return law
+    slope = ca.jacobian(law, torque)
+    newton = (law - slope * torque) / (1 - slope)
+    found: Expression = ca.SX(0)
+    for _ in range(NEWTON_STEPS if ca.depends_on(slope, torque) else 1):
+        (found,) = ca.substitute([newton], [torque], [found])
+    return found
+
+
+def rigid_solution(
+    right: Expression, carried: Expression, inertia: Expression, acceleration: Expression, torque: Expression
+) -> tuple[Expression, Expression]:
+    """Acceleration a and torque into the link T of a rigid joint.
+
+    Solves inertia * a = right(a, T) and T = carried(a, T) together.
+
+    Parameters
+    ----------
+    right, carried, inertia : expression
+    acceleration, torque : symbol
+        a and T as they stand in `right` and `carried`.
+    """
+    unknown = ca.vertcat(acceleration, torque)
+    defect = ca.vertcat(inertia * acceleration - right, torque - carried)
+    m = ca.jacobian(defect, unknown)
+    determinant = m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0]
+    newton = unknown - ca.vertcat(
+        (m[1, 1] * defect[0] - m[0, 1] * defect[1]) / determinant,
+        (m[0, 0] * defect[1] - m[1, 0] * defect[0]) / determinant,
+    )
+    found = ca.SX.zeros(2, 1)
+    for _ in range(NEWTON_STEPS if ca.depends_on(m, unknown) else 1):
+        (found,) = ca.substitute([newton], [unknown], [found])
+    return found[0], found[1]

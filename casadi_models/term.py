@@ -1,0 +1,67 @@
+"""An effect put in its place, and the parameters that a joint has besides its effects."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Final, final
+
+from .effect import Effect, Place
+from .parameter import Parameter
+from .signals import Expression
+
+INERTIAS: Final = {
+    "motor_inertia": Parameter(
+        "motor_inertia", "kg.m2", 1.0, 1e-12, math.inf,
+        "inertia of rotor and wave generator, times the ratio squared", "motor",
+    ),
+    "link_inertia": Parameter(
+        "link_inertia", "kg.m2", 1.0, 1e-12, math.inf, "inertia of the link with its payload", "link"
+    ),
+    "inertia": Parameter("inertia", "kg.m2", 1.0, 1e-12, math.inf, "inertia of motor and link together", "link"),
+}  # fmt: skip
+"""Inertias by name, all link-referred."""
+
+
+@final
+@dataclass(frozen=True)
+class Term:
+    """One effect in one place."""
+
+    effect: Effect
+    place: Place
+    instance: int = 1
+
+    @property
+    def label(self) -> str:
+        """``key``, ``key@place`` where the effect may act on several places, ``#2`` for a second one."""
+        label = f"{self.effect.key}@{self.place}" if len(self.effect.acts_on) > 1 else self.effect.key
+        return label if self.instance == 1 else f"{label}#{self.instance}"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Parameter names in the model, in the order of the effect's parameters."""
+        tail = "" if self.instance == 1 else f"_{self.instance}"
+        return tuple(n + tail for n in self.effect.parameter_names(self.place))
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Parameters with the names they have in the model."""
+        return tuple(p.renamed(n, p.side) for p, n in zip(self.effect.placed(self.place), self.names, strict=True))
+
+    def bound(self, values: Mapping[str, Expression]) -> SimpleNamespace:
+        """Values of the model's parameters under the names that the law of this term uses."""
+        pairs = zip(self.effect.parameters, self.names, strict=True)
+        return SimpleNamespace(**{p.name: values[n] for p, n in pairs})
+
+
+def smoothing(place: str) -> Parameter:
+    """Velocity over which sign(v) is smoothed to tanh(v/v0): a nuisance of every friction law."""
+    return Parameter(
+        f"{place}_smoothing_velocity", "rad/s", 1e-3, 1e-9, math.inf,
+        f"velocity over which {place}-side friction changes its sign (nuisance)",
+        "motor" if place == "motor" else "link",
+        grid=(0.0003, 0.001, 0.003, 0.01, 0.03), scale="velocity",
+    )  # fmt: skip

@@ -1,0 +1,143 @@
+"""Order of a subspace model: singular-value gap, held-out simulation and spectral radius together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from identification._hankel_qr import HankelFactor
+from identification._io_records import Source
+from identification._response_fit import ResponseFit
+from identification._triangle import FloatArray, single_thread
+from identification.errors import InputError
+
+# singular values below this part of the largest are rounding
+_FLOOR = 1e-11
+# orders whose simulation is tried where the singular values show a clear gap
+_TRIED = 5
+# samples the order choice looks at, before and after the split
+_BEFORE, _AFTER = 40_000, 20_000
+# a lower order is preferred while it leaves at most this much more variance unexplained:
+# factor without and with a clear gap, and percent points
+_RATIO, _RATIO_CLEAR, _PERCENT = 1.1, 1.5, 0.05
+_CLEAR_GAP = 3.0
+
+
+@final
+@dataclass(frozen=True)
+class OrderCandidate:
+    """One order and what speaks for it.
+
+    Attributes
+    ----------
+    order : int
+    gap : float
+        Ratio of the last singular value kept to the first one dropped.
+    spectral_radius : float
+        Of the model fitted without the held-out samples.
+    held_out_vaf_percent : ndarray, shape (outputs,)
+        Variance accounted for in simulation of held-out samples; NaN where the model is unstable.
+    """
+
+    order: int
+    gap: float
+    spectral_radius: float
+    held_out_vaf_percent: FloatArray
+
+    @property
+    def clear_gap(self) -> bool:
+        """Whether the singular values fall by more than a factor of 3 after this order."""
+        return self.gap >= _CLEAR_GAP
+
+    @property
+    def unexplained_percent(self) -> float:
+        """Mean over the outputs of the held-out variance left unexplained; infinite where unstable."""
+        left = 100.0 - self.held_out_vaf_percent
+        return float(left.mean()) if np.isfinite(left).all() else float("inf")
+
+
+def shortlist(singular_values: FloatArray, highest: int) -> tuple[int, ...]:
+    """Orders up to `highest` followed by the largest gaps, in rising order; all of them where no gap is clear."""
+    kept = np.flatnonzero(singular_values > _FLOOR * singular_values[0]) + 1
+    orders = kept[kept <= highest]
+    gaps = np.array([_gap(singular_values, int(order)) for order in orders])
+    tried = _TRIED if gaps.max() >= _CLEAR_GAP else len(orders)
+    return tuple(sorted(int(order) for order in orders[np.argsort(-gaps, kind="stable")[:tried]]))
+
+
+def judge(
+    source: Source,
+    early: HankelFactor,
+    orders: tuple[int, ...],
+    singular_values: FloatArray,
+    split: int,
+    weights: FloatArray,
+) -> tuple[OrderCandidate, ...]:
+    """Fit every order before the split and simulate it after the split."""
+    left = early.directions()[0]
+    before = _spans(source.lengths, max(split - _BEFORE, 0), split)
+    after = _spans(source.lengths, split, split + _AFTER)
+    candidates = []
+    for order in orders:
+        a, c = early.realise(left, order)
+        with single_thread():
+            radius = float(np.abs(np.linalg.eigvals(a)).max())
+        vaf = np.full(early.outputs, np.nan)
+        if radius < 1.0:
+            trained = _fit(source, before, (a, c), weights).solve()
+            tested = _fit(source, after, (a, c), weights)
+            vaf = tested.vaf_percent(trained.b, trained.d, tested.initial_states(trained.b, trained.d))
+            if not np.isfinite(vaf).all():
+                still = int(np.flatnonzero(~np.isfinite(vaf))[0])
+                raise InputError(f"y channel {still} does not move in the held-out samples: give order or held_out")
+        candidates.append(OrderCandidate(order, _gap(singular_values, order), radius, vaf))
+    return tuple(candidates)
+
+
+def choose(candidates: tuple[OrderCandidate, ...], radius: Callable[[int], float]) -> int:
+    """Lowest stable order that simulates about as well as the best one.
+
+    "About" is wider for an order after which the singular values fall clearly.
+    `radius` gives the spectral radius of the final model of an order. Where no order
+    is stable in both, the one with the smallest radius is returned.
+    """
+    stable = [one for one in candidates if np.isfinite(one.unexplained_percent) and radius(one.order) < 1.0]
+    if not stable:
+        return min((one.order for one in candidates), key=radius)
+    best = min(one.unexplained_percent for one in stable)
+    for one in stable:
+        ratio = _RATIO_CLEAR if one.clear_gap else _RATIO
+        if one.unexplained_percent <= ratio * best + _PERCENT:
+            return one.order
+    return stable[-1].order
+
+
+def _gap(singular_values: FloatArray, order: int) -> float:
+    below = singular_values[order] if order < len(singular_values) else 0.0
+    return float(singular_values[order - 1] / max(below, _FLOOR * singular_values[0]))
+
+
+def _spans(lengths: tuple[int, ...], start: int, stop: int) -> list[tuple[int, int, int]]:
+    """Parts (record, first, last) of the samples `start` to `stop` counted over all records."""
+    spans = []
+    seen = 0
+    for index, length in enumerate(lengths):
+        first, last = max(start - seen, 0), min(stop - seen, length)
+        if last > first:
+            spans.append((index, first, last))
+        seen += length
+    return spans
+
+
+def _fit(
+    source: Source, spans: list[tuple[int, int, int]], matrices: tuple[FloatArray, FloatArray], weights: FloatArray
+) -> ResponseFit:
+    fit = ResponseFit(*matrices, source.channels[0])
+    for index, first, last in spans:
+        for u, y in source.pieces(index, first, last):
+            fit.add(u, y * weights)
+        fit.end_record()
+    return fit

@@ -1,0 +1,91 @@
+"""How far a fitted model is from the measurements: errors per balance, ratio to the noise floor."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, final
+
+import numpy as np
+import numpy.typing as npt
+
+from casadi_models import JointModel
+from identification.balances import Balances
+from identification.engine import Dataset, floors, references, rms, row_weights, stack
+from identification.weak import WeakRecord
+
+FloatArray = npt.NDArray[np.float64]
+
+VERDICT_KERNELS: Final = {"motor": 0.03, "link": 0.12, "transmission": 0.06, "sum": 0.12, "deflection": 0.06, "axis": 0.2}
+"""Kernel at which a balance is compared with its floor: where records without a hidden effect read 1 [s]."""
+
+
+@final
+@dataclass(frozen=True)
+class BalanceError:
+    """Error of one balance: RMS, noise floor, ratio of the two (rows near reversals count with their own floor)."""
+
+    rms: float
+    floor: float
+    ratio: float
+    unit: str
+
+    def as_json(self) -> dict[str, Any]:
+        """The shape of `improve --json`."""
+        return {"rms": self.rms, "unit": self.unit, "floor": self.floor, "ratio": self.ratio}
+
+
+@final
+@dataclass(frozen=True)
+class Error:
+    """Error of a model on a set of records.
+
+    Attributes
+    ----------
+    relative_error_percent : float
+        100 norm(residual) / norm(measured) over the balanced torques.
+    fit_percent : float
+        100 (1 - norm(residual) / norm(measured - mean)).
+    vaf_percent : float
+        100 (1 - var(residual) / var(measured)).
+    balances : mapping of str to BalanceError
+    """
+
+    relative_error_percent: float
+    fit_percent: float
+    vaf_percent: float
+    balances: Mapping[str, BalanceError]
+
+    def as_json(self) -> dict[str, Any]:
+        """The shape of `improve --json`."""
+        return {
+            "relative_error_percent": self.relative_error_percent, "fit_percent": self.fit_percent,
+            "vaf_percent": self.vaf_percent, "balances": {b: e.as_json() for b, e in self.balances.items()},
+        }  # fmt: skip
+
+
+def assess(model: JointModel, data: Dataset, records: Sequence[WeakRecord], values: Mapping[str, float]) -> Error:
+    """Error of a model with the given values on prepared records."""
+    balances = Balances(model, data.sensing, wrt=())
+    residual = stack(balances, records, values).residual
+    measured = references(data, records)
+    floor = floors(model, data, values)
+    weights = row_weights(balances, data, values, {b: max(floor[b], 1e-12) for b in floor}, records)
+    unit = "N.m" if model.kind == "rotary" else "N"
+    errors = {
+        b: BalanceError(rms(residual[b]), floor[b], rms(residual[b] * weights[b]) if floor[b] > 0 else math.inf, unit)
+        for b in balances.balances
+    }  # fmt: skip
+    r = np.concatenate([residual[b] for b in balances.balances])
+    y = np.concatenate([measured[b] for b in balances.balances])
+    centred = np.concatenate([measured[b] - measured[b].mean() for b in balances.balances])
+    size = float(np.linalg.norm(y)) or 1e-300
+    spread = float(np.linalg.norm(centred)) or 1e-300
+    varying = np.concatenate([residual[b] - residual[b].mean() for b in balances.balances])
+    return Error(
+        100 * float(np.linalg.norm(r)) / size,
+        100 * (1 - float(np.linalg.norm(r)) / spread),
+        100 * (1 - float(varying @ varying) / spread**2),
+        errors,
+    )

@@ -1,0 +1,230 @@
+"""Residuals of the balances, from the declared physics, as numbers on prepared records."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, final
+
+import casadi as ca
+import numpy as np
+import numpy.typing as npt
+
+from casadi_models import JointModel, Signals
+from casadi_models.vectorised import Vectorised
+from identification.sensing import Sensing
+from identification.weak import WeakRecord
+
+FloatArray = npt.NDArray[np.float64]
+Expression = Any
+
+_NAMES: Final = Signals.names()
+
+_DIRECT: Final = ("motor_position", "link_position", "torque")
+"""Signals whose noise enters nonlinear laws directly."""
+
+UNROLLED: Final = 200
+"""Steps of a memory law in one compiled stretch."""
+
+
+def residual_expressions(model: JointModel, sensing: Sensing) -> dict[str, Expression]:
+    """Symbolic residual of every balance: what drives minus what the model explains [N.m]."""
+    e = model.equations
+    motor_inertia = e.inertia.get("motor_inertia", ca.SX(0))
+    link_inertia = e.inertia.get("link_inertia", ca.SX(0))
+    motor = motor_inertia * e.motor_acceleration + e.motor_resistance
+    link = link_inertia * e.link_acceleration + e.link_resistance
+    out: dict[str, Expression] = {}
+    # in the units of the reading: a gain error must not shrink the residual with the signal
+    drive_gain = ca.jacobian(e.drive, e.signals.drive)
+    torque_gain = ca.jacobian(e.torque, e.signals.torque)
+    for balance in sensing.balances:
+        if balance == "motor":
+            out[balance] = (e.drive - e.torque * e.motor_lever - motor) / drive_gain
+        elif balance == "link":
+            out[balance] = (e.torque * e.link_lever - link) / torque_gain
+        elif balance == "transmission":
+            out[balance] = (e.torque - e.transmitted) / torque_gain
+        elif balance == "sum":
+            out[balance] = (e.drive - motor - link + e.transmitted * (e.link_lever - e.motor_lever)) / drive_gain
+        elif balance == "deflection":
+            out[balance] = (e.drive - motor - e.transmitted * e.motor_lever) / drive_gain
+        else:
+            total: Expression = e.inertia["inertia"] if "inertia" in e.inertia else motor_inertia + link_inertia
+            resist = e.motor_resistance + e.link_resistance + e.transmitted
+            out[balance] = (e.drive - total * e.motor_acceleration - resist) / drive_gain
+    return out
+
+
+@final
+class Balances:
+    """Residuals and their Jacobian of one model with one set of channels.
+
+    Parameters
+    ----------
+    model : JointModel
+        Already adapted to the channels.
+    sensing : Sensing
+    wrt : sequence of str, optional
+        Parameters whose Jacobian columns are wanted; all by default.
+    """
+
+    def __init__(self, model: JointModel, sensing: Sensing, wrt: Sequence[str] | None = None) -> None:
+        self.model = model
+        self.sensing = sensing
+        self.names: tuple[str, ...] = model.parameter_names
+        self.wrt: tuple[str, ...] = tuple(wrt) if wrt is not None else self.names
+        e = model.equations
+        signals = e.signals.vector()
+        parameters = e.parameters
+        expressions = residual_expressions(model, sensing)
+        columns = [self.names.index(n) for n in self.wrt]
+        stacked: list[Expression] = []
+        for r in expressions.values():
+            stacked += [r, *(ca.vertsplit(ca.jacobian(r, parameters)[:, columns].T) if columns else [])]
+        out = ca.vertcat(*stacked)
+        self.balances = tuple(expressions)
+        slopes = ca.jacobian(out, signals)
+        sparsity = ca.jacobian_sparsity(ca.vec(ca.densify(slopes)), ca.vertcat(signals, e.memory))
+        varying = np.zeros(slopes.shape[0] * slopes.shape[1], dtype=bool)
+        varying[list(set(sparsity.get_triplet()[0]))] = True
+        linear = ~varying.reshape(slopes.shape[1], slopes.shape[0]).T
+        present = np.zeros(slopes.shape, dtype=bool)
+        rows, cols = slopes.sparsity().get_triplet()
+        present[rows, cols] = True
+        linear &= present
+        keep = ca.DM(linear.astype(float))
+        self._linear = ca.Function("linear", [parameters], [ca.densify(slopes * keep)])
+        zeroed = []
+        for i in range(out.shape[0]):
+            names = [signals[j] for j in range(len(_NAMES)) if linear[i, j]]
+            zeroed.append(ca.substitute([out[i]], names, [ca.SX(0)] * len(names))[0] if names else out[i])
+        self._has_rest = [not z.is_zero() for z in zeroed]
+        needed = [i for i, used in enumerate(self._has_rest) if used]
+        rest = ca.vertcat(*(zeroed[i] for i in needed)) if needed else ca.SX(0, 1)
+        self._needed = needed
+        self._rest = Vectorised(ca.Function("rest", [signals, e.memory, parameters], [ca.densify(rest)]))
+        own = [expressions[b] for b in self.balances]
+        sources = ca.vertcat(*(signals[_NAMES.index(n)] for n in _DIRECT))
+        self._slopes = ca.Function("slopes", [signals, e.memory, parameters], [ca.densify(ca.jacobian(ca.vertcat(*own), sources))])
+        self._memory = Memory(model) if e.memory_terms else None
+        self._size = out.shape[0]
+
+    def point_values(self, data: WeakRecord, values: Mapping[str, float]) -> FloatArray:
+        """The nonlinear parts at the points, (points, outputs that have one)."""
+        p = [float(values[n]) for n in self.names]
+        count = len(data.points["motor_position"])
+        if not self._needed:
+            return np.empty((count, 0))
+        matrix = np.zeros((len(_NAMES), count))
+        for i, name in enumerate(_NAMES):
+            if name in data.points:
+                matrix[i] = data.points[name]
+        memory = self.memory_values(data, values)
+        return self._rest(count, matrix, memory, p).T
+
+    def memory_values(self, data: WeakRecord, values: Mapping[str, float]) -> FloatArray:
+        """Internal states of displacement-memory effects at the points, (states, points)."""
+        states = self.model.equations.memory.shape[0]
+        count = len(data.points["motor_position"])
+        out = np.zeros((states, count))
+        if self._memory is None:
+            return out
+        p = np.array([float(values[n]) for n in self.names])
+        matrix = np.zeros((len(_NAMES), count))
+        for i, name in enumerate(_NAMES):
+            if name in data.smooth:
+                matrix[i] = data.smooth[name]
+        where = self._memory.coordinates(count, matrix, p)
+        for first, last in zip(data.starts[:-1], data.starts[1:], strict=True):
+            out[:, first:last] = self._memory.follow(where[:, first:last], matrix[:, first:last], p, data.grid.dt * data.grid.step)
+        return out
+
+    def evaluate(self, data: WeakRecord, values: Mapping[str, float]) -> dict[str, tuple[FloatArray, FloatArray]]:
+        """Residual (rows,) and Jacobian (rows, wrt) of every balance at the given parameter values."""
+        p = [float(values[n]) for n in self.names]
+        averaged = np.zeros((data.rows, len(_NAMES)))
+        for i, name in enumerate(_NAMES):
+            if name in data.averaged:
+                averaged[:, i] = data.averaged[name]
+        full = averaged @ np.array(self._linear(p)).T
+        if self._needed:
+            full[:, self._needed] += data.average(self.point_values(data, values))
+        width = 1 + len(self.wrt)
+        return {
+            b: (full[:, i * width], full[:, i * width + 1 : (i + 1) * width]) for i, b in enumerate(self.balances)
+        }  # fmt: skip
+
+    def coefficients(self, values: Mapping[str, float], data: WeakRecord) -> dict[str, dict[str, float]]:
+        """How strongly each averaged signal enters each residual (for the noise floor); RMS over the record where it varies."""
+        p = [float(values[n]) for n in self.names]
+        linear = np.array(self._linear(p))
+        width = 1 + len(self.wrt)
+        out = {
+            b: {n: float(linear[i * width, j]) for j, n in enumerate(_NAMES) if linear[i * width, j]}
+            for i, b in enumerate(self.balances)
+        }  # fmt: skip
+        if self._needed:
+            count = min(len(data.points["motor_position"]), 2000)
+            pick = np.linspace(0, len(data.points["motor_position"]) - 1, count).astype(np.int64)
+            matrix = np.array([data.points[n][pick] if n in data.points else np.zeros(count) for n in _NAMES])
+            memory = np.zeros((self.model.equations.memory.shape[0], count))
+            flat = np.array(self._slopes.map(count)(matrix, memory, np.tile(np.array(p)[:, None], count)))
+            cube = flat.reshape(len(self.balances), count, len(_DIRECT))
+            for i, b in enumerate(self.balances):
+                for k, n in enumerate(_DIRECT):
+                    size = float(np.sqrt(np.mean(cube[i, :, k] ** 2)))
+                    if n not in out[b] and size > 0:
+                        out[b][n] = size * (np.sign(float(np.mean(cube[i, :, k]))) or 1.0)
+        return out
+
+
+@final
+class Memory:
+    """Internal states along a record, from the step form of the memory laws.
+
+    Steps are unrolled into one SX function of :data:`UNROLLED` steps, so that the virtual machine is
+    entered once per stretch and not once per sample.
+    """
+
+    def __init__(self, model: JointModel) -> None:
+        e = model.equations
+        signals = e.signals.vector()
+        coordinates = [t[1] for t in e.memory_terms]
+        steps = ca.SX.sym("steps", len(coordinates))
+        moved: list[Expression] = []
+        for i, (term, _, z, view, values) in enumerate(e.memory_terms):
+            if term.effect.memory is not None:
+                moved.extend(term.effect.memory(z, steps[i], view, values))
+        after = ca.vertcat(*moved)
+        self._states = int(e.memory.shape[0])
+        self._used = sorted(set(ca.jacobian_sparsity(after, signals).get_triplet()[1]))
+        kept = ca.vertcat(*(signals[i] for i in self._used)) if self._used else ca.SX(0, 1)
+        one = ca.Function("one", [e.memory, steps, kept, e.parameters, e.clock], [after])
+        self.coordinates = Vectorised(ca.Function("where", [signals, e.parameters], [ca.densify(ca.vertcat(*coordinates))]))
+        z0 = ca.SX.sym("z0", self._states)
+        many = ca.SX.sym("many", len(coordinates), UNROLLED)
+        aside = ca.SX.sym("aside", len(self._used), UNROLLED)
+        p = ca.SX.sym("p", e.parameters.shape[0])
+        clock = ca.SX.sym("clock")
+        z, trail = z0, []
+        for k in range(UNROLLED):
+            z = one(z, many[:, k], aside[:, k], p, clock)
+            trail.append(z)
+        self._stretch = ca.Function("stretch", [z0, many, aside, p, clock], [ca.horzcat(*trail)])
+
+    def follow(self, where: FloatArray, signals: FloatArray, p: FloatArray, step: float) -> FloatArray:
+        """States (states, points) along coordinates (coordinates, points) `step` seconds apart, from rest at zero."""
+        count = where.shape[1]
+        out = np.zeros((self._states, count))
+        steps = np.diff(where, axis=1, prepend=where[:, :1])
+        z = np.zeros(self._states)
+        for first in range(0, count, UNROLLED):
+            last = min(first + UNROLLED, count)
+            many = np.zeros((where.shape[0], UNROLLED))
+            many[:, : last - first] = steps[:, first:last]
+            aside = np.zeros((len(self._used), UNROLLED))
+            aside[:, : last - first] = signals[self._used, first:last]
+            trail = np.array(self._stretch(z, many, aside, p, step))
+            out[:, first:last] = trail[:, : last - first]
+            z = trail[:, last - first - 1]
+        return out

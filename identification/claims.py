@@ -1,0 +1,179 @@
+"""From tried candidates to claims: who is significant, who cannot be told apart, what is minor."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final, final
+
+import numpy as np
+
+from casadi_models import EFFECTS
+from identification.candidates import Base, Candidate, NotTestable, Trial, offered, try_candidate
+
+MAJOR_DROP: Final = 10.0
+HELD_OUT_DROP: Final = 5.0
+GAIN: Final = 3.0
+FALSE_DISCOVERY: Final = 0.05
+MINOR_DROP: Final = 2.5
+MINOR_HELD_OUT: Final = 2.0
+MINOR_GAIN: Final = 100.0
+SET_P: Final = 0.05
+SET_LOST: Final = 0.15
+SET_RMS: Final = 1.5
+LARGEST_SET: Final = 4
+
+
+@final
+@dataclass(frozen=True)
+class Claim:
+    """A set of names for one missing effect.
+
+    Attributes
+    ----------
+    effects : tuple of str
+        Keys that the data cannot tell apart, the most likely first.
+    label : str
+        Label that was added to the model.
+    balance : str
+    held_out_drop_percent : float
+    separate_by : str or None
+        The run that would separate the names.
+    """
+
+    effects: tuple[str, ...]
+    label: str
+    balance: str
+    held_out_drop_percent: float
+    separate_by: str | None = None
+    partial: bool = False
+    contribution: float = 0.0
+
+    def as_json(self) -> dict[str, Any]:
+        """The shape of `improve --json`."""
+        out: dict[str, Any] = {
+            "effects": list(self.effects), "balance": self.balance,
+            "held_out_drop_percent": self.held_out_drop_percent, "separate_by": self.separate_by,
+        }  # fmt: skip
+        if self.partial:
+            out["partial"] = True
+        return out
+
+
+@final
+@dataclass(frozen=True)
+class Ranking:
+    """All candidates tried on one base, best first; one entry per effect."""
+
+    trials: tuple[Trial, ...]
+    significant: frozenset[str]
+    not_testable: tuple[NotTestable, ...]
+    everything: tuple[Trial, ...] = field(default=())
+
+    def best(self, refused: frozenset[str] = frozenset()) -> Trial | None:
+        """Best significant trial whose label was not refused before."""
+        for t in self.everything:
+            if t.candidate.label in self.significant and t.candidate.label not in refused:
+                return t
+        return None
+
+
+def rank(base: Base, extra: Sequence[Candidate] = (), *, late: bool = False) -> Ranking:
+    """Try every candidate that the records can show on the fitted base (`late`: the costly ones too)."""
+    candidates, refused = offered(base.solution.model, base.data, late=late)
+    trials: list[Trial] = []
+    untestable = {n.effect: n for n in refused}
+    for candidate in (*candidates, *extra):
+        found = try_candidate(candidate, base)
+        if isinstance(found, Trial):
+            trials.append(found)
+        elif isinstance(found, NotTestable):
+            untestable.setdefault(found.effect, found)
+    trials.sort(key=lambda t: -t.score)
+    seen: dict[str, Trial] = {}
+    for t in trials:
+        seen.setdefault(t.key, t)
+        untestable.pop(t.key, None)
+    kept: dict[str, Trial] = {}
+    for t in trials:
+        kept.setdefault(t.candidate.label, t)
+    unique = sorted(kept.values(), key=lambda t: -t.score)
+    passed = _discoveries(unique)
+    significant = frozenset(t.candidate.label for t in unique if t.candidate.label in passed and _major(t, base))
+    order = sorted(seen.values(), key=lambda t: (t.candidate.label not in significant, -t.score))
+    return Ranking(tuple(order), significant, tuple(untestable.values()), tuple(unique))
+
+
+def _discoveries(trials: Sequence[Trial]) -> set[str]:
+    """Benjamini-Hochberg at 5 %."""
+    ordered = sorted(trials, key=lambda t: t.p_value)
+    last = -1
+    for i, t in enumerate(ordered):
+        if t.p_value <= FALSE_DISCOVERY * (i + 1) / len(ordered):
+            last = i
+    return {t.candidate.label for t in ordered[: last + 1]}
+
+
+def _major(trial: Trial, base: Base) -> bool:
+    if trial.gain <= GAIN or trial.cv_drop_percent < MAJOR_DROP:
+        return False
+    if not math.isnan(trial.held_out_drop_percent) and trial.held_out_drop_percent < HELD_OUT_DROP:
+        return False
+    if trial.key == "channel_delay":
+        dt = base.data.train[0].grid.dt
+        delay = max(abs(trial.values[n]) for n in trial.candidate.amplitudes)
+        return delay > dt / 2
+    return True
+
+
+def confusion_set(best: Trial, trials: Sequence[Trial], base: Base) -> tuple[str, ...]:
+    """Names that these records cannot tell from the best one, the best first."""
+    names = [best.key]
+    blocks = np.unique(base.block[base.block >= 0])
+    for other in trials:
+        if other.key in names or other.score <= 0 or other.candidate.effect.key == best.key:
+            continue
+        lost = (best.score - other.score) / best.score
+        difference = best.block_score[blocks] - other.block_score[blocks]
+        spread = float(np.std(difference, ddof=1)) / math.sqrt(len(blocks)) if len(blocks) > 1 else math.inf
+        t = float(np.mean(difference)) / spread if spread > 0 else 0.0
+        alike = abs(t) < 2.0 or lost < SET_LOST
+        involved = [i for i in range(len(best.rms)) if best.rms[i] > 0]
+        ratio = max(float(other.rms[i] / best.rms[i]) for i in involved)
+        if alike and ratio <= SET_RMS and _still_helps(other, best):
+            names.append(other.key)
+    return tuple(names)
+
+
+def _still_helps(other: Trial, best: Trial) -> bool:
+    """A name stays in the set only if it does a fair part of the work itself."""
+    return other.cv_drop_percent >= 0.5 * best.cv_drop_percent and (
+        math.isnan(other.held_out_drop_percent) or other.held_out_drop_percent >= 0.5 * best.held_out_drop_percent
+    )
+
+
+def make_claim(best: Trial, ranking: Ranking, base: Base) -> Claim:
+    """The claim that follows from the best trial."""
+    names = confusion_set(best, ranking.everything, base)
+    hints = [EFFECTS[n].separate_by for n in names if EFFECTS[n].separate_by]
+    separate = hints[0] if len(names) > 1 and hints else None
+    held = best.held_out_drop_percent
+    return Claim(
+        names, best.candidate.label, best.balance, best.cv_drop_percent if math.isnan(held) else held, separate,
+        contribution=best.contribution,
+    )  # fmt: skip
+
+
+def minor_claims(ranking: Ranking, base: Base) -> list[Trial]:
+    """Small but certain candidates (to be confirmed at other kernels by the caller)."""
+    out = []
+    for t in ranking.trials:
+        if t.candidate.label in ranking.significant or t.score < MINOR_GAIN or t.cv_drop_percent < MINOR_DROP:
+            continue
+        if math.isnan(t.held_out_drop_percent) or t.held_out_drop_percent < MINOR_HELD_OUT or t.p_value > 0.01:
+            continue
+        if t.key == "channel_delay":
+            continue
+        out.append(t)
+    return out[:2]

@@ -1,0 +1,492 @@
+"""Weighted least squares over the balances of several records: the numbers behind fit, compare and diagnose."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Final, final
+
+import numpy as np
+import numpy.typing as npt
+
+from casadi_models import JointModel
+from identification.balances import Balances
+from identification.errors import InputError
+from identification.joint_file import Joint, Known
+from identification.noise import noise_level
+from identification.record import Record
+from identification.sensing import Sensing, adapt, sense, signals_of
+from identification.weak import POSITION_CHAINS, WeakRecord, differentiated_kernel, kernel, prepare
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+CLAIM_KERNEL: Final = 0.06
+ONE_SIDED_KERNEL: Final = 0.2
+
+
+@final
+@dataclass(frozen=True)
+class Dataset:
+    """Records prepared for the balances: training rows and rows the fit never sees.
+
+    Attributes
+    ----------
+    joint, sensing : what is known and what is measured
+    train, held_out : tuple of WeakRecord
+    ranges : mapping of str to float
+        99 % range of velocity [rad/s], torsion [rad], position [rad] and the duration [s]: scales of shape grids.
+    noise : mapping of str to float
+        White-noise level of each measured signal.
+    """
+
+    joint: Joint
+    sensing: Sensing
+    train: tuple[WeakRecord, ...]
+    held_out: tuple[WeakRecord, ...]
+    ranges: Mapping[str, float]
+    noise: Mapping[str, float]
+    train_names: tuple[str, ...] = ()
+    held_out_names: tuple[str, ...] = ()
+    note: str = ""
+
+    @property
+    def kernel(self) -> float:
+        """Kernel length of the balances [s]."""
+        return self.train[0].grid.length
+
+    @property
+    def blocks(self) -> int:
+        """Number of training blocks."""
+        return 1 + max(int(w.block.max(initial=-1)) for w in self.train)
+
+
+def load_dataset(
+    train: Sequence[Record], held_out: Sequence[Record], joint: Joint, model: JointModel, *, kernel: float | None = None
+) -> Dataset:
+    """Prepare records for the balances that their common channels allow.
+
+    Raises
+    ------
+    InputError
+        Too short; channels that do not fit the model; a record of training and held-out data without a common channel set.
+    """
+    sensing = sense(train[0], model)
+    for record in (*train[1:], *held_out):
+        if sense(record, model).balances != sensing.balances:
+            raise InputError(f"{record.name}: has other channels than {train[0].name}; give records with the same channels")
+    length = kernel or (ONE_SIDED_KERNEL if sensing.balances == ("axis",) else CLAIM_KERNEL)
+    prepared: list[WeakRecord] = []
+    first = 0
+    for record in (*train, *held_out):
+        made = weak_record(record, joint, sensing, length, first)
+        first = max(first, 1 + int(made.block.max(initial=first - 1)))
+        prepared.append(made)
+    count = len(train)
+    signals = [signals_of(r, joint, sensing) for r in train]
+    names = {c for s in signals for c in s if c in POSITION_CHAINS}
+    noise = {c: float(np.median([noise_level(s[c], tuple(r.segments())) for s, r in zip(signals, train, strict=True)])) for c in names}
+    return Dataset(
+        joint, sensing, tuple(prepared[:count]), tuple(prepared[count:]), _ranges(prepared[:count]), noise,
+        tuple(r.name for r in train), tuple(r.name for r in held_out),
+    )  # fmt: skip
+
+
+def weak_record(record: Record, joint: Joint, sensing: Sensing, length: float, first_block: int = 0) -> WeakRecord:
+    """One record, resampled to uniform time where needed, averaged with the kernel."""
+    steps = np.diff(record.time)
+    inside = np.diff(record.segment) == 0
+    if inside.any() and np.ptp(steps[inside]) > 0.02 * float(np.median(steps[inside])):
+        record = record.resampled()
+    length = max(length, 8 * record.dt)
+    made = prepare(
+        record.time, signals_of(record, joint, sensing), tuple(record.segments()), length=length,
+        pointwise=max(length / 2 if length <= CLAIM_KERNEL else 0.06, 6 * record.dt), first_block=first_block,
+    )  # fmt: skip
+    if made.rows < 8:
+        raise InputError(f"{record.name}: {len(record)} samples in {record.duration:.3g} s are too few for a kernel of {length:.3g} s; give a longer record")
+    return made
+
+
+def _ranges(data: Sequence[WeakRecord]) -> dict[str, float]:
+    def span(values: FloatArray) -> float:
+        return float(np.quantile(np.abs(values), 0.99)) or 1e-12
+
+    speed = np.concatenate([w.smooth["motor_velocity"] for w in data])
+    q = np.concatenate([w.smooth["motor_position"] for w in data])
+    twist = np.concatenate([w.smooth["motor_position"] - w.smooth["link_position"] for w in data])
+    duration = sum(float(np.ptp(w.time)) for w in data)
+    return {"velocity": span(speed), "torsion": span(twist), "position": span(q - np.median(q)), "duration": duration, "absolute": 1.0}
+
+
+def floors(model: JointModel, data: Dataset, values: Mapping[str, float], kernel_data: WeakRecord | None = None) -> dict[str, float]:
+    """RMS that measurement noise alone would leave in each balance."""
+    balances = Balances(model, data.sensing, wrt=())
+    grid = (kernel_data or data.train[0]).grid
+    out = {}
+    for balance, entering in balances.coefficients(values, kernel_data or data.train[0]).items():
+        variance = 0.0
+        for source, chain in POSITION_CHAINS.items():
+            if source not in data.noise:
+                continue
+            weights: list[FloatArray] = [
+                entering[n] * differentiated_kernel(grid.length, grid.dt, o) for o, n in enumerate(chain) if n in entering
+            ]  # fmt: skip
+            if not weights:
+                continue
+            size = max(len(w) for w in weights)
+            combined = np.zeros(size)
+            for w in weights:
+                pad = (size - len(w)) // 2
+                combined[pad : size - pad] += w
+            variance += data.noise[source] ** 2 * float(np.sum(combined**2))
+        out[balance] = math.sqrt(variance)
+    return out
+
+
+def references(data: Dataset, records: Sequence[WeakRecord]) -> dict[str, FloatArray]:
+    """The measured torque of each balance, averaged: what the relative error refers to."""
+    names = {"link": "torque", "transmission": "torque"}
+    return {
+        b: np.concatenate([w.averaged[names.get(b, "drive")] for w in records])
+        for b in data.sensing.balances
+    }  # fmt: skip
+
+
+@final
+@dataclass(frozen=True)
+class Stacked:
+    """Residual and Jacobian of several records, balance by balance."""
+
+    residual: Mapping[str, FloatArray]
+    jacobian: Mapping[str, FloatArray]
+    block: IntArray
+
+
+def stack(balances: Balances, records: Sequence[WeakRecord], values: Mapping[str, float]) -> Stacked:
+    """Evaluate the balances on records one after the other."""
+    parts = [balances.evaluate(w, values) for w in records]
+    return Stacked(
+        {b: np.concatenate([p[b][0] for p in parts]) for b in balances.balances},
+        {b: np.concatenate([p[b][1] for p in parts]) for b in balances.balances},
+        np.concatenate([w.block for w in records]),
+    )
+
+
+@final
+@dataclass(frozen=True)
+class Solution:
+    """A fitted model in the terms of the balances.
+
+    Attributes
+    ----------
+    model : JointModel
+        With the fitted values.
+    values, stderr : mapping
+        Every parameter; standard errors from blocks (None for fixed, nuisance or unidentifiable ones).
+    free : tuple of str
+    weights : mapping of str to (rows,) array
+        1/sigma of each training row.
+    sigma : mapping of str to float
+    at_bound, unidentified : tuple of str
+    correlation : mapping
+        Largest correlation of each parameter with another one: (name, value).
+    """
+
+    model: JointModel
+    values: Mapping[str, float]
+    stderr: Mapping[str, float | None]
+    free: tuple[str, ...]
+    weights: Mapping[str, FloatArray]
+    sigma: Mapping[str, float]
+    at_bound: tuple[str, ...] = ()
+    unidentified: tuple[str, ...] = ()
+    correlation: Mapping[str, tuple[str, float]] = field(default_factory=dict)
+    iterations: int = 0
+
+
+def starts(model: JointModel, data: Dataset) -> dict[str, float]:
+    """Start values: those of the model; shapes and smoothing from the ranges of the record."""
+    out = {}
+    for p in model.parameters:
+        if p.name in model.values:
+            out[p.name] = float(model.values[p.name])
+        elif p.is_shape and p.scale != "absolute":
+            out[p.name] = p.grid[len(p.grid) // 2] * data.ranges[p.scale]
+        else:
+            out[p.name] = p.start
+    return out
+
+
+def bounds_of(model: JointModel, known: Mapping[str, Known], data: Dataset) -> dict[str, tuple[float, float]]:
+    """Bounds of every parameter: physical ones, narrowed by what is known and what the record can show."""
+    out = {}
+    for p in model.parameters:
+        low, high = p.low, p.high
+        if p.name.endswith("_smoothing_velocity") or (p.is_shape and p.scale != "absolute"):
+            scale = data.ranges[p.scale]
+            low, high = max(low, p.grid[0] * scale / 3), min(high, p.grid[-1] * scale * 3)
+        k = known.get(p.name)
+        if k is not None:
+            low = max(low, k.low) if k.low is not None else low
+            high = min(high, k.high) if k.high is not None else high
+        out[p.name] = (low, high)
+    return out
+
+
+def row_weights(
+    balances: Balances, data: Dataset, values: Mapping[str, float], sigma: Mapping[str, float], records: Sequence[WeakRecord]
+) -> dict[str, FloatArray]:
+    """1/sigma of each row: rows that hang on where exactly friction changes its sign count less."""
+    names = [n for n in balances.names if n.endswith("_smoothing_velocity")]
+    doubled = {**values, **{n: 2 * values[n] for n in names}}
+    bare = Balances(balances.model, data.sensing, wrt=())
+    here = stack(bare, records, values).residual
+    there = stack(bare, records, doubled).residual if names else here
+    stuck = _standstill(balances.model, data, values, records)
+    return {
+        b: 1 / np.sqrt(sigma[b] ** 2 + (here[b] - there[b]) ** 2 / 4 + stuck[b] ** 2) for b in here
+    }  # fmt: skip
+
+
+def _standstill(model: JointModel, data: Dataset, values: Mapping[str, float], records: Sequence[WeakRecord]) -> dict[str, FloatArray]:
+    """Friction torque that a standing joint may hold in either direction, averaged like a row [N.m]."""
+    zero = np.zeros(sum(w.rows for w in records))
+    out = dict.fromkeys(data.sensing.balances, zero)
+    for place, balances in (("motor", ("motor", "sum", "deflection", "axis")), ("link", ("link", "sum", "axis"))):
+        level = sum(
+            abs(values[n]) for t in model.terms if t.place == place and t.effect.key in ("coulomb", "stribeck") for n in t.names[:1]
+        )  # fmt: skip
+        source = f"{place}_position"
+        if not level or source not in data.noise:
+            continue
+        shares = []
+        for w in records:
+            grid = w.grid
+            slow = 3 * data.noise[source] * float(np.linalg.norm(kernel(grid.pointwise, grid.dt, 1)))
+            shares.append(w.average((np.abs(w.points[f"{place}_velocity"]) < slow).astype(float)))
+        held = level * np.concatenate(shares)
+        for b in balances:
+            if b in out:
+                out[b] = np.hypot(out[b], held)
+    return out
+
+
+def rms(values: FloatArray) -> float:
+    """Root mean square."""
+    return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0
+
+
+def solve(model: JointModel, data: Dataset, *, iterations: int = 15, start: Mapping[str, float] | None = None) -> Solution:
+    """Fit a model to the training rows by Levenberg-Marquardt steps on the weak form.
+
+    Raises
+    ------
+    InputError
+        A free parameter that moves no output.
+    """
+    known = data.joint.known
+    values = starts(model, data)
+    values.update({k: v for k, v in (start or {}).items() if k in values})
+    fixed = {n: k.value for n, k in known.items() if k.value is not None and n in values}
+    values.update({n: v for n, v in fixed.items() if v is not None})
+    limits = bounds_of(model, known, data)
+    shapes = {p.name for p in model.parameters if p.is_shape}
+    frozen_shapes = {p.name for p in model.parameters if p.is_shape and p.scale == "absolute" and p.name.endswith("exponent")}
+    free = [n for n in model.parameter_names if n not in fixed and n not in frozen_shapes]
+    balances = Balances(model, data.sensing, wrt=free)
+    memory_shapes = _memory_shapes(model, free)
+    for n in free:
+        low, high = limits[n]
+        values[n] = min(max(values[n], low), high)
+    floor = floors(model, data, {**values})
+    # first pass without shapes: linear amplitudes from any start
+    sigma = {b: 1.0 for b in balances.balances}
+    linear_only = [n for n in free if n not in shapes]
+    _check_moves(balances, data, values, linear_only)
+    values, _ = _steps(balances, data, values, linear_only, limits, sigma, {}, 3, memory_shapes)
+    for _ in range(2):
+        residual = stack(Balances(model, data.sensing, wrt=()), data.train, values).residual
+        floor = floors(model, data, values)
+        sigma = {b: max(rms(residual[b]), floor[b], 1e-12) for b in residual}
+        weights = row_weights(balances, data, values, sigma, data.train)
+        values, used = _steps(balances, data, values, free, limits, sigma, weights, iterations, memory_shapes)
+    residual = stack(Balances(model, data.sensing, wrt=()), data.train, values).residual
+    floor = floors(model, data, values)
+    sigma = {b: max(rms(residual[b]), floor[b], 1e-12) for b in residual}
+    weights = row_weights(balances, data, values, sigma, data.train)
+    return _with_errors(model, balances, data, values, free, limits, weights, sigma, memory_shapes, used)
+
+
+def _memory_shapes(model: JointModel, free: Sequence[str]) -> tuple[str, ...]:
+    """Shape parameters that act through internal states only: differentiated numerically."""
+    out = []
+    for t in model.terms:
+        if t.effect.memory is not None:
+            out += [n for n, p in zip(t.names, t.effect.parameters, strict=True) if p.is_shape and n in free]
+    return tuple(out)
+
+
+def _jacobian(
+    balances: Balances, data: Dataset, values: Mapping[str, float], free: Sequence[str], memory_shapes: Sequence[str]
+) -> Stacked:
+    """Stacked residual and Jacobian with the columns of `free`."""
+    stacked = stack(balances, data.train, values)
+    columns = [balances.wrt.index(n) for n in free]
+    jacobian = {b: np.array(j[:, columns]) for b, j in stacked.jacobian.items()}
+    numeric = [n for n in memory_shapes if n in free]
+    if numeric:
+        bare = Balances(balances.model, data.sensing, wrt=())
+        for n in numeric:
+            step = 1e-2 * values[n]
+            moved = stack(bare, data.train, {**values, n: values[n] + step}).residual
+            for b in jacobian:
+                jacobian[b][:, list(free).index(n)] = (moved[b] - stacked.residual[b]) / step
+    return Stacked(stacked.residual, jacobian, stacked.block)
+
+
+def _check_moves(balances: Balances, data: Dataset, values: Mapping[str, float], free: Sequence[str]) -> None:
+    stacked = _jacobian(balances, data, values, free, ())
+    dead = [
+        n for i, n in enumerate(free)
+        if max(float(np.abs(j[:, i]).max(initial=0.0)) for j in stacked.jacobian.values()) == 0.0 and values[n] != 0.0
+    ]  # fmt: skip
+    truly = [n for n in dead if n in ("motor_inertia", "link_inertia", "inertia", "stiffness")]
+    if truly:
+        raise InputError(f"parameter {', '.join(truly)} moves no output of these records; give it a known value or add the channel that shows it")
+
+
+def _steps(
+    balances: Balances, data: Dataset, values: Mapping[str, float], free: Sequence[str],
+    limits: Mapping[str, tuple[float, float]], sigma: Mapping[str, float], weights: Mapping[str, FloatArray],
+    iterations: int, memory_shapes: Sequence[str],
+) -> tuple[dict[str, float], int]:  # fmt: skip
+    """Damped Gauss-Newton with bounds; shape parameters move on a log scale."""
+    now = dict(values)
+    parameters = {p.name: p for p in balances.model.parameters}
+    logs = np.array([parameters[n].is_shape and parameters[n].scale != "absolute" for n in free])
+    bare = Balances(balances.model, data.sensing, wrt=())
+
+    def scaled(residual: Mapping[str, FloatArray]) -> FloatArray:
+        return np.concatenate([residual[b] * (weights[b] if b in weights else 1 / sigma[b]) for b in balances.balances])
+
+    damping = 1e-9
+    cost = math.inf
+    for used in range(1, iterations + 1):
+        stacked = _jacobian(balances, data, now, free, memory_shapes)
+        r = scaled(stacked.residual)
+        j = np.concatenate([stacked.jacobian[b] * (weights[b][:, None] if b in weights else 1 / sigma[b]) for b in balances.balances])
+        j = j * np.where(logs, [now[n] for n in free], 1.0)
+        cost = float(r @ r)
+        norms = np.linalg.norm(j, axis=0)
+        alive = norms > 1e-12 * max(float(norms.max(initial=0.0)), 1e-300)
+        better = False
+        for _ in range(6):
+            step = _bounded_step(j / np.where(alive, norms, 1.0), -r, alive, norms, damping, now, free, limits, logs)
+            trial = dict(now)
+            for n, s, log in zip(free, step, logs, strict=True):
+                low, high = limits[n]
+                trial[n] = min(max(now[n] * math.exp(min(max(s, -1.0), 1.0)) if log else now[n] + s, low), high)
+            after = scaled(stack(bare, data.train, trial).residual)
+            if float(after @ after) <= cost * (1 + 1e-12):
+                better = True
+                break
+            damping = max(damping * 30, 1e-4)
+        if not better:
+            return now, used
+        gained = cost - float(after @ after)
+        now = trial
+        damping = max(damping / 10, 1e-12)
+        if gained <= 1e-6 * cost:
+            return now, used
+    return now, iterations
+
+
+def _bounded_step(
+    j: FloatArray, r: FloatArray, alive: npt.NDArray[np.bool_], norms: FloatArray, damping: float,
+    now: Mapping[str, float], free: Sequence[str], limits: Mapping[str, tuple[float, float]], logs: npt.NDArray[np.bool_],
+) -> FloatArray:  # fmt: skip
+    """Least-squares step; a parameter that would leave its bound goes to the bound and the others are solved again."""
+    active = alive.copy()
+    fixed = np.zeros(len(free))
+    step = np.zeros(len(free))
+    gram, right = j.T @ j, j.T @ r
+    for _ in range(len(free) + 1):
+        index = np.flatnonzero(active)
+        if not len(index):
+            break
+        a = gram[np.ix_(index, index)] + damping * np.eye(len(index))
+        b = right[index] - gram[np.ix_(index, np.flatnonzero(~active))] @ fixed[~active]
+        part = np.linalg.lstsq(a, b, rcond=1e-13)[0]
+        step[:] = fixed
+        step[index] = part
+        outside = []
+        for i in index:
+            if logs[i]:
+                continue
+            low, high = limits[free[i]]
+            target = now[free[i]] + step[i] / norms[i]
+            if target < low - 1e-12 * abs(low) or target > high + 1e-12 * abs(high):
+                fixed[i] = (min(max(target, low), high) - now[free[i]]) * norms[i]
+                outside.append(i)
+        if not outside:
+            break
+        active[outside] = False
+    step[~active] = fixed[~active]
+    return np.where(alive, step / np.where(alive, norms, 1.0), 0.0)
+
+
+def _with_errors(
+    model: JointModel, balances: Balances, data: Dataset, values: Mapping[str, float], free: Sequence[str],
+    limits: Mapping[str, tuple[float, float]], weights: Mapping[str, FloatArray], sigma: Mapping[str, float],
+    memory_shapes: Sequence[str], used: int,
+) -> Solution:  # fmt: skip
+    """Standard errors by the block sandwich; what cannot be identified is said."""
+    stacked = _jacobian(balances, data, values, free, memory_shapes)
+    j = np.concatenate([stacked.jacobian[b] * weights[b][:, None] for b in balances.balances])
+    r = np.concatenate([stacked.residual[b] * weights[b] for b in balances.balances])
+    block = np.tile(stacked.block, len(balances.balances))
+    norms = np.linalg.norm(j, axis=0)
+    at_bound = [
+        n for n in free
+        if any(math.isfinite(limit) and abs(values[n] - limit) <= 1e-9 * max(abs(limit), 1e-300) for limit in limits[n])
+        and not n.endswith("_smoothing_velocity")
+    ]  # fmt: skip
+    usable = np.array([norm > 1e-12 * norms.max() and n not in at_bound for n, norm in zip(free, norms, strict=True)])
+    stderr: dict[str, float | None] = {n: None for n in values}
+    correlation: dict[str, tuple[str, float]] = {}
+    unidentified = [n for n, norm in zip(free, norms, strict=True) if norm <= 1e-12 * norms.max() and not n.endswith("_smoothing_velocity")]
+    index = np.flatnonzero(usable)
+    if len(index):
+        scaled = j[:, index] / norms[index]
+        inverse = np.linalg.pinv(scaled.T @ scaled, rcond=1e-12)
+        numbers = np.unique(block[block >= 0])
+        scores = np.array([scaled[block == k].T @ r[block == k] for k in numbers])
+        covariance = inverse @ (scores.T @ scores) @ inverse * len(numbers) / max(len(numbers) - 1, 1)
+        size = np.sqrt(np.maximum(np.diag(covariance), 0.0)) / norms[index]
+        spread = np.sqrt(np.maximum(np.diag(inverse), 1e-300))
+        corr = inverse / np.outer(spread, spread)
+        np.fill_diagonal(corr, 0.0)
+        for k, i in enumerate(index):
+            stderr[free[i]] = float(size[k])
+            other = int(np.argmax(np.abs(corr[k])))
+            correlation[free[i]] = (free[index[other]], float(corr[k, other]))
+            weak = values[free[i]] != 0 and size[k] > abs(values[free[i]])
+            if (spread[k] > 1e4 or weak) and not free[i].endswith("_smoothing_velocity"):
+                unidentified.append(free[i])
+    kept = {n: v for n, v in values.items()}
+    return Solution(
+        replace(model, values=kept), kept, stderr, tuple(free), weights, sigma, tuple(at_bound), tuple(unidentified),
+        correlation, used,
+    )  # fmt: skip
+
+
+def prepared_model(joint: Joint, record: Record) -> JointModel:
+    """The joint's model in the form that the record's channels can carry."""
+    model = joint.model()
+    sensing = sense(record, model)
+    adapted = adapt(model, sensing, joint.known)
+    if sensing.has_drive and not record.has("motor_torque") and not adapted.has("channel_delay", "drive"):
+        adapted = adapted.add("channel_delay@drive")
+    return adapted

@@ -1,0 +1,122 @@
+"""Fit: parameters of a joint model from records."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, final
+
+from casadi_models import JointModel
+from identification.assess import Error, assess
+from identification.engine import Dataset, Solution, load_dataset, prepared_model, solve
+from identification.joint_file import Joint, toml_text
+from identification.parameters import parameter_table
+from identification.record import Record
+
+
+@final
+@dataclass(frozen=True)
+class Fit:
+    """A fitted joint model.
+
+    Attributes
+    ----------
+    joint : Joint
+        What was known beforehand.
+    solution : Solution
+        Values, standard errors, flags.
+    data : Dataset
+        The prepared records.
+    train : Error
+        On the records of the fit.
+    held_out : Error or None
+    """
+
+    joint: Joint
+    solution: Solution
+    data: Dataset
+    train: Error
+    held_out: Error | None
+    records: tuple[Record, ...] = ()
+
+    @property
+    def model(self) -> JointModel:
+        """The model with its fitted values."""
+        return self.solution.model
+
+    @property
+    def parameters(self) -> dict[str, dict[str, Any]]:
+        """Parameter table (see :func:`identification.parameters.parameter_table`)."""
+        return parameter_table(self.solution, self.data)
+
+    def as_json(self) -> dict[str, Any]:
+        """Values, errors and flags as data."""
+        return {
+            "records": list(self.data.train_names), "effects": list(self.model.effects), "train": self.train.as_json(),
+            "held_out": self.held_out.as_json() if self.held_out else None, "parameters": self.parameters,
+        }  # fmt: skip
+
+    def to_joint_file(self) -> str:
+        """The fitted joint as the text of a joint file."""
+        return joint_text(self.joint, self.solution, self.data)
+
+    def _repr_html_(self) -> str:
+        from identification.html import fit_html
+
+        return fit_html(self)
+
+
+def joint_text(joint: Joint, solution: Solution, data: Dataset) -> str:
+    """A joint file with fitted values, standard errors and provenance."""
+    labels = tuple(label for label in solution.model.effects if label != "channel_delay@drive")
+    fitted = {n: p for n, p in parameter_table(solution, data).items() if n in solution.values}
+    whole = replace(joint, effects=labels, virtual_work=solution.model.virtual_work)
+    from identification import __version__
+
+    return toml_text(whole, fitted, {"records": ", ".join(data.train_names), "version": __version__})
+
+
+def as_joint(model: JointModel | Joint, joint: Joint | None = None) -> Joint:
+    """The joint behind a model: the joint given, with the model's effects."""
+    if isinstance(model, Joint):
+        return model
+    base = joint or Joint(name=model.name, kind=model.kind, gear_ratio=model.gear_ratio)
+    return replace(
+        base, gear_ratio=model.gear_ratio, kind=model.kind, effects=model.effects, model_name="hd1",
+        virtual_work=model.virtual_work, fitted=dict(model.values),
+    )  # fmt: skip
+
+
+def fit(
+    model: JointModel | Joint, records: Record | Sequence[Record], *, joint: Joint | None = None, held_out: Sequence[Record] = ()
+) -> Fit:
+    """Fit a joint model to records by weighted least squares on the weak form of its balances.
+
+    Parameters
+    ----------
+    model : JointModel or Joint
+        The model, or a joint file read with :func:`identification.load_joint`.
+    records : Record or sequence of Record
+    joint : Joint, optional
+        Motor constant and known values where `model` is a JointModel.
+    held_out : sequence of Record
+        Records the fit does not see; their error is given too.
+
+    Raises
+    ------
+    InputError
+        Unusable records, missing channels, a parameter that moves no output.
+
+    Examples
+    --------
+    >>> first = fit(load_joint("joint.toml"), read("joint3.csv"))   # doctest: +SKIP
+    """
+    train = [records] if isinstance(records, Record) else list(records)
+    whole = as_joint(model, joint)
+    prepared = prepared_model(whole, train[0])
+    data = load_dataset(train, list(held_out), whole, prepared)
+    solution = solve(prepared, data)
+    return Fit(
+        whole, solution, data, assess(solution.model, data, data.train, solution.values),
+        assess(solution.model, data, data.held_out, solution.values) if held_out else None, tuple(train),
+    )  # fmt: skip

@@ -1,0 +1,397 @@
+"""The loop: fit, see where it fails, name what is missing, add it, fit again, until nothing is left to name."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final, final
+
+from casadi_models import EFFECTS, JointModel
+from identification.assess import VERDICT_KERNELS, BalanceError, Error, assess
+from identification.candidates import Base, NotTestable, Trial, make_base
+from identification.claims import Claim, Ranking, confusion_set, make_claim, minor_claims, rank
+from identification.engine import Dataset, Solution, load_dataset, prepared_model, solve
+from identification.errors import InputError
+from identification.joint_file import Joint
+from identification.lines import Line, find_lines
+from identification.locate import Unexplained, locate
+from identification.parameters import parameter_table
+from identification.record import Record
+
+MAX_ADDITIONS: Final = 6
+RATIO_LIMIT: Final = 1.5
+HOLD_DELAY: Final = "channel_delay@drive"
+"""In every model with a commanded drive: the hold of the logged command is not an effect."""
+
+EXPLAINED_SHARE: Final = 0.5
+SWAP_GAIN: Final = 3.0
+
+Progress = Callable[[str, float], None]
+
+
+@final
+@dataclass(frozen=True)
+class Step:
+    """One step of the loop: the model after an addition and its errors.
+
+    Attributes
+    ----------
+    added : str or None
+        Key of the effect that was added (None for the start model).
+    effects : tuple of str
+        Keys in the model.
+    train, held_out : Error
+    solution : Solution
+    """
+
+    added: str | None
+    effects: tuple[str, ...]
+    train: Error
+    held_out: Error
+    solution: Solution
+    label: str | None = None
+
+    def as_json(self, data: Dataset) -> dict[str, Any]:
+        """The shape of `improve --json`."""
+        return {
+            "added": self.added, "effects": list(self.effects), "labels": list(visible_labels(self.solution.model)),
+            "train": self.train.as_json(), "held_out": self.held_out.as_json(),
+            "parameters": parameter_table(self.solution, data),
+        }  # fmt: skip
+
+
+@final
+@dataclass(frozen=True)
+class Improvement:
+    """Result of the loop (see contract: `improve --json`).
+
+    Attributes
+    ----------
+    steps : tuple of Step
+        The start model and one per addition.
+    claims, minor : tuple of Claim
+    ranking : Ranking
+        The one before the first addition.
+    lines : tuple of Line
+    unexplained : tuple of Unexplained
+    verdict : {"complete", "nothing_missing", "unexplained", "not_identifiable"}
+    reason : str
+        One sentence that a reader understands.
+    """
+
+    joint: Joint
+    data: Dataset
+    steps: tuple[Step, ...]
+    claims: tuple[Claim, ...]
+    minor: tuple[Claim, ...]
+    ranking: Ranking | None
+    lines: tuple[Line, ...]
+    unexplained: tuple[Unexplained, ...]
+    verdict: str
+    reason: str
+    final_ratios: Mapping[str, BalanceError]
+    not_testable: tuple[NotTestable, ...] = ()
+    warnings: tuple[str, ...] = ()
+    refused: tuple[str, ...] = ()
+
+    @property
+    def added(self) -> tuple[str, ...]:
+        """Keys added, in order."""
+        return tuple(s.added for s in self.steps if s.added)
+
+    @property
+    def model(self) -> JointModel:
+        """The final model with its values."""
+        return self.steps[-1].solution.model
+
+    def as_json(self) -> dict[str, Any]:
+        """The loop as data; held to improve.schema.json by a test."""
+        significant = self.ranking.significant if self.ranking else frozenset()
+        best = self.ranking.everything[0] if self.ranking and self.ranking.everything else None
+        return {
+            "records": {"train": list(self.data.train_names), "held_out": list(self.data.held_out_names), "note": self.data.note},
+            "steps": [s.as_json(self.data) for s in self.steps],
+            "added": list(self.added),
+            "claims": [c.as_json() for c in self.claims],
+            "minor": [c.as_json() for c in self.minor],
+            "lines": [line.as_json() for line in self.lines],
+            "ranking": [ranked_json(t, t.candidate.label in significant) for t in self.ranking.trials] if self.ranking else [],
+            "not_testable": [{"effect": n.effect, "why": n.why} for n in self.not_testable],
+            "verdict": self.verdict, "reason": self.reason,
+            "unexplained": [u.as_json() for u in self.unexplained],
+            "floor_ratio": {b: e.as_json() for b, e in self.final_ratios.items()},
+            "warnings": list(self.warnings), "best_candidate": best.key if best else None,
+        }  # fmt: skip
+
+
+def ranked_json(trial: Trial, significant: bool) -> dict[str, Any]:
+    """One row of the ranking."""
+    drop = trial.held_out_drop_percent if not math.isnan(trial.held_out_drop_percent) else trial.cv_drop_percent
+    return {
+        "effect": trial.key, "title": trial.candidate.effect.title, "balance": trial.balance,
+        "held_out_drop_percent": drop, "significant": significant,
+        "confusable_with": list(trial.candidate.effect.confused_with), "place": trial.candidate.place,
+        "cv_drop_percent": trial.cv_drop_percent, "gain_nats": trial.gain, "p_value": trial.p_value,
+    }  # fmt: skip
+
+
+def visible_labels(model: JointModel) -> tuple[str, ...]:
+    """Labels of the effects, without the nuisance delay of the drive."""
+    return tuple(label for label in model.effects if label != HOLD_DELAY)
+
+
+def visible_keys(model: JointModel) -> tuple[str, ...]:
+    """Keys of the effects in the model, each once."""
+    return tuple(dict.fromkeys(t.effect.key for t in model.terms if t.label != HOLD_DELAY))
+
+
+def improve(
+    records: Sequence[Record] | Record, joint: Joint, held_out: Sequence[Record] = (), *,
+    max_additions: int = MAX_ADDITIONS, progress: Progress | None = None,
+) -> Improvement:  # fmt: skip
+    """Find the missing effects of a joint model, add them and measure the error on held-out records.
+
+    Parameters
+    ----------
+    records : Record or sequence of Record
+        Training records.
+    joint : Joint
+        What is known, and the start model (see :func:`identification.joint_file.load_joint`).
+    held_out : sequence of Record
+        Records that the fit never sees; without them blocks of the training records are held out.
+    max_additions : int
+    progress : callable, optional
+        ``progress(text, share)``.
+
+    Raises
+    ------
+    InputError
+        Unusable records or joint, in one line.
+    """
+    train = [records] if isinstance(records, Record) else list(records)
+    if not train:
+        raise InputError("no training record; give at least one")
+    train, held, note = with_held_out(train, list(held_out))
+    model = prepared_model(joint, train[0])
+    data = replace(load_dataset(train, held, joint, model), note=note)
+    return _Loop(joint, data, train, held, progress or (lambda text, share: None)).run(model, max_additions)
+
+
+def with_held_out(train: list[Record], held_out: list[Record]) -> tuple[list[Record], list[Record], str]:
+    """Training and held-out records; without given ones the last 30 % of the time blocks are held out."""
+    if held_out:
+        return train, held_out, ""
+    pairs = [r.split(0.7) for r in train]
+    note = "no held-out records given: the last 30 % of each training record (or of its runs) is held out"
+    return [p[0] for p in pairs], [p[1] for p in pairs], note
+
+
+@final
+class _Loop:
+    """State of one run of the loop."""
+
+    def __init__(self, joint: Joint, data: Dataset, train: list[Record], held: list[Record], progress: Progress) -> None:
+        self.joint, self.data, self.progress = joint, data, progress
+        self._train, self._held = train, held
+        self.refused: set[str] = set()
+
+    def run(self, model: JointModel, max_additions: int) -> Improvement:
+        self.progress("fitting the start model", 0.05)
+        steps, claims = self._start(model)
+        self.progress("ranking the library", 0.15)
+        base = make_base(steps[-1].solution, self.data)
+        first = ranking = rank(base)
+        late = False
+        while len(claims) < max_additions:
+            best = ranking.best(frozenset(self.refused))
+            if best is None and not late and max(e.ratio for e in steps[-1].held_out.balances.values()) > RATIO_LIMIT:
+                late = True
+                ranking = rank(base, late=True)
+                best = ranking.best(frozenset(self.refused))
+            if best is None:
+                break
+            claim = make_claim(best, ranking, base)
+            if len(claim.effects) > 4:
+                break
+            self.progress(f"adding {best.key}", 0.2 + 0.6 * len(claims) / max_additions)
+            before = steps[-1]
+            solution = solve(best.candidate.model, self.data, start={**before.solution.values, **best.values})
+            after = self._step(best.key, best.candidate.label, solution)
+            drop = held_drop(before.held_out, after.held_out, claim.balance)
+            if drop < 2.0:
+                self.refused.add(best.candidate.label)
+                continue
+            claims.append(replace(claim, held_out_drop_percent=drop))
+            steps.append(after)
+            if len(claims) > 1:
+                claims, steps = self._revise(claims, steps)
+            base = make_base(steps[-1].solution, self.data)
+            ranking = rank(base)
+        return self._finish(first, ranking, base, claims, steps)
+
+    def _start(self, model: JointModel) -> tuple[list[Step], list[Claim]]:
+        """The start model; a delay of the drive beyond the hold of one sample is the first claim, not a nuisance."""
+        start = solve(model, self.data)
+        delay = abs(start.values.get("drive_delay", 0.0))
+        if HOLD_DELAY in model.effects and HOLD_DELAY not in self.joint.effects and delay > self.data.train[0].grid.dt:
+            plain = solve(model.drop(HOLD_DELAY), self.data)
+            without, having = self._step(None, None, plain), self._step("channel_delay", HOLD_DELAY, start)
+            balance = self.data.sensing.balances[0]
+            drop = held_drop(without.held_out, having.held_out, balance)
+            if drop >= 10.0:
+                return [without, having], [Claim(("channel_delay",), HOLD_DELAY, balance, drop)]
+        return [self._step(None, None, start)], []
+
+    def _step(self, key: str | None, label: str | None, solution: Solution) -> Step:
+        train = assess(solution.model, self.data, self.data.train, solution.values)
+        held = assess(solution.model, self.data, self.data.held_out, solution.values)
+        keys = visible_keys(solution.model)
+        return Step(key, (*keys, key) if key == "channel_delay" and key not in keys else keys, train, held, solution, label)
+
+    def _revise(self, claims: list[Claim], steps: list[Step]) -> tuple[list[Claim], list[Step]]:
+        """Judge every earlier claim given all the others: drop it, swap it, or renew its set."""
+        current = list(claims)
+        for claim in claims[:-1]:
+            model = steps[-1].solution.model.drop(claim.label)
+            if model.terms == steps[-1].solution.model.terms:
+                continue
+            without = solve(model, self.data, start=steps[-1].solution.values)
+            base = make_base(without, self.data)
+            ranking = rank(base)
+            same = next((t for t in ranking.everything if t.candidate.label == claim.label), None)
+            best = ranking.best(frozenset(self.refused))
+            position = current.index(claim)
+            if same is None or same.cv_drop_percent < 10.0 or claim.label not in ranking.significant:
+                if best is None or best.score < 10:
+                    current.pop(position)
+                    self.refused.add(claim.label)
+                    return self._replay(current, steps)
+            if best is not None and best.candidate.label != claim.label and (same is None or best.score > same.score + SWAP_GAIN):
+                renewed = make_claim(best, ranking, base)
+                self.refused.add(claim.label)
+                if len(renewed.effects) <= 4 and all(c.label != renewed.label for c in current):
+                    current[position] = renewed
+                    return self._replay(current, steps)
+            if same is not None:
+                names = confusion_set(same, ranking.everything, base)
+                current[position] = replace(claim, effects=names, separate_by=claim.separate_by if len(names) > 1 else None)
+        return current, steps
+
+    def _replay(self, claims: list[Claim], steps: list[Step]) -> tuple[list[Claim], list[Step]]:
+        """Steps again from the start model with the revised claims."""
+        out = [steps[0]]
+        kept = []
+        for claim in claims:
+            before = out[-1]
+            try:
+                model = before.solution.model.add(claim.label)
+            except ValueError:
+                continue
+            variant = next((s.solution.model.virtual_work for s in reversed(steps) if claim.label in s.solution.model.effects), None)
+            if variant is not None:
+                model = replace(model, virtual_work=variant)
+            known = {k: v for s in steps for k, v in s.solution.values.items()}
+            solution = solve(model, self.data, start={**known, **before.solution.values})
+            after = self._step(claim.effects[0], claim.label, solution)
+            kept.append(replace(claim, held_out_drop_percent=held_drop(before.held_out, after.held_out, claim.balance)))
+            out.append(after)
+        return kept, out
+
+    def _finish(self, first: Ranking, last: Ranking, base: Base, claims: list[Claim], steps: list[Step]) -> Improvement:
+        self.progress("looking at what is left", 0.85)
+        solution = steps[-1].solution
+        ratios = self._ratios(solution)
+        lines = find_lines(solution, self.data, self._at_kernel(self._shortest()))
+        if not claims:
+            lines = [x for x in lines]
+        claims = [self._partial(c, steps[0], steps[-1], ratios) for c in claims]
+        minor = tuple(self._minor(t, solution) for t in minor_claims(last, base) if self._same_sign(t, solution))
+        error = replace(steps[-1].held_out, balances=ratios)
+        where = locate(solution, self.data, error, lines, RATIO_LIMIT)
+        verdict, reason = _verdict(claims, where, ratios, steps)
+        return Improvement(
+            self.joint, self.data, tuple(steps), tuple(claims), minor, first, tuple(lines), tuple(where), verdict, reason, ratios,
+            tuple(n for n in first.not_testable if n.effect not in {c for x in claims for c in x.effects}),
+            excitation_warnings(self.data), tuple(sorted(self.refused)),
+        )  # fmt: skip
+
+    def _shortest(self) -> float:
+        dt = self.data.train[0].grid.dt
+        return max(8 * dt, 0.012)
+
+    def _at_kernel(self, length: float) -> Dataset:
+        """The same records with another kernel."""
+        return load_dataset(self._train, self._held, self.joint, prepared_model(self.joint, self._train[0]), kernel=length)
+
+    def _ratios(self, solution: Solution) -> dict[str, BalanceError]:
+        """Residual over floor, each balance at its own kernel, on held-out records."""
+        out: dict[str, BalanceError] = {}
+        for length in sorted({VERDICT_KERNELS[b] for b in self.data.sensing.balances}):
+            near = abs(length - self.data.kernel) < 1e-9
+            data = self.data if near else self._at_kernel(length)
+            error = assess(solution.model, data, data.held_out, solution.values)
+            out.update({b: e for b, e in error.balances.items() if VERDICT_KERNELS[b] == length})
+        return {b: out[b] for b in self.data.sensing.balances}
+
+    def _partial(self, claim: Claim, first: Step, last: Step, ratios: Mapping[str, BalanceError]) -> Claim:
+        """A claim that explains less than half of what stood over the floor is partial."""
+        before, after = first.held_out.balances[claim.balance], last.held_out.balances[claim.balance]
+        over = before.rms**2 - before.floor**2
+        share = (before.rms**2 - after.rms**2) / over if over > 0 else 1.0
+        return replace(claim, partial=ratios[claim.balance].ratio > RATIO_LIMIT and share < EXPLAINED_SHARE)
+
+    def _minor(self, trial: Trial, solution: Solution) -> Claim:
+        return Claim((trial.key,), trial.candidate.label, trial.balance, trial.held_out_drop_percent)
+
+    def _same_sign(self, trial: Trial, solution: Solution) -> bool:
+        """A minor effect must have the same sign at half and at double kernel."""
+        from identification.candidates import try_candidate
+
+        for factor in (0.5, 2.0):
+            data = self._at_kernel(self.data.kernel * factor)
+            other = solve(solution.model, data, start=solution.values)
+            found = try_candidate(trial.candidate, make_base(other, data))
+            if not isinstance(found, Trial):
+                return False
+            name = max(trial.candidate.amplitudes, key=lambda n: abs(trial.values[n]))
+            if trial.values[name] * found.values[name] <= 0:
+                return False
+        return True
+
+
+def held_drop(before: Error, after: Error, balance: str) -> float:
+    """Fall of a balance's RMS in percent."""
+    old = before.balances[balance].rms
+    return 100 * (1 - after.balances[balance].rms / old) if old > 0 else 0.0
+
+
+def _verdict(
+    claims: Sequence[Claim], where: Sequence[Unexplained], ratios: Mapping[str, BalanceError], steps: Sequence[Step]
+) -> tuple[str, str]:
+    names = " and ".join(EFFECTS[c.effects[0]].title if len(c.effects) == 1 else "one of (" + ", ".join(c.effects) + ")" for c in claims)
+    fall = f"the error on held-out data falls from {steps[0].held_out.relative_error_percent:.3g} % to {steps[-1].held_out.relative_error_percent:.3g} %"
+    if where:
+        left = ", ".join(f"{u.balance} ({ratios[u.balance].ratio:.2g} times its noise floor)" for u in where)
+        if claims:
+            return "unexplained", f"Missing: {names}; {fall}. Structure that is not in the library is left in: {left}."
+        return "unexplained", f"No effect of the library explains what is left in: {left}."
+    if claims:
+        return "complete", f"Missing: {names}; with it {fall}, and what is left looks like measurement noise."
+    return "nothing_missing", "The model explains the records down to their measurement noise: nothing is missing that these records could show."
+
+
+def excitation_warnings(data: Dataset) -> tuple[str, ...]:
+    """What the training records are too poor to show, said before the diagnosis."""
+    import numpy as np
+
+    out = []
+    speed = np.concatenate([w.smooth["motor_velocity"] for w in data.train])
+    top = float(np.quantile(np.abs(speed), 0.99)) or 1e-12
+    reversals = int(np.sum(np.diff(np.sign(speed[np.abs(speed) > 0.02 * top])) != 0))
+    if reversals < 4:
+        out.append(f"the motor reverses {reversals} times only: friction cannot be told from offsets; record more reversals")
+    levels = np.histogram(np.abs(speed) / top, bins=10, range=(0, 1))[0] / max(len(speed), 1)
+    if float(levels.max()) > 0.75 and int(np.argmax(levels)) > 2:
+        out.append("the training records run at one speed nearly all the time (triangle only): add a multisine record before trusting small claims")
+    return tuple(out)

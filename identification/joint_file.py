@@ -1,0 +1,214 @@
+"""Joint file (TOML): what is known about a joint and its model; written back by a fit."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final, final
+
+from casadi_models import JointModel
+from casadi_models.transmission import MODELS, build
+from identification.errors import InputError
+from identification.units import base_unit, same_dimension
+
+_JOINT_KEYS: Final = frozenset(
+    ("name", "kind", "gear_ratio", "motor_constant", "torque_per_current", "torque_per_voltage", "model", "effects", "virtual_work")
+)  # fmt: skip
+
+
+@final
+@dataclass(frozen=True)
+class Known:
+    """What is known about one parameter: a fixed value, or bounds (link-referred, SI)."""
+
+    value: float | None = None
+    low: float | None = None
+    high: float | None = None
+
+
+@final
+@dataclass(frozen=True)
+class Joint:
+    """A joint file in memory.
+
+    Attributes
+    ----------
+    name, kind : str
+    gear_ratio : float
+        theta_motor / theta_link, signed.
+    torque_per_current, torque_per_voltage : float or None
+        Link-side torque per ampere or volt.
+    model_name : str
+    effects : tuple of str
+        Labels beyond the model's own.
+    known, fitted : mapping
+        By parameter name; fitted values come from a fit written back.
+    columns : mapping or None
+        Column map of the record files.
+    """
+
+    name: str = "joint"
+    kind: str = "rotary"
+    gear_ratio: float = 1.0
+    torque_per_current: float | None = None
+    torque_per_voltage: float | None = None
+    model_name: str = "hd1"
+    effects: tuple[str, ...] = ()
+    known: Mapping[str, Known] = field(default_factory=dict)
+    fitted: Mapping[str, float] = field(default_factory=dict)
+    columns: Mapping[str, Any] | None = None
+    virtual_work: bool = True
+    source: str = ""
+
+    def model(self) -> JointModel:
+        """The joint model with its effects (values of a fit written back included).
+
+        Raises
+        ------
+        InputError
+            An effect that is not in the library.
+        """
+        try:
+            model = replace(
+                build(self.model_name, self.gear_ratio, kind=self.kind, effects=self.effects),
+                name=self.name, virtual_work=self.virtual_work,
+            )  # fmt: skip
+        except (KeyError, ValueError) as error:
+            raise InputError(f"{self.source or self.name}: {error.args[0]}") from None
+        names = set(model.parameter_names)
+        return model.with_values({k: v for k, v in self.fitted.items() if k in names})
+
+
+def load_joint(path: str | Path) -> Joint:
+    """Read a joint file.
+
+    Raises
+    ------
+    InputError
+        One line: what is wrong, where, and what to write instead.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); give the path of a joint file") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: not a text file; a joint file is TOML") from None
+    try:
+        data = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path}: not valid TOML ({error})") from None
+    return parse_joint(data, str(path))
+
+
+def parse_joint(data: Mapping[str, Any], source: str = "joint") -> Joint:
+    """A joint from the tables of a joint file (see :func:`load_joint`)."""
+    table = data.get("joint")
+    if not isinstance(table, Mapping):
+        raise InputError(f"{source}: no [joint] table; it needs at least gear_ratio and model")
+    for key in table:
+        if key not in _JOINT_KEYS:
+            raise InputError(f"{source}: [joint] has an unknown key {key!r}; known: {', '.join(sorted(_JOINT_KEYS))}")
+    kind = str(table.get("kind", "rotary"))
+    if kind not in ("rotary", "linear"):
+        raise InputError(f"{source}: kind = {kind!r}; use 'rotary' or 'linear'")
+    ratio = _number(table, "gear_ratio", source, 1.0)
+    if ratio is None or ratio == 0:
+        raise InputError(f"{source}: gear_ratio is 0; give theta_motor / theta_link with its sign")
+    constant = _number(table, "motor_constant", source, None)
+    per_current = _number(table, "torque_per_current", source, None)
+    if constant is not None and per_current is not None:
+        raise InputError(f"{source}: motor_constant and torque_per_current are both given; keep one of them")
+    name = str(table.get("model", "hd1"))
+    if name not in MODELS:
+        raise InputError(f"{source}: model = {name!r} is not known; use one of {', '.join(MODELS)}")
+    effects = table.get("effects", [])
+    if not isinstance(effects, list) or not all(isinstance(e, str) for e in effects):
+        raise InputError(f"{source}: effects must be a list of names, as effects = [\"viscous\", \"coulomb\"]")
+    joint = Joint(
+        name=str(table.get("name", Path(source).stem)), kind=kind, gear_ratio=ratio,
+        torque_per_current=ratio * constant if constant is not None else per_current,
+        torque_per_voltage=_number(table, "torque_per_voltage", source, None),
+        model_name=name, effects=tuple(effects), columns=data.get("columns"),
+        virtual_work=bool(table.get("virtual_work", True)), source=source,
+        fitted={k: float(v["value"]) for k, v in data.get("fitted", {}).items()},
+    )  # fmt: skip
+    model = joint.model()
+    known = {k: _known(k, v, ratio, model, source) for k, v in data.get("known", {}).items()}
+    return replace(joint, known=known)
+
+
+def _number(table: Mapping[str, Any], key: str, source: str, default: float | None) -> float | None:
+    value = table.get(key, default)
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | float) or value != value or abs(value) == float("inf"):
+        raise InputError(f"{source}: {key} = {value!r} is not a finite number")
+    return float(value)
+
+
+def _known(name: str, entry: Any, ratio: float, model: JointModel, source: str) -> Known:
+    parameters = {p.name: p for p in model.parameters}
+    extra = {"inertia": "kg.m2"}
+    if name not in parameters and name not in extra:
+        raise InputError(f"{source}: [known] {name}: the model has no such parameter; it has {', '.join(sorted(parameters))}")
+    if isinstance(entry, int | float):
+        entry = {"value": entry}
+    if not isinstance(entry, Mapping):
+        raise InputError(f"{source}: [known] {name} must be a number or a table with value, or low and high")
+    unit = parameters[name].unit if name in parameters else extra[name]
+    scale = 1.0
+    if "unit" in entry:
+        given, wanted = base_unit(str(entry["unit"])), base_unit(unit)
+        if not same_dimension(given, wanted):
+            raise InputError(f"{source}: [known] {name} has unit {entry['unit']!r}; it must be one like {unit}")
+        scale = given.factor / wanted.factor
+    if entry.get("side") == "motor":
+        powers = {"kg.m2": 2, "N.m/rad": 2, "N.m.s/rad": 2, "N.m": 1, "N.m/rad3": 4, "rad": -1, "rad/s": -1}
+        scale *= abs(ratio) ** powers.get(unit, 0)
+    values = {k: float(entry[k]) * scale for k in ("value", "low", "high") if k in entry}
+    if not values:
+        raise InputError(f"{source}: [known] {name} has neither value nor low nor high")
+    return Known(**values)
+
+
+def toml_text(joint: Joint, parameters: Mapping[str, Mapping[str, Any]] | None = None, provenance: Mapping[str, str] | None = None) -> str:
+    """The joint as the text of a joint file, with fitted values, standard errors and provenance."""
+    lines = ["[joint]", f'name = "{_escaped(joint.name)}"', f'kind = "{joint.kind}"', f"gear_ratio = {joint.gear_ratio!r}"]
+    if joint.torque_per_current is not None:
+        lines.append(f"torque_per_current = {joint.torque_per_current!r}")
+    if joint.torque_per_voltage is not None:
+        lines.append(f"torque_per_voltage = {joint.torque_per_voltage!r}")
+    lines += [f'model = "{joint.model_name}"', "effects = [" + ", ".join(f'"{e}"' for e in joint.effects) + "]"]
+    if not joint.virtual_work:
+        lines.append("virtual_work = false")
+    if joint.known:
+        lines += ["", "[known]"]
+        for name, known in joint.known.items():
+            parts = [f"{k} = {getattr(known, k)!r}" for k in ("value", "low", "high") if getattr(known, k) is not None]
+            lines.append(f"{name} = {{ {', '.join(parts)} }}")
+    if joint.columns:
+        lines += ["", "[columns]"]
+        for channel, entry in joint.columns.items():
+            inside = ", ".join(f"{k} = {_toml(v)}" for k, v in entry.items()) if isinstance(entry, Mapping) else None
+            lines.append(f"{channel} = {{ {inside} }}" if inside else f"{channel} = {_toml(entry)}")
+    if parameters:
+        lines += ["", "[fitted]"]
+        for name, p in parameters.items():
+            error = f", stderr = {p['stderr']:.6g}" if p.get("stderr") is not None else ""
+            lines.append(f'{name} = {{ value = {p["value"]:.10g}{error}, unit = "{p["unit"]}", side = "{p["side"]}" }}')
+    if provenance:
+        lines += ["", "[provenance]", *(f'{k} = "{_escaped(v)}"' for k, v in provenance.items())]
+    return "\n".join(lines) + "\n"
+
+
+def _escaped(text: str) -> str:
+    return text.replace("\\", "\\\\").replace('"', '\\"')
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return f'"{_escaped(value)}"' if isinstance(value, str) else repr(value)

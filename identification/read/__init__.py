@@ -1,0 +1,121 @@
+"""Reading measurement files: one function, `read`, and one module a format."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from identification.columns import Column, choose, load_map
+from identification.errors import InputError
+from identification.read._formats import open_table
+from identification.record import Provenance, Record, channel_unit
+from identification.units import to_si
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from identification.read._table import Table
+
+__all__ = ["open_table", "read"]
+
+
+def read(
+    path: str | Path,
+    columns: Mapping[str, Any] | str | Path | None = None,
+    kind: str | None = None,
+    name: str | None = None,
+) -> Record:
+    """Read one measurement file.
+
+    Parameters
+    ----------
+    path : str or Path
+        CSV/TSV text, MAT (v5, 7.3), NPZ, HDF5, Parquet, MDF4, ROS bag or MCAP; told apart by content.
+    columns : mapping, str, Path or None
+        Column map ``{channel: {column, unit, scale, sign, counts_per_turn}}``, or the TOML file that holds it
+        (a ``[columns]`` table, a joint file).  Headers like ``motor_current_A`` need none.
+    kind : {"rotary", "linear"}, optional
+        Kind of the axis; without it what the joint file says, or ``"rotary"``.
+    name : str, optional
+        Name of the record; the file's stem where it is left out.
+
+    Returns
+    -------
+    Record
+        In SI units.  A ``run`` column cuts it into segments.  Nothing is repaired: see `identification.check`.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be used; where columns are not recognised the message shows a guess as TOML.
+    """
+    file = Path(path)
+    raw, said = load_map(columns)
+    axis = kind or said or "rotary"
+    channel_unit("time", axis)
+    table = open_table(file)
+    chosen, notes = choose(raw, table.names, table.units, axis, str(file))
+    time, channels, run_notes = _load(table, chosen, axis, file)
+    provenance = Provenance(
+        paths=(str(file),),
+        sha256=(_digest(file),),
+        reader=table.reader,
+        columns=tuple(entry.describe() for entry in chosen),
+        notes=table.notes + notes + run_notes,
+    )
+    return Record.from_channels(time, channels, name=name or file.stem, kind=axis, provenance=provenance)
+
+
+def _load(
+    table: Table, chosen: tuple[Column, ...], kind: str, file: Path
+) -> tuple[npt.NDArray[np.float64], dict[str, npt.NDArray[np.float64]], tuple[str, ...]]:
+    numeric = [entry.column for entry in chosen if entry.channel != "run" and entry.step is None]
+    text = [entry.column for entry in chosen if entry.channel == "run"]
+    loaded = table.load(list(dict.fromkeys(numeric)), text)
+    channels: dict[str, npt.NDArray[np.float64]] = {}
+    notes: tuple[str, ...] = ()
+    for entry in chosen:
+        if entry.step is not None:
+            count = len(next(iter(loaded.values())))
+            channels[entry.channel] = to_si(entry.step * np.arange(count), entry.unit, "time")
+        elif entry.channel == "run":
+            channels["run"], notes = _runs(loaded[entry.column])
+        else:
+            channels[entry.channel] = _si(loaded[entry.column], entry, kind, file)
+    time = channels.pop("time")
+    if time.size == 0:
+        raise InputError(f"{file}: has no sample: record again or give another file")
+    return time, channels, notes
+
+
+def _si(values: npt.NDArray[Any], entry: Column, kind: str, file: Path) -> npt.NDArray[np.float64]:
+    try:
+        raw = np.asarray(values, dtype=np.float64)
+    except (ValueError, TypeError):
+        raise InputError(f"{file}: column {entry.column!r} is not numeric: give {entry.channel} another") from None
+    factor = entry.scale * entry.sign
+    wanted = channel_unit(entry.channel, kind)
+    scaled = raw if factor == 1.0 else raw * factor
+    return to_si(scaled, entry.unit, wanted, counts_per_turn=entry.counts_per_turn, channel=entry.channel)
+
+
+def _runs(values: npt.NDArray[Any]) -> tuple[npt.NDArray[np.float64], tuple[str, ...]]:
+    """Number the runs in the order in which they come, and name them in a note."""
+    changes = np.concatenate([[True], values[1:] != values[:-1]]) if values.size else np.zeros(0, dtype=np.bool_)
+    labels = [str(value).strip() for value in values[changes]]
+    shown = ", ".join(labels[:20]) + (", ..." if len(labels) > 20 else "")
+    return (np.cumsum(changes) - 1).astype(np.float64), (f"{len(labels)} run(s): {shown}",)
+
+
+def _digest(path: Path) -> str:
+    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+    digest = hashlib.sha256()
+    for file in files:
+        with file.open("rb") as stream:
+            while block := stream.read(1 << 20):
+                digest.update(block)
+    return digest.hexdigest()

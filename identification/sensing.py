@@ -1,0 +1,157 @@
+"""Which balances the channels of a record allow, and its signals link-referred."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Final, final
+
+import numpy as np
+import numpy.typing as npt
+
+from casadi_models import JointModel
+from identification.errors import InputError
+from identification.joint_file import Joint
+from identification.record import Record
+
+FloatArray = npt.NDArray[np.float64]
+
+BALANCE_TITLES: Final = {
+    "motor": "motor balance (drive, torque sensor, motor)",
+    "link": "link balance (torque sensor, link)",
+    "transmission": "transmission balance (torque sensor, torsion)",
+    "sum": "sum of motor and link balance (no torque sensor)",
+    "deflection": "motor balance with the torsion in place of a torque sensor",
+    "axis": "balance of the axis",
+}
+
+
+@final
+@dataclass(frozen=True)
+class Sensing:
+    """What a set of channels lets one see.
+
+    Attributes
+    ----------
+    balances : tuple of str
+        Keys of :data:`BALANCE_TITLES`.
+    both_positions : bool
+        False: the side that is not measured is taken to move with the other.
+    has_torque, has_drive, has_temperature : bool
+    clamped_link : bool
+        A torque-against-torsion test: the one position is the torsion.
+    """
+
+    balances: tuple[str, ...]
+    both_positions: bool
+    has_torque: bool
+    has_drive: bool
+    has_temperature: bool
+    clamped_link: bool = False
+    moving: str = "motor_position"
+
+
+DRIVES: Final = ("motor_torque", "motor_current", "motor_voltage")
+
+
+def sense(record: Record, model: JointModel) -> Sensing:
+    """Balances that the record's channels and the model allow.
+
+    Raises
+    ------
+    InputError
+        No position; nothing to balance; an elastic model on one-sided data (says what is missing).
+    """
+    drive = any(record.has(c) for c in DRIVES)
+    torque = record.has("link_torque")
+    motor, link = record.has("motor_position"), record.has("link_position")
+    temperature = record.has("temperature") and float(np.ptp(record["temperature"])) > 2.0
+    if not (motor or link):
+        raise InputError(f"{record.name}: no motor_position and no link_position; add one of them or map it in [columns]")
+    if not (drive or torque):
+        raise InputError(f"{record.name}: no motor_current, motor_torque, motor_voltage or link_torque; a balance needs one of them")
+    common = {"has_torque": torque, "has_drive": drive, "has_temperature": temperature, "both_positions": motor and link}
+    moving = "motor_position" if motor else "link_position"
+    if not drive and not (motor and link):
+        if link and not motor and not model.is_elastic:
+            return Sensing(("link",), moving=moving, **common)
+        return Sensing(("transmission",), clamped_link=True, moving=moving, **common)
+    if torque:
+        found: list[str] = []
+        if drive and motor:
+            found.append("motor")
+        if link:
+            found.append("link")
+        if motor and link and (model.is_elastic or _twists(record)):
+            found.append("transmission")
+        if drive and not motor:
+            found.insert(0, "axis")
+        if model.is_elastic and "transmission" not in found:
+            raise InputError(f"{record.name}: model is elastic but {'link' if motor else 'motor'}_position is missing; add it or use model = \"hd1\"")
+        return Sensing(tuple(found), moving=moving, **common)
+    if model.is_elastic:
+        if not (motor and link):
+            missing = "link_position" if motor else "motor_position"
+            raise InputError(f"{record.name}: model is elastic but channel {missing} is missing; add it, or use a rigid model (hd1, hd2)")
+        return Sensing(("sum", "deflection"), moving=moving, **common)
+    return Sensing(("axis",), moving=moving, **common)
+
+
+def _twists(record: Record) -> bool:
+    """True where torsion can be told from rigid motion at all."""
+    q, link = record["motor_position"], record["link_position"]
+    slope = float(np.dot(q - q.mean(), link - link.mean()) / max(np.dot(link - link.mean(), link - link.mean()), 1e-300))
+    if slope == 0:
+        return False
+    twist = q / slope - link
+    return abs(float(np.corrcoef(twist, record["link_torque"])[0, 1])) > 0.5
+
+
+def adapt(model: JointModel, sensing: Sensing, known: Mapping[str, object] | None = None) -> JointModel:
+    """The model in the form these channels can carry: one inertia for one balance, load from gravity without a torque sensor."""
+    if sensing.balances == ("axis",) and "motor_inertia" not in (known or {}) and "link_inertia" not in (known or {}):
+        model = replace(model, inertias=("inertia",))
+        terms = tuple(t for t in model.terms if not (t.place == "link" and model.has(t.effect.key, "motor")))
+        model = replace(model, terms=terms)
+    return replace(model, load_from="torque" if sensing.has_torque else "gravity")
+
+
+def drive_torque(record: Record, joint: Joint) -> FloatArray:
+    """n Km I, link-referred [N.m].
+
+    Raises
+    ------
+    InputError
+        Current without a motor constant.
+    """
+    if record.has("motor_torque"):
+        return np.asarray(record["motor_torque"] * joint.gear_ratio, dtype=np.float64)
+    if record.has("motor_current"):
+        if joint.torque_per_current is None:
+            raise InputError(f"{joint.source or joint.name}: motor_current needs motor_constant (Nm/A on the motor shaft) or torque_per_current in [joint]")
+        return np.asarray(record["motor_current"] * joint.torque_per_current, dtype=np.float64)
+    return np.asarray(record["motor_voltage"] * (joint.torque_per_voltage or 1.0), dtype=np.float64)
+
+
+def signals_of(record: Record, joint: Joint, sensing: Sensing) -> dict[str, FloatArray]:
+    """Measured signals by the names of :class:`casadi_models.Signals`, link-referred, full rate."""
+    out: dict[str, FloatArray] = {}
+    ratio = joint.gear_ratio
+    if sensing.has_drive:
+        out["drive"] = drive_torque(record, joint)
+    motor = record["motor_position"] / ratio if record.has("motor_position") else None
+    link = np.asarray(record["link_position"]) if record.has("link_position") else None
+    if sensing.clamped_link:
+        twist = motor if motor is not None else link
+        if twist is not None:
+            out["motor_position"], out["link_position"] = np.asarray(twist), np.zeros_like(twist)
+    else:
+        one = motor if motor is not None else link
+        if one is not None:
+            out["motor_position"] = np.asarray(motor if motor is not None else one)
+            out["link_position"] = np.asarray(link if link is not None else one)
+    if sensing.has_torque:
+        out["torque"] = np.asarray(record["link_torque"])
+    if sensing.has_temperature:
+        out["temperature"] = record["temperature"] - record["temperature"][0]
+    return out

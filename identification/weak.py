@@ -1,0 +1,301 @@
+"""Weak form: balances averaged with a smooth kernel, so that no measured signal is differentiated.
+
+Row i of a balance is the integral of w(t - t_i) r(t) dt with the kernel w(t) = c cos^4(pi t / L).
+Terms that are linear in the signals take their derivatives on the kernel (w', w''); laws that are
+nonlinear are evaluated at the samples (velocities from a shorter kernel) and then averaged.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Final, final
+
+import numpy as np
+import numpy.typing as npt
+from numpy.lib.stride_tricks import sliding_window_view
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+POSITION_CHAINS: Final = {
+    "motor_position": ("motor_position", "motor_velocity", "motor_acceleration", "motor_jerk"),
+    "link_position": ("link_position", "link_velocity", "link_acceleration", "link_jerk"),
+    "torque": ("torque", "torque_rate"),
+    "drive": ("drive", "drive_rate"),
+}
+"""Measured signals and the signals that follow from them by derivatives."""
+
+
+def kernel(length: float, dt: float, order: int = 0) -> FloatArray:
+    """Samples of the cos^4 kernel or of a derivative of it, for correlation with a signal.
+
+    Parameters
+    ----------
+    length : float
+        Full width [s].
+    dt : float
+        Sample time [s].
+    order : {0, 1, 2, 3}
+        Derivative of the signal that the correlation gives.
+
+    Returns
+    -------
+    (k,) array, k odd
+        Weights that reproduce the derivative of polynomials up to `order` + 1 exactly.
+    """
+    half = max(order + 2, round(length / dt / 2))
+    t = np.arange(-half, half + 1) * dt
+    width = (2 * half + 2) * dt
+    window = np.cos(np.pi * t / width) ** 4
+    # least-squares polynomial weights under the window: exact for polynomials, the window keeps it smooth
+    degree = order + 1
+    scale = half * dt
+    basis = np.vander(t / scale, degree + 1, increasing=True)
+    weighted = basis * window[:, None]
+    coefficients = np.linalg.solve(basis.T @ weighted, np.eye(degree + 1)[order])
+    weights: FloatArray = weighted @ coefficients * float(np.prod(np.arange(1, order + 1))) / scale**order
+    return weights
+
+
+def differentiated_kernel(length: float, dt: float, order: int) -> FloatArray:
+    """Derivative of the cos^4 kernel itself, so that averages of a signal and of its derivative agree.
+
+    Shapes and units as in :func:`kernel`; exact for polynomials of degree `order`.
+    """
+    half = max(order + 2, round(length / dt / 2))
+    t = np.arange(-half, half + 1) * dt
+    width = (2 * half + 2) * dt
+    phase = np.pi * t / width
+    c, s, a = np.cos(phase), np.sin(phase), np.pi / width
+    shapes = (
+        c**4,
+        4 * a * c**3 * s,
+        a**2 * (12 * c**2 * s**2 - 4 * c**4),
+        a**3 * (24 * c * s**3 - 40 * c**3 * s),
+    )
+    weights = np.asarray(shapes[order], dtype=float)
+    unit = c**4 / np.sum(c**4)
+    moments = [np.sum(weights * t**k) for k in range(order)]
+    if order:
+        powers = np.vander(t, order, increasing=True)
+        gram = powers.T @ (powers * unit[:, None])
+        weights = weights - (powers * unit[:, None]) @ np.linalg.solve(gram, np.array(moments))
+    factorial = float(np.prod(np.arange(1, order + 1)))
+    weights = weights * factorial / np.sum(weights * t**order)
+    return np.asarray(weights, dtype=np.float64)
+
+
+@final
+@dataclass(frozen=True)
+class Grid:
+    """Where the rows of one record's balances stand.
+
+    Attributes
+    ----------
+    length, dt : float
+        Kernel length and sample time [s].
+    stride, step : int
+        Samples between rows; samples between the points at which nonlinear laws are evaluated.
+    segments : tuple of slice
+        Contiguous stretches that are long enough.
+    half : int
+        Samples left out at either end of a stretch.
+    pointwise : float
+        Kernel length of the velocities inside nonlinear laws [s].
+    """
+
+    length: float
+    dt: float
+    stride: int
+    step: int
+    segments: tuple[slice, ...]
+    half: int
+    pointwise: float = 0.03
+
+    def correlate(self, values: FloatArray, weights: FloatArray) -> FloatArray:
+        """Rows of a correlation of a full-rate signal with kernel weights."""
+        return _strided(values, weights, self.segments, self.half, self.stride)
+
+    def pick(self, values: FloatArray) -> FloatArray:
+        """Full-rate values at the rows."""
+        return _strided(values, np.ones(1), self.segments, self.half, self.stride)
+
+
+def _strided(values: FloatArray, weights: FloatArray, segments: tuple[slice, ...], half: int, stride: int) -> FloatArray:
+    own = len(weights) // 2
+    parts = []
+    for segment in segments:
+        x = values[segment]
+        rows = np.arange(half, len(x) - half, stride)
+        windows = sliding_window_view(x, len(weights))[rows - own]
+        parts.append(windows @ weights)
+    return np.concatenate(parts) if parts else np.empty(0)
+
+
+@final
+@dataclass(frozen=True)
+class WeakRecord:
+    """One record prepared for weak-form regression.
+
+    Attributes
+    ----------
+    averaged : mapping of str to (rows,) array
+        Kernel average of every signal, derivatives taken on the kernel.
+    points : mapping of str to (points,) array
+        Signals where nonlinear laws are evaluated.
+    smooth : mapping of str to (points,) array
+        The same, positions smoothed too: input of memory operators.
+    time : (rows,) array
+        Centre of each row [s].
+    block : (rows,) int array
+        Block of each row; -1 for a row that touches another block's samples.
+    starts : (segments + 1,) int array
+        First point of each segment.
+    """
+
+    grid: Grid
+    averaged: Mapping[str, FloatArray]
+    points: Mapping[str, FloatArray]
+    smooth: Mapping[str, FloatArray]
+    time: FloatArray
+    block: IntArray
+    starts: IntArray
+
+    def average(self, values: FloatArray) -> FloatArray:
+        """Kernel average of values at the points, one row per row.
+
+        Parameters
+        ----------
+        values : (points,) or (points, columns) array
+
+        Returns
+        -------
+        (rows,) or (rows, columns) array
+        """
+        return np.asarray(self.averaging @ values, dtype=np.float64)
+
+    @cached_property
+    def averaging(self) -> Any:
+        """Sparse matrix (rows, points) of the kernel average."""
+        from scipy.sparse import csr_array
+
+        grid = self.grid
+        half = grid.half // grid.step
+        stride = grid.stride // grid.step
+        weights = differentiated_kernel(grid.length, grid.dt * grid.step, 0)
+        own = len(weights) // 2
+        centres = np.concatenate([
+            np.arange(half, last - first - half, stride) + first
+            for first, last in zip(self.starts[:-1], self.starts[1:], strict=True)
+        ])  # fmt: skip
+        columns = (centres[:, None] + np.arange(-own, own + 1)).ravel()
+        pointers = np.arange(0, len(columns) + 1, len(weights))
+        return csr_array((np.tile(weights, len(centres)), columns, pointers), shape=(len(centres), int(self.starts[-1])))
+
+    @property
+    def rows(self) -> int:
+        """Number of rows of each balance."""
+        return len(self.time)
+
+
+def prepare(
+    time: FloatArray,
+    signals: Mapping[str, FloatArray],
+    segments: tuple[slice, ...],
+    *,
+    length: float = 0.06,
+    pointwise: float = 0.03,
+    block: float = 1.5,
+    overlap: int = 4,
+    first_block: int = 0,
+) -> WeakRecord:
+    """Average a uniformly sampled record with the kernel.
+
+    Parameters
+    ----------
+    time : (n,) array
+        Uniform within each segment [s].
+    signals : mapping
+        Measured signals (keys of :data:`POSITION_CHAINS`, ``temperature``), full rate, link-referred.
+    segments : tuple of slice
+        Contiguous stretches.
+    length, pointwise : float
+        Kernel of the balances and of the velocities inside nonlinear laws [s].
+    block : float
+        Length of the blocks that count as independent [s].
+    overlap : int
+        Rows per kernel length.
+
+    Returns
+    -------
+    WeakRecord
+    """
+    dt = float(np.median(np.concatenate([np.diff(time[s]) for s in segments])))
+    step = max(1, round(0.002 / dt))
+    stride = max(step, round(length / dt / overlap / step) * step)
+    half = step * (max(2, round(length / (dt * step) / 2)) + 1)
+    reach = max(half, round(length / dt / 2) + 3, round(pointwise / dt / 2) + 5)
+    half = step * int(np.ceil(reach / step))
+    long_enough = tuple(s for s in segments if s.stop - s.start > 2 * half + stride)
+    grid = Grid(length, dt, stride, step, long_enough, half, pointwise)
+    averaged: dict[str, FloatArray] = {}
+    points: dict[str, FloatArray] = {}
+    smooth: dict[str, FloatArray] = {}
+    for source, chain in POSITION_CHAINS.items():
+        if source not in signals:
+            continue
+        for order, name in enumerate(chain):
+            averaged[name] = grid.correlate(signals[source], differentiated_kernel(length, dt, order))
+            points[name], smooth[name] = _pointwise(signals[source], long_enough, pointwise, dt, order, step)
+    for name, values in (("temperature", signals.get("temperature")), ("time", time)):
+        if values is not None:
+            averaged[name] = grid.correlate(values, differentiated_kernel(length, dt, 0))
+            points[name] = smooth[name] = np.concatenate([values[s][::step] for s in long_enough] or [np.empty(0)])
+    stamps = grid.pick(time)
+    numbers = np.concatenate([np.full(len(range(half, s.stop - s.start - half, stride)), i) for i, s in enumerate(long_enough)] or [np.empty(0)])
+    blocks, inside = _blocks(stamps, numbers.astype(np.int64), block, (half - 1) * dt)
+    counts = [len(range(0, s.stop - s.start, step)) for s in long_enough]
+    return WeakRecord(
+        grid, averaged, points, smooth, stamps, np.where(inside, blocks + first_block, -1),
+        np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+    )  # fmt: skip
+
+
+def _pointwise(
+    values: FloatArray, segments: tuple[slice, ...], length: float, dt: float, order: int, step: int
+) -> tuple[FloatArray, FloatArray]:
+    """Raw (order 0) or smoothed derivative at every `step`-th sample; ends by the nearest full window."""
+    weights = kernel(length, dt, order)
+    half = len(weights) // 2
+    raw, soft = [], []
+    for segment in segments:
+        x = values[segment]
+        inner = sliding_window_view(x, len(weights))[::1]
+        centres = np.clip(np.arange(0, len(x), step) - half, 0, len(inner) - 1)
+        filtered = inner[centres] @ weights
+        soft.append(filtered)
+        raw.append(x[::step] if order == 0 else filtered)
+    if not raw:
+        return np.empty(0), np.empty(0)
+    return np.concatenate(raw), np.concatenate(soft)
+
+
+def _blocks(time: FloatArray, segment: IntArray, length: float, reach: float) -> tuple[IntArray, npt.NDArray[np.bool_]]:
+    """Block number of each row and whether its kernel stays inside the block."""
+    number = np.zeros(len(time), dtype=np.int64)
+    inside = np.ones(len(time), dtype=np.bool_)
+    offset = 0
+    for s in np.unique(segment):
+        here = segment == s
+        t = time[here] - time[here][0]
+        count = max(1, round((t[-1] + 1e-9) / length))
+        width = (t[-1] + 1e-9) / count if t[-1] > 0 else 1.0
+        index = np.minimum((t / width).astype(np.int64), count - 1)
+        number[here] = index + offset
+        into = t - index * width
+        keep = ((into >= min(reach, width / 8)) | (index == 0)) & ((width - into >= min(reach, width / 8)) | (index == count - 1))
+        inside[here] = keep
+        offset += count
+    return number, inside
