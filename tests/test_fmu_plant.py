@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import time
 import zipfile
 from pathlib import Path
@@ -124,6 +126,30 @@ def test_validates_clean(fmu: Path) -> None:
     from fmpy.validation import validate_fmu
 
     assert validate_fmu(str(fmu)) == []
+
+
+def test_fmutool_check_is_clean(fmu: Path, tmp_path: Path) -> None:
+    tool = Path(sys.executable).with_name("fmutool")
+    done = subprocess.run([tool, "-input", str(fmu), "-check"], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0
+    assert "compliant with FMI-2" in done.stdout + done.stderr
+    assert "No semantic error" in done.stdout + done.stderr
+
+
+def test_casadi_imports_it_with_exact_jacobians(unzipped: Path) -> None:
+    """DaeBuilder reads the model exchange back; its Jacobians are those of the symbolic plant, parameters included."""
+    spec = joint()
+    tunable = [i for i, v in enumerate(PARAMETERS) if v.variability == "tunable"]
+    builder = ca.DaeBuilder("two_mass", str(unzipped))
+    assert builder.p() == [PARAMETERS[i].name for i in tunable]
+    model = builder.create("model", ["x", "u", "p"], ["ode", "y"])
+    x, u = np.array([0.1, 0.2, 0.05, -0.1]), np.array([1.0, 2.0])
+    found = [block.full() for block in model.jacobian()(x, u, START[tunable], 0, 0)]
+    for row, function in enumerate((spec.dynamics, spec.output)):
+        expected = [block.full() for block in function.jacobian()(x, u, START, 0)]
+        expected[2] = expected[2][:, tunable]
+        for one, other in zip(found[3 * row : 3 * row + 3], expected, strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12)
 
 
 def test_co_simulation_follows_scipy(unzipped: Path) -> None:
@@ -258,7 +284,7 @@ def test_not_finite_input_is_an_error_and_keeps_the_state(unzipped: Path) -> Non
 
 
 def test_cost_per_step(unzipped: Path) -> None:
-    """Set, step and get from Python within 12 us (twice that on a busy machine)."""
+    """Set, step and get from Python within 12 us."""
     import ctypes
 
     plant = slave(unzipped)
@@ -274,7 +300,7 @@ def test_cost_per_step(unzipped: Path) -> None:
             plant.fmi2GetReal(plant.component, y_vr, 1, y)
         best = min(best, (time.perf_counter() - start) / 1000)
     plant.freeInstance()
-    assert best < 24e-6
+    assert best < 12e-6
 
 
 def hysteretic() -> PlantSpec:
