@@ -140,7 +140,7 @@ class _Builder:
         link = term.place in ("link", "link_position_sensor")
         gear = term.place == "transmission"
         # the approximation (2.58) lets the kinematic error wind up the stiffness only, not the damping
-        twist = view.torsion if self.model.virtual_work else s.motor_position - s.link_position
+        twist = view.torsion if self.model.virtual_work else bare_twist(self.model, s)
         rate = time_derivative(twist, self.symbols.signals)
         velocity = s.link_velocity if link else s.motor_velocity
         smooth = self.symbols.parameters.get(f"{'link' if link else 'motor'}_smoothing_velocity")
@@ -199,6 +199,11 @@ class _Builder:
         return 1 - ca.jacobian(error, raw.motor_position), 1 + ca.jacobian(error, raw.link_position)
 
 
+def bare_twist(model: JointModel, s: Signals) -> Expression:
+    """Motor side minus link side; the position itself where the link is clamped."""
+    return s.motor_position if model.clamped_link else s.motor_position - s.link_position
+
+
 def time_derivative(expression: Expression, signals: Signals) -> Expression:
     """Rate of an expression of the signals by the chain rule."""
     total = _zero()
@@ -222,7 +227,7 @@ def build_equations(model: JointModel, symbols: Symbols, *, sensors: bool) -> Eq
     raw = symbols.signals
     s = builder.true_signals() if sensors else raw
     drive_view = _View(s, _zero(), _zero(), s.drive, s.drive_rate)
-    twist = s.motor_position - s.link_position
+    twist = bare_twist(model, s)
     error = builder.total("torsion", _View(s, twist, s.torque, _zero(), _zero()))
     torsion = twist - error
     unloaded = _View(s, torsion, _zero(), _zero(), _zero())

@@ -51,6 +51,8 @@ class JointModel:
         thesis's approximation (2.58).
     load_from : {"torque", "gravity"}
         What presses the gear's teeth in load-dependent laws.
+    clamped_link : bool
+        True for a torque-against-displacement test: the torsion is the position itself.
     name : str
         Name in reports.
     """
@@ -62,6 +64,7 @@ class JointModel:
     kind: str = "rotary"
     virtual_work: bool = True
     load_from: str = "torque"
+    clamped_link: bool = False
     name: str = "joint"
 
     @staticmethod

@@ -38,8 +38,8 @@ class ObserverCore:
 
     State: that of the joint (motor and link position and velocity, memory), then the unknown torques on motor and
     link. :meth:`advance` reads `readings`, `used` and the gain, and fills `out`:
-    [state after prediction | estimates of the six readings | innovations of rows 1 to 5 | motor and link
-    acceleration as the torque reading says | torque as the position readings say].
+    [state after prediction | the six readings, failed ones replaced | innovations of readings 1 to 5 | motor and link
+    acceleration as the torque reading says | torque as the position readings say | estimates of readings 1 to 5].
     """
 
     def __init__(self, model: JointModel, dt: float, noise: Mapping[str, float], *, has_torque: bool) -> None:
@@ -51,6 +51,7 @@ class ObserverCore:
         self.size = len(f.state_names) + len(f.memory_names) + 2
         self._values = np.array(model.value_vector())
         self._substeps = self._choose_substeps()
+        self.link_gain, self.motor_gain = self._link_gain(), self._motor_gain()
         self._step, self._function = self._symbolic()
         self.torque_deviation = max(float(noise["torque"]), 1.0)
         self._gains: dict[tuple[bool, ...], FloatArray] = {}
@@ -79,7 +80,7 @@ class ObserverCore:
         f, p, size = self.model.functions, ca.DM(self._values), self.size - 2
         z, w, u = ca.SX.sym("z", size), ca.SX.sym("w", 2), ca.SX.sym("u")
         inputs = ca.vertcat(u + w[0], 0, 0)
-        link_gain = self._link_gain()
+        link_gain, motor_gain = self.link_gain, self.motor_gain
         moved = z
         for _ in range(self._substeps):
             moved = f.step(moved, inputs, p, self.dt / self._substeps)
@@ -98,7 +99,6 @@ class ObserverCore:
         after = x + gain @ cut
         estimate = seen(after)
         rates = f.dynamics(after[:size], none, p)
-        motor_gain = self._motor_gain()
         hold = -rates[1] / motor_gain  # drive that keeps the motor's speed
         drive = used[0] * y[0] + (1 - used[0]) * hold
         filled = used[1:] * y[1:] + (1 - used[1:]) * estimate
@@ -117,6 +117,12 @@ class ObserverCore:
         """d motor acceleration / d drive [1/(kg m2)]."""
         size = self.size - 2
         return float(self.model.jacobian(np.zeros(size), np.zeros(3), self._values)[1][1, 0])
+
+    @property
+    def stiffness(self) -> float:
+        """Linear stiffness of the transmission [N.m/rad]."""
+        names = self.model.parameter_names
+        return float(self._values[names.index("stiffness")]) if "stiffness" in names else 1e4
 
     def _link_gain(self) -> float:
         """d link acceleration / d torque on the link [1/(kg m2)]."""
@@ -176,6 +182,8 @@ class ObserverCore:
         q[:4] = np.array([1e-12, 1e-10, 1e-12, 1e-10]) * self.dt
         q[4:size] = 1e-12
         q[size:] = np.square(DISTURBANCE) * self.dt
+        if not any(rows[2:]):
+            q[size + 1] = 0.0  # nothing on the link is measured: its unknown torque cannot be seen
         kept = c[keep]
         r = np.diag(deviations[keep] ** 2)
         active = [*range(4), size, size + 1]

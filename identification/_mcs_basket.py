@@ -10,7 +10,6 @@ from identification._mcs_evaluate import Evaluator
 from identification._mcs_local import LocalSearch
 from identification._mcs_numeric import Vector
 
-
 _SAME = 1e-6
 """Distance, in widths of the box, below which two minima are taken as one."""
 

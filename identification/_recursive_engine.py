@@ -102,7 +102,7 @@ class Engine:
         self._fast_next, self._slow_next = np.zeros_like(self.fast), np.zeros_like(self.slow)
         self.y, self.h = np.zeros(outputs), np.zeros((outputs, n))
         self.theta, self._error, self._status = np.zeros(n), np.zeros(outputs), np.zeros(2)
-        flags = self.slow[:n + outputs]
+        flags = self.slow[:n + 2 * outputs]
         out = [self.theta, self._error, self._status]
         rows = self.h.reshape(-1)
         self._step = _trigger(self._formulas.step, [self.fast, flags, self.config, self.y, rows],

@@ -64,11 +64,17 @@ class Settings:
     freeze
         Freeze parameters and outputs whose sliding information matrix has lost rank.
     window_seconds
-        Length of the sliding window of that matrix, s.
+        Window in which a loss of motion is seen, s. Half a window later at most everything lost is frozen.
     lost_share
-        A parameter is lost when its window information falls under this share of the best window so far.
+        A regressor is lost when its mean square in that window falls under this share of its best one so far, and an
+        output when that holds for the variance of half of its regressors or more ...
     clear_amplitude
-        ... and when its part in y, moved by one scale, is under this many noise standard deviations.
+        ... unless its part in y, its parameter moved by one scale, is over this many noise standard deviations.
+    rank_seconds
+        Window of the information matrix whose rank is watched, s.
+    rank_share
+        The weakest parameter is frozen when what the matrix tells of it beside the others falls under this share of
+        its best so far; it moves again at four times this share.
     noise_seconds
         Time constant of the estimate of R2 (used where R2 is not given), s.
     """
@@ -90,9 +96,11 @@ class Settings:
     output_floor: float | tuple[float, ...] | None = None
     covariance_limit: float = 1.0
     freeze: bool = True
-    window_seconds: float = 0.5
+    window_seconds: float = 0.3
     lost_share: float = 1e-3
     clear_amplitude: float = 10.0
+    rank_seconds: float = 4.0
+    rank_share: float = 1e-4
     noise_seconds: float = 5.0
 
     def __post_init__(self) -> None:
@@ -104,7 +112,7 @@ class Settings:
             if not isinstance(value, (int, float)) or not math.isfinite(value) or value < 0:
                 raise InputError(f"RecursiveLeastSquares: {field.name} must be a finite number >= 0, not {value!r}")
         for name in ("sample_time", "alarm_samples", "bell_width", "polynomial_width", "covariance_limit",
-                     "window_seconds", "noise_seconds"):
+                     "window_seconds", "rank_seconds", "noise_seconds"):
             if getattr(self, name) <= 0:
                 raise InputError(f"RecursiveLeastSquares: {name} must be positive, not {getattr(self, name)!r}")
         for name in ("forgetting", "forgetting_low", "schedule_start", "schedule_rate"):
@@ -158,13 +166,6 @@ def forgetting_curve(method: str, relative_error: npt.ArrayLike, settings: Setti
     return clipped
 
 
-def chi_square_limit(samples: float, probability: float) -> float:
-    """Limit of chi2(samples)/samples that is passed with the given probability (Wilson and Hilferty, 1931)."""
-    z = NormalDist().inv_cdf(1.0 - probability)
-    share = 2.0 / (9.0 * samples)
-    return float((1.0 - share + z * math.sqrt(share)) ** 3)
-
-
 @final
 class Block:
     """A flat vector of doubles cut into named parts."""
@@ -194,22 +195,26 @@ class Layout:
         self.n, self.m = n, m
         self.fast = Block([
             ("theta", n), ("d", n), ("u", triangle), ("noise", m), ("innovation", m), ("power", m),
-            ("error", m), ("forgetting", 1), ("samples", 1), ("skipped", 1), ("alarm", 1), ("pause", 1),
-            ("alarms", 1), ("low", 1), ("resets", 1), ("since_check", 1), ("in_block", 1), ("due", 1),
-            ("info", triangle), ("energy", m * n),
+            ("error", m), ("sum", m), ("squares", m), ("forgetting", 1), ("samples", 1), ("skipped", 1),
+            ("alarm", 1), ("pause", 1), ("alarms", 1), ("low", 1), ("resets", 1), ("since_check", 1), ("due", 1),
+            ("info", triangle), ("energy", m * n), ("mean", m * n),
         ])
         self.slow = Block([
-            ("excited", n), ("live", m), ("info", triangle), ("energy", m * n), ("info_best", n),
-            ("energy_best", m * n), ("blocks", 1),
+            ("excited", n), ("live", m), ("inflation", m), ("kept", n),
+            ("whole", m), ("parts", m), ("energy", 2 * m * n), ("energy_before", 2 * m * n),
+            ("energy_best", m * n), ("swing_best", m * n), ("in_block", 1), ("length_before", 1),
+            ("info", triangle + n), ("info_before", triangle + n), ("info_best", n),
+            ("in_rank", 1), ("rank_before", 1),
         ])
         self.config = Block([
             ("scale", n), ("free", n), ("walk", n), ("walk_alarm", n), ("start", n), ("limit", n),
             ("enabled", m), ("noise_given", m), ("noise_known", m), ("noise_rate", 1),
             ("floor", m), ("floor_share", 1),
-            ("alarm_limit", 1), ("alarm_rate", 1), ("alarm_length", 1), ("pause_length", 1),
+            ("alarm_freedom", 1), ("alarm_normal", 1), ("alarm_rate", 1), ("alarm_length", 1), ("pause_length", 1),
             ("low", 1), ("beta", 1), ("rate", 1), ("forgetting", 1), ("end", 1), ("poly", POLYNOMIAL_DEGREE + 1),
             ("reset_under", 1), ("reset_length", 1),
-            ("check_length", 1), ("block_length", 1), ("lost_share", 1), ("clear_info", 1), ("decay", 1),
+            ("check_length", 1), ("block_length", 1), ("rank_length", 1), ("lost_share", 1), ("rank_share", 1),
+            ("clear_info", 1), ("decay", 1),
         ])
 
 
@@ -234,7 +239,8 @@ def fill_config(layout: Layout, method: str, scale: FloatArray, settings: Settin
     config[at["floor_share"]] = 0.1 if floor is None else 0.0
     rate = 2.0 / (settings.alarm_samples + 1.0)
     config[at["alarm_rate"]] = rate
-    config[at["alarm_limit"]] = chi_square_limit((2.0 - rate) / rate, settings.alarm_probability)
+    config[at["alarm_freedom"]] = (2.0 - rate) / rate
+    config[at["alarm_normal"]] = NormalDist().inv_cdf(1.0 - settings.alarm_probability)
     config[at["alarm_length"]] = math.ceil(settings.alarm_seconds / step)
     config[at["pause_length"]] = math.ceil((settings.alarm_seconds + settings.alarm_pause) / step)
     config[at["low"]] = settings.forgetting_low
@@ -245,8 +251,9 @@ def fill_config(layout: Layout, method: str, scale: FloatArray, settings: Settin
     config[at["reset_under"]] = settings.forgetting_low + 0.2 * (1.0 - settings.forgetting_low)
     config[at["reset_length"]] = max(1.0, math.ceil(settings.reset_seconds / step))
     block = max(10.0, math.ceil(0.5 * settings.window_seconds / step))
-    config[at["block_length"]], config[at["check_length"]] = block, max(2.0, math.floor(block / 10.0))
-    config[at["lost_share"]] = settings.lost_share
+    config[at["block_length"]], config[at["check_length"]] = block, max(2.0, math.floor(block / 6.0))
+    config[at["rank_length"]] = max(2.0 * layout.n, math.ceil(0.5 * settings.rank_seconds / step))
+    config[at["lost_share"]], config[at["rank_share"]] = settings.lost_share, settings.rank_share
     config[at["clear_info"]] = settings.clear_amplitude**2
     config[at["decay"]] = math.exp(-config[at["check_length"]][0] / (1000.0 * block))
     return config
@@ -263,6 +270,9 @@ def start_state(layout: Layout, theta: FloatArray, config: FloatArray, settings:
     fast[layout.fast["forgetting"]] = settings.schedule_start
     slow[layout.slow["excited"]] = 1.0
     slow[layout.slow["live"]] = 1.0
+    slow[layout.slow["kept"]] = 1.0
+    for name in ("inflation", "whole", "parts"):
+        slow[layout.slow[name]] = 1.0
     return fast, slow
 
 

@@ -33,13 +33,6 @@ def every(conditions: list[SX]) -> SX:
     return result
 
 
-def some(conditions: list[SX]) -> SX:
-    result = conditions[0]
-    for condition in conditions[1:]:
-        result = ca.logic_or(result, condition)
-    return result
-
-
 def total(terms: list[SX]) -> SX:
     result = ca.SX(0)
     for term in terms:

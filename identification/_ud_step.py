@@ -7,14 +7,13 @@ from typing import Any, final
 import casadi as ca
 
 from identification._recursive_settings import POLYNOMIAL_DEGREE, Layout
-from identification._ud_factor import SX, Factor, Parts, dot, every, select, some, total, where
+from identification._ud_factor import SX, Factor, Parts, dot, every, select, total, where
 
 _INPUT_LIMIT = 1e30  # larger inputs would overflow in squares: treated as invalid samples
 _ERROR_LIMIT = 1e60
 _NOISE_LOW = 1e-30
-_NOISE_HURRY = 0.02
 _NOISE_CLIP = 10.0  # of the squared normalised innovation, in the estimate of R2
-_ALARM_CLIP = 12.0  # ... and in the alarm: no single outlier fires it
+_SUM_CLIP = 3.0  # of the normalised innovation, in the estimate of its correlation
 
 
 def _forgetting(method: str, fast: Parts, config: Parts, relative_error: SX) -> SX:
@@ -55,6 +54,7 @@ class _Sample:
         self.seen = [self.valid * enabled[o] for o in range(m)]
         self.used = [self.seen[o] * flags[n + o] for o in range(m)]
         self.moving = [config["free"][i] * flags[i] for i in range(n)]
+        self.inflation = flags[n + m:]
         self.acts = total(self.used) > 0
 
     def relative_error(self, fast: Parts, config: Parts) -> SX:
@@ -88,12 +88,13 @@ def _forget(factor: Factor, method: str, fast: Parts, config: Parts, sample: _Sa
 
 
 def _correct(layout: Layout, factor: Factor, fast: Parts, config: Parts, sample: _Sample,
-             new: Parts) -> list[SX]:
-    """The sequential scalar updates of all outputs; gives the variance R2 each of them used."""
+             new: Parts) -> SX:
+    """The sequential scalar updates of all outputs; tells whether an innovation is over its limit."""
     theta = list(fast["theta"])
     count = fast["samples"][0] - fast["skipped"][0]
+    quick = ca.fmax(config["noise_rate"][0], 1.0 / (20.0 + count))
     calm = ca.logic_not(fast["alarm"][0])
-    variances, noises, innovations, powers = [], [], [], []
+    noises, innovations, powers, sums, squares, over = [], [], [], [], [], []
     for o in range(layout.m):
         used = sample.used[o]
         h = [used * sample.moving[i] * sample.h[o][i] for i in range(layout.n)]
@@ -103,29 +104,48 @@ def _correct(layout: Layout, factor: Factor, fast: Parts, config: Parts, sample:
         first = 1e-4 * (square + error**2)
         noise = select(config["noise_known"][o], config["noise_given"][o],
                        select(fast["noise"][o] > 0, fast["noise"][o], first + _NOISE_LOW))
-        gain, expected = factor.measure(h, noise)
+        # Correlated noise (filtered measurements) tells less per sample than its variance says. In an alarm the
+        # error is no noise.
+        used_noise = noise * select(config["noise_known"][o], 1.0, sample.inflation[o])
+        gain, expected = factor.measure(h, used_noise)
         step = error / expected
         theta = [theta[i] + sample.moving[i] * (gain[i] * step) for i in range(layout.n)]
-        normalised = error * step
-        # An alarm that did not help means more noise, not another plant: R2 then rises quickly.
-        helpless = calm * (fast["pause"][0] > 0) * (fast["innovation"][o] > config["alarm_limit"][0])
-        rate = ca.fmax(ca.fmax(config["noise_rate"][0], 1.0 / (20.0 + count)), helpless * _NOISE_HURRY)
+        expected = ca.fmax(expected - used_noise, 0.0) + noise
+        normalised = error * error / expected
         power = fast["power"][o] + used * ca.fmax(config["noise_rate"][0], 1.0 / (1.0 + count)) * (
             square - fast["power"][o])
-        learned = noise * (1.0 + used * calm * rate * (ca.fmin(normalised, _NOISE_CLIP) - 1.0))
+        learned = noise * (1.0 + used * calm * quick * (ca.fmin(normalised, _NOISE_CLIP) - 1.0))
         known = ca.logic_or(fast["noise"][o] > 0, first * used > 0)
         noises.append(where(known, ca.fmax(learned, 1e-12 * power + _NOISE_LOW)))
-        innovations.append(fast["innovation"][o] + used * config["alarm_rate"][0] * (
-            ca.fmin(normalised, _ALARM_CLIP) - fast["innovation"][o]))
+        standard = used * calm * ca.fmax(-_SUM_CLIP, ca.fmin(error / ca.sqrt(expected), _SUM_CLIP))
+        sums.append(fast["sum"][o] + standard)
+        squares.append(fast["squares"][o] + standard * standard)
+        limit = _alarm_limit(config, sample.inflation[o])
+        # Three samples at least: no single outlier fires the alarm.
+        most = limit / (3.0 * config["alarm_rate"][0])
+        average = fast["innovation"][o] + used * config["alarm_rate"][0] * (
+            ca.fmin(normalised, most) - fast["innovation"][o])
+        innovations.append(average)
+        over.append(used * (average > limit))
         powers.append(power)
-        variances.append(noise)
-    new.values.update(theta=theta, noise=noises, innovation=innovations, power=powers, d=factor.d, u=factor.packed())
-    return variances
+    new.values.update(theta=theta, noise=noises, innovation=innovations, power=powers, sum=sums, squares=squares,
+                      d=factor.d, u=factor.packed())
+    return total(over) > 0
 
 
-def _alarm(fast: Parts, config: Parts, sample: _Sample, new: Parts) -> None:
+def _alarm_limit(config: Parts, inflation: SX) -> SX:
+    """Chi-square limit of the averaged squared innovation, over its degrees of freedom (Wilson and Hilferty, 1931).
+
+    Correlation between the innovations leaves fewer degrees of freedom; see `_inflation` in the check.
+    """
+    freedom = ca.fmax(0.5, config["alarm_freedom"][0] / (2.0 * inflation - 1.0))
+    share = 2.0 / (9.0 * freedom)
+    root = 1.0 - share + config["alarm_normal"][0] * ca.sqrt(share)
+    return root * root * root
+
+
+def _alarm(fast: Parts, config: Parts, sample: _Sample, over: SX, new: Parts) -> None:
     """Chi-square alarm on the averaged normalised innovation, for a limited time, then a pause."""
-    over = some([item > config["alarm_limit"][0] for item in new["innovation"]])
     pause, alarm = fast["pause"][0], fast["alarm"][0]
     fires = over * sample.acts * (pause <= 0)
     new.values["alarm"] = [select(fires, config["alarm_length"][0], ca.fmax(0.0, alarm - sample.acts))]
@@ -133,27 +153,27 @@ def _alarm(fast: Parts, config: Parts, sample: _Sample, new: Parts) -> None:
     new.values["alarms"] = [fast["alarms"][0] + fires]
 
 
-def _collect(layout: Layout, fast: Parts, config: Parts, sample: _Sample, variances: list[SX], new: Parts) -> None:
-    """Adds the sample to the information matrix of the running block."""
+def _collect(layout: Layout, fast: Parts, config: Parts, sample: _Sample, new: Parts) -> None:
+    """Adds the sample to the information matrix (scaled parameters, weight 1/R2 where R2 is given)."""
     n, m = layout.n, layout.m
-    info, energy = list(fast["info"]), list(fast["energy"])
+    info, energy, mean = list(fast["info"]), list(fast["energy"]), list(fast["mean"])
     for o in range(m):
-        weight = sample.seen[o] / variances[o]
-        weighted = [weight * item for item in sample.h[o]]
+        given = select(config["noise_known"][o], 1.0 / ca.fmax(config["noise_given"][o], _NOISE_LOW), 1.0)
+        weighted = [sample.seen[o] * given * item for item in sample.h[o]]
         for j in range(n):
             for i in range(j):
                 at = j * (j - 1) // 2 + i
                 info[at] = info[at] + weighted[i] * sample.h[o][j]
             energy[o * n + j] = energy[o * n + j] + weighted[j] * sample.h[o][j]
-    new.values.update(info=info, energy=energy)
-    new.values["in_block"] = [fast["in_block"][0] + sample.valid]
+            mean[o * n + j] = mean[o * n + j] + sample.seen[o] * sample.h[o][j]
+    new.values.update(info=info, energy=energy, mean=mean)
 
 
 def step_function(layout: Layout, method: str, freeze: bool) -> Any:
     """The step of one sample."""
     n, m = layout.n, layout.m
-    symbols = [ca.SX.sym("fast", layout.fast.size), ca.SX.sym("flags", n + m), ca.SX.sym("config", layout.config.size),
-               ca.SX.sym("y", m), ca.SX.sym("H", n * m)]
+    symbols = [ca.SX.sym("fast", layout.fast.size), ca.SX.sym("flags", n + 2 * m),
+               ca.SX.sym("config", layout.config.size), ca.SX.sym("y", m), ca.SX.sym("H", n * m)]
     fast, config = Parts(symbols[0], layout.fast), Parts(symbols[2], layout.config)
     new = Parts(symbols[0], layout.fast)
     flags = ca.vertsplit(symbols[1])
@@ -163,10 +183,10 @@ def step_function(layout: Layout, method: str, freeze: bool) -> Any:
         new.values["forgetting"] = [ca.SX(1.0)]
     else:
         _forget(factor, method, fast, config, sample, new)
-    variances = _correct(layout, factor, fast, config, sample, new)
-    _alarm(fast, config, sample, new)
+    over = _correct(layout, factor, fast, config, sample, new)
+    _alarm(fast, config, sample, over, new)
     if freeze:
-        _collect(layout, fast, config, sample, variances, new)
+        _collect(layout, fast, config, sample, new)
     since = fast["since_check"][0] + sample.valid
     new.values["since_check"] = [since]
     new.values["due"] = [since >= config["check_length"][0]]

@@ -43,7 +43,8 @@ def residual_expressions(model: JointModel, sensing: Sensing) -> dict[str, Expre
         elif balance == "link":
             out[balance] = (e.torque * e.link_lever - link) / torque_gain
         elif balance == "transmission":
-            out[balance] = (e.torque - e.transmitted) / torque_gain
+            resist = e.motor_resistance + e.link_resistance if sensing.clamped_link else 0
+            out[balance] = (e.torque - e.transmitted - resist) / torque_gain
         elif balance == "sum":
             out[balance] = (e.drive - motor - link + e.transmitted * (e.link_lever - e.motor_lever)) / drive_gain
         elif balance == "deflection":

@@ -22,8 +22,13 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
 FOLDS: Final = 4
+FEW_BLOCKS: Final = 32
+"""Below this many blocks up to ten folds are used, so that no fold takes a whole kind of motion away."""
 OTHER_FORMS: Final = frozenset({"smooth_stribeck"})
 """Second forms of an effect that is tried already."""
+
+DISPLACEMENT: Final = frozenset({"hysteresis", "backlash", "soft_windup"})
+"""Laws of a displacement that also make sense on the position of an axis without gear."""
 
 LATE: Final = frozenset({"flexible_mode"})
 """Tried only when nothing else is left to claim and the residual stays over its floor (costly memory)."""
@@ -94,7 +99,8 @@ def offered(model: JointModel, data: Dataset, *, late: bool = False) -> tuple[li
     out: list[Candidate] = []
     refused: list[NotTestable] = []
     sensing = data.sensing
-    one_sided = sensing.balances == ("axis",)
+    one_sided = sensing.one_sided
+    direct = one_sided and not sensing.both_positions and abs(data.joint.gear_ratio) == 1.0
     for effect in EFFECTS.values():
         if effect.key in OTHER_FORMS or (effect.key in LATE and not late):
             continue
@@ -102,22 +108,30 @@ def offered(model: JointModel, data: Dataset, *, late: bool = False) -> tuple[li
         if why:
             refused.append(NotTestable(effect.key, why))
             continue
-        places = [p for p in effect.acts_on if observable(p, sensing)]
+        places = [p for p in effect.acts_on if observable(p, sensing) or (sensing.clamped_link and p in ("motor", "link"))]
         if one_sided and "motor" in places and "link" in places:
             places.remove("link")
         if one_sided and not sensing.both_positions:
-            places = [p for p in places if p not in ("transmission", "torsion")]
+            kept = ("transmission",) if direct and effect.key in DISPLACEMENT else ()
+            places = [p for p in places if p in kept or p not in ("transmission", "torsion")]
+        if effect.periodic and (data.joint.kind == "linear" or _turns(data) < 2):
+            places = []
         if not places:
             refused.append(NotTestable(effect.key, f"needs a channel that shows the {_shown(effect.acts_on[0])}; these records have none"))
             continue
         parents = [n for n in effect.needs if n != "transmission_compliance"]
         for place in places:
-            if any(not model.has(n) for n in effect.needs) and not data.sensing.clamped_link:
+            if any(not model.has(n) for n in effect.needs) and not (direct and place == "transmission"):
                 continue
             if effect.family == "friction" and any(not model.has(n, place) for n in parents) and not one_sided and place != "transmission":
                 continue
             out.extend(_placed(effect, place, model))
     return out, refused
+
+
+def _turns(data: Dataset) -> float:
+    """Turns of the motor over the travel of the records."""
+    return 2 * data.ranges["position"] * abs(data.joint.gear_ratio) / (2 * math.pi)
 
 
 def _shown(place: str) -> str:
@@ -150,9 +164,10 @@ def _why_not(effect: Effect, model: JointModel, data: Dataset) -> str:
 def _placed(effect: Effect, place: Place, model: JointModel) -> list[Candidate]:
     label = f"{effect.key}@{place}" if len(effect.acts_on) > 1 else effect.key
     if model.has(effect.key, place):
-        if not effect.periodic:
+        hold = effect.key == "channel_delay" and place == "drive" and sum(t.effect.key == effect.key for t in model.terms) == 1
+        if not (effect.periodic or hold):
             return []
-        label += f"#{1 + sum(t.effect.key == effect.key for t in model.terms)}"
+        label += f"#{1 + sum(t.effect.key == effect.key and t.place == place for t in model.terms)}"
     variants = [model]
     if place == "torsion" and not any(t.place == "torsion" for t in model.terms):
         variants = [replace(model, virtual_work=True), replace(model, virtual_work=False)]
@@ -443,10 +458,11 @@ def _score(
     numbers = np.bincount(base.block[used] * count + base.balance[used], minlength=blocks * count).reshape(blocks, count)
     total = grams.sum(axis=(0, 1))
     sse0, sse1 = np.zeros((blocks, count)), np.zeros((blocks, count))
-    fold = np.arange(blocks) % FOLDS if blocks >= FOLDS else np.zeros(blocks, dtype=int)
-    for k in range(FOLDS if blocks >= FOLDS else 1):
+    folds = FOLDS if blocks >= FEW_BLOCKS else max(1, min(blocks, 10))
+    fold = np.arange(blocks) % folds
+    for k in range(folds):
         test = fold == k
-        train = total - grams[test].sum(axis=(0, 1)) if blocks >= FOLDS else total
+        train = total - grams[test].sum(axis=(0, 1)) if folds > 1 else total
         plain = _signed_fit(train[:p, :p], -train[:p, -1], np.empty(0), p)
         more = _signed_fit(train[:-1, :-1], -train[:-1, -1], lows, p)
         sse0[test] = _quadratic(grams[test], np.concatenate([plain, np.zeros(len(lows)), [1.0]]))

@@ -23,6 +23,16 @@ SET_P: Final = 0.05
 SET_LOST: Final = 0.15
 SET_RMS: Final = 1.5
 LARGEST_SET: Final = 4
+COMMON_DROP: Final = 4.0
+"""Fall of the RMS that is enough for viscous and Coulomb friction and gravity: hardly a joint is without them."""
+PLAIN_FIRST: Final = 0.5
+"""Coulomb friction goes before a law that gains less than twice as much."""
+LADDER_STEP: Final = "transmission_compliance"
+"""Both positions show the torsion itself: the step from a rigid to an elastic model comes before laws of friction."""
+COMMON: Final = frozenset({"coulomb", "viscous", "gravity"})
+"""Named first among effects that the data cannot tell apart and that have as many parameters."""
+NESTED: Final = {"coulomb": frozenset({"hysteresis", "lugre"}), "viscous": frozenset({"cubic_viscous"})}
+"""Richer laws that contain a simpler one: they do not stand beside it as another explanation."""
 
 
 @final
@@ -72,11 +82,15 @@ class Ranking:
     everything: tuple[Trial, ...] = field(default=())
 
     def best(self, refused: frozenset[str] = frozenset()) -> Trial | None:
-        """Best significant trial whose label was not refused before."""
+        """Best significant trial whose label was not refused before; a visible torsion comes first."""
         for t in self.everything:
-            if t.candidate.label in self.significant and t.candidate.label not in refused:
+            if t.key == LADDER_STEP and t.candidate.label in self.significant and t.candidate.label not in refused:
                 return t
-        return None
+        left = [t for t in self.everything if t.candidate.label in self.significant and t.candidate.label not in refused]
+        plain = next((t for t in left if t.key == "coulomb"), None)
+        if plain is not None and plain.score >= PLAIN_FIRST * left[0].score:
+            return plain
+        return left[0] if left else None
 
 
 def rank(base: Base, extra: Sequence[Candidate] = (), *, late: bool = False) -> Ranking:
@@ -116,9 +130,11 @@ def _discoveries(trials: Sequence[Trial]) -> set[str]:
 
 
 def _major(trial: Trial, base: Base) -> bool:
-    if trial.gain <= GAIN or trial.cv_drop_percent < MAJOR_DROP:
+    common = trial.key in COMMON
+    if trial.gain <= GAIN or trial.cv_drop_percent < (COMMON_DROP if common else MAJOR_DROP):
         return False
-    if not math.isnan(trial.held_out_drop_percent) and trial.held_out_drop_percent < HELD_OUT_DROP:
+    held = trial.held_out_drop_percent
+    if not math.isnan(held) and held < (COMMON_DROP / 2 if common else HELD_OUT_DROP):
         return False
     if trial.key == "channel_delay":
         dt = base.data.train[0].grid.dt
@@ -130,9 +146,11 @@ def _major(trial: Trial, base: Base) -> bool:
 def confusion_set(best: Trial, trials: Sequence[Trial], base: Base) -> tuple[str, ...]:
     """Names that these records cannot tell from the best one, the best first."""
     names = [best.key]
+    if best.key == LADDER_STEP and base.data.sensing.both_positions:
+        return (best.key,)
     blocks = np.unique(base.block[base.block >= 0])
     for other in trials:
-        if other.key in names or other.score <= 0 or other.candidate.effect.key == best.key:
+        if other.key in names or other.score <= 0 or other.key in NESTED.get(best.key, frozenset()):
             continue
         lost = (best.score - other.score) / best.score
         difference = best.block_score[blocks] - other.block_score[blocks]
@@ -153,9 +171,16 @@ def _still_helps(other: Trial, best: Trial) -> bool:
     )
 
 
-def make_claim(best: Trial, ranking: Ranking, base: Base) -> Claim:
+def simplest(best: Trial, names: Sequence[str], ranking: Ranking) -> Trial:
+    """Of the names that cannot be told apart, the one with the fewest parameters."""
+    alike = [t for t in ranking.trials if t.key in names and t.candidate.label in ranking.significant]
+    return min(alike or [best], key=lambda t: (len(t.values), t.key not in COMMON, -t.score))
+
+
+def make_claim(best: Trial, ranking: Ranking, base: Base, names: tuple[str, ...] | None = None) -> Claim:
     """The claim that follows from the best trial."""
-    names = confusion_set(best, ranking.everything, base)
+    names = names or confusion_set(best, ranking.everything, base)
+    names = (best.key, *(n for n in names if n != best.key))
     hints = [EFFECTS[n].separate_by for n in names if EFFECTS[n].separate_by]
     separate = hints[0] if len(names) > 1 and hints else None
     held = best.held_out_drop_percent

@@ -76,7 +76,8 @@ def load_dataset(
     for record in (*train[1:], *held_out):
         if sense(record, model).balances != sensing.balances:
             raise InputError(f"{record.name}: has other channels than {train[0].name}; give records with the same channels")
-    length = kernel or (ONE_SIDED_KERNEL if sensing.balances == ("axis",) else CLAIM_KERNEL)
+    alone = sensing.balances == ("axis",) and not sensing.both_positions and abs(joint.gear_ratio) != 1.0
+    length = kernel or (ONE_SIDED_KERNEL if alone else CLAIM_KERNEL)
     prepared: list[WeakRecord] = []
     first = 0
     for record in (*train, *held_out):
@@ -88,7 +89,7 @@ def load_dataset(
     names = {c for s in signals for c in s if c in POSITION_CHAINS}
     noise = {c: float(np.median([noise_level(s[c], tuple(r.segments())) for s, r in zip(signals, train, strict=True)])) for c in names}
     return Dataset(
-        joint, sensing, tuple(prepared[:count]), tuple(prepared[count:]), _ranges(prepared[:count]), noise,
+        joint, sensing, tuple(prepared[:count]), tuple(prepared[count:]), _ranges(prepared[:count], model.clamped_link), noise,
         tuple(r.name for r in train), tuple(r.name for r in held_out),
     )  # fmt: skip
 
@@ -109,13 +110,13 @@ def weak_record(record: Record, joint: Joint, sensing: Sensing, length: float, f
     return made
 
 
-def _ranges(data: Sequence[WeakRecord]) -> dict[str, float]:
+def _ranges(data: Sequence[WeakRecord], clamped: bool) -> dict[str, float]:
     def span(values: FloatArray) -> float:
         return float(np.quantile(np.abs(values), 0.99)) or 1e-12
 
     speed = np.concatenate([w.smooth["motor_velocity"] for w in data])
     q = np.concatenate([w.smooth["motor_position"] for w in data])
-    twist = np.concatenate([w.smooth["motor_position"] - w.smooth["link_position"] for w in data])
+    twist = q if clamped else np.concatenate([w.smooth["motor_position"] - w.smooth["link_position"] for w in data])
     duration = sum(float(np.ptp(w.time)) for w in data)
     return {"velocity": span(speed), "torsion": span(twist), "position": span(q - np.median(q)), "duration": duration, "absolute": 1.0}
 
@@ -227,6 +228,9 @@ def bounds_of(model: JointModel, known: Mapping[str, Known], data: Dataset) -> d
         if p.name.endswith("_smoothing_velocity") or (p.is_shape and p.scale != "absolute"):
             scale = data.ranges[p.scale]
             low, high = max(low, p.grid[0] * scale / 3), min(high, p.grid[-1] * scale * 3)
+        if p.name == "drive_delay":
+            hold = data.train[0].grid.dt
+            low, high = -hold, hold
         k = known.get(p.name)
         if k is not None:
             low = max(low, k.low) if k.low is not None else low

@@ -10,7 +10,7 @@ from typing import Any, Final, final
 from casadi_models import EFFECTS, JointModel
 from identification.assess import VERDICT_KERNELS, BalanceError, Error, assess
 from identification.candidates import Base, NotTestable, Trial, make_base
-from identification.claims import Claim, Ranking, confusion_set, make_claim, minor_claims, rank
+from identification.claims import LADDER_STEP, Claim, Ranking, confusion_set, make_claim, minor_claims, rank, simplest
 from identification.engine import Dataset, Solution, load_dataset, prepared_model, solve
 from identification.errors import InputError
 from identification.joint_file import Joint
@@ -198,7 +198,8 @@ class _Loop:
 
     def run(self, model: JointModel, max_additions: int) -> Improvement:
         self.progress("fitting the start model", 0.05)
-        steps, claims = self._start(model)
+        steps = [self._step(None, None, solve(model, self.data))]
+        claims: list[Claim] = []
         self.progress("ranking the library", 0.15)
         base = make_base(steps[-1].solution, self.data)
         first = ranking = rank(base)
@@ -211,7 +212,9 @@ class _Loop:
                 best = ranking.best(frozenset(self.refused))
             if best is None:
                 break
-            claim = make_claim(best, ranking, base)
+            names = confusion_set(best, ranking.everything, base)
+            best = simplest(best, names, ranking)
+            claim = make_claim(best, ranking, base, names)
             if len(claim.effects) > 4:
                 break
             self.progress(f"adding {best.key}", 0.2 + 0.6 * len(claims) / max_additions)
@@ -230,29 +233,18 @@ class _Loop:
             ranking = rank(base)
         return self._finish(first, ranking, base, claims, steps)
 
-    def _start(self, model: JointModel) -> tuple[list[Step], list[Claim]]:
-        """The start model; a delay of the drive beyond the hold of one sample is the first claim, not a nuisance."""
-        start = solve(model, self.data)
-        delay = abs(start.values.get("drive_delay", 0.0))
-        if HOLD_DELAY in model.effects and HOLD_DELAY not in self.joint.effects and delay > self.data.train[0].grid.dt:
-            plain = solve(model.drop(HOLD_DELAY), self.data)
-            without, having = self._step(None, None, plain), self._step("channel_delay", HOLD_DELAY, start)
-            balance = self.data.sensing.balances[0]
-            drop = held_drop(without.held_out, having.held_out, balance)
-            if drop >= 10.0:
-                return [without, having], [Claim(("channel_delay",), HOLD_DELAY, balance, drop)]
-        return [self._step(None, None, start)], []
-
     def _step(self, key: str | None, label: str | None, solution: Solution) -> Step:
         train = assess(solution.model, self.data, self.data.train, solution.values)
         held = assess(solution.model, self.data, self.data.held_out, solution.values)
-        keys = visible_keys(solution.model)
-        return Step(key, (*keys, key) if key == "channel_delay" and key not in keys else keys, train, held, solution, label)
+        return Step(key, visible_keys(solution.model), train, held, solution, label)
 
     def _revise(self, claims: list[Claim], steps: list[Step]) -> tuple[list[Claim], list[Step]]:
         """Judge every earlier claim given all the others: drop it, swap it, or renew its set."""
         current = list(claims)
         for claim in claims[:-1]:
+            needed = {n for c in current if c is not claim for n in EFFECTS[c.effects[0]].needs}
+            if claim.effects[0] == LADDER_STEP or claim.effects[0] in needed:
+                continue
             model = steps[-1].solution.model.drop(claim.label)
             if model.terms == steps[-1].solution.model.terms:
                 continue
@@ -262,19 +254,23 @@ class _Loop:
             same = next((t for t in ranking.everything if t.candidate.label == claim.label), None)
             best = ranking.best(frozenset(self.refused))
             position = current.index(claim)
-            if same is None or same.cv_drop_percent < 10.0 or claim.label not in ranking.significant:
+            if same is None or claim.label not in ranking.significant:
                 if best is None or best.score < 10:
                     current.pop(position)
                     self.refused.add(claim.label)
                     return self._replay(current, steps)
             if best is not None and best.candidate.label != claim.label and (same is None or best.score > same.score + SWAP_GAIN):
-                renewed = make_claim(best, ranking, base)
+                names = confusion_set(best, ranking.everything, base)
+                if claim.effects[0] in names:
+                    continue
+                renewed = make_claim(best, ranking, base, names)
                 self.refused.add(claim.label)
                 if len(renewed.effects) <= 4 and all(c.label != renewed.label for c in current):
                     current[position] = renewed
                     return self._replay(current, steps)
             if same is not None:
                 names = confusion_set(same, ranking.everything, base)
+                names = (claim.effects[0], *(n for n in names if n != claim.effects[0]))
                 current[position] = replace(claim, effects=names, separate_by=claim.separate_by if len(names) > 1 else None)
         return current, steps
 

@@ -73,9 +73,11 @@ def axes(records: Sequence[WeakRecord], sensing_has_torque: bool) -> dict[str, t
     }
     if sensing_has_torque:
         out["load"] = (joined("torque"), "N.m")
+    out["motor_position"] = (joined("motor_position"), "rad")
     twist = joined("motor_position") - joined("link_position")
     if float(np.ptp(twist)) > 0:
         out["torsion"] = (twist, "rad")
+    out.pop("link_position" if float(np.ptp(twist)) == 0 else "motor_position")
     out["time"] = (np.concatenate([w.time for w in records]), "s")
     return out
 

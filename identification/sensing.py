@@ -50,6 +50,11 @@ class Sensing:
     clamped_link: bool = False
     moving: str = "motor_position"
 
+    @property
+    def one_sided(self) -> bool:
+        """True where one balance of one side carries everything."""
+        return self.balances == ("axis",) or self.clamped_link
+
 
 DRIVES: Final = ("motor_torque", "motor_current", "motor_voltage")
 
@@ -109,11 +114,19 @@ def _twists(record: Record) -> bool:
 
 def adapt(model: JointModel, sensing: Sensing, known: Mapping[str, object] | None = None) -> JointModel:
     """The model in the form these channels can carry: one inertia for one balance, load from gravity without a torque sensor."""
-    if sensing.balances == ("axis",) and "motor_inertia" not in (known or {}) and "link_inertia" not in (known or {}):
+    if sensing.clamped_link:
+        model = replace(model, inertias=())
+    elif sensing.balances == ("axis",) and "motor_inertia" not in (known or {}) and "link_inertia" not in (known or {}):
         model = replace(model, inertias=("inertia",))
+    if sensing.one_sided:
         terms = tuple(t for t in model.terms if not (t.place == "link" and model.has(t.effect.key, "motor")))
         model = replace(model, terms=terms)
-    return replace(model, load_from="torque" if sensing.has_torque else "gravity")
+    # without gear and second encoder the axis is its own spring: displacement laws act on its position
+    direct = sensing.balances == ("axis",) and not sensing.both_positions and abs(model.gear_ratio) == 1.0
+    return replace(
+        model, load_from="torque" if sensing.has_torque and not sensing.clamped_link else "gravity",
+        clamped_link=sensing.clamped_link or direct,
+    )  # fmt: skip
 
 
 def drive_torque(record: Record, joint: Joint) -> FloatArray:
@@ -141,15 +154,10 @@ def signals_of(record: Record, joint: Joint, sensing: Sensing) -> dict[str, Floa
         out["drive"] = drive_torque(record, joint)
     motor = record["motor_position"] / ratio if record.has("motor_position") else None
     link = np.asarray(record["link_position"]) if record.has("link_position") else None
-    if sensing.clamped_link:
-        twist = motor if motor is not None else link
-        if twist is not None:
-            out["motor_position"], out["link_position"] = np.asarray(twist), np.zeros_like(twist)
-    else:
-        one = motor if motor is not None else link
-        if one is not None:
-            out["motor_position"] = np.asarray(motor if motor is not None else one)
-            out["link_position"] = np.asarray(link if link is not None else one)
+    one = motor if motor is not None else link
+    if one is not None:
+        out["motor_position"] = np.asarray(motor if motor is not None else one)
+        out["link_position"] = np.asarray(link if link is not None else one)
     if sensing.has_torque:
         out["torque"] = np.asarray(record["link_torque"])
     if sensing.has_temperature:

@@ -19,9 +19,10 @@ import numpy as np
 import pytest
 from scipy.optimize import Bounds, direct
 
+from identification._mcs_basket import Basket
 from identification._mcs_evaluate import Evaluator
 from identification._mcs_line import LineSearch
-from identification._mcs_local import LocalSearch
+from identification._mcs_local import LocalModel, LocalSearch
 from identification._mcs_numeric import (
     cubic_roots,
     divided_differences,
@@ -481,10 +482,10 @@ def test_refused_bounds(bounds: Any, said: str) -> None:
         ({"options": MCSOptions(start=[0.5])}, "1 entries for 2"),
         ({"options": MCSOptions(start=[0.5, 1.5])}, "outside the bounds"),
         ({"options": MCSOptions(start=[0.5, math.nan])}, "outside the bounds"),
-        ({"options": MCSOptions(start=[[0, 0.5, 1], [0, 1]])}, "at least three"),
-        ({"options": MCSOptions(start=[[0, 0.5, 1], [0, 0.5, 0.5]])}, "ascending"),
-        ({"options": MCSOptions(start=[[0, 0.5, 1], [0, 0.5, 2]])}, "leaves the bounds"),
-        ({"options": MCSOptions(start=["a", "b"])}, "cannot be read"),  # type: ignore[list-item]
+        ({"options": MCSOptions(start=[[0.0, 0.5, 1.0], [0.0, 1.0]])}, "at least three"),
+        ({"options": MCSOptions(start=[[0.0, 0.5, 1.0], [0.0, 0.5, 0.5]])}, "ascending"),
+        ({"options": MCSOptions(start=[[0.0, 0.5, 1.0], [0.0, 0.5, 2.0]])}, "leaves the bounds"),
+        ({"options": MCSOptions(start=["a", "b"])}, "cannot be read"),  # type: ignore[arg-type]
     ],
 )
 def test_refused_arguments(arguments: dict[str, Any], said: str) -> None:
@@ -657,6 +658,47 @@ def test_local_search_from_every_corner_of_hartman3() -> None:
         inner = [0.0 < c < 1.0 for c in x]
         assert np.abs(gradient[inner]).max(initial=0.0) < 1e-4
         assert f <= evaluate(start)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_model_of_a_quadratic_is_exact(seed: int) -> None:
+    """Also where better samples move the point of expansion while the model is built, and near bounds."""
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(4, 4))
+    matrix, centre = root @ root.T + 0.3 * np.eye(4), rng.uniform(-1.2, 1.2, 4)
+    evaluate = _evaluator(lambda x: float(0.5 * (x - centre) @ matrix @ (x - centre)), [-1.0] * 4, [1.0] * 4)
+    start = rng.uniform(-0.9, 0.9, 4).tolist()
+    model = LocalModel(evaluate, [[True] * 4] * 4, start, evaluate(start))
+    model.coordinate_search()
+    np.testing.assert_allclose(model.hessian, matrix, atol=1e-3)
+    np.testing.assert_allclose(model.g, matrix @ (np.array(model.x) - centre), atol=1e-3)
+    assert model.f == evaluate(model.x)
+    model.triple_search(full=True)
+    inside = [i for i in range(4) if not model.on_bound(i)]
+    np.testing.assert_allclose(np.array(model.g)[inside], (matrix @ (np.array(model.x) - centre))[inside], atol=1e-4)
+    np.testing.assert_allclose(
+        np.array(model.hessian)[np.ix_(inside, inside)], matrix[np.ix_(inside, inside)], atol=1e-2
+    )
+
+
+def test_search_out_of_steps_admits_one_more_from_the_same_valley() -> None:
+    evaluate = _evaluator(lambda x: float(((x - 0.11) ** 4).sum()), [-4.0, -4.0], [4.0, 4.0])
+    basket = Basket(evaluate, LocalSearch(evaluate, [[True] * 2] * 2, 1, 2.2e-16))
+    assert basket.offer(evaluate([3.0, 2.0]), [3.0, 2.0])
+    assert [minimum.converged for minimum in basket.minima] == [False]
+    assert basket.offer(evaluate([3.5, 2.5]), [3.5, 2.5])
+    assert not basket.offer(evaluate([2.5, 3.5]), [2.5, 3.5])
+    assert basket.searches == 2
+    assert len(basket.minima) == 1
+
+
+def test_first_coarse_model_does_not_end_a_local_search() -> None:
+    """In this box of Goldstein and Price the first model predicts a step that fails, near the global minimum."""
+    case = JONES["GP"]
+    box = [(-3.5037119137449, 0.4962880862550998), (-2.89747450664728, 1.10252549335272)]
+    result = BENCH.solve(case, box)
+    assert result.outcome is MCSOutcome.TARGET
+    assert result.nfev <= 400
 
 
 def test_local_search_stays_at_a_minimum_on_the_bound() -> None:

@@ -30,7 +30,7 @@ def _stops(z: tuple[Expression, ...], step: Expression, s: LocalSignals, p: Simp
             "hysteresis_width",
             "rad",
             "torsion over which the short element turns round; the others 3 and 9 times",
-            (0.01, 0.03, 0.1, 0.25),
+            (0.005, 0.015, 0.04, 0.09),
             "torsion",
             start=1e-4,
             low=1e-12,

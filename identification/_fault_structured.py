@@ -1,0 +1,426 @@
+"""The structured rule: residuals, arming, isolation by signature, replacement, recovery."""
+
+from __future__ import annotations
+
+import math
+from typing import Final, final
+
+import numpy as np
+import numpy.typing as npt
+
+from identification._fault_core import (
+    CURRENT,
+    LINK_POSITION,
+    LINK_VELOCITY,
+    MOTOR_POSITION,
+    MOTOR_VELOCITY,
+    SENSORS,
+    TORQUE,
+    ObserverCore,
+)
+from identification._fault_residuals import (
+    BIT_NAMES,
+    COUNT,
+    ENERGY_RESIDUALS,
+    LINK,
+    LINK_JUMP,
+    LINK_PARITY,
+    MOTOR,
+    MOTOR_JUMP,
+    MOTOR_PARITY,
+    TORSION,
+    Residuals,
+)
+from identification._fault_types import FaultEvent, FaultSettings, Verdict
+from identification.errors import InputError
+
+FloatArray = npt.NDArray[np.float64]
+
+PARITY_SENSORS: Final = (
+    (LINK_POSITION, LINK_VELOCITY), (MOTOR_POSITION, MOTOR_VELOCITY), (LINK_VELOCITY, TORQUE),
+    (MOTOR_VELOCITY, TORQUE, CURRENT), (TORQUE, MOTOR_POSITION, LINK_POSITION),
+)  # fmt: skip
+_BITS: Final = tuple(BIT_NAMES)
+_MOVED: Final = (20.0, 2e-3, 2e-2, 2e-3, 2e-2, 10.0)
+"""A sensor is taken back only after its estimate has moved by this much, so that a stuck one is not taken back."""
+_ABSURD: Final = 1e9
+
+
+@final
+class StructuredRule:
+    """State of the structured rule; see :class:`identification.fault.FaultDetector`."""
+
+    def __init__(self, core: ObserverCore, settings: FaultSettings) -> None:
+        self.core, self.settings = core, settings
+        dt = core.dt
+        self.residuals = Residuals(dt, settings, has_torque=core.has_torque)
+        self.arm = max(2, round(settings.arm_seconds / dt))
+        self.waits = {
+            name: max(1, round(getattr(settings, name) / dt))
+            for name in ("link_wait", "torque_wait", "pair_wait", "plant_wait", "quiet_seconds", "recover_seconds",
+                         "plant_rest_seconds")
+        }  # fmt: skip
+        self.recover_limits = self._default_recovery()
+        self.widening = [[2.0] * 5 for _ in range(6)]
+        self.calibrating = False
+        self._default_limits()
+        self.reset()
+
+    def reset(self) -> None:
+        """Before the first sample; limits stay."""
+        self.k = -1
+        self.failed = [False] * 6
+        self.events: list[FaultEvent] = []
+        self.residuals.clear()
+        self.first = [-1] * len(_BITS)
+        self.latest = [-1] * len(_BITS)
+        self.latched = 0
+        self.opened = -1
+        self.peak = 0.0
+        self.plant_rest = -1
+        self.muted = 0
+        self.good = [0] * 6
+        self.low, self.high = [math.inf] * 6, [-math.inf] * 6
+        self.core.set_used((True,) * 5 + (self.core.has_torque,))
+
+    # --- limits ------------------------------------------------------------------------------------------------------
+
+    def _default_recovery(self) -> list[float]:
+        noise = self.core.noise
+        model = (30.0, 3e-4, 1e-2, 3e-4, 1e-2, 10.0)
+        return [8.0 * float(n) + m for n, m in zip(noise, model, strict=True)]
+
+    def floors(self) -> list[float]:
+        """Smallest limits: what noise and the joint's largest change of torque can do."""
+        core, lags = self.core, self.settings.lags
+        noise, dt = core.noise, core.dt
+        out = []
+        pairs = ((LINK_POSITION, LINK_VELOCITY), (MOTOR_POSITION, MOTOR_VELOCITY))
+        for position, velocity in pairs:
+            for lag in lags:
+                out.append(5.5 * math.sqrt(2.0 * noise[position] ** 2 + noise[velocity] ** 2 * dt * lag))
+        for velocity, gain in ((LINK_VELOCITY, core.link_gain), (MOTOR_VELOCITY, core.motor_gain)):
+            for i, lag in enumerate(lags):
+                jump = self.settings.torque_step * gain * lag if i == 0 else 0.0
+                out.append(max(jump, 5.5 * math.sqrt(2.0) * noise[velocity]))
+        torsion = math.hypot(float(noise[TORQUE]), core.stiffness * math.hypot(noise[LINK_POSITION], noise[MOTOR_POSITION]))
+        out.append(5.5 * torsion)
+        out.extend(5.5 * torsion * math.sqrt(dt / lag) for lag in lags[1:3])
+        return [float(v) for v in out]
+
+    def _default_limits(self) -> None:
+        """Limits without calibration: noise plus a guess of the model's error."""
+        core, floors = self.core, self.floors()
+        for i, gain in ((8, core.link_gain), (12, core.motor_gain)):
+            for j, lag in enumerate(self.settings.lags):
+                floors[i + j] += 10.0 * gain * min(lag, 0.5)
+        for i in (16, 17, 18):
+            floors[i] += 10.0
+        self.residuals.limits = floors
+
+    def calibrate(self, readings: FloatArray) -> None:
+        """Limits, noise of r1 and recovery limits from healthy readings (n, 6)."""
+        settings, res = self.settings, self.residuals
+        if len(readings) < 4 * self.arm:
+            raise InputError(f"calibrate: {len(readings)} samples; give at least {4 * self.arm} healthy ones")
+        if not np.isfinite(readings).all():
+            raise InputError("calibrate: the readings hold NaN or infinity; give a healthy record")
+        seen = self._watch(readings)
+        if self.core.has_torque:
+            self.core.tune(max(float(np.sqrt(np.mean(seen[:, 16] ** 2))), float(self.core.noise[TORQUE])))
+            seen = self._watch(readings)
+        floors = self.floors()
+        top = np.max(np.abs(seen[:, :COUNT]), axis=0)
+        res.limits = [max(f, settings.margin * float(t)) for f, t in zip(floors, top, strict=True)]
+        res.inverse = [
+            1.0 / max(float(np.mean(seen[:, at] ** 2)), (floors[at] / 8.0) ** 2 if at in (0, 4, 16) else 1e-30)
+            for at in ENERGY_RESIDUALS
+        ]
+        peaks = [self._energy_peak(seen[:, at], inverse) for at, inverse in zip(ENERGY_RESIDUALS, res.inverse, strict=True)]
+        res.energy_limits = [max(60.0, settings.energy_margin * peak) for peak in peaks]
+        for sensor in range(6):
+            if sensor != TORQUE or self.core.has_torque:
+                self._calibrate_without(sensor, readings)
+        self.reset()
+
+    def _energy_peak(self, values: FloatArray, inverse: float) -> float:
+        level = peak = 0.0
+        for gain in (values**2 * inverse - self.settings.energy_drift).tolist():
+            level = max(0.0, level + gain)
+            peak = max(peak, level)
+        return peak
+
+    def _watch(self, readings: FloatArray, without: int | None = None) -> FloatArray:
+        """Values of all residuals over healthy readings after the start-up, and one column more.
+
+        With a sensor left out, the last column is how far its reading lies from the estimate.
+        """
+        res = self.residuals
+        kept = (res.limits, res.inverse, res.energy_limits)
+        res.limits, res.inverse = [math.inf] * COUNT, [0.0] * len(res.inverse)
+        self.reset()
+        self.calibrating = True
+        if without is not None:
+            self.failed[without] = True
+            self._exchange([without])
+        out = np.zeros((len(readings), COUNT + 1))
+        for k, row in enumerate(readings):
+            used = self.update(row.tolist())
+            out[k, :COUNT] = res.values
+            if without is not None:
+                out[k, COUNT] = used[without] - row[without]
+        self.calibrating = False
+        res.limits, res.inverse, res.energy_limits = kept
+        return out[self.arm :]
+
+    def _calibrate_without(self, sensor: int, readings: FloatArray) -> None:
+        """What healthy readings give while one of them is replaced: recovery limit, and wider residual limits."""
+        seen = np.max(np.abs(self._watch(readings, sensor)), axis=0)
+        limits, margin = self.residuals.limits, self.settings.margin
+        self.recover_limits[sensor] = max(margin * float(seen[COUNT]), 6.0 * float(self.core.noise[sensor]))
+        for i in range(5):
+            rows = range(4 * i, 4 * i + 4) if i < 4 else range(16, COUNT)
+            self.widening[sensor][i] = max(1.0, *(margin * float(seen[j]) / limits[j] for j in rows if limits[j] > 0))
+
+    # --- one sample --------------------------------------------------------------------------------------------------
+
+    def update(self, reading: list[float]) -> list[float]:
+        """One sample; gives the six readings with failed ones replaced."""
+        core = self.core
+        self.k = k = self.k + 1
+        if k == 0:
+            core.start(np.array(reading))
+        missing = False
+        for value in reading:
+            if not -_ABSURD < value < _ABSURD:  # NaN, infinity
+                missing = True
+        if missing:
+            reading = self._fill(reading)
+        core.readings[:] = reading
+        out = core.advance()
+        n = core.size
+        used = out[n : n + 6]
+        drive, qm, vm, ql, vl, torque = used
+        motor, link, sprung = out[n + 11 : n + 14]
+        bits = self.residuals.step(k, (ql, qm, vl, vm), (vl, vm, link, motor), torque - sprung)
+        if k < self.arm:
+            return used
+        if k == self.arm:
+            self.events.append(FaultEvent(k, k, Verdict.ARMED, (), ()))
+        if bits or self.latched:
+            self._suspect(bits & ~self.muted, bits)
+        if True in self.failed and not self.calibrating:
+            self._watch_recovery(reading, out)
+        return used
+
+    def _fill(self, reading: list[float]) -> list[float]:
+        """Missing readings: the sensor fails at once."""
+        gone = [i for i, v in enumerate(reading) if not -_ABSURD < v < _ABSURD]
+        fresh = [i for i in gone if not self.failed[i] and not (i == TORQUE and not self.core.has_torque)]
+        if fresh:
+            self._fail(fresh, Verdict.DROPOUT, self.k)
+        for i in gone:
+            self.good[i] = 0
+        return [0.0 if i in gone else v for i, v in enumerate(reading)]
+
+    # --- isolation ---------------------------------------------------------------------------------------------------
+
+    def _suspect(self, bits: int, raw: int) -> None:
+        k = self.k
+        if self.muted and not raw & self.muted:
+            if k - self.plant_rest > 0:
+                self.muted = 0
+        if bits:
+            if not self.latched:
+                self.opened = k
+                self.peak = 0.0
+            for i, bit in enumerate(_BITS):
+                if bits & bit:
+                    self.latest[i] = k
+                    if not self.latched & bit:
+                        self.first[i] = k
+            self.latched |= bits
+        if bits & TORSION:
+            self.peak = max(self.peak, abs(self.residuals.values[16]) / self.residuals.limits[16])
+        if self.latched:
+            self._decide()
+
+    def _age(self, bit: int) -> int:
+        """Samples since a residual first passed its limit in this suspicion; -1 if it did not."""
+        return self.k - self.first[_BITS.index(bit)] if self.latched & bit else -1
+
+    def _since(self, bit: int) -> int:
+        return self.k - self.latest[_BITS.index(bit)]
+
+    def _decide(self) -> None:
+        waits, latched = self.waits, self.latched
+        found = self._side(LINK_PARITY, LINK_JUMP, LINK_POSITION, LINK_VELOCITY)
+        found += self._side(MOTOR_PARITY, MOTOR_JUMP, MOTOR_POSITION, MOTOR_VELOCITY)
+        parity = latched & (LINK_PARITY | MOTOR_PARITY)
+        torsion = latched & TORSION
+        if not found and not parity and torsion and not self.failed[TORQUE]:
+            moving = latched & (LINK | MOTOR | LINK_JUMP | MOTOR_JUMP)
+            age = min((self._age(b) for b in (LINK, MOTOR, LINK_JUMP, MOTOR_JUMP) if latched & b), default=-1)
+            gone = self.peak > 2.0 and 2 <= self._since(TORSION) <= 10 and self._age(TORSION) < 20
+            if (moving and age >= waits["torque_wait"] and self._age(TORSION) >= waits["torque_wait"]) or gone:
+                found = [TORQUE]
+        if found:
+            self._fail(found, Verdict.SENSOR, self.opened)
+            return
+        if parity:
+            return
+        self._decide_plant()
+
+    def _side(self, parity: int, jump: int, position: int, velocity: int) -> list[int]:
+        """Position, velocity or both of one side."""
+        latched, wait = self.latched, self.waits["link_wait"]
+        torsion = bool(latched & TORSION) if self.core.has_torque else bool(latched & LINK and latched & MOTOR)
+        jumped = bool(latched & jump) and not self.failed[velocity] and self._age(jump) >= wait
+        if latched & parity and self._age(parity) >= wait:
+            if self.failed[position] or self.failed[velocity]:
+                return [s for s in (position, velocity) if not self.failed[s]]
+            if self.muted & TORSION:
+                return [self._worse(position, velocity)]
+            if torsion:
+                return [position, velocity] if jumped and jump == LINK_JUMP else [position]
+            if jumped or self._would_show(parity) or self._age(parity) >= self.waits["plant_wait"]:
+                return [velocity]
+            return []
+        if jumped and jump == LINK_JUMP and not latched & TORSION:
+            return [velocity]
+        return []
+
+    def _would_show(self, parity: int) -> bool:
+        """True where a position error of the parity's size would have passed the limit of r1."""
+        res = self.residuals
+        at = 0 if parity == LINK_PARITY else 4
+        size = max(abs(v) for v in res.values[at : at + 4]) * self.core.stiffness
+        return size > 2.0 * res.limits[16] if self.core.has_torque else self._age(parity) >= self.waits["pair_wait"]
+
+    def _worse(self, position: int, velocity: int) -> int:
+        """The sensor further from the observer, where r1 cannot decide."""
+        out, at = self.core.out, self.core.size + 5
+        noise = self.core.noise
+        shares = [abs(float(out[at + s])) / float(noise[s]) for s in (position, velocity)]
+        return position if shares[0] > shares[1] else velocity
+
+    def _decide_plant(self) -> None:
+        """What none of the sensors explains."""
+        waits, latched, k = self.waits, self.latched, self.k
+        recent = max(k - self._since(b) for b in _BITS if latched & b)
+        if k - recent > waits["quiet_seconds"]:
+            self._close()
+            return
+        motor_only = latched & (MOTOR | MOTOR_JUMP) and not latched & ~(MOTOR | MOTOR_JUMP)
+        if motor_only:
+            if self._age(MOTOR) >= waits["pair_wait"] and self._since(MOTOR) < 5:
+                self._report(Verdict.CURRENT_OR_FRICTION, ("current", "motor friction"))
+            return
+        if k - self.opened >= waits["plant_wait"]:
+            parts = []
+            if latched & TORSION:
+                parts.append("stiffness")
+            if latched & LINK:
+                parts.append("link")
+            if latched & MOTOR and not latched & TORSION:
+                parts.append("motor")
+            self._report(Verdict.PLANT, tuple(parts))
+
+    def _report(self, verdict: Verdict, parts: tuple[str, ...]) -> None:
+        """An event that is no sensor failure; its residuals are not looked at while they stay over the limit."""
+        self.events.append(FaultEvent(self.k, self.opened, verdict, parts, self._names()))
+        self.muted |= self.latched & (TORSION | LINK | MOTOR | LINK_JUMP | MOTOR_JUMP)
+        self.plant_rest = self.k + self.waits["plant_rest_seconds"]
+        self._close()
+
+    def _names(self) -> tuple[str, ...]:
+        return tuple(name for bit, name in BIT_NAMES.items() if self.latched & bit)
+
+    def _close(self) -> None:
+        self.latched, self.opened = 0, -1
+
+    # --- replacement and recovery ------------------------------------------------------------------------------------
+
+    def _fail(self, sensors: list[int], verdict: Verdict, first: int) -> None:
+        names = tuple(SENSORS[s] for s in sensors)
+        self.events.append(FaultEvent(self.k, max(first, 0), verdict, names, self._names()))
+        for s in sensors:
+            self.failed[s] = True
+            self.good[s] = 0
+            self.low[s], self.high[s] = math.inf, -math.inf
+        self._exchange(sensors)
+
+    def _exchange(self, sensors: list[int]) -> None:
+        """The readings in use have changed."""
+        used = tuple(not f and (i != TORQUE or self.core.has_torque) for i, f in enumerate(self.failed))
+        self.core.set_used(used)
+        for i, involved in enumerate(PARITY_SENSORS):
+            if any(s in involved for s in sensors) or not self.core.has_torque:
+                self.residuals.invalidate(i, self.k + 1)
+            wide = [self.widening[s][i] for s in range(6) if self.failed[s]]
+            self.residuals.scale[i] = 1.0 / (max(wide) * 1.5 ** (len(wide) - 1)) if wide else 1.0
+        if any(self.failed[s] for s in PARITY_SENSORS[4]):
+            self.residuals.scale[4] = 0.0  # r1 compares the estimate with itself
+        self._close()
+
+    def _watch_recovery(self, reading: list[float], out: list[float]) -> None:
+        """A failed sensor that agrees with the estimate over a moving stretch is used again."""
+        back = []
+        n = self.core.size
+        for s in range(6):
+            if not self.failed[s]:
+                continue
+            estimate = out[n + s]
+            if abs(reading[s] - estimate) <= self.recover_limits[s] and reading[s] != 0.0:
+                self.good[s] += 1
+                self.low[s], self.high[s] = min(self.low[s], estimate), max(self.high[s], estimate)
+                if self.good[s] >= self.waits["recover_seconds"] and self.high[s] - self.low[s] > _MOVED[s]:
+                    back.append(s)
+            else:
+                self.good[s] = 0
+                self.low[s], self.high[s] = math.inf, -math.inf
+        if back:
+            for s in back:
+                self.failed[s] = False
+            names = tuple(SENSORS[s] for s in back)
+            self.events.append(FaultEvent(self.k, self.k, Verdict.RECOVERED, names, ()))
+            self._exchange(back)
+
+    # --- state -------------------------------------------------------------------------------------------------------
+
+    def numbers(self) -> list[float]:
+        """Everything that changes, limits included, as floats."""
+        counters = [self.k, self.latched, self.opened, self.plant_rest, self.muted]
+        res = self.residuals
+        return [
+            *map(float, counters), self.peak, self.core.torque_deviation, *map(float, self.failed),
+            *map(float, self.first), *map(float, self.latest), *map(float, self.good), *self.low, *self.high,
+            *self.recover_limits, *(v for row in self.widening for v in row), *res.limits, *res.inverse, *res.energy_limits, *self.core.state.tolist(),
+            *res.numbers(max(self.k, 0)),
+        ]  # fmt: skip
+
+    def load(self, numbers: list[float]) -> None:
+        """Take up what :meth:`numbers` gave."""
+        at = 0
+
+        def take(count: int) -> list[float]:
+            nonlocal at
+            at += count
+            return numbers[at - count : at]
+
+        self.residuals.clear()
+        self.k, self.latched, self.opened, self.plant_rest, self.muted = (int(v) for v in take(5))
+        self.peak, deviation = take(2)
+        self.failed = [v != 0.0 for v in take(6)]
+        self.first, self.latest = [int(v) for v in take(len(_BITS))], [int(v) for v in take(len(_BITS))]
+        self.good = [int(v) for v in take(6)]
+        self.low, self.high, self.recover_limits = take(6), take(6), take(6)
+        self.widening = [take(5) for _ in range(6)]
+        res = self.residuals
+        res.limits, res.inverse = take(COUNT), take(len(res.inverse))
+        res.energy_limits = take(len(res.energy_limits))
+        state = take(self.core.size)
+        res.load(max(self.k, 0), numbers[at:])
+        self.core.tune(deviation)
+        self.core.set_used(tuple(not f and (i != TORQUE or self.core.has_torque) for i, f in enumerate(self.failed)))
+        self.core.state[:] = state

@@ -1,0 +1,179 @@
+"""Sensor faults of a joint: found, isolated, told from plant changes, replaced (thesis 4.2, 4.4)."""
+
+from __future__ import annotations
+
+import json
+import struct
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from typing import Final, Literal, final
+
+import numpy as np
+import numpy.typing as npt
+
+from casadi_models import JointModel
+from identification._fault_core import NOISE, SENSORS, ObserverCore
+from identification._fault_reconfigure import Reconfiguration
+from identification._fault_structured import StructuredRule
+from identification._fault_thesis import Predictor, ThesisRule, ThesisSettings
+from identification._fault_types import FaultEvent, FaultSettings, FaultTrack, Verdict
+from identification.errors import InputError
+from identification.fault_injector import ABRUPT, KINDS, Fault, inject
+
+__all__ = [
+    "ABRUPT", "KINDS", "NOISE", "SENSORS", "Fault", "FaultDetector", "FaultEvent", "FaultSettings", "FaultTrack",
+    "Reconfiguration", "ThesisSettings", "Verdict", "inject",
+]  # fmt: skip
+
+FloatArray = npt.NDArray[np.float64]
+
+_MAGIC: Final = b"FAULTD01"
+_HEAD: Final = struct.Struct("<8sIII")
+
+
+@final
+class FaultDetector:
+    """Watches the readings of an elastic joint, sample by sample.
+
+    The readings are those of :data:`SENSORS`: current (n Km I, the drive torque referred to the link [N.m]), motor
+    position and velocity, link position and velocity (link-referred [rad, rad/s]), torque [N.m].
+
+    Parameters
+    ----------
+    model : JointModel
+        The identified joint, elastic.
+    dt : float
+        Sample time [s].
+    method
+        "structured" (default): residuals that each hold some of the sensors only; the set of residuals over their
+        limits tells the sensor. "thesis": rule (4.6) to (4.8) for link position and velocity.
+    noise : mapping, optional
+        Standard deviation of each reading; :data:`NOISE` by default.
+    has_torque : bool
+        False where there is no torque sensor; its reading is ignored.
+    settings : FaultSettings or ThesisSettings, optional
+    predictor : control.StateSpace or (A, B, C, D), optional
+        Thesis rule: discrete model from motor position, velocity (and acceleration) to link position and velocity,
+        as MOESP gives it. The observer without link sensors where it is missing.
+
+    Notes
+    -----
+    Give a healthy record to :meth:`calibrate` first: the limits come from it. Without it they are guesses. The step
+    at which a sensor fails may design the gains of the remaining ones, which takes some milliseconds once.
+    """
+
+    def __init__(
+        self, model: JointModel, dt: float, method: Literal["structured", "thesis"] = "structured", *,
+        noise: Mapping[str, float] | None = None, has_torque: bool = True,
+        settings: FaultSettings | ThesisSettings | None = None, predictor: object | None = None,
+    ) -> None:  # fmt: skip
+        if not (np.isfinite(dt) and dt > 0):
+            raise InputError(f"FaultDetector: the sample time is {dt!r}; give a positive number of seconds")
+        levels = {**NOISE, **(noise or {})}
+        unknown = set(levels) - set(SENSORS)
+        if unknown or not all(v > 0 for v in levels.values()):
+            raise InputError(f"FaultDetector: noise needs positive values for {', '.join(SENSORS)} only")
+        core = ObserverCore(model, dt, levels, has_torque=has_torque)
+        self.dt, self.method = dt, method
+        self._rule: StructuredRule | ThesisRule
+        if method == "structured":
+            if settings is not None and not isinstance(settings, FaultSettings):
+                raise InputError("FaultDetector: the structured rule takes FaultSettings")
+            self._rule = StructuredRule(core, settings or FaultSettings())
+        elif method == "thesis":
+            if settings is not None and not isinstance(settings, ThesisSettings):
+                raise InputError("FaultDetector: the thesis rule takes ThesisSettings")
+            source = None if predictor is None else Predictor.of(predictor)
+            self._rule = ThesisRule(core, settings or ThesisSettings(), source)
+        else:
+            raise InputError(f"FaultDetector: unknown method {method!r}; use 'structured' or 'thesis'")
+        self._reported = 0
+        self.on_event: Callable[[FaultEvent], object] | None = None
+
+    def calibrate(self, readings: npt.ArrayLike) -> None:
+        """Take the limits from healthy readings (n, 6), several representative motions, a minute or more."""
+        self._rule.calibrate(_table(readings, "calibrate"))
+        self._reported = 0
+
+    def update(self, readings: Sequence[float]) -> list[float]:
+        """One sample: six readings in the order of :data:`SENSORS`; gives them with failed ones replaced.
+
+        A NaN is a missing reading.
+        """
+        if len(readings) != 6:
+            raise InputError(f"FaultDetector.update: {len(readings)} readings; give the six of {', '.join(SENSORS)}")
+        found = self._rule.update(readings if isinstance(readings, list) else [float(v) for v in readings])
+        events = self._rule.events
+        while self._reported < len(events):
+            self._reported += 1
+            if self.on_event is not None:
+                self.on_event(events[self._reported - 1])
+        return found
+
+    def run(self, readings: npt.ArrayLike) -> FaultTrack:
+        """A whole record (n, 6), from the present state on."""
+        table = _table(readings, "run")
+        out, failed = np.empty_like(table), np.zeros(table.shape, dtype=bool)
+        rule, count = self._rule, len(self._rule.events)
+        for k, row in enumerate(table.tolist()):
+            out[k] = self.update(row)
+            failed[k] = rule.failed
+        return FaultTrack(out, failed, tuple(rule.events[count:]))
+
+    @property
+    def failed(self) -> tuple[str, ...]:
+        """Sensors that are replaced now."""
+        return tuple(n for n, f in zip(SENSORS, self._rule.failed, strict=True) if f)
+
+    @property
+    def events(self) -> tuple[FaultEvent, ...]:
+        """All events so far."""
+        return tuple(self._rule.events)
+
+    @property
+    def armed(self) -> bool:
+        """False during the start-up transient."""
+        return self._rule.k >= self._rule.arm
+
+    def reset(self) -> None:
+        """Before the first sample; limits from the calibration stay."""
+        self._rule.reset()
+        self._reported = 0
+
+    def state(self) -> bytes:
+        """Everything the detector will use again, limits and events included, as bytes."""
+        events = [[e.sample, e.first, e.verdict.name, e.sensors, e.residuals] for e in self._rule.events]
+        text = json.dumps({"method": self.method, "events": events}).encode()
+        body = np.array(self._rule.numbers(), dtype="<f8").tobytes()
+        return _HEAD.pack(_MAGIC, len(text), len(body), zlib.crc32(text + body)) + text + body
+
+    def restore(self, state: bytes) -> None:
+        """Take up a state of a detector of the same joint and settings; it goes on bit by bit.
+
+        Raises
+        ------
+        InputError
+            The bytes are damaged or of another detector.
+        """
+        if len(state) < _HEAD.size or state[:8] != _MAGIC:
+            raise InputError("restore: these bytes are no state of a fault detector; give what state() returned")
+        _, text_size, body_size, crc = _HEAD.unpack_from(state)
+        rest = bytes(state[_HEAD.size :])
+        if len(rest) != text_size + body_size or zlib.crc32(rest) != crc:
+            raise InputError("restore: the state is damaged; give the bytes that state() returned")
+        described = json.loads(rest[:text_size])
+        numbers = np.frombuffer(rest[text_size:], dtype="<f8").tolist()
+        if described["method"] != self.method or len(numbers) != len(self._rule.numbers()):
+            raise InputError("restore: the state is of a detector with another model, method or settings")
+        self._rule.load(numbers)
+        self._rule.events = [
+            FaultEvent(s, f, Verdict[v], tuple(sensors), tuple(r)) for s, f, v, sensors, r in described["events"]
+        ]
+        self._reported = len(self._rule.events)
+
+
+def _table(readings: npt.ArrayLike, asked: str) -> FloatArray:
+    found = np.asarray(readings, dtype=np.float64)
+    if found.ndim != 2 or found.shape[1] != len(SENSORS) or not len(found):
+        raise InputError(f"FaultDetector.{asked}: readings have shape {found.shape}; give (n, {len(SENSORS)})")
+    return found
