@@ -34,21 +34,23 @@ class JointRecord:
 
 
 def simulate(*, seconds: float = 80.0, rate: float = 1000.0, standstill: tuple[float, float] = (30.0, 50.0),
-             step_at: float = 60.0, step: float = 1.3, stiction: float = 0.0, cutoff: float = 15.0,
-             seed: int = 0) -> JointRecord:
+             step_at: float = 60.0, step: float = 1.3, stiction: float = 0.0, quick: float = 0.05,
+             cutoff: float = 15.0, seed: int = 0) -> JointRecord:
     """Motion, standstill, motion; all parameters times `step` at `step_at`.
 
     Parameters
     ----------
     stiction
         Torque on the motor side during the standstill that the regressor cannot explain, N m.
+    quick
+        Amplitude of the part of the trajectory with 0.5 s period (thesis 3.8: periods 0.5 to 6 s), rad.
     cutoff
         Corner of the fourth-order filter on both sides of the regression, Hz.
     """
     rng = np.random.default_rng(seed)
     dt = 1.0 / rate
     time = np.arange(0.0, seconds, dt)
-    link, velocity, acceleration = _motion(time, standstill)
+    link, velocity, acceleration = _motion(time, standstill, quick)
     truth = np.where(time[:, None] < step_at, 1.0, step) * THETA
     carried = LINK_INERTIA * acceleration + LOAD * np.sin(link) + truth[:, 5] * velocity
     twist, twist_rate = _twist(carried, truth, dt)
@@ -69,13 +71,13 @@ def simulate(*, seconds: float = 80.0, rate: float = 1000.0, standstill: tuple[f
     return JointRecord(time, _filtered(y, cutoff, dt), _filtered(h, cutoff, dt), truth)
 
 
-def _motion(time: FloatArray, standstill: tuple[float, float]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Link angle of two sines whose phase runs with a speed that falls smoothly to zero for the standstill."""
+def _motion(time: FloatArray, standstill: tuple[float, float], quick: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Link angle of three sines whose phase runs with a speed that falls smoothly to zero for the standstill."""
     dt = float(time[1] - time[0])
     ramp = np.clip(np.minimum(np.abs(time - standstill[0]), np.abs(time - standstill[1])), 0.0, 1.0)
     speed = np.where((time > standstill[0]) & (time < standstill[1]), 0.0, 0.5 - 0.5 * np.cos(np.pi * ramp))
     phase = np.cumsum(speed) * dt
-    link = 0.7 * np.sin(2.1 * phase) + 0.25 * np.sin(5.3 * phase + 0.4)
+    link = 0.7 * np.sin(2.1 * phase) + 0.25 * np.sin(5.3 * phase + 0.4) + quick * np.sin(4.0 * np.pi * phase)
     velocity = np.gradient(link, dt)
     return link, velocity, np.gradient(velocity, dt)
 

@@ -58,7 +58,7 @@ class StructuredRule:
         self.waits = {
             name: max(1, round(getattr(settings, name) / dt))
             for name in ("link_wait", "torque_wait", "pair_wait", "plant_wait", "quiet_seconds", "recover_seconds",
-                         "plant_rest_seconds")
+                         "settle_seconds", "plant_rest_seconds")
         }  # fmt: skip
         self.recover_limits = self._default_recovery()
         self.widening = [[2.0] * 5 for _ in range(6)]
@@ -267,7 +267,7 @@ class StructuredRule:
         if found:
             self._fail(found, Verdict.SENSOR, self.opened)
             return
-        if parity:
+        if parity and min(self._since(b) for b in (LINK_PARITY, MOTOR_PARITY) if parity & b) <= waits["quiet_seconds"]:
             return
         self._decide_plant()
 
@@ -277,8 +277,10 @@ class StructuredRule:
         torsion = bool(latched & TORSION) if self.core.has_torque else bool(latched & LINK and latched & MOTOR)
         jumped = bool(latched & jump) and not self.failed[velocity] and self._age(jump) >= wait
         if latched & parity and self._age(parity) >= wait:
-            if self.failed[position] or self.failed[velocity]:
-                return [s for s in (position, velocity) if not self.failed[s]]
+            if self.failed[velocity]:
+                return [position] if torsion and not self.failed[position] else []
+            if self.failed[position]:
+                return [velocity]
             if self.muted & TORSION:
                 return [self._worse(position, velocity)]
             if torsion:
@@ -356,7 +358,7 @@ class StructuredRule:
         self.core.set_used(used)
         for i, involved in enumerate(PARITY_SENSORS):
             if any(s in involved for s in sensors) or not self.core.has_torque:
-                self.residuals.invalidate(i, self.k + 1)
+                self.residuals.invalidate(i, self.k + 1 + self.waits["settle_seconds"])
             wide = [self.widening[s][i] for s in range(6) if self.failed[s]]
             self.residuals.scale[i] = 1.0 / (max(wide) * 1.5 ** (len(wide) - 1)) if wide else 1.0
         if any(self.failed[s] for s in PARITY_SENSORS[4]):

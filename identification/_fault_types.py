@@ -86,6 +86,8 @@ class FaultSettings:
         A suspicion without a decision ends after this time without a residual over its limit.
     recover_seconds
         A failed sensor must agree with the estimate for this long before it is used again.
+    settle_seconds
+        After a replacement the estimate settles for this long before its residuals are looked at again.
     plant_rest_seconds
         No second plant report for this long.
     """
@@ -102,6 +104,7 @@ class FaultSettings:
     plant_wait: float = 1.0
     quiet_seconds: float = 0.3
     recover_seconds: float = 0.5
+    settle_seconds: float = 0.1
     plant_rest_seconds: float = 5.0
 
     def __post_init__(self) -> None:

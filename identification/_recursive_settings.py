@@ -81,8 +81,8 @@ class Settings:
 
     sample_time: float = 1e-3
     drift: float = 3e-3
-    alarm_drift: float = 1.0
-    alarm_seconds: float = 0.25
+    alarm_drift: float = 2.0
+    alarm_seconds: float = 0.15
     alarm_pause: float = 1.0
     alarm_samples: int = 20
     alarm_probability: float = 1e-6

@@ -104,8 +104,7 @@ def _correct(layout: Layout, factor: Factor, fast: Parts, config: Parts, sample:
         first = 1e-4 * (square + error**2)
         noise = select(config["noise_known"][o], config["noise_given"][o],
                        select(fast["noise"][o] > 0, fast["noise"][o], first + _NOISE_LOW))
-        # Correlated noise (filtered measurements) tells less per sample than its variance says. In an alarm the
-        # error is no noise.
+        # Correlated noise (filtered measurements) tells less per sample than its variance says.
         used_noise = noise * select(config["noise_known"][o], 1.0, sample.inflation[o])
         gain, expected = factor.measure(h, used_noise)
         step = error / expected

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from identification._recursive_engine import Engine, RunOutcome, Trajectory
+from identification._recursive_input import doubles, spread, variances, vector
 from identification._recursive_settings import MAX_PARAMETERS, METHODS, Settings, forgetting_curve
 from identification._startup import Startup, StartupOutcome, solve_window
 from identification.errors import InputError
@@ -86,11 +87,11 @@ class RecursiveLeastSquares:
     def __init__(self, theta0: npt.ArrayLike, scale: npt.ArrayLike, method: str = "random_walk", *,
                  outputs: int | None = None, names: Sequence[str] | None = None, R1: npt.ArrayLike | None = None,
                  R2: npt.ArrayLike | None = None, settings: Settings | None = None) -> None:
-        self._theta0 = _vector(theta0, "theta0")
+        self._theta0 = vector(theta0, "theta0")
         n = self._theta0.size
         if not 1 <= n <= MAX_PARAMETERS:
             raise InputError(f"RecursiveLeastSquares: theta0 has {n} values; give 1 to {MAX_PARAMETERS} parameters")
-        self._scale = _spread(_vector(scale, "scale"), n, "scale", "parameters")
+        self._scale = spread(vector(scale, "scale"), n, "scale", "parameters")
         if not np.all(self._scale > 0):
             raise InputError("RecursiveLeastSquares: scale must be positive; give each parameter's prior range")
         if method not in METHODS:
@@ -100,8 +101,8 @@ class RecursiveLeastSquares:
             raise InputError(f"RecursiveLeastSquares: names must be {n} different names, one per parameter")
         self._method = method
         self._settings = settings or Settings()
-        self._walk = None if R1 is None else _variances(R1, n, "R1", "parameters", zero=True)
-        self._noise = None if R2 is None else _variances(R2, None, "R2", "outputs", zero=False)
+        self._walk = None if R1 is None else variances(R1, n, "R1", "parameters", zero=True)
+        self._noise = None if R2 is None else variances(R2, None, "R2", "outputs", zero=False)
         self._engine: Engine | None = None
         if outputs is None and self._noise is not None and self._noise.size > 1:
             outputs = self._noise.size
@@ -200,7 +201,7 @@ class RecursiveLeastSquares:
         if R2 is None:
             engine.part("config", "noise_known")[:] = 0.0
             return
-        engine.part("config", "noise_given")[:] = _variances(R2, engine.y.size, "R2", "outputs", zero=False)
+        engine.part("config", "noise_given")[:] = variances(R2, engine.y.size, "R2", "outputs", zero=False)
         engine.part("config", "noise_known")[:] = 1.0
 
     # State
@@ -350,7 +351,7 @@ class RecursiveLeastSquares:
         return self._engine
 
     def _build(self, outputs: int) -> Engine:
-        noise = None if self._noise is None else _spread(self._noise, outputs, "R2", "outputs")
+        noise = None if self._noise is None else spread(self._noise, outputs, "R2", "outputs")
         self._engine = Engine(self._theta0, self._scale, outputs, self._method, self._settings, self._walk, noise)
         return self._engine
 
@@ -367,7 +368,7 @@ class RecursiveLeastSquares:
 
     def _arranged(self, y: npt.ArrayLike, H: npt.ArrayLike) -> tuple[Engine, FloatArray, FloatArray]:
         """One sample in full shape: (outputs,) and (outputs, parameters)."""
-        values, rows = _doubles(y, "update", "y"), _doubles(H, "update", "H")
+        values, rows = doubles(y, "update", "y"), doubles(H, "update", "H")
         values = values.reshape(1) if values.ndim == 0 else values
         rows = rows.reshape(1, -1) if rows.ndim == 1 and values.size == 1 else rows
         engine = self._engine
@@ -379,7 +380,7 @@ class RecursiveLeastSquares:
 
     def _record(self, Y: npt.ArrayLike, H: npt.ArrayLike, asked: str) -> tuple[Engine, FloatArray, FloatArray]:
         """A record in full shape: (samples, outputs) and (samples, outputs, parameters)."""
-        y, h = _doubles(Y, asked, "Y"), _doubles(H, asked, "H")
+        y, h = doubles(Y, asked, "Y"), doubles(H, asked, "H")
         y = y.reshape(-1, 1) if y.ndim == 1 else y
         h = h[:, None, :] if h.ndim == 2 and y.ndim == 2 and y.shape[1] == 1 else h
         n = self._theta0.size
@@ -389,36 +390,3 @@ class RecursiveLeastSquares:
             raise InputError(f"{asked}: Y has shape {np.shape(Y)} and H {np.shape(H)}; "
                              f"give (samples, {m}) and (samples, {m}, {n})")
         return self._engine or self._build(y.shape[1]), y, h
-
-
-def _doubles(value: npt.ArrayLike, asked: str, name: str) -> FloatArray:
-    try:
-        return np.ascontiguousarray(value, dtype=np.float64) if np.ndim(value) else np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{asked}: {name} is not an array of real numbers ({error})") from None
-
-
-def _vector(value: npt.ArrayLike, name: str) -> FloatArray:
-    found = np.atleast_1d(_doubles(value, "RecursiveLeastSquares", name))
-    if found.ndim != 1 or not np.all(np.isfinite(found)):
-        raise InputError(f"RecursiveLeastSquares: {name} must be a vector of finite numbers")
-    return found.copy()
-
-
-def _spread(value: FloatArray, size: int, name: str, what: str) -> FloatArray:
-    if value.shape not in ((1,), (size,)):
-        raise InputError(f"RecursiveLeastSquares: {name} has {value.size} values for {size} {what}; give {size}")
-    return np.broadcast_to(value, (size,)).copy()
-
-
-def _variances(value: npt.ArrayLike, size: int | None, name: str, what: str, *, zero: bool) -> FloatArray:
-    """Variances from one number, a vector or a diagonal matrix."""
-    given = _doubles(value, "RecursiveLeastSquares", name)
-    if given.ndim == 2:
-        if given.shape[0] != given.shape[1] or np.any(given != np.diag(np.diag(given))):
-            raise InputError(f"RecursiveLeastSquares: {name} must be diagonal; scale the {what} apart first")
-        given = np.diag(given)
-    found = _vector(given, name)
-    if np.any(found < 0) or (not zero and np.any(found <= 0)):
-        raise InputError(f"RecursiveLeastSquares: {name} must be {'>= 0' if zero else 'positive'}")
-    return found if size is None else _spread(found, size, name, what)
