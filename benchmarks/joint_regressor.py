@@ -71,7 +71,8 @@ def simulate(*, seconds: float = 80.0, rate: float = 1000.0, standstill: tuple[f
     return JointRecord(time, _filtered(y, cutoff, dt), _filtered(h, cutoff, dt), truth)
 
 
-def _motion(time: FloatArray, standstill: tuple[float, float], quick: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _motion(time: FloatArray, standstill: tuple[float, float],
+            quick: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Link angle of three sines whose phase runs with a speed that falls smoothly to zero for the standstill."""
     dt = float(time[1] - time[0])
     ramp = np.clip(np.minimum(np.abs(time - standstill[0]), np.abs(time - standstill[1])), 0.0, 1.0)

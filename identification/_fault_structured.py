@@ -138,9 +138,10 @@ class StructuredRule:
         ]
         peaks = [self._energy_peak(seen[:, at], inverse) for at, inverse in zip(ENERGY_RESIDUALS, res.inverse, strict=True)]
         res.energy_limits = [max(60.0, settings.energy_margin * peak) for peak in peaks]
+        longest = max(round(60.0 / self.core.dt), 2 * self.arm)
         for sensor in range(6):
             if sensor != TORQUE or self.core.has_torque:
-                self._calibrate_without(sensor, readings)
+                self._calibrate_without(sensor, readings[-longest:])
         self.reset()
 
     def _energy_peak(self, values: FloatArray, inverse: float) -> float:
@@ -211,6 +212,17 @@ class StructuredRule:
             self._suspect(bits & ~self.muted, bits)
         if True in self.failed and not self.calibrating:
             self._watch_recovery(reading, out)
+        if self.latched or True in self.failed:
+            return self._replaced(used, out)
+        return used
+
+    def _replaced(self, used: list[float], out: list[float]) -> list[float]:
+        """Readings to go on with: estimates for failed sensors, and for doubtful ones while a suspicion is open."""
+        n, gate = self.core.size, self.core.gate
+        for s in range(1, 6):
+            doubtful = self.latched and not -gate[s - 1] <= out[n + 5 + s] <= gate[s - 1]
+            if self.failed[s] or doubtful:
+                used[s] = out[n + 13 + s]
         return used
 
     def _fill(self, reading: list[float]) -> list[float]:
@@ -261,7 +273,7 @@ class StructuredRule:
         if not found and not parity and torsion and not self.failed[TORQUE]:
             moving = latched & (LINK | MOTOR | LINK_JUMP | MOTOR_JUMP)
             age = min((self._age(b) for b in (LINK, MOTOR, LINK_JUMP, MOTOR_JUMP) if latched & b), default=-1)
-            gone = self.peak > 2.0 and 2 <= self._since(TORSION) <= 10 and self._age(TORSION) < 20
+            gone = self.peak > 1.5 and 2 <= self._since(TORSION) <= 10 and self._age(TORSION) < 20
             if (moving and age >= waits["torque_wait"] and self._age(TORSION) >= waits["torque_wait"]) or gone:
                 found = [TORQUE]
         if found:

@@ -6,7 +6,7 @@ import ctypes
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, final
 
 import numpy as np
@@ -94,10 +94,9 @@ class Engine:
                  walk: FloatArray | None, noise: FloatArray | None) -> None:
         n = theta0.size
         self.freeze, self.walking = settings.freeze, walk is not None or method == "random_walk"
-        self._settings = settings
         self._formulas = formulas(n, outputs, method, self.freeze, self.walking)
         layout = self._layout = self._formulas.layout
-        self.config = fill_config(layout, method, scale, settings, walk, noise)
+        self.config = fill_config(layout, method, theta0, scale, settings, walk, noise)
         self.fast, self.slow = np.zeros(layout.fast.size), np.zeros(layout.slow.size)
         self._fast_next, self._slow_next = np.zeros_like(self.fast), np.zeros_like(self.slow)
         self.y, self.h = np.zeros(outputs), np.zeros((outputs, n))
@@ -109,13 +108,15 @@ class Engine:
                               [self._fast_next, *out])
         self._check = _trigger(self._formulas.check, [self._fast_next, self.slow, self.config],
                                [self.fast, self._slow_next])
+        self._native: Any = None
+        self._native_step: Callable[[], None] | None = None
         self._due = int(layout.fast["due"].start)
         self.start(theta0, None)
 
     def start(self, theta: FloatArray, covariance: FloatArray | None) -> None:
         """Before the first sample: theta and its covariance (None: P0), user units."""
         layout, scale = self._layout, self.part("config", "scale")
-        self.fast[:], self.slow[:] = start_state(layout, theta, self.config, self._settings)
+        self.fast[:], self.slow[:] = start_state(layout, theta, self.config)
         self.theta[:] = theta
         if covariance is None:
             return
@@ -151,6 +152,9 @@ class Engine:
 
     def advance(self) -> None:
         """One step on the sample in `y` and `h`."""
+        if self._native_step is not None:
+            self._native_step()
+            return
         self._step()
         if self._fast_next[self._due]:
             self._check()
@@ -158,30 +162,40 @@ class Engine:
         else:
             self.fast[:] = self._fast_next
 
+    def compile(self) -> tuple[RunOutcome, str]:
+        """Load the compiled step, building it where needed; without a compiler all stays interpreted."""
+        self._native, note = _library(self._formulas)
+        if self._native is None:
+            return RunOutcome.NO_COMPILER, note
+        memory = (self.y, self.h, self.fast, self.slow, self.config, self.theta, self._error, self._status)
+        one = ctypes.c_longlong(1)
+        self._native_step = partial(self._native, one, one, *(ctypes.c_void_p(item.ctypes.data) for item in memory))
+        return RunOutcome.COMPILED, ""
+
     def replay(self, y: FloatArray, h: FloatArray, stride: int, compiled: bool | None) -> Trajectory:
         """All samples of a record; `compiled` as in `RecursiveLeastSquares.run`."""
         rows = y.shape[0] // stride
         theta, error, status = np.empty((rows, self.theta.size)), np.empty((rows, self.y.size)), np.empty((rows, 2))
-        outcome, note, native = RunOutcome.INTERPRETED, "", None
-        if compiled or (compiled is None and y.shape[0] >= _LONG_RECORD):
-            native, note = _library(self._formulas)
-            outcome = RunOutcome.NO_COMPILER if native is None else RunOutcome.COMPILED
-        if native is None:
-            self._interpret(y, h, stride, theta, error, status)
-        else:
+        outcome, note = RunOutcome.INTERPRETED, ""
+        if compiled is not False and (compiled or self._native is not None or y.shape[0] >= _LONG_RECORD):
+            outcome, note = self.compile()
+        if outcome is RunOutcome.COMPILED:
             chunk = stride * max(1, _CHUNK // stride)
             for first in range(0, y.shape[0], chunk):
                 row = first // stride
                 part = slice(first, min(first + chunk, y.shape[0]))
-                native(part.stop - first, stride, *(item.ctypes.data for item in (
+                self._native(part.stop - first, stride, *(item.ctypes.data for item in (
                     y[part], h[part], self.fast, self.slow, self.config, theta[row:], error[row:], status[row:])))
             self.theta[:] = self.part("fast", "theta") * self.part("config", "scale")
+        else:
+            self._interpret(y, h, stride, theta, error, status)
         code = status[:, 1].astype(np.int64)
         return Trajectory(theta, error, status[:, 0].copy(), (code & 1) > 0, (code & 2) > 0, (code & 4) > 0,
                           outcome, note)
 
     def _interpret(self, y: FloatArray, h: FloatArray, stride: int, theta: FloatArray, error: FloatArray,
                    status: FloatArray) -> None:
+        native, self._native_step = self._native_step, None
         for k in range(y.shape[0]):
             self.y[:] = y[k]
             self.h[:] = h[k]
@@ -189,3 +203,4 @@ class Engine:
             if (k + 1) % stride == 0:
                 row = k // stride
                 theta[row], error[row], status[row] = self.theta, self._error, self._status
+        self._native_step = native

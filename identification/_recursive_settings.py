@@ -207,7 +207,7 @@ class Layout:
             ("in_rank", 1), ("rank_before", 1),
         ])
         self.config = Block([
-            ("scale", n), ("free", n), ("walk", n), ("walk_alarm", n), ("start", n), ("limit", n),
+            ("scale", n), ("theta0", n), ("schedule_start", 1), ("free", n), ("walk", n), ("walk_alarm", n), ("start", n), ("limit", n),
             ("enabled", m), ("noise_given", m), ("noise_known", m), ("noise_rate", 1),
             ("floor", m), ("floor_share", 1),
             ("alarm_freedom", 1), ("alarm_normal", 1), ("alarm_rate", 1), ("alarm_length", 1), ("pause_length", 1),
@@ -218,12 +218,13 @@ class Layout:
         ])
 
 
-def fill_config(layout: Layout, method: str, scale: FloatArray, settings: Settings, walk: FloatArray | None,
+def fill_config(layout: Layout, method: str, theta0: FloatArray, scale: FloatArray, settings: Settings, walk: FloatArray | None,
                 noise: FloatArray | None) -> FloatArray:
     """The `config` vector: `walk` (R1) and `noise` (R2) are per-sample variances in user units, or None."""
     config, at = np.zeros(layout.config.size), layout.config
     step = settings.sample_time
     config[at["scale"]], config[at["free"]], config[at["enabled"]] = scale, 1.0, 1.0
+    config[at["theta0"]], config[at["schedule_start"]] = theta0, settings.schedule_start
     config[at["start"]], config[at["limit"]] = min(1.0, settings.covariance_limit), settings.covariance_limit
     if walk is not None:
         config[at["walk"]] = walk / scale**2
@@ -259,15 +260,14 @@ def fill_config(layout: Layout, method: str, scale: FloatArray, settings: Settin
     return config
 
 
-def start_state(layout: Layout, theta: FloatArray, config: FloatArray, settings: Settings) -> tuple[FloatArray,
-                                                                                                    FloatArray]:
+def start_state(layout: Layout, theta: FloatArray, config: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The `fast` and `slow` vectors before the first sample."""
     fast, slow, at = np.zeros(layout.fast.size), np.zeros(layout.slow.size), layout.config
     fast[layout.fast["theta"]] = theta / config[at["scale"]]
     fast[layout.fast["d"]] = config[at["start"]]
     fast[layout.fast["noise"]] = config[at["noise_given"]]
     fast[layout.fast["innovation"]] = 1.0
-    fast[layout.fast["forgetting"]] = settings.schedule_start
+    fast[layout.fast["forgetting"]] = config[at["schedule_start"]]
     slow[layout.slow["excited"]] = 1.0
     slow[layout.slow["live"]] = 1.0
     slow[layout.slow["kept"]] = 1.0

@@ -10,7 +10,7 @@ from typing import Any, Final, final
 import numpy as np
 
 from casadi_models import EFFECTS
-from identification.candidates import Base, Candidate, NotTestable, Trial, offered, try_candidate
+from identification.candidates import LATE, Base, Candidate, NotTestable, Trial, offered, try_candidate
 
 MAJOR_DROP: Final = 10.0
 HELD_OUT_DROP: Final = 5.0
@@ -23,6 +23,8 @@ SET_P: Final = 0.05
 SET_LOST: Final = 0.15
 SET_RMS: Final = 1.5
 LARGEST_SET: Final = 4
+LATE_DROP: Final = 30.0
+"""Fall of the RMS for effects with free dynamics of their own, which fit a little of anything."""
 COMMON_DROP: Final = 4.0
 """Fall of the RMS that is enough for viscous and Coulomb friction and gravity: hardly a joint is without them."""
 PLAIN_FIRST: Final = 0.5
@@ -136,6 +138,8 @@ def _major(trial: Trial, base: Base) -> bool:
     held = trial.held_out_drop_percent
     if not math.isnan(held) and held < (COMMON_DROP / 2 if common else HELD_OUT_DROP):
         return False
+    if trial.key in LATE:
+        return trial.cv_drop_percent >= LATE_DROP and (math.isnan(held) or held >= LATE_DROP)
     if trial.key == "channel_delay":
         dt = base.data.train[0].grid.dt
         delay = max(abs(trial.values[n]) for n in trial.candidate.amplitudes)
@@ -198,7 +202,7 @@ def minor_claims(ranking: Ranking, base: Base) -> list[Trial]:
             continue
         if math.isnan(t.held_out_drop_percent) or t.held_out_drop_percent < MINOR_HELD_OUT or t.p_value > 0.01:
             continue
-        if t.key == "channel_delay":
+        if t.key == "channel_delay" or t.key in LATE:
             continue
         out.append(t)
     return out[:2]

@@ -9,7 +9,7 @@ from typing import Any, Final, final
 
 from casadi_models import EFFECTS, JointModel
 from identification.assess import VERDICT_KERNELS, BalanceError, Error, assess
-from identification.candidates import Base, NotTestable, Trial, make_base
+from identification.candidates import LATE, Base, NotTestable, Trial, make_base
 from identification.claims import LADDER_STEP, Claim, Ranking, confusion_set, make_claim, minor_claims, rank, simplest
 from identification.engine import Dataset, Solution, load_dataset, prepared_model, solve
 from identification.errors import InputError
@@ -298,9 +298,7 @@ class _Loop:
         self.progress("looking at what is left", 0.85)
         solution = steps[-1].solution
         ratios = self._ratios(solution)
-        lines = find_lines(solution, self.data, self._at_kernel(self._shortest()))
-        if not claims:
-            lines = [x for x in lines]
+        lines = find_lines(solution, [self._at_kernel(k) for k in self._line_kernels()] + [self.data])
         claims = [self._partial(c, steps[0], steps[-1], ratios) for c in claims]
         minor = tuple(self._minor(t, solution) for t in minor_claims(last, base) if self._same_sign(t, solution))
         error = replace(steps[-1].held_out, balances=ratios)
@@ -312,9 +310,10 @@ class _Loop:
             excitation_warnings(self.data), tuple(sorted(self.refused)),
         )  # fmt: skip
 
-    def _shortest(self) -> float:
-        dt = self.data.train[0].grid.dt
-        return max(8 * dt, 0.012)
+    def _line_kernels(self) -> list[float]:
+        """The shortest kernel and one between it and that of the claims."""
+        shortest = max(8 * self.data.train[0].grid.dt, 0.012)
+        return [k for k in (shortest, 0.03) if k < 0.7 * self.data.kernel]
 
     def _at_kernel(self, length: float) -> Dataset:
         """The same records with another kernel."""
@@ -335,7 +334,8 @@ class _Loop:
         before, after = first.held_out.balances[claim.balance], last.held_out.balances[claim.balance]
         over = before.rms**2 - before.floor**2
         share = (before.rms**2 - after.rms**2) / over if over > 0 else 1.0
-        return replace(claim, partial=ratios[claim.balance].ratio > RATIO_LIMIT and share < EXPLAINED_SHARE)
+        over_floor = ratios[claim.balance].ratio > RATIO_LIMIT
+        return replace(claim, partial=over_floor and (share < EXPLAINED_SHARE or claim.effects[0] in LATE))
 
     def _minor(self, trial: Trial, solution: Solution) -> Claim:
         return Claim((trial.key,), trial.candidate.label, trial.balance, trial.held_out_drop_percent)

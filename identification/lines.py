@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,14 +12,19 @@ import numpy as np
 import numpy.typing as npt
 
 from identification.balances import Balances
-from identification.engine import Dataset, Solution, floors, stack
+from identification.engine import Dataset, Solution, floors, row_weights, stack
 from identification.weak import WeakRecord
 
 FloatArray = npt.NDArray[np.float64]
 
 PROMINENCE: Final = 20.0
+HELD_OUT_DROP: Final = 0.2
 LOWEST_ORDER: Final = 0.25
 HIGHEST_ORDER: Final = 14.0
+BANDS: Final = tuple(np.geomspace(LOWEST_ORDER, HIGHEST_ORDER, 9))
+PASS: Final = 0.8
+"""Share of 1/kernel up to which a line counts (the kernel's -3 dB point is 0.93)."""
+
 NAMED_ORDERS: Final = (1.0, 2.0, 4.0)
 
 
@@ -93,27 +99,42 @@ def _phase_fit(order: float, angle: FloatArray, residual: FloatArray, weight: Fl
     return np.asarray(np.linalg.lstsq(a, residual * weight, rcond=None)[0])
 
 
-def find_lines(solution: Solution, data: Dataset, short: Dataset, most: int = 4) -> list[Line]:
+def find_lines(solution: Solution, kernels: Sequence[Dataset], most: int = 4) -> list[Line]:
     """Lines in the residuals of the motor-side balances, confirmed on held-out records.
 
     Parameters
     ----------
     solution : Solution
-    data : Dataset
-        For names and floors.
-    short : Dataset
-        The same records with the shortest kernel: a long one hides fast lines.
+    kernels : sequence of Dataset
+        The same records with several kernels: a long one hides fast lines, a short one lets the
+        noise of the acceleration cover slow ones.
+    most : int
+        Lines per balance.
+
+    Returns
+    -------
+    list of Line
+        The most prominent first; a line seen with several kernels once.
     """
     found: list[Line] = []
-    balances = Balances(solution.model, data.sensing, wrt=())
-    ratio = abs(data.joint.gear_ratio)
-    train = stack(balances, short.train, solution.values).residual
-    held = stack(balances, short.held_out, solution.values).residual if short.held_out else None
-    floor = floors(solution.model, short, solution.values)
-    for balance in balances.balances:
-        if balance == "link":
-            continue
-        found += _in_balance(balance, short, train[balance], None if held is None else held[balance], floor[balance], ratio, most)
+    for data in kernels:
+        balances = Balances(solution.model, data.sensing, wrt=())
+        train = stack(balances, data.train, solution.values).residual
+        held = stack(balances, data.held_out, solution.values).residual if data.held_out else None
+        floor = floors(solution.model, data, solution.values)
+        sigma = {b: max(floor[b], 1e-12) for b in floor}
+        weights = row_weights(balances, data, solution.values, sigma, data.train)
+        held_weights = row_weights(balances, data, solution.values, sigma, data.held_out) if data.held_out else {}
+        for balance in balances.balances:
+            if balance == "link":
+                continue
+            rows = _Rows(
+                _angles(data.train, data), _angles(data.train, data, "motor_velocity"), data.kernel, train[balance], weights[balance],
+                _angles(data.held_out, data) if held is not None else None,
+                _angles(data.held_out, data, "motor_velocity") if held is not None else None,
+                None if held is None else held[balance], held_weights.get(balance),
+            )  # fmt: skip
+            found += _in_balance(balance, rows, most)
     found = [line for line in found if not _echo(line, found)]
     return sorted(found, key=lambda x: -x.prominence)[:most]
 
@@ -124,49 +145,92 @@ def _echo(line: Line, lines: Sequence[Line]) -> bool:
     )  # fmt: skip
 
 
-def _angles(records: Sequence[WeakRecord], ratio: float) -> FloatArray:
-    return np.concatenate([w.averaged["motor_position"] * ratio for w in records])
+@final
+@dataclass(frozen=True)
+class _Rows:
+    """Rows of one balance: motor angle, residual, 1/sigma, for training and held-out records."""
+
+    angle: FloatArray
+    speed: FloatArray
+    kernel: float
+    residual: FloatArray
+    weight: FloatArray
+    held_angle: FloatArray | None
+    held_speed: FloatArray | None
+    held_residual: FloatArray | None
+    held_weight: FloatArray | None
 
 
-def _in_balance(
-    balance: str, data: Dataset, residual: FloatArray, held: FloatArray | None, floor: float, ratio: float, most: int
-) -> list[Line]:
-    angle = _angles(data.train, ratio)
+def _angles(records: Sequence[WeakRecord], data: Dataset, name: str = "motor_position") -> FloatArray:
+    ratio = abs(data.joint.gear_ratio)
+    return np.concatenate([w.averaged[name] * ratio for w in records])
+
+
+def _banded_scan(rows: _Rows, left: FloatArray) -> list[tuple[float, float, FloatArray]]:
+    """Peak of each band of orders: (order, power over the median of its band, weight used).
+
+    In each band only the rows count whose speed lets the kernel pass the line, and once all rows do.
+    """
+    out = []
+    for (low, high), gated in itertools.product(zip(BANDS[:-1], BANDS[1:], strict=True), (True, False)):
+        passes = np.abs(rows.speed) * high * rows.kernel < 2 * np.pi * PASS
+        if int(passes.sum()) < 200:
+            continue
+        weight = rows.weight * passes if gated else rows.weight
+        orders, power = scan(rows.angle, left, weight, high)
+        here = orders >= low
+        orders, power = orders[here], power[here]
+        k = int(np.argmax(power))
+        background = float(np.median(power))
+        if k in (0, len(power) - 1) or background <= 0:
+            continue
+        out.append((_refined(orders, power, k), float(power[k] / background), weight))
+    return out
+
+
+def _in_balance(balance: str, rows: _Rows, most: int) -> list[Line]:
+    angle = rows.angle
     stroke = float(np.ptp(angle))
     if stroke < 4 * np.pi:
         return []
-    clipped = float(np.quantile(np.abs(residual), 0.98)) + 1e-300
-    left = np.clip(residual, -clipped, clipped)
-    weight = np.ones_like(left)
+    left = np.clip(rows.residual * rows.weight, -4 * _spread(rows), 4 * _spread(rows)) / rows.weight
     out = []
     for _ in range(most):
-        orders, power = scan(angle, left, weight)
-        background = float(np.median(power))
-        k = int(np.argmax(power))
-        if background <= 0 or power[k] < PROMINENCE * background or k in (0, len(power) - 1):
+        peaks = _banded_scan(rows, left)
+        if not peaks:
             break
-        around = (orders > orders[k] * 0.7) & (orders < orders[k] * 1.4)
-        if power[k] < PROMINENCE * float(np.median(power[around])):
+        order, prominence, weight = max(peaks, key=lambda x: x[1])
+        if prominence < PROMINENCE:
             break
-        order = _refined(orders, power, k)
         sine, cosine, offset = _phase_fit(order, angle, left, weight)
-        drop = 0.0
-        if held is not None:
-            h = _angles(data.held_out, ratio)
-            before = held - held.mean()
-            after = held - sine * np.sin(order * h) - cosine * np.cos(order * h)
-            after = after - after.mean()
-            drop = 100 * (1 - float(np.linalg.norm(after) / max(np.linalg.norm(before), 1e-300)))
-            if drop <= 0.2:
-                break
+        drop = _held_out_drop(rows, order, sine, cosine)
+        if drop is not None and drop <= HELD_OUT_DROP:
+            break
         tolerance = 2 * np.pi / stroke
         named = any(abs(order - o) <= 2 * tolerance for o in NAMED_ORDERS)
         names = ("kinematic_error",) if balance in ("transmission", "deflection") and named else ()
         if balance == "motor":
             names = ("torque_ripple",)
-        out.append(Line(float(order), tolerance, float(math.hypot(sine, cosine)), balance, float(power[k] / background), names, drop))
+        size = float(math.hypot(sine, cosine))
+        out.append(Line(float(order), tolerance, size, balance, prominence, names, drop or 0.0))
         left = left - sine * np.sin(order * angle) - cosine * np.cos(order * angle) - offset
     return out
+
+
+def _spread(rows: _Rows) -> float:
+    """Robust spread of the weighted residual."""
+    return float(np.median(np.abs(rows.residual * rows.weight))) * 1.4826 + 1e-300
+
+
+def _held_out_drop(rows: _Rows, order: float, sine: float, cosine: float) -> float | None:
+    """Fall of the weighted RMS on held-out records by the line with its phase from training, in percent."""
+    if rows.held_angle is None or rows.held_speed is None or rows.held_residual is None or rows.held_weight is None:
+        return None
+    line = sine * np.sin(order * rows.held_angle) + cosine * np.cos(order * rows.held_angle)
+    passes = np.abs(rows.held_speed) * order * rows.kernel < 2 * np.pi * PASS
+    before = rows.held_residual[passes] * rows.held_weight[passes]
+    after = (rows.held_residual - line)[passes] * rows.held_weight[passes]
+    return 100 * (1 - float(np.linalg.norm(after) / max(np.linalg.norm(before), 1e-300)))
 
 
 def _refined(orders: FloatArray, power: FloatArray, k: int) -> float:

@@ -148,6 +148,10 @@ class RecursiveLeastSquares:
         engine, y, h = self._record(Y, H, "run")
         return engine.replay(y, h, stride, compiled)
 
+    def compile(self) -> RunOutcome:
+        """Build and load the compiled step now: `update` then costs a third. The numbers stay the same bit by bit."""
+        return self._ready("compile").compile()[0]
+
     def startup(self, Y: npt.ArrayLike, H: npt.ArrayLike, *, limit: float = 1e-9) -> Startup:
         """Start values from a window of samples by SVD, (3.47) to (3.49).
 
@@ -238,6 +242,7 @@ class RecursiveLeastSquares:
             raise InputError(f"restore: the state is of {m} outputs or other settings; this estimator has "
                              f"{engine.y.size} outputs")
         engine.load(np.frombuffer(body, dtype=np.float64))
+        self._theta0, self._scale = engine.part("config", "theta0").copy(), engine.part("config", "scale").copy()
 
     def __getstate__(self) -> dict[str, object]:
         """For pickle and copy: the functions are rebuilt, the numbers travel as `state()`."""

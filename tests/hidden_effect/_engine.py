@@ -29,7 +29,8 @@ SIDE = (
     "B", "B2", "B3", "BA", "TC", "TCA", "TS", "VS", "DS", "MU", "CYC", "CYC_P", "V0", "ZS", "SIN", "COS", "KA",
 )  # fmt: skip
 """Parameters each side has: viscous, quadratic, cubic and even viscous; Coulomb, its asymmetry, Stribeck extra torque,
-velocity and exponent; load factor; cyclic friction and phase; smoothing velocity; bristle distance; position torques."""
+velocity and exponent; load factor; cyclic friction and phase; smoothing velocity; bristle distance; torques of
+position."""
 
 COMMON = (
     "JM", "JL", "TG", "K", "C", "N", "NKM", "KP", "KD", "KM", "K3", "PW_X1", "PW_X2", "PW_D1", "PW_D2",

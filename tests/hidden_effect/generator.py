@@ -97,7 +97,7 @@ def names_of(effect: Hidden) -> tuple[str, ...]:
 
 
 def draw_joint(rng: np.random.Generator) -> dict[str, float]:
-    """Parameters of a plain joint (about the thesis's table 4.1 to 4.3), link-referred; NKM carries the ratio's sign."""
+    """Parameters of a plain joint near the thesis's tables 4.1 to 4.3, link-referred; NKM carries the ratio's sign."""
     ratio = TURNS if rng.random() < 0.5 else -TURNS
     smooth = float(rng.uniform(0.002, 0.006)) if rng.random() < 0.6 else 0.0
     return {

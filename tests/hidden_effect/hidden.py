@@ -210,7 +210,8 @@ def torque_sensor_offset(s: Setting) -> Draw:
 
 
 def channel_delay(s: Setting) -> Draw:
-    channel = str(s.rng.choice(["motor_current", "link_torque"])) if s.base.get("torque_sensor", 1.0) else "motor_current"
+    drawn = str(s.rng.choice(["motor_current", "link_torque"]))
+    channel = drawn if s.base.get("torque_sensor", 1.0) else "motor_current"
     delay = round(s.between(5e-3, 1e-2) / STEP) * STEP
     name = "LAG_I" if channel == "motor_current" else "LAG_T"
     balance = "motor" if channel == "motor_current" else "sensor"
@@ -265,7 +266,7 @@ OUTSIDE: dict[str, Callable[[Setting], Draw]] = {
     "local_bump": _local_bump, "snags": _snags, "odd_order": _odd_order, "link_mode": _link_mode,
     "soft_stop": _soft_stop,
 }  # fmt: skip
-"""Kinds that no key names: rubbing in a sector, random snags, a gear error of odd order, a flexible link, a soft stop."""
+"""Kinds that no key names: rubbing in a sector, random snags, gear error of odd order, flexible link, soft stop."""
 
 NEEDS_TORQUE_SENSOR = frozenset({"torque_sensor_gain", "torque_sensor_offset"})
 ONE_SIDED_HIDDEN = frozenset({
@@ -274,7 +275,7 @@ ONE_SIDED_HIDDEN = frozenset({
 })  # fmt: skip
 """Effects that a record of the motor side alone is not asked to show (transmission and torque sensor)."""
 SIDED = frozenset({
-    "cubic_viscous", "quadratic_drag", "asymmetric_coulomb", "asymmetric_viscous", "stribeck", "load_dependent_friction",
-    "lugre", "cyclic_friction", "cyclic_torque", "added_spring",
+    "cubic_viscous", "quadratic_drag", "asymmetric_coulomb", "asymmetric_viscous", "stribeck", "lugre",
+    "load_dependent_friction", "cyclic_friction", "cyclic_torque", "added_spring",
 })  # fmt: skip
 """Effects that can sit on either side."""

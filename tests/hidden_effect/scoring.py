@@ -25,8 +25,8 @@ CLASSES: tuple[frozenset[str], ...] = (
 ORDERED = {"kinematic_error": "kinematic_error_order", "torque_ripple": "ripple_order_per_motor_turn"}
 ORDER_SLACK = 0.05
 SEEN_IN: dict[str, frozenset[str]] = {
-    "motor": frozenset({"motor", "sum", "deflection", "drive", "rigid"}),
-    "link": frozenset({"link", "sum", "drive", "rigid"}),
+    "motor": frozenset({"motor", "sum", "deflection", "axis"}),
+    "link": frozenset({"link", "sum", "axis"}),
     "transmission": frozenset({"transmission", "deflection"}),
     "sensor": frozenset({"motor", "link", "transmission", "sensor"}),
 }

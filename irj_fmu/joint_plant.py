@@ -1,0 +1,279 @@
+"""A joint model as a plant FMU: dynamics, readings, and on request a controller and faulty sensors.
+
+States are link-referred, as everywhere in :mod:`casadi_models`. Inputs and outputs are those of the joint: motor
+quantities on the motor shaft, link quantities on the link, with the names of a record's channels.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from typing import Any, Final, Literal, final
+
+import casadi as ca
+import numpy as np
+
+from casadi_models import JointModel
+from casadi_models.parameter import LINEAR_UNITS, Parameter
+from identification.channels import channel_unit
+from identification.errors import InputError
+from identification.joint_file import Joint
+
+from .plant import PlantSpec
+from .readings import CHANNELS, Readings
+from .variables import Variable
+
+Drive = Literal["current", "torque"]
+REFERENCE: Final = ("reference_position", "reference_velocity", "reference_acceleration")
+BANDWIDTH: Final = 30.0
+"""Bandwidth of the position controller's default gains [rad/s]; its damping ratio is 0.8."""
+_DAMPING: Final = 0.8
+_MOTOR: Final = ("motor_position", "motor_velocity")
+
+
+@final
+@dataclass(frozen=True)
+class PlantOptions:
+    """What a plant FMU holds besides the joint.
+
+    Attributes
+    ----------
+    drive : {"current", "torque"}, optional
+        Input of a plant without controller: ``i_m`` [A], or ``tau_m``, the motor's torque on its shaft [N.m]. By
+        default current where the joint file has a motor constant.
+    controller : bool
+        True: inputs are a reference position and its two derivatives on the link; a PD controller with feed-forward
+        drives the motor.
+    sensors : bool
+        True: outputs are readings with noise, quantisation and faults, all of them parameters that start at "none".
+    name : str, optional
+        Name of the FMU; the joint's name by default.
+    sample_time : float
+        Communication step, and time between two values of the noise [s].
+    tolerance : float
+        Relative tolerance of the integrator where the host names none.
+    """
+
+    drive: Drive | None = None
+    controller: bool = False
+    sensors: bool = False
+    name: str | None = None
+    sample_time: float = 1e-3
+    tolerance: float = 1e-9
+
+
+def identifier(name: str) -> str:
+    """Return a C identifier made of a name."""
+    made = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_") or "joint"
+    return f"joint_{made}" if made[0].isdigit() else made
+
+
+def plant_spec(joint: Joint | JointModel, options: PlantOptions | None = None) -> PlantSpec:
+    """Declare the plant of a joint.
+
+    Parameters
+    ----------
+    joint : Joint or JointModel
+        A joint file, fitted or not, with all its effects; or a model, which is driven by torque.
+    options : PlantOptions, optional
+        Drive, controller, sensors.
+
+    Returns
+    -------
+    PlantSpec
+        Parameters are those of the model with unit, bounds and meaning, link-referred and tunable. Effects with
+        internal states add states; where an effect knows its states only as steps of a displacement (hysteresis),
+        they are memory and the plant runs in co-simulation only.
+
+    Raises
+    ------
+    InputError
+        Where the drive is a current and the joint has no motor constant, or the model has no inertia.
+    """
+    options = options or PlantOptions()
+    model = joint if isinstance(joint, JointModel) else joint.model()
+    per_current = None if isinstance(joint, JointModel) else joint.torque_per_current
+    if not model.inertias or model.clamped_link:
+        raise InputError(f"{model.name}: a joint with a clamped link does not move; choose a model with an inertia")
+    return _Builder(model, per_current, options).spec()
+
+
+@final
+class _Builder:
+    """Symbols and expressions of one plant."""
+
+    def __init__(self, model: JointModel, per_current: float | None, options: PlantOptions) -> None:
+        self.model, self.options = model, options
+        self.functions = model.functions
+        kind = options.drive or ("torque" if per_current is None else "current")
+        if kind == "current" and per_current is None and not options.controller:
+            raise InputError(
+                f"{model.name}: a plant driven by current needs motor_constant or torque_per_current in [joint]; "
+                "or choose drive = 'torque'"
+            )
+        self.per_current = per_current
+        self.by_current = kind == "current" and per_current is not None
+        terms = model.true_equations.memory_terms
+        self.stepped = any(term.effect.rate is None for term, *_ in terms)
+        needs = _used_inputs(self.functions, self.stepped)
+        self.heated = needs[1]
+        self.clocked = needs[2] or self.stepped or options.sensors
+        self.own_parameters = model.parameters
+        self.extra: list[tuple[Variable, Any]] = []
+
+    # --- declarations ------------------------------------------------------------------------------------------------
+
+    def _unit(self, rotary: str) -> str:
+        return rotary if self.model.kind == "rotary" else LINEAR_UNITS.get(rotary, rotary)
+
+    def _channel(self, name: str) -> str:
+        return channel_unit(name, self.model.kind)
+
+    def _states(self) -> list[Variable]:
+        display = "deg" if self.model.kind == "rotary" else None
+        out = []
+        for name in self.functions.state_names:
+            is_rate = name.endswith("velocity")
+            out.append(
+                Variable(
+                    f"state.{name}", self._channel("link_velocity" if is_rate else "link_position"),
+                    description=f"{name.replace('_', ' ').capitalize()}, link-referred.",
+                    display_unit=None if is_rate else display,
+                )
+            )  # fmt: skip
+        return out
+
+    def _memory(self) -> list[Variable]:
+        return [
+            Variable(f"state.{identifier(name)}", description=f"Internal state of {name.rpartition('_')[0]}.")
+            for name in self.functions.memory_names
+        ]
+
+    def _inputs(self) -> list[Variable]:
+        if self.options.controller:
+            units = (self._channel("link_position"), self._channel("link_velocity"), self._channel("link_acceleration"))
+            pairs = zip(REFERENCE, units, strict=True)
+            found = [Variable(n, u, description=f"{n.replace('_', ' ').capitalize()} of the link.") for n, u in pairs]
+        elif self.by_current:
+            found = [Variable("i_m", "A", description="Motor current.")]
+        else:
+            found = [Variable("tau_m", self._channel("motor_torque"), description="Motor torque on the motor shaft.")]
+        if self.heated:
+            found.append(Variable("temperature", "K", description="Rise of temperature since the start."))
+        return found
+
+    def _parameter(self, name: str, unit: str, start: float, description: str, low: float | None = None) -> Any:
+        symbol = ca.SX.sym(name)
+        variable = Variable(name, unit, start, low, description=description, variability="tunable")
+        self.extra.append((variable, symbol))
+        return symbol
+
+    # --- expressions -------------------------------------------------------------------------------------------------
+
+    def spec(self) -> PlantSpec:
+        """Put everything together."""
+        f, options = self.functions, self.options
+        mechanical, memory = self._states(), self._memory()
+        size, held = len(mechanical), len(memory)
+        inputs = self._inputs()
+        x = ca.SX.sym("x", size + (0 if self.stepped else held) + self.clocked)
+        z = ca.SX.sym("z", held) if self.stepped else ca.SX(0, 1)
+        u, p = ca.SX.sym("u", len(inputs)), ca.SX.sym("p", len(self.own_parameters))
+        clock = x[-1] if self.clocked else ca.SX(0)
+        full = ca.vertcat(x[:size], z) if self.stepped else x[: size + held]
+        drive = self._drive(x, u)
+        model_input = ca.vertcat(drive, u[-1] if self.heated else 0, clock)
+        rates = f.dynamics(full, model_input, p)
+        rates = ca.vertcat(rates[: size if self.stepped else size + held], *([1] if self.clocked else []))
+        channels = self._readings(f.outputs(full, model_input, p), drive)
+        if options.sensors:
+            readings = Readings(self._parameter, clock, options.sample_time)
+            channels = [replace_expression(pair, readings) for pair in channels]
+        every = ca.vertcat(p, *(symbol for _, symbol in self.extra))
+        arguments = [x, u, every, *([z] if self.stepped else [])]
+        states = [*mechanical, *([] if self.stepped else memory)]
+        if self.clocked:
+            states.append(Variable("state.clock", "s", description="Time since the start."))
+        return PlantSpec(
+            name=identifier(options.name or self.model.name),
+            dynamics=ca.Function("f", arguments, [ca.densify(rates)]),
+            output=ca.Function("y", arguments, [ca.densify(ca.vertcat(*(value for _, value in channels)))]),
+            states=tuple(states),
+            inputs=tuple(inputs),
+            parameters=(
+                *(_variable(q, v) for q, v in zip(self.own_parameters, self.model.value_vector(), strict=True)),
+                *(variable for variable, _ in self.extra),
+            ),
+            outputs=tuple(variable for variable, _ in channels),
+            description=self._description(),
+            update=self._update(x, z, u, every, p) if self.stepped else None,
+            memory=tuple(memory) if self.stepped else (),
+            default_step=options.sample_time,
+            tolerance=options.tolerance,
+        )  # fmt: skip
+
+    def _drive(self, x: Any, u: Any) -> Any:
+        """n Km I, link-referred."""
+        if self.options.controller:
+            start = dict(zip(self.model.parameter_names, self.model.value_vector(), strict=True))
+            inertia = sum(start[n] for n in self.model.inertias)
+            damping = 2 * _DAMPING * inertia * BANDWIDTH
+            weight = start.get("gravity_torque", 0.0)
+            unit = self._unit
+            stiff = self._parameter("controller.stiffness", unit("N.m/rad"), inertia * BANDWIDTH**2, "Gain on the position error, link-referred.", 0.0)
+            damp = self._parameter("controller.damping", unit("N.m.s/rad"), damping, "Gain on the velocity error, link-referred.", 0.0)
+            feed = self._parameter("controller.inertia", unit("kg.m2"), inertia, "Feed-forward of the reference acceleration.", 0.0)
+            hold = self._parameter("controller.gravity", unit("N.m"), weight, "Feed-forward of gravity at the reference position.")
+            limit = self._parameter("controller.limit", unit("N.m"), 1e9, "Largest drive torque, link-referred.", 0.0)
+            wish = stiff * (u[0] - x[0]) + damp * (u[1] - x[1]) + feed * u[2] + hold * ca.sin(u[0])
+            return ca.fmin(limit, ca.fmax(-limit, wish))
+        if self.by_current:
+            constant = self._parameter(
+                "torque_per_current", f"{self._unit('N.m')}/A", float(self.per_current or 0.0), "Drive torque per ampere, link-referred."
+            )
+            return u[0] * constant
+        return u[0] * self.model.gear_ratio
+
+    def _readings(self, outputs: Any, drive: Any) -> list[tuple[Variable, Any]]:
+        """Record channels as readings: motor side on the motor shaft."""
+        ratio = self.model.gear_ratio
+        found: list[tuple[Variable, Any]] = []
+        for i, name in enumerate(CHANNELS[:5]):
+            variable = Variable(name, self._channel(name), description=f"{name.replace('_', ' ').capitalize()} as read.")
+            found.append((variable, outputs[i] * (ratio if name in _MOTOR else 1.0)))
+        if self.per_current is not None:
+            constant = next((s for v, s in self.extra if v.name == "torque_per_current"), self.per_current)
+            found.append((Variable("motor_current", "A", description="Motor current as read."), drive / constant))
+        else:
+            unit = self._channel("motor_torque")
+            found.append((Variable("motor_torque", unit, description="Motor torque on its shaft."), drive / ratio))
+        return found
+
+    def _update(self, x: Any, z: Any, u: Any, every: Any, p: Any) -> Any:
+        """Step form of the displacement memory between two states."""
+        f, size = self.functions, len(self.functions.state_names)
+        before = ca.SX.sym("x_prev", x.shape[0])
+        drive = self._again(x, u)
+        here = ca.vertcat(drive, u[-1] if self.heated else 0, x[-1])
+        moved = f.memory_step(ca.vertcat(x[:size], z), here, p, before[:size], x[-1] - before[-1])
+        kept = ca.if_else(x[-1] > before[-1], moved, z)
+        return ca.Function("z", [x, z, u, every, before], [ca.densify(kept)])
+
+    def _again(self, x: Any, u: Any) -> Any:
+        """The drive once more, on the symbols that exist already."""
+        known = {variable.name: symbol for variable, symbol in self.extra}
+        kept, self._parameter = self._parameter, lambda name, *_: known[name]  # type: ignore[method-assign]
+        try:
+            return self._drive(x, u)
+        finally:
+            self._parameter = kept  # type: ignore[method-assign]
+
+    def _description(self) -> str:
+        parts = [f"Joint {self.model.name}", f"gear ratio {self.model.gear_ratio:g}"]
+        if self.model.effects:
+            parts.append(f"effects {', '.join(self.model.effects)}")
+        if self.options.controller:
+            parts.append("position controller")
+        if self.options.sensors:
+            parts.append("sensors")
+        return "; ".join(parts) + "."
