@@ -49,7 +49,8 @@ def simulate(*, seconds: float = 80.0, rate: float = 1000.0, standstill: tuple[f
     """
     rng = np.random.default_rng(seed)
     dt = 1.0 / rate
-    time = np.arange(0.0, seconds, dt)
+    lead = round(rate)  # one second that the filter settles in
+    time = (np.arange(-lead, round(seconds * rate))) * dt
     link, velocity, acceleration = _motion(time, standstill, quick)
     truth = np.where(time[:, None] < step_at, 1.0, step) * THETA
     carried = LINK_INERTIA * acceleration + LOAD * np.sin(link) + truth[:, 5] * velocity
@@ -68,7 +69,7 @@ def simulate(*, seconds: float = 80.0, rate: float = 1000.0, standstill: tuple[f
     seen_torque = net + TORQUE * rng.standard_normal(time.size)
     y, h = _regression(seen_motor, seen_link, seen_drive, seen_torque, dt)
     # Both sides of the regression pass the same filter (thesis 4.3.1), so the equation stays true.
-    return JointRecord(time, _filtered(y, cutoff, dt), _filtered(h, cutoff, dt), truth)
+    return JointRecord(time[lead:], _filtered(y, cutoff, dt)[lead:], _filtered(h, cutoff, dt)[lead:], truth[lead:])
 
 
 def _motion(time: FloatArray, standstill: tuple[float, float],

@@ -141,7 +141,12 @@ class ObserverCore:
         innovation = deviations.copy()
         innovation[1] *= 3.0
         innovation[3] *= 3.0
-        self.gate[:] = GATE * innovation
+        self._gates = GATE * innovation
+        self.gate[:] = self._gates
+
+    def open_gates(self, is_open: bool) -> None:
+        """Take innovations whole (after a replacement, so that the estimate settles), or cut them again."""
+        self.gate[:] = 1e9 if is_open else self._gates
 
     def tune(self, torque_deviation: float) -> None:
         """Take the deviation of torque reading less spring torque from healthy data; gains follow."""

@@ -60,6 +60,7 @@ class StructuredRule:
             for name in ("link_wait", "torque_wait", "pair_wait", "plant_wait", "quiet_seconds", "recover_seconds",
                          "settle_seconds", "plant_rest_seconds")
         }  # fmt: skip
+        self.waits["unlock"] = self.waits["settle_seconds"]
         self.recover_limits = self._default_recovery()
         self.widening = [[2.0] * 5 for _ in range(6)]
         self.calibrating = False
@@ -81,7 +82,12 @@ class StructuredRule:
         self.muted = 0
         self.good = [0] * 6
         self.low, self.high = [math.inf] * 6, [-math.inf] * 6
-        self.core.set_used((True,) * 5 + (self.core.has_torque,))
+        self.gate_until, self.cut = -1, 0
+        self._use((True,) * 5 + (self.core.has_torque,))
+
+    def _use(self, used: tuple[bool, ...]) -> None:
+        self.core.set_used(used)
+        self.gates: list[float] = [g if u else math.inf for g, u in zip(self.core.gate.tolist(), used[1:], strict=True)]
 
     # --- limits ------------------------------------------------------------------------------------------------------
 
@@ -200,6 +206,11 @@ class StructuredRule:
         core.readings[:] = reading
         out = core.advance()
         n = core.size
+        if k == self.gate_until:
+            core.open_gates(False)
+            self.gate_until = -1
+        elif self.gate_until < 0 and not self.latched:
+            self._unlock(out)
         used = out[n : n + 6]
         drive, qm, vm, ql, vl, torque = used
         motor, link, sprung = out[n + 11 : n + 14]
@@ -218,12 +229,28 @@ class StructuredRule:
 
     def _replaced(self, used: list[float], out: list[float]) -> list[float]:
         """Readings to go on with: estimates for failed sensors, and for doubtful ones while a suspicion is open."""
-        n, gate = self.core.size, self.core.gate
+        n, gate = self.core.size, self.gates
         for s in range(1, 6):
             doubtful = self.latched and not -gate[s - 1] <= out[n + 5 + s] <= gate[s - 1]
             if self.failed[s] or doubtful:
                 used[s] = out[n + 13 + s]
         return used
+
+    def _unlock(self, out: list[float]) -> None:
+        """Cut innovations must not hold the estimate off for long without a suspicion."""
+        a, b, c, d, e = out[self.core.size + 6 : self.core.size + 11]
+        ga, gb, gc, gd, ge = self.gates
+        if -ga <= a <= ga and -gb <= b <= gb and -gc <= c <= gc and -gd <= d <= gd and -ge <= e <= ge:
+            self.cut = 0
+            return
+        self.cut += 1
+        if self.cut > self.waits["unlock"]:
+            self._open_gates()
+
+    def _open_gates(self) -> None:
+        self.core.open_gates(True)
+        self.gate_until = self.k + self.waits["settle_seconds"]
+        self.cut = 0
 
     def _fill(self, reading: list[float]) -> list[float]:
         """Missing readings: the sensor fails at once."""
@@ -367,7 +394,7 @@ class StructuredRule:
     def _exchange(self, sensors: list[int]) -> None:
         """The readings in use have changed."""
         used = tuple(not f and (i != TORQUE or self.core.has_torque) for i, f in enumerate(self.failed))
-        self.core.set_used(used)
+        self._use(used)
         for i, involved in enumerate(PARITY_SENSORS):
             if any(s in involved for s in sensors) or not self.core.has_torque:
                 self.residuals.invalidate(i, self.k + 1 + self.waits["settle_seconds"])
@@ -375,6 +402,7 @@ class StructuredRule:
             self.residuals.scale[i] = 1.0 / (max(wide) * 1.5 ** (len(wide) - 1)) if wide else 1.0
         if any(self.failed[s] for s in PARITY_SENSORS[4]):
             self.residuals.scale[4] = 0.0  # r1 compares the estimate with itself
+        self._open_gates()
         self._close()
 
     def _watch_recovery(self, reading: list[float], out: list[float]) -> None:
@@ -404,7 +432,7 @@ class StructuredRule:
 
     def numbers(self) -> list[float]:
         """Everything that changes, limits included, as floats."""
-        counters = [self.k, self.latched, self.opened, self.plant_rest, self.muted]
+        counters = [self.k, self.latched, self.opened, self.plant_rest, self.muted, self.gate_until, self.cut]
         res = self.residuals
         return [
             *map(float, counters), self.peak, self.core.torque_deviation, *map(float, self.failed),
@@ -423,7 +451,8 @@ class StructuredRule:
             return numbers[at - count : at]
 
         self.residuals.clear()
-        self.k, self.latched, self.opened, self.plant_rest, self.muted = (int(v) for v in take(5))
+        counters = [int(v) for v in take(7)]
+        self.k, self.latched, self.opened, self.plant_rest, self.muted, self.gate_until, self.cut = counters
         self.peak, deviation = take(2)
         self.failed = [v != 0.0 for v in take(6)]
         self.first, self.latest = [int(v) for v in take(len(_BITS))], [int(v) for v in take(len(_BITS))]
@@ -436,5 +465,7 @@ class StructuredRule:
         state = take(self.core.size)
         res.load(max(self.k, 0), numbers[at:])
         self.core.tune(deviation)
-        self.core.set_used(tuple(not f and (i != TORQUE or self.core.has_torque) for i, f in enumerate(self.failed)))
+        self._use(tuple(not f and (i != TORQUE or self.core.has_torque) for i, f in enumerate(self.failed)))
+        if self.gate_until >= 0:
+            self.core.open_gates(True)
         self.core.state[:] = state

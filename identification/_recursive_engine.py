@@ -76,9 +76,9 @@ def _trigger(function: Any, arguments: list[FloatArray], results: list[FloatArra
     """A CasADi function bound to fixed memory."""
     buffer, trigger = function.buffer()
     for i, item in enumerate(arguments):
-        buffer.set_arg(i, memoryview(item))
+        buffer.set_arg(i, item.data)
     for i, item in enumerate(results):
-        buffer.set_res(i, memoryview(item))
+        buffer.set_res(i, item.data)
 
     def call(_keep: tuple[Any, ...] = (buffer, arguments, results), run: Callable[[], None] = trigger) -> None:
         run()

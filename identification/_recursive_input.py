@@ -12,6 +12,8 @@ FloatArray = npt.NDArray[np.float64]
 
 def doubles(value: npt.ArrayLike, asked: str, name: str) -> FloatArray:
     """An array of doubles from anything array-like."""
+    if np.iscomplexobj(value):
+        raise InputError(f"{asked}: {name} is complex; give real numbers")
     try:
         return np.ascontiguousarray(value, dtype=np.float64) if np.ndim(value) else np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:

@@ -24,7 +24,18 @@ VERDICT_KERNELS: Final = {"motor": 0.03, "link": 0.12, "transmission": 0.06, "su
 @final
 @dataclass(frozen=True)
 class BalanceError:
-    """Error of one balance: RMS, noise floor, ratio of the two (rows near reversals count with their own floor)."""
+    """Error of one balance.
+
+    Attributes
+    ----------
+    rms : float
+        Weighted by what noise allows in each row: rows at a reversal or at standstill count less.
+    floor : float
+        What measurement noise alone would leave.
+    ratio : float
+        RMS of residual over noise, row by row: 1 where only noise is left.
+    unit : str
+    """
 
     rms: float
     floor: float
@@ -74,7 +85,10 @@ def assess(model: JointModel, data: Dataset, records: Sequence[WeakRecord], valu
     weights = row_weights(balances, data, values, {b: max(floor[b], 1e-12) for b in floor}, records)
     unit = "N.m" if model.kind == "rotary" else "N"
     errors = {
-        b: BalanceError(rms(residual[b]), floor[b], rms(residual[b] * weights[b]) if floor[b] > 0 else math.inf, unit)
+        b: BalanceError(
+            rms(residual[b] * weights[b]) / max(rms(weights[b]), 1e-300), floor[b],
+            rms(residual[b] * weights[b]) if floor[b] > 0 else math.inf, unit,
+        )
         for b in balances.balances
     }  # fmt: skip
     r = np.concatenate([residual[b] for b in balances.balances])

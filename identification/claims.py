@@ -175,9 +175,10 @@ def _still_helps(other: Trial, best: Trial) -> bool:
     )
 
 
-def simplest(best: Trial, names: Sequence[str], ranking: Ranking) -> Trial:
+def simplest(best: Trial, names: Sequence[str], ranking: Ranking, refused: frozenset[str] = frozenset()) -> Trial:
     """Of the names that cannot be told apart, the one with the fewest parameters."""
-    alike = [t for t in ranking.trials if t.key in names and t.candidate.label in ranking.significant]
+    usable = ranking.significant - refused
+    alike = [t for t in ranking.trials if t.key in names and t.candidate.label in usable]
     return min(alike or [best], key=lambda t: (len(t.values), t.key not in COMMON, -t.score))
 
 

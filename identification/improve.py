@@ -204,7 +204,9 @@ class _Loop:
         base = make_base(steps[-1].solution, self.data)
         first = ranking = rank(base)
         late = False
-        while len(claims) < max_additions:
+        for _ in range(2 * max_additions):
+            if len(claims) >= max_additions:
+                break
             best = ranking.best(frozenset(self.refused))
             if best is None and not late and max(e.ratio for e in steps[-1].held_out.balances.values()) > RATIO_LIMIT:
                 late = True
@@ -213,7 +215,7 @@ class _Loop:
             if best is None:
                 break
             names = confusion_set(best, ranking.everything, base)
-            best = simplest(best, names, ranking)
+            best = simplest(best, names, ranking, frozenset(self.refused))
             claim = make_claim(best, ranking, base, names)
             if len(claim.effects) > 4:
                 break

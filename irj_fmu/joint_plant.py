@@ -6,14 +6,16 @@ quantities on the motor shaft, link quantities on the link, with the names of a 
 
 from __future__ import annotations
 
+import math
 import re
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, Final, Literal, final
 
 import casadi as ca
-import numpy as np
 
 from casadi_models import JointModel
+from casadi_models.functions import JointFunctions
 from casadi_models.parameter import LINEAR_UNITS, Parameter
 from identification.channels import channel_unit
 from identification.errors import InputError
@@ -115,7 +117,7 @@ class _Builder:
         self.by_current = kind == "current" and per_current is not None
         terms = model.true_equations.memory_terms
         self.stepped = any(term.effect.rate is None for term, *_ in terms)
-        needs = _used_inputs(self.functions, self.stepped)
+        needs = _used_inputs(self.functions)
         self.heated = needs[1]
         self.clocked = needs[2] or self.stepped or options.sensors
         self.own_parameters = model.parameters
@@ -188,7 +190,7 @@ class _Builder:
         channels = self._readings(f.outputs(full, model_input, p), drive)
         if options.sensors:
             readings = Readings(self._parameter, clock, options.sample_time)
-            channels = [replace_expression(pair, readings) for pair in channels]
+            channels = [readings.read(*pair) for pair in channels]
         every = ca.vertcat(p, *(symbol for _, symbol in self.extra))
         arguments = [x, u, every, *([z] if self.stepped else [])]
         states = [*mechanical, *([] if self.stepped else memory)]
@@ -206,7 +208,7 @@ class _Builder:
             ),
             outputs=tuple(variable for variable, _ in channels),
             description=self._description(),
-            update=self._update(x, z, u, every, p) if self.stepped else None,
+            update=self._update(arguments, model_input, p) if self.stepped else None,
             memory=tuple(memory) if self.stepped else (),
             default_step=options.sample_time,
             tolerance=options.tolerance,
@@ -249,24 +251,15 @@ class _Builder:
             found.append((Variable("motor_torque", unit, description="Motor torque on its shaft."), drive / ratio))
         return found
 
-    def _update(self, x: Any, z: Any, u: Any, every: Any, p: Any) -> Any:
+    def _update(self, arguments: list[Any], model_input: Any, p: Any) -> Any:
         """Step form of the displacement memory between two states."""
         f, size = self.functions, len(self.functions.state_names)
+        x, u, every, z = arguments
         before = ca.SX.sym("x_prev", x.shape[0])
-        drive = self._again(x, u)
-        here = ca.vertcat(drive, u[-1] if self.heated else 0, x[-1])
-        moved = f.memory_step(ca.vertcat(x[:size], z), here, p, before[:size], x[-1] - before[-1])
-        kept = ca.if_else(x[-1] > before[-1], moved, z)
+        duration = x[-1] - before[-1]
+        moved = _memory_step(f)(x[:size], before[:size], z, model_input, p, duration)
+        kept = ca.if_else(duration > 0, moved, z)
         return ca.Function("z", [x, z, u, every, before], [ca.densify(kept)])
-
-    def _again(self, x: Any, u: Any) -> Any:
-        """The drive once more, on the symbols that exist already."""
-        known = {variable.name: symbol for variable, symbol in self.extra}
-        kept, self._parameter = self._parameter, lambda name, *_: known[name]  # type: ignore[method-assign]
-        try:
-            return self._drive(x, u)
-        finally:
-            self._parameter = kept  # type: ignore[method-assign]
 
     def _description(self) -> str:
         parts = [f"Joint {self.model.name}", f"gear ratio {self.model.gear_ratio:g}"]
@@ -277,3 +270,37 @@ class _Builder:
         if self.options.sensors:
             parts.append("sensors")
         return "; ".join(parts) + "."
+
+
+def _variable(parameter: Parameter, value: float) -> Variable:
+    """An FMU parameter of a parameter of the model."""
+    side = "" if parameter.side == "none" else f" ({parameter.side} side)"
+    text = f"{parameter.meaning[:1].upper()}{parameter.meaning[1:]}{side}."
+    return Variable(
+        parameter.name, "" if parameter.unit == "1" else parameter.unit, value, _bound(parameter.low, value, min),
+        _bound(parameter.high, value, max), description=text, variability="tunable",
+    )  # fmt: skip
+
+
+def _bound(limit: float, value: float, widest: Callable[[float, float], float]) -> float | None:
+    """A finite bound that holds the value, which a fit may have put beyond it."""
+    return widest(limit, value) if math.isfinite(limit) else None
+
+
+def _used_inputs(functions: JointFunctions) -> tuple[bool, bool, bool]:
+    """Which of drive, temperature and time enter the dynamics or the readings."""
+    size = len(functions.state_names) + len(functions.memory_names)
+    x, u = ca.SX.sym("x", size), ca.SX.sym("u", 3)
+    p = ca.SX.sym("p", functions.dynamics.size1_in(2))
+    both = ca.vertcat(functions.dynamics(x, u, p), functions.outputs(x, u, p))
+    used = set(ca.jacobian_sparsity(both, u).get_triplet()[1])
+    return 0 in used, 1 in used, 2 in used
+
+
+def _memory_step(functions: JointFunctions) -> Any:
+    """(x, x before, z, u, p, duration) -> z after the step, from the step form of the declared memory."""
+    x, z, u, p = functions._symbols
+    where = ca.Function("where", [x, z, u, p], [ca.vertcat(*functions._memory_coordinates)])
+    before, duration = ca.SX.sym("before", x.shape[0]), ca.SX.sym("duration")
+    steps = ca.vertsplit(where(x, z, u, p) - where(before, z, u, p))
+    return ca.Function("moved", [x, before, z, u, p, duration], [functions._moved_memory(steps, duration)])

@@ -474,7 +474,9 @@ def test_joint_standstill_and_step(joint: ModuleType) -> None:
     for name in ("k1", "ka", "coulomb_motor"):
         last_outside = np.flatnonzero(~inside[:, joint.NAMES.index(name)])[-1]
         assert last_outside < 500, name
-    assert estimator.alarms == 2  # the wrong start values and the step
+    starts = np.flatnonzero(np.diff(run.alarm.astype(int)) == 1) * 1e-3
+    assert starts.size == 1  # the step alone, not the standstill
+    assert 60.0 <= starts[0] < 60.05
 
 
 # Start-up
@@ -494,7 +496,7 @@ def test_startup_names_and_freezes_what_the_window_cannot_carry() -> None:
     assert "b" in str(found)
     assert found.theta[1] == 7.0
     np.testing.assert_allclose(h @ found.theta, y, atol=1e-6)
-    np.testing.assert_allclose(found.singular_values[1], 0.0, atol=1e-9)
+    assert found.singular_values[1] < 1e-12 * found.singular_values.max()
     estimator.run(y, h)
     assert estimator.theta[1] == 7.0
     assert not estimator.excited[1]

@@ -158,22 +158,30 @@ def _match(
 
 
 def _claims(result: Json, orders: Mapping[str, float]) -> tuple[list[frozenset[str]], list[Json], set[str]]:
-    """Claims, the entries they come from, and hidden names that a line of the right order names."""
+    """Names by which each claim can be right, the entries they come from, and hidden names of right lines.
+
+    A periodic effect that only lines of a wrong order name is not found: its name is struck from every claim.
+    """
     entries = list(result["claims"])
-    claims = [frozenset(c["effects"]) for c in entries]
+    lines = result.get("lines", [])
+    periodic = frozenset(ORDERED)
+    missed = {
+        n for n, order in orders.items()
+        if any(n in x["effects"] for x in lines) and not any(_order_near(x, order) for x in lines)
+    }  # fmt: skip
+    claims = [frozenset(c["effects"]) - missed for c in entries]
     lined: set[str] = set()
-    periodic = {"kinematic_error", "torque_ripple"}
     right_lines = []
-    for line in result.get("lines", []):
+    for line in lines:
         owners = [n for n, order in orders.items() if _order_near(line, order)]
         if owners:
             right_lines.append(line)
             lined |= {n for n in owners if n in line["effects"] or n == "odd_order"}
-        elif line["effects"] and not any(frozenset(line["effects"]) <= c for c in claims):
+        elif line["effects"] and not any(set(line["effects"]) <= set(c["effects"]) for c in result["claims"]):
             entries.append(line)
-            claims.append(frozenset(line["effects"]))
+            claims.append(frozenset(line["effects"]) - periodic)
     if "odd_order" in orders and right_lines:  # "kinematic error of order 3.37" is true: not a claim against us
-        kept = [(c, e) for c, e in zip(claims, entries, strict=True) if not c <= periodic]
+        kept = [(c, e) for c, e in zip(claims, entries, strict=True) if not set(e["effects"]) <= periodic]
         claims, entries = [c for c, _ in kept], [e for _, e in kept]
     return claims, entries, lined
 
@@ -258,7 +266,7 @@ def score(truth: Mapping[str, Any], result: Json) -> Score:
     in_set = set(strict) | (lined & set(names))
     in_class = set(both) | in_set
     taken = set(both.values())
-    single = [i for i, c in enumerate(claims) if len(c) == 1]
+    single = [i for i, e in enumerate(entries) if len(e["effects"]) == 1]
     everything: frozenset[str] = frozenset().union(*accepted.values()) if accepted else frozenset()
     left = [i for i in range(len(claims)) if i not in taken]
     minor = [frozenset(m["effects"]) for m in result.get("minor", [])]
@@ -272,15 +280,15 @@ def score(truth: Mapping[str, Any], result: Json) -> Score:
         in_set_class=len(in_class),
         in_minor=sum(1 for n in names if n not in in_set and any(n in m for m in minor)),
         one_name=len(single),
-        one_name_right=sum(1 for i in single if next(iter(claims[i])) in names),
+        one_name_right=sum(1 for i in single if claims[i] & set(names)),
         one_name_right_class=sum(1 for i in single if claims[i] & everything),
         extra=len(left),
-        extra_names=tuple(tuple(sorted(claims[i])) for i in left),
+        extra_names=tuple(tuple(sorted(entries[i]["effects"])) for i in left),
         downgraded=sum(1 for i in left if entries[i].get("partial")),
         minor_extra=sum(1 for m in minor if not m & everything),
         top1=None if first is None or not names else first in names,
         top1_class=None if first is None or not names else first in everything,
-        set_sizes=tuple(len(claims[i]) for i in both.values()),
+        set_sizes=tuple(len(entries[i]["effects"]) for i in both.values()),
         verdict=str(result["verdict"]),
         balance_right=balance,
         axis_right=axis,

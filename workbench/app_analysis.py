@@ -1,0 +1,293 @@
+"""The loop in memory: records prepared once, then each click adds or removes an effect and fits again."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Final, final
+
+import numpy as np
+import numpy.typing as npt
+
+from casadi_models import EFFECTS, JointModel
+from identification.assess import Error, assess
+from identification.balances import Balances
+from identification.candidates import Trial, make_base
+from identification.claims import confusion_set, make_claim, rank, simplest
+from identification.engine import Dataset, Solution, load_dataset, prepared_model, references, solve, stack
+from identification.errors import InputError
+from identification.fit import joint_text
+from identification.improve import HOLD_DELAY, excitation_warnings, ranked_json, with_held_out
+from identification.joint_file import Joint
+from identification.parameters import parameter_table
+from identification.places import Rows, gather, places_of
+from identification.record import Record
+from workbench.app_records import thinned
+from workbench.session import StepEntry
+
+FloatArray = npt.NDArray[np.float64]
+Progress = Callable[[str, float], None]
+
+QUICK_TRAIN: Final = 100.0
+QUICK_HELD_OUT: Final = 50.0
+"""Seconds of record that a click fits and judges at once; longer records are taken in windows [s]."""
+
+
+def clean(value: Any) -> Any:
+    """Data for JSON: NaN and infinity become None, arrays become lists."""
+    if isinstance(value, Mapping):
+        return {str(k): clean(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple, frozenset, set)):
+        return [clean(v) for v in value]
+    if isinstance(value, np.ndarray):
+        return clean(value.tolist())
+    if isinstance(value, (float, np.floating)):
+        return float(value) if math.isfinite(value) else None
+    return value.item() if isinstance(value, np.generic) else value
+
+
+@final
+class Analysis:
+    """Records and joint of a session, prepared; holds the current solution and the tried candidates.
+
+    Parameters
+    ----------
+    joint : Joint
+    train, held_out : sequence of Record
+        Without held-out records the last part of each training record is held out.
+
+    Raises
+    ------
+    InputError
+        Records that do not carry the model.
+    """
+
+    def __init__(self, joint: Joint, train: Sequence[Record], held_out: Sequence[Record]) -> None:
+        if not train:
+            raise InputError("no record to fit: load one, or set the role of one to fit")
+        self.joint = joint
+        whole, held, self.note = with_held_out(list(train), list(held_out))
+        self.records = (*whole, *held)
+        self._train, self._held = whole, held
+        quick_train, quick_held = _share(whole, QUICK_TRAIN), _share(held, QUICK_HELD_OUT)
+        self.whole = quick_train is whole and quick_held is held
+        if not self.whole:
+            seconds = sum(r.duration for r in (*quick_train, *quick_held))
+            total = sum(r.duration for r in self.records)
+            part = f"clicks fit {seconds:.0f} s of the {total:.0f} s of record, in windows spread over it; Confirm fits all of it"
+            self.note = f"{self.note}; {part}" if self.note else part
+        self.start_model = prepared_model(joint, whole[0])
+        self.data = load_dataset(quick_train, quick_held, joint, self.start_model)
+        self.solution: Solution | None = None
+        self.trials: dict[str, Trial] = {}
+        self._rows: Rows | None = None
+        self._prepared: dict[str, tuple[Solution, Solution, StepEntry]] = {}
+
+    # --- models -----------------------------------------------------------------------------------------------------
+
+    def model_of(self, effects: Sequence[str], virtual_work: bool) -> JointModel:
+        """The model with these labels, in the form that the records carry."""
+        labels = tuple(label for label in effects if label != HOLD_DELAY)
+        made = prepared_model(replace(self.joint, model_name="hd1", effects=labels, virtual_work=virtual_work), self._train[0])
+        return made
+
+    def restore(self, step: StepEntry) -> None:
+        """Make the solution of a step of the ledger current again."""
+        model = self.model_of(step.effects, step.virtual_work)
+        self.solution = solve(model, self.data, start=step.values, iterations=1)
+        self.trials = {}
+
+    # --- verbs ------------------------------------------------------------------------------------------------------
+
+    def fit_start(self) -> StepEntry:
+        """Fit the start model."""
+        began = time.perf_counter()
+        self.solution = solve(self.start_model, self.data)
+        self.trials = {}
+        return self._entry("start", None, self.data, began)
+
+    def add(self, label: str, hint: Mapping[str, Any] | None = None) -> StepEntry:
+        """Add an effect and fit again from where the fit stands.
+
+        Parameters
+        ----------
+        label : str
+            Label of a candidate, or key of an effect.
+        hint : mapping, optional
+            Start values and form from a diagnosis: ``{"values", "virtual_work"}``.
+
+        Raises
+        ------
+        InputError
+            The effect is in the model already, or cannot be there.
+        """
+        began = time.perf_counter()
+        now = self._current()
+        ready = self._prepared.get(label)
+        if ready is not None and ready[0] is now:
+            self.solution, self.trials = ready[1], {}
+            return replace(ready[2], seconds=round(time.perf_counter() - began, 3))
+        solution = self._added(label, hint)
+        self.solution, self.trials = solution, {}
+        return self._entry("add", label, self.data, began)
+
+    def prepare(self, label: str, wanted: Callable[[], bool]) -> None:
+        """Fit a candidate ahead of the click, so that `add` has it at once."""
+        began, now = time.perf_counter(), self._current()
+        made = self._added(label, None)
+        if wanted():
+            self._prepared = {k: v for k, v in self._prepared.items() if v[0] is now}
+            self._prepared[label] = (now, made, self._entry("add", label, self.data, began, made))
+
+    def _added(self, label: str, hint: Mapping[str, Any] | None) -> Solution:
+        now = self._current()
+        trial = self.trials.get(label)
+        values = {**now.values, **(trial.values if trial else (hint or {}).get("values", {}))}
+        try:
+            model = trial.candidate.model if trial else now.model.add(label)
+        except (KeyError, ValueError) as error:
+            raise InputError(f"{label}: {error.args[0]}") from None
+        if not trial and hint and "virtual_work" in hint:
+            model = replace(model, virtual_work=bool(hint["virtual_work"]))
+        return solve(model, self.data, start=values)
+
+    def remove(self, label: str) -> StepEntry:
+        """Take an effect out of the model and fit again."""
+        began = time.perf_counter()
+        now = self._current()
+        try:
+            model = now.model.drop(label)
+        except (KeyError, ValueError) as error:
+            raise InputError(f"{label}: {error.args[0]}") from None
+        self.solution, self.trials = solve(model, self.data, start=now.values), {}
+        return self._entry("remove", label, self.data, began)
+
+    def diagnose(self, progress: Progress) -> dict[str, Any]:
+        """Try the whole library on the current model."""
+        now = self._current()
+        progress("projecting the model", 0.1)
+        base = make_base(now, self.data)
+        progress(f"trying {len(EFFECTS)} effects in every place", 0.2)
+        ranking = rank(base)
+        best = ranking.best()
+        claim = None
+        if best is not None:
+            names = confusion_set(best, ranking.everything, base)
+            best = simplest(best, names, ranking)
+            claim = make_claim(best, ranking, base, names).as_json() | {"label": best.candidate.label}
+        self.trials = {t.candidate.label: t for t in ranking.everything}
+        rows = []
+        for trial in ranking.trials:
+            e = trial.candidate.effect
+            rows.append(ranked_json(trial, trial.candidate.label in ranking.significant) | {
+                "label": trial.candidate.label, "values": dict(trial.values), "virtual_work": trial.candidate.model.virtual_work,
+                "absence": e.absence, "excitation": e.excitation, "source": e.source, "separate_by": e.separate_by,
+                "family": e.family, "contribution": trial.contribution, "score": trial.score,
+            })  # fmt: skip
+        unit = "N" if self.joint.kind == "linear" else "N.m"
+        out: dict[str, Any] = clean({
+            "ranking": rows, "claim": claim, "unit": unit, "warnings": excitation_warnings(self.data),
+            "not_testable": [{"effect": n.effect, "title": EFFECTS[n.effect].title, "why": n.why} for n in ranking.not_testable],
+        })  # fmt: skip
+        return out
+
+    def confirm(self, step: StepEntry, progress: Progress) -> StepEntry:
+        """Fit the current model to every sample, and judge it on every held-out sample."""
+        began = time.perf_counter()
+        progress("preparing every sample", 0.1)
+        data = load_dataset(self._train, self._held, self.joint, self.start_model)
+        progress("fitting every sample", 0.4)
+        now = self._current()
+        self.solution = solve(now.model, data, start=now.values, iterations=4)
+        made = self._entry(step.action, step.label, data, began)
+        self.restore(made)
+        return replace(made, exact=True)
+
+    # --- views ------------------------------------------------------------------------------------------------------
+
+    def compare(self) -> dict[str, Any]:
+        """Error, and places with the most telling first, on the held-out records."""
+        now = self._current()
+        rows = self._gathered()
+        residual = self._residuals()
+        found = places_of(residual, rows)
+        error = assess(now.model, self.data, self.data.held_out, now.values)
+        out: dict[str, Any] = clean({
+            "error": error.as_json(), "places": [p.as_json() for p in found], "worst": self._worst(residual, error, rows),
+            "records": list(self.data.held_out_names), "note": self.note,
+        })  # fmt: skip
+        return out
+
+    def balance_series(self, balance: str) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Time, measured torque and what the model explains of it, on the held-out records.
+
+        Raises
+        ------
+        InputError
+            The records have no such balance.
+        """
+        residual = self._residuals()
+        if balance not in residual:
+            raise InputError(f"no {balance} balance in these records; they have {', '.join(residual)}")
+        measured = references(self.data, self.data.held_out)[balance]
+        return self._gathered().axes["time"].values, measured, measured - residual[balance]
+
+    def parameters(self) -> dict[str, Any]:
+        """Table of the parameters of the current model."""
+        table = parameter_table(self._current(), self.data)
+        limits = {p.name: (p.low, p.high) for p in self._current().model.parameters}
+        out: dict[str, Any] = clean({n: {**row, "low": limits.get(n, (None, None))[0], "high": limits.get(n, (None, None))[1]} for n, row in table.items()})
+        return out
+
+    def to_joint_file(self) -> str:
+        """The fitted joint as the text of a joint file."""
+        now = self._current()
+        own = set(self.start_model.effects) - set(self.joint.effects)
+        kept = self.joint if own <= set(now.model.effects) else replace(self.joint, model_name="hd1")
+        return joint_text(kept, now, self.data)
+
+    # --- inside -----------------------------------------------------------------------------------------------------
+
+    def _current(self) -> Solution:
+        if self.solution is None:
+            raise InputError("no fit yet: press Fit first")
+        return self.solution
+
+    def _gathered(self) -> Rows:
+        if self._rows is None:
+            self._rows = gather(self.data, self.data.held_out)
+        return self._rows
+
+    def _residuals(self) -> dict[str, FloatArray]:
+        now = self._current()
+        return dict(stack(Balances(now.model, self.data.sensing, wrt=()), self.data.held_out, now.values).residual)
+
+    def _worst(self, residual: Mapping[str, FloatArray], error: Error, rows: Rows) -> dict[str, Any]:
+        """The two seconds in which the residual stands highest over its floor."""
+        stamps = rows.axes["time"].values
+        power = sum((r / max(error.balances[b].floor, 1e-12)) ** 2 for b, r in residual.items())
+        step = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1.0
+        width = max(1, min(len(stamps), round(2.0 / step)))
+        k = int(np.argmax(np.convolve(np.asarray(power), np.ones(width), "valid")))
+        where = {b: float(np.sum(r[k : k + width] ** 2)) / max(error.balances[b].floor, 1e-12) ** 2 for b, r in residual.items()}
+        return {"low": float(stamps[k]), "high": float(stamps[min(k + width, len(stamps) - 1)]), "balance": max(where, key=lambda b: where[b])}
+
+    def _entry(self, action: str, label: str | None, data: Dataset, began: float, made: Solution | None = None) -> StepEntry:
+        now = made or self._current()
+        train = assess(now.model, data, data.train, now.values)
+        held = assess(now.model, data, data.held_out, now.values)
+        key = label.partition("@")[0].partition("#")[0] if label else None
+        return StepEntry(
+            action, tuple(now.model.effects), {k: float(v) for k, v in now.values.items()}, clean(train.as_json()), clean(held.as_json()),
+            key, label, EFFECTS[key].title if key in EFFECTS else None, now.model.virtual_work, self.whole, round(time.perf_counter() - began, 3),
+        )  # fmt: skip
+
+
+def _share(records: list[Record], seconds: float) -> list[Record]:
+    """Records thinned to `seconds` in all; the same list where they are short enough."""
+    total = sum(r.duration for r in records)
+    if total <= 1.5 * seconds:
+        return records
+    return [thinned(r, seconds * r.duration / total) for r in records]
