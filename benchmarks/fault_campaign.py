@@ -97,7 +97,8 @@ def reference(seed: int, seconds: float) -> FloatArray:
     out = raw
     for _ in range(4):
         out = lfilter([1 - a], [1, -a], out)
-    velocity = np.gradient(out, DT)
+    out = np.asarray(out, dtype=np.float64)
+    velocity = np.asarray(np.gradient(out, DT), dtype=np.float64)
     return np.column_stack([out, velocity, np.gradient(velocity, DT)])
 
 
@@ -385,14 +386,16 @@ def regression(record: FloatArray, joint: JointModel) -> tuple[FloatArray, Float
 
 def _pairs() -> list[list[Fault]]:
     """Staggered, simultaneous and temporary faults of the link sensors, and one across the joint."""
-    noise, velocity = ("link_position", "noise"), ("link_velocity", "noise")
+    def noisy(sensor: str, start: float, end: float = float("inf")) -> Fault:
+        return Fault(sensor, "noise", start, 0.1, end)
+
     return [
-        [Fault(*noise, START, 0.1), Fault(*velocity, START + 2.0, 0.1)],
-        [Fault(*velocity, START, 0.1), Fault(*noise, START + 2.0, 0.1)],
-        [Fault(*noise, START, 0.1), Fault(*velocity, START, 0.1)],
-        [Fault(*noise, START, 0.1, START + 2.0)],
-        [Fault(*velocity, START, 0.1, START + 2.0)],
-        [Fault("motor_velocity", "noise", START, 0.1), Fault("link_position", "stuck", START + 2.0)],
+        [noisy("link_position", START), noisy("link_velocity", START + 2.0)],
+        [noisy("link_velocity", START), noisy("link_position", START + 2.0)],
+        [noisy("link_position", START), noisy("link_velocity", START)],
+        [noisy("link_position", START, START + 2.0)],
+        [noisy("link_velocity", START, START + 2.0)],
+        [noisy("motor_velocity", START), Fault("link_position", "stuck", START + 2.0)],
     ]  # fmt: skip
 
 

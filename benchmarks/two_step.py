@@ -10,7 +10,6 @@ import argparse
 import math
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -87,16 +86,16 @@ def table(seeds: int) -> None:
                 found = []
                 for method in ("variable_projection", "alternating"):
                     start = time.perf_counter()
-                    fit = TwoStep(model, method, settings=settings).fit(y, w)  # type: ignore[arg-type]
+                    fit = TwoStep(model, method, settings=settings).fit(y, w)
                     found.append((method, fit, time.perf_counter() - start))
                 reference = min(reference, *(f.sum_of_squares for _, f, _ in found if min(f.linear.values()) >= 0))
                 for method, fit, seconds in found:
                     excess = fit.sum_of_squares / reference - 1
                     rows.setdefault(method, []).append((excess, fit.evaluations, seconds, bool(fit.negative)))
             for method, results in rows.items():
-                excess, evaluations, seconds, repeated = (np.array(v) for v in zip(*results, strict=True))
+                over, evaluations, seconds, repeated = (np.array(v) for v in zip(*results, strict=True))
                 print(
-                    f"{name:11} {method:20} {np.sum(excess < 1 / len(w)):3d}/{seeds}  {np.sum(excess < 1e-5):3d}/{seeds} "
+                    f"{name:11} {method:20} {np.sum(over < 1 / len(w)):3d}/{seeds}  {np.sum(over < 1e-5):3d}/{seeds} "
                     f"{np.median(evaluations):8.0f} {np.max(evaluations):6.0f} {'':10} {np.mean(seconds):8.2f}"
                     f" {np.sum(repeated):8d}",
                     flush=True,

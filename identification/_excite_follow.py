@@ -123,6 +123,6 @@ class Follower:
             readings.append(reading)
         out, rate, reading = (np.concatenate(v, axis=1)[:, :samples] for v in (rows, rates, readings))
         return Followed(
-            time=np.arange(samples) * self.dt, drive=out[-1], states=out[:4].T.copy(),
+            time=np.arange(samples, dtype=np.float64) * self.dt, drive=out[-1], states=out[:4].T.copy(),
             accelerations=rate[[1, 3]].T.copy(), torque=reading[4],
         )  # fmt: skip

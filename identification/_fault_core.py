@@ -63,8 +63,8 @@ class ObserverCore:
         self.out = np.zeros(self._function.size1_out(0))
         self._buffer, self._trigger = self._function.buffer()
         for i, item in enumerate((self.state, self.readings, self.used, self.gain, self.gate)):
-            self._buffer.set_arg(i, memoryview(item))
-        self._buffer.set_res(0, memoryview(self.out))
+            self._buffer.set_arg(i, item.data)
+        self._buffer.set_res(0, self.out.data)
         self.set_used((True,) * 5 + (has_torque,))
 
     def _choose_substeps(self) -> int:

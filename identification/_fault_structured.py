@@ -8,6 +8,7 @@ from typing import Final, final
 import numpy as np
 import numpy.typing as npt
 
+from identification._fault_calibrate import calibrate, default_limits, default_recovery
 from identification._fault_core import (
     CURRENT,
     LINK_POSITION,
@@ -21,7 +22,6 @@ from identification._fault_core import (
 from identification._fault_residuals import (
     BIT_NAMES,
     COUNT,
-    ENERGY_RESIDUALS,
     LINK,
     LINK_JUMP,
     LINK_PARITY,
@@ -32,7 +32,6 @@ from identification._fault_residuals import (
     Residuals,
 )
 from identification._fault_types import FaultEvent, FaultSettings, Verdict
-from identification.errors import InputError
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -61,10 +60,10 @@ class StructuredRule:
                          "settle_seconds", "plant_rest_seconds")
         }  # fmt: skip
         self.waits["unlock"] = self.waits["settle_seconds"]
-        self.recover_limits = self._default_recovery()
+        self.recover_limits = default_recovery(core)
         self.widening = [[2.0] * 5 for _ in range(6)]
         self.calibrating = False
-        self._default_limits()
+        self.residuals.limits = default_limits(core, settings)
         self.reset()
 
     def reset(self) -> None:
@@ -89,105 +88,9 @@ class StructuredRule:
         self.core.set_used(used)
         self.gates: list[float] = [g if u else math.inf for g, u in zip(self.core.gate.tolist(), used[1:], strict=True)]
 
-    # --- limits ------------------------------------------------------------------------------------------------------
-
-    def _default_recovery(self) -> list[float]:
-        noise = self.core.noise
-        model = (30.0, 3e-4, 1e-2, 3e-4, 1e-2, 10.0)
-        return [8.0 * float(n) + m for n, m in zip(noise, model, strict=True)]
-
-    def floors(self) -> list[float]:
-        """Smallest limits: what noise and the joint's largest change of torque can do."""
-        core, lags = self.core, self.settings.lags
-        noise, dt = core.noise, core.dt
-        out = []
-        pairs = ((LINK_POSITION, LINK_VELOCITY), (MOTOR_POSITION, MOTOR_VELOCITY))
-        for position, velocity in pairs:
-            for lag in lags:
-                out.append(5.5 * math.sqrt(2.0 * noise[position] ** 2 + noise[velocity] ** 2 * dt * lag))
-        for velocity, gain in ((LINK_VELOCITY, core.link_gain), (MOTOR_VELOCITY, core.motor_gain)):
-            for i, lag in enumerate(lags):
-                jump = self.settings.torque_step * gain * lag if i == 0 else 0.0
-                out.append(max(jump, 5.5 * math.sqrt(2.0) * noise[velocity]))
-        torsion = math.hypot(float(noise[TORQUE]), core.stiffness * math.hypot(noise[LINK_POSITION], noise[MOTOR_POSITION]))
-        out.append(5.5 * torsion)
-        out.extend(5.5 * torsion * math.sqrt(dt / lag) for lag in lags[1:3])
-        return [float(v) for v in out]
-
-    def _default_limits(self) -> None:
-        """Limits without calibration: noise plus a guess of the model's error."""
-        core, floors = self.core, self.floors()
-        for i, gain in ((8, core.link_gain), (12, core.motor_gain)):
-            for j, lag in enumerate(self.settings.lags):
-                floors[i + j] += 10.0 * gain * min(lag, 0.5)
-        for i in (16, 17, 18):
-            floors[i] += 10.0
-        self.residuals.limits = floors
-
     def calibrate(self, readings: FloatArray) -> None:
         """Limits, noise of r1 and recovery limits from healthy readings (n, 6)."""
-        settings, res = self.settings, self.residuals
-        if len(readings) < 4 * self.arm:
-            raise InputError(f"calibrate: {len(readings)} samples; give at least {4 * self.arm} healthy ones")
-        if not np.isfinite(readings).all():
-            raise InputError("calibrate: the readings hold NaN or infinity; give a healthy record")
-        seen = self._watch(readings)
-        if self.core.has_torque:
-            self.core.tune(max(float(np.sqrt(np.mean(seen[:, 16] ** 2))), float(self.core.noise[TORQUE])))
-            seen = self._watch(readings)
-        floors = self.floors()
-        top = np.max(np.abs(seen[:, :COUNT]), axis=0)
-        res.limits = [max(f, settings.margin * float(t)) for f, t in zip(floors, top, strict=True)]
-        res.inverse = [
-            1.0 / max(float(np.mean(seen[:, at] ** 2)), (floors[at] / 8.0) ** 2 if at in (0, 4, 16) else 1e-30)
-            for at in ENERGY_RESIDUALS
-        ]
-        peaks = [self._energy_peak(seen[:, at], inverse) for at, inverse in zip(ENERGY_RESIDUALS, res.inverse, strict=True)]
-        res.energy_limits = [max(60.0, settings.energy_margin * peak) for peak in peaks]
-        longest = max(round(60.0 / self.core.dt), 2 * self.arm)
-        for sensor in range(6):
-            if sensor != TORQUE or self.core.has_torque:
-                self._calibrate_without(sensor, readings[-longest:])
-        self.reset()
-
-    def _energy_peak(self, values: FloatArray, inverse: float) -> float:
-        level = peak = 0.0
-        for gain in (values**2 * inverse - self.settings.energy_drift).tolist():
-            level = max(0.0, level + gain)
-            peak = max(peak, level)
-        return peak
-
-    def _watch(self, readings: FloatArray, without: int | None = None) -> FloatArray:
-        """Values of all residuals over healthy readings after the start-up, and one column more.
-
-        With a sensor left out, the last column is how far its reading lies from the estimate.
-        """
-        res = self.residuals
-        kept = (res.limits, res.inverse, res.energy_limits)
-        res.limits, res.inverse = [math.inf] * COUNT, [0.0] * len(res.inverse)
-        self.reset()
-        self.calibrating = True
-        if without is not None:
-            self.failed[without] = True
-            self._exchange([without])
-        out = np.zeros((len(readings), COUNT + 1))
-        for k, row in enumerate(readings):
-            used = self.update(row.tolist())
-            out[k, :COUNT] = res.values
-            if without is not None:
-                out[k, COUNT] = used[without] - row[without]
-        self.calibrating = False
-        res.limits, res.inverse, res.energy_limits = kept
-        return out[self.arm :]
-
-    def _calibrate_without(self, sensor: int, readings: FloatArray) -> None:
-        """What healthy readings give while one of them is replaced: recovery limit, and wider residual limits."""
-        seen = np.max(np.abs(self._watch(readings, sensor)), axis=0)
-        limits, margin = self.residuals.limits, self.settings.margin
-        self.recover_limits[sensor] = max(margin * float(seen[COUNT]), 6.0 * float(self.core.noise[sensor]))
-        for i in range(5):
-            rows = range(4 * i, 4 * i + 4) if i < 4 else range(16, COUNT)
-            self.widening[sensor][i] = max(1.0, *(margin * float(seen[j]) / limits[j] for j in rows if limits[j] > 0))
+        calibrate(self, readings)
 
     # --- one sample --------------------------------------------------------------------------------------------------
 
@@ -389,9 +292,9 @@ class StructuredRule:
             self.failed[s] = True
             self.good[s] = 0
             self.low[s], self.high[s] = math.inf, -math.inf
-        self._exchange(sensors)
+        self.exchange(sensors)
 
-    def _exchange(self, sensors: list[int]) -> None:
+    def exchange(self, sensors: list[int]) -> None:
         """The readings in use have changed."""
         used = tuple(not f and (i != TORQUE or self.core.has_torque) for i, f in enumerate(self.failed))
         self._use(used)
@@ -426,7 +329,7 @@ class StructuredRule:
                 self.failed[s] = False
             names = tuple(SENSORS[s] for s in back)
             self.events.append(FaultEvent(self.k, self.k, Verdict.RECOVERED, names, ()))
-            self._exchange(back)
+            self.exchange(back)
 
     # --- state -------------------------------------------------------------------------------------------------------
 

@@ -8,7 +8,14 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from identification._fault_core import LINK_POSITION, LINK_VELOCITY, MOTOR_POSITION, MOTOR_VELOCITY, SENSORS, ObserverCore
+from identification._fault_core import (
+    LINK_POSITION,
+    LINK_VELOCITY,
+    MOTOR_POSITION,
+    MOTOR_VELOCITY,
+    SENSORS,
+    ObserverCore,
+)
 from identification._fault_types import FaultEvent, Verdict
 from identification.errors import InputError
 

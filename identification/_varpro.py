@@ -143,7 +143,7 @@ class Projection:
             raise InputError(f"two-step: phi is not finite at {dict(zip(self.model.shape_names, eta, strict=True))}")
         scale = np.linalg.norm(matrix, axis=0)
         scale[scale == 0] = 1.0
-        r = np.linalg.qr(np.column_stack([matrix / scale, target]), mode="r")
+        r: FloatArray = np.asarray(np.linalg.qr(np.column_stack([matrix / scale, target]), mode="r"))
         p = len(scale)
         found = Reduced(z.copy(), r[:p, :p], r[:p, p], scale, float(r[p, p] ** 2) if len(r) > p else 0.0)
         self.seen.append(found)

@@ -155,7 +155,8 @@ def _solve(
 ) -> _Solution:  # fmt: skip
     if method == "alternating":
         z, theta = alternating_search(problem, settings)
-        square, negative = 2.0 * _square(problem, z, theta), ()
+        square = 2.0 * _square(problem, z, theta)
+        negative: tuple[str, ...] = ()
     else:
         z, theta, square, negative = _project(problem, settings, start)
     deviations, rank_lost = cramer_rao(problem, z, theta, square)

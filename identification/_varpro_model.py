@@ -288,8 +288,8 @@ class _Mapped:
             out = np.zeros((block, one.size2_out(0), one.size1_out(0)))
             buffer, trigger = function.buffer()
             for i, item in enumerate([given, *held]):
-                buffer.set_arg(i, memoryview(item))
-            buffer.set_res(0, memoryview(out))
+                buffer.set_arg(i, item.data)
+            buffer.set_res(0, out.data)
             kept[block] = (function, buffer, trigger, given, held, out)
         _, _, trigger, given, held, out = kept[block]
         return trigger, given, held, out

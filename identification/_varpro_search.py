@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Literal, final
 
@@ -98,14 +99,12 @@ def global_search(problem: Projection, settings: TwoStepSettings) -> FloatArray:
     ends: list[FloatArray] = []
     reserve = problem.budget
     problem.budget = max(problem.evaluations + 1, int(0.93 * reserve))
-    try:
+    with suppress(BudgetSpent):
         found = mcs(problem.objective, np.column_stack([problem.low, problem.high]), max_evaluations=max(share, 3))
-        for minimum in (found, *found.basket):
-            _polish_new(problem, np.asarray(minimum.x), ends, settings)
+        for point in (found.x, *(minimum.x for minimum in found.basket)):
+            _polish_new(problem, point, ends, settings)
         for start in hypercube(settings.starts, problem.low, problem.high, settings.seed):
             _polish_new(problem, start, ends, settings)
-    except BudgetSpent:
-        pass
     return finish(problem, settings, reserve)
 
 
@@ -113,10 +112,8 @@ def finish(problem: Projection, settings: TwoStepSettings, budget: int) -> Float
     """Fine polish of the best point seen, within the evaluations that are left."""
     problem.budget = budget
     if problem.low.size:
-        try:
+        with suppress(BudgetSpent):
             polish(problem, problem.best().z, settings.fine)
-        except BudgetSpent:
-            pass
     return problem.best().z
 
 
@@ -131,10 +128,8 @@ def _polish_new(problem: Projection, start: FloatArray, ends: list[FloatArray], 
 def warm_search(problem: Projection, start: FloatArray, settings: TwoStepSettings) -> FloatArray:
     """Least squares from the present shape parameters only."""
     reserve = problem.budget
-    try:
+    with suppress(BudgetSpent):
         polish(problem, start, 1e-8)
-    except BudgetSpent:
-        pass
     return finish(problem, settings, reserve)
 
 
@@ -152,15 +147,13 @@ def repeat_non_negative(problem: Projection, settings: TwoStepSettings, budget: 
     ends: list[FloatArray] = []
     width = np.maximum(problem.high - problem.low, 1e-300)
     tried: list[FloatArray] = []
-    try:
+    with suppress(BudgetSpent):
         for reduced in ranked:
             if all(np.max(np.abs(reduced.z - t) / width) > 0.1 for t in tried):
                 tried.append(reduced.z)
                 _polish_new(problem, reduced.z, ends, settings)
             if len(tried) >= settings.starts + 4:
                 break
-    except BudgetSpent:
-        pass
     return finish(problem, settings, reserve)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import final
 
@@ -94,14 +95,12 @@ def simplex_fit(
     problem = Projection(model, y, signals, weights, settings.max_evaluations)
     problem.tick = tick
     given = np.array([min(max(start.get(s.name, s.nominal), s.low), s.high) for s in model.shapes])
-    try:
+    with suppress(BudgetSpent):
         minimize(
             problem.objective, problem.inner(given), method="Nelder-Mead",
             bounds=np.column_stack([problem.low, problem.high]),
             options={"maxfev": settings.max_evaluations, "xatol": 1e-6, "fatol": 1e-12},
         )  # fmt: skip
-    except BudgetSpent:
-        pass
     found = dict(zip(model.shape_names, problem.outer(problem.best().z).tolist(), strict=True))
     end = fit(model, y, signals, weights, method="variable_projection", settings=settings, start=found, tick=tick)
     return replace(end, evaluations=end.evaluations + problem.evaluations)

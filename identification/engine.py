@@ -297,7 +297,7 @@ def solve(model: JointModel, data: Dataset, *, iterations: int = 15, start: Mapp
     values.update({n: v for n, v in fixed.items() if v is not None})
     limits = bounds_of(model, known, data)
     shapes = {p.name for p in model.parameters if p.is_shape}
-    frozen_shapes = {p.name for p in model.parameters if p.is_shape and p.scale == "absolute" and p.name.endswith("exponent")}
+    frozen_shapes: set[str] = set()
     free = [n for n in model.parameter_names if n not in fixed and n not in frozen_shapes]
     balances = Balances(model, data.sensing, wrt=free)
     memory_shapes = _memory_shapes(model, free)

@@ -8,6 +8,8 @@ from typing import Final
 
 _SUPERSCRIPT: Final = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 MINUS: Final = "−"
+SPACE: Final = "\u00a0"
+"""Between a number and its sign of unit: no line break."""
 
 
 def number(value: float | None, digits: int = 4) -> str:
@@ -63,9 +65,25 @@ def pretty_unit(unit: str) -> str:
 def percent(value: float | None, digits: int = 3) -> str:
     """A percentage with its sign of percent; a dash where there is none."""
     text = number(value, digits)
-    return text if text == "–" else f"{text} %"
+    return text if text == "–" else f"{text}{SPACE}%"
 
 
 def words(name: str) -> str:
     """A name of a file's vocabulary as words: ``motor_viscous`` as motor viscous."""
     return name.replace("_", " ")
+
+
+def ratio(value: float | None) -> str:
+    """A ratio to the noise, as 14.6 ×; two decimals where it is small, so that 1.00 × can be told from 0.96 ×."""
+    if value is None or not math.isfinite(value):
+        return f"{number(value)}{SPACE}×"
+    return f"{value:.2f}{SPACE}×" if abs(value) < 10 else f"{number(value, 3)}{SPACE}×"
+
+
+def interval(low: float, high: float) -> str:
+    """Two ends to the same decimal place, as 0.00 to 0.16: two digits of the span."""
+    span = abs(high - low)
+    if not (math.isfinite(span) and 1e-4 <= span < 1e6):
+        return f"{number(low, 3)} to {number(high, 3)}"
+    places = max(1 - math.floor(math.log10(span)), 0)
+    return f"{low:.{places}f} to {high:.{places}f}".replace("-0." + "0" * places + " ", "0." + "0" * places + " ").replace("-", MINUS)

@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
-from identification.formats import number, percent, pretty_unit, with_error, words
+from identification.formats import number, percent, pretty_unit, ratio, with_error, words
 from identification.pictures import bar, place_picture, staircase_picture
 
 if TYPE_CHECKING:
@@ -36,6 +36,7 @@ BALANCES: Final = {
     "axis": "drive torque against everything that moves, seen from one side",
 }
 STRONG_CORRELATION: Final = 0.95
+WIDE: Final = 4
 SHOWN_PLACES: Final = 4
 
 
@@ -63,7 +64,8 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], caption: str, *, c
         kind = f' class="{classes[i]}"' if i < len(classes) and classes[i] else ""
         cells = "".join(f"<td>{c}</td>" for c in row[1:])
         body.append(f'<tr{kind}><th scope="row">{row[0]}</th>{cells}</tr>')
-    return f"<table><caption>{caption}</caption><thead><tr>{top}</tr></thead><tbody>{''.join(body)}</tbody></table>"
+    wide = ' class="wide"' if len(head) > WIDE else ""
+    return f"<table{wide}><caption>{caption}</caption><thead><tr>{top}</tr></thead><tbody>{''.join(body)}</tbody></table>"
 
 
 def title_of(key: str) -> str:
@@ -76,11 +78,13 @@ def title_of(key: str) -> str:
 def verdict_html(result: Mapping[str, Any], level: int = 2) -> str:
     """Headline and sentence of an `improve --json` result."""
     headline = HEADLINES.get(result["verdict"], words(result["verdict"]))
+    if result["verdict"] == "unexplained" and result["claims"]:
+        headline = "Found a part of what is missing; something is left"
     return f"<h{level}>{text(headline)}</h{level}><p>{text(result.get('reason', ''))}</p>"
 
 
 def _ratios(balances: Mapping[str, Mapping[str, Any]], names: Sequence[str]) -> list[str]:
-    return [f"{number(balances[n]['ratio'], 3)} ×" if n in balances else "–" for n in names]
+    return [ratio(balances[n]["ratio"]) if n in balances else "–" for n in names]
 
 
 def floor_percent(error: Mapping[str, Any]) -> float | None:
@@ -149,17 +153,19 @@ def ranking_html(
     """The ranked effects: what adding one alone would lower, its estimate, and what it is mistaken for."""
     values = {t.key: trial_values(t) for t in trials}
     claimed = {k: c for c in result["claims"] for k in c["effects"]}
-    head = ["effect", "acts on", "held-out error falls by", "state", "estimate", "easily mistaken for"]
+    head = ["effect", "acts on", "seen in", "held-out error falls by", "state", "estimate", "easily mistaken for"]
     rows, classes = [], []
     for i, r in list(enumerate(result["ranking"], 1))[first:last]:
         drop = r["held_out_drop_percent"]
-        state = "claimed" if r["effect"] in claimed else "over the threshold" if r["significant"] else "under the threshold"
+        state = "over the threshold" if r["significant"] else "under the threshold"
+        if r["effect"] in claimed:
+            state = "claimed" if r["significant"] else "claimed in a later step"
         rows.append([
-            f"{i}. {text(r['title'])}", f"{text(words(r.get('place', '')))} ({text(r['balance'])} balance)",
-            f"{bar(drop, f'{drop:.0f} percent')} {percent(drop, 2)}", state, values.get(r["effect"], ""),
+            f"{i}. {text(r['title'])}", text(words(r.get("place", ""))), f"{text(r['balance'])} balance",
+            f'<span class="nowrap">{bar(drop, f"{drop:.0f} percent")} {percent(drop, 2) if drop > 0 else "no fall"}</span>', state, values.get(r["effect"], ""),
             ", ".join(title_of(k) for k in r["confusable_with"]) or "–",
         ])  # fmt: skip
-        classes.append("" if r["significant"] else "under")
+        classes.append("" if r["significant"] or r["effect"] in claimed else "under")
     return table(head, rows, caption or "Effects of the library, each tried alone on the start model", classes=classes)
 
 
@@ -226,7 +232,7 @@ def error_html(error: Mapping[str, Any], caption: str) -> str:
     """An error: relative, fit, and each balance with its noise floor."""
     rows = [
         [f"{text(n)} balance", f"{number(b['rms'], 3)} {pretty_unit(b['unit'])}", f"{number(b['floor'], 3)} {pretty_unit(b['unit'])}",
-         f"{number(b['ratio'], 3)} ×"]
+         ratio(b["ratio"])]
         for n, b in error["balances"].items()
     ]  # fmt: skip
     whole = f"{caption}: relative error {percent(error['relative_error_percent'])}, fit {percent(error['fit_percent'])}"

@@ -83,7 +83,7 @@ def _axes(frame: Frame, x_label: str, y_label: str, *, x_ticks: bool = True) -> 
     if x_ticks:
         for t in ticks(*frame.x, 5):
             x = frame.across(t)
-            out.append(f'<path class="s-grid" stroke="{GRID}" d="M{x:.1f} {base}v4"/>' + _text(x, base + 16, number(t, 3)))
+            out.append(f'<path class="s-grid" stroke="{GRID}" d="M{x:.1f} {base}v4"/>' + _text(min(x, WIDTH - 16), base + 16, number(t, 3)))
     out.append(_text((LEFT + WIDTH - RIGHT) / 2, frame.height - 6, x_label))
     middle = (TOP + base) / 2
     out.append(_text(11, middle, y_label, "middle", f' transform="rotate(-90 11 {middle:.1f})"'))

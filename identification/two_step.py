@@ -65,7 +65,8 @@ class TwoStep:
 
     def __init__(
         self, model: SeparableModel, method: Method = "variable_projection", *, weights: npt.ArrayLike | None = None,
-        settings: TwoStepSettings | None = None, online: OnlineSettings | None = None, recursive: Settings | None = None,
+        settings: TwoStepSettings | None = None, online: OnlineSettings | None = None,
+        recursive: Settings | None = None,
     ) -> None:  # fmt: skip
         if method not in ("variable_projection", "alternating"):
             raise InputError(f"TwoStep: unknown method {method!r}; use 'variable_projection' or 'alternating'")
@@ -219,7 +220,8 @@ class TwoStep:
             self._quiet_until = self._samples + self.online.samples(self.online.rest_seconds)
             self._enter(Mode.RECURSIVE, f"linear parameters explain it: {ratio:.2f} of the noise")
             return
-        self._start_search(count, warm=True, mode=Mode.REOPTIMISING, why=f"linear parameters leave {ratio:.2f} of the noise")
+        why = f"linear parameters leave {ratio:.2f} of the noise"
+        self._start_search(count, warm=True, mode=Mode.REOPTIMISING, why=why)
 
     def _start_search(self, count: int, *, warm: bool, mode: Mode, why: str) -> None:
         """Begin the search on the last samples (steps 6 and 11)."""

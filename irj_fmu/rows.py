@@ -26,6 +26,8 @@ BoolArray = npt.NDArray[np.bool_]
 SOURCES: Final = ("motor_position", "link_position", "torque", "drive")
 """Signals that are sampled; the others follow from them on the kernel."""
 _NAMES: Final = Signals.names()
+_SHARP: Final = 2e-3
+"""A smoothing velocity above this is a law of its own, below it only stands for a jump [rad/s]."""
 _LENGTH, _OVERLAP, _POINT_STEP = 0.06, 4, 0.002
 
 
@@ -233,7 +235,7 @@ class RowMaker:
         ]  # fmt: skip
         index, order, source = (np.array(column) for column in zip(*self._place, strict=True))
         self._index, self._flat = index, order * len(SOURCES) + source
-        self._centre = centre
+        self._velocity_gain = float(np.linalg.norm(kernel(t.pointwise, t.dt, 1)))
 
     def _slope_function(self, expressions: Mapping[str, Any], signals: Any, p: Any) -> Any:
         own = ca.vertcat(*expressions.values())
@@ -300,6 +302,15 @@ class RowMaker:
             return None
         table = full.reshape(len(self.balances), self.width)
         return table[:, 0].copy(), -table[:, 1:]
+
+    def standstill(self, place: str, noise: float) -> float:
+        """Share of the newest points at which a side stands still, as far as its noise lets one see."""
+        if not self.needed:
+            return 0.0
+        column = _NAMES.index(f"{place}_velocity")
+        values = dict(zip(self.model.parameter_names, self.model.value_vector(), strict=True))
+        slow = max(3 * noise * self._velocity_gain, 2 * min(values.get(f"{place}_smoothing_velocity", 0.0), _SHARP))
+        return float(np.mean(np.abs(self._in[0][:, column]) < slow))
 
     # --- noise -------------------------------------------------------------------------------------------------------
 

@@ -40,7 +40,9 @@ def still(rows: int) -> tuple[FloatArray, FloatArray]:
 
 def free_run(changes: dict[str, float], state: list[float], step: float = STEP) -> FloatArray:
     joint = {"JM": 4.4, "JL": 10.3, "TG": -105.0, "K": 2.15e4, "N": 160.0, "NKM": 8.8, **changes}
-    return simulate([pack(joint)], [still(1000)], [np.array(state)], [np.zeros((0, 3))], dt=DT, pre_roll=0.0, step=step)[0]
+    return simulate(
+        [pack(joint)], [still(1000)], [np.array(state)], [np.zeros((0, 3))], dt=DT, pre_roll=0.0, step=step
+    )[0]
 
 
 def energy(table: FloatArray, k3: float = 0.0) -> FloatArray:
@@ -166,12 +168,20 @@ def balance_ratios(table: FloatArray, ratio: float, truth: dict[str, float]) -> 
         return np.convolve(y, k, "valid")
 
     jm, jl, k = truth["motor_inertia_kg_m2"], truth["link_inertia_kg_m2"], truth["stiffness_Nm_per_rad"]
-    bm, bl, c = truth["motor_viscous_Nms_per_rad"], truth["link_viscous_Nms_per_rad"], truth["structural_damping_Nms_per_rad"]
+    bm, bl, c = (
+        truth["motor_viscous_Nms_per_rad"],
+        truth["link_viscous_Nms_per_rad"],
+        truth["structural_damping_Nms_per_rad"],
+    )
     v, vl = f(q, d), f(ql, d)
     # away from reversals, over the whole window, where the friction does not depend on its smoothing
     away = np.convolve((np.abs(np.convolve(table[:, 5], np.ones(15) / 15, "same")) < 0.08), np.ones(31), "valid") < 0.5
     m = f(ratio * KM * i - t, w) - f(q, jm * dd + bm * d) - truth["motor_coulomb_Nm"] * np.sign(v)
-    li = f(t + truth["gravity_torque_Nm"] * np.sin(ql), w) - f(ql, jl * dd + bl * d) - truth["link_coulomb_Nm"] * np.sign(vl)
+    li = (
+        f(t + truth["gravity_torque_Nm"] * np.sin(ql), w)
+        - f(ql, jl * dd + bl * d)
+        - truth["link_coulomb_Nm"] * np.sign(vl)
+    )
     tr = f(t, w) - f(q - ql, k * w + c * d)
     norm = np.linalg.norm
     expected = {
@@ -243,6 +253,7 @@ def test_unloaded_is_the_same_joint_without_gravity() -> None:
     loaded = simulate_case("motor_constant_error", 1, overrides=story, records=("train",), span=3.0)
     free = simulate_case("motor_constant_error", 1, overrides=story, unloaded=True, records=("train",), span=3.0)
     assert free.parameters["TG"] == 0.0
+    assert free.truth["hidden"] == {"motor_constant_error": {"motor_constant_factor": 0.82}}
     assert {k for k in loaded.parameters if loaded.parameters[k] != free.parameters[k]} == {"TG", "JL"}
     # steady slow motion: the current carries friction only
     torque = free.exact["train"][:, 6]
@@ -263,7 +274,7 @@ def test_written_table_reads_back(tmp_path: Path) -> None:
 
 
 def answer(*claims: list[str], first: str | None = None, **more: Any) -> dict[str, Any]:
-    step = {"added": None, "effects": [], "parameters": {},
+    step: dict[str, Any] = {"added": None, "effects": [], "parameters": {},
             "held_out": {"balances": {"motor": {"rms": 4.0, "unit": "N.m", "floor": 1.0, "ratio": 4.0}}}}  # fmt: skip
     last = {**step, "held_out": {"balances": {"motor": {"rms": 1.0, "unit": "N.m", "floor": 1.0, "ratio": 1.0}}}}
     found = [{"effects": c, "balance": "motor", "held_out_drop_percent": 50.0} for c in claims]
@@ -302,7 +313,14 @@ def test_score_of_sets_classes_and_extras() -> None:
 
 def test_score_of_lines() -> None:
     truth = about("torque_ripple", torque_ripple={"ripple_order_per_motor_turn": 4.0})
-    line = {"order": 4.0, "per": "motor turn", "tolerance": 0.02, "amplitude": 1.0, "unit": "N.m", "effects": ["torque_ripple"]}
+    line = {
+        "order": 4.0,
+        "per": "motor turn",
+        "tolerance": 0.02,
+        "amplitude": 1.0,
+        "unit": "N.m",
+        "effects": ["torque_ripple"],
+    }
     assert score(truth, answer(lines=[line])).in_set == 1
     wrong = score(truth, answer(lines=[{**line, "order": 3.0}]))
     assert (wrong.in_set, wrong.extra) == (0, 1)
@@ -330,7 +348,9 @@ def oracle(train: list[Path], held_out: list[Path], joint: Path) -> dict[str, An
     name = truth["hidden_effect"]
     if truth["outside"]:
         return answer(verdict="unexplained", unexplained=[{"balance": truth["balance"][name], "share_percent": 90}])
-    return answer(*([name],) if name else (), first=name or "stribeck", verdict="complete" if name else "nothing_missing")
+    return answer(
+        *([name],) if name else (), first=name or "stribeck", verdict="complete" if name else "nothing_missing"
+    )
 
 
 def test_campaign_counts_and_reports(tmp_path: Path) -> None:

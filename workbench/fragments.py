@@ -9,7 +9,8 @@ from typing import Any, Final
 
 from casadi_models import EFFECTS
 from casadi_models.parameter import LINEAR_UNITS
-from identification.formats import number, percent, pretty_unit, words
+from identification.assess import VERDICT_KERNELS
+from identification.formats import interval, number, percent, pretty_unit, ratio, words
 from identification.html import BALANCES, table, text, title_of
 from identification.improve import RATIO_LIMIT, Improvement
 from identification.lines import Line
@@ -21,8 +22,6 @@ from workbench.plots import Overlay, ReportPlots, StepPlace
 
 SHOWN_PER_BALANCE: Final = 3
 TELLING_STRENGTH: Final = 2.5
-NEVER_AT: Final = 0.1
-"""Share of the largest mean residual below which a curve counts as flat."""
 
 PATTERNS: Final[Mapping[frozenset[str], str]] = {
     frozenset(("motor",)): "a physical effect on the motor side (friction, ripple, inertia), or the current: its offset, its ripple, the motor constant",
@@ -73,16 +72,23 @@ def pattern_html(improvement: Improvement) -> str:
     for b, e in first.items():
         end = improvement.final_ratios.get(b, last[b])
         rows.append([
-            f"{text(b)} balance", text(BALANCES.get(b, "")), f"{number(e.ratio, 3)} ×", f"{number(last[b].ratio, 3)} ×", f"{number(end.ratio, 3)} ×",
-            "over the noise" if end.ratio > RATIO_LIMIT else "at the noise",
+            f"{text(b)} balance", text(BALANCES.get(b, "")), ratio(e.ratio), ratio(last[b].ratio), ratio(end.ratio),
+            _state(e.ratio, end.ratio),
         ])  # fmt: skip
-    kinds = ["flagged" if e.ratio > RATIO_LIMIT else "" for e in first.values()]
+    kinds = ["flagged" if improvement.final_ratios.get(b, last[b]).ratio > RATIO_LIMIT else "" for b in first]
     head = ["balance", "what it compares", "start model", "after the additions", "at the verdict", "state"]
     note = (
         f"1 × means: only measurement noise is left. Above {number(RATIO_LIMIT)} × counts as over the noise. "
-        "At the verdict each balance is averaged over the time at which complete models were found to read 1 ×."
+        f"Start and additions: all balances averaged over {number(1e3 * improvement.data.kernel)} ms. At the verdict each balance is averaged over the time "
+        f"at which complete models read 1 ×: {', '.join(f'{text(b)} {number(1e3 * VERDICT_KERNELS[b])} ms' for b in first)}."
     )
     return f"<p>{text(meaning)}.</p>{table(head, rows, 'Residual ÷ noise, held-out records', classes=kinds)}<p class='note'>{note}</p>"
+
+
+def _state(start: float, end: float) -> str:
+    if end > RATIO_LIMIT:
+        return "over the noise"
+    return "was over the noise, now at it" if start > RATIO_LIMIT else "at the noise"
 
 
 def telling(p: Place) -> bool:
@@ -122,9 +128,9 @@ def places_html(improvement: Improvement, plots: ReportPlots) -> str:
     count = dict.fromkeys(over, 0)
     first: Place | None = None
     for before, after in plots.places:
-        if before.balance in count and telling(before) and count[before.balance] < SHOWN_PER_BALANCE:
+        if before.balance in count and count[before.balance] < SHOWN_PER_BALANCE:
             count[before.balance] += 1
-            first = first or before
+            first = first or (before if telling(before) else None)
             shown.append(place_figure(before, after))
         else:
             rest.append(place_figure(before, after))
@@ -140,6 +146,8 @@ def places_html(improvement: Improvement, plots: ReportPlots) -> str:
     body = f"<p>{sentence} A flat curve at zero is a model that fits there.</p>{_legend(len(improvement.steps) > 1)}"
     if shown:
         body += f"<div class='grid'>{''.join(shown)}</div>"
+    if not rest:
+        return body
     return body + f"<details><summary>All other balances and signals ({len(rest)})</summary><div class='grid'>{''.join(rest)}</div></details>"
 
 
@@ -184,7 +192,7 @@ def unexplained_sentence(u: Unexplained, linear: bool) -> str:
         by = ", differently in the two directions of motion" if u.by_direction else ""
         out += f"; {number(u.share_percent, 2)} % of it depend on the {text(AXIS_TITLES.get(u.axis, words(u.axis)))}{by}"
         if u.low is not None and u.high is not None:
-            out += f", mostly between {number(u.low, 3)} and {number(u.high, 3)} {unit}"
+            out += f", mostly at {interval(u.low, u.high)} {unit}"
     if u.order is not None:
         out += f"; it repeats {number(u.order)} times per turn of the motor"
     if u.frequency_hz is not None:
@@ -229,7 +237,7 @@ def overlay_html(shown: Sequence[Overlay]) -> str:
         f'<span role="group" aria-label="Time window">{buttons}</span></div>'
         '<p id="overlay-status" class="note" aria-live="polite"></p>'
         '<div id="overlay" tabindex="0" role="group" aria-label="Measured and modelled torque over time; arrow keys move, plus and minus zoom">'
-        '<div id="overlay-torque" class="chart"></div><div id="overlay-residual" class="chart"></div><div id="overlay-whole" class="chart"></div></div>'
+        '<div id="overlay-torque" class="chart"></div><div id="overlay-residual" class="chart"></div><p class="note">The whole record; drag to choose a window.</p><div id="overlay-whole" class="chart"></div></div>'
         "<noscript><p>These three plots need scripts; every other part of this page does without.</p></noscript>"
     )
 

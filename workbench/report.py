@@ -7,16 +7,18 @@ import hashlib
 import json
 import os
 import platform
+import re
 import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from importlib import metadata, resources
+from itertools import count
 from pathlib import Path
 from typing import Any, Final
 
 from identification.errors import InputError
-from identification.formats import number, percent
+from identification.formats import percent, ratio
 from identification.html import (
     claims_html,
     floor_percent,
@@ -115,7 +117,7 @@ def _sections(improvement: Improvement, result: dict[str, Any], plots: ReportPlo
         ranked = ranking_html(result, trials, last=RANKED_SHOWN)
         if rest > 0:
             ranked += f"<details><summary>{rest} more</summary>{ranking_html(result, trials, first=RANKED_SHOWN, caption='The others')}</details>"
-        ranked += "<p class='note'>Grey: under the threshold, so not to be told from chance or too small to matter. Each effect is tried alone; falls do not add up.</p>"
+        ranked += "<p class='note'>Grey: under the threshold, so not to be told from chance or too small to matter. Each effect is tried alone and in a quick way, so falls do not add up; the fall of a claim above is the one after the whole fit.</p>"
     final = result["steps"][-1]["parameters"] if result["steps"] else {}
     start = result["steps"][0]["parameters"] if len(result["steps"]) > 1 else None
     return [
@@ -144,7 +146,7 @@ def _tiles(result: dict[str, Any]) -> str:
         return ""
     first, last = result["steps"][0]["held_out"], result["steps"][-1]["held_out"]
     floor = floor_percent(last)
-    names = ", ".join(f"{text(b)} {number(e['ratio'], 2)} ×" for b, e in result["floor_ratio"].items())
+    names = ", ".join(f"{text(b)} {ratio(e['ratio'])}" for b, e in result["floor_ratio"].items())
     before = f"{percent(first['relative_error_percent'])} → " if len(result["steps"]) > 1 else ""
     tiles = [
         ("error on records the fit never saw", f"{before}{percent(last['relative_error_percent'])}"),
@@ -180,12 +182,12 @@ def _overlay(plots: ReportPlots, where: str) -> str:
 
 def _scrollable(body: str) -> str:
     """Tables in regions that scroll by themselves on a narrow screen and can be reached by keyboard."""
-    pieces = body.split("<table>")
-    out = [pieces[0]]
-    for i, piece in enumerate(pieces[1:], 1):
-        inside, rest = piece.split("</table>", 1)
-        out.append(f'<div class="scroll" role="region" aria-label="Table {i}" tabindex="0"><table>{inside}</table></div>{rest}')
-    return "".join(out)
+    numbers = count(1)
+
+    def wrapped(found: re.Match[str]) -> str:
+        return f'<div class="scroll" role="region" aria-label="Table {next(numbers)}" tabindex="0">{found.group()}</div>'
+
+    return re.sub(r"<table\b.*?</table>", wrapped, body, flags=re.DOTALL)
 
 
 def versions() -> dict[str, str]:

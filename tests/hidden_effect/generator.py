@@ -213,6 +213,9 @@ def simulate_case(
         table[:, 2:4] *= ratio
     noise = _stream(seed, label, "noise", unloaded)
     measured = {name: _sense(noise, table, sensor) for name, table in exact.items()}
+    hidden = {n: dict(d.truth) for n, d in draws.items()}
+    if "motor_constant_error" in hidden:
+        hidden["motor_constant_error"]["motor_constant_factor"] = values["KM"]
     truth: dict[str, object] = {
         "hidden_effect": None if not names else names[0] if len(names) == 1 else list(names),
         "outside": [n for n in names if n in OUTSIDE],
@@ -222,7 +225,8 @@ def simulate_case(
         "options": {"size": size, "dirt": dirt, "unloaded": unloaded, "side": side},
         "link_referred": {text: values[key] for key, text in _TRUTH.items()}
         | {"friction_smoothing_rad_s": values["M_V0"]},
-        "hidden": {n: dict(d.truth) for n, d in draws.items()} | ({"dirt": extra} if dirt else {}),
+        "hidden": hidden | ({"dirt": dict(extra)} if dirt else {}),
+        "overrides": dict(overrides or {}),
         "note": "kinematic error: T = k (q_m - q_l + A sin(order |N| q_m + phase)); cyclic: A sin(q_l + phase)",
     }
     return Case(ratio, values, exact, measured, truth)

@@ -63,6 +63,7 @@
         [entry.data[0], entry.data[4]], boxes[2])
     ];
     show(range[0], range[1]);
+    requestAnimationFrame(function () { show(range[0], range[1]); });
   }
   function rms(rows, low, high) {
     var t = rows[0], y = rows[1], sum = 0, n = 0;
@@ -118,13 +119,14 @@
   });
   if (window.matchMedia) { window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", build); }
   var width = 0;
-  new ResizeObserver(function () {
+  new ResizeObserver(function () { requestAnimationFrame(fit); }).observe(area);
+  function fit() {
     if (Math.abs(area.clientWidth - width) > 2) {
       width = area.clientWidth;
       charts.forEach(function (c, i) { c.setSize({ width: Math.max(boxes[i].clientWidth, 200), height: c.height }); });
       show(range[0], range[1]);
     }
-  }).observe(area);
+  }
   build();
   width = area.clientWidth;
 })();

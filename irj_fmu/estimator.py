@@ -1,0 +1,281 @@
+"""The estimator FMU: the online estimator of a joint file behind FMI variables."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+from identification.channels import channel_unit
+from identification.errors import InputError
+from identification.joint_file import Joint, load_joint
+
+from .online import FAULT_TEXT, OnlineEstimator, OnlineOptions, held_parameters, prepared
+from .rows import linear_parameters
+from .slave_base import Health, TableSlave
+from .variables import Value, Variable
+from .watch import Q_L, READINGS, W_L
+
+JOINT_FILE: Final = "joint.toml"
+OPTIONS_FILE: Final = "estimator.toml"
+DETECTOR_FILE: Final = "detector.bin"
+_BALANCE_TEXT: Final = {
+    "motor": "motor balance", "link": "link balance", "transmission": "transmission balance",
+    "sum": "sum of motor and link balance", "deflection": "motor balance with the torsion for a torque sensor",
+    "axis": "balance of the axis",
+}  # fmt: skip
+
+
+def estimator_variables(joint: Joint, options: OnlineOptions) -> tuple[Variable, ...]:
+    """Inputs, parameters and outputs of a joint's estimator besides those every slave has."""
+    model, sensing = prepared(joint, options)
+    names = linear_parameters(model, sensing, held_parameters(joint))
+    balances = sensing.balances
+    return (
+        *_inputs(joint), *_parameters(options), *_estimates(joint, names, model),
+        *(
+            variable for b in balances
+            for variable in (
+                Variable(f"residual.{b}", _torque(joint), causality="output", description=f"Residual of the {_BALANCE_TEXT[b]}, newest row."),
+                Variable(f"ratio.{b}", minimum=0.0, causality="output", description=f"Residual of the {_BALANCE_TEXT[b]}, root mean square of the last seconds over its floor."),
+            )
+        ),
+        Variable("q_l_hat", channel_unit("link_position", joint.kind), causality="output", description="Link position; the estimate where its reading is missing or failed."),
+        Variable("w_l_hat", channel_unit("link_velocity", joint.kind), causality="output", description="Link velocity; the estimate where its reading is missing or failed."),
+        Variable("fault", start=0, minimum=0, maximum=99, causality="output", kind="integer", description=f"{FAULT_TEXT}."),
+        *(
+            Variable(f"fault_score[{i}]", minimum=0.0, causality="output", description=f"How near the residuals with {name} are to their limits (1: at the limit).")
+            for i, name in enumerate(READINGS, 1)
+        ),
+        Variable("n_rows", start=0, minimum=0, causality="output", kind="integer", description="Rows of the balances so far."),
+        Variable("alarm", start=False, causality="output", kind="boolean", description="The recursion has seen a change and lets the parameters move."),
+    )  # fmt: skip
+
+
+def _torque(joint: Joint) -> str:
+    return channel_unit("link_torque", joint.kind)
+
+
+def _inputs(joint: Joint) -> list[Variable]:
+    by_current = joint.torque_per_current is not None
+    drive = Variable(
+        "i_m" if by_current else "tau_m", channel_unit("motor_current" if by_current else "motor_torque", joint.kind),
+        causality="input", description="Motor current." if by_current else "Motor torque on the motor shaft.",
+    )  # fmt: skip
+    channels = {"q_m": "motor_position", "w_m": "motor_velocity", "q_l": "link_position", "w_l": "link_velocity", "tau_l": "link_torque"}
+    found = [drive]
+    for name, channel in channels.items():
+        found.append(
+            Variable(name, channel_unit(channel, joint.kind), causality="input", description=f"{channel.replace('_', ' ').capitalize()}.")
+        )
+    found.append(Variable("enable", start=True, causality="input", kind="boolean", description="False holds the estimate."))
+    found += [
+        Variable(f"valid.{name}", start=True, causality="input", kind="boolean", description=f"False where {name} is missing.")
+        for name in (drive.name, *channels)
+    ]
+    return found
+
+
+def _parameters(options: OnlineOptions) -> list[Variable]:
+    tunable: dict[str, Any] = {"causality": "parameter", "variability": "tunable"}
+    return [
+        Variable("joint_file", start="", causality="parameter", kind="string", description="Path of a joint file in place of the packed one; it must have the same estimated parameters."),
+        Variable("warm_up", "s", options.warm_up, 0.1, causality="parameter", description="First window, from which the recursion starts."),
+        Variable("detect", start=options.detect, causality="parameter", kind="boolean", description="Run the fault detector; it needs an elastic joint with fitted values."),
+        Variable("drift", "1/s", options.drift, 0.0, 10.0, description="Forgetting in calm: drift of a parameter as a share of its prior range in one second.", **tunable),
+        Variable("alarm_drift", "1/s", options.alarm_drift, 0.0, 100.0, description="Forgetting in an alarm, as drift.", **tunable),
+        Variable("floor_share", start=options.floor_share, minimum=0.0, maximum=1.0, description="A balance's floor is never below this share of the torque it balances.", **tunable),
+        Variable("fault_margin", start=1.0, minimum=1e-3, description="Factor on the limits of the fault detector.", **tunable),
+        Variable("reset", start=False, kind="boolean", description="Set to true: start anew.", **tunable),
+    ]  # fmt: skip
+
+
+def _estimates(joint: Joint, names: tuple[str, ...], model: Any) -> list[Variable]:
+    known = {p.name: p for p in model.parameters}
+    values = dict(zip(model.parameter_names, model.value_vector(), strict=True))
+    found = []
+    for i, name in enumerate(names, 1):
+        p = known[name]
+        unit = "" if p.unit == "1" else p.unit
+        found.append(Variable(f"theta[{i}]", unit, values[name], causality="output", description=f"{name}: {p.meaning}."))
+    for i, name in enumerate(names, 1):
+        p = known[name]
+        unit = "" if p.unit == "1" else p.unit
+        found.append(Variable(f"sigma[{i}]", unit, minimum=0.0, causality="output", description=f"{name}: standard deviation."))
+    return found
+
+
+class Estimator(TableSlave):
+    """Estimates a joint's parameters from its readings; see :class:`irj_fmu.online.OnlineEstimator`."""
+
+    default_sample_time = 1e-3
+    summary = "Online estimation of the parameters of a geared joint, with residuals of its balances and fault detection."
+
+    def __init__(self, **kwargs: Any) -> None:
+        folder = Path(str(kwargs.get("resources") or "."))
+        self._packed = load_joint(folder / JOINT_FILE)
+        self._fixed = load_options(folder / OPTIONS_FILE)
+        detector = folder / DETECTOR_FILE
+        self._detector_state = detector.read_bytes() if detector.is_file() else None
+        self.__dict__["variables"] = estimator_variables(self._packed, self._fixed)
+        self._estimator: OnlineEstimator | None = None
+        self._setup: tuple[Any, ...] = ()
+        self._lost: frozenset[int] = frozenset()
+        self._held: dict[int, Value] = {}
+        self._told = 0
+        self._reset_before = False
+        super().__init__(**kwargs)
+        self._places()
+
+    def _places(self) -> None:
+        """Where inputs and outputs stand in the table."""
+        drive = "i_m" if self._packed.torque_per_current is not None else "tau_m"
+        self._drive = drive
+        self._six = [self._index[n] for n in (drive, *READINGS[1:])]
+        self._flags = [self._index[f"valid.{n}"] for n in (drive, *READINGS[1:])]
+        ratio = self._packed.gear_ratio
+        per_unit = self._packed.torque_per_current if drive == "i_m" else ratio
+        self._gains = [float(per_unit or 1.0), 1.0 / ratio, 1.0 / ratio, 1.0, 1.0, 1.0]
+        self._enable = self._index["enable"]
+        self._q_at, self._fault_at = self._index["q_l_hat"], self._index["fault"]
+        count = sum(1 for v in self.table if v.name.startswith("theta["))
+        self._theta_at, self._sigma_at = self._index["theta[1]"], self._index["sigma[1]"]
+        self._thetas = count
+
+    # --- life --------------------------------------------------------------------------------------------------------
+
+    def configure(self, parameters: Mapping[str, Value]) -> None:
+        """Build the estimator where what it is built from has changed; take the tunable parameters over."""
+        setup = tuple(parameters[n] for n in ("sample_time", "joint_file", "warm_up", "detect"))
+        options = replace(
+            self._fixed, warm_up=float(parameters["warm_up"]), detect=bool(parameters["detect"]),
+            drift=float(parameters["drift"]), alarm_drift=float(parameters["alarm_drift"]),
+            floor_share=float(parameters["floor_share"]),
+        )  # fmt: skip
+        if self._estimator is None or setup != self._setup:
+            self._estimator = self._build(str(parameters["joint_file"]), float(parameters["sample_time"]), options)
+            self._setup = setup
+        elif options != self._estimator.options:
+            self._estimator.retune(options)
+        self._estimator.set_fault_margin(float(parameters["fault_margin"]))
+        if parameters["reset"] and not self._reset_before:
+            self._estimator.reset()
+        self._reset_before = bool(parameters["reset"])
+        self._publish()
+
+    def _build(self, path: str, dt: float, options: OnlineOptions) -> OnlineEstimator:
+        joint = load_joint(path) if path else self._packed
+        made = OnlineEstimator(joint, dt, options, self._detector_state if not path else None)
+        if len(made.names) != self._thetas or joint.gear_ratio != self._packed.gear_ratio:
+            raise InputError(f"{path}: has other estimated parameters or another gear ratio than the packed joint file")
+        return made
+
+    # --- a sample ----------------------------------------------------------------------------------------------------
+
+    def _sample(self, time: float, length: float) -> None:
+        """Readings that are not finite count as missing; the others of that sample are used."""
+        values = self._values
+        lost = [i for i in self._reals if not math.isfinite(values[i])]  # type: ignore[arg-type]
+        if not lost:
+            super()._sample(time, length)
+            return
+        names = ", ".join(self.table[i].name for i in lost)
+        self._report(f"input not finite: {names}; it counts as missing")
+        kept = {i: values[i] for i in lost}
+        for i in lost:
+            values[i] = self._held.get(i, 0.0)
+        self._lost = frozenset(lost)
+        try:
+            super()._sample(time, length)
+        finally:
+            self._lost = frozenset()
+            for i, value in kept.items():
+                values[i] = value
+
+    def process(self, time: float, step: float, inputs: Mapping[str, Value]) -> Mapping[str, Value]:
+        """Take one sample; see :class:`OnlineEstimator`."""
+        estimator = self._estimator
+        if estimator is None:
+            raise InputError("the estimator is not configured; see the first message of the log")
+        values, lost = self._values, self._lost
+        raw = [float(values[i]) for i in self._six]
+        gains = self._gains
+        readings = [raw[0] * gains[0], raw[1] * gains[1], raw[2] * gains[2], raw[3], raw[4], raw[5]]
+        flags = [bool(values[i]) for i in self._flags]
+        if lost:
+            flags = [flag and i not in lost for flag, i in zip(flags, self._six, strict=True)]
+        else:
+            self._held = dict(zip(self._six, raw, strict=True))
+        if estimator.update(time, readings, flags, enable=bool(values[self._enable])):
+            self._publish()
+        values[self._q_at], values[self._q_at + 1] = estimator.readings[Q_L], estimator.readings[W_L]
+        fault = estimator.fault
+        if fault != values[self._fault_at]:
+            values[self._fault_at] = fault
+            if fault:
+                self._report(f"fault {fault} at t = {time:g} s ({FAULT_TEXT})")
+        if lost or fault > 8:
+            return {"health": int(Health.NUMERIC_TROUBLE)}
+        return {"health": int(Health.WARMING_UP)} if estimator.warming_up else {}
+
+    def _publish(self) -> None:
+        """Copy the estimates into the outputs."""
+        estimator, values, at = self._estimator, self._values, self._index
+        if estimator is None:
+            return
+        n = self._thetas
+        values[self._theta_at : self._theta_at + n] = estimator.theta.tolist()
+        values[self._sigma_at : self._sigma_at + n] = estimator.sigma.tolist()
+        first = at[f"residual.{estimator.balances[0]}"]
+        for b, (residual, ratio) in enumerate(zip(estimator.residual.tolist(), estimator.ratio.tolist(), strict=True)):
+            values[first + 2 * b], values[first + 2 * b + 1] = residual, ratio
+        score = at["fault_score[1]"]
+        values[score : score + 6] = estimator.score  # type: ignore[assignment]
+        values[at["n_rows"]] = estimator.made
+        values[at["alarm"]] = estimator.alarm
+        for text in estimator.events[self._told :]:
+            self._report(text)
+        self._told = len(estimator.events)
+
+    # --- state -------------------------------------------------------------------------------------------------------
+
+    def get_state(self) -> bytes:
+        """Everything the estimator remembers."""
+        return b"" if self._estimator is None else self._estimator.state()
+
+    def set_state(self, state: bytes) -> None:
+        """Take up what :meth:`get_state` returned."""
+        if not state or self._estimator is None:
+            return
+        self._estimator.restore(state)
+        self._told = len(self._estimator.events)
+
+
+def load_options(path: Path) -> OnlineOptions:
+    """Options that an estimator was built with.
+
+    Raises
+    ------
+    InputError
+        Where the file is not one that :func:`options_text` wrote.
+    """
+    import tomllib
+
+    try:
+        return OnlineOptions(**tomllib.loads(path.read_text(encoding="utf-8")))
+    except (OSError, tomllib.TOMLDecodeError, TypeError) as error:
+        raise InputError(f"{path}: not the options of an estimator ({error}); build the FMU again") from error
+
+
+def options_text(options: OnlineOptions) -> str:
+    """The options as TOML."""
+    from dataclasses import asdict
+
+    return "".join(
+        f"{name} = {str(value).lower() if isinstance(value, bool) else repr(float(value))}\n" for name, value in asdict(options).items()
+    )
+
+
+__all__ = ["DETECTOR_FILE", "JOINT_FILE", "OPTIONS_FILE", "Estimator", "estimator_variables", "load_options", "options_text"]

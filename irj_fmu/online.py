@@ -1,0 +1,535 @@
+"""The online estimator of a joint: balances, recursive least squares, checks, fault detection; no FMI in it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Final, final
+
+import numpy as np
+import numpy.typing as npt
+
+from casadi_models import JointModel
+from identification.errors import InputError
+from identification.joint_file import Joint
+from identification.recursive import RecursiveLeastSquares, Settings
+from identification.sensing import Sensing, adapt
+
+from .rows import SOURCES, RowMaker
+from .state_bytes import pack, unpack
+from .watch import DRIVE, Q_L, Q_M, READINGS, SAMPLED, TAU, W_L, W_M, Watch
+
+if TYPE_CHECKING:
+    from identification.fault import FaultDetector
+
+FloatArray = npt.NDArray[np.float64]
+
+BALANCES: Final = ("motor", "link", "transmission")
+NONE, MISSING, CONSTANT, SCALED = 0, 10, 20, 30
+CURRENT_OR_FRICTION, PLANT = 7, 8
+FAULT_TEXT: Final = (
+    "0 none; 1 to 6 sensor failed: motor current, motor position, motor velocity, link position, link velocity, "
+    "torque; 7 current sensor or motor friction; 8 the joint changed; 11 to 16 reading missing, 21 to 26 reading "
+    "constant while the joint moves, 31 to 36 reading of wrong scale, in the same order"
+)
+_RESIDUAL_SECONDS: Final = 2.0
+
+
+@final
+@dataclass(frozen=True)
+class OnlineOptions:
+    """Tuning of the online estimator.
+
+    Attributes
+    ----------
+    has_link, has_torque : bool
+        Whether there are a link encoder and a torque sensor.
+    warm_up : float
+        First window, from which the recursion starts [s]; 7 s in the thesis.
+    drift, alarm_drift : float
+        Forgetting: drift of a parameter as a share of its prior range per sqrt(s), in calm and in an alarm.
+    floor_share : float
+        A balance's floor is never below this share of the torque it balances.
+    detect : bool
+        Run the fault detector; it needs an elastic joint whose values are known.
+    """
+
+    has_link: bool = True
+    has_torque: bool = True
+    warm_up: float = 7.0
+    drift: float = 3e-3
+    alarm_drift: float = 1.0
+    floor_share: float = 1e-3
+    detect: bool = True
+
+
+def sensing_of(model: JointModel, options: OnlineOptions) -> Sensing:
+    """Balances that the joint's sensors allow.
+
+    Raises
+    ------
+    InputError
+        Where the model is elastic and there is no link encoder.
+    """
+    common: dict[str, Any] = {"both_positions": options.has_link, "has_drive": True, "has_temperature": False}
+    if options.has_torque:
+        found = ["motor", *(["link"] if options.has_link else [])]
+        if model.is_elastic:
+            if not options.has_link:
+                raise InputError(f"{model.name}: an elastic model needs the link position; use a rigid one (hd1, hd2)")
+            found.append("transmission")
+        return Sensing(tuple(found), has_torque=True, **common)
+    if model.is_elastic:
+        if not options.has_link:
+            raise InputError(f"{model.name}: an elastic model needs the link position; use a rigid one (hd1, hd2)")
+        return Sensing(("sum", "deflection"), has_torque=False, **common)
+    return Sensing(("axis",), has_torque=False, **common)
+
+
+def prepared(joint: Joint, options: OnlineOptions) -> tuple[JointModel, Sensing]:
+    """The joint's model adapted to its sensors, known values filled in."""
+    model = joint.model()
+    sensing = sensing_of(model, options)
+    model = adapt(model, sensing, joint.known)
+    known = {k: v.value for k, v in joint.known.items() if v.value is not None and k in model.parameter_names}
+    return model.with_values(known), sensing
+
+
+def held_parameters(joint: Joint) -> frozenset[str]:
+    """Parameters the estimator leaves alone: known ones, delays, gains that hide in all others."""
+    delays = {"drive_delay", "torque_sensor_delay", "link_position_sensor_delay"}
+    return frozenset(k for k, v in joint.known.items() if v.value is not None) | delays
+
+
+@final
+class OnlineEstimator:
+    """Estimates the linear parameters of a joint sample by sample.
+
+    Parameters
+    ----------
+    joint : Joint
+        The joint file; shapes of friction laws are held at its values.
+    dt : float
+        Sample time [s].
+    options : OnlineOptions, optional
+    detector_state : bytes, optional
+        State of a calibrated :class:`identification.fault.FaultDetector` of this joint.
+
+    Attributes
+    ----------
+    names, theta, sigma
+        Estimated parameters, values and standard deviations, link-referred SI.
+    residual, floor, ratio : (balances,) array
+        Residual of the last row, floor, and root mean square of the last seconds over the floor.
+    fault, score
+        See :data:`FAULT_TEXT`; how far each reading's residuals are from their limits (1: at the limit).
+    """
+
+    def __init__(
+        self, joint: Joint, dt: float, options: OnlineOptions | None = None, detector_state: bytes | None = None
+    ) -> None:
+        self.joint, self.dt = joint, dt
+        self.options = options or OnlineOptions()
+        self.model, self.sensing = prepared(joint, self.options)
+        self.rows = RowMaker(self.model, self.sensing, dt, held_parameters(joint))
+        self.names, self.balances = self.rows.names, self.rows.balances
+        self._units = {p.name: p for p in self.model.parameters}
+        used = self.rows.uses.any(axis=0)
+        self._needs = [False] * 6
+        for k, reading in enumerate(SAMPLED):
+            self._needs[reading] = bool(used[k])
+        present = [True, True, True, self.options.has_link, self.options.has_link, self.options.has_torque]
+        self.present = tuple(present)
+        self.watch = Watch(dt, self.present)
+        self._detector_state, self._margin = detector_state, 1.0
+        self.detector = self._make_detector() if self.options.detect else None
+        self._collect = max(2 * len(self.names), round(self.options.warm_up / (self.rows.timing.stride * dt)))
+        self._friction = [
+            [self.names.index(n) for t in self.model.terms if t.place == place and t.effect.key in ("coulomb", "stribeck")
+             for n in t.names[:1] if n in self.names]
+            for place in ("motor", "link")
+        ]  # fmt: skip
+        self.reset()
+        self._recursion(self.theta)  # its functions are made here and not inside a step
+
+    def _make_detector(self) -> FaultDetector | None:
+        if not (self.model.is_elastic and self.joint.fitted):
+            return None
+        from identification.fault import FaultDetector
+
+        made = FaultDetector(self.model, self.dt, has_torque=self.options.has_torque)
+        if self._detector_state:
+            made.restore(self._detector_state)
+            made.reset()
+        return made
+
+    # --- life --------------------------------------------------------------------------------------------------------
+
+    def reset(self) -> None:
+        """Before the first sample."""
+        t, count, n = self.rows.timing, len(self.balances), len(self.names)
+        self.rows.reset()
+        self.watch.reset()
+        if self.detector is not None:
+            self.detector.reset()
+        self._buffer = np.zeros((4 * t.window, len(SOURCES)))
+        self._end = self._since = self._rows = 0
+        self._started = False
+        self._last_good = [0.0] * 6
+        self._lost = [0] * len(SOURCES)
+        self._collected: list[tuple[FloatArray, FloatArray]] = []
+        self.estimator: RecursiveLeastSquares | None = None
+        self._scale = np.ones(n)
+        values = dict(zip(self.model.parameter_names, self.model.value_vector(), strict=True))
+        self.theta = np.array([values[name] for name in self.names])
+        self.sigma = np.zeros(n)
+        self.residual, self.floor, self.ratio = np.zeros(count), np.zeros(count), np.zeros(count)
+        self._square, self._torque = np.zeros(count), np.zeros(count)
+        self.fault, self.score = NONE, [0.0] * 6
+        self.plant_alarm = 0
+        self.readings = [0.0] * 6
+        self.events: list[str] = []
+
+    @property
+    def warming_up(self) -> bool:
+        """True until the recursion has started."""
+        return self.estimator is None
+
+    @property
+    def made(self) -> int:
+        """Rows so far."""
+        return self._rows
+
+    @property
+    def alarm(self) -> bool:
+        """True while the recursion follows a change."""
+        return self.estimator is not None and self.estimator.alarm
+
+    def set_fault_margin(self, factor: float) -> None:
+        """Multiply the fault detector's limits."""
+        if self.detector is None or factor == self._margin:
+            return
+        residuals = self.detector._rule.residuals
+        residuals.limits = [limit * factor / self._margin for limit in residuals.limits]
+        self._margin = factor
+
+    @property
+    def delay(self) -> float:
+        """Age of the newest row [s]."""
+        return self.rows.timing.delay
+
+    def update(self, time: float, readings: Sequence[float], valid: Sequence[bool], *, enable: bool = True) -> bool:
+        """Take one sample.
+
+        Parameters
+        ----------
+        time : float
+            [s]
+        readings : sequence of float
+            Drive torque, motor position and velocity, link position and velocity, torque; link-referred SI, finite.
+        valid : sequence of bool
+            False for a reading that is missing.
+        enable : bool
+            False: the estimate is held.
+
+        Returns
+        -------
+        bool
+            True where a row was made.
+        """
+        good = [bool(valid[i]) and self.present[i] for i in range(6)]
+        looked = self.watch.add(list(readings), good)
+        used = [float(readings[i]) if good[i] else self._last_good[i] for i in range(6)]
+        self._last_good = used
+        failed = self._detect(readings, good)
+        self._push(failed, good)
+        made = False
+        self._since += 1
+        if self._since >= self.rows.timing.stride:
+            self._since = 0
+            made = self._row(time, enable)
+            self._judge(good)
+        if looked:
+            self._floors()
+        return made
+
+    def _detect(self, readings: Sequence[float], good: list[bool]) -> list[bool]:
+        """Run the fault detector; readings with failed ones replaced go to `self.readings`."""
+        detector = self.detector
+        if detector is None:
+            self.readings = list(self._last_good)
+            if not good[Q_L]:
+                self.readings[Q_L], self.readings[W_L] = self._link_from_motor()
+            return [False] * 6
+        row = [float(readings[i]) if good[i] else float("nan") for i in range(6)]
+        self.readings = detector.update(row)
+        return list(detector._rule.failed)
+
+    def _link_from_motor(self) -> tuple[float, float]:
+        """Link position and velocity from the motor, torsion taken off."""
+        q = self._last_good
+        if not self.model.is_elastic or not self.options.has_torque:
+            return q[Q_M], q[W_M]
+        stiffness = dict(zip(self.names, self.theta.tolist(), strict=True)).get("stiffness", 0.0)
+        return (q[Q_M] - q[TAU] / stiffness if stiffness > 0 else q[Q_M]), q[W_M]
+
+    def _push(self, failed: list[bool], good: list[bool]) -> None:
+        t = self.rows.timing
+        if self._end == len(self._buffer):
+            keep = t.window
+            self._buffer[:keep] = self._buffer[-keep:].copy()
+            self._end = keep
+        q = self.readings
+        motor, link = q[Q_M], q[Q_L] if self.present[Q_L] else q[Q_M]
+        new = (motor, link, q[TAU], q[DRIVE])
+        if not self._started:
+            self._started = True
+            self._buffer[: t.window] = new
+            self._end = t.window
+        self._buffer[self._end] = new
+        self._end += 1
+        watch = self.watch
+        for k, reading in enumerate(SAMPLED):
+            bad = not good[reading] and self._needs[reading]
+            if bad or failed[reading] or watch.constant[reading] or watch.scaled[reading]:
+                self._lost[k] = t.window + t.stride
+            elif self._lost[k]:
+                self._lost[k] -= 1
+
+    # --- rows --------------------------------------------------------------------------------------------------------
+
+    def _row(self, time: float, enable: bool) -> bool:
+        window = self._buffer[self._end - self.rows.timing.window : self._end]
+        found = self.rows.make(window, time)
+        if found is None:
+            return False
+        y, h = found
+        self._rows += 1
+        lost = np.array([count > 0 for count in self._lost])
+        on = ~(self.rows.uses & lost).any(axis=1)
+        if self.estimator is None:
+            if enable and on.all():
+                self._collected.append((y, h))
+                if len(self._collected) >= self._collect:
+                    self._begin()
+            return True
+        error = y - h @ self.theta
+        self.residual = error
+        period = self.rows.timing.stride * self.dt
+        rate = period / _RESIDUAL_SECONDS
+        signals, weight = self.rows.signals, self._weights()
+        for b, balance in enumerate(self.balances):
+            if on[b]:
+                reference = signals[11] if balance in ("link", "transmission") else signals[1]
+                self._square[b] += rate * ((weight[b] * error[b]) ** 2 - self._square[b])
+                self._torque[b] += rate / 5 * (reference**2 - self._torque[b])
+        self._ratios()
+        if not enable or not on.any():
+            return True
+        for b in range(len(on)):
+            self.estimator.enable(b, bool(on[b]))
+        self.theta = self.estimator.update(y * weight, h * weight[:, None])
+        return True
+
+    def _weights(self) -> FloatArray:
+        """Rows at a reversal count less: there friction may take any value between its limits."""
+        weight = np.ones(len(self.balances))
+        for side, place in enumerate(("motor", "link")):
+            level = float(np.abs(self.theta[self._friction[side]]).sum()) if self._friction[side] else 0.0
+            if not level:
+                continue
+            share = self.rows.standstill(place, self.watch.noise[Q_M if place == "motor" else Q_L])
+            if not share:
+                continue
+            for b, balance in enumerate(self.balances):
+                if place in balance or (balance in ("sum", "axis")) or (balance == "deflection" and place == "motor"):
+                    scale = max(self.floor[b], np.sqrt(self._square[b]), 1e-12)
+                    weight[b] = 1.0 / np.hypot(1.0 / weight[b], level * share / scale)
+        return weight
+
+    def _begin(self) -> None:
+        """Start the recursion from the collected rows."""
+        y = np.array([pair[0] for pair in self._collected])
+        h = np.array([pair[1] for pair in self._collected])
+        first = self._least_squares(y, h)
+        values = self.theta
+        self._scale = np.maximum(np.maximum(np.abs(first), np.abs(values)), self._least(h, y))
+        self.estimator = self._recursion(values)
+        started = self.estimator.startup(y, h, limit=1e-6)
+        self.estimator.release()
+        if started.removed:
+            self.events.append(f"not determined by the first window: {', '.join(started.removed)}")
+        self.theta = self.estimator.theta
+        self.sigma = self.estimator.deviation
+        self._square = np.mean((y - h @ self.theta) ** 2, axis=0)
+        signals = self.rows.signals
+        self._torque[:] = [signals[11] ** 2 if b in ("link", "transmission") else signals[1] ** 2 for b in self.balances]
+        self._collected = []
+        self._floors()
+
+    def _recursion(self, values: FloatArray) -> RecursiveLeastSquares:
+        period = self.rows.timing.stride * self.dt
+        settings = Settings(
+            sample_time=period, drift=self.options.drift, alarm_drift=self.options.alarm_drift, window_seconds=2.0,
+            rank_seconds=8.0,
+        )  # fmt: skip
+        return RecursiveLeastSquares(values, self._scale, outputs=len(self.balances), names=self.names, settings=settings)
+
+    @staticmethod
+    def _least(h: FloatArray, y: FloatArray) -> FloatArray:
+        """Smallest prior range: what moves the balances by a hundredth of their torque."""
+        size = np.sqrt(np.mean(h**2, axis=(0, 1)))
+        level = float(np.sqrt(np.mean(y**2))) or 1.0
+        return np.where(size > 0, 0.01 * level / np.maximum(size, 1e-300), 1.0)
+
+    @staticmethod
+    def _least_squares(y: FloatArray, h: FloatArray) -> FloatArray:
+        """Least squares with columns of equal size and balances of equal residual."""
+        count = h.shape[2]
+        weight = np.ones(y.shape[1])
+        theta = np.zeros(count)
+        for _ in range(2):
+            rows = (h * weight[:, None]).reshape(-1, count)
+            size = np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
+            theta = np.linalg.lstsq(rows / size, (y * weight).ravel(), rcond=1e-9)[0] / size
+            left = np.sqrt(np.mean((y - h @ theta) ** 2, axis=0))
+            weight = 1.0 / np.maximum(left, 1e-12 + 1e-9 * float(np.max(np.abs(y))))
+        return theta
+
+    def retune(self, options: OnlineOptions) -> None:
+        """Take up other forgetting bounds and floors while running; the estimate stays."""
+        self.options = replace(self.options, drift=options.drift, alarm_drift=options.alarm_drift, floor_share=options.floor_share)
+        if self.estimator is not None:
+            fresh = self._recursion(self.theta)
+            old, new = self.estimator._ready("retune"), fresh._ready("retune")
+            new.fast[:], new.slow[:] = old.fast, old.slow
+            new.theta[:] = old.theta
+            self.estimator = fresh
+
+    # --- judgement ---------------------------------------------------------------------------------------------------
+
+    def _floors(self) -> None:
+        if self.estimator is None:
+            return
+        noise = self.watch.noise[list(SAMPLED)]
+        self.floor = self.rows.floor(self.theta.tolist(), noise)
+        self.sigma = self.estimator.deviation
+        self._ratios()
+
+    def _ratios(self) -> None:
+        least = self.options.floor_share * np.sqrt(self._torque)
+        self.ratio = np.sqrt(self._square) / np.maximum(np.maximum(self.floor, least), 1e-12)
+
+    def _judge(self, good: list[bool]) -> None:
+        """The most severe fault now, and the scores."""
+        found, watch = NONE, self.watch
+        for i in range(6):
+            if not good[i] and (self._needs[i] or (self.detector is not None and self.present[i])):
+                found = found or MISSING + 1 + i
+        detector = self.detector
+        if detector is not None:
+            for i, failed in enumerate(detector._rule.failed):
+                if failed and not found:
+                    found = 1 + i
+            self._plant(len(detector.events))
+            self._scores()
+        for flags, code in ((watch.constant, CONSTANT), (watch.scaled, SCALED)):
+            for i in range(6):
+                if flags[i] and not found:
+                    found = code + 1 + i
+        found = found or self._implausible() or self.plant_alarm
+        if found != self.fault and found:
+            self.events.append(f"fault {found}")
+        self.fault = found
+
+    def _plant(self, count: int) -> None:
+        """Take the detector's newest verdict on the joint itself."""
+        detector = self.detector
+        if detector is None or not count:
+            return
+        last = detector.events[-1]
+        recent = detector._rule.k - last.sample < round(5.0 / self.dt)
+        codes = {"CURRENT_OR_FRICTION": CURRENT_OR_FRICTION, "PLANT": PLANT}
+        self.plant_alarm = codes.get(last.verdict.name, NONE) if recent else NONE
+
+    def _scores(self) -> None:
+        from identification._fault_structured import PARITY_SENSORS, StructuredRule
+
+        rule = self.detector._rule if self.detector is not None else None
+        if not isinstance(rule, StructuredRule):
+            return
+        residuals = rule.residuals
+        limits, values = residuals.limits, residuals.values
+        score = [0.0] * 6
+        for parity, sensors in enumerate(PARITY_SENSORS):
+            rows = range(4 * parity, 4 * parity + 4) if parity < 4 else range(16, len(values))
+            worst = max(abs(values[j]) / limits[j] if limits[j] > 0 else 0.0 for j in rows)
+            for s in sensors:
+                score[s] = max(score[s], worst)
+        for i, failed in enumerate(rule.failed):
+            score[i] = max(1.0, score[i]) if failed else score[i]
+        self.score = score
+
+    def _implausible(self) -> int:
+        """Inertias far from those of a fitted joint: the scale of torque or current is wrong."""
+        if self.estimator is None or not self.joint.fitted:
+            return NONE
+        for name, code in (("link_inertia", SCALED + 1 + TAU), ("motor_inertia", SCALED + 1 + DRIVE)):
+            if name in self.names and name in self.joint.fitted:
+                i = self.names.index(name)
+                before, now, spread = self.joint.fitted[name], float(self.theta[i]), float(self.sigma[i])
+                if not before / 3 < now < 3 * before and abs(now - before) > 5 * spread:
+                    return code
+        return NONE
+
+    # --- state -------------------------------------------------------------------------------------------------------
+
+    def state(self) -> bytes:
+        """Everything the estimator will use again, as bytes."""
+        plain = {
+            "end": self._end, "since": self._since, "rows": self._rows, "started": self._started, "lost": self._lost,
+            "last_good": self._last_good, "fault": self.fault, "score": self.score, "readings": self.readings,
+            "plant": self.plant_alarm, "events": self.events,
+        }  # fmt: skip
+        arrays = {
+            "buffer": self._buffer, "theta": self.theta, "sigma": self.sigma, "residual": self.residual,
+            "floor": self.floor, "ratio": self.ratio, "square": self._square, "torque": self._torque,
+            "scale": self._scale, "watch": self.watch.numbers(),
+        }  # fmt: skip
+        if self._collected:
+            arrays["y"] = np.array([pair[0] for pair in self._collected])
+            arrays["h"] = np.array([pair[1] for pair in self._collected])
+        arrays.update({f"row{i}": values for i, values in enumerate(self.rows.numbers())})
+        parts = {} if self.estimator is None else {"rls": self.estimator.state()}
+        if self.detector is not None:
+            parts["detector"] = self.detector.state()
+        return pack(plain, arrays, parts)
+
+    def restore(self, state: bytes) -> None:
+        """Take up a state of an estimator of the same joint and options."""
+        plain, arrays, parts = unpack(state)
+        if arrays["theta"].shape != self.theta.shape or arrays["buffer"].shape != self._buffer.shape:
+            raise InputError("restore: the state is of another joint or sample time; give one of this estimator")
+        self._restore_plain(plain)
+        self._buffer = arrays["buffer"]
+        self.theta, self.sigma, self.residual = arrays["theta"], arrays["sigma"], arrays["residual"]
+        self.floor, self.ratio, self._scale = arrays["floor"], arrays["ratio"], arrays["scale"]
+        self._square, self._torque = arrays["square"], arrays["torque"]
+        self.watch.load(arrays["watch"])
+        self._collected = list(zip(arrays["y"], arrays["h"], strict=True)) if "y" in arrays else []
+        self.rows.load([arrays[f"row{i}"] for i in range(len(self.rows.numbers()))])
+        self.estimator = self._recursion(self.theta) if "rls" in parts else None
+        if self.estimator is not None:
+            self.estimator.restore(parts["rls"])
+        if self.detector is not None and "detector" in parts:
+            self.detector.restore(parts["detector"])
+
+    def _restore_plain(self, plain: Mapping[str, Any]) -> None:
+        self._end, self._since, self._rows = plain["end"], plain["since"], plain["rows"]
+        self._started, self._lost = plain["started"], list(plain["lost"])
+        self._last_good, self.readings = list(plain["last_good"]), list(plain["readings"])
+        self.fault, self.score = plain["fault"], list(plain["score"])
+        self.plant_alarm, self.events = plain["plant"], list(plain["events"])
+
+
+__all__ = ["BALANCES", "FAULT_TEXT", "READINGS", "OnlineEstimator", "OnlineOptions", "prepared", "sensing_of"]

@@ -1,0 +1,131 @@
+"""What the page asks for: each view is a function of the session and the query, the answer is JSON or a download."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, Final
+from urllib.parse import quote
+
+import numpy as np
+from starlette.responses import FileResponse, Response
+
+from casadi_models import EFFECTS
+from casadi_models.transmission import MODELS
+from identification.channels import CHANNELS
+from identification.errors import InputError
+from workbench import app_export
+from workbench.app_input import folder_of, joint_form
+from workbench.app_live import Live
+from workbench.app_records import decimated, plot_time
+from workbench.app_verbs import addable
+from workbench.session import safe_name
+
+Query = Mapping[str, Any]
+MOST_POINTS: Final = 4000
+
+
+def _config(live: Any, query: Query) -> dict[str, Any]:
+    """What does not change: models, channels, effects, limits, what can be exported."""
+    return {
+        "max_upload": query["max_upload"], "channels": ["time", *CHANNELS],
+        "models": {name: list(own) for name, own in MODELS.items()},
+        "effects": [{"key": e.key, "title": e.title, "family": e.family, "places": list(e.acts_on)} for e in EFFECTS.values()],
+        "report": app_export.report_available(), "fmu": app_export.fmu_available(),
+    }  # fmt: skip
+
+
+def _series(live: Live, query: Query) -> dict[str, Any]:
+    """Channels of a record, decimated to the width of the plot."""
+    record = live.record(str(query.get("file", "")))
+    names = [n for n in str(query.get("channels", "")).split(",") if n] or list(record.channels)[:1]
+    values = [record[n] for n in names]
+    stamps, columns, full = decimated(plot_time(record), values, _points(query), _window(query))
+    return {"time": _numbers(stamps), "series": [{"name": n, "unit": record.unit(n), "values": _numbers(c)} for n, c in zip(names, columns, strict=True)], "full": full}
+
+
+def _balance(live: Live, query: Query) -> dict[str, Any]:
+    """Measured torque, model and residual of a balance, decimated."""
+    analysis = live.analysis()
+    time, measured, model = analysis.balance_series(str(query.get("balance", "")))
+    stamps, columns, full = decimated(time, [measured, model, measured - model], _points(query), _window(query))
+    unit = "N" if analysis.joint.kind == "linear" else "N.m"
+    names = ("measured", "model", "residual")
+    return {"time": _numbers(stamps), "series": [{"name": n, "unit": unit, "values": _numbers(c)} for n, c in zip(names, columns, strict=True)], "full": full}
+
+
+def _points(query: Query) -> int:
+    try:
+        return min(max(int(query.get("points", 600)), 50), MOST_POINTS)
+    except ValueError:
+        raise InputError("points must be a whole number") from None
+
+
+def _window(query: Query) -> tuple[float, float] | None:
+    if "from" not in query or "to" not in query:
+        return None
+    try:
+        low, high = float(query["from"]), float(query["to"])
+    except ValueError:
+        raise InputError("from and to must be numbers") from None
+    if not (math.isfinite(low) and math.isfinite(high) and low < high):
+        raise InputError("from must be less than to")
+    return low, high
+
+
+def _numbers(values: Any) -> list[float | None]:
+    """Seven digits are enough for a picture, and half the bytes."""
+    return [float(f"{v:.7g}") if math.isfinite(v) else None for v in np.asarray(values).tolist()]
+
+
+def _compare(live: Live, query: Query) -> dict[str, Any]:
+    return live.analysis().compare()
+
+
+def _parameters(live: Live, query: Query) -> dict[str, Any]:
+    return live.analysis().parameters()
+
+
+def _library(live: Live, query: Query) -> list[dict[str, Any]]:
+    return addable(live)
+
+
+def _joint(live: Live, query: Query) -> dict[str, Any]:
+    return {"text": live.state.joint_text, "form": joint_form(live.state.joint_text)}
+
+
+def _code(live: Live, query: Query) -> dict[str, Any]:
+    return {"code": app_export.session_code(live.state)}
+
+
+def _named(live: Live) -> str:
+    form = joint_form(live.state.joint_text)
+    return safe_name(str(form.get("name") or "joint")).replace(" ", "_")
+
+
+def _download(content: str, name: str, kind: str) -> Response:
+    return Response(content, media_type=kind, headers={"content-disposition": f"attachment; filename*=UTF-8''{quote(name)}", "cache-control": "no-store"})
+
+
+def _joint_file(live: Live, query: Query) -> Response:
+    return _download(app_export.joint_file(live), f"{_named(live)}.toml", "application/toml")
+
+
+def _script(live: Live, query: Query) -> Response:
+    return _download(app_export.session_code(live.state), f"{_named(live)}.py", "text/x-python")
+
+
+def _report(live: Live, query: Query) -> Response:
+    path = app_export.report(live, folder_of(live))
+    return FileResponse(path, filename=f"{_named(live)}.html", media_type="application/octet-stream", headers={"cache-control": "no-store"})
+
+
+def _fmu(live: Live, query: Query) -> Response:
+    path = app_export.fmu(live, folder_of(live))
+    return FileResponse(path, filename=f"{_named(live)}.fmu", media_type="application/octet-stream", headers={"cache-control": "no-store"})
+
+
+VIEWS: Final[Mapping[str, Callable[[Any, Query], Any]]] = {
+    "config": _config, "series": _series, "balance": _balance, "compare": _compare, "parameters": _parameters, "library": _library,
+    "joint": _joint, "code": _code, "joint.toml": _joint_file, "session.py": _script, "report.html": _report, "model.fmu": _fmu,
+}  # fmt: skip

@@ -1,0 +1,126 @@
+"""The command line `irj`: thin doors on the Python calls of the same names."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from identification.errors import InputError
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="irj", description="Tells which physics a geared joint's model is missing.")
+    parser.add_argument("--effects", metavar="FILE.py", action="append", default=[], help="register your own effects from a Python file")
+    verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
+
+    def verb(name: str, module: str, text: str, *, records: bool = False, joint: bool = False) -> argparse.ArgumentParser:
+        sub = verbs.add_parser(name, help=text, description=text)
+        sub.set_defaults(module=module)
+        sub.add_argument("--json", metavar="FILE", help="write the result as JSON")
+        if records:
+            sub.add_argument("records", nargs="+", metavar="REC", help="record files")
+        if joint:
+            sub.add_argument("--joint", metavar="J", required=True, help="joint file (TOML)")
+        return sub
+
+    demo = verb("demo", "loop", "the main job on embedded data: a simulated joint with a hidden effect")
+    demo.add_argument("--report", default="irj-demo.html", metavar="FILE", help="where the report goes (default irj-demo.html)")
+    checked = verb("check", "records", "check records before a fit", records=True)
+    checked.add_argument("--joint", metavar="J", help="joint file: column map and gear ratio")
+    fitted = verb("fit", "loop", "fit the joint's model", records=True, joint=True)
+    fitted.add_argument("-o", "--output", metavar="FILE", help="write the fitted joint file")
+    compared = verb("compare", "loop", "how far the model is from the records, and where", records=True, joint=True)
+    compared.add_argument("--fit", dest="fit_records", nargs="+", metavar="REC", default=[], help="fit to these records and compare with REC")
+    diagnosed = verb("diagnose", "loop", "rank what is missing", records=True, joint=True)
+    diagnosed.add_argument("--held-out", nargs="+", metavar="REC", default=[], help="records the fit must not see")
+    improved = verb("improve", "loop", "name what is missing, add it, watch the error fall", records=True, joint=True)
+    improved.add_argument("--held-out", nargs="+", metavar="REC", default=[], help="records the fit must not see")
+    improved.add_argument("--report", metavar="FILE", help="write the HTML report")
+    improved.add_argument("-o", "--output", metavar="FILE", help="write the improved joint file")
+    improved.add_argument("--max-steps", type=int, default=6, help="most effects to add (default 6)")
+    report = verb("report", "loop", "the improve loop, written as one HTML file", records=True, joint=True)
+    report.add_argument("--held-out", nargs="+", metavar="REC", default=[], help="records the fit must not see")
+    report.add_argument("-o", "--output", metavar="FILE", default="irj-report.html", help="the HTML file")
+    listed = verb("effects", "library", "list the effect library, or one effect")
+    listed.add_argument("key", nargs="?", help="key of one effect")
+    added = verb("add", "library", "add an effect to a joint file")
+    added.add_argument("key", help="effect key, or key@place")
+    added.add_argument("--joint", metavar="J", required=True)
+    added.add_argument("-o", "--output", metavar="FILE", required=True)
+    simulated = verb("simulate", "virtual", "simulate the joint with its sensors", joint=True)
+    simulated.add_argument("--hide", metavar="KEY", action="append", default=[], help="add this effect without saying so in the record")
+    simulated.add_argument("-o", "--output", metavar="FILE", default="simulated.csv", help="record file, .csv or .npz")
+    simulated.add_argument("--truth", metavar="FILE", help="write the true parameters as JSON")
+    simulated.add_argument("--seconds", type=float, default=24.0)
+    simulated.add_argument("--rate", type=float, default=500.0, help="samples per second (default 500)")
+    simulated.add_argument("--seed", type=int, default=0)
+    simulated.add_argument("--motion", choices=("multisine", "triangle"), default="multisine")
+    tracked = verb("track", "online", "replay the online estimator with sensor-fault detection", records=True, joint=True)
+    tracked.add_argument("--report", metavar="FILE", help="write the HTML report")
+    planned = verb("plan", "online", "select a trajectory that makes the parameters identifiable", joint=True)
+    planned.add_argument("-o", "--output", metavar="FILE", default="trajectory.csv")
+    exported = verb("export", "fmi", "export as FMU", joint=True)
+    exported.add_argument("what", nargs="?", default="plant", choices=("estimator", "plant", "native", "ssp", "all"))
+    exported.add_argument("--out", metavar="FOLDER", default="dist")
+    exported.add_argument("--cc", help="compiler")
+    exported.add_argument("--target", help="target platform")
+    cosim = verb("cosim", "fmi", "co-simulate plant and estimator FMU", joint=True)
+    cosim.add_argument("--out", metavar="FOLDER", default="dist")
+    batch = verb("batch", "fmi", "many runs of a study")
+    batch.add_argument("study", metavar="study.toml")
+    app = verb("app", "page", "the page in your browser")
+    app.add_argument("files", nargs="*", metavar="FILES")
+    app.add_argument("--port", type=int, default=0)
+    app.add_argument("--no-browser", action="store_true")
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run `irj`; returns the exit code: 0 done, 1 a check failed, 2 unusable input, 130 interrupted."""
+    arguments = _parser().parse_args(argv)
+    try:
+        _register(arguments.effects)
+        module = importlib.import_module(f"workbench.commands.{arguments.module}")
+        return int(getattr(module, f"run_{arguments.verb}")(arguments))
+    except InputError as error:
+        return _fail(str(error))
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        return _fail(f"{where}{error.strerror or error}; check the path, its permissions and the space on the disk")
+    except KeyboardInterrupt:
+        print("irj: interrupted, nothing was written", file=sys.stderr)
+        return 130
+
+
+def _register(files: Sequence[str]) -> None:
+    from casadi_models import EFFECTS
+
+    for name in files:
+        path = Path(name)
+        if not path.is_file():
+            raise InputError(f"{path}: no such file; --effects takes a Python file that declares effects")
+        try:
+            EFFECTS.load(path)
+        except Exception as error:  # a user's file may fail in any way
+            raise InputError(f"{path}: cannot be used as effects ({type(error).__name__}: {error})") from None
+
+
+def _fail(text: str) -> int:
+    print("irj: " + " ".join(str(text).split()), file=sys.stderr)
+    return 2
+
+
+def improve_json(train: Sequence[str | Path], held_out: Sequence[str | Path], joint: str | Path) -> dict[str, Any]:
+    """The loop on files, as the data of `improve --json`."""
+    from workbench.commands.loop import improve_files
+
+    found, _, _ = improve_files([str(p) for p in train], [str(p) for p in held_out], str(joint))
+    return found
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

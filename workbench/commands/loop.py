@@ -1,0 +1,150 @@
+"""demo, fit, compare, diagnose, improve, report: the main job."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from importlib.resources import as_file, files
+from typing import Any
+
+from identification.compare import compare
+from identification.diagnose import diagnose
+from identification.fit import fit, joint_text
+from identification.improve import Improvement, improve
+from identification.record import Record
+from workbench.commands.files import open_joint, open_records, progress_bar, write_json, write_text
+
+
+def improve_files(
+    train: Sequence[str], held_out: Sequence[str], joint_path: str, *, max_additions: int = 6
+) -> tuple[dict[str, Any], Improvement, list[Record]]:
+    """The loop on files: its JSON, the result and the records."""
+    joint = open_joint(joint_path)
+    records, warnings = open_records(train, joint)
+    held, more = open_records(held_out, joint)
+    found = improve(records, joint, held, max_additions=max_additions, progress=progress_bar)
+    progress_bar("done", 1.0)
+    found = replace(found, warnings=(*found.warnings, *warnings, *more))
+    return found.as_json(), found, [*records, *held]
+
+
+def run_improve(arguments: Namespace) -> int:
+    """`irj improve`."""
+    data, found, records = improve_files(arguments.records, arguments.held_out, arguments.joint, max_additions=arguments.max_steps)
+    _print_improvement(found)
+    _write_improvement(found, records, arguments.report, arguments.output)
+    write_json(arguments.json, data)
+    return 0
+
+
+def run_report(arguments: Namespace) -> int:
+    """`irj report`."""
+    data, found, records = improve_files(arguments.records, arguments.held_out, arguments.joint)
+    print(found.reason)
+    _write_improvement(found, records, arguments.output, None)
+    write_json(arguments.json, data)
+    return 0
+
+
+def run_demo(arguments: Namespace) -> int:
+    """`irj demo`."""
+    with as_file(files("workbench") / "demo") as folder:
+        names = {n: str(folder / n) for n in ("joint.toml", "train.npz", "held_out.npz")}
+        print("A simulated harmonic-drive joint with one effect that its model lacks; the answer is not in these files.")
+        data, found, records = improve_files([names["train.npz"]], [names["held_out.npz"]], names["joint.toml"])
+    _print_improvement(found)
+    _write_improvement(found, records, arguments.report, None)
+    write_json(arguments.json, data)
+    return 0
+
+
+def _write_improvement(found: Improvement, records: Sequence[Record], report: str | None, output: str | None) -> None:
+    if report:
+        from workbench.report import write_report
+
+        print(f"report: {write_report(found, report, records=records)}")
+    if output:
+        write_text(output, joint_text(found.joint, found.steps[-1].solution, found.data))
+        print(f"joint file: {output}")
+
+
+def _print_improvement(found: Improvement) -> None:
+    if found.data.note:
+        print(f"note: {found.data.note}")
+    for text in found.warnings:
+        if text in found.warnings[:1] or "only" in text:
+            print(f"warning: {text}")
+    print(f"{'step':<32} {'train %':>8} {'held-out %':>10}   residual over noise floor")
+    for step in found.steps:
+        ratios = "  ".join(f"{b} {e.ratio:.3g}" for b, e in step.held_out.balances.items())
+        name = f"+ {step.added}" if step.added else "start model"
+        print(f"{name:<32} {step.train.relative_error_percent:8.3f} {step.held_out.relative_error_percent:10.3f}   {ratios}")
+    for claim in found.claims:
+        names = claim.effects[0] if len(claim.effects) == 1 else "{" + ", ".join(claim.effects) + "}"
+        part = " (partial: structure is left that is not in the library)" if claim.partial else ""
+        print(f"missing: {names}, {claim.balance} balance, held-out RMS falls by {claim.held_out_drop_percent:.1f} %{part}")
+        if claim.separate_by:
+            print(f"  these cannot be told apart on these records; {claim.separate_by} would separate them")
+    for claim in found.minor:
+        print(f"minor, small but certain: {', '.join(claim.effects)} ({claim.balance} balance, {claim.held_out_drop_percent:.1f} %)")
+    for line in found.lines:
+        named = f", {' or '.join(line.effects)}" if line.effects else ", position-periodic"
+        print(f"line: order {line.order:.3f} +- {line.tolerance:.3f} per motor turn, {line.amplitude:.3g} {line.unit} ({line.balance}{named})")
+    for place in found.unexplained:
+        where = f"{place.axis} from {place.low:.3g} to {place.high:.3g} {place.unit}" if place.axis and place.low is not None and place.high is not None else "no measured variable"
+        extra = f", order {place.order:.2f}" if place.order else (f", near {place.frequency_hz:.1f} Hz" if place.frequency_hz else "")
+        print(f"unexplained: {place.balance} balance, depends on {where} ({place.share_percent:.0f} % of it){extra}")
+    if found.not_testable:
+        print(f"not testable with these records: {', '.join(n.effect for n in found.not_testable)}")
+    print(found.reason)
+
+
+def run_fit(arguments: Namespace) -> int:
+    """`irj fit`."""
+    joint = open_joint(arguments.joint)
+    records, warnings = open_records(arguments.records, joint)
+    fitted = fit(joint, records)
+    print(f"relative error {fitted.train.relative_error_percent:.3f} %, fit {fitted.train.fit_percent:.2f} %")
+    _print_parameters(fitted.parameters)
+    if arguments.output:
+        write_text(arguments.output, fitted.to_joint_file())
+    write_json(arguments.json, {**fitted.as_json(), "warnings": warnings})
+    return 0
+
+
+def _print_parameters(parameters: Mapping[str, Mapping[str, Any]]) -> None:
+    for name, p in parameters.items():
+        if p["nuisance"]:
+            continue
+        error = f" +- {p['stderr']:.2g}" if p["stderr"] is not None else ""
+        flags = "".join([" at its bound" * bool(p["at_bound"]), " not identifiable" * (not p["identifiable"])])
+        print(f"  {name:<28} {p['value']:.6g}{error} {p['unit']} ({p['side']} side){flags}")
+
+
+def run_compare(arguments: Namespace) -> int:
+    """`irj compare`."""
+    joint = open_joint(arguments.joint)
+    records, warnings = open_records(arguments.records, joint)
+    basis = open_records(arguments.fit_records, joint)[0] if arguments.fit_records else records
+    comparison = compare(fit(joint, basis), records)
+    print(comparison)
+    for place in comparison.places[:5]:
+        print(f"  {place.balance} against {place.axis.replace('_', ' ')}: mean residual up to {place.strength:.3g} times its 95 % band")
+    write_json(arguments.json, {**comparison.as_json(), "warnings": warnings})
+    return 0
+
+
+def run_diagnose(arguments: Namespace) -> int:
+    """`irj diagnose`."""
+    joint = open_joint(arguments.joint)
+    records, warnings = open_records(arguments.records, joint)
+    held, more = open_records(arguments.held_out, joint)
+    found = diagnose(fit(joint, records), held)
+    for text in found.warnings:
+        print(f"warning: {text}")
+    print(found)
+    for item in found.ranking.not_testable:
+        print(f"not testable: {item.effect}: {item.why}")
+    write_json(arguments.json, {**found.as_json(), "warnings": [*found.warnings, *warnings, *more]})
+    return 0

@@ -1,0 +1,26 @@
+"""check: is a record fit for use?"""
+
+from __future__ import annotations
+
+from argparse import Namespace
+
+from identification.check import check
+from identification.read import read
+from workbench.commands.files import open_joint, write_json
+
+
+def run_check(arguments: Namespace) -> int:
+    """`irj check`: 1 where a record would be refused."""
+    joint = open_joint(arguments.joint) if arguments.joint else None
+    refused = False
+    out = {}
+    for path in arguments.records:
+        record = read(path, columns=joint.columns if joint else None, kind=joint.kind if joint else None)
+        findings = check(record, joint.gear_ratio if joint else None)
+        print(f"{path}: {len(record)} samples, {record.duration:.3g} s, channels {', '.join(record.channels)}")
+        for finding in findings:
+            print(f"  {finding.severity}: {finding.message}")
+        refused |= any(f.severity == "refuse" for f in findings)
+        out[str(path)] = [{"severity": f.severity, "code": f.code, "message": f.message} for f in findings]
+    write_json(arguments.json, out)
+    return 1 if refused else 0
