@@ -96,9 +96,8 @@ def reference(seed: int, seconds: float) -> FloatArray:
     a = np.exp(-w * DT)
     out = raw
     for _ in range(4):
-        out = lfilter([1 - a], [1, -a], out)
-    out = np.asarray(out, dtype=np.float64)
-    velocity = np.asarray(np.gradient(out, DT), dtype=np.float64)
+        out = np.asarray(lfilter([1 - a], [1, -a], out), dtype=np.float64)
+    velocity: FloatArray = np.gradient(out, DT)
     return np.column_stack([out, velocity, np.gradient(velocity, DT)])
 
 

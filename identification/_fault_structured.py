@@ -169,9 +169,8 @@ class StructuredRule:
 
     def _suspect(self, bits: int, raw: int) -> None:
         k = self.k
-        if self.muted and not raw & self.muted:
-            if k - self.plant_rest > 0:
-                self.muted = 0
+        if self.muted and not raw & self.muted and k > self.plant_rest:
+            self.muted = 0
         if bits:
             if not self.latched:
                 self.opened = k

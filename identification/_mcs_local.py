@@ -47,7 +47,7 @@ class LocalModel:
         """Return the distance of difference samples in coordinate `i`."""
         width = self._evaluate.high[i] - self._evaluate.low[i]
         size = abs(self.x[i])
-        return min(max(_DIFFERENCE * min(max(size, 0.01 * width), width), 1e-7 * size), 0.05 * width)
+        return float(min(max(_DIFFERENCE * min(max(size, 0.01 * width), width), 1e-7 * size), 0.05 * width))
 
     def on_bound(self, i: int) -> bool:
         """Return whether coordinate `i` sits exactly on a bound."""

@@ -95,10 +95,11 @@ class Balances:
         linear &= present
         keep = ca.DM(linear.astype(float))
         self._linear = ca.Function("linear", [parameters], [ca.densify(slopes * keep)])
-        zeroed = []
+        zeroed: list[Expression] = []
+        substitute: Any = ca.substitute
         for i in range(out.shape[0]):
             names = [signals[j] for j in range(len(_NAMES)) if linear[i, j]]
-            zeroed.append(ca.substitute([out[i]], names, [ca.SX(0)] * len(names))[0] if names else out[i])
+            zeroed.append(substitute([out[i]], names, [ca.SX(0)] * len(names))[0] if names else out[i])
         self._has_rest = [not z.is_zero() for z in zeroed]
         needed = [i for i, used in enumerate(self._has_rest) if used]
         rest = ca.vertcat(*(zeroed[i] for i in needed)) if needed else ca.SX(0, 1)
@@ -200,14 +201,15 @@ class Memory:
         self._states = int(e.memory.shape[0])
         self._used = sorted(set(ca.jacobian_sparsity(after, signals).get_triplet()[1]))
         kept = ca.vertcat(*(signals[i] for i in self._used)) if self._used else ca.SX(0, 1)
-        one = ca.Function("one", [e.memory, steps, kept, e.parameters, e.clock], [after])
+        one: Any = ca.Function("one", [e.memory, steps, kept, e.parameters, e.clock], [after])
         self.coordinates = Vectorised(ca.Function("where", [signals, e.parameters], [ca.densify(ca.vertcat(*coordinates))]))
-        z0 = ca.SX.sym("z0", self._states)
+        z0: Any = ca.SX.sym("z0", self._states)
         many = ca.SX.sym("many", len(coordinates), UNROLLED)
         aside = ca.SX.sym("aside", len(self._used), UNROLLED)
         p = ca.SX.sym("p", e.parameters.shape[0])
         clock = ca.SX.sym("clock")
-        z, trail = z0, []
+        z: Any = z0
+        trail: list[Any] = []
         for k in range(UNROLLED):
             z = one(z, many[:, k], aside[:, k], p, clock)
             trail.append(z)

@@ -285,7 +285,7 @@ def columns(candidate: Candidate, base: Base, shapes: Mapping[str, float], recor
     """Unweighted columns of the candidate's amplitudes at amplitude zero."""
     values = {p.name: p.start for p in candidate.model.parameters}
     values.update(base.solution.values)
-    values.update({n: 0.0 for n in candidate.amplitudes})
+    values.update(dict.fromkeys(candidate.amplitudes, 0.0))
     values.update(shapes)
     stacked = stack(balances, records, values)
     return np.concatenate([stacked.jacobian[b] for b in balances.balances])
@@ -409,7 +409,8 @@ def _refined(
 
 def _collinear_reason(candidate: Candidate) -> str:
     names = ", ".join(candidate.effect.confused_with) or "what the model has already"
-    return f"on these records it cannot be told from {names}" + (f"; {candidate.effect.separate_by} would separate them" if candidate.effect.separate_by else "")
+    separate = f"; {candidate.effect.separate_by} would separate them" if candidate.effect.separate_by else ""
+    return f"on these records it cannot be told from {names}{separate}"
 
 
 def _signed_fit(gram: FloatArray, right: FloatArray, lows: FloatArray, first: int) -> FloatArray:
@@ -441,7 +442,6 @@ def _projected_gain(outside: FloatArray, residual: FloatArray, lows: FloatArray)
 def _score(
     candidate: Candidate, base: Base, balances: Balances, shapes: Mapping[str, float], raw: FloatArray, lows: FloatArray, inside: float
 ) -> Trial | None:
-    data = base.data
     p = base.jacobian.shape[1]
     count = len(base.balances)
     size = np.linalg.norm(raw * base.weight[:, None], axis=0)

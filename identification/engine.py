@@ -306,7 +306,7 @@ def solve(model: JointModel, data: Dataset, *, iterations: int = 15, start: Mapp
         values[n] = min(max(values[n], low), high)
     floor = floors(model, data, {**values})
     # first pass without shapes: linear amplitudes from any start
-    sigma = {b: 1.0 for b in balances.balances}
+    sigma = dict.fromkeys(balances.balances, 1.0)
     linear_only = [n for n in free if n not in shapes]
     _check_moves(balances, data, values, linear_only)
     values, _ = _steps(balances, data, values, linear_only, limits, sigma, {}, 3, memory_shapes)
@@ -426,7 +426,7 @@ def _bounded_step(
         step[:] = fixed
         step[index] = part
         outside = []
-        for i in index:
+        for i in index.tolist():
             if logs[i]:
                 continue
             low, high = limits[free[i]]
@@ -458,7 +458,7 @@ def _with_errors(
         and not n.endswith("_smoothing_velocity")
     ]  # fmt: skip
     usable = np.array([norm > 1e-12 * norms.max() and n not in at_bound for n, norm in zip(free, norms, strict=True)])
-    stderr: dict[str, float | None] = {n: None for n in values}
+    stderr: dict[str, float | None] = dict.fromkeys(values)
     correlation: dict[str, tuple[str, float]] = {}
     unidentified = [n for n, norm in zip(free, norms, strict=True) if norm <= 1e-12 * norms.max() and not n.endswith("_smoothing_velocity")]
     index = np.flatnonzero(usable)
@@ -472,14 +472,14 @@ def _with_errors(
         spread = np.sqrt(np.maximum(np.diag(inverse), 1e-300))
         corr = inverse / np.outer(spread, spread)
         np.fill_diagonal(corr, 0.0)
-        for k, i in enumerate(index):
+        for k, i in enumerate(index.tolist()):
             stderr[free[i]] = float(size[k])
             other = int(np.argmax(np.abs(corr[k])))
-            correlation[free[i]] = (free[index[other]], float(corr[k, other]))
+            correlation[free[i]] = (free[int(index[other])], float(corr[k, other]))
             weak = values[free[i]] != 0 and size[k] > abs(values[free[i]])
             if (spread[k] > 1e4 or weak) and not free[i].endswith("_smoothing_velocity"):
                 unidentified.append(free[i])
-    kept = {n: v for n, v in values.items()}
+    kept = dict(values)
     return Solution(
         replace(model, values=kept), kept, stderr, tuple(free), weights, sigma, tuple(at_bound), tuple(unidentified),
         correlation, used,

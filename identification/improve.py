@@ -256,11 +256,11 @@ class _Loop:
             same = next((t for t in ranking.everything if t.candidate.label == claim.label), None)
             best = ranking.best(frozenset(self.refused))
             position = current.index(claim)
-            if same is None or claim.label not in ranking.significant:
-                if best is None or best.score < 10:
-                    current.pop(position)
-                    self.refused.add(claim.label)
-                    return self._replay(current, steps)
+            gone = same is None or claim.label not in ranking.significant
+            if gone and (best is None or best.score < 10):
+                current.pop(position)
+                self.refused.add(claim.label)
+                return self._replay(current, steps)
             if best is not None and best.candidate.label != claim.label and (same is None or best.score > same.score + SWAP_GAIN):
                 names = confusion_set(best, ranking.everything, base)
                 if claim.effects[0] in names:

@@ -91,7 +91,7 @@ def scan(angle: FloatArray, residual: FloatArray, weight: FloatArray, highest: f
     spectrum = np.abs(np.fft.rfft(summed, length)) ** 2
     orders = np.arange(len(spectrum)) * 2 * np.pi / (length * width)
     use = (orders >= LOWEST_ORDER) & (orders <= highest)
-    return orders[use], spectrum[use]
+    return np.asarray(orders[use]), np.asarray(spectrum[use], dtype=np.float64)
 
 
 def _phase_fit(order: float, angle: FloatArray, residual: FloatArray, weight: FloatArray) -> FloatArray:
@@ -228,9 +228,9 @@ def _held_out_drop(rows: _Rows, order: float, sine: float, cosine: float) -> flo
         return None
     line = sine * np.sin(order * rows.held_angle) + cosine * np.cos(order * rows.held_angle)
     passes = np.abs(rows.held_speed) * order * rows.kernel < 2 * np.pi * PASS
-    before = rows.held_residual[passes] * rows.held_weight[passes]
-    after = (rows.held_residual - line)[passes] * rows.held_weight[passes]
-    return 100 * (1 - float(np.linalg.norm(after) / max(np.linalg.norm(before), 1e-300)))
+    before = float(np.linalg.norm(rows.held_residual[passes] * rows.held_weight[passes]))
+    after = float(np.linalg.norm((rows.held_residual - line)[passes] * rows.held_weight[passes]))
+    return 100 * (1 - after / max(before, 1e-300))
 
 
 def _refined(orders: FloatArray, power: FloatArray, k: int) -> float:

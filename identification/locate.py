@@ -120,9 +120,7 @@ def locate(solution: Solution, data: Dataset, error: Error, lines: Sequence[Line
         best = max(found, key=lambda u: u.share_percent)
         line = next((x for x in lines if x.balance == balance), None)
         peak = _peak(data, balance, residual)
-        unit = error.balances[balance].unit
         size = error.balances[balance].rms
-        del unit
         if best.share_percent < 100 * AXIS_R2:
             best = Unexplained(balance, max(best.share_percent, 0.0), rms=size)
         order = line.order if line is not None else None
@@ -142,7 +140,7 @@ def _axis(
     direction = (velocity > 0).astype(np.int64)
     both = table_r2(residual, index * 2 + direction, block, 2 * size)
     by_direction = both > plain + 0.02
-    power = np.bincount(index, weights=residual**2, minlength=size)
+    power = np.asarray(np.bincount(index, weights=residual**2, minlength=size), dtype=np.float64)
     low, high = _window(edges, power)
     return Unexplained(balance, 100 * max(plain, both), name, low, high, unit, by_direction=by_direction)
 

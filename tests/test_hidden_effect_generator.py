@@ -84,7 +84,8 @@ def test_numpy_twin_agrees_with_the_compiled_integrator() -> None:
     motion = (0.2 * np.sin(20.0 * t) + 0.4, 4.0 * np.cos(20.0 * t))
     hidden: list[dict[str, float]] = [
         {}, {"M_V0": 0.0, "L_V0": 0.0, "M_TCA": 3.0, "M_MU": 0.1}, {"M_ZS": 2e-3, "M_TS": 9.0, "M_VS": 0.05},
-        {"HK1": 5e3, "HS1": 3e-4, "HK3": 900.0, "HS3": 1e-3, "GAP": 1e-4}, {"WIND": 2e-4, "WIND_X": 4e-4, "LAG_T": 90.0},
+        {"HK1": 5e3, "HS1": 3e-4, "HK3": 900.0, "HS3": 1e-3, "GAP": 1e-4},
+        {"WIND": 2e-4, "WIND_X": 4e-4, "LAG_T": 90.0},
         {"PW_X1": 7e-4, "PW_X2": 2e-3, "PW_D1": 9e3, "PW_D2": 5e3, "COG": 2.0, "COG_O": 4.0, "HEAT": 0.3},
         {"FLEX": 0.2, "FLEX_F": 11.0, "FLEX_Z": 0.02, "STOP": 90.0, "STOP_X": 0.3, "BUMP": 8.0, "BUMP_X": 0.4},
         {"KE1": 3e-4, "KE1_O": 2.0, "M_CYC": 3.0, "L_SIN": 4.0, "M_COS": 2.0, "M_KA": 50.0, "LAG_I": 33.0},
@@ -354,9 +355,10 @@ def oracle(train: list[Path], held_out: list[Path], joint: Path) -> dict[str, An
 
 
 def test_campaign_counts_and_reports(tmp_path: Path) -> None:
-    options = ["--effects", "backlash,torque_sensor_offset", "--seeds", "1", "--none", "1", "--pairs", "0", "--outside", "0",
-               "--cache", str(tmp_path / "cache"), "--entry", f"{__name__}:oracle", "--out", str(tmp_path / "report.md"),
-               "--json", str(tmp_path / "scores.json")]  # fmt: skip
+    cache, entry = str(tmp_path / "cache"), f"{__name__}:oracle"
+    options = ["--effects", "backlash,torque_sensor_offset", "--seeds", "1", "--none", "1", "--pairs", "0"]
+    options += ["--outside", "0", "--cache", cache, "--entry", entry]
+    options += ["--out", str(tmp_path / "report.md"), "--json", str(tmp_path / "scores.json")]
     campaign.main(options)
     report = (tmp_path / "report.md").read_text(encoding="utf-8")
     assert "| single: true name in a set, % | 100.00 | >= 95 | 2 | ok |" in report

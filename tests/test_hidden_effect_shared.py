@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -82,10 +83,9 @@ def test_held_out_error_falls_as_far_as_with_the_true_effect(case: str) -> None:
     folder = SHARED / case
     model = found.steps[0].solution.model
     true = model.add(found.claims[0].label)
-    from dataclasses import replace
-
     true = replace(true, virtual_work=found.model.virtual_work)
-    oracle = fit(true, [read(folder / "train.csv"), read(folder / "train2.csv")], joint=load_joint(folder / "joint.toml"), held_out=[read(folder / "test.csv"), read(folder / "test2.csv")])
+    train, held = ([read(folder / f"{n}{i}.csv") for i in ("", "2")] for n in ("train", "test"))
+    oracle = fit(true, train, joint=load_joint(folder / "joint.toml"), held_out=held)
     assert oracle.held_out is not None
     best = oracle.held_out.balances[claim.balance].rms
     assert before - after >= 0.8 * (before - best)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from argparse import Namespace
+from importlib import import_module
+from typing import Any
 
 from identification.errors import InputError
 
@@ -20,7 +22,7 @@ def run_export(arguments: Namespace) -> int:
 def run_cosim(arguments: Namespace) -> int:
     """`irj cosim`."""
     try:
-        from irj_fmu import cosim
+        cosim: Any = import_module("irj_fmu.cosim")
     except ImportError:
         raise InputError("cosim is not part of this version; build the FMUs with `irj export all` and co-simulate them in any FMI host") from None
     return int(cosim.main(["--joint", arguments.joint, "--out", arguments.out]))
@@ -29,7 +31,7 @@ def run_cosim(arguments: Namespace) -> int:
 def run_batch(arguments: Namespace) -> int:
     """`irj batch`."""
     try:
-        from irj_fmu import batch
+        batch: Any = import_module("irj_fmu.batch")
     except ImportError:
         raise InputError("batch is not part of the command line yet; use irj_fmu.fleet.run_fleet from Python") from None
     return int(batch.main([arguments.study]))

@@ -92,7 +92,9 @@ def _print_improvement(found: Improvement) -> None:
         named = f", {' or '.join(line.effects)}" if line.effects else ", position-periodic"
         print(f"line: order {line.order:.3f} +- {line.tolerance:.3f} per motor turn, {line.amplitude:.3g} {line.unit} ({line.balance}{named})")
     for place in found.unexplained:
-        where = f"{place.axis} from {place.low:.3g} to {place.high:.3g} {place.unit}" if place.axis and place.low is not None and place.high is not None else "no measured variable"
+        where = "no measured variable"
+        if place.axis and place.low is not None and place.high is not None:
+            where = f"{place.axis} from {place.low:.3g} to {place.high:.3g} {place.unit}"
         extra = f", order {place.order:.2f}" if place.order else (f", near {place.frequency_hz:.1f} Hz" if place.frequency_hz else "")
         print(f"unexplained: {place.balance} balance, depends on {where} ({place.share_percent:.0f} % of it){extra}")
     if found.not_testable:

@@ -98,7 +98,7 @@ def recording(model: JointModel, joint: Joint, seconds: float, rate: float, seed
     """Closed-loop record with the sensors of the thesis's table B.1, as columns of a record file."""
     rng = np.random.default_rng(seed)
     dt = 1.0 / rate
-    time = np.arange(round(seconds * rate)) * dt
+    time: FloatArray = np.arange(round(seconds * rate)).astype(np.float64) * dt
     q, v = reference(time, motion, rng)
     step = sampled_step(model, dt, max(2, round(dt / 2e-4)))
     outputs = model.functions.outputs
@@ -122,7 +122,7 @@ def recording(model: JointModel, joint: Joint, seconds: float, rate: float, seed
     n = joint.gear_ratio
     per_current = joint.torque_per_current or n
     motor = np.round(rows[:, 0] / grain_motor) * grain_motor * n
-    table = {
+    table: dict[str, FloatArray] = {
         "time_s": time,
         "motor_current_A": drive / per_current + noise(len(time)) * 0.035 / abs(per_current),
         "motor_position_rad": motor,

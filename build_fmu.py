@@ -1,0 +1,20 @@
+"""Build the FMUs of a joint: ``python build_fmu.py estimator|plant|native|ssp|all --joint J --out dist``.
+
+    estimator   online estimator of the joint file's parameters (FMI 2.0 co-simulation)
+    plant       the joint itself, open loop (FMI 2.0 model exchange and co-simulation)
+    native      the estimator's recursion in C, without Python in the host
+    ssp         source, plant and estimator as one system (SSP 1.0)
+    all         everything above, and the plant with controller and sensors
+
+Options: --cc gcc|zig, --target TRIPLE|all, --controller, --sensors, --healthy RECORD; see ``--help``.
+Every FMU is checked by fmpy's ``validate_fmu`` and run in a fresh process before it appears in the folder.
+"""
+
+from __future__ import annotations
+
+import sys
+
+from irj_fmu.build import main
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,357 @@
+"""Build the FMUs of a joint file, check them, and put them where they are wanted."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, final
+
+from identification.errors import InputError
+from identification.joint_file import Joint, load_joint
+
+from .compiler import find_compiler
+
+KINDS: Final = ("estimator", "plant", "native", "ssp", "all")
+_TRY: Final = (
+    "no C compiler: the estimator still builds (`build_fmu.py estimator`), for Python hosts; plants, native estimators "
+    "and systems need one: run `pip install ziglang`, or install gcc and pass --cc gcc"
+)
+_SMOKE: Final = """
+import sys
+from fmpy import read_model_description, simulate_fmu
+import numpy as np
+path, step, count = sys.argv[1], float(sys.argv[2]), int(sys.argv[3])
+names = [v.name for v in read_model_description(path).modelVariables if v.causality == "output"]
+found = simulate_fmu(path, stop_time=step * count, output_interval=step, step_size=step, output=names,
+                     fmi_type="CoSimulation")
+if len(found) != count + 1:
+    sys.exit(f"{len(found)} of {count + 1} steps")
+for name in names:
+    if not np.isfinite(np.asarray(found[name], dtype=float)).all():
+        sys.exit(f"output {name} is not finite")
+if "health" in names and found["health"].max() > 1:
+    sys.exit(f"health is {found['health'].max()}")
+"""
+
+
+@final
+@dataclass(frozen=True)
+class Request:
+    """What is to be built.
+
+    Attributes
+    ----------
+    joint : Joint
+        The joint file.
+    source : Path
+        Where it lies.
+    out : Path
+        Folder of the results.
+    cc, target : str, optional
+        See :func:`irj_fmu.plant.build_plant`.
+    controller, sensors : bool
+        Of the plant.
+    healthy : tuple of Path
+        Records of the healthy joint, from which the estimator's fault detector takes its limits.
+    has_link, has_torque : bool
+        Sensors of the joint.
+    """
+
+    joint: Joint
+    source: Path
+    out: Path
+    cc: str | None = None
+    target: str | None = None
+    controller: bool = False
+    sensors: bool = False
+    healthy: tuple[Path, ...] = ()
+    has_link: bool = True
+    has_torque: bool = True
+
+
+def build(kind: str, request: Request, say: Callable[[str], object] = lambda _text: None) -> list[Path]:
+    """Build, validate, run and only then put into place.
+
+    Parameters
+    ----------
+    kind : str
+        One of :data:`KINDS`.
+    request : Request
+    say : callable
+        Called with one sentence per result.
+
+    Returns
+    -------
+    list of Path
+        The files, in `request.out`.
+
+    Raises
+    ------
+    InputError
+        Where something is missing or a check fails; what was complete before stays, nothing is left half-written.
+    """
+    if kind not in KINDS:
+        raise InputError(f"{kind!r} cannot be built; choose one of {', '.join(KINDS)}")
+    made_folder = _prepare(request.out)
+    done: list[Path] = []
+    try:
+        with tempfile.TemporaryDirectory(prefix=".build-", dir=request.out) as temporary:
+            for maker in _makers(kind):
+                for path, note in maker(request, Path(temporary)):
+                    _check(path)
+                    final_path = request.out / path.name
+                    path.replace(final_path)
+                    done.append(final_path)
+                    say(f"{final_path} ({note}; validated, smoke run passed)")
+    finally:
+        if made_folder and not any(request.out.iterdir()):
+            request.out.rmdir()
+    return done
+
+
+_Maker = Callable[[Request, Path], list[tuple[Path, str]]]
+
+
+def _makers(kind: str) -> list[_Maker]:
+    table: dict[str, list[_Maker]] = {
+        "estimator": [_estimator], "plant": [_plant], "native": [_native], "ssp": [_ssp],
+        "all": [_estimator, _plant, _controlled, _native, _ssp],
+    }  # fmt: skip
+    return table[kind]
+
+
+def _prepare(out: Path) -> bool:
+    """Make the folder where it is missing; True where it was."""
+    missing = not out.exists()
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(prefix=".write-", dir=out):
+            return missing
+    except OSError as error:
+        raise InputError(f"{out}: cannot write there ({error.strerror}); choose a writable folder with --out") from None
+
+
+# --- the kinds -------------------------------------------------------------------------------------------------------
+
+
+def _base(request: Request) -> str:
+    from .joint_plant import identifier
+
+    return identifier(request.joint.name)
+
+
+def _compiler(request: Request) -> None:
+    try:
+        find_compiler(None if request.target in (None, "all") else request.target, request.cc)
+    except InputError as error:
+        raise InputError(_TRY if request.cc is None else str(error)) from None
+
+
+def _plant(request: Request, folder: Path) -> list[tuple[Path, str]]:
+    return [_one_plant(request, folder, f"{_base(request)}_plant", controller=request.controller, sensors=request.sensors)]
+
+
+def _controlled(request: Request, folder: Path) -> list[tuple[Path, str]]:
+    return [_one_plant(request, folder, f"{_base(request)}_plant_controlled", controller=True, sensors=True)]
+
+
+def _one_plant(request: Request, folder: Path, name: str, *, controller: bool, sensors: bool) -> tuple[Path, str]:
+    from .joint_plant import PlantOptions, plant_spec
+    from .plant import build_plant
+
+    _compiler(request)
+    spec = plant_spec(request.joint, PlantOptions(controller=controller, sensors=sensors, name=name))
+    path = build_plant(spec, folder / f"{name}.fmu", cc=request.cc, target=request.target)
+    kinds = "co-simulation" if spec.memory else "model exchange and co-simulation"
+    return path, f"FMI 2.0 {kinds}, {len(spec.states) + len(spec.memory)} states, {len(spec.parameters)} parameters"
+
+
+def _estimator(request: Request, folder: Path) -> list[tuple[Path, str]]:
+    from .estimator import DETECTOR_FILE, JOINT_FILE, OPTIONS_FILE, options_text
+    from .online import OnlineOptions, prepared
+    from .package import SlaveSpec, package_slave
+
+    name = f"{_base(request)}_estimator"
+    options = OnlineOptions(has_link=request.has_link, has_torque=request.has_torque)
+    prepared(request.joint, options)
+    texts = folder / "texts"
+    texts.mkdir(exist_ok=True)
+    (texts / OPTIONS_FILE).write_text(options_text(options), encoding="utf-8")
+    files = {JOINT_FILE: request.source, OPTIONS_FILE: texts / OPTIONS_FILE}
+    state = detector_state(request.joint, options, request.healthy)
+    if state is not None:
+        (texts / DETECTOR_FILE).write_bytes(state)
+        files[DETECTOR_FILE] = texts / DETECTOR_FILE
+    spec = SlaveSpec(name, "irj_fmu.estimator", "Estimator", tuple(_package(p) for p in ("casadi_models", "identification", "irj_fmu")), files)
+    packaged = package_slave(spec, folder / f"{name}.fmu", cc=request.cc)
+    return [(packaged.path, f"FMI 2.0 co-simulation; {packaged.message}")]
+
+
+def detector_state(joint: Joint, options: object, healthy: Sequence[Path], dt: float = 1e-3) -> bytes | None:
+    """State of a fault detector calibrated with healthy records; None without records.
+
+    Raises
+    ------
+    InputError
+        Where the joint is rigid or not fitted, or a record lacks a channel.
+    """
+    if not healthy:
+        return None
+    import numpy as np
+
+    from identification.fault import FaultDetector
+    from identification.read import read
+
+    from .online import OnlineOptions, prepared
+
+    if not isinstance(options, OnlineOptions):
+        raise InputError("detector_state: options must be OnlineOptions")
+    model, _ = prepared(joint, options)
+    if not joint.fitted or not model.is_elastic:
+        raise InputError(f"{joint.source or joint.name}: the fault detector needs an elastic joint with fitted values")
+    tables = []
+    for path in healthy:
+        record = read(path, columns=joint.columns)
+        ratio = joint.gear_ratio
+        drive = record["motor_current"] * (joint.torque_per_current or 1.0) if record.has("motor_current") else record["motor_torque"] * ratio
+        torque = record["link_torque"] if record.has("link_torque") else np.zeros(len(drive))
+        dt = record.dt
+        tables.append(
+            np.column_stack([
+                drive, record["motor_position"] / ratio, record["motor_velocity"] / ratio, record["link_position"],
+                record["link_velocity"], torque,
+            ])
+        )  # fmt: skip
+    detector = FaultDetector(model, dt, has_torque=options.has_torque)
+    detector.calibrate(np.concatenate(tables))
+    return detector.state()
+
+
+def _native(request: Request, folder: Path) -> list[tuple[Path, str]]:
+    try:
+        from .native import build_native
+    except ImportError:
+        raise InputError("the native estimator is not part of this installation; build `estimator` instead") from None
+    _compiler(request)
+    name = f"{_base(request)}_native"
+    path = build_native(request.joint, folder / f"{name}.fmu", cc=request.cc, target=request.target)
+    return [(path, "FMI 2.0 co-simulation without Python")]
+
+
+def _ssp(request: Request, folder: Path) -> list[tuple[Path, str]]:
+    from .plant import build_plant
+    from .ssp import System, multisine_source, write_ssp
+
+    _compiler(request)
+    base = _base(request)
+    plant, _ = _one_plant(request, folder, f"{base}_plant", controller=False, sensors=request.sensors)
+    estimator = _estimator(request, folder)[0][0]
+    by_current = request.joint.torque_per_current is not None
+    scale = request.joint.torque_per_current if by_current else request.joint.gear_ratio
+    tones = [size / abs(float(scale or 1.0)) for size in (60.0, 30.0, 10.0)]
+    spec = multisine_source(tones, (0.2, 0.7, 2.3), (0.0, 1.0, 2.0), unit="A" if by_current else "N.m")
+    source = build_plant(spec, folder / "source.fmu", cc=request.cc)
+    drive = "i_m" if by_current else "tau_m"
+    channels = {"q_m": "motor_position", "w_m": "motor_velocity", "q_l": "link_position", "w_l": "link_velocity", "tau_l": "link_torque"}
+    connections = {f"plant.{drive}": "source.signal", f"estimator.{drive}": "source.signal"}
+    connections |= {f"estimator.{k}": f"plant.{v}" for k, v in channels.items()}
+    system = System({"source": source, "plant": plant, "estimator": estimator}, connections, name=base, stop=40.0)
+    path = write_ssp(system, folder / f"{base}.ssp")
+    return [(path, "SSP 1.0: source, plant, estimator")]
+
+
+def _package(name: str) -> Path:
+    found = importlib.util.find_spec(name)
+    for place in (found.submodule_search_locations or []) if found else []:
+        return Path(place)
+    raise InputError(f"package {name} is missing; install the project again")
+
+
+# --- checks ----------------------------------------------------------------------------------------------------------
+
+
+def _check(path: Path) -> None:
+    if path.suffix == ".ssp":
+        _run(path, [sys.executable, "-I", "-c", _SMOKE_SSP, str(path)])
+        return
+    from fmpy.validation import validate_fmu
+
+    problems = validate_fmu(str(path))
+    if problems:
+        raise InputError(f"{path.name}: not a valid FMU: {problems[0]}")
+    if _runs_here(path):
+        _run(path, [sys.executable, "-I", "-c", _SMOKE, str(path), "0.001", "200"])
+
+
+_SMOKE_SSP: Final = """
+import sys
+from fmpy.ssp.ssd import read_ssd
+found = read_ssd(sys.argv[1])
+if len(found.system.elements) < 2 or not found.system.connections:
+    sys.exit("no components or connections")
+"""
+
+
+def _runs_here(path: Path) -> bool:
+    from fmpy import platform, supported_platforms
+
+    return platform in supported_platforms(str(path))
+
+
+def _run(path: Path, command: Sequence[str]) -> None:
+    """A fresh process in another folder."""
+    with tempfile.TemporaryDirectory(prefix="irj-smoke-") as elsewhere:
+        environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+        done = subprocess.run(command, cwd=elsewhere, capture_output=True, text=True, check=False, env=environment)
+    if done.returncode != 0:
+        last = (done.stderr.strip() or done.stdout.strip() or f"exit {done.returncode}").splitlines()[-1]
+        raise InputError(f"{path.name}: the smoke run failed: {last}")
+
+
+# --- command line ----------------------------------------------------------------------------------------------------
+
+
+def parser() -> argparse.ArgumentParser:
+    """Arguments of ``build_fmu.py``."""
+    made = argparse.ArgumentParser(prog="build_fmu.py", description="Build, validate and try the FMUs of a joint file.")
+    made.add_argument("kind", choices=KINDS)
+    made.add_argument("--joint", required=True, type=Path, help="joint file (TOML), fitted or not")
+    made.add_argument("--out", default=Path("dist"), type=Path, help="folder of the results (default: dist)")
+    made.add_argument("--cc", help="C compiler: a command such as gcc, or zig for the ziglang package")
+    made.add_argument("--target", help="platform of plants: x86_64-linux-gnu, x86_64-windows-gnu, ..., or all")
+    made.add_argument("--controller", action="store_true", help="plant: drive it by a position controller")
+    made.add_argument("--sensors", action="store_true", help="plant: readings with noise, quantisation and faults as parameters")
+    made.add_argument("--healthy", nargs="+", default=[], type=Path, metavar="RECORD", help="estimator: records of the healthy joint, for the limits of its fault detector")
+    made.add_argument("--no-link", action="store_true", help="estimator: the joint has no link encoder")
+    made.add_argument("--no-torque", action="store_true", help="estimator: the joint has no torque sensor")
+    made.add_argument("--json", type=Path, metavar="FILE", help="write what was built as JSON")
+    return made
+
+
+def main(argv: Sequence[str]) -> int:
+    """Build; 0 where everything was built, 2 with one line on unusable input."""
+    arguments = parser().parse_args(argv)
+    try:
+        request = Request(
+            joint=load_joint(arguments.joint), source=arguments.joint, out=arguments.out, cc=arguments.cc,
+            target=arguments.target, controller=arguments.controller, sensors=arguments.sensors,
+            healthy=tuple(arguments.healthy), has_link=not arguments.no_link, has_torque=not arguments.no_torque,
+        )  # fmt: skip
+        done = build(arguments.kind, request, lambda text: sys.stdout.write(f"{text}\n"))
+        if arguments.json is not None:
+            try:
+                arguments.json.write_text(json.dumps({"built": [str(p) for p in done]}, indent=1), encoding="utf-8")
+            except OSError as error:
+                raise InputError(f"{arguments.json}: cannot write there ({error.strerror})") from None
+    except InputError as error:
+        sys.stderr.write(f"{error}\n")
+        return 2
+    return 0
