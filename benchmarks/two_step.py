@@ -89,14 +89,14 @@ def table(seeds: int) -> None:
                     fit = TwoStep(model, method, settings=settings).fit(y, w)
                     found.append((method, fit, time.perf_counter() - start))
                 reference = min(reference, *(f.sum_of_squares for _, f, _ in found if min(f.linear.values()) >= 0))
-                for method, fit, seconds in found:
+                for method, fit, took in found:
                     excess = fit.sum_of_squares / reference - 1
-                    rows.setdefault(method, []).append((excess, fit.evaluations, seconds, bool(fit.negative)))
+                    rows.setdefault(method, []).append((excess, fit.evaluations, took, bool(fit.negative)))
             for method, results in rows.items():
-                over, evaluations, seconds, repeated = (np.array(v) for v in zip(*results, strict=True))
+                over, evaluations, spent, repeated = (np.array(v) for v in zip(*results, strict=True))
                 print(
                     f"{name:11} {method:20} {np.sum(over < 1 / len(w)):3d}/{seeds}  {np.sum(over < 1e-5):3d}/{seeds} "
-                    f"{np.median(evaluations):8.0f} {np.max(evaluations):6.0f} {'':10} {np.mean(seconds):8.2f}"
+                    f"{np.median(evaluations):8.0f} {np.max(evaluations):6.0f} {'':10} {np.mean(spent):8.2f}"
                     f" {np.sum(repeated):8d}",
                     flush=True,
                 )  # fmt: skip
@@ -163,13 +163,11 @@ def variant(seeds: int) -> None:
         model, y, signals = variant_record(seed, dt, seconds)
         two = TwoStep(model, online=OnlineSettings(sample_time=dt))
         path = np.zeros((len(y), len(model.names)))
-        begin = time.perf_counter()
         cost = []
         for k in range(len(y)):
             t0 = time.perf_counter()
             path[k] = two.update(y[k], signals[k])
             cost.append(time.perf_counter() - t0)
-        del begin
         names = list(model.names)
         recovery = []
         for name in ("k1", "ka", "C1"):

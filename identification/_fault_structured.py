@@ -339,7 +339,8 @@ class StructuredRule:
         return [
             *map(float, counters), self.peak, self.core.torque_deviation, *map(float, self.failed),
             *map(float, self.first), *map(float, self.latest), *map(float, self.good), *self.low, *self.high,
-            *self.recover_limits, *(v for row in self.widening for v in row), *res.limits, *res.inverse, *res.energy_limits, *self.core.state.tolist(),
+            *self.recover_limits, *(v for row in self.widening for v in row), *res.limits,
+            *res.inverse, *res.energy_limits, *self.core.state.tolist(),
             *res.numbers(max(self.k, 0)),
         ]  # fmt: skip
 

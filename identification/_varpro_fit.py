@@ -156,7 +156,8 @@ def _solve(
     if method == "alternating":
         z, theta = alternating_search(problem, settings)
         square = 2.0 * _square(problem, z, theta)
-        negative: tuple[str, ...] = ()
+        signs = zip(problem.model.coefficients, theta, strict=True)
+        negative = tuple(c.name for c, v in signs if c.non_negative and v < 0)
     else:
         z, theta, square, negative = _project(problem, settings, start)
     deviations, rank_lost = cramer_rao(problem, z, theta, square)

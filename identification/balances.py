@@ -75,7 +75,7 @@ class Balances:
         self.names: tuple[str, ...] = model.parameter_names
         self.wrt: tuple[str, ...] = tuple(wrt) if wrt is not None else self.names
         e = model.equations
-        signals = e.signals.vector()
+        signals: Any = e.signals.vector()
         parameters = e.parameters
         expressions = residual_expressions(model, sensing)
         columns = [self.names.index(n) for n in self.wrt]
@@ -98,9 +98,9 @@ class Balances:
         zeroed: list[Expression] = []
         substitute: Any = ca.substitute
         for i in range(out.shape[0]):
-            names = [signals[j] for j in range(len(_NAMES)) if linear[i, j]]
+            names: list[Any] = [signals[j] for j in range(len(_NAMES)) if linear[i, j]]
             zeroed.append(substitute([out[i]], names, [ca.SX(0)] * len(names))[0] if names else out[i])
-        self._has_rest = [not z.is_zero() for z in zeroed]
+        self._has_rest = [not part.is_zero() for part in zeroed]
         needed = [i for i, used in enumerate(self._has_rest) if used]
         rest = ca.vertcat(*(zeroed[i] for i in needed)) if needed else ca.SX(0, 1)
         self._needed = needed
@@ -208,11 +208,11 @@ class Memory:
         aside = ca.SX.sym("aside", len(self._used), UNROLLED)
         p = ca.SX.sym("p", e.parameters.shape[0])
         clock = ca.SX.sym("clock")
-        z: Any = z0
+        state: Any = z0
         trail: list[Any] = []
         for k in range(UNROLLED):
-            z = one(z, many[:, k], aside[:, k], p, clock)
-            trail.append(z)
+            state = one(state, many[:, k], aside[:, k], p, clock)
+            trail.append(state)
         self._stretch = ca.Function("stretch", [z0, many, aside, p, clock], [ca.horzcat(*trail)])
 
     def follow(self, where: FloatArray, signals: FloatArray, p: FloatArray, step: float) -> FloatArray:

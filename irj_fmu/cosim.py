@@ -1,0 +1,305 @@
+"""Co-simulate a plant FMU with its estimator FMU and compare the estimate with the plant's values."""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final, final
+
+import numpy as np
+import numpy.typing as npt
+
+from identification.errors import InputError
+from identification.joint_file import Joint, load_joint, toml_text
+
+from .build import detector_state
+from .estimator import DETECTOR_FILE, JOINT_FILE, OPTIONS_FILE, options_text
+from .host import Fmu, Instance, Trajectory, Wiring, simulate_cs
+from .joint_plant import PlantOptions, identifier, plant_spec
+from .online import OnlineOptions, prepared
+from .plant import build_plant
+from .reference import NAMES, Motion, published_joint, reference_joint, start_of
+from .signals import Fault, Table
+
+FloatArray = npt.NDArray[np.float64]
+
+CHANNELS: Final = {"q_m": "motor_position", "w_m": "motor_velocity", "q_l": "link_position", "w_l": "link_velocity", "tau_l": "link_torque"}
+"""Inputs of the estimator and the outputs of the plant that feed them."""
+TIGHT: Final = 2.0
+LOOSE: Final = 10.0
+"""Largest errors [%]; the loose one holds for the Stribeck part and the cubic stiffness."""
+_TIGHT_NAMES: Final = ("stiffness", "inertia", "gravity_torque", "coulomb", "viscous", "loss_constant", "loss_viscous")
+_LOOSE_NAMES: Final = ("stribeck", "cubic_stiffness", "loss_cubic", "structural_damping")
+
+
+@final
+@dataclass(frozen=True)
+class Row:
+    """One parameter: what the plant has, what the estimator says.
+
+    Attributes
+    ----------
+    plant, estimate, sigma : float
+        In `unit`; a name with ``+`` is the sum of parameters that no motion of this joint tells apart.
+    limit : float or None
+        Largest error asked for [%].
+    """
+
+    joint: str
+    name: str
+    unit: str
+    plant: float
+    estimate: float
+    sigma: float
+    limit: float | None
+
+    @property
+    def error(self) -> float:
+        """Relative error [%]; NaN where the plant has 0."""
+        return 100.0 * (self.estimate / self.plant - 1.0) if self.plant else float("nan")
+
+    @property
+    def passed(self) -> bool:
+        """True where the limit holds or there is none."""
+        return self.limit is None or abs(self.error) <= self.limit
+
+
+@final
+@dataclass(frozen=True)
+class Cosimulation:
+    """A co-simulation of plant and estimator.
+
+    Attributes
+    ----------
+    trajectory : Trajectory
+        ``estimator.theta[k]``, ``estimator.health``, ``estimator.fault``, the ratios, and what else was asked for.
+    names : tuple of str
+        Estimated parameters.
+    rows : tuple of Row
+        At the end.
+    ratios : mapping of str to float
+        Residual over floor of each balance at the end.
+    messages : tuple of str
+        What the estimator logged.
+    """
+
+    trajectory: Trajectory
+    names: tuple[str, ...]
+    rows: tuple[Row, ...]
+    ratios: Mapping[str, float]
+    messages: tuple[str, ...]
+
+
+@final
+@dataclass(frozen=True)
+class Setting:
+    """How a co-simulation runs.
+
+    Attributes
+    ----------
+    stop, step : float
+        Length and communication step [s].
+    motion : Motion
+    parameters : mapping
+        Start values by ``plant.name`` or ``estimator.name``, e.g. noise and faults of the plant's sensors.
+    faults : mapping
+        By input of the estimator, e.g. ``{"q_l": bias(20.0, 0.01)}``.
+    record : sequence of str
+        Further variables.
+    """
+
+    stop: float = 40.0
+    step: float = 1e-3
+    motion: Motion = field(default_factory=Motion)
+    parameters: Mapping[str, float | str | bool] = field(default_factory=dict)
+    faults: Mapping[str, Fault] = field(default_factory=dict)
+    record: Sequence[str] = ()
+
+
+def make_pair(
+    plant: Joint, model: Joint, folder: Path, *, cc: str | None = None, healthy: Sequence[Path] = (), shim: bool = False
+) -> tuple[Path, Path]:
+    """Build a plant FMU with controller and sensors, and an estimator FMU of a joint file.
+
+    Parameters
+    ----------
+    plant : Joint
+        What the plant is.
+    model : Joint
+        What the estimator believes.
+    folder : Path
+    cc : str, optional
+        C compiler.
+    healthy : sequence of Path
+        Records for the estimator's fault detector.
+    shim : bool
+        Give the estimator the shim for C hosts.
+
+    Returns
+    -------
+    tuple of Path
+        Plant and estimator.
+    """
+    from .build import _package
+    from .package import SlaveSpec, package_slave
+
+    folder.mkdir(parents=True, exist_ok=True)
+    name = identifier(plant.name)
+    spec = plant_spec(plant, PlantOptions(controller=True, sensors=True, name=f"{name}_plant"))
+    built = build_plant(spec, folder / f"{name}_plant.fmu", cc=cc)
+    options = OnlineOptions()
+    texts = folder / f"{name}_texts"
+    texts.mkdir(exist_ok=True)
+    values = {k: {"value": v, "unit": "", "side": ""} for k, v in model.fitted.items()}
+    (texts / JOINT_FILE).write_text(toml_text(model, values), encoding="utf-8")
+    (texts / OPTIONS_FILE).write_text(options_text(options), encoding="utf-8")
+    files = {n: texts / n for n in (JOINT_FILE, OPTIONS_FILE)}
+    state = detector_state(model, options, healthy)
+    if state is not None:
+        (texts / DETECTOR_FILE).write_bytes(state)
+        files[DETECTOR_FILE] = texts / DETECTOR_FILE
+    packages = tuple(_package(p) for p in ("casadi_models", "identification", "irj_fmu"))
+    made = package_slave(
+        SlaveSpec(f"{name}_estimator", "irj_fmu.estimator", "Estimator", packages, files),
+        folder / f"{name}_estimator.fmu", cc=cc, shim=shim,
+    )  # fmt: skip
+    return built, made.path
+
+
+def cosimulate(plant: Joint, model: Joint, files: tuple[Path, Path], setting: Setting | None = None) -> Cosimulation:
+    """Run plant and estimator together along a motion.
+
+    Raises
+    ------
+    InputError
+        Unknown names in the setting.
+    FmuError
+        An FMU refused a call.
+    """
+    setting = setting or Setting()
+    adapted, sensing = prepared(model, OnlineOptions())
+    from .online import held_parameters
+    from .rows import linear_parameters
+
+    names = linear_parameters(adapted, sensing, held_parameters(model))
+    time = setting.step * np.arange(round(setting.stop / setting.step) + 1)
+    references = zip(("position", "velocity", "acceleration"), setting.motion.signals(), strict=True)
+    drive = ("i_m", "motor_current") if model.torque_per_current is not None else ("tau_m", "motor_torque")
+    connections = {f"estimator.{k}": f"plant.{v}" for k, v in {**CHANNELS, drive[0]: drive[1]}.items()}
+    outputs = [f"theta[{i}]" for i in range(1, len(names) + 1)] + [f"sigma[{i}]" for i in range(1, len(names) + 1)]
+    outputs += ["health", "fault", *(f"ratio.{b}" for b in sensing.balances)]
+    wiring = Wiring(
+        connections=connections,
+        inputs={f"plant.reference_{n}": Table(time, np.array([f(t) for t in time])) for n, f in references},
+        faults={f"estimator.{k}": f for k, f in setting.faults.items()},
+        parameters={**start_state(plant, setting.motion), **setting.parameters},
+        record=[*(f"estimator.{n}" for n in outputs), *setting.record],
+    )  # fmt: skip
+    with Fmu(files[0]) as first, Fmu(files[1]) as second, Instance(first, name="plant") as a, Instance(second, name="estimator") as b:
+        found = simulate_cs({"plant": a, "estimator": b}, wiring, step=setting.step, stop=setting.stop)
+        messages = tuple(b.messages)
+    ratios = {key: float(found[f"estimator.ratio.{key}"][-1]) for key in sensing.balances}
+    return Cosimulation(found, names, tuple(_rows(plant, names, found)), ratios, messages)
+
+
+def start_state(plant: Joint, motion: Motion) -> dict[str, float]:
+    """Start values that put the plant on the motion."""
+    q, v, _ = (f(0.0) for f in motion.signals())
+    sides = ("motor_", "link_") if plant.model().is_elastic else ("",)
+    return {f"plant.state.{side}{n}": x for side in sides for n, x in (("position", q), ("velocity", v))}
+
+
+def _rows(plant: Joint, names: Sequence[str], found: Trajectory) -> list[Row]:
+    model = plant.model()
+    units = {p.name: p.unit for p in model.parameters}
+    true = dict(zip(model.parameter_names, model.value_vector(), strict=True))
+    last = {n: float(found[f"estimator.theta[{i}]"][-1]) for i, n in enumerate(names, 1)}
+    spread = {n: float(found[f"estimator.sigma[{i}]"][-1]) for i, n in enumerate(names, 1)}
+    rows = []
+    twins = ("gravity_torque", "link_cyclic_torque_sine")
+    joined = twins if all(n in last for n in twins) else ()
+    for n in names:
+        if n in joined[1:] or n not in true:
+            continue
+        group = joined if n in joined else (n,)
+        rows.append(
+            Row(
+                plant.name, " + ".join(group), units[n], sum(true[g] for g in group), sum(last[g] for g in group),
+                min(spread[g] for g in group), _limit(n),
+            )
+        )  # fmt: skip
+    return rows
+
+
+def _limit(name: str) -> float | None:
+    if any(name.endswith(part) or part in name for part in _LOOSE_NAMES):
+        return LOOSE
+    return TIGHT if any(name.endswith(part) for part in _TIGHT_NAMES) and "cubic" not in name else None
+
+
+def convergence(
+    joints: Sequence[Joint], setting: Setting | None = None, *, cc: str | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[Row]:
+    """The table of convergence: each joint as a plant, its estimator started without values.
+
+    Returns
+    -------
+    list of Row
+        One per joint and parameter.
+    """
+    rows: list[Row] = []
+    for i, joint in enumerate(joints):
+        model = start_of(joint)
+        with tempfile.TemporaryDirectory(prefix="irj-cosim-") as folder:
+            rows += cosimulate(joint, model, make_pair(joint, model, Path(folder), cc=cc), setting).rows
+        if progress is not None:
+            progress(i + 1, len(joints))
+    return rows
+
+
+def table(rows: Sequence[Row]) -> str:
+    """The rows as text."""
+    lines = [f"{'joint':12s} {'parameter':40s} {'unit':12s} {'plant':>12s} {'estimate':>12s} {'error %':>9s} {'limit %':>8s}"]
+    for r in rows:
+        limit = f"{r.limit:8.0f}" if r.limit is not None else "       -"
+        mark = "" if r.passed else "  over"
+        lines.append(f"{r.joint:12s} {r.name:40s} {r.unit:12s} {r.plant:12.6g} {r.estimate:12.6g} {r.error:9.3f} {limit}{mark}")
+    return "\n".join(lines)
+
+
+def main(argv: Sequence[str]) -> int:
+    """``irj cosim``: print the table of convergence; 0 where every limit holds, 1 where not, 2 on unusable input."""
+    import argparse
+
+    parser = argparse.ArgumentParser(prog="irj cosim", description="Co-simulate plants and estimators and compare.")
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"reference joints: {', '.join(NAMES)} (default: all)")
+    parser.add_argument("--joint", action="append", default=[], type=Path, help="a fitted joint file as a plant")
+    parser.add_argument("--published", nargs=2, action="append", default=[], metavar=("FILE", "KEY"), help="a row of a table of published friction parameters")
+    parser.add_argument("--stop", type=float, default=40.0, help="length in s (default: 40)")
+    parser.add_argument("--cc", help="C compiler")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the table as JSON")
+    arguments = parser.parse_args(argv)
+    try:
+        joints = [load_joint(p) for p in arguments.joint] + [published_joint(Path(f), k) for f, k in arguments.published]
+        names = arguments.names or (() if joints else NAMES)
+        joints = [*(reference_joint(n) for n in names), *joints]
+        for joint in joints:
+            if not joint.fitted:
+                raise InputError(f"{joint.source}: has no fitted values; a plant needs them (run `irj fit` first)")
+        rows = convergence(joints, Setting(stop=arguments.stop), cc=arguments.cc)
+        sys.stdout.write(table(rows) + "\n")
+        if arguments.json is not None:
+            content: list[dict[str, Any]] = [{**r.__dict__, "error_percent": r.error, "passed": r.passed} for r in rows]
+            arguments.json.write_text(json.dumps({"rows": content}, indent=1), encoding="utf-8")
+    except (InputError, OSError) as error:
+        sys.stderr.write(f"{error}\n")
+        return 2
+    return 0 if all(r.passed for r in rows) else 1
+
+
+__all__ = ["Cosimulation", "Row", "Setting", "convergence", "cosimulate", "main", "make_pair", "replace", "table"]
