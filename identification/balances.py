@@ -82,7 +82,7 @@ class Balances:
         stacked: list[Expression] = []
         for r in expressions.values():
             stacked += [r, *(ca.vertsplit(ca.jacobian(r, parameters)[:, columns].T) if columns else [])]
-        out = ca.vertcat(*stacked)
+        out: Any = ca.vertcat(*stacked)
         self.balances = tuple(expressions)
         slopes = ca.jacobian(out, signals)
         sparsity = ca.jacobian_sparsity(ca.vec(ca.densify(slopes)), ca.vertcat(signals, e.memory))

@@ -81,9 +81,10 @@ def ratio(value: float | None) -> str:
 
 
 def interval(low: float, high: float) -> str:
-    """Two ends to the same decimal place, as 0.00 to 0.16: two digits of the span."""
+    """Two ends to the same decimal place, as 0.35 to 0.75: a hundredth of the span or so."""
     span = abs(high - low)
     if not (math.isfinite(span) and 1e-4 <= span < 1e6):
         return f"{number(low, 3)} to {number(high, 3)}"
-    places = max(1 - math.floor(math.log10(span)), 0)
-    return f"{low:.{places}f} to {high:.{places}f}".replace("-0." + "0" * places + " ", "0." + "0" * places + " ").replace("-", MINUS)
+    places = max(1 - math.floor(math.log10(span / 3)), 0)
+    ends = (round(v, places) + 0.0 for v in (low, high))
+    return " to ".join(f"{v:.{places}f}" for v in ends).replace("-", MINUS)

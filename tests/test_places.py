@@ -153,7 +153,7 @@ def swinging(kind: str, coulomb: float, ratio: float) -> Record:
     return Record.from_channels(time, channels, name="swing", kind=kind)
 
 
-@pytest.mark.parametrize(("kind", "ratio"), [("rotary", 50.0), ("linear", 1.0)])
+@pytest.mark.parametrize(("kind", "ratio"), [("rotary", 12.0), ("linear", 1.0)])
 def test_axes_and_units_of_a_record(kind: str, ratio: float) -> None:
     record = swinging(kind, 1.0, ratio)
     joint = Joint(kind=kind, gear_ratio=ratio, effects=("viscous",))

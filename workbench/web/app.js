@@ -1,0 +1,193 @@
+"use strict";
+/* The page's state, its talk with the server, and what surrounds the views. */
+const VIEWS = [["load", "Load"], ["model", "Model"], ["compare", "Compare"], ["diagnose", "Diagnose"], ["ledger", "Improve"], ["parameters", "Parameters"], ["export", "Export"]];
+const $ = (id) => document.getElementById(id);
+const app = { id: null, config: null, state: null, view: "load", source: null, plots: [], cleanup: [], then: null, sent: false, drafts: {} };
+
+function h(tag, attributes, ...children) {
+  const node = document.createElement(tag);
+  for (const [key, value] of Object.entries(attributes || {})) {
+    if (value == null || value === false) continue;
+    if (key.startsWith("on")) node.addEventListener(key.slice(2), value);
+    else if (key === "value" || key === "checked" || key === "selected" || key === "disabled" || key === "open" || key === "hidden") node[key] = value;
+    else node.setAttribute(key, value);
+  }
+  for (const child of children.flat(3)) if (child != null && child !== false) node.append(child);
+  return node;
+}
+
+async function call(method, path, body, raw) {
+  const options = { method, headers: { "X-IRJ": "1" } };
+  if (raw) options.body = raw;
+  else if (body) { options.body = JSON.stringify(body); options.headers["Content-Type"] = "application/json"; }
+  let answer;
+  try { answer = await fetch(path, options); } catch (error) { throw new Error("the server does not answer; is it still running? What was done is kept in the session folder."); }
+  if (!answer.ok) throw new Error((await answer.text()) || `error ${answer.status}`);
+  const type = answer.headers.get("content-type") || "";
+  return type.includes("json") ? answer.json() : answer.text();
+}
+const base = () => `/api/session/${app.id}`;
+const get = (path) => call("GET", base() + path);
+const post = (path, body) => call("POST", base() + path, body || {});
+
+function fail(error) {
+  $("error-text").textContent = error.message || String(error);
+  $("error").hidden = false;
+}
+function clearError() { $("error").hidden = true; }
+
+async function act(work) {
+  if (app.sent) return;
+  app.sent = true; clearError(); surround();
+  try { await work(); } catch (error) { fail(error); } finally { app.sent = false; surround(); }
+}
+
+/* Start long work; `then` is the view to open when it came to its end. */
+function run(action, body, then) {
+  return act(async () => {
+    app.then = then ? { view: then, steps: app.state.steps.length, revision: app.state.revision } : null;
+    try { await post("/run", { action, ...body }); } catch (error) { app.then = null; throw error; }
+  });
+}
+
+function busy() { return Boolean(app.sent || (app.state && app.state.job)); }
+
+async function refresh() {
+  const state = await get("");
+  if (app.state && state.id === app.state.id && state.revision < app.state.revision) return;
+  const changed = !app.state || state.revision !== app.state.revision || state.id !== app.state.id;
+  app.state = state;
+  const then = app.then;
+  if (then && !state.job) {
+    app.then = null;
+    if (!state.error && state.revision > then.revision) { if (typeof then.view === "function") then.view(); else if (app.view !== then.view) { open(then.view); return; } }
+  }
+  if (state.error) fail(new Error(state.error));
+  surround();
+  if (changed) render(false);
+}
+
+function listen() {
+  if (app.source) app.source.close();
+  app.source = new EventSource(base() + "/events");
+  app.source.onmessage = (event) => {
+    const news = JSON.parse(event.data);
+    if (!app.state) return;
+    const ended = app.state.job && !news.job;
+    app.state.job = news.job;
+    surround();
+    if (news.revision !== app.state.revision || ended || news.error) refresh().catch(fail);
+  };
+}
+
+function surround() {
+  const state = app.state;
+  if (!state) return;
+  const fitted = state.steps.length > 0, ready = state.files.some((f) => f.status === "ready");
+  const usable = { load: true, model: true, compare: fitted, diagnose: fitted, ledger: fitted, parameters: fitted, export: Boolean(state.joint_text) };
+  const done = { load: ready, model: Boolean(state.joint_text), compare: fitted, diagnose: Boolean(state.diagnosis), ledger: state.steps.length > 1, parameters: false, export: false };
+  const list = $("nav");
+  if (!list.children.length) VIEWS.forEach(([key, name], k) => list.append(h("li", {}, h("button", { type: "button", id: `nav-${key}`, onclick: () => open(key) }, h("span", { class: "count", "aria-hidden": "true" }, String(k + 1)), name))));
+  for (const [key] of VIEWS) {
+    const button = $(`nav-${key}`);
+    button.disabled = !usable[key];
+    button.title = usable[key] ? "" : "after the first fit";
+    button.className = done[key] ? "done" : "";
+    if (key === app.view) button.setAttribute("aria-current", "page"); else button.removeAttribute("aria-current");
+  }
+  const last = state.steps[state.steps.length - 1];
+  const headline = last ? `${digits(last.held_out.relative_error_percent)} %` : "";
+  if ($("headline").dataset.text !== headline) { $("headline").dataset.text = headline; $("headline").replaceChildren(...(last ? ["held-out error ", h("strong", {}, headline)] : [])); }
+  $("undo").disabled = busy() || state.steps.length < 2;
+  $("redo").disabled = busy() || !state.undone.length;
+  $("job").hidden = !state.job;
+  if (state.job) {
+    $("job-text").textContent = state.job.text + " …";
+    if (state.job.share > 0) $("job-bar").value = state.job.share; else $("job-bar").removeAttribute("value");
+  }
+  document.querySelectorAll("[data-work]").forEach((b) => { b.disabled = busy() || b.dataset.off === "1"; });
+}
+
+function open(view) {
+  app.view = view;
+  try { history.replaceState(null, "", `#session=${app.id}&view=${view}`); } catch (error) { location.hash = `session=${app.id}&view=${view}`; }
+  surround();
+  render(true);
+}
+
+/* Draw the view again; the focus stays on the control with the same id. */
+function render(moved) {
+  const focused = document.activeElement && document.activeElement.id, where = moved ? 0 : scrollY;
+  app.plots.forEach((p) => p.destroy());
+  app.plots = [];
+  const main = $("main");
+  const token = (app.token = (app.token || 0) + 1);
+  Promise.resolve(views[app.view](app.state)).then((nodes) => {
+    if (token !== app.token) return;
+    main.replaceChildren(...[nodes].flat(3).filter(Boolean));
+    main.dataset.view = app.view; main.dataset.revision = app.state.revision;
+    document.title = `${VIEWS.find((v) => v[0] === app.view)[1]} – Joint workbench`;
+    surround();
+    (app.after || []).forEach((f) => f());
+    app.after = [];
+    if (moved) main.focus({ preventScroll: true });
+    else if (focused && $(focused)) $(focused).focus({ preventScroll: true });
+    scrollTo(0, where);
+  }).catch(fail);
+}
+
+async function upload(files) {
+  clearError();
+  const list = [...files].sort((a, b) => b.name.endsWith(".toml") - a.name.endsWith(".toml"));
+  for (const file of list) {
+    if (file.size > app.config.max_upload) { fail(new Error(`${file.name}: ${Math.round(file.size / 1e6)} MB is over the limit of ${Math.round(app.config.max_upload / 1e6)} MB; cut it, save it as NPZ, or start with: irj app FILE`)); continue; }
+    app.state.job = { text: `reading ${file.name}`, share: 0 };
+    surround();
+    try { await call("PUT", `${base()}/files/${encodeURIComponent(file.name)}`, null, file); } catch (error) { fail(error); }
+  }
+  app.state.job = null;
+  await refresh().catch(fail);
+}
+
+function theme(name) {
+  document.documentElement.dataset.theme = name;
+  $("theme").textContent = name === "dark" ? "Light" : "Dark";
+  $("theme").setAttribute("aria-label", name === "dark" ? "Use light colours" : "Use dark colours");
+}
+
+function remembered(key, value) {
+  try { if (value === undefined) return localStorage.getItem(key); localStorage.setItem(key, value); } catch (error) { return null; }
+  return value;
+}
+
+async function enter(id) {
+  app.id = id; app.state = null; app.drafts = {};
+  app.state = await get("");
+  remembered("irj-session", id);
+  listen();
+}
+
+async function fresh() {
+  await enter((await call("POST", "/api/session")).id);
+  open("load");
+}
+
+async function boot() {
+  theme(remembered("irj-theme") || (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light"));
+  $("theme").addEventListener("click", () => { const next = document.documentElement.dataset.theme === "dark" ? "light" : "dark"; remembered("irj-theme", next); theme(next); render(false); });
+  $("undo").addEventListener("click", () => run("undo"));
+  $("redo").addEventListener("click", () => run("redo"));
+  $("cancel").addEventListener("click", () => post("/cancel").catch(fail));
+  $("fresh").addEventListener("click", () => act(fresh));
+  $("error-close").addEventListener("click", clearError);
+  addEventListener("dragover", (e) => { e.preventDefault(); document.querySelectorAll(".drop").forEach((d) => d.classList.add("over")); });
+  addEventListener("dragleave", () => document.querySelectorAll(".drop").forEach((d) => d.classList.remove("over")));
+  addEventListener("drop", (e) => { e.preventDefault(); if (e.dataTransfer && e.dataTransfer.files.length) { if (app.view !== "load") open("load"); upload(e.dataTransfer.files); } });
+  app.config = await call("GET", "/api/config");
+  const asked = new URLSearchParams(location.hash.slice(1));
+  const known = asked.get("session") || remembered("irj-session");
+  try { if (!known) throw new Error(); await enter(known); } catch (error) { await enter((await call("POST", "/api/session")).id); }
+  const wanted = asked.get("view");
+  open(VIEWS.some(([key]) => key === wanted) && (app.state.steps.length || ["load", "model"].includes(wanted)) ? wanted : app.state.steps.length ? "ledger" : "load");
+}
+addEventListener("DOMContentLoaded", () => boot().catch(fail));

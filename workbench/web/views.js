@@ -1,0 +1,215 @@
+"use strict";
+/* One function per view: from the state to the nodes of the main region. */
+const later = (f) => { (app.after = app.after || []).push(f); };
+const button = (text, onclick, { kind = "", id, off, work = true, label } = {}) => h("button", { type: "button", class: kind, id, onclick, "aria-label": label, "data-work": work ? "1" : null, "data-off": off ? "1" : null, disabled: Boolean(off) }, text);
+const plural = (n, one, many) => `${n.toLocaleString("en")} ${n === 1 ? one : many || one + "s"}`;
+const effectTitle = (label) => { const e = app.config.effects.find((x) => x.key === label.split(/[@#]/)[0]); const p = label.includes("@") ? ` (${label.split("@")[1].replace(/_/g, " ")})` : ""; return (e ? e.title : label) + p; };
+const SEVERITY = { refuse: ["bad", "refused"], repair: ["warn", "repaired"], warn: ["warn", "check"], ok: ["good", "fine"] };
+
+function heading(title, lead) { return [h("h1", {}, title), lead && h("p", { class: "lead" }, lead)]; }
+
+function plotControls(plot, extra) {
+  return h("div", { class: "row" }, extra, button("Zoom in", () => plot.move(0.5), { kind: "quiet", work: false }), button("Zoom out", () => plot.move(2), { kind: "quiet", work: false }),
+    button("◀", () => plot.move(1, -0.5), { kind: "quiet", work: false, label: "Earlier" }), button("▶", () => plot.move(1, 0.5), { kind: "quiet", work: false, label: "Later" }),
+    button("Whole record", () => plot.show(null), { kind: "quiet", work: false }));
+}
+
+const views = {
+  load(state) {
+    const input = h("input", { type: "file", multiple: "", id: "files", "aria-label": "Measurement files and joint file", onchange: (e) => upload(e.target.files) });
+    const drop = h("div", { class: "drop" }, h("h2", {}, "Drop measurement files here"), h("p", { class: "soft" }, "CSV, MAT, NPZ, HDF5, Parquet, MDF, ROS bag; a joint file (TOML) too. They stay on this machine."), input);
+    if (!state.files.length) return [
+      heading("Which physics is your joint model missing?", "Load records of a joint, fit a model, see where it fails, add the missing effect and watch the error fall."),
+      h("div", { class: "first" }, drop, h("div", { class: "card" }, h("h2", {}, "No data at hand?"), h("p", {}, "The demo is a simulated harmonic-drive joint whose model lacks one effect. Find it in four clicks."),
+        button("Try the demo", () => act(async () => { await post("/demo"); await refresh(); }), { kind: "primary", id: "demo" }))),
+    ];
+    const ready = state.files.filter((f) => f.status === "ready");
+    const next = state.joint_text
+      ? button("Fit the start model", () => run("fit", {}, "compare"), { kind: "primary", id: "fit", off: !ready.length })
+      : button("Next: describe the joint", () => open("model"), { kind: "primary", id: "to-model", work: false });
+    return [
+      h("div", { class: "row between" }, h("div", {}, heading("Records")), next),
+      state.joint_text ? h("p", { class: "soft" }, "Joint: ", h("strong", {}, jointLine(state)), " ", h("button", { type: "button", class: "quiet", onclick: () => open("model") }, "Change")) : h("p", { class: "soft" }, "No joint described yet: gear ratio, motor constant and start model come next."),
+      state.files.map(fileCard), ready.length ? seriesCard(ready) : null, drop,
+    ];
+  },
+
+  async model(state) {
+    const { text, form } = await get("/view/joint");
+    const linear = form.kind === "linear", own = (m) => app.config.models[m] || [];
+    const field = (id, label, value, hint, more) => h("div", { class: "field" }, h("label", { for: id }, label), h("input", { id, value: value == null ? "" : String(value), "aria-describedby": `${id}-hint`, autocomplete: "off", ...more }), h("span", { class: "small soft", id: `${id}-hint` }, hint));
+    const select = h("select", { id: "model" }, Object.keys(app.config.models).map((m) => h("option", { value: m, selected: (form.model || "hd1") === m }, MODEL_TITLES[m] ? `${m}: ${MODEL_TITLES[m]}` : m)));
+    const chosen = new Set(form.effects || (text ? [] : ["viscous", "coulomb"])), common = ["viscous", "coulomb", "gravity"];
+    const box = (key, title) => h("label", { class: "check" }, h("input", { type: "checkbox", name: "effect", value: key, checked: chosen.has(key) }), title);
+    const others = app.config.effects.filter((e) => !common.includes(e.key)), exact = [...chosen].filter((c) => !app.config.effects.some((e) => e.key === c));
+    const read = () => ({
+      name: $("name").value, kind: document.querySelector("[name=kind]:checked").value, gear_ratio: $("gear_ratio").value, motor_constant: $("motor_constant").value,
+      torque_per_current: $("torque_per_current").value, torque_per_voltage: $("torque_per_voltage").value, model: $("model").value,
+      effects: [...document.querySelectorAll("[name=effect]:checked")].map((c) => c.value),
+    });
+    let edited = !text;
+    const save = async () => { if ($("joint-text").value !== text) await post("/joint", { text: $("joint-text").value, source: state.joint_source || "joint" }); else if (edited) await post("/joint", read()); };
+    const node = h("form", { oninput: (e) => { if (e.target.id !== "joint-text") edited = true; }, onsubmit: (e) => e.preventDefault() },
+      h("div", { class: "two" }, h("div", { class: "card" }, h("h2", {}, "The joint"),
+        field("name", "Name", form.name || "joint", "As it appears in the report."),
+        h("fieldset", {}, h("legend", {}, "Kind"), h("div", { class: "row" }, ["rotary", "linear"].map((k) => h("label", { class: "check" }, h("input", { type: "radio", name: "kind", value: k, id: `kind-${k}`, checked: (form.kind || "rotary") === k }), k)))),
+        field("gear_ratio", "Gear ratio", form.gear_ratio ?? "", "Motor angle over link angle, with its sign: −160 where the link turns the other way. 1 where everything is measured on one side.", { inputmode: "decimal" }),
+        h("fieldset", {}, h("legend", {}, "Drive: one of these, none where the torque itself is recorded"),
+          field("motor_constant", "Motor constant [N·m/A], on the motor shaft", form.motor_constant, "From the motor's data sheet.", { inputmode: "decimal" }),
+          field("torque_per_current", `${linear ? "Force" : "Torque"} per current [${linear ? "N/A" : "N·m/A"}], on the link side`, form.torque_per_current, "Motor constant times gear ratio.", { inputmode: "decimal" }),
+          field("torque_per_voltage", `${linear ? "Force" : "Torque"} per volt [${linear ? "N/V" : "N·m/V"}], on the link side`, form.torque_per_voltage, "Where only a voltage or a controller output is recorded.", { inputmode: "decimal" }))),
+      h("div", { class: "card" }, h("h2", {}, "The start model"), h("div", { class: "field" }, h("label", { for: "model" }, "Model"), select, h("span", { class: "small soft" }, "Start simple: the diagnosis says what is missing.")),
+        h("fieldset", {}, h("legend", {}, "Effects in it from the start"), h("div", { class: "checks" }, common.map((k) => box(k, effectTitle(k))), exact.map((k) => box(k, effectTitle(k)))),
+          h("details", { open: others.some((e) => chosen.has(e.key)) }, h("summary", {}, `All others (${others.length})`), h("div", { class: "checks" }, others.map((e) => box(e.key, e.title))))),
+        h("details", {}, h("summary", {}, "As joint file (TOML), with known values and column map"), h("label", { for: "joint-text" }, "Joint file"), h("textarea", { id: "joint-text", spellcheck: "false", value: text })))),
+      h("div", { class: "row" }, button("Save and fit", () => act(async () => { await save(); await refresh(); }).then(() => { if ($("error").hidden) run("fit", {}, "compare"); }), { kind: "primary", id: "save-fit", off: !state.files.some((f) => ["ready", "columns"].includes(f.status)) }),
+        button("Save", () => act(async () => { await save(); await refresh(); }), { id: "save" })));
+    return [heading("Model", "What is known about the joint, and the model to start from. Everything else has a start value and bounds derived from the records."), node];
+  },
+
+  async compare(state) {
+    const found = await get("/view/compare"), last = state.steps[state.steps.length - 1];
+    const balances = Object.keys(found.error.balances), first = found.places[0], host = h("div", { class: "plot" });
+    let balance = found.worst.balance;
+    const plot = new SeriesPlot(host, (range, points) => get(`/view/balance?balance=${balance}&points=${points}${range ? `&from=${range[0]}&to=${range[1]}` : ""}`), { title: "Measured torque, model and residual" });
+    app.plots.push(plot);
+    later(() => plot.show(null).then(() => plot.show([found.worst.low, found.worst.high])).catch(fail));
+    const pick = h("select", { id: "balance", "aria-label": "Balance in the time plot", onchange: (e) => { balance = e.target.value; plot.show(plot.range).catch(fail); } }, balances.map((b) => h("option", { value: b, selected: b === balance }, `${b} balance`)));
+    const strong = found.places.filter((p) => p.share_percent > 5), rest = found.places.filter((p) => !strong.includes(p));
+    const figure = (p) => h("figure", { class: "card place" }, h("figcaption", {}, `${p.balance} balance against ${p.title}`, h("span", {}, p.share_percent > 5 ? `explains ${digits(p.share_percent, 2)} % of the residual's variance on blocks it was not drawn from` : "explains next to nothing")), placePlot(p));
+    return [
+      h("div", { class: "row between" }, h("div", {}, heading("Where does the model fail?")), button("What is missing? Diagnose", () => run("diagnose", {}, "diagnose"), { kind: "primary", id: "diagnose" })),
+      state.note ? h("p", { class: "note small" }, state.note) : null,
+      h("div", { class: "tiles" }, h("div", { class: "card" }, h("p", { class: "soft" }, "Held-out error"), h("div", { class: "figure", id: "held-out-error" }, `${digits(found.error.relative_error_percent)} %`), h("p", { class: "small soft" }, `of the measured torque is not explained, on records the fit did not see (${found.records.join(", ")}). On the fit's own: ${digits(last.train.relative_error_percent)} %.`)),
+        balances.map((b) => { const e = found.error.balances[b]; return h("div", { class: "card" }, h("p", { class: "soft" }, `${b} balance`), h("div", { class: "figure" }, digits(e.ratio), h("small", {}, " × noise floor")), h("p", { class: "small soft" }, `residual ${digits(e.rms)} ${unit(e.unit)} rms; noise alone would leave ${digits(e.floor)}. ${e.ratio < 1.5 ? "Down to the noise." : "There is something left."}`)); })),
+      h("h2", { class: "gap" }, strong.length ? "Places where the residual is not chance" : "No place stands out"),
+      strong.length && first ? h("p", { class: "soft" }, `Line: mean residual; shade: 95 % band. The ${first.balance} balance fails most clearly against ${first.title}.`) : h("p", { class: "soft" }, "The residual looks alike everywhere: what is left is noise, or depends on something that was not measured."),
+      h("div", { class: "grid" }, (strong.length ? strong : found.places.slice(0, 1)).map(figure)),
+      h("details", {}, h("summary", {}, `Other places (${rest.length})`), h("div", { class: "grid" }, rest.map(figure))),
+      h("section", { class: "card gap" }, h("h2", {}, "In time, at the worst two seconds"), h("p", { class: "soft small" }, "Drag to zoom: up close every row is drawn. Double-click for the whole record."),
+        plotControls(plot, [pick, button("Worst window", () => plot.show([found.worst.low, found.worst.high]), { kind: "quiet", work: false })]), host),
+    ];
+  },
+
+  diagnose(state) {
+    const d = state.diagnosis;
+    const again = button(d ? "Diagnose again" : "Diagnose", () => run("diagnose", {}, "diagnose"), { kind: d ? "" : "primary", id: "diagnose" });
+    if (!d) return [h("div", { class: "row between" }, h("div", {}, heading("What is missing?", "Every effect of the library is tried in every place of the current model, and judged on blocks and records it was not fitted to.")), again)];
+    const clear = d.ranking.filter((r) => r.significant), faint = d.ranking.filter((r) => !r.significant), most = Math.max(1, ...d.ranking.map((r) => r.held_out_drop_percent || 0));
+    const row = (r, k) => {
+      const bar = h("i"), drop = r.held_out_drop_percent || 0;
+      later(() => { bar.style.width = `${Math.max(0, (100 * drop) / most)}%`; });
+      const key = d.claim && d.claim.label === r.label;
+      return h("li", { class: `candidate${r.significant ? "" : " dim"}` }, h("span", { class: "rank" }, String(k + 1)),
+        h("div", {}, h("h3", {}, r.title, " ", h("span", { class: "place" }, `· ${r.place.replace(/_/g, " ")}`)), h("p", { class: "small" }, `Without it ${r.absence}.`),
+          h("p", { class: "small soft" }, `${digits(r.contribution)} ${unit(d.unit)} rms in the ${r.balance} balance; p ${r.p_value < 1e-4 ? "< 0.0001" : "= " + digits(r.p_value, 2)}; ${digits(r.gain_nats)} nats.${r.confusable_with.length ? ` Often confused with ${r.confusable_with.map(effectTitle).join(", ")}.` : ""}`)),
+        h("div", { class: "effect-size" }, h("p", { class: "small" }, drop > 0 ? `residual −${digits(drop, 2)} %` : "no fall"), h("span", { class: "bar", "aria-hidden": "true" }, bar)),
+        h("div", { class: "act" }, button("Add", () => run("add", { label: r.label }, "ledger"), { kind: key ? "primary" : "", id: `add-${r.label.replace(/[@#]/g, "-")}`, label: `Add ${r.title}, ${r.place.replace(/_/g, " ")}` })));
+    };
+    const claim = d.claim;
+    return [
+      h("div", { class: "row between" }, h("div", {}, heading("What is missing?")), again),
+      claim ? h("div", { class: "card" }, h("p", { class: "figure", id: "claim" }, claim.effects.map(effectTitle).join(" or ")), h("p", {}, claim.effects.length > 1 ? `These records cannot tell the ${claim.effects.length} apart.${claim.separate_by ? ` ${claim.separate_by} would.` : ""}` : `The ${claim.balance} balance says so: with it the held-out residual there falls by ${digits(claim.held_out_drop_percent, 2)} %.`))
+        : h("div", { class: "card" }, h("p", { class: "figure", id: "claim" }, "Nothing that these records show"), h("p", {}, "No effect of the library helps enough on held-out data to be told from chance.")),
+      d.warnings.map((w) => h("p", { class: "note small" }, w)),
+      clear.length ? h("div", { class: "card" }, h("h2", {}, "Ranked effects"), h("p", { class: "soft small" }, "The bar is the fall of the residual on held-out records if the effect is added to the model as it stands. Falls do not add up: add one, then diagnose again."), h("ol", { class: "ranked" }, clear.map(row))) : null,
+      faint.length ? h("details", { class: "card" }, h("summary", {}, `Not to be told from chance, or too small (${faint.length})`), h("ol", { class: "ranked" }, faint.map((r, k) => row(r, k + clear.length)))) : null,
+      d.not_testable.length ? h("details", { class: "card" }, h("summary", {}, `Not testable with these records (${d.not_testable.length})`), h("ul", {}, d.not_testable.map((n) => h("li", {}, h("strong", {}, n.title), `: ${n.why}.`)))) : null,
+    ];
+  },
+
+  async ledger(state) {
+    const library = await get("/view/library"), steps = state.steps, last = steps[steps.length - 1], before = steps[steps.length - 2];
+    const now = last.held_out.relative_error_percent, was = before && before.held_out.relative_error_percent;
+    const story = state.improvement, inside = last.effects.filter((e) => e !== "channel_delay@drive");
+    const add = h("select", { id: "add-label", "aria-label": "Effect to add" }, library.filter((e) => !e.inside).map((e) => h("option", { value: e.label }, `${e.title} (${e.place.replace(/_/g, " ")})`)));
+    return [
+      h("div", { class: "row between" }, h("div", {}, heading(before ? (now < was ? `The error falls from ${digits(was)} to ${digits(now)} %` : `The error is ${digits(now)} %, from ${digits(was)} %`) : `The error is ${digits(now)} %`, "Each step is fitted to the training records and judged on records the fit did not see.")),
+        h("div", { class: "row" }, button(steps.length > 1 ? "What else is missing?" : "What is missing? Diagnose", () => run("diagnose", {}, "diagnose"), { kind: "primary", id: "diagnose" }), button("Take it home", () => open("export"), { work: false, id: "to-export" }))),
+      state.note ? h("p", { class: "note small" }, state.note) : null,
+      !last.exact ? h("p", { class: "note" }, "Fitted and judged on a part of the samples. ", button("Confirm on every sample", () => run("confirm"), { kind: "quiet", id: "confirm" })) : null,
+      story ? h("p", { class: "note", id: "verdict" }, h("strong", {}, story.verdict.replace(/_/g, " ") + ". "), story.reason) : null,
+      h("div", { class: "two" }, h("figure", { class: "card", id: "staircase" }, h("figcaption", {}, "The falling staircase"), staircase(steps)),
+        h("div", { class: "card" }, h("h2", {}, "In the model now"), h("ul", { class: "plain" }, inside.map((e) => h("li", {}, h("div", { class: "row between" }, effectTitle(e), button("Remove", () => run("remove", { label: e }), { kind: "quiet", label: `Remove ${effectTitle(e)}`, off: e === "transmission_compliance" && inside.includes("structural_damping") })))))),
+      ),
+      h("div", { class: "card scroll" }, h("table", {}, h("caption", {}, "Ledger"), h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Step"), h("th", { scope: "col", class: "num" }, "Held-out error"), h("th", { scope: "col", class: "num" }, "Fit"), h("th", { scope: "col", class: "num" }, "VAF"), Object.keys(last.held_out.balances).map((b) => h("th", { scope: "col", class: "num" }, `${b}: × floor`)))),
+        h("tbody", {}, steps.map((s, k) => h("tr", { class: k === steps.length - 1 ? "now" : null }, h("td", {}, stepName(s)), h("td", { class: "num" }, `${digits(s.held_out.relative_error_percent)} %`), h("td", { class: "num" }, `${digits(s.held_out.fit_percent)} %`), h("td", { class: "num" }, `${digits(s.held_out.vaf_percent, 4)} %`), Object.keys(last.held_out.balances).map((b) => h("td", { class: "num" }, s.held_out.balances[b] ? digits(s.held_out.balances[b].ratio) : "–"))))))),
+      h("div", { class: "card" }, h("h2", {}, "By hand"), h("div", { class: "row" }, add, button("Add", () => run("add", { label: $("add-label").value }), { id: "add-by-hand", label: "Add the chosen effect" }), button("Run the whole loop", () => run("improve", {}, "ledger"), { id: "improve" })), h("p", { class: "small soft" }, "The whole loop diagnoses and adds until nothing is left to name; it starts from the start model again.")),
+    ];
+  },
+
+  async parameters(state) {
+    const table = await get("/view/parameters"), rows = Object.entries(table).filter(([, p]) => !p.nuisance);
+    const band = (p) => p.stderr == null ? "–" : `${digits(p.value - 1.96 * p.stderr, 4)} … ${digits(p.value + 1.96 * p.stderr, 4)}`;
+    const flags = (p) => [p.at_bound && h("span", { class: "tag warn" }, "at its bound"), p.identifiable === false && h("span", { class: "tag warn" }, "not identified"), p.correlation && Math.abs(p.correlation.value) > 0.95 && h("span", { class: "tag warn" }, `tied to ${p.correlation.with.replace(/_/g, " ")}`)].filter(Boolean);
+    return [heading("Parameters", "Standard errors come from the scatter between blocks of the records. All values are referred to the link."),
+      h("div", { class: "card scroll" }, h("table", {}, h("thead", {}, h("tr", {}, ["Parameter", "Value", "± std. error", "95 % band", "Unit", "Side", "Flags"].map((t, k) => h("th", { scope: "col", class: k > 0 && k < 4 ? "num" : null }, t)))),
+        h("tbody", {}, rows.map(([name, p]) => h("tr", {}, h("td", {}, name.replace(/_/g, " "), h("div", { class: "small soft" }, p.meaning)), h("td", { class: "num" }, digits(p.value, 5)), h("td", { class: "num" }, digits(p.stderr, 2)), h("td", { class: "num" }, band(p)), h("td", {}, unit(p.unit)), h("td", {}, p.side), h("td", {}, h("div", { class: "row" }, flags(p).length ? flags(p) : h("span", { class: "soft" }, "–"))))))))];
+  },
+
+  async export(state) {
+    const { code } = await get("/view/code"), fitted = state.steps.length > 0;
+    const link = (name, text, note) => h("div", { class: "card" }, h("h2", {}, text), h("p", { class: "soft" }, note), h("a", { class: "button primary", href: `${base()}/view/${name}`, download: "", id: `get-${name.replace(".", "-")}` }, "Download"));
+    const made = (action, name, text, note, on) => h("div", { class: "card" }, h("h2", {}, text), h("p", { class: "soft" }, note), on ? button(`Make the ${text}`, () => run(action, {}, () => { const a = h("a", { href: `${base()}/view/${name}`, download: "" }); document.body.append(a); a.click(); a.remove(); }), { kind: "primary", id: `make-${action}`, off: !fitted }) : h("p", { class: "small" }, "Not available in this installation."));
+    const copied = h("span", { class: "small good", role: "status" });
+    return [heading("Take it home"), h("div", { class: "grid" },
+      link("joint.toml", "Joint file", fitted ? "The joint with its fitted values, standard errors and provenance. It is a joint file again." : "The joint as it was described; nothing is fitted yet."),
+      made("report", "report.html", "report", "One HTML file that opens offline: verdict, staircase, places before and after, parameters.", app.config.report),
+      made("fmu", "model.fmu", "FMU", "The joint as a simulation unit for other tools.", app.config.fmu)),
+      h("section", { class: "card" }, h("h2", {}, "Copy as code"), h("p", { class: "soft" }, "Python that does this session again, with the same errors. Run it in the folder of the measurement files."), h("div", { class: "row" }, button("Copy", () => navigator.clipboard.writeText(code).then(() => { copied.textContent = "copied"; }, () => { copied.textContent = "not allowed; select the text instead"; }), { work: false, id: "copy" }), h("a", { class: "button", href: `${base()}/view/session.py`, download: "" }, "Download"), copied), h("pre", { tabindex: "0", "aria-label": "Python code" }, h("code", {}, code)))];
+  },
+};
+
+const MODEL_TITLES = {
+  hd1: "rigid", hd2: "rigid, with the transmission's losses", hd3: "elastic, with structural damping", hd4: "elastic, with kinematic error",
+  irj1a: "rigid, with gravity", irj1b: "rigid, with gravity and Coulomb friction", irj2a: "elastic with cubic stiffness", irj2b: "elastic with cubic stiffness and friction", irj_ts: "elastic, full friction of the test stand",
+};
+
+function jointLine(state) {
+  const name = (state.joint_text.match(/name\s*=\s*"([^"]*)"/) || [])[1], model = (state.joint_text.match(/^model\s*=\s*"([^"]*)"/m) || [])[1];
+  return [name, model && `model ${model}`].filter(Boolean).join(", ");
+}
+
+function fileCard(f) {
+  const s = f.summary || {}, bad = f.findings.filter((x) => x.severity !== "ok"), fine = f.findings.filter((x) => x.severity === "ok");
+  const role = h("select", { id: `role-${f.id}`, "aria-label": `Role of ${f.name}`, onchange: (e) => act(async () => { await post(`/file/${f.id}`, { role: e.target.value }); await refresh(); }) }, [["train", "Fit"], ["held_out", "Held out"]].map(([v, t]) => h("option", { value: v, selected: f.role === v }, t)));
+  return h("section", { class: "card", "aria-label": f.name }, h("div", { class: "row between" },
+    h("div", {}, h("h2", {}, f.name), f.status === "ready" ? h("p", { class: "soft small" }, `${plural(s.samples, "sample")}, ${digits(s.duration, 4)} s, every ${digits(1000 * s.dt, 3)} ms${s.segments > 1 ? `, ${s.segments} stretches` : ""}. ${f.role === "held_out" ? "Held out" : "Fit"}: ${f.role_reason}.`) : null),
+    h("div", { class: "row" }, f.status === "ready" ? role : null, button("Remove", () => act(async () => { await call("DELETE", `${base()}/file/${f.id}`); await refresh(); }), { kind: "quiet", label: `Remove ${f.name}` }))),
+    f.status === "refused" ? h("p", { class: "bad" }, f.message) : null,
+    f.status === "columns" ? columnMap(f) : null,
+    bad.length ? h("ul", { class: "findings" }, bad.map((x) => h("li", {}, h("span", { class: `tag ${SEVERITY[x.severity][0]}` }, SEVERITY[x.severity][1]), " ", x.message))) : null,
+    f.status === "ready" ? h("details", {}, h("summary", {}, bad.length ? `Checked: ${fine.length} fine; columns` : "Checked, nothing to repair; columns"), h("ul", { class: "findings" }, s.columns.map((c) => h("li", {}, c)), s.notes.map((n) => h("li", {}, n)), fine.map((x) => h("li", {}, x.message)))) : null);
+}
+
+/* The guess is shown; it is used when the user confirms it. */
+function columnMap(f) {
+  const guessed = Object.fromEntries(f.guess.map((g) => [g.column, g])), same = app.state.files.filter((o) => o.status === "columns" && o.names.join() === f.names.join()).length;
+  const rows = f.names.map((name, k) => {
+    const g = guessed[name] || {}, id = `map-${f.id}-${k}`;
+    const channel = h("select", { id: `${id}-channel`, "aria-label": `Channel of column ${name}` }, h("option", { value: "" }, "not used"), app.config.channels.map((c) => h("option", { value: c, selected: c === g.channel }, c.replace(/_/g, " "))));
+    const box = (part, value, label) => h("input", { id: `${id}-${part}`, value, size: "9", "aria-label": `${label} of column ${name}`, autocomplete: "off" });
+    const parts = { channel, unit: box("unit", g.unit || "", "Unit"), scale: box("scale", g.scale && g.scale !== 1 ? String(g.scale) : "", "Scale"), sign: h("select", { id: `${id}-sign`, "aria-label": `Sign of column ${name}` }, h("option", { value: "1" }, "+"), h("option", { value: "-1", selected: g.sign === -1 }, "−")), counts: box("counts", "", "Counts per turn") };
+    return { name, parts, node: h("tr", {}, h("td", {}, h("strong", {}, name)), h("td", {}, parts.channel), h("td", {}, parts.unit), h("td", {}, parts.scale), h("td", {}, parts.sign), h("td", {}, parts.counts), h("td", { class: "small soft" }, g.reason || "no guess")) };
+  });
+  const confirm = () => act(async () => {
+    const columns = {};
+    for (const { name, parts } of rows) if (parts.channel.value) columns[parts.channel.value] = { column: name, unit: parts.unit.value.trim(), scale: parts.scale.value, sign: Number(parts.sign.value), counts_per_turn: parts.counts.value };
+    const made = await post(`/file/${f.id}`, { columns, all: true });
+    await refresh();
+    if (made.status !== "ready") throw new Error(made.message);
+  });
+  return h("div", {}, h("p", { class: "note" }, f.message, ". This is a guess by name and unit: check it, then use it."), h("div", { class: "scroll" }, h("table", { class: "map-table" }, h("thead", {}, h("tr", {}, ["Column", "Channel", "Unit", "Scale", "Sign", "Counts/turn", "Why"].map((t) => h("th", { scope: "col" }, t)))), h("tbody", {}, rows.map((r) => r.node)))),
+    h("div", { class: "row gap" }, button(same > 1 ? `Use for all ${same} files with these columns` : "Use these columns", confirm, { kind: "primary", id: `use-${f.id}` })));
+}
+
+function seriesCard(files) {
+  const draft = app.drafts.series || (app.drafts.series = {});
+  const file = files.find((f) => f.id === draft.file) || files[0], channels = file.summary.channels.map((c) => c.name);
+  const channel = channels.includes(draft.channel) ? draft.channel : channels[0], host = h("div", { class: "plot" });
+  const plot = new SeriesPlot(host, (range, points) => get(`/view/series?file=${file.id}&channels=${channel}&points=${points}${range ? `&from=${range[0]}&to=${range[1]}` : ""}`), { title: `${channel} of ${file.name}` });
+  app.plots.push(plot);
+  later(() => plot.show(null).catch(fail));
+  const pick = (id, label, options, chosen, key) => h("select", { id, "aria-label": label, onchange: (e) => { draft[key] = e.target.value; render(false); } }, options.map(([v, t]) => h("option", { value: v, selected: v === chosen }, t)));
+  return h("section", { class: "card" }, h("h2", {}, "Look at the records"), plotControls(plot, [pick("series-file", "Record", files.map((f) => [f.id, f.name]), file.id, "file"), pick("series-channel", "Channel", channels.map((c) => [c, c.replace(/_/g, " ")]), channel, "channel")]), host);
+}
