@@ -14,7 +14,7 @@ import numpy.typing as npt
 from casadi_models import EFFECTS, Effect, JointModel
 from casadi_models.effect import Place
 from identification.balances import Balances
-from identification.engine import Dataset, Solution, Stacked, stack
+from identification.engine import Dataset, Solution, Stacked, row_weights, stack
 from identification.sensing import Sensing
 from identification.weak import WeakRecord
 
@@ -247,7 +247,8 @@ def make_base(solution: Solution, data: Dataset) -> Base:
     if data.held_out:
         held = stack(balances, data.held_out, solution.values)
         hr, hj, _, hb = flatten(held, balances.balances)
-        held_weights = np.array([1 / solution.sigma[b] for b in balances.balances])[hb]
+        rows = row_weights(balances, data, solution.values, solution.sigma, data.held_out)
+        held_weights = np.concatenate([rows[b] for b in balances.balances])
         hj = hj[:, alive] * held_weights[:, None] / norms[alive]
         hr = hr * held_weights
     else:

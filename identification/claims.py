@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final, final
 
 import numpy as np
@@ -119,6 +119,18 @@ def rank(base: Base, extra: Sequence[Candidate] = (), *, late: bool = False) -> 
     significant = frozenset(t.candidate.label for t in unique if t.candidate.label in passed and _major(t, base))
     order = sorted(seen.values(), key=lambda t: (t.candidate.label not in significant, -t.score))
     return Ranking(tuple(order), significant, tuple(untestable.values()), tuple(unique))
+
+
+def nearly(ranking: Ranking, base: Base, refused: frozenset[str]) -> Trial | None:
+    """Best trial that the training blocks support and that only its linearised held-out drop keeps from being significant."""
+    for t in ranking.everything:
+        if t.candidate.label in ranking.significant:
+            return None
+        if t.candidate.label in refused or t.p_value > FALSE_DISCOVERY / max(len(ranking.everything), 1):
+            continue
+        if not math.isnan(t.held_out_drop_percent) and _major(replace(t, held_out_drop_percent=math.nan), base):
+            return t
+    return None
 
 
 def _discoveries(trials: Sequence[Trial]) -> set[str]:

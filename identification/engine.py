@@ -310,6 +310,7 @@ def solve(model: JointModel, data: Dataset, *, iterations: int = 15, start: Mapp
     linear_only = [n for n in free if n not in shapes]
     _check_moves(balances, data, values, linear_only)
     values, _ = _steps(balances, data, values, linear_only, limits, sigma, {}, 3, memory_shapes)
+    values = _best_start(balances, data, values, free, limits, memory_shapes)
     for _ in range(2):
         residual = stack(Balances(model, data.sensing, wrt=()), data.train, values).residual
         floor = floors(model, data, values)
@@ -321,6 +322,36 @@ def solve(model: JointModel, data: Dataset, *, iterations: int = 15, start: Mapp
     sigma = {b: max(rms(residual[b]), floor[b], 1e-12) for b in residual}
     weights = row_weights(balances, data, values, sigma, data.train)
     return _with_errors(model, balances, data, values, free, limits, weights, sigma, memory_shapes, used)
+
+
+def _best_start(
+    balances: Balances, data: Dataset, values: dict[str, float], free: Sequence[str],
+    limits: Mapping[str, tuple[float, float]], memory_shapes: Sequence[str],
+) -> dict[str, float]:  # fmt: skip
+    """Friction laws with a shape near zero velocity have several valleys: the best of a few smoothing velocities and exponents."""
+    shaped = [t for t in balances.model.terms if t.effect.key in ("stribeck", "lugre", "load_dependent_presliding")]
+    if not shaped:
+        return values
+    smooth = [f"{t.place}_smoothing_velocity" for t in shaped]
+    exponents = [n for t in shaped for n in t.names if n.endswith("exponent") and n in free]
+    trials = [dict(values)]
+    for share in (0.003, 0.01):
+        for power in (1.0, 2.0) if exponents else (1.0,):
+            moved = {n: min(max(share * data.ranges["velocity"], limits[n][0]), limits[n][1]) for n in smooth if n in free}
+            trials.append({**values, **moved, **dict.fromkeys(exponents, power)})
+    floor = floors(balances.model, data, values)
+    sigma = {b: max(floor[b], 1e-12) for b in floor}
+    reference = trials[-1]
+    weights = row_weights(balances, data, reference, sigma, data.train)
+    bare = Balances(balances.model, data.sensing, wrt=())
+    best: tuple[float, dict[str, float]] | None = None
+    for trial in trials:
+        fitted, _ = _steps(balances, data, trial, free, limits, sigma, weights, 6, memory_shapes)
+        residual = stack(bare, data.train, fitted).residual
+        cost = sum(float(np.sum((residual[b] * weights[b]) ** 2)) for b in residual)
+        if best is None or cost < best[0]:
+            best = (cost, fitted)
+    return best[1] if best is not None else values
 
 
 def _memory_shapes(model: JointModel, free: Sequence[str]) -> tuple[str, ...]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Final, Literal, final
+from dataclasses import dataclass
+from typing import Any, Final, Literal, final
 
 import numpy as np
 import numpy.typing as npt
@@ -163,6 +163,7 @@ class Experiment:
             raise InputError("Experiment: noise must be positive")
         self._columns = [linear.index(n) for n in chosen]
         self._follower = Follower(model, dt)
+        self._maps: dict[int, Any] = {}
         values = dict(zip(model.parameter_names, model.value_vector(), strict=True))
         self._values = np.array([values[n] for n in chosen])
 
@@ -177,8 +178,9 @@ class Experiment:
         rows = slice(None, None, self.stride)
         x, a = run.states[rows].T, run.accelerations[rows].T
         count = x.shape[1]
-        mapped = self.model.functions.regressor.map(count)
-        flat = np.asarray(mapped(x, a, np.zeros((3, count)), self.model.value_vector())[0])
+        if count not in self._maps:
+            self._maps[count] = self.model.functions.regressor.map(count)
+        flat = np.asarray(self._maps[count](x, a, np.zeros((3, count)), self.model.value_vector())[0])
         phi = flat.reshape(2, count, -1).transpose(1, 0, 2)
         return phi[:, :, self._columns]
 
@@ -299,7 +301,7 @@ def _refined(
             float(at[0]), float(at[1]), hold=base.parameters["hold"], start=base.parameters["start"],
             duration=float(base.time[-1] + base.dt), dt=base.dt,
         )  # fmt: skip
-        one = experiment.evaluate(replace(motion), normalised=criterion == "normalised", limits=limits)
+        one = experiment.evaluate(motion, normalised=criterion == "normalised", limits=limits)
         found.append(one)
         return _cost(one, criterion) + 1e6 * len(one.broken)
 

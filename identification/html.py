@@ -36,7 +36,6 @@ BALANCES: Final = {
     "axis": "drive torque against everything that moves, seen from one side",
 }
 STRONG_CORRELATION: Final = 0.95
-WIDE: Final = 4
 SHOWN_PLACES: Final = 4
 
 
@@ -45,7 +44,7 @@ def text(value: object) -> str:
     return html.escape(str(value), quote=True)
 
 
-def table(head: Sequence[str], rows: Iterable[Sequence[str]], caption: str, *, classes: Sequence[str] = ()) -> str:
+def table(head: Sequence[str], rows: Iterable[Sequence[str]], caption: str, *, classes: Sequence[str] = (), wide: bool = False) -> str:
     """A table from cells that are HTML already; the first cell of a row is its header.
 
     Parameters
@@ -57,6 +56,8 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], caption: str, *, c
         HTML.
     classes : sequence of str
         Class of each row; may be shorter than the rows.
+    wide : bool
+        With long texts: a page scrolls it sideways rather than squeeze it.
     """
     top = "".join(f'<th scope="col">{h}</th>' for h in head)
     body = []
@@ -64,8 +65,8 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], caption: str, *, c
         kind = f' class="{classes[i]}"' if i < len(classes) and classes[i] else ""
         cells = "".join(f"<td>{c}</td>" for c in row[1:])
         body.append(f'<tr{kind}><th scope="row">{row[0]}</th>{cells}</tr>')
-    wide = ' class="wide"' if len(head) > WIDE else ""
-    return f"<table{wide}><caption>{caption}</caption><thead><tr>{top}</tr></thead><tbody>{''.join(body)}</tbody></table>"
+    shape = ' class="wide"' if wide else ""
+    return f"<table{shape}><caption>{caption}</caption><thead><tr>{top}</tr></thead><tbody>{''.join(body)}</tbody></table>"
 
 
 def title_of(key: str) -> str:
@@ -105,9 +106,9 @@ def ledger_html(result: Mapping[str, Any]) -> str:
     if not steps:
         return "<p>No model was fitted.</p>"
     names = list(steps[0]["held_out"]["balances"])
-    head = ["step", "error, training", "error, held-out", "fit, held-out", *(f"{text(n)} ÷ noise" for n in names)]
+    head = ["step", "error, held-out", "error, training", "fit, held-out", *(f"{text(n)} ÷ noise" for n in names)]
     rows = [
-        [step_title(s, i), percent(s["train"]["relative_error_percent"]), percent(s["held_out"]["relative_error_percent"]),
+        [step_title(s, i), percent(s["held_out"]["relative_error_percent"]), percent(s["train"]["relative_error_percent"]),
          percent(s["held_out"]["fit_percent"]), *_ratios(s["held_out"]["balances"], names)]
         for i, s in enumerate(steps)
     ]  # fmt: skip
@@ -166,7 +167,7 @@ def ranking_html(
             ", ".join(title_of(k) for k in r["confusable_with"]) or "–",
         ])  # fmt: skip
         classes.append("" if r["significant"] or r["effect"] in claimed else "under")
-    return table(head, rows, caption or "Effects of the library, each tried alone on the start model", classes=classes)
+    return table(head, rows, caption or "Effects of the library, each tried alone on the start model", classes=classes, wide=True)
 
 
 def not_testable_html(result: Mapping[str, Any]) -> str:
@@ -210,7 +211,7 @@ def parameters_html(parameters: Mapping[str, Mapping[str, Any]], start: Mapping[
             "; ".join(flags) or "–", text(p["meaning"]),
         ])  # fmt: skip
         classes.append("under" if p.get("nuisance") else "flagged" if flags else "")
-    return table(head, rows, "Parameters, link-referred", classes=classes)
+    return table(head, rows, "Parameters, link-referred", classes=classes, wide=True)
 
 
 def record_html(record: Record) -> str:

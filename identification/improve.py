@@ -10,7 +10,7 @@ from typing import Any, Final, final
 from casadi_models import EFFECTS, JointModel
 from identification.assess import VERDICT_KERNELS, BalanceError, Error, assess
 from identification.candidates import LATE, Base, NotTestable, Trial, make_base
-from identification.claims import LADDER_STEP, Claim, Ranking, confusion_set, make_claim, minor_claims, rank, simplest
+from identification.claims import HELD_OUT_DROP, LADDER_STEP, Claim, Ranking, confusion_set, make_claim, minor_claims, nearly, rank, simplest
 from identification.engine import Dataset, Solution, load_dataset, prepared_model, solve
 from identification.errors import InputError
 from identification.joint_file import Joint
@@ -207,6 +207,7 @@ class _Loop:
         for _ in range(2 * max_additions):
             if len(claims) >= max_additions:
                 break
+            ranking = self._confirmed(ranking, base, steps[-1])
             best = ranking.best(frozenset(self.refused))
             if best is None and not late and max(e.ratio for e in steps[-1].held_out.balances.values()) > RATIO_LIMIT:
                 late = True
@@ -234,6 +235,21 @@ class _Loop:
             base = make_base(steps[-1].solution, self.data)
             ranking = rank(base)
         return self._finish(first, ranking, base, claims, steps)
+
+    def _confirmed(self, ranking: Ranking, base: Base, now: Step) -> Ranking:
+        """A candidate that fails on held-out records in its linear form only is judged by a whole fit."""
+        trial = nearly(ranking, base, frozenset(self.refused))
+        if trial is None:
+            return ranking
+        solution = solve(trial.candidate.model, self.data, start={**now.solution.values, **trial.values})
+        after = assess(solution.model, self.data, self.data.held_out, solution.values)
+        drop = held_drop(now.held_out, after, trial.balance)
+        if drop < HELD_OUT_DROP:
+            return ranking
+        passed = replace(trial, held_out_drop_percent=drop)
+        label = trial.candidate.label
+        renewed = tuple(passed if t.candidate.label == label else t for t in ranking.everything)
+        return replace(ranking, everything=renewed, significant=ranking.significant | {label})
 
     def _step(self, key: str | None, label: str | None, solution: Solution) -> Step:
         train = assess(solution.model, self.data, self.data.train, solution.values)

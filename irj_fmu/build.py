@@ -166,9 +166,11 @@ def _controlled(request: Request, folder: Path) -> list[tuple[Path, str]]:
 def _one_plant(request: Request, folder: Path, name: str, *, controller: bool, sensors: bool) -> tuple[Path, str]:
     from .joint_plant import PlantOptions, plant_spec
     from .plant import build_plant
+    from .reference import Motion
 
     _compiler(request)
-    spec = plant_spec(request.joint, PlantOptions(controller=controller, sensors=sensors, name=name))
+    motion = Motion() if controller else None
+    spec = plant_spec(request.joint, PlantOptions(controller=controller, motion=motion, sensors=sensors, name=name))
     path = build_plant(spec, folder / f"{name}.fmu", cc=request.cc, target=request.target)
     kinds = "co-simulation" if spec.memory else "model exchange and co-simulation"
     return path, f"FMI 2.0 {kinds}, {len(spec.states) + len(spec.memory)} states, {len(spec.parameters)} parameters"

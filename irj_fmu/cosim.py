@@ -23,7 +23,7 @@ from .joint_plant import PlantOptions, identifier, plant_spec
 from .online import OnlineOptions, prepared
 from .plant import build_plant
 from .reference import NAMES, Motion, published_joint, reference_joint, start_of
-from .signals import Fault, Table
+from .signals import Fault
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -44,7 +44,7 @@ class Row:
     Attributes
     ----------
     plant, estimate, sigma : float
-        In `unit`; a name with ``+`` is the sum of parameters that no motion of this joint tells apart.
+        In `unit`; a name with ``-`` is a difference of parameters that no motion of this joint tells apart.
     limit : float or None
         Largest error asked for [%].
     """
@@ -103,7 +103,6 @@ class Setting:
     ----------
     stop, step : float
         Length and communication step [s].
-    motion : Motion
     parameters : mapping
         Start values by ``plant.name`` or ``estimator.name``, e.g. noise and faults of the plant's sensors.
     faults : mapping
@@ -114,14 +113,14 @@ class Setting:
 
     stop: float = 40.0
     step: float = 1e-3
-    motion: Motion = field(default_factory=Motion)
     parameters: Mapping[str, float | str | bool] = field(default_factory=dict)
     faults: Mapping[str, Fault] = field(default_factory=dict)
     record: Sequence[str] = ()
 
 
 def make_pair(
-    plant: Joint, model: Joint, folder: Path, *, cc: str | None = None, healthy: Sequence[Path] = (), shim: bool = False
+    plant: Joint, model: Joint, folder: Path, *, cc: str | None = None, healthy: Sequence[Path] = (), shim: bool = False,
+    motion: Motion | None = None,
 ) -> tuple[Path, Path]:
     """Build a plant FMU with controller and sensors, and an estimator FMU of a joint file.
 
@@ -138,6 +137,8 @@ def make_pair(
         Records for the estimator's fault detector.
     shim : bool
         Give the estimator the shim for C hosts.
+    motion : Motion, optional
+        What the plant's controller follows.
 
     Returns
     -------
@@ -149,7 +150,7 @@ def make_pair(
 
     folder.mkdir(parents=True, exist_ok=True)
     name = identifier(plant.name)
-    spec = plant_spec(plant, PlantOptions(controller=True, sensors=True, name=f"{name}_plant"))
+    spec = plant_spec(plant, PlantOptions(controller=True, motion=motion or Motion(), sensors=True, name=f"{name}_plant"))
     built = build_plant(spec, folder / f"{name}_plant.fmu", cc=cc)
     options = OnlineOptions()
     texts = folder / f"{name}_texts"
@@ -170,8 +171,10 @@ def make_pair(
     return built, made.path
 
 
-def cosimulate(plant: Joint, model: Joint, files: tuple[Path, Path], setting: Setting | None = None) -> Cosimulation:
-    """Run plant and estimator together along a motion.
+def cosimulate(
+    plant: Joint, model: Joint, files: tuple[Path, Path], setting: Setting | None = None, motion: Motion | None = None
+) -> Cosimulation:
+    """Run plant and estimator together along the plant's built-in motion; `files` are those of :func:`make_pair`.
 
     Raises
     ------
@@ -180,23 +183,20 @@ def cosimulate(plant: Joint, model: Joint, files: tuple[Path, Path], setting: Se
     FmuError
         An FMU refused a call.
     """
-    setting = setting or Setting()
+    setting, motion = setting or Setting(), motion or Motion()
     adapted, sensing = prepared(model, OnlineOptions())
     from .online import held_parameters
     from .rows import linear_parameters
 
     names = linear_parameters(adapted, sensing, held_parameters(model))
-    time = setting.step * np.arange(round(setting.stop / setting.step) + 1)
-    references = zip(("position", "velocity", "acceleration"), setting.motion.signals(), strict=True)
     drive = ("i_m", "motor_current") if model.torque_per_current is not None else ("tau_m", "motor_torque")
     connections = {f"estimator.{k}": f"plant.{v}" for k, v in {**CHANNELS, drive[0]: drive[1]}.items()}
     outputs = [f"theta[{i}]" for i in range(1, len(names) + 1)] + [f"sigma[{i}]" for i in range(1, len(names) + 1)]
     outputs += ["health", "fault", *(f"ratio.{b}" for b in sensing.balances)]
     wiring = Wiring(
         connections=connections,
-        inputs={f"plant.reference_{n}": Table(time, np.array([f(t) for t in time])) for n, f in references},
         faults={f"estimator.{k}": f for k, f in setting.faults.items()},
-        parameters={**start_state(plant, setting.motion), **setting.parameters},
+        parameters={**start_state(plant, motion), **setting.parameters},
         record=[*(f"estimator.{n}" for n in outputs), *setting.record],
     )  # fmt: skip
     with Fmu(files[0]) as first, Fmu(files[1]) as second, Instance(first, name="plant") as a, Instance(second, name="estimator") as b:
@@ -208,7 +208,7 @@ def cosimulate(plant: Joint, model: Joint, files: tuple[Path, Path], setting: Se
 
 def start_state(plant: Joint, motion: Motion) -> dict[str, float]:
     """Start values that put the plant on the motion."""
-    q, v, _ = (f(0.0) for f in motion.signals())
+    q, v = motion.start()
     sides = ("motor_", "link_") if plant.model().is_elastic else ("",)
     return {f"plant.state.{side}{n}": x for side in sides for n, x in (("position", q), ("velocity", v))}
 
@@ -228,11 +228,15 @@ def _rows(plant: Joint, names: Sequence[str], found: Trajectory) -> list[Row]:
         group = joined if n in joined else (n,)
         rows.append(
             Row(
-                plant.name, " + ".join(group), units[n], sum(true[g] for g in group), sum(last[g] for g in group),
+                plant.name, " - ".join(group), units[n], _difference(true, group), _difference(last, group),
                 min(spread[g] for g in group), _limit(n),
             )
         )  # fmt: skip
     return rows
+
+
+def _difference(values: Mapping[str, float], group: Sequence[str]) -> float:
+    return values[group[0]] - sum(values[g] for g in group[1:])
 
 
 def _limit(name: str) -> float | None:

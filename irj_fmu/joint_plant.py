@@ -23,6 +23,7 @@ from identification.joint_file import Joint
 
 from .plant import PlantSpec
 from .readings import CHANNELS, Readings
+from .reference import Motion
 from .variables import Variable
 
 Drive = Literal["current", "torque"]
@@ -46,6 +47,8 @@ class PlantOptions:
     controller : bool
         True: inputs are a reference position and its two derivatives on the link; a PD controller with feed-forward
         drives the motor.
+    motion : Motion, optional
+        A reference of the controller's own, added to its inputs; the parameter ``motion.scale`` switches it.
     sensors : bool
         True: outputs are readings with noise, quantisation and faults, all of them parameters that start at "none".
     name : str, optional
@@ -58,6 +61,7 @@ class PlantOptions:
 
     drive: Drive | None = None
     controller: bool = False
+    motion: Motion | None = None
     sensors: bool = False
     name: str | None = None
     sample_time: float = 1e-3
@@ -119,7 +123,7 @@ class _Builder:
         self.stepped = any(term.effect.rate is None for term, *_ in terms)
         needs = _used_inputs(self.functions)
         self.heated = needs[1]
-        self.clocked = needs[2] or self.stepped or options.sensors
+        self.clocked = needs[2] or self.stepped or options.sensors or (options.controller and options.motion is not None)
         self.own_parameters = model.parameters
         self.extra: list[tuple[Variable, Any]] = []
 
@@ -183,7 +187,7 @@ class _Builder:
         u, p = ca.SX.sym("u", len(inputs)), ca.SX.sym("p", len(self.own_parameters))
         clock = x[-1] if self.clocked else ca.SX(0)
         full = ca.vertcat(x[:size], z) if self.stepped else x[: size + held]
-        drive = self._drive(x, u)
+        drive = self._drive(x, u, clock)
         model_input = ca.vertcat(drive, u[-1] if self.heated else 0, clock)
         rates = f.dynamics(full, model_input, p)
         rates = ca.vertcat(rates[: size if self.stepped else size + held], *([1] if self.clocked else []))
@@ -214,7 +218,16 @@ class _Builder:
             tolerance=options.tolerance,
         )  # fmt: skip
 
-    def _drive(self, x: Any, u: Any) -> Any:
+    def _reference(self, u: Any, clock: Any) -> tuple[Any, Any, Any]:
+        """Position, velocity and acceleration that the controller follows."""
+        motion = self.options.motion
+        if motion is None:
+            return u[0], u[1], u[2]
+        scale = self._parameter("motion.scale", "", 1.0, "Factor on the built-in motion, 0 for none.")
+        q, v, a = motion.expressions(clock)
+        return u[0] + scale * q, u[1] + scale * v, u[2] + scale * a
+
+    def _drive(self, x: Any, u: Any, clock: Any) -> Any:
         """n Km I, link-referred."""
         if self.options.controller:
             start = dict(zip(self.model.parameter_names, self.model.value_vector(), strict=True))
@@ -227,7 +240,8 @@ class _Builder:
             feed = self._parameter("controller.inertia", unit("kg.m2"), inertia, "Feed-forward of the reference acceleration.", 0.0)
             hold = self._parameter("controller.gravity", unit("N.m"), weight, "Feed-forward of gravity at the reference position.")
             limit = self._parameter("controller.limit", unit("N.m"), 1e9, "Largest drive torque, link-referred.", 0.0)
-            wish = stiff * (u[0] - x[0]) + damp * (u[1] - x[1]) + feed * u[2] + hold * ca.sin(u[0])
+            q, v, a = self._reference(u, clock)
+            wish = stiff * (q - x[0]) + damp * (v - x[1]) + feed * a + hold * ca.sin(q)
             return ca.fmin(limit, ca.fmax(-limit, wish))
         if self.by_current:
             constant = self._parameter(

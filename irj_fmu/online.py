@@ -153,7 +153,7 @@ class OnlineEstimator:
         self._recursion(self.theta)  # its functions are made here and not inside a step
 
     def _make_detector(self) -> FaultDetector | None:
-        if not (self.model.is_elastic and self.joint.fitted):
+        if not (self.model.is_elastic and self.is_fitted):
             return None
         from identification.fault import FaultDetector
 
@@ -194,6 +194,11 @@ class OnlineEstimator:
     def warming_up(self) -> bool:
         """True until the recursion has started."""
         return self.estimator is None
+
+    @property
+    def is_fitted(self) -> bool:
+        """True where the joint file has a value for every estimated parameter."""
+        return all(n in self.joint.fitted for n in self.names)
 
     @property
     def made(self) -> int:
@@ -472,7 +477,7 @@ class OnlineEstimator:
 
     def _implausible(self) -> int:
         """Inertias far from those of a fitted joint: the scale of torque or current is wrong."""
-        if self.estimator is None or not self.joint.fitted:
+        if self.estimator is None or not self.is_fitted:
             return NONE
         for name, code in (("link_inertia", SCALED + 1 + TAU), ("motor_inertia", SCALED + 1 + DRIVE)):
             if name in self.names and name in self.joint.fitted:

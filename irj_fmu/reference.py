@@ -146,18 +146,20 @@ class Motion:
     range: float = 0.8
     speed: float = 1.0
 
-    def signals(self) -> tuple[Any, Any, Any]:
-        """Position, velocity and acceleration as functions of time [rad, rad/s, rad/s2]."""
+    def expressions(self, t: Any) -> tuple[Any, Any, Any]:
+        """Position, velocity and acceleration as CasADi expressions of a time symbol or expression."""
         import casadi as ca
 
-        t = ca.SX.sym("t")
+        now = ca.SX.sym("now")
         s = 2 * math.pi * self.speed
-        swell = ca.sin(math.pi * self.speed * t / 20) ** 2
-        fast = 0.2 * ca.sin(s * 0.37 * t) + 0.06 * ca.sin(s * 1.13 * t + 1) + 0.015 * ca.sin(s * 2.9 * t + 2)
-        q = self.range * ca.sin(s * 0.07 * t) + swell * fast + 0.02 * ca.sin(s * 0.31 * t)
-        v = ca.jacobian(q, t)
-        found = []
-        for name, value in (("q", q), ("v", v), ("a", ca.jacobian(v, t))):
-            function = ca.Function(name, [t], [value])
-            found.append(lambda time, f=function: float(f(time)))
+        swell = ca.sin(math.pi * self.speed * now / 20) ** 2
+        fast = 0.2 * ca.sin(s * 0.37 * now) + 0.06 * ca.sin(s * 1.13 * now + 1) + 0.015 * ca.sin(s * 2.9 * now + 2)
+        q = self.range * ca.sin(s * 0.07 * now) + swell * fast + 0.02 * ca.sin(s * 0.31 * now)
+        v = ca.jacobian(q, now)
+        found = ca.Function("motion", [now], [q, v, ca.jacobian(v, now)])(t)
         return found[0], found[1], found[2]
+
+    def start(self) -> tuple[float, float]:
+        """Position and velocity at the beginning."""
+        q, v, _ = self.expressions(0.0)
+        return float(q), float(v)

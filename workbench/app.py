@@ -119,12 +119,12 @@ def _json(data: Any) -> Response:
 
 
 async def _state(request: Request, live: Live) -> Response:
-    state = live.state.as_json()
+    state = await run_in_threadpool(live.whole)
     for step in state["steps"] + state["undone"]:
         step.pop("values")
     for entry in state["files"]:
         entry.pop("stored")
-    return _json({**state, **live.snapshot(), "id": live.session.id})
+    return _json(state)
 
 
 async def _events(request: Request, live: Live) -> Response:

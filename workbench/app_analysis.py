@@ -85,6 +85,11 @@ class Analysis:
         self._rows: Rows | None = None
         self._prepared: dict[str, tuple[Solution, Solution, StepEntry]] = {}
 
+    @property
+    def split(self) -> tuple[list[Record], list[Record]]:
+        """Records of the fit and held-out records, every sample of them."""
+        return self._train, self._held
+
     # --- models -----------------------------------------------------------------------------------------------------
 
     def model_of(self, effects: Sequence[str], virtual_work: bool) -> JointModel:

@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from identification.improve import HOLD_DELAY
+from workbench.app_analysis import Progress
 from workbench.app_live import Live
+from workbench.app_report import improvement_of
 from workbench.session import FileEntry, State
 
 
@@ -77,11 +79,16 @@ def fmu_available() -> bool:
     return importlib.util.find_spec("irj_fmu.build") is not None
 
 
-def report(live: Live, folder: Path) -> Path:
+def report(live: Live, folder: Path, progress: Progress) -> Path:
     """Write the HTML report of the session into a folder."""
-    raise NotImplementedError
+    from workbench.report import write_report
+
+    analysis = live.analysis()
+    result = improvement_of(analysis, live.state.steps, progress)
+    progress("writing the report", 0.95)
+    return write_report(result, folder / "report.html", records=analysis.records)
 
 
-def fmu(live: Live, folder: Path) -> Path:
+def fmu(live: Live, folder: Path, progress: Progress) -> Path:
     """Build the FMU of the current model into a folder."""
     raise NotImplementedError

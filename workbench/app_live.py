@@ -79,6 +79,7 @@ class Live:
         """Apply a change, write it and tell the pages."""
         with self.lock:
             self.state = self.session.save(change(self.state))
+            self.error = None
             now = self.state
         self.tell()
         return now
@@ -100,6 +101,11 @@ class Live:
         """What the page needs to know at once when something changed."""
         with self.lock:
             return {"revision": self.state.revision, "job": self.job.as_json() if self.job else None, "error": self.error}
+
+    def whole(self) -> dict[str, Any]:
+        """State and snapshot of one moment, for the page."""
+        with self.lock:
+            return {**self.state.as_json(), **self.snapshot(), "id": self.session.id}
 
     def tell(self) -> None:
         """Send the snapshot to every open page."""

@@ -65,6 +65,11 @@ def examined(entry: FileEntry, path: Path, kind: str, ratio: float | None, colum
 
 
 def _record(path: Path, entry: FileEntry, kind: str, columns: Mapping[str, Any] | None) -> Record:
+    made = _read(path, entry, kind, columns)
+    return replace(made, provenance=replace(made.provenance, paths=(entry.name,)))
+
+
+def _read(path: Path, entry: FileEntry, kind: str, columns: Mapping[str, Any] | None) -> Record:
     name = Path(entry.name).stem
     if columns:
         names = open_table(path).names

@@ -8,7 +8,9 @@ from typing import Any
 
 from identification.errors import InputError
 from identification.improve import HOLD_DELAY, Improvement, improve
+from workbench import app_export
 from workbench.app_analysis import Analysis, Progress, clean
+from workbench.app_input import folder_of
 from workbench.app_live import PREPARED, Change, Live, hint_for, with_step
 from workbench.session import State, StepEntry
 
@@ -31,6 +33,8 @@ def run(live: Live, action: str, body: Mapping[str, Any]) -> None:
         "redo": ("redoing", lambda p: _redo(live)),
         "confirm": ("fitting every sample", lambda p: _confirm(live, p)),
         "improve": ("running the whole loop", lambda p: _improve(live, p)),
+        "report": ("writing the report", lambda p: _export(live, "report", p)),
+        "fmu": ("building the FMU", lambda p: _export(live, "fmu", p)),
     }
     if action not in verbs:
         raise InputError(f"unknown action {action!r}; known: {', '.join(verbs)}")
@@ -61,6 +65,9 @@ def _diagnose(live: Live, progress: Progress) -> Change:
 def _add(live: Live, label: str) -> Change:
     analysis = live.analysis()
     step = analysis.add(label, hint_for(live.state, label))
+    claim = (live.state.diagnosis or {}).get("claim")
+    if claim and claim["label"] == label:
+        step = replace(step, names=tuple(claim["effects"]), separate_by=claim["separate_by"])
     return lambda s: with_step(s, step)
 
 
@@ -102,6 +109,14 @@ def _improve(live: Live, progress: Progress) -> Change:
     live.analysis().restore(steps[-1])
     story = clean(result.as_json())
     return lambda s: replace(s, steps=steps, undone=(), diagnosis=None, improvement=story, note=result.data.note)
+
+
+def _export(live: Live, kind: str, progress: Progress) -> Change:
+    if not live.state.steps:
+        raise InputError(f"no {kind} yet: fit first")
+    make = app_export.report if kind == "report" else app_export.fmu
+    make(live, folder_of(live), progress)
+    return lambda s: s
 
 
 def ledger(result: Improvement) -> tuple[StepEntry, ...]:

@@ -115,14 +115,21 @@ def _script(live: Live, query: Query) -> Response:
     return _download(app_export.session_code(live.state), f"{_named(live)}.py", "text/x-python")
 
 
+def _made(live: Live, name: str) -> Response:
+    path = folder_of(live) / f"{name}"
+    if not path.is_file():
+        raise InputError(f"no {name} yet; make it on the Export page")
+    return FileResponse(
+        path, filename=f"{_named(live)}{path.suffix}", media_type="application/octet-stream", headers={"cache-control": "no-store"}
+    )
+
+
 def _report(live: Live, query: Query) -> Response:
-    path = app_export.report(live, folder_of(live))
-    return FileResponse(path, filename=f"{_named(live)}.html", media_type="application/octet-stream", headers={"cache-control": "no-store"})
+    return _made(live, "report.html")
 
 
 def _fmu(live: Live, query: Query) -> Response:
-    path = app_export.fmu(live, folder_of(live))
-    return FileResponse(path, filename=f"{_named(live)}.fmu", media_type="application/octet-stream", headers={"cache-control": "no-store"})
+    return _made(live, "model.fmu")
 
 
 VIEWS: Final[Mapping[str, Callable[[Any, Query], Any]]] = {

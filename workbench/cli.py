@@ -4,22 +4,36 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import os
+import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn, final
 
+from identification import __version__
 from identification.errors import InputError
+from workbench.commands.files import check_outputs
+
+
+@final
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong with the arguments in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"irj: {message}; see `{self.prog} --help`\n")
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="irj", description="Tells which physics a geared joint's model is missing.")
+    parser = _Parser(prog="irj", description="Tells which physics a geared joint's model is missing.")
+    parser.add_argument("--version", action="version", version=f"irj {__version__}")
     parser.add_argument("--effects", metavar="FILE.py", action="append", default=[], help="register your own effects from a Python file")
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
 
     def verb(name: str, module: str, text: str, *, records: bool = False, joint: bool = False) -> argparse.ArgumentParser:
         sub = verbs.add_parser(name, help=text, description=text)
         sub.set_defaults(module=module)
+        sub.add_argument("--effects", dest="own_effects", metavar="FILE.py", action="append", default=[], help=argparse.SUPPRESS)
         sub.add_argument("--json", metavar="FILE", help="write the result as JSON")
         if records:
             sub.add_argument("records", nargs="+", metavar="REC", help="record files")
@@ -60,9 +74,13 @@ def _parser() -> argparse.ArgumentParser:
     simulated.add_argument("--seed", type=int, default=0)
     simulated.add_argument("--motion", choices=("multisine", "triangle"), default="multisine")
     tracked = verb("track", "online", "replay the online estimator with sensor-fault detection", records=True, joint=True)
-    tracked.add_argument("--report", metavar="FILE", help="write the HTML report")
-    planned = verb("plan", "online", "select a trajectory that makes the parameters identifiable", joint=True)
-    planned.add_argument("-o", "--output", metavar="FILE", default="trajectory.csv")
+    tracked.add_argument("--healthy", nargs="+", metavar="REC", default=[], help="records of the healthy joint: limits of the fault detector")
+    tracked.add_argument("--fail-on-fault", action="store_true", help="exit with 1 where a fault is found")
+    planned = verb("plan", "online", "select a motion that makes the parameters identifiable", joint=True)
+    planned.add_argument("-o", "--output", metavar="FILE", default="trajectory.csv", help="the motion as CSV (default trajectory.csv)")
+    planned.add_argument("--max-position", type=float, metavar="DEG", default=85.0, help="half of the link's workspace [deg]")
+    planned.add_argument("--max-speed", type=float, metavar="DEG_S", default=60.0, help="link speed [deg/s]")
+    planned.add_argument("--max-torque", type=float, metavar="NM", default=float("inf"), help="drive torque on the link side [Nm]")
     exported = verb("export", "fmi", "export as FMU", joint=True)
     exported.add_argument("what", nargs="?", default="plant", choices=("estimator", "plant", "native", "ssp", "all"))
     exported.add_argument("--out", metavar="FOLDER", default="dist")
@@ -81,18 +99,26 @@ def _parser() -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run `irj`; returns the exit code: 0 done, 1 a check failed, 2 unusable input, 130 interrupted."""
-    arguments = _parser().parse_args(argv)
+    given = list(sys.argv[1:] if argv is None else argv)
+    arguments = _parser().parse_args(given)
+    arguments.command = shlex.join(["irj", *given])
     try:
-        _register(arguments.effects)
+        check_outputs(arguments)
+        _register([*arguments.effects, *arguments.own_effects])
         module = importlib.import_module(f"workbench.commands.{arguments.module}")
-        return int(getattr(module, f"run_{arguments.verb}")(arguments))
+        code = int(getattr(module, f"run_{arguments.verb}")(arguments))
+        sys.stdout.flush()
+        return code
     except InputError as error:
         return _fail(str(error))
+    except BrokenPipeError:  # the reader of our output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         return _fail(f"{where}{error.strerror or error}; check the path, its permissions and the space on the disk")
     except KeyboardInterrupt:
-        print("irj: interrupted, nothing was written", file=sys.stderr)
+        print("\nirj: interrupted" if sys.stderr.isatty() else "irj: interrupted", file=sys.stderr)
         return 130
 
 

@@ -82,7 +82,7 @@ def pattern_html(improvement: Improvement) -> str:
         f"Start and additions: all balances averaged over {number(1e3 * improvement.data.kernel)} ms. At the verdict each balance is averaged over the time "
         f"at which complete models read 1 ×: {', '.join(f'{text(b)} {number(1e3 * VERDICT_KERNELS[b])} ms' for b in first)}."
     )
-    return f"<p>{text(meaning)}.</p>{table(head, rows, 'Residual ÷ noise, held-out records', classes=kinds)}<p class='note'>{note}</p>"
+    return f"<p>{text(meaning)}.</p>{table(head, rows, 'Residual ÷ noise, held-out records', classes=kinds, wide=True)}<p class='note'>{note}</p>"
 
 
 def _state(start: float, end: float) -> str:
@@ -153,7 +153,7 @@ def places_html(improvement: Improvement, plots: ReportPlots) -> str:
 
 def addition_html(step: StepPlace, claim: Mapping[str, Any], before: float, after: float) -> str:
     """Before and after one addition: the picture, the error, how the absence of the effect looks."""
-    known = EFFECTS[step.effect] if step.effect in EFFECTS else None
+    known = EFFECTS.get(step.effect)
     absence = f"<p>How its absence looks: {text(known.absence)}.</p>" if known else ""
     drop = percent(claim["held_out_drop_percent"])
     return (
@@ -237,7 +237,8 @@ def overlay_html(shown: Sequence[Overlay]) -> str:
         f'<span role="group" aria-label="Time window">{buttons}</span></div>'
         '<p id="overlay-status" class="note" aria-live="polite"></p>'
         '<div id="overlay" tabindex="0" role="group" aria-label="Measured and modelled torque over time; arrow keys move, plus and minus zoom">'
-        '<div id="overlay-torque" class="chart"></div><div id="overlay-residual" class="chart"></div><p class="note">The whole record; drag to choose a window.</p><div id="overlay-whole" class="chart"></div></div>'
+        '<div id="overlay-torque" class="chart"></div><div id="overlay-residual" class="chart"></div>'
+        '<p class="note">The whole record; drag to choose a window.</p><div id="overlay-whole" class="chart"></div></div>'
         "<noscript><p>These three plots need scripts; every other part of this page does without.</p></noscript>"
     )
 
@@ -252,7 +253,7 @@ def provenance_html(improvement: Improvement, records: Sequence[Record], version
         notes = "".join(f"<li>{text(n)}</li>" for n in (*p.columns, *p.notes))
         folded = f"<details><summary>columns and repairs ({len(p.columns) + len(p.notes)})</summary><ul>{notes}</ul></details>" if notes else "–"
         rows.append([text(r.name), "held out" if r.name in held else "training", f"{len(r)} samples, {number(r.duration)} s", files, folded])
-    shown = table(["record", "used for", "size", "file: SHA-256", "how it was read"], rows, "Records") if rows else ""
+    shown = table(["record", "used for", "size", "file: SHA-256", "how it was read"], rows, "Records", wide=True) if rows else ""
     if not rows:
         names = ", ".join(text(n) for n in (*improvement.data.train_names, *improvement.data.held_out_names))
         shown = f"<p>Records: {names} (their digests were not handed to this report).</p>"

@@ -94,7 +94,10 @@ def render_report(improvement: Improvement, *, records: Sequence[Record] = (), c
     made = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
     sections.append(("provenance", "Where the figures come from", fragments.provenance_html(improvement, records, versions(), command, made)))
     links = "".join(f'<li><a href="#{key}">{text(title)}</a></li>' for key, title, _ in sections)
-    parts = "".join(f'<section id="{key}" aria-labelledby="{key}-title"><h2 id="{key}-title">{text(title)}</h2>{body}</section>' for key, title, body in sections)
+    parts = "".join(
+        f'<section id="{key}" aria-labelledby="{key}-title"><h2 id="{key}-title">{text(title)}</h2>{body}</section>'
+        for key, title, body in sections
+    )
     body = (
         f'<a class="skip" href="#ledger">Skip to the figures</a><header><p class="eyebrow">Joint report</p><h1>{text(name)}</h1></header><main>'
         f'<section class="verdict {text(result["verdict"])}" aria-label="Verdict">{verdict_html(result)}{_next_html(result)}'
@@ -117,7 +120,10 @@ def _sections(improvement: Improvement, result: dict[str, Any], plots: ReportPlo
         ranked = ranking_html(result, trials, last=RANKED_SHOWN)
         if rest > 0:
             ranked += f"<details><summary>{rest} more</summary>{ranking_html(result, trials, first=RANKED_SHOWN, caption='The others')}</details>"
-        ranked += "<p class='note'>Grey: under the threshold, so not to be told from chance or too small to matter. Each effect is tried alone and in a quick way, so falls do not add up; the fall of a claim above is the one after the whole fit.</p>"
+        ranked += (
+            "<p class='note'>Grey: under the threshold, so not to be told from chance or too small to matter. Each effect is tried alone "
+            "and in a quick way, so falls do not add up; the fall of a claim above is the one after the whole fit.</p>"
+        )
     final = result["steps"][-1]["parameters"] if result["steps"] else {}
     start = result["steps"][0]["parameters"] if len(result["steps"]) > 1 else None
     return [
@@ -159,7 +165,8 @@ def _tiles(result: dict[str, Any]) -> str:
 def _ledger_note(result: dict[str, Any]) -> str:
     note = text(result["records"].get("note") or "")
     return (
-        "Error: size of the residual torque as a share of the measured torque, over all balances. Fit: 100 % is a perfect model, 0 % no better than a constant. "
+        "Error: size of the residual torque as a share of the measured torque, over all balances. "
+        "Fit: 100 % is a perfect model, 0 % no better than a constant. "
         "÷ noise: residual over what measurement noise alone would leave; 1 × cannot be improved. The dotted line in the picture is that noise. "
         "Held-out records were not used to fit or to choose." + (f" Note: {note}." if note else "")
     )
@@ -168,8 +175,8 @@ def _ledger_note(result: dict[str, Any]) -> str:
 def _parameter_note() -> str:
     return (
         "<p class='note'>Torques, angles and inertias are referred to the link. The standard error comes from the scatter between time blocks; "
-        "a true value more than three standard errors away is unlikely if the model is complete. A value that stands at its bound, is not identifiable, or moves "
-        "together with another one should not be read as physics.</p>"
+        "a true value more than three standard errors away is unlikely if the model is complete. "
+        "A value that stands at its bound, is not identifiable, or moves together with another one should not be read as physics.</p>"
     )
 
 

@@ -94,6 +94,8 @@ class StepEntry:
         The effect that was added or removed.
     effects : tuple of str
         Labels in the model.
+    names, separate_by
+        What the diagnosis could not tell apart when it was added, and the run that would.
     exact : bool
         False while the values come from a part of the samples.
     """
@@ -109,6 +111,8 @@ class StepEntry:
     virtual_work: bool = True
     exact: bool = True
     seconds: float = 0.0
+    names: tuple[str, ...] = ()
+    separate_by: str | None = None
 
 
 @final

@@ -6,16 +6,17 @@ import json
 import math
 import os
 import sys
-import tempfile
+from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from identification.check import gate
 from identification.errors import InputError
 from identification.joint_file import Joint, load_joint
 from identification.read import read
 from identification.record import Record
+from workbench.session import write_atomic
 
 
 def open_joint(path: str) -> Joint:
@@ -24,39 +25,90 @@ def open_joint(path: str) -> Joint:
 
 
 def open_records(paths: Sequence[str], joint: Joint | None) -> tuple[list[Record], list[str]]:
-    """Records in SI through the check gate, and its warnings (also printed)."""
+    """Records in SI through the check gate, and its warnings (also printed).
+
+    Raises
+    ------
+    InputError
+        A record that cannot be used: one line that starts with its path.
+    """
     records, warnings = [], []
     for path in paths:
-        columns = joint.columns if joint is not None else None
-        record = read(path, columns=columns, kind=joint.kind if joint is not None else None)
+        record = read(path, columns=joint.columns if joint is not None else None, kind=joint.kind if joint is not None else None)
         try:
             record, findings = gate(record, joint.gear_ratio if joint is not None else None)
         except InputError as error:
-            text = str(error)
-            raise InputError(text if str(path) in text or Path(path).name in text else f"{path}: {text}") from None
-        for finding in findings:
-            if finding.severity in ("warn", "repair"):
-                warnings.append(f"{Path(path).name}: {finding.message}")
+            raise InputError(f"{path}: {str(error).removeprefix(record.name + ': ')}") from None
+        warnings += [f"{path}: {f.message.removeprefix(record.name + ': ')}" for f in findings if f.severity in ("warn", "repair")]
         records.append(record)
     for text in warnings:
         print(f"irj: {text}", file=sys.stderr)
     return records, warnings
 
 
-def write_text(path: str | Path, text: str) -> None:
-    """Write a file in one piece: a reader sees the old one or the new one."""
-    target = Path(path)
-    if not target.parent.is_dir():
-        raise InputError(f"{target.parent}: no such folder; make it first or write somewhere else")
-    handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".part")
+OUTPUTS: Final = ("json", "output", "report", "truth")
+
+
+def check_outputs(arguments: Namespace) -> None:
+    """Refuse results that could not be written, or that would replace an input, before any work is done.
+
+    The joint file may be written back in place by ``fit``, ``improve`` and ``add``.
+    """
+    inputs = [*_listed(arguments, "records"), *_listed(arguments, "held_out"), *_listed(arguments, "fit_records")]
+    inputs += _listed(arguments, "healthy")
+    joint = getattr(arguments, "joint", None)
+    named: dict[str, str] = {}
+    for option in OUTPUTS:
+        path = getattr(arguments, option, None)
+        if not path:
+            continue
+        target = Path(path)
+        if target.is_dir():
+            raise InputError(f"{path}: is a folder; give the name of a file")
+        if not target.parent.is_dir():
+            raise InputError(f"{target.parent}: no such folder; make it first or write somewhere else")
+        if not os.access(target if _special(target) else target.parent, os.W_OK):
+            raise InputError(f"{path}: its folder is not writable; write somewhere else")
+        in_place = option == "output" and arguments.verb in ("fit", "improve", "add")
+        for other in inputs + ([joint] if joint and not in_place else []):
+            if target.exists() and Path(other).exists() and target.samefile(other):
+                raise InputError(f"{path}: is an input of this command and would be lost; write somewhere else")
+        if str(target) in named and not _special(target):
+            raise InputError(f"{path}: given for two results; give each a file of its own")
+        named[str(target)] = option
+
+
+def _listed(arguments: Namespace, name: str) -> list[str]:
+    return list(getattr(arguments, name, None) or [])
+
+
+def _special(path: Path) -> bool:
+    """A device or a pipe: written straight, not replaced."""
+    return path.exists() and not path.is_file()
+
+
+def write_bytes(path: str | Path, content: bytes) -> None:
+    """Write a file in one piece: a reader sees the old one or the new one, never a part.
+
+    Raises
+    ------
+    InputError
+        The folder is missing or not writable; the disk is full.
+    """
+    target = Path(os.path.realpath(path))
     try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text)
-        Path(name).chmod(0o644)
-        Path(name).replace(target)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
+        if _special(Path(path)):
+            with Path(path).open("wb") as stream:
+                stream.write(content)
+        else:
+            write_atomic(target, content)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror or error}); check the folder, its permissions and the space on the disk") from None
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write a text file in one piece (see :func:`write_bytes`)."""
+    write_bytes(path, text.encode())
 
 
 def write_json(path: str | None, data: Any) -> None:

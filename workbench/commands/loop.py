@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -25,6 +26,8 @@ def improve_files(
     held, more = open_records(held_out, joint)
     found = improve(records, joint, held, max_additions=max_additions, progress=progress_bar)
     progress_bar("done", 1.0)
+    for text in found.warnings:
+        print(f"irj: {text}", file=sys.stderr)
     found = replace(found, warnings=(*found.warnings, *warnings, *more))
     return found.as_json(), found, [*records, *held]
 
@@ -33,7 +36,7 @@ def run_improve(arguments: Namespace) -> int:
     """`irj improve`."""
     data, found, records = improve_files(arguments.records, arguments.held_out, arguments.joint, max_additions=arguments.max_steps)
     _print_improvement(found)
-    _write_improvement(found, records, arguments.report, arguments.output)
+    _write_improvement(found, records, arguments.report, arguments.output, arguments.command)
     write_json(arguments.json, data)
     return 0
 
@@ -42,7 +45,7 @@ def run_report(arguments: Namespace) -> int:
     """`irj report`."""
     data, found, records = improve_files(arguments.records, arguments.held_out, arguments.joint)
     print(found.reason)
-    _write_improvement(found, records, arguments.output, None)
+    _write_improvement(found, records, arguments.output, None, arguments.command)
     write_json(arguments.json, data)
     return 0
 
@@ -54,16 +57,16 @@ def run_demo(arguments: Namespace) -> int:
         print("A simulated harmonic-drive joint with one effect that its model lacks; the answer is not in these files.")
         data, found, records = improve_files([names["train.npz"]], [names["held_out.npz"]], names["joint.toml"])
     _print_improvement(found)
-    _write_improvement(found, records, arguments.report, None)
+    _write_improvement(found, records, arguments.report, None, arguments.command)
     write_json(arguments.json, data)
     return 0
 
 
-def _write_improvement(found: Improvement, records: Sequence[Record], report: str | None, output: str | None) -> None:
+def _write_improvement(found: Improvement, records: Sequence[Record], report: str | None, output: str | None, command: str) -> None:
     if report:
         from workbench.report import write_report
 
-        print(f"report: {write_report(found, report, records=records)}")
+        print(f"report: {write_report(found, report, records=records, command=command)}")
     if output:
         write_text(output, joint_text(found.joint, found.steps[-1].solution, found.data))
         print(f"joint file: {output}")
@@ -72,9 +75,6 @@ def _write_improvement(found: Improvement, records: Sequence[Record], report: st
 def _print_improvement(found: Improvement) -> None:
     if found.data.note:
         print(f"note: {found.data.note}")
-    for text in found.warnings:
-        if text in found.warnings[:1] or "only" in text:
-            print(f"warning: {text}")
     print(f"{'step':<32} {'train %':>8} {'held-out %':>10}   residual over noise floor")
     for step in found.steps:
         ratios = "  ".join(f"{b} {e.ratio:.3g}" for b, e in step.held_out.balances.items())
@@ -98,7 +98,7 @@ def _print_improvement(found: Improvement) -> None:
         extra = f", order {place.order:.2f}" if place.order else (f", near {place.frequency_hz:.1f} Hz" if place.frequency_hz else "")
         print(f"unexplained: {place.balance} balance, depends on {where} ({place.share_percent:.0f} % of it){extra}")
     if found.not_testable:
-        print(f"not testable with these records: {', '.join(n.effect for n in found.not_testable)}")
+        print(f"not testable with these records ({len(found.not_testable)}): {', '.join(n.effect for n in found.not_testable)}")
     print(found.reason)
 
 
@@ -144,7 +144,7 @@ def run_diagnose(arguments: Namespace) -> int:
     held, more = open_records(arguments.held_out, joint)
     found = diagnose(fit(joint, records), held)
     for text in found.warnings:
-        print(f"warning: {text}")
+        print(f"irj: {text}", file=sys.stderr)
     print(found)
     for item in found.ranking.not_testable:
         print(f"not testable: {item.effect}: {item.why}")

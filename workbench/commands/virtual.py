@@ -13,7 +13,7 @@ from casadi_models import JointModel
 from casadi_models.simulate import sampled_step
 from identification.errors import InputError
 from identification.joint_file import Joint
-from workbench.commands.files import open_joint, write_json, write_text
+from workbench.commands.files import open_joint, progress_bar, write_bytes, write_json, write_text
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -146,18 +146,10 @@ def _write_table(path: Path, table: dict[str, FloatArray]) -> None:
 
 
 def _write_npz(path: Path, table: dict[str, FloatArray]) -> None:
-    import os
-    import tempfile
+    import io
 
-    if not path.parent.is_dir():
-        raise InputError(f"{path.parent}: no such folder; make it first or write somewhere else")
-    small: dict[str, Any] = {k: v if k in ("time_s", "motor_position_rad", "link_position_rad") else v.astype(np.float32) for k, v in table.items()}
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".npz")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            np.savez_compressed(file, **small)
-        Path(name).chmod(0o644)
-        Path(name).replace(path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
+    wide = ("time_s", "motor_position_rad", "link_position_rad")
+    small: dict[str, Any] = {k: v if k in wide else v.astype(np.float32) for k, v in table.items()}
+    content = io.BytesIO()
+    np.savez_compressed(content, **small)
+    write_bytes(path, content.getvalue())

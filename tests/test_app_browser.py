@@ -1,0 +1,304 @@
+"""The whole loop in Debian's Chromium, by clicks, from an empty page to the falling error and the files taken home."""
+
+from __future__ import annotations
+
+import os
+import re
+import threading
+import tomllib
+import zipfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+SHARED = Path(__file__).resolve().parents[1].parent / "shared"
+CHROMIUM = Path(os.environ.get("IRJ_CHROMIUM", "/usr/bin/chromium"))
+AXE = os.environ.get("IRJ_AXE", "")
+CI = bool(os.environ.get("CI"))
+
+playwright_sync = pytest.importorskip("playwright.sync_api") if not CI else __import__("playwright.sync_api", fromlist=["x"])
+
+pytestmark = pytest.mark.skipif(not CI and not CHROMIUM.exists(), reason="no chromium here (with CI set this fails)")
+
+
+@dataclass
+class Served:
+    """A running server."""
+
+    address: str
+    root: Path
+    server: Any
+
+
+@pytest.fixture
+def served(tmp_path: Path) -> Iterator[Served]:
+    import uvicorn
+
+    from workbench.app import _listen, create_app
+
+    listening = _listen(0)
+    port = int(listening.getsockname()[1])
+    server = uvicorn.Server(uvicorn.Config(create_app(tmp_path / "sessions", port=port), log_level="error", ws="none", timeout_graceful_shutdown=1))
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
+    thread.start()
+    yield Served(f"http://127.0.0.1:{port}/", tmp_path / "sessions", server)
+    server.should_exit = True
+    thread.join(10)
+    listening.close()
+
+
+@dataclass
+class Browser:
+    """A page, with what went wrong in it, the clicks made and the pictures taken."""
+
+    page: Any
+    shots: Path
+    problems: list[str]
+    clicks: int = 0
+
+    def click(self, selector: str) -> None:
+        self.page.click(selector, timeout=60_000)
+        self.clicks += 1
+
+    def idle(self, view: str) -> None:
+        self.page.wait_for_function(
+            "v => document.querySelector('#main').dataset.view === v && document.querySelector('#job').hidden && !app.sent", arg=view, timeout=120_000
+        )
+        self.page.wait_for_timeout(150)
+
+    def shot(self, name: str) -> None:
+        self.page.wait_for_timeout(250)
+        self.page.screenshot(path=str(self.shots / f"{name}.png"), full_page=True)
+
+    def error(self) -> float:
+        return float(self.page.inner_text("#headline strong").split()[0])
+
+
+@pytest.fixture
+def browser(tmp_path: Path) -> Iterator[Browser]:
+    assert CHROMIUM.exists(), f"{CHROMIUM} is missing"
+    shots = Path(os.environ.get("IRJ_SCREENSHOTS", str(tmp_path)))
+    shots.mkdir(parents=True, exist_ok=True)
+    with playwright_sync.sync_playwright() as play:
+        chromium = play.chromium.launch(executable_path=str(CHROMIUM), args=["--no-sandbox"])
+        page = chromium.new_page(viewport={"width": 1280, "height": 860}, accept_downloads=True)
+        problems: list[str] = []
+        page.on("pageerror", lambda e: problems.append(str(e)))
+        page.on("console", lambda m: problems.append(m.text) if m.type == "error" else None)
+        page.on("request", lambda r: problems.append(f"network: {r.url}") if not re.match(r"(http://127\.0\.0\.1:|data:|blob:)", r.url) else None)
+        yield Browser(page, shots, problems)
+        chromium.close()
+    assert problems == []
+
+
+def need(path: Path) -> Path:
+    if not path.exists():
+        if CI:
+            pytest.fail(f"{path} is missing")
+        pytest.skip(f"{path} is not beside the checkout")
+    return path
+
+
+def test_a_new_user_sees_the_error_fall_within_five_clicks(served: Served, browser: Browser) -> None:
+    browser.page.goto(served.address)
+    browser.page.wait_for_selector("#demo")
+    browser.shot("01-empty")
+    browser.click("#demo")
+    browser.page.wait_for_selector("#fit", timeout=60_000)
+    browser.page.wait_for_selector(".uplot")
+    browser.shot("02-demo-loaded")
+    browser.click("#fit")
+    browser.idle("compare")
+    start = browser.error()
+    browser.page.wait_for_selector(".uplot")
+    browser.shot("03-compare")
+    browser.click("#diagnose")
+    browser.idle("diagnose")
+    assert "Stribeck" in browser.page.inner_text("#claim")
+    browser.shot("04-diagnose")
+    browser.click("button.primary:has-text('Add')")
+    browser.idle("ledger")
+    assert browser.clicks <= 5
+    assert browser.error() < 0.5 * start
+    browser.shot("05-falling")
+
+
+def take_home(browser: Browser, tmp_path: Path) -> None:
+    """Report and joint file, and the FMU where it can be built, downloaded and valid."""
+    page = browser.page
+    browser.click("#nav-export")
+    browser.idle("export")
+    with page.expect_download() as joint:
+        page.click("#get-joint-toml")
+    joint.value.save_as(tmp_path / "joint.toml")
+    assert tomllib.loads((tmp_path / "joint.toml").read_text())["fitted"]
+    with page.expect_download(timeout=120_000) as report:
+        page.click("#make-report")
+    report.value.save_as(tmp_path / "report.html")
+    text = (tmp_path / "report.html").read_text()
+    assert text.startswith("<!doctype html>") or text.startswith("<!DOCTYPE html>")
+    assert not re.search(r"""(src|href)=["']https?://""", text)
+    browser.idle("export")
+    if page.locator("#make-fmu").count():
+        with page.expect_download(timeout=300_000) as fmu:
+            page.click("#make-fmu")
+        fmu.value.save_as(tmp_path / "joint.fmu")
+        with zipfile.ZipFile(tmp_path / "joint.fmu") as archive:
+            assert "modelDescription.xml" in archive.namelist()
+        import fmpy.validation
+
+        assert fmpy.validation.validate_fmu(str(tmp_path / "joint.fmu")) == []
+        browser.idle("export")
+    browser.shot("export")
+
+
+def test_the_loop_on_stribeck(served: Served, browser: Browser, tmp_path: Path) -> None:
+    folder = need(SHARED / "hidden_effect" / "stribeck")
+    page = browser.page
+    page.goto(served.address)
+    page.wait_for_selector("#files")
+    page.set_input_files("#files", [folder / f for f in ("joint.toml", "train.csv", "train2.csv", "test.csv", "test2.csv")])
+    page.wait_for_function("() => app.state.files.length === 4 && !app.state.job && document.querySelector('#fit')", timeout=60_000)
+    browser.shot("stribeck-1-load")
+    browser.click("#fit")
+    browser.idle("compare")
+    start = browser.error()
+    assert "velocity" in page.inner_text("figure.place >> nth=0")
+    browser.click("#diagnose")
+    browser.idle("diagnose")
+    browser.shot("stribeck-2-diagnose")
+    assert page.inner_text("#claim") == "Stribeck effect"
+    browser.click("#add-stribeck-motor")
+    browser.idle("ledger")
+    after = browser.error()
+    assert after < 0.5 * start
+    browser.shot("stribeck-3-ledger")
+    browser.click("#undo")
+    browser.idle("ledger")
+    assert browser.error() == pytest.approx(start, rel=1e-3)
+    browser.click("#redo")
+    browser.idle("ledger")
+    assert browser.error() == pytest.approx(after, rel=1e-3)
+    browser.click("#nav-parameters")
+    browser.idle("parameters")
+    assert "stribeck extra" in page.inner_text("table")
+    browser.shot("stribeck-4-parameters")
+    take_home(browser, tmp_path)
+    page.reload()
+    browser.idle("export")
+    assert browser.error() == pytest.approx(after, rel=1e-3)
+
+
+def test_the_loop_on_emps(served: Served, browser: Browser, tmp_path: Path) -> None:
+    """A file without recognised headers: the guess is shown, corrected and confirmed, and the loop follows."""
+    folder = need(SHARED / "measurements" / "emps")
+    page = browser.page
+    page.goto(served.address)
+    page.wait_for_selector("#files")
+    page.set_input_files("#files", [folder / "train.csv", folder / "test_pulses.csv"])
+    page.wait_for_function("() => app.state.files.length === 2 && !app.state.job", timeout=60_000)
+    page.wait_for_selector(".map-table")
+    browser.shot("emps-1-columns")
+    browser.click("#nav-model")
+    browser.idle("model")
+    page.fill("#name", "emps")
+    page.check("#kind-linear")
+    page.fill("#gear_ratio", "1")
+    page.fill("#torque_per_voltage", "35.15065188")
+    page.check("input[value=viscous]")
+    page.uncheck("input[value=coulomb]")
+    browser.shot("emps-2-model")
+    browser.click("#save")
+    browser.idle("model")
+    browser.click("#nav-load")
+    browser.idle("load")
+    for _ in range(2):
+        browser.click("button:has-text('Use')")
+        browser.idle("load")
+        if page.locator(".map-table").count() == 0:
+            break
+    browser.shot("emps-3-load")
+    browser.click("#fit")
+    browser.idle("compare")
+    start = browser.error()
+    browser.shot("emps-4-compare")
+    browser.click("#diagnose")
+    browser.idle("diagnose")
+    browser.shot("emps-5-diagnose")
+    assert "Coulomb" in page.inner_text("#claim")
+    browser.click("button.primary:has-text('Add')")
+    browser.idle("ledger")
+    assert browser.error() < 0.8 * start
+    browser.shot("emps-6-ledger")
+    take_home(browser, tmp_path)
+
+
+@pytest.mark.parametrize("colours", ["light", "dark"])
+def test_every_view_fits_a_phone_and_passes_axe(served: Served, browser: Browser, colours: str) -> None:
+    page = browser.page
+    page.emulate_media(color_scheme=colours)
+    page.goto(served.address)
+    page.wait_for_selector("#demo")
+    serious = axe(page, "empty")
+    page.click("#demo")
+    page.wait_for_selector("#fit", timeout=60_000)
+    page.click("#fit")
+    browser.idle("compare")
+    page.click("#diagnose")
+    browser.idle("diagnose")
+    page.click("button.primary:has-text('Add')")
+    browser.idle("ledger")
+    for width in (1280, 375):
+        page.set_viewport_size({"width": width, "height": 812})
+        for view in ("load", "model", "compare", "ledger", "parameters", "export"):
+            page.click(f"#nav-{view}")
+            browser.idle(view)
+            browser.shot(f"{colours}-{width}-{view}")
+            assert page.evaluate("document.documentElement.scrollWidth") <= width, f"{view} is wider than {width} pixels"
+            serious += axe(page, f"{view} {width}")
+    page.click("#nav-ledger")
+    browser.idle("ledger")
+    page.click("#diagnose")
+    browser.idle("diagnose")
+    browser.shot(f"{colours}-375-diagnose")
+    serious += axe(page, "diagnose")
+    assert serious == []
+
+
+def axe(page: Any, where: str) -> list[str]:
+    """Serious findings of axe-core, where IRJ_AXE names its file (npm package axe-core)."""
+    if not AXE:
+        assert not CI or os.environ.get("IRJ_NO_AXE"), "IRJ_AXE must name axe.min.js of the npm package axe-core"
+        return []
+    page.evaluate(Path(AXE).read_text(encoding="utf-8"))
+    found = page.evaluate("() => axe.run(document)")
+    bad = [v for v in found["violations"] if v["impact"] in ("serious", "critical")]
+    return [f"{where}: {v['id']}: {n['html'][:120]} {n.get('failureSummary', '')[:200]}" for v in bad for n in v["nodes"][:3]]
+
+
+def test_the_keyboard_alone_reaches_the_falling_error(served: Served, browser: Browser) -> None:
+    page = browser.page
+    page.goto(served.address)
+    page.wait_for_selector("#demo")
+
+    def press(selector: str) -> None:
+        for _ in range(60):
+            page.keyboard.press("Tab")
+            if page.evaluate("s => document.activeElement.matches(s)", selector):
+                page.keyboard.press("Enter")
+                return
+        pytest.fail(f"{selector} is not reached by the Tab key")
+
+    press("#demo")
+    page.wait_for_selector("#fit", timeout=60_000)
+    press("#fit")
+    browser.idle("compare")
+    start = browser.error()
+    press("#diagnose")
+    browser.idle("diagnose")
+    press(".candidate button.primary")
+    browser.idle("ledger")
+    assert browser.error() < 0.5 * start

@@ -1,0 +1,90 @@
+"""From the ledger of a session to the result that the report is written from."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from identification.assess import BalanceError, Error, assess
+from identification.candidates import make_base
+from identification.claims import Claim, Ranking, rank
+from identification.engine import Dataset, Solution, load_dataset, solve
+from identification.improve import HOLD_DELAY, Improvement, Step, _Loop, held_drop, visible_keys
+from workbench.app_analysis import Analysis, Progress
+from workbench.session import StepEntry
+
+
+def improvement_of(analysis: Analysis, entries: Sequence[StepEntry], progress: Progress) -> Improvement:
+    """The session's steps as the result of a loop: with rankings, what is left, and a verdict.
+
+    Parameters
+    ----------
+    analysis : Analysis
+    entries : sequence of StepEntry
+        The ledger; a removed effect is left out of the path.
+    progress : callable
+    """
+    train, held = analysis.split
+    data = analysis.data if analysis.whole else load_dataset(train, held, analysis.joint, analysis.start_model)
+    data = replace(data, note=analysis.note)
+    progress("fitting the steps", 0.1)
+    steps = _steps(analysis, data, entries)
+    progress("ranking the library on the start model", 0.25)
+    base = make_base(steps[0].solution, data)
+    first = last = rank(base)
+    if len(steps) > 1:
+        progress("ranking the library on the final model", 0.5)
+        base = make_base(steps[-1].solution, data)
+        last = rank(base)
+    named = {e.label: e for e in entries if e.action == "add"}
+    claims = [_claim(before, after, first, named.get(after.label)) for before, after in zip(steps[:-1], steps[1:], strict=True)]
+    loop = _Loop(analysis.joint, data, train, held, progress)
+    return loop._finish(first, last, base, claims, steps)
+
+
+def _steps(analysis: Analysis, data: Dataset, entries: Sequence[StepEntry]) -> list[Step]:
+    if all(e.action != "remove" for e in entries):
+        made = [_solved(analysis, data, e.effects, e.virtual_work, e.values) for e in entries]
+        return [_step(s, data, e.label, e if e.exact else None) for s, e in zip(made, entries, strict=True)]
+    final = entries[-1]
+    start = [label for label in entries[0].effects if label in final.effects]
+    added = [label for label in final.effects if label not in entries[0].effects]
+    known = {k: v for e in entries for k, v in e.values.items()}
+    out = []
+    for count in range(len(added) + 1):
+        solution = _solved(analysis, data, (*start, *added[:count]), final.virtual_work, known, iterations=15)
+        out.append(_step(solution, data, added[count - 1] if count else None, None))
+    return out
+
+
+def _solved(
+    analysis: Analysis, data: Dataset, effects: Sequence[str], virtual_work: bool, values: Mapping[str, float], iterations: int = 2
+) -> Solution:
+    model = analysis.model_of([label for label in effects if label != HOLD_DELAY], virtual_work)
+    return solve(model, data, start=values, iterations=iterations)
+
+
+def _step(solution: Solution, data: Dataset, label: str | None, entry: StepEntry | None) -> Step:
+    key = label.partition("@")[0].partition("#")[0] if label else None
+    train = _error(entry.train) if entry else assess(solution.model, data, data.train, solution.values)
+    held = _error(entry.held_out) if entry else assess(solution.model, data, data.held_out, solution.values)
+    return Step(key, visible_keys(solution.model), train, held, solution, label)
+
+
+def _error(data: Mapping[str, Any]) -> Error:
+    balances = {
+        b: BalanceError(float(e["rms"]), float(e["floor"]), math.inf if e["ratio"] is None else float(e["ratio"]), str(e["unit"]))
+        for b, e in data["balances"].items()
+    }  # fmt: skip
+    return Error(float(data["relative_error_percent"]), float(data["fit_percent"]), float(data["vaf_percent"]), balances)
+
+
+def _claim(before: Step, after: Step, first: Ranking, entry: StepEntry | None) -> Claim:
+    label = after.label or ""
+    trial = next((t for t in first.everything if t.candidate.label == label), None)
+    drops = {b: held_drop(before.held_out, after.held_out, b) for b in after.held_out.balances}
+    balance = trial.balance if trial else max(drops, key=lambda b: drops[b])
+    names = entry.names if entry and entry.names else (after.added or label,)
+    return Claim(names, label, balance, drops[balance], entry.separate_by if entry else None)
