@@ -13,34 +13,10 @@ from identification.assess import Error, assess
 from identification.balances import Balances
 from identification.engine import load_dataset, stack
 from identification.fit import Fit
-from identification.locate import axes, binned
+from identification.places import Place, gather, places_of
 from identification.record import Record
 
 FloatArray = npt.NDArray[np.float64]
-
-
-@final
-@dataclass(frozen=True)
-class Place:
-    """Mean residual of a balance in bins of one signal, with a band from blocks.
-
-    Attributes
-    ----------
-    balance, axis, unit : str
-    centre, mean, low, high : (bins,) array
-        Bin centres; mean residual and its 95 % band [N.m].
-    strength : float
-        Largest |mean| over the half width of its band.
-    """
-
-    balance: str
-    axis: str
-    unit: str
-    centre: FloatArray
-    mean: FloatArray
-    low: FloatArray
-    high: FloatArray
-    strength: float
 
 
 @final
@@ -70,11 +46,7 @@ class Comparison:
         return {
             "record": self.name, **self.error.as_json(),
             "worst_window_s": list(self.worst_window), "whiteness": self.whiteness,
-            "places": [
-                {"balance": p.balance, "axis": p.axis, "unit": p.unit, "strength": p.strength, "centre": p.centre.tolist(),
-                 "mean": p.mean.tolist(), "low": p.low.tolist(), "high": p.high.tolist()}
-                for p in self.places
-            ],
+            "places": [p.as_json() for p in self.places],
         }  # fmt: skip
 
     def __str__(self) -> str:
@@ -105,41 +77,15 @@ def compare(fitted: Fit, records: Record | Sequence[Record]) -> Comparison:
     data = load_dataset(given, [], fitted.joint, fitted.model, kernel=fitted.data.kernel)
     error = assess(fitted.model, data, data.train, fitted.solution.values)
     residual = stack(Balances(fitted.model, data.sensing, wrt=()), data.train, fitted.solution.values).residual
-    block = np.concatenate([w.block for w in data.train])
-    signals = axes(data.train, data.sensing.has_torque)
-    places = [
-        place(balance, name, unit, residual[balance], values, block)
-        for balance in residual for name, (values, unit) in signals.items()
-    ]  # fmt: skip
-    places.sort(key=lambda p: -p.strength)
+    places = places_of(residual, gather(data))
     time = np.concatenate([w.time for w in data.train])
     sigma = {b: max(error.balances[b].floor, 1e-12) for b in residual}
     power = sum((residual[b] / sigma[b]) ** 2 for b in residual)
     worst = _worst(time, np.asarray(power))
     return Comparison(
-        ", ".join(r.name for r in given), error, tuple(places), worst,
+        ", ".join(r.name for r in given), error, places, worst,
         {b: _lagged(r) for b, r in residual.items()},
     )  # fmt: skip
-
-
-def place(balance: str, axis: str, unit: str, residual: FloatArray, values: FloatArray, block: npt.NDArray[np.int64]) -> Place:
-    """Binned mean residual with a 95 % band from the scatter between blocks."""
-    edges, index = binned(residual, values)
-    size = max(len(edges) - 1, 1)
-    blocks = int(block.max()) + 1
-    inside = block >= 0
-    key = block[inside] * size + index[inside]
-    count = np.bincount(key, minlength=blocks * size).reshape(blocks, size)
-    total = np.bincount(key, weights=residual[inside], minlength=blocks * size).reshape(blocks, size)
-    rows = np.maximum(count.sum(axis=0), 1)
-    mean = total.sum(axis=0) / rows
-    deviation = total - count * mean
-    seen = np.maximum((count > 0).sum(axis=0), 1)
-    spread = np.sqrt((deviation**2).sum(axis=0) * seen / np.maximum(seen - 1, 1)) / rows
-    half = 1.96 * np.maximum(spread, 1e-12)
-    centre = (edges[:-1] + edges[1:]) / 2 if len(edges) > 1 else np.zeros(1)
-    strength = float(np.max(np.abs(mean) / half * (seen > 3), initial=0.0))
-    return Place(balance, axis, unit, centre, mean, mean - half, mean + half, strength)
 
 
 def _worst(time: FloatArray, power: FloatArray) -> tuple[float, float]:

@@ -154,7 +154,7 @@ def ranking_html(
     """The ranked effects: what adding one alone would lower, its estimate, and what it is mistaken for."""
     values = {t.key: trial_values(t) for t in trials}
     claimed = {k: c for c in result["claims"] for k in c["effects"]}
-    head = ["effect", "acts on", "seen in", "held-out error falls by", "state", "estimate", "easily mistaken for"]
+    head = ["effect", "held-out error falls by", "state", "acts on", "seen in", "estimate", "easily mistaken for"]
     rows, classes = [], []
     for i, r in list(enumerate(result["ranking"], 1))[first:last]:
         drop = r["held_out_drop_percent"]
@@ -162,8 +162,9 @@ def ranking_html(
         if r["effect"] in claimed:
             state = "claimed" if r["significant"] else "claimed in a later step"
         rows.append([
-            f"{i}. {text(r['title'])}", text(words(r.get("place", ""))), f"{text(r['balance'])} balance",
-            f'<span class="nowrap">{bar(drop, f"{drop:.0f} percent")} {percent(drop, 2) if drop > 0 else "no fall"}</span>', state, values.get(r["effect"], ""),
+            f"{i}. {text(r['title'])}",
+            f'<span class="nowrap">{bar(drop, f"{drop:.0f} percent")} {percent(drop, 2) if drop > 0 else "no fall"}</span>', state,
+            text(words(r.get("place", ""))), f"{text(r['balance'])} balance", values.get(r["effect"], ""),
             ", ".join(title_of(k) for k in r["confusable_with"]) or "–",
         ])  # fmt: skip
         classes.append("" if r["significant"] or r["effect"] in claimed else "under")
@@ -250,15 +251,7 @@ def fit_html(fit: Fit) -> str:
 
 def comparison_html(comparison: Comparison) -> str:
     """A comparison: errors, the most telling places as pictures, the worst window."""
-    from identification.places import Branch, Place
-
-    pictures = []
-    for p in comparison.places[:SHOWN_PLACES]:
-        import numpy as np
-
-        shown = Branch("both", p.centre, p.mean, p.low, p.high, np.ones(len(p.centre), dtype=np.int64))
-        unit = next(iter(comparison.error.balances.values())).unit
-        pictures.append(place_picture(Place(p.balance, p.axis, words(p.axis), p.unit, unit, p.centre, (shown,), math.nan, p.strength)))
+    pictures = [place_picture(p) for p in comparison.places[:SHOWN_PLACES]]
     low, high = comparison.worst_window
     window = f"<p>Worst window: {number(low)} s to {number(high)} s.</p>"
     return f"<div>{error_html(comparison.error.as_json(), text(comparison.name))}{''.join(pictures)}{window}</div>"

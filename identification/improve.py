@@ -13,6 +13,7 @@ from identification.candidates import LATE, Base, NotTestable, Trial, make_base
 from identification.claims import HELD_OUT_DROP, LADDER_STEP, Claim, Ranking, confusion_set, make_claim, minor_claims, nearly, rank, simplest
 from identification.engine import Dataset, Solution, load_dataset, prepared_model, solve
 from identification.errors import InputError
+from identification.formats import number
 from identification.joint_file import Joint
 from identification.lines import Line, find_lines
 from identification.locate import Unexplained, locate
@@ -104,6 +105,11 @@ class Improvement:
     def model(self) -> JointModel:
         """The final model with its values."""
         return self.steps[-1].solution.model
+
+    def _repr_html_(self) -> str:
+        from identification.html import improvement_html
+
+        return improvement_html(self)
 
     def as_json(self) -> dict[str, Any]:
         """The loop as data; held to improve.schema.json by a test."""
@@ -386,7 +392,7 @@ def _verdict(
     names = " and ".join(EFFECTS[c.effects[0]].title if len(c.effects) == 1 else "one of (" + ", ".join(c.effects) + ")" for c in claims)
     fall = f"the error on held-out data falls from {steps[0].held_out.relative_error_percent:.3g} % to {steps[-1].held_out.relative_error_percent:.3g} %"
     if where:
-        left = ", ".join(f"{u.balance} ({ratios[u.balance].ratio:.2g} times its noise floor)" for u in where)
+        left = ", ".join(f"{u.balance} ({number(ratios[u.balance].ratio, 2)} times its noise floor)" for u in where)
         if claims:
             return "unexplained", f"Missing: {names}; {fall}. Structure that is not in the library is left in: {left}."
         return "unexplained", f"No effect of the library explains what is left in: {left}."

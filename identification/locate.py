@@ -21,6 +21,7 @@ IntArray = npt.NDArray[np.int64]
 BINS: Final = 24
 AXIS_R2: Final = 0.05
 PEAK: Final = 15.0
+LINEAR: Final = {"rad": "m", "rad/s": "m/s", "N.m": "N"}
 
 
 @final
@@ -62,7 +63,7 @@ class Unexplained:
         }  # fmt: skip
 
 
-def axes(records: Sequence[WeakRecord], sensing_has_torque: bool) -> dict[str, tuple[FloatArray, str]]:
+def axes(records: Sequence[WeakRecord], sensing_has_torque: bool, kind: str = "rotary") -> dict[str, tuple[FloatArray, str]]:
     """Signals against which residuals are binned, averaged like the residuals."""
     def joined(name: str) -> FloatArray:
         return np.concatenate([w.averaged[name] for w in records])
@@ -79,7 +80,7 @@ def axes(records: Sequence[WeakRecord], sensing_has_torque: bool) -> dict[str, t
         out["torsion"] = (twist, "rad")
     out.pop("link_position" if float(np.ptp(twist)) == 0 else "motor_position")
     out["time"] = (np.concatenate([w.time for w in records]), "s")
-    return out
+    return {n: (values, LINEAR.get(unit, unit) if kind == "linear" else unit) for n, (values, unit) in out.items()}
 
 
 def binned(residual: FloatArray, axis: FloatArray, bins: int = BINS) -> tuple[FloatArray, IntArray]:
@@ -110,7 +111,7 @@ def locate(solution: Solution, data: Dataset, error: Error, lines: Sequence[Line
     balances = Balances(solution.model, data.sensing, wrt=())
     residual = stack(balances, data.train, solution.values).residual
     block = np.concatenate([w.block for w in data.train])
-    signals = axes(data.train, data.sensing.has_torque)
+    signals = axes(data.train, data.sensing.has_torque, data.joint.kind)
     out: list[Unexplained] = []
     for balance in balances.balances:
         if error.balances[balance].ratio <= threshold:

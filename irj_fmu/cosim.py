@@ -6,12 +6,9 @@ import json
 import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, final
-
-import numpy as np
-import numpy.typing as npt
 
 from identification.errors import InputError
 from identification.joint_file import Joint, load_joint, toml_text
@@ -20,12 +17,10 @@ from .build import detector_state
 from .estimator import DETECTOR_FILE, JOINT_FILE, OPTIONS_FILE, options_text
 from .host import Fmu, Instance, Trajectory, Wiring, simulate_cs
 from .joint_plant import PlantOptions, identifier, plant_spec
-from .online import OnlineOptions, prepared
+from .online import OnlineOptions, estimated_parameters, prepared
 from .plant import build_plant
 from .reference import NAMES, Motion, published_joint, reference_joint, start_of
 from .signals import Fault
-
-FloatArray = npt.NDArray[np.float64]
 
 CHANNELS: Final = {"q_m": "motor_position", "w_m": "motor_velocity", "q_l": "link_position", "w_l": "link_velocity", "tau_l": "link_torque"}
 """Inputs of the estimator and the outputs of the plant that feed them."""
@@ -184,11 +179,8 @@ def cosimulate(
         An FMU refused a call.
     """
     setting, motion = setting or Setting(), motion or Motion()
-    adapted, sensing = prepared(model, OnlineOptions())
-    from .online import held_parameters
-    from .rows import linear_parameters
-
-    names = linear_parameters(adapted, sensing, held_parameters(model))
+    sensing = prepared(model, OnlineOptions())[1]
+    names = estimated_parameters(model)
     drive = ("i_m", "motor_current") if model.torque_per_current is not None else ("tau_m", "motor_torque")
     connections = {f"estimator.{k}": f"plant.{v}" for k, v in {**CHANNELS, drive[0]: drive[1]}.items()}
     outputs = [f"theta[{i}]" for i in range(1, len(names) + 1)] + [f"sigma[{i}]" for i in range(1, len(names) + 1)]
@@ -306,4 +298,4 @@ def main(argv: Sequence[str]) -> int:
     return 0 if all(r.passed for r in rows) else 1
 
 
-__all__ = ["Cosimulation", "Row", "Setting", "convergence", "cosimulate", "main", "make_pair", "replace", "table"]
+__all__ = ["Cosimulation", "Row", "Setting", "convergence", "cosimulate", "main", "make_pair", "table"]

@@ -15,7 +15,7 @@ from identification.joint_file import Joint
 from identification.recursive import RecursiveLeastSquares, Settings
 from identification.sensing import Sensing, adapt
 
-from .rows import SOURCES, RowMaker
+from .rows import SOURCES, RowMaker, linear_parameters
 from .state_bytes import pack, unpack
 from .watch import DRIVE, Q_L, Q_M, READINGS, SAMPLED, TAU, W_L, W_M, Watch
 
@@ -96,9 +96,20 @@ def prepared(joint: Joint, options: OnlineOptions) -> tuple[JointModel, Sensing]
 
 
 def held_parameters(joint: Joint) -> frozenset[str]:
-    """Parameters the estimator leaves alone: known ones, delays, gains that hide in all others."""
+    """Parameters the estimator leaves alone: known ones, delays, and kinematic errors.
+
+    A kinematic error multiplies the stiffness, so that one of the two must be held; it is the geometry.
+    """
     delays = {"drive_delay", "torque_sensor_delay", "link_position_sensor_delay"}
-    return frozenset(k for k, v in joint.known.items() if v.value is not None) | delays
+    model = joint.model()
+    geometry = {n for t in model.terms if t.place == "torsion" for n in t.names}
+    return frozenset(k for k, v in joint.known.items() if v.value is not None) | delays | geometry
+
+
+def estimated_parameters(joint: Joint, options: OnlineOptions | None = None) -> tuple[str, ...]:
+    """Names of the parameters that an estimator of this joint follows, in the order of ``theta[k]``."""
+    model, sensing = prepared(joint, options or OnlineOptions())
+    return linear_parameters(model, sensing, held_parameters(joint))
 
 
 @final
@@ -145,10 +156,14 @@ class OnlineEstimator:
         self.detector = self._make_detector() if self.options.detect else None
         self._collect = max(2 * len(self.names), round(self.options.warm_up / (self.rows.timing.stride * dt)))
         self._friction = [
-            [self.names.index(n) for t in self.model.terms if t.place == place and t.effect.key in ("coulomb", "stribeck")
-             for n in t.names[:1] if n in self.names]
+            [self.names.index(p.name) for t in self.model.terms if t.place == place and t.effect.family == "friction"
+             for p in t.parameters if p.unit == "N.m" and p.name in self.names]
             for place in ("motor", "link")
         ]  # fmt: skip
+        self._feels = np.array([
+            [place in b or b in ("sum", "axis") or (b == "deflection" and place == "motor") for place in ("motor", "link")]
+            for b in self.balances
+        ])  # fmt: skip
         self.reset()
         self._recursion(self.theta)  # its functions are made here and not inside a step
 
@@ -177,7 +192,7 @@ class OnlineEstimator:
         self._started = False
         self._last_good = [0.0] * 6
         self._lost = [0] * len(SOURCES)
-        self._collected: list[tuple[FloatArray, FloatArray]] = []
+        self._collected: list[tuple[FloatArray, FloatArray, FloatArray]] = []
         self.estimator: RecursiveLeastSquares | None = None
         self._scale = np.ones(n)
         values = dict(zip(self.model.parameter_names, self.model.value_vector(), strict=True))
@@ -314,7 +329,7 @@ class OnlineEstimator:
         on = ~(self.rows.uses & lost).any(axis=1)
         if self.estimator is None:
             if enable and on.all():
-                self._collected.append((y, h))
+                self._collected.append((y, h, self._shares()))
                 if len(self._collected) >= self._collect:
                     self._begin()
             return True
@@ -336,30 +351,35 @@ class OnlineEstimator:
         self.theta = self.estimator.update(y * weight, h * weight[:, None])
         return True
 
+    def _shares(self) -> FloatArray:
+        """Share of the kernel in which motor and link stand still or turn round."""
+        noise = self.watch.noise
+        return np.array([self.rows.standstill("motor", noise[Q_M]), self.rows.standstill("link", noise[Q_L])])
+
     def _weights(self) -> FloatArray:
         """Rows at a reversal count less: there friction may take any value between its limits."""
-        weight = np.ones(len(self.balances))
-        for side, place in enumerate(("motor", "link")):
-            level = float(np.abs(self.theta[self._friction[side]]).sum()) if self._friction[side] else 0.0
-            if not level:
-                continue
-            share = self.rows.standstill(place, self.watch.noise[Q_M if place == "motor" else Q_L])
-            if not share:
-                continue
-            for b, balance in enumerate(self.balances):
-                if place in balance or (balance in ("sum", "axis")) or (balance == "deflection" and place == "motor"):
-                    scale = max(self.floor[b], np.sqrt(self._square[b]), 1e-12)
-                    weight[b] = 1.0 / np.hypot(1.0 / weight[b], level * share / scale)
-        return weight
+        size = np.maximum(np.maximum(self.floor, np.sqrt(self._square)), 1e-12)
+        return self._weight_of(self._shares()[None], self.theta, size)[0]
+
+    def _weight_of(self, shares: FloatArray, theta: FloatArray, size: FloatArray) -> FloatArray:
+        """Weights (rows, balances) from the shares (rows, 2) and the size of the residuals (balances,)."""
+        level = np.array([float(np.abs(theta[which]).sum()) if which else 0.0 for which in self._friction])
+        doubt = (shares * level)[:, None, :] * self._feels
+        return np.asarray(1.0 / np.sqrt(1.0 + np.sum(doubt**2, axis=2) / size**2), dtype=np.float64)
 
     def _begin(self) -> None:
         """Start the recursion from the collected rows."""
-        y = np.array([pair[0] for pair in self._collected])
-        h = np.array([pair[1] for pair in self._collected])
-        first = self._least_squares(y, h)
-        values = self.theta
-        self._scale = np.maximum(np.maximum(np.abs(first), np.abs(values)), self._least(h, y))
-        self.estimator = self._recursion(values)
+        y = np.array([row[0] for row in self._collected])
+        h = np.array([row[1] for row in self._collected])
+        shares = np.array([row[2] for row in self._collected])
+        weight = np.ones_like(y)
+        for _ in range(3):
+            first = self._least_squares(y * weight, h * weight[:, :, None])
+            size = 1.5 * np.median(np.abs(y - h @ first), axis=0)
+            weight = self._weight_of(shares, first, np.maximum(size, 1e-9 * float(np.max(np.abs(y)))))
+        y, h = y * weight, h * weight[:, :, None]
+        self._scale = np.maximum(np.maximum(np.abs(first), np.abs(self.theta)), self._least(h, y))
+        self.estimator = self._recursion(self.theta)
         started = self.estimator.startup(y, h, limit=1e-6)
         self.estimator.release()
         if started.removed:
@@ -502,8 +522,7 @@ class OnlineEstimator:
             "scale": self._scale, "watch": self.watch.numbers(),
         }  # fmt: skip
         if self._collected:
-            arrays["y"] = np.array([pair[0] for pair in self._collected])
-            arrays["h"] = np.array([pair[1] for pair in self._collected])
+            arrays |= {key: np.array([row[i] for row in self._collected]) for i, key in enumerate(("y", "h", "shares"))}
         arrays.update({f"row{i}": values for i, values in enumerate(self.rows.numbers())})
         parts = {} if self.estimator is None else {"rls": self.estimator.state()}
         if self.detector is not None:
@@ -521,7 +540,7 @@ class OnlineEstimator:
         self.floor, self.ratio, self._scale = arrays["floor"], arrays["ratio"], arrays["scale"]
         self._square, self._torque = arrays["square"], arrays["torque"]
         self.watch.load(arrays["watch"])
-        self._collected = list(zip(arrays["y"], arrays["h"], strict=True)) if "y" in arrays else []
+        self._collected = list(zip(arrays["y"], arrays["h"], arrays["shares"], strict=True)) if "y" in arrays else []
         self.rows.load([arrays[f"row{i}"] for i in range(len(self.rows.numbers()))])
         self.estimator = self._recursion(self.theta) if "rls" in parts else None
         if self.estimator is not None:
@@ -537,4 +556,4 @@ class OnlineEstimator:
         self.plant_alarm, self.events = plain["plant"], list(plain["events"])
 
 
-__all__ = ["BALANCES", "FAULT_TEXT", "READINGS", "OnlineEstimator", "OnlineOptions", "prepared", "sensing_of"]
+__all__ = ["BALANCES", "FAULT_TEXT", "READINGS", "OnlineEstimator", "OnlineOptions", "estimated_parameters", "prepared", "sensing_of"]

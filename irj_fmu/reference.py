@@ -122,9 +122,11 @@ def published_joint(path: Path, name: str, *, link_inertia: float = 0.5, gravity
 
 
 def start_of(joint: Joint) -> Joint:
-    """The joint before a fit: the shapes of its laws are known, every other value is forgotten."""
-    shapes = {p.name for p in joint.model().parameters if p.is_shape}
-    return replace(joint, fitted={k: v for k, v in joint.fitted.items() if k in shapes})
+    """The joint before a fit: what an estimator holds is known, everything it estimates is forgotten."""
+    from .online import estimated_parameters
+
+    forgotten = set(estimated_parameters(joint))
+    return replace(joint, fitted={k: v for k, v in joint.fitted.items() if k not in forgotten})
 
 
 @final

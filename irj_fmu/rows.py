@@ -235,6 +235,7 @@ class RowMaker:
         ]  # fmt: skip
         index, order, source = (np.array(column) for column in zip(*self._place, strict=True))
         self._index, self._flat = index, order * len(SOURCES) + source
+        self._speeds = [_NAMES.index("motor_velocity"), _NAMES.index("link_velocity")]
         self._velocity_gain = float(np.linalg.norm(kernel(t.pointwise, t.dt, 1)))
 
     def _slope_function(self, expressions: Mapping[str, Any], signals: Any, p: Any) -> Any:
@@ -249,7 +250,7 @@ class RowMaker:
         """Before the first sample."""
         t = self.timing
         length = 2 * t.point_half + 1
-        self._ring = np.zeros((length, len(self.needed)))
+        self._ring, self._speed = np.zeros((length, len(self.needed))), np.zeros((length, 2))
         new = t.stride // t.step
         count, states = self._point.size1_in(2), self._point.size1_in(3)
         self._in = [np.zeros((new, len(_NAMES))), np.zeros((new, len(_NAMES))), np.zeros(count), np.zeros(states), np.zeros(1)]
@@ -291,6 +292,8 @@ class RowMaker:
             new = len(raw)
             self._ring[:-new] = self._ring[new:].copy()
             self._ring[-new:] = out
+            self._speed[:-new] = self._speed[new:].copy()
+            self._speed[-new:] = raw[:, self._speeds]
         self.made += 1
         averaged = (self.averaging @ window).ravel()
         self.signals[self._index] = averaged[self._flat]
@@ -304,13 +307,15 @@ class RowMaker:
         return table[:, 0].copy(), -table[:, 1:]
 
     def standstill(self, place: str, noise: float) -> float:
-        """Share of the newest points at which a side stands still, as far as its noise lets one see."""
+        """Share of the kernel in which a side stands still or turns round, as far as its noise lets one see."""
         if not self.needed:
             return 0.0
-        column = _NAMES.index(f"{place}_velocity")
         values = dict(zip(self.model.parameter_names, self.model.value_vector(), strict=True))
         slow = max(3 * noise * self._velocity_gain, 2 * min(values.get(f"{place}_smoothing_velocity", 0.0), _SHARP))
-        return float(np.mean(np.abs(self._in[0][:, column]) < slow))
+        speed = self._speed[:, 0 if place == "motor" else 1]
+        still = np.abs(speed) < slow
+        still[1:] |= speed[1:] * speed[:-1] < 0
+        return float(self._weights @ still)
 
     # --- noise -------------------------------------------------------------------------------------------------------
 
@@ -343,7 +348,7 @@ class RowMaker:
 
     def numbers(self) -> list[FloatArray]:
         """Everything that changes."""
-        return [self._ring, self._in[2], self._in[3], self._in[4], self.signals, np.array([float(self.made)])]
+        return [self._ring, self._speed, self._in[2], self._in[3], self._in[4], self.signals, np.array([float(self.made)])]
 
     def load(self, arrays: Sequence[FloatArray]) -> None:
         """Take up what :meth:`numbers` gave."""

@@ -142,9 +142,9 @@ def take_home(browser: Browser, tmp_path: Path) -> None:
     assert text.startswith("<!doctype html>") or text.startswith("<!DOCTYPE html>")
     assert not re.search(r"""(src|href)=["']https?://""", text)
     browser.idle("export")
-    if page.locator("#make-fmu").count():
+    if page.locator("#make-plant").count():
         with page.expect_download(timeout=300_000) as fmu:
-            page.click("#make-fmu")
+            page.click("#make-plant")
         fmu.value.save_as(tmp_path / "joint.fmu")
         with zipfile.ZipFile(tmp_path / "joint.fmu") as archive:
             assert "modelDescription.xml" in archive.namelist()

@@ -11,7 +11,7 @@ from identification.improve import HOLD_DELAY
 from workbench.app_analysis import Progress
 from workbench.app_live import Live
 from workbench.app_report import improvement_of
-from workbench.session import FileEntry, State
+from workbench.session import FileEntry, State, write_atomic
 
 
 def session_code(state: State) -> str:
@@ -89,6 +89,17 @@ def report(live: Live, folder: Path, progress: Progress) -> Path:
     return write_report(result, folder / "report.html", records=analysis.records)
 
 
-def fmu(live: Live, folder: Path, progress: Progress) -> Path:
-    """Build the FMU of the current model into a folder."""
-    raise NotImplementedError
+def fmu(live: Live, folder: Path, progress: Progress, kind: str = "plant") -> Path:
+    """Build the FMU of the fitted joint (``plant``) or of its online estimator (``estimator``) into a folder."""
+    from identification.joint_file import load_joint
+    from irj_fmu.build import Request, build
+
+    source = folder / f"{kind}.toml"
+    write_atomic(source, joint_file(live).encode())
+    sensing = live.analysis().data.sensing
+    request = Request(joint=load_joint(source), source=source, out=folder / kind, has_link=sensing.both_positions, has_torque=sensing.has_torque)
+    progress(f"building and trying the {kind} FMU", 0.3)
+    made = build(kind, request)
+    target = folder / f"{kind}.fmu"
+    next(path for path in made if path.suffix == ".fmu").replace(target)
+    return target

@@ -34,7 +34,8 @@ def run(live: Live, action: str, body: Mapping[str, Any]) -> None:
         "confirm": ("fitting every sample", lambda p: _confirm(live, p)),
         "improve": ("running the whole loop", lambda p: _improve(live, p)),
         "report": ("writing the report", lambda p: _export(live, "report", p)),
-        "fmu": ("building the FMU", lambda p: _export(live, "fmu", p)),
+        "plant": ("building the FMU of the joint", lambda p: _export(live, "plant", p)),
+        "estimator": ("building the FMU of the estimator", lambda p: _export(live, "estimator", p)),
     }
     if action not in verbs:
         raise InputError(f"unknown action {action!r}; known: {', '.join(verbs)}")
@@ -113,9 +114,11 @@ def _improve(live: Live, progress: Progress) -> Change:
 
 def _export(live: Live, kind: str, progress: Progress) -> Change:
     if not live.state.steps:
-        raise InputError(f"no {kind} yet: fit first")
-    make = app_export.report if kind == "report" else app_export.fmu
-    make(live, folder_of(live), progress)
+        raise InputError("nothing to take home yet: fit first")
+    if kind == "report":
+        app_export.report(live, folder_of(live), progress)
+    else:
+        app_export.fmu(live, folder_of(live), progress, kind)
     return lambda s: s
 
 

@@ -116,11 +116,11 @@ def _script(live: Live, query: Query) -> Response:
 
 
 def _made(live: Live, name: str) -> Response:
-    path = folder_of(live) / f"{name}"
+    path = folder_of(live) / name
     if not path.is_file():
         raise InputError(f"no {name} yet; make it on the Export page")
     return FileResponse(
-        path, filename=f"{_named(live)}{path.suffix}", media_type="application/octet-stream", headers={"cache-control": "no-store"}
+        path, filename=f"{_named(live)}{'_' + path.stem if path.suffix == '.fmu' else ''}{path.suffix}", media_type="application/octet-stream", headers={"cache-control": "no-store"}
     )
 
 
@@ -128,11 +128,16 @@ def _report(live: Live, query: Query) -> Response:
     return _made(live, "report.html")
 
 
-def _fmu(live: Live, query: Query) -> Response:
-    return _made(live, "model.fmu")
+def _plant(live: Live, query: Query) -> Response:
+    return _made(live, "plant.fmu")
+
+
+def _estimator(live: Live, query: Query) -> Response:
+    return _made(live, "estimator.fmu")
 
 
 VIEWS: Final[Mapping[str, Callable[[Any, Query], Any]]] = {
     "config": _config, "series": _series, "balance": _balance, "compare": _compare, "parameters": _parameters, "library": _library,
-    "joint": _joint, "code": _code, "joint.toml": _joint_file, "session.py": _script, "report.html": _report, "model.fmu": _fmu,
+    "joint": _joint, "code": _code, "joint.toml": _joint_file, "session.py": _script, "report.html": _report, 
+    "plant.fmu": _plant, "estimator.fmu": _estimator,
 }  # fmt: skip

@@ -69,6 +69,7 @@ def _parser() -> argparse.ArgumentParser:
     simulated.add_argument("--hide", metavar="KEY", action="append", default=[], help="add this effect without saying so in the record")
     simulated.add_argument("-o", "--output", metavar="FILE", default="simulated.csv", help="record file, .csv or .npz")
     simulated.add_argument("--truth", metavar="FILE", help="write the true parameters as JSON")
+    simulated.add_argument("--set", metavar="NAME=VALUE", action="append", default=[], help="true value of a parameter, link-referred SI")
     simulated.add_argument("--seconds", type=float, default=24.0)
     simulated.add_argument("--rate", type=float, default=500.0, help="samples per second (default 500)")
     simulated.add_argument("--seed", type=int, default=0)

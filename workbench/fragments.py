@@ -175,7 +175,7 @@ def additions_html(improvement: Improvement, plots: ReportPlots) -> str:
 def lines_html(lines: Sequence[Line]) -> str:
     """Lines: residual periodic in the motor angle."""
     if not lines:
-        return "<p>None: no residual repeats with the motor angle.</p>"
+        return "<p>None: nothing that is left repeats with the motor angle.</p>"
     rows = [
         [f"{number(x.order)} ± {number(x.tolerance, 2)} per {text(x.per)}", f"{text(x.balance)} balance", f"{number(x.amplitude, 3)} {pretty_unit(x.unit)}",
          f"{number(x.prominence, 2)} ×", " or ".join(title_of(k) for k in x.effects) or "position-periodic, no name in the library"]

@@ -132,7 +132,7 @@ def run_compare(arguments: Namespace) -> int:
     comparison = compare(fit(joint, basis), records)
     print(comparison)
     for place in comparison.places[:5]:
-        print(f"  {place.balance} against {place.axis.replace('_', ' ')}: mean residual up to {place.strength:.3g} times its 95 % band")
+        print(f"  {place.balance} balance against {place.title}: explains {max(place.share_percent, 0):.0f} % of what is left there")
     write_json(arguments.json, {**comparison.as_json(), "warnings": warnings})
     return 0
 

@@ -198,7 +198,7 @@ def _write_motion(path: str, best: Excitation) -> None:
 
 def _print_plan(path: str, chosen: Selection, refused: int, fitted: bool) -> None:
     best = chosen.best
-    values = ", ".join(f"{k} {math.degrees(v):.3g} {'deg/s' if k == 'speed' else 'deg'}" if k in ("speed", "limit", "start") else f"{k} {v:.3g} s" for k, v in best.motion.parameters.items())
+    values = ", ".join(_shown(k, v) for k, v in best.motion.parameters.items())
     print(f"{path}: {best.motion.family} motion, {values}; best of {len(chosen.tried)}" + (f", {refused} break the limits" if refused else ""))
     if not fitted:
         print("  the joint file has no fitted values: typical ones were taken, so read the figures as orders of magnitude")
@@ -206,3 +206,9 @@ def _print_plan(path: str, chosen: Selection, refused: int, fitted: bool) -> Non
     for name, deviation in best.relative_deviation.items():
         shown = f"{100 * deviation:.3g} %" if math.isfinite(deviation) else "cannot be identified by this motion"
         print(f"    {name:<28} {shown}")
+
+
+def _shown(name: str, value: float) -> str:
+    if name in ("hold", "period", "rendezvous", "reversal"):
+        return f"{name} {value:.3g} s"
+    return f"{name} {math.degrees(value):.3g} deg" + ("/s" if name == "speed" else "")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from argparse import Namespace
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -35,6 +36,8 @@ HIDDEN: Final = {
     "backlash_stiffness_loss": 1.5e4, "backlash": 3e-4, "soft_windup_torque": 6.0, "soft_windup_width": 4e-4,
     "torque_sensor_gain": 0.1, "torque_sensor_offset": 3.0, "delay": 0.006, "gravity_cosine": 5.0, "extra_inertia": 1.0,
     "sensor_compliance": 1e-5, "thermal_coulomb": 0.3, "thermal_viscous": 0.0,
+    "flexible_inertia": 1.5, "flexible_stiffness": 1.2e3, "load_friction_mean": 0.08, "load_friction_difference": 0.03,
+    "smooth_stribeck": 300.0, "loss_constant": 12.0, "loss_viscous": 8.0, "loss_cubic": 2.0, "loss_sine": 1.0, "loss_cosine": 0.5,
 }  # fmt: skip
 """Sizes of hidden effects, of the order of the thesis and of catalogues."""
 
@@ -50,7 +53,11 @@ def run_simulate(arguments: Namespace) -> int:
             model = model.add(key)
         except (KeyError, ValueError) as error:
             raise InputError(f"--hide {key}: {error.args[0]}") from None
-    model = model.with_values(true_values(model, joint))
+    try:
+        model = model.with_values({**true_values(model, joint), **_given(arguments.set)})
+    except ValueError as error:
+        raise InputError(f"--set: {error.args[0]}") from None
+    _check_hidden(model, arguments.hide)
     table = recording(model, joint, arguments.seconds, arguments.rate, arguments.seed, arguments.motion)
     _write_table(Path(arguments.output), table)
     truth = {"hidden": arguments.hide, "parameters": dict(zip(model.parameter_names, model.value_vector(), strict=True))}
@@ -58,6 +65,28 @@ def run_simulate(arguments: Namespace) -> int:
     write_json(arguments.json, {"file": arguments.output, "samples": len(table["time_s"])})
     print(f"{arguments.output}: {len(table['time_s'])} samples, channels {', '.join(table)}")
     return 0
+
+
+def _given(pairs: Sequence[str]) -> dict[str, float]:
+    """Values of ``--set NAME=VALUE``."""
+    out = {}
+    for pair in pairs:
+        name, _, value = pair.partition("=")
+        try:
+            out[name.strip()] = float(value)
+        except ValueError:
+            raise InputError(f"--set {pair}: give NAME=VALUE with a number, as motor_coulomb=20") from None
+    return out
+
+
+def _check_hidden(model: JointModel, keys: Sequence[str]) -> None:
+    """An effect whose amplitudes are all 0 would be hidden from everybody."""
+    values = dict(zip(model.parameter_names, model.value_vector(), strict=True))
+    for key in keys:
+        bare = key.partition("#")[0].partition("@")[0]
+        sizes = [p.name for t in model.terms if t.effect.key == bare for p in t.parameters if not p.is_shape]
+        if not any(values[n] for n in sizes):
+            raise InputError(f"--hide {key}: no typical size is known, so it would do nothing; give one with --set {sizes[0]}=VALUE")
 
 
 def true_values(model: JointModel, joint: Joint) -> dict[str, float]:
@@ -107,31 +136,42 @@ def recording(model: JointModel, joint: Joint, seconds: float, rate: float, seed
     natural = 2 * np.pi * 3.0
     stiff, damp = inertia * natural**2, 2 * 0.8 * inertia * natural
     x = np.zeros(step.size1_in(0))
-    turn = 2 * np.pi / 360
-    grain_motor, grain_link = 0.16 * turn / abs(joint.gear_ratio), 0.0036 * turn
+    warm = 20.0 * (1.0 - np.exp(-time / 60.0)) * model.has("thermal_friction")
     drive = np.zeros(len(time))
     rows = np.zeros((len(time), 5))
     for k in range(len(time)):
         drive[k] = stiff * (q[k] - x[0]) + damp * (v[k] - x[1])
-        u = np.array([drive[k], 0.0, time[k]])
+        u = np.array([drive[k], warm[k], time[k]])
         rows[k] = np.array(outputs(x, u, values)).ravel()
         x = np.array(step(x, u, values)).ravel()
+        if k % 2000 == 0:
+            progress_bar("simulating", k / len(time))
+    progress_bar("done", 1.0)
     if not np.all(np.isfinite(rows)):
         raise InputError(f"{joint.name}: the simulation diverges; check the values in the joint file")
-    noise = rng.standard_normal
-    n = joint.gear_ratio
-    per_current = joint.torque_per_current or n
-    motor = np.round(rows[:, 0] / grain_motor) * grain_motor * n
-    table: dict[str, FloatArray] = {
-        "time_s": time,
-        "motor_current_A": drive / per_current + noise(len(time)) * 0.035 / abs(per_current),
-        "motor_position_rad": motor,
-        "motor_velocity_rad_s": rows[:, 1] * n + noise(len(time)) * 2e-3 * abs(n),
-    }
+    return _read_off(model, joint, time, drive, rows, warm, rng)
+
+
+def _read_off(
+    model: JointModel, joint: Joint, time: FloatArray, drive: FloatArray, rows: FloatArray, warm: FloatArray, rng: np.random.Generator
+) -> dict[str, FloatArray]:
+    """What the sensors of the thesis's table B.1 would have logged."""
+    noise, count, ratio = rng.standard_normal, len(time), joint.gear_ratio
+    grain_motor, grain_link = np.deg2rad(0.16) / abs(ratio), np.deg2rad(0.0036)
+    length, torque = ("rad", "Nm") if model.kind == "rotary" else ("m", "N")
+    table: dict[str, FloatArray] = {"time_s": time}
+    if joint.torque_per_current is not None:
+        table["motor_current_A"] = drive / joint.torque_per_current + noise(count) * 0.035 / abs(joint.torque_per_current)
+    else:
+        table[f"motor_torque_{torque}"] = drive / ratio + noise(count) * 0.035 / abs(ratio)
+    table[f"motor_position_{length}"] = np.round(rows[:, 0] / grain_motor) * grain_motor * ratio
+    table[f"motor_velocity_{length}_s"] = rows[:, 1] * ratio + noise(count) * 2e-3 * abs(ratio)
     if model.is_elastic:
-        table["link_position_rad"] = np.round(rows[:, 2] / grain_link) * grain_link
-        table["link_velocity_rad_s"] = rows[:, 3] + noise(len(time)) * 2e-3
-        table["link_torque_Nm"] = rows[:, 4] + noise(len(time)) * 0.05
+        table[f"link_position_{length}"] = np.round(rows[:, 2] / grain_link) * grain_link
+        table[f"link_velocity_{length}_s"] = rows[:, 3] + noise(count) * 2e-3
+        table[f"link_torque_{torque}"] = rows[:, 4] + noise(count) * 0.05
+    if warm.any():
+        table["temperature_K"] = np.round((293.15 + warm + noise(count) * 0.1) / 0.0625) * 0.0625
     return table
 
 
@@ -148,8 +188,7 @@ def _write_table(path: Path, table: dict[str, FloatArray]) -> None:
 def _write_npz(path: Path, table: dict[str, FloatArray]) -> None:
     import io
 
-    wide = ("time_s", "motor_position_rad", "link_position_rad")
-    small: dict[str, Any] = {k: v if k in wide else v.astype(np.float32) for k, v in table.items()}
+    small: dict[str, Any] = {k: v if k == "time_s" or "_position_" in k else v.astype(np.float32) for k, v in table.items()}
     content = io.BytesIO()
     np.savez_compressed(content, **small)
     write_bytes(path, content.getvalue())

@@ -28,7 +28,7 @@ const views = {
       ? button("Fit the start model", () => run("fit", {}, "compare"), { kind: "primary", id: "fit", off: !ready.length })
       : button("Next: describe the joint", () => open("model"), { kind: "primary", id: "to-model", work: false });
     return [
-      h("div", { class: "row between" }, h("div", {}, heading("Records")), next),
+      h("div", { class: "row between head" }, h("div", {}, heading("Records")), next),
       state.joint_text ? h("p", { class: "soft" }, "Joint: ", h("strong", {}, jointLine(state)), " ", h("button", { type: "button", class: "quiet", onclick: () => open("model") }, "Change")) : h("p", { class: "soft" }, "No joint described yet: gear ratio, motor constant and start model come next."),
       state.files.map(fileCard), ready.length ? seriesCard(ready) : null, drop,
     ];
@@ -78,7 +78,7 @@ const views = {
     const strong = found.places.filter((p) => p.share_percent > 5), rest = found.places.filter((p) => !strong.includes(p));
     const figure = (p) => h("figure", { class: "card place" }, h("figcaption", {}, `${p.balance} balance against ${p.title}`, h("span", {}, p.share_percent > 5 ? `explains ${digits(p.share_percent, 2)} % of the residual's variance on blocks it was not drawn from` : "explains next to nothing")), placePlot(p));
     return [
-      h("div", { class: "row between" }, h("div", {}, heading("Where does the model fail?")), button("What is missing? Diagnose", () => run("diagnose", {}, "diagnose"), { kind: "primary", id: "diagnose" })),
+      h("div", { class: "row between head" }, h("div", {}, heading("Where does the model fail?")), button("What is missing? Diagnose", () => run("diagnose", {}, "diagnose"), { kind: "primary", id: "diagnose" })),
       state.note ? h("p", { class: "note small" }, state.note) : null,
       h("div", { class: "tiles" }, h("div", { class: "card" }, h("p", { class: "soft" }, "Held-out error"), h("div", { class: "figure", id: "held-out-error" }, `${digits(found.error.relative_error_percent)} %`), h("p", { class: "small soft" }, `of the measured torque is not explained, on records the fit did not see (${found.records.join(", ")}). On the fit's own: ${digits(last.train.relative_error_percent)} %.`)),
         balances.map((b) => { const e = found.error.balances[b]; return h("div", { class: "card" }, h("p", { class: "soft" }, `${b} balance`), h("div", { class: "figure" }, digits(e.ratio), h("small", {}, " × noise floor")), h("p", { class: "small soft" }, `residual ${digits(e.rms)} ${unit(e.unit)} rms; noise alone would leave ${digits(e.floor)}. ${e.ratio < 1.5 ? "Down to the noise." : "There is something left."}`)); })),
@@ -94,7 +94,7 @@ const views = {
   diagnose(state) {
     const d = state.diagnosis;
     const again = button(d ? "Diagnose again" : "Diagnose", () => run("diagnose", {}, "diagnose"), { kind: d ? "" : "primary", id: "diagnose" });
-    if (!d) return [h("div", { class: "row between" }, h("div", {}, heading("What is missing?", "Every effect of the library is tried in every place of the current model, and judged on blocks and records it was not fitted to.")), again)];
+    if (!d) return [h("div", { class: "row between head" }, h("div", {}, heading("What is missing?", "Every effect of the library is tried in every place of the current model, and judged on blocks and records it was not fitted to.")), again)];
     const clear = d.ranking.filter((r) => r.significant), faint = d.ranking.filter((r) => !r.significant), most = Math.max(1, ...d.ranking.map((r) => r.held_out_drop_percent || 0));
     const row = (r, k) => {
       const bar = h("i"), drop = r.held_out_drop_percent || 0;
@@ -108,7 +108,7 @@ const views = {
     };
     const claim = d.claim;
     return [
-      h("div", { class: "row between" }, h("div", {}, heading("What is missing?")), again),
+      h("div", { class: "row between head" }, h("div", {}, heading("What is missing?")), again),
       claim ? h("div", { class: "card" }, h("p", { class: "figure", id: "claim" }, claim.effects.map(effectTitle).join(" or ")), h("p", {}, claim.effects.length > 1 ? `These records cannot tell the ${claim.effects.length} apart.${claim.separate_by ? ` ${claim.separate_by} would.` : ""}` : `The ${claim.balance} balance says so: with it the held-out residual there falls by ${digits(claim.held_out_drop_percent, 2)} %.`))
         : h("div", { class: "card" }, h("p", { class: "figure", id: "claim" }, "Nothing that these records show"), h("p", {}, "No effect of the library helps enough on held-out data to be told from chance.")),
       d.warnings.map((w) => h("p", { class: "note small" }, w)),
@@ -124,7 +124,7 @@ const views = {
     const story = state.improvement, inside = last.effects.filter((e) => e !== "channel_delay@drive");
     const add = h("select", { id: "add-label", "aria-label": "Effect to add" }, library.filter((e) => !e.inside).map((e) => h("option", { value: e.label }, `${e.title} (${e.place.replace(/_/g, " ")})`)));
     return [
-      h("div", { class: "row between" }, h("div", {}, heading(before ? (now < was ? `The error falls from ${digits(was)} to ${digits(now)} %` : `The error is ${digits(now)} %, from ${digits(was)} %`) : `The error is ${digits(now)} %`, "Each step is fitted to the training records and judged on records the fit did not see.")),
+      h("div", { class: "row between head" }, h("div", {}, heading(before ? (now < was ? `The error falls from ${digits(was)} to ${digits(now)} %` : `The error is ${digits(now)} %, from ${digits(was)} %`) : `The error is ${digits(now)} %`, "Each step is fitted to the training records and judged on records the fit did not see.")),
         h("div", { class: "row" }, button(steps.length > 1 ? "What else is missing?" : "What is missing? Diagnose", () => run("diagnose", {}, "diagnose"), { kind: "primary", id: "diagnose" }), button("Take it home", () => open("export"), { work: false, id: "to-export" }))),
       state.note ? h("p", { class: "note small" }, state.note) : null,
       !last.exact ? h("p", { class: "note" }, "Fitted and judged on a part of the samples. ", button("Confirm on every sample", () => run("confirm"), { kind: "quiet", id: "confirm" })) : null,
@@ -155,7 +155,8 @@ const views = {
     return [heading("Take it home"), h("div", { class: "grid" },
       link("joint.toml", "Joint file", fitted ? "The joint with its fitted values, standard errors and provenance. It is a joint file again." : "The joint as it was described; nothing is fitted yet."),
       made("report", "report.html", "report", "One HTML file that opens offline: verdict, staircase, places before and after, parameters.", app.config.report),
-      made("fmu", "model.fmu", "FMU", "The joint as a simulation unit for other tools.", app.config.fmu)),
+      made("plant", "plant.fmu", "FMU of the joint", "The fitted joint as a simulation unit (FMI 2.0) for other tools; needs a C compiler on this machine.", app.config.fmu),
+      made("estimator", "estimator.fmu", "FMU of the estimator", "The online estimator with this joint's values; it carries its Python along.", app.config.fmu)),
       h("section", { class: "card" }, h("h2", {}, "Copy as code"), h("p", { class: "soft" }, "Python that does this session again, with the same errors. Run it in the folder of the measurement files."), h("div", { class: "row" }, button("Copy", () => navigator.clipboard.writeText(code).then(() => { copied.textContent = "copied"; }, () => { copied.textContent = "not allowed; select the text instead"; }), { work: false, id: "copy" }), h("a", { class: "button", href: `${base()}/view/session.py`, download: "" }, "Download"), copied), h("pre", { tabindex: "0", "aria-label": "Python code" }, h("code", {}, code)))];
   },
 };
