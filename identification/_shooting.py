@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import Any, Final, final
 
@@ -23,7 +24,7 @@ FloatArray = npt.NDArray[np.float64]
 OUTPUT_ROWS: Final = {"motor_position": 0, "link_position": 2, "torque": 4}
 """Measured outputs and their row in ``JointFunctions.outputs``."""
 RECORD_CHANNELS: Final = {"motor_position": "motor_position", "link_position": "link_position", "torque": "link_torque"}
-STABLE: Final = 1.2
+STABLE: Final = 1.5
 """Largest |eigenvalue| times step of the Runge-Kutta steps (their limit is 2.78)."""
 MOST_SUBSTEPS: Final = 40
 INLINED: Final = 4
@@ -62,6 +63,12 @@ class Windows:
     def length(self) -> int:
         """Samples in a window."""
         return self.measured.shape[2]
+
+    def every(self, stride: int) -> Windows:
+        """One window in `stride`."""
+        count, length = self.count, self.length
+        inputs = self.inputs.reshape(len(self.inputs), count, length)[:, ::stride].reshape(len(self.inputs), -1)
+        return Windows(self.channels, self.measured[::stride], np.ascontiguousarray(inputs), self.noise, self.dt)
 
     def start_states(self, elastic: bool) -> FloatArray:
         """Position and velocity at the start of each window from a parabola through its first samples, (windows, states)."""
@@ -173,56 +180,52 @@ class Shooting:
         self._names = model.parameter_names
         self._data = data
         self._columns = self.states + len(self.free)
-        sample = _sample(model, self.free, [OUTPUT_ROWS[c] for c in data.channels], data.dt, substeps)
-        self._run = sample.mapaccum("window", data.length).map(data.count)
+        rows = [OUTPUT_ROWS[c] for c in data.channels]
+        self._window = _sample(model, self.free, rows, data.dt, substeps).mapaccum("window", data.length)
+        self._run = self._window.map(data.count)
 
-    def _simulate(self, values: Mapping[str, float], x0: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Errors (windows, channels, length) and sensitivities (columns, channels, windows, length)."""
-        data = self._data
+    @property
+    def noise(self) -> FloatArray:
+        """Noise level of each channel."""
+        return self._data.noise
+
+    def every(self, stride: int) -> Shooting:
+        """The same simulation over one window in `stride`."""
+        out = copy(self)
+        out._data = self._data.every(stride)
+        out._run = self._window.map(out._data.count)
+        return out
+
+    def evaluate(self, values: Mapping[str, float], x0: FloatArray) -> FloatArray:
+        """Products of the columns (initial states, parameters, error) by channel and window, (channels, windows, k, k).
+
+        Infinite where the simulation diverges.
+        """
+        data, channels = self._data, len(self._data.channels)
         start = np.zeros((data.count, self.states * (1 + self._columns)))
         start[:, : self.states] = x0
         for i in range(self.states):
             start[:, self.states * (1 + i) + i] = 1.0
         p = np.array([values[n] for n in self._names])
-        _, out = self._run(start.T, data.inputs, p)
-        full = out.full()
-        channels = len(data.channels)
-        y = full[:channels].reshape(channels, data.count, data.length).transpose(1, 0, 2)
-        slopes = full[channels:].reshape(self._columns, channels, data.count, data.length)
-        return data.measured - y, slopes
-
-    def gram(self, values: Mapping[str, float], x0: FloatArray, sigma: FloatArray) -> FloatArray:
-        """Products of the weighted columns (initial states, parameters, error) in each window, (windows, k, k)."""
-        error, slopes = self._simulate(values, x0)
-        data = self._data
-        rows = np.empty((data.count, len(data.channels), data.length, self._columns + 1))
-        rows[..., :-1] = slopes.transpose(2, 1, 3, 0)
-        rows[..., -1] = error
-        rows /= sigma[:, None, None]
-        flat = rows.reshape(data.count, -1, self._columns + 1)
-        with np.errstate(invalid="ignore", over="ignore"):
-            product: FloatArray = flat.transpose(0, 2, 1) @ flat
+        full = self._run(start.T, data.inputs, p)[1].full()
+        rows = np.empty((channels, data.count, self._columns + 1, data.length))
+        rows[:, :, :-1] = full[channels:].reshape(self._columns, channels, data.count, data.length).transpose(1, 2, 0, 3)
+        rows[:, :, -1] = data.measured.transpose(1, 0, 2) - full[:channels].reshape(channels, data.count, data.length)
+        if not np.isfinite(rows).all():
+            return np.full((channels, data.count, self._columns + 1, self._columns + 1), np.inf)
+        product: FloatArray = rows @ rows.transpose(0, 1, 3, 2)
         return product
 
-    def channel_rms(self, values: Mapping[str, float], x0: FloatArray) -> FloatArray:
+    def rms(self, products: FloatArray) -> FloatArray:
         """RMS error of each channel."""
-        error, _ = self._simulate(values, x0)
-        out: FloatArray = np.sqrt(np.mean(error**2, axis=(0, 2)))
+        out: FloatArray = np.sqrt(products[:, :, -1, -1].sum(axis=1) / (self._data.count * self._data.length))
         return out
 
-    def standard_errors(self, values: Mapping[str, float], x0: FloatArray, sigma: FloatArray) -> dict[str, float]:
-        """Standard errors of the free parameters from the scatter of the windows' scores."""
-        gram, n = self.gram(values, x0, sigma), self.states
-        ridge = np.eye(n) * 1e-12 * np.trace(gram[:, :n, :n], axis1=1, axis2=2)[:, None, None]
-        block = np.linalg.solve(gram[:, :n, :n] + ridge, gram[:, :n, n:])
-        rest = gram[:, n:, n:] - gram[:, n:, :n] @ block
-        whole, scores = rest[:, :-1, :-1].sum(axis=0), rest[:, :-1, -1]
-        scale = np.sqrt(np.maximum(np.diag(whole), 1e-300))
-        inverse = np.linalg.pinv(whole / np.outer(scale, scale), rcond=1e-12)
-        scaled = scores / scale
-        covariance = inverse @ (scaled.T @ scaled) @ inverse
-        size = np.sqrt(np.maximum(np.diag(covariance), 0.0)) / scale
-        return dict(zip(self.free, size.tolist(), strict=True))
+
+def weighted(products: FloatArray, sigma: FloatArray) -> FloatArray:
+    """Products of all channels, each divided by its sigma, (windows, k, k)."""
+    out: FloatArray = np.einsum("cwij,c->wij", products, 1 / sigma**2)
+    return out
 
 
 def _sample(model: JointModel, free: Sequence[str], rows: Sequence[int], dt: float, substeps: int) -> Any:

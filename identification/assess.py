@@ -17,7 +17,7 @@ from identification.weak import WeakRecord
 
 FloatArray = npt.NDArray[np.float64]
 
-VERDICT_KERNELS: Final = {"motor": 0.03, "link": 0.12, "transmission": 0.06, "sum": 0.12, "deflection": 0.06, "axis": 0.2}
+VERDICT_KERNELS: Final = {"motor": 0.03, "link": 0.12, "transmission": 0.06, "sum": 0.06, "deflection": 0.06, "axis": 0.2}
 """Kernel at which a balance is compared with its floor: where records without a hidden effect read 1 [s]."""
 
 

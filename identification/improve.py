@@ -215,7 +215,8 @@ class _Loop:
                 break
             ranking = self._confirmed(ranking, base, steps[-1])
             best = ranking.best(frozenset(self.refused))
-            if best is None and not late and max(e.ratio for e in steps[-1].held_out.balances.values()) > RATIO_LIMIT:
+            may_move = not late and not self.data.sensing.one_sided
+            if best is None and may_move and max(e.ratio for e in steps[-1].held_out.balances.values()) > RATIO_LIMIT:
                 late = True
                 ranking = rank(base, late=True)
                 best = ranking.best(frozenset(self.refused))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -16,6 +17,8 @@ from identification.units import base_unit, same_dimension
 _JOINT_KEYS: Final = frozenset(
     ("name", "kind", "gear_ratio", "motor_constant", "torque_per_current", "torque_per_voltage", "model", "effects", "virtual_work")
 )  # fmt: skip
+_KNOWN_KEYS: Final = ("value", "low", "high", "unit", "side", "source", "note")
+_TABLES: Final = ("joint", "known", "columns", "fitted", "provenance")
 
 
 @final
@@ -105,6 +108,11 @@ def load_joint(path: str | Path) -> Joint:
 
 def parse_joint(data: Mapping[str, Any], source: str = "joint") -> Joint:
     """A joint from the tables of a joint file (see :func:`load_joint`)."""
+    for key, value in data.items():
+        if key not in _TABLES:
+            raise InputError(f"{source}: unknown table [{key}]; a joint file has [{'], ['.join(_TABLES)}]")
+        if not isinstance(value, Mapping):
+            raise InputError(f"{source}: {key} must be a table, as [{key}] on a line of its own")
     table = data.get("joint")
     if not isinstance(table, Mapping):
         raise InputError(f"{source}: no [joint] table; it needs at least gear_ratio and model")
@@ -119,6 +127,8 @@ def parse_joint(data: Mapping[str, Any], source: str = "joint") -> Joint:
         raise InputError(f"{source}: gear_ratio is 0; give theta_motor / theta_link with its sign")
     constant = _number(table, "motor_constant", source, None)
     per_current = _number(table, "torque_per_current", source, None)
+    if constant == 0 or per_current == 0:
+        raise InputError(f"{source}: {'motor_constant' if constant == 0 else 'torque_per_current'} is 0; give the torque per ampere")
     if constant is not None and per_current is not None:
         raise InputError(f"{source}: motor_constant and torque_per_current are both given; keep one of them")
     name = str(table.get("model", "hd1"))
@@ -132,8 +142,8 @@ def parse_joint(data: Mapping[str, Any], source: str = "joint") -> Joint:
         torque_per_current=ratio * constant if constant is not None else per_current,
         torque_per_voltage=_number(table, "torque_per_voltage", source, None),
         model_name=name, effects=tuple(effects), columns=data.get("columns"),
-        virtual_work=bool(table.get("virtual_work", True)), source=source,
-        fitted={k: float(v["value"]) for k, v in data.get("fitted", {}).items()},
+        virtual_work=_flag(table, "virtual_work", source), source=source,
+        fitted={k: _fitted(k, v, source) for k, v in data.get("fitted", {}).items()},
     )  # fmt: skip
     model = joint.model()
     known = {k: _known(k, v, ratio, model, source) for k, v in data.get("known", {}).items()}
@@ -168,10 +178,41 @@ def _known(name: str, entry: Any, ratio: float, model: JointModel, source: str) 
     if entry.get("side") == "motor":
         powers = {"kg.m2": 2, "N.m/rad": 2, "N.m.s/rad": 2, "N.m": 1, "N.m/rad3": 4, "rad": -1, "rad/s": -1}
         scale *= abs(ratio) ** powers.get(unit, 0)
-    values = {k: float(entry[k]) * scale for k in ("value", "low", "high") if k in entry}
+    for key in entry:
+        if key not in _KNOWN_KEYS:
+            raise InputError(f"{source}: [known] {name} has an unknown key {key!r}; known: {', '.join(_KNOWN_KEYS)}")
+    if entry.get("side", "link") not in ("motor", "link", "gear", "sensor", "none"):
+        raise InputError(f"{source}: [known] {name} has side = {entry['side']!r}; use 'motor' or 'link'")
+    values = {k: _entry_number(entry, k, f"{source}: [known] {name}") * scale for k in ("value", "low", "high") if k in entry}
     if not values:
         raise InputError(f"{source}: [known] {name} has neither value nor low nor high")
+    if values.get("low", -math.inf) > values.get("high", math.inf):
+        raise InputError(f"{source}: [known] {name} has low above high; exchange them")
+    if name in parameters:
+        p = parameters[name]
+        if not all(p.low <= v <= p.high for k, v in values.items() if k == "value"):
+            raise InputError(f"{source}: [known] {name} = {values['value']:g} lies outside its physical bounds {p.low:g} to {p.high:g} {unit}")
     return Known(**values)
+
+
+def _entry_number(entry: Mapping[str, Any], key: str, where: str) -> float:
+    value = entry[key]
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise InputError(f"{where}: {key} = {value!r} is not a finite number")
+    return float(value)
+
+
+def _fitted(name: str, entry: Any, source: str) -> float:
+    if not isinstance(entry, Mapping) or "value" not in entry:
+        raise InputError(f"{source}: [fitted] {name} must be a table with value, as {name} = {{ value = 1.0 }}")
+    return _entry_number(entry, "value", f"{source}: [fitted] {name}")
+
+
+def _flag(table: Mapping[str, Any], key: str, source: str) -> bool:
+    value = table.get(key, True)
+    if not isinstance(value, bool):
+        raise InputError(f"{source}: {key} = {value!r}; use true or false")
+    return value
 
 
 def toml_text(joint: Joint, parameters: Mapping[str, Mapping[str, Any]] | None = None, provenance: Mapping[str, str] | None = None) -> str:

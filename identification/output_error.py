@@ -15,7 +15,7 @@ from typing import Any, Final, final
 import numpy as np
 import numpy.typing as npt
 
-from identification._shooting import Shooting, Windows, cut_windows, substeps_for
+from identification._shooting import Shooting, cut_windows, substeps_for, weighted
 from identification.assess import assess
 from identification.engine import bounds_of, row_weights
 from identification.errors import InputError
@@ -26,6 +26,8 @@ FloatArray = npt.NDArray[np.float64]
 
 SMOOTHING_SHRINK: Final = 1.5
 """Factor by which a smoothing velocity may fall below its start: the steps were chosen for the start."""
+FEW_WINDOWS: Final = 40
+"""Windows of the first steps; all of them take the last ones."""
 ENOUGH: Final = 1e-5
 """Relative fall of the cost below which the iteration ends."""
 
@@ -82,9 +84,20 @@ class _State:
 
     values: dict[str, float]
     x0: FloatArray
-    sigma: FloatArray
-    cost: float = math.inf
+    products: FloatArray
     damping: float = 1e-8
+
+    def cost(self, sigma: FloatArray) -> float:
+        """Sum of squares of the weighted errors."""
+        return float(np.sum(self.products[:, :, -1, -1] / sigma[:, None] ** 2))
+
+    def projected(self, sigma: FloatArray, states: int) -> float:
+        """The cost that the best initial states would leave, to first order."""
+        gram = weighted(self.products, sigma)
+        if not np.isfinite(gram).all():
+            return math.inf
+        part = gram[:, :states, -1:]
+        return float(np.sum(gram[:, -1, -1] - (part * np.linalg.solve(_ridged(gram[:, :states, :states]), part)).sum(axis=(1, 2))))
 
 
 def refine(fit: Fit, records: Record | Sequence[Record] | None = None, *, window: float = 0.25, iterations: int = 8) -> Refinement:
@@ -122,28 +135,31 @@ def refine(fit: Fit, records: Record | Sequence[Record] | None = None, *, window
         limits[n] = (max(low, start[n] / SMOOTHING_SHRINK), high) if n.endswith("_smoothing_velocity") else (low, high)
     data = cut_windows(given, fit.joint, fit.data.sensing, window)
     shooting = Shooting(model, free, data, substeps_for(model, start, data))
-    state = _State(start, data.start_states(model.is_elastic), data.noise.copy())
-    _settle(shooting, state)
-    before, sigma = shooting.channel_rms(state.values, state.x0), data.noise
-    cost_before = math.inf
-    used = 0
+    state = _settled(shooting, start, data.start_states(model.is_elastic))
+    first = state
+    before = shooting.rms(state.products)
+    sigma, used = np.maximum(data.noise, before), 0
+    stride = max(1, data.count // FEW_WINDOWS)
+    if stride > 1:
+        few = shooting.every(stride)
+        part = _State(start, state.x0[::stride], state.products[:, ::stride])
+        used = _iterate(few, part, limits, sigma, iterations)
+        near = _State(part.values, state.x0, shooting.evaluate(part.values, state.x0))
+        if near.projected(sigma, shooting.states) < state.cost(sigma):
+            state = near
     for _ in range(2):
-        # the second round divides a channel by the error of the model where that is above the noise
-        sigma = np.maximum(data.noise, shooting.channel_rms(state.values, state.x0))
-        first = float(np.sqrt(np.mean((before / sigma) ** 2)))
-        state.sigma, state.cost = sigma, math.inf
-        used += _iterate(shooting, state, limits, iterations - used)
-        cost_before = first
-    after = shooting.channel_rms(state.values, state.x0)
-    cost_after = float(np.sqrt(np.mean((after / sigma) ** 2)))
-    if cost_after > cost_before:
-        state.values, after, cost_after = start, before, cost_before
-    stderr = shooting.standard_errors(state.values, state.x0, state.sigma)
+        # a channel is divided by the error of the model where that is above the noise
+        sigma = np.maximum(data.noise, shooting.rms(state.products))
+        used += _iterate(shooting, state, limits, sigma, max(iterations - used, 1))
+    if state.cost(sigma) > first.cost(sigma):
+        state = first
+    after, total = shooting.rms(state.products), before.size * data.count * data.length
     names = data.channels
     return Refinement(
-        _refined(fit, state.values, stderr, limits, used),
+        _refined(fit, state.values, dict(zip(free, _stderr(state, shooting.states, sigma), strict=True)), limits, used),
         dict(zip(names, before.tolist(), strict=True)), dict(zip(names, after.tolist(), strict=True)),
-        dict(zip(names, sigma.tolist(), strict=True)), cost_before, cost_after, used, data.count, data.count * data.length,
+        dict(zip(names, sigma.tolist(), strict=True)), math.sqrt(first.cost(sigma) / total), math.sqrt(state.cost(sigma) / total),
+        used, data.count, data.count * data.length,
     )  # fmt: skip
 
 
@@ -158,65 +174,89 @@ def _refuse(fit: Fit, records: Sequence[Record]) -> None:
         raise InputError(f"{name}: output-error refinement simulates the joint from its drive torque; add motor_current, motor_torque or motor_voltage")
 
 
-def _settle(shooting: Shooting, state: _State) -> None:
-    """Initial states alone, with the start values of the parameters."""
-    for _ in range(3):
-        gram = shooting.gram(state.values, state.x0, state.sigma)
-        if not np.isfinite(gram).all():
-            raise InputError("output-error refinement: the simulation with the start values diverges; fit the model first or shorten the window")
-        n = shooting.states
-        state.x0 = state.x0 + np.linalg.solve(_ridged(gram[:, :n, :n]), gram[:, :n, -1:])[:, :, 0]
+def _settled(shooting: Shooting, values: dict[str, float], x0: FloatArray) -> _State:
+    """The state of the iteration with initial states fitted and the parameters left alone."""
+    n = shooting.states
+    products = shooting.evaluate(values, x0)
+    if not np.isfinite(products).all():
+        raise InputError("output-error refinement: the simulation with the start values diverges; fit the model first or shorten the window")
+    gram = weighted(products, shooting.noise)
+    trial = x0 + np.linalg.solve(_ridged(gram[:, :n, :n]), gram[:, :n, -1:])[:, :, 0]
+    moved = shooting.evaluate(values, trial)
+    better = weighted(moved, shooting.noise)[:, -1, -1] < gram[:, -1, -1]
+    x0 = np.where(better[:, None], trial, x0)
+    products = np.where(better[:, None, None], moved, products)
+    return _State(values, x0, products)
 
 
 def _ridged(matrices: FloatArray) -> FloatArray:
-    diagonal = np.einsum("wii->wi", matrices)
-    return matrices + np.eye(matrices.shape[1]) * (1e-12 * diagonal.max(axis=1)[:, None] + 1e-300)[:, :, None]
+    largest = np.einsum("wii->wi", matrices).max(axis=1)
+    out: FloatArray = matrices + np.eye(matrices.shape[1]) * (1e-12 * largest + 1e-300)[:, None, None]
+    return out
 
 
-def _iterate(shooting: Shooting, state: _State, limits: Mapping[str, tuple[float, float]], iterations: int) -> int:
+def _iterate(
+    shooting: Shooting, state: _State, limits: Mapping[str, tuple[float, float]], sigma: FloatArray, iterations: int
+) -> int:
     """Damped Gauss-Newton steps; a step that raises the cost is shortened."""
-    gram = shooting.gram(state.values, state.x0, state.sigma)
-    state.cost = float(gram[:, -1, -1].sum())
     for used in range(1, iterations + 1):
-        reduced, right, back = schur(gram, shooting.states)
+        cost = state.cost(sigma)
+        reduced, right, back, _ = schur(weighted(state.products, sigma), shooting.states)
+        scale = np.sqrt(np.maximum(np.diag(reduced), 1e-300))
+        promised = right / scale @ np.linalg.lstsq(reduced / np.outer(scale, scale), right / scale, rcond=1e-13)[0]
+        unsettled = cost - state.projected(sigma, shooting.states)
+        if used > 1 and promised + unsettled <= ENOUGH * cost:
+            return used - 1
         for _ in range(5):
-            trial, moved = _trial(shooting, state, limits, reduced, right)
-            x0 = state.x0 + back[0] - np.einsum("wij,j->wi", back[1], moved)
-            after = shooting.gram(trial, x0, state.sigma)
-            cost = float(after[:, -1, -1].sum())
-            if math.isfinite(cost) and cost <= state.cost:
+            values, step = _trial(shooting, state, limits, reduced, right)
+            x0 = state.x0 + back[:, :, -1] - back[:, :, :-1] @ step
+            trial = _State(values, x0, shooting.evaluate(values, x0))
+            if trial.cost(sigma) <= cost:
                 break
             state.damping = max(30 * state.damping, 1e-4)
         else:
             return used
-        gained = state.cost - cost
-        state.values, state.x0, state.cost, gram = trial, x0, cost, after
+        gained = cost - trial.cost(sigma)
+        state.values, state.x0, state.products = trial.values, trial.x0, trial.products
         state.damping = max(state.damping / 10, 1e-10)
         if gained <= ENOUGH * cost:
             return used
     return iterations
 
 
-def schur(gram: FloatArray, states: int) -> tuple[FloatArray, FloatArray, tuple[FloatArray, FloatArray]]:
+def schur(gram: FloatArray, states: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Normal equations of the parameters with the initial states eliminated.
 
     Parameters
     ----------
     gram : (windows, k, k) array
-        Products of the columns (initial states, parameters, residual).
+        Products of the columns (initial states, parameters, error).
     states : int
 
     Returns
     -------
     reduced : (parameters, parameters) array
     right : (parameters,) array
-    back : (windows, states) and (windows, states, parameters) array
-        Initial states: their own step, and what a parameter step takes off it.
+    back : (windows, states, parameters + 1) array
+        Step of the initial states: last column less the others times the parameter step.
+    scores : (windows, parameters) array
+        What each window adds to `right`.
     """
-    block = np.linalg.solve(_ridged(gram[:, :states, :states]), gram[:, :states, states:])
-    rest = gram[:, states:, states:] - gram[:, states:, :states] @ block
+    back = np.linalg.solve(_ridged(gram[:, :states, :states]), gram[:, :states, states:])
+    rest = gram[:, states:, states:] - gram[:, states:, :states] @ back
     whole = rest.sum(axis=0)
-    return whole[:-1, :-1], whole[:-1, -1], (block[:, :, -1], block[:, :, :-1])
+    return whole[:-1, :-1], whole[:-1, -1], back, rest[:, :-1, -1]
+
+
+def _stderr(state: _State, states: int, sigma: FloatArray) -> list[float]:
+    """Standard errors of the free parameters from the scatter of the windows' scores."""
+    reduced, _, _, scores = schur(weighted(state.products, sigma), states)
+    scale = np.sqrt(np.maximum(np.diag(reduced), 1e-300))
+    inverse = np.linalg.pinv(reduced / np.outer(scale, scale), rcond=1e-12)
+    scaled = scores / scale
+    covariance = inverse @ (scaled.T @ scaled) @ inverse
+    out: list[float] = (np.sqrt(np.maximum(np.diag(covariance), 0.0)) / scale).tolist()
+    return out
 
 
 def _trial(
@@ -271,6 +311,3 @@ def _refined(
         fit, solution=solution, train=assess(model, fit.data, fit.data.train, values),
         held_out=assess(model, fit.data, fit.data.held_out, values) if fit.data.held_out else None,
     )  # fmt: skip
-
-
-__all__ = ["Refinement", "Windows", "refine"]

@@ -331,7 +331,10 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--target", help="platform of plants: x86_64-linux-gnu, x86_64-windows-gnu, ..., or all")
     made.add_argument("--controller", action="store_true", help="plant: drive it by a position controller")
     made.add_argument("--sensors", action="store_true", help="plant: readings with noise, quantisation and faults as parameters")
-    made.add_argument("--healthy", nargs="+", default=[], type=Path, metavar="RECORD", help="estimator: records of the healthy joint, for the limits of its fault detector")
+    made.add_argument(
+        "--healthy", nargs="+", default=[], type=Path, metavar="RECORD",
+        help="estimator: records of the healthy joint, for the limits of its fault detector",
+    )  # fmt: skip
     made.add_argument("--no-link", action="store_true", help="estimator: the joint has no link encoder")
     made.add_argument("--no-torque", action="store_true", help="estimator: the joint has no torque sensor")
     made.add_argument("--json", type=Path, metavar="FILE", help="write what was built as JSON")

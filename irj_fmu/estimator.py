@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 
 from identification.channels import channel_unit
 from identification.errors import InputError
@@ -38,20 +38,24 @@ def estimator_variables(joint: Joint, options: OnlineOptions) -> tuple[Variable,
         *(
             variable for b in balances
             for variable in (
-                Variable(f"residual.{b}", _torque(joint), causality="output", description=f"Residual of the {_BALANCE_TEXT[b]}, newest row."),
-                Variable(f"ratio.{b}", minimum=0.0, causality="output", description=f"Residual of the {_BALANCE_TEXT[b]}, root mean square of the last seconds over its floor."),
+                _output(f"residual.{b}", _torque(joint), f"Residual of the {_BALANCE_TEXT[b]}, newest row."),
+                _output(f"ratio.{b}", "", f"Residual of the {_BALANCE_TEXT[b]}: root mean square of the last seconds over its floor.", 0.0),
             )
         ),
-        Variable("q_l_hat", channel_unit("link_position", joint.kind), causality="output", description="Link position; the estimate where its reading is missing or failed."),
-        Variable("w_l_hat", channel_unit("link_velocity", joint.kind), causality="output", description="Link velocity; the estimate where its reading is missing or failed."),
+        _output("q_l_hat", channel_unit("link_position", joint.kind), "Link position; the estimate where its reading is missing or failed."),
+        _output("w_l_hat", channel_unit("link_velocity", joint.kind), "Link velocity; the estimate where its reading is missing or failed."),
         Variable("fault", start=0, minimum=0, maximum=99, causality="output", kind="integer", description=f"{FAULT_TEXT}."),
         *(
-            Variable(f"fault_score[{i}]", minimum=0.0, causality="output", description=f"How near the residuals with {name} are to their limits (1: at the limit).")
+            _output(f"fault_score[{i}]", "", f"How near the residuals with {name} are to their limits (1: at the limit).", 0.0)
             for i, name in enumerate(READINGS, 1)
         ),
         Variable("n_rows", start=0, minimum=0, causality="output", kind="integer", description="Rows of the balances so far."),
         Variable("alarm", start=False, causality="output", kind="boolean", description="The recursion has seen a change and lets the parameters move."),
     )  # fmt: skip
+
+
+def _output(name: str, unit: str, description: str, minimum: float | None = None) -> Variable:
+    return Variable(name, unit, minimum=minimum, causality="output", description=description)
 
 
 def _torque(joint: Joint) -> str:
@@ -79,17 +83,24 @@ def _inputs(joint: Joint) -> list[Variable]:
 
 
 def _parameters(options: OnlineOptions) -> list[Variable]:
+    fixed: dict[str, Any] = {"causality": "parameter"}
     tunable: dict[str, Any] = {"causality": "parameter", "variability": "tunable"}
-    return [
-        Variable("joint_file", start="", causality="parameter", kind="string", description="Path of a joint file in place of the packed one; it must have the same estimated parameters."),
-        Variable("warm_up", "s", options.warm_up, 0.1, causality="parameter", description="First window, from which the recursion starts."),
-        Variable("detect", start=options.detect, causality="parameter", kind="boolean", description="Run the fault detector; it needs an elastic joint with fitted values."),
-        Variable("drift", "1/s", options.drift, 0.0, 10.0, description="Forgetting in calm: drift of a parameter as a share of its prior range in one second.", **tunable),
-        Variable("alarm_drift", "1/s", options.alarm_drift, 0.0, 100.0, description="Forgetting in an alarm, as drift.", **tunable),
-        Variable("floor_share", start=options.floor_share, minimum=0.0, maximum=1.0, description="A balance's floor is never below this share of the torque it balances.", **tunable),
-        Variable("fault_margin", start=1.0, minimum=1e-3, description="Factor on the limits of the fault detector.", **tunable),
-        Variable("reset", start=False, kind="boolean", description="Set to true: start anew.", **tunable),
-    ]  # fmt: skip
+    share = "as a share of its prior range in one second"
+    rows: list[tuple[str, str, Value, float | None, float | None, str, dict[str, Any]]] = [
+        ("joint_file", "", "", None, None, "Path of a joint file in place of the packed one, with the same estimated parameters.", fixed),
+        ("warm_up", "s", options.warm_up, 0.1, None, "First window, from which the recursion starts.", fixed),
+        ("detect", "", options.detect, None, None, "Run the fault detector, for an elastic joint with fitted values.", fixed),
+        ("drift", "1/s", options.drift, 0.0, 10.0, f"Forgetting in calm: drift of a parameter {share}.", tunable),
+        ("alarm_drift", "1/s", options.alarm_drift, 0.0, 100.0, f"Forgetting in an alarm: drift of a parameter {share}.", tunable),
+        ("floor_share", "", options.floor_share, 0.0, 1.0, "A floor is never below this share of the torque it balances.", tunable),
+        ("fault_margin", "", 1.0, 1e-3, None, "Factor on the limits of the fault detector.", tunable),
+        ("reset", "", False, None, None, "Set to true: start anew.", tunable),
+    ]
+    found = []
+    for name, unit, start, low, high, text, about in rows:
+        kind = {str: "string", bool: "boolean"}.get(type(start), "real")
+        found.append(Variable(name, unit, start, low, high, description=text, kind=cast(Any, kind), **about))
+    return found
 
 
 def _estimates(joint: Joint, names: tuple[str, ...], model: Any) -> list[Variable]:
@@ -177,7 +188,7 @@ class Estimator(TableSlave):
     def _sample(self, time: float, length: float) -> None:
         """Readings that are not finite count as missing; the others of that sample are used."""
         values = self._values
-        lost = [i for i in self._reals if not math.isfinite(values[i])]  # type: ignore[arg-type]
+        lost = [i for i in self._reals if not math.isfinite(values[i])]  # type: ignore[arg-type, unused-ignore]
         if not lost:
             super()._sample(time, length)
             return
@@ -232,7 +243,7 @@ class Estimator(TableSlave):
         for b, (residual, ratio) in enumerate(zip(estimator.residual.tolist(), estimator.ratio.tolist(), strict=True)):
             values[first + 2 * b], values[first + 2 * b + 1] = residual, ratio
         score = at["fault_score[1]"]
-        values[score : score + 6] = estimator.score  # type: ignore[assignment]
+        values[score : score + 6] = estimator.score
         values[at["n_rows"]] = estimator.made
         values[at["alarm"]] = estimator.alarm
         for text in estimator.events[self._told :]:

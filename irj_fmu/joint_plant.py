@@ -238,10 +238,10 @@ class _Builder:
             stiff = self._parameter("controller.stiffness", unit("N.m/rad"), inertia * BANDWIDTH**2, "Gain on the position error, link-referred.", 0.0)
             damp = self._parameter("controller.damping", unit("N.m.s/rad"), damping, "Gain on the velocity error, link-referred.", 0.0)
             feed = self._parameter("controller.inertia", unit("kg.m2"), inertia, "Feed-forward of the reference acceleration.", 0.0)
-            hold = self._parameter("controller.gravity", unit("N.m"), weight, "Feed-forward of gravity at the reference position.")
+            hold = self._parameter("controller.gravity", unit("N.m"), weight, "Feed-forward of gravity; positive is upright at zero.")
             limit = self._parameter("controller.limit", unit("N.m"), 1e9, "Largest drive torque, link-referred.", 0.0)
             q, v, a = self._reference(u, clock)
-            wish = stiff * (q - x[0]) + damp * (v - x[1]) + feed * a + hold * ca.sin(q)
+            wish = stiff * (q - x[0]) + damp * (v - x[1]) + feed * a - hold * ca.sin(q)
             return ca.fmin(limit, ca.fmax(-limit, wish))
         if self.by_current:
             constant = self._parameter(

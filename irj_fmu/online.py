@@ -145,10 +145,10 @@ class OnlineEstimator:
         self.rows = RowMaker(self.model, self.sensing, dt, held_parameters(joint))
         self.names, self.balances = self.rows.names, self.rows.balances
         self._units = {p.name: p for p in self.model.parameters}
-        used = self.rows.uses.any(axis=0)
+        used: list[bool] = np.any(self.rows.uses, axis=0).tolist()
         self._needs = [False] * 6
         for k, reading in enumerate(SAMPLED):
-            self._needs[reading] = bool(used[k])
+            self._needs[reading] = used[k]
         present = [True, True, True, self.options.has_link, self.options.has_link, self.options.has_torque]
         self.present = tuple(present)
         self.watch = Watch(dt, self.present)
@@ -227,9 +227,12 @@ class OnlineEstimator:
 
     def set_fault_margin(self, factor: float) -> None:
         """Multiply the fault detector's limits."""
-        if self.detector is None or factor == self._margin:
+        from identification._fault_structured import StructuredRule
+
+        rule = self.detector._rule if self.detector is not None and factor != self._margin else None
+        if not isinstance(rule, StructuredRule):
             return
-        residuals = self.detector._rule.residuals
+        residuals = rule.residuals
         residuals.limits = [limit * factor / self._margin for limit in residuals.limits]
         self._margin = factor
 

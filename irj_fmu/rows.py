@@ -233,8 +233,8 @@ class RowMaker:
             (_NAMES.index(name), order, k)
             for k, source in enumerate(SOURCES) for order, name in enumerate(POSITION_CHAINS[source])
         ]  # fmt: skip
-        index, order, source = (np.array(column) for column in zip(*self._place, strict=True))
-        self._index, self._flat = index, order * len(SOURCES) + source
+        columns = np.array(self._place).T
+        self._index, self._flat = columns[0], columns[1] * len(SOURCES) + columns[2]
         self._speeds = [_NAMES.index("motor_velocity"), _NAMES.index("link_velocity")]
         self._velocity_gain = float(np.linalg.norm(kernel(t.pointwise, t.dt, 1)))
 
@@ -253,13 +253,13 @@ class RowMaker:
         self._ring, self._speed = np.zeros((length, len(self.needed))), np.zeros((length, 2))
         new = t.stride // t.step
         count, states = self._point.size1_in(2), self._point.size1_in(3)
-        self._in = [np.zeros((new, len(_NAMES))), np.zeros((new, len(_NAMES))), np.zeros(count), np.zeros(states), np.zeros(1)]
-        self._out = [np.zeros((new, len(self.needed))), np.zeros(count), np.zeros(states)]
+        self._in: list[FloatArray] = [np.zeros((new, len(_NAMES))), np.zeros((new, len(_NAMES))), np.zeros(count), np.zeros(states), np.zeros(1)]
+        self._out: list[FloatArray] = [np.zeros((new, len(self.needed))), np.zeros(count), np.zeros(states)]
         buffer, self._trigger = self._point.buffer()
         for i, item in enumerate(self._in):
-            buffer.set_arg(i, memoryview(item))
+            buffer.set_arg(i, memoryview(item))  # type: ignore[arg-type, unused-ignore]
         for i, item in enumerate(self._out):
-            buffer.set_res(i, memoryview(item))
+            buffer.set_res(i, memoryview(item))  # type: ignore[arg-type, unused-ignore]
         self._buffer = buffer
         self.rows_before_ready = -(-length // new)
         self.made = 0

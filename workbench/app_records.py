@@ -50,6 +50,11 @@ def examined(entry: FileEntry, path: Path, kind: str, ratio: float | None, colum
     """
     try:
         check_unpacked(path, entry.name)
+    except InputError as error:
+        return replace(entry, status="refused", message=str(error), findings=()), None
+    except (OSError, ValueError, LookupError) as error:
+        return replace(entry, status="refused", message=f"{entry.name}: is not readable ({error}); export it again", findings=()), None
+    try:
         record = _record(path, entry, kind, columns)
     except InputError as error:
         return _unread(entry, path, kind, str(error)), None

@@ -13,7 +13,7 @@ from identification.errors import InputError
 
 MAX_UPLOAD: Final = 1 << 30
 """Largest upload in bytes."""
-MAX_UNPACKED: Final = 2 << 30
+MAX_UNPACKED = 2 << 30
 """Largest size of an archive's content in bytes."""
 RESERVE: Final = 256 << 20
 """Free space that an upload must leave on the disk in bytes."""
@@ -67,7 +67,7 @@ async def stream_to(path: Path, chunks: AsyncIterator[bytes], limit: int) -> int
     return size
 
 
-def check_unpacked(path: Path, name: str, limit: int = MAX_UNPACKED) -> None:
+def check_unpacked(path: Path, name: str, limit: int | None = None) -> None:
     """Refuse an archive that unpacks to more than the limit, without unpacking it.
 
     Raises
@@ -75,6 +75,7 @@ def check_unpacked(path: Path, name: str, limit: int = MAX_UNPACKED) -> None:
     InputError
         A zip bomb, in an NPZ, MAT or HDF5 file.
     """
+    limit = MAX_UNPACKED if limit is None else limit
     with path.open("rb") as stream:
         head = stream.read(8)
     if head.startswith(b"PK\x03\x04"):

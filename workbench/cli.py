@@ -82,15 +82,10 @@ def _parser() -> argparse.ArgumentParser:
     planned.add_argument("--max-position", type=float, metavar="DEG", default=85.0, help="half of the link's workspace [deg]")
     planned.add_argument("--max-speed", type=float, metavar="DEG_S", default=60.0, help="link speed [deg/s]")
     planned.add_argument("--max-torque", type=float, metavar="NM", default=float("inf"), help="drive torque on the link side [Nm]")
-    exported = verb("export", "fmi", "export as FMU", joint=True)
-    exported.add_argument("what", nargs="?", default="plant", choices=("estimator", "plant", "native", "ssp", "all"))
-    exported.add_argument("--out", metavar="FOLDER", default="dist")
-    exported.add_argument("--cc", help="compiler")
-    exported.add_argument("--target", help="target platform")
-    cosim = verb("cosim", "fmi", "co-simulate plant and estimator FMU", joint=True)
-    cosim.add_argument("--out", metavar="FOLDER", default="dist")
-    batch = verb("batch", "fmi", "many runs of a study")
-    batch.add_argument("study", metavar="study.toml")
+    for name, text in (
+        ("export", "export as FMU, C or CasADi function"), ("cosim", "co-simulate plant and estimator FMU"), ("batch", "many runs of a study"),
+    ):  # fmt: skip
+        verbs.add_parser(name, help=text, add_help=False).set_defaults(module="fmi", own_effects=[])
     app = verb("app", "page", "the page in your browser")
     app.add_argument("files", nargs="*", metavar="FILES")
     app.add_argument("--port", type=int, default=0)
@@ -101,7 +96,10 @@ def _parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run `irj`; returns the exit code: 0 done, 1 a check failed, 2 unusable input, 130 interrupted."""
     given = list(sys.argv[1:] if argv is None else argv)
-    arguments = _parser().parse_args(given)
+    parser = _parser()
+    arguments, arguments.rest = parser.parse_known_args(given)
+    if arguments.rest and arguments.module != "fmi":
+        parser.error(f"unrecognized arguments: {' '.join(arguments.rest)}")
     arguments.command = shlex.join(["irj", *given])
     try:
         check_outputs(arguments)

@@ -16,6 +16,7 @@ from identification.errors import InputError
 from identification.joint_file import Joint, load_joint
 from identification.read import read
 from identification.record import Record
+from identification.sensing import DRIVES
 from workbench.session import write_atomic
 
 
@@ -36,7 +37,7 @@ def open_records(paths: Sequence[str], joint: Joint | None) -> tuple[list[Record
     for path in paths:
         record = read(path, columns=joint.columns if joint is not None else None, kind=joint.kind if joint is not None else None)
         try:
-            record, findings = gate(record, joint.gear_ratio if joint is not None else None)
+            record, findings = gate(record, joint.gear_ratio if joint is not None else None, needed(record, joint))
         except InputError as error:
             raise InputError(f"{path}: {str(error).removeprefix(record.name + ': ')}") from None
         warnings += [f"{path}: {f.message.removeprefix(record.name + ': ')}" for f in findings if f.severity in ("warn", "repair")]
@@ -44,6 +45,13 @@ def open_records(paths: Sequence[str], joint: Joint | None) -> tuple[list[Record
     for text in warnings:
         print(f"irj: {text}", file=sys.stderr)
     return records, warnings
+
+
+def needed(record: Record, joint: Joint | None) -> tuple[str, ...]:
+    """Channels that this joint file says are there: a motor constant goes with a current."""
+    if joint is None or joint.torque_per_current is None or any(record.has(c) for c in DRIVES):
+        return ()
+    return ("motor_current",)
 
 
 OUTPUTS: Final = ("json", "output", "report", "truth")

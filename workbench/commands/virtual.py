@@ -157,8 +157,8 @@ def _read_off(
 ) -> dict[str, FloatArray]:
     """What the sensors of the thesis's table B.1 would have logged."""
     noise, count, ratio = rng.standard_normal, len(time), joint.gear_ratio
-    grain_motor, grain_link = np.deg2rad(0.16) / abs(ratio), np.deg2rad(0.0036)
-    length, torque = ("rad", "Nm") if model.kind == "rotary" else ("m", "N")
+    length, torque, grain_link = ("rad", "Nm", np.deg2rad(0.0036)) if model.kind == "rotary" else ("m", "N", 1e-6)
+    grain_motor = min(np.deg2rad(0.16) / abs(ratio), grain_link)
     table: dict[str, FloatArray] = {"time_s": time}
     if joint.torque_per_current is not None:
         table["motor_current_A"] = drive / joint.torque_per_current + noise(count) * 0.035 / abs(joint.torque_per_current)

@@ -75,8 +75,8 @@ const views = {
     app.plots.push(plot);
     later(() => plot.show(null).then(() => plot.show([found.worst.low, found.worst.high])).catch(fail));
     const pick = h("select", { id: "balance", "aria-label": "Balance in the time plot", onchange: (e) => { balance = e.target.value; plot.show(plot.range).catch(fail); } }, balances.map((b) => h("option", { value: b, selected: b === balance }, `${b} balance`)));
-    const strong = found.places.filter((p) => p.share_percent > 5), rest = found.places.filter((p) => !strong.includes(p));
-    const figure = (p) => h("figure", { class: "card place" }, h("figcaption", {}, `${p.balance} balance against ${p.title}`, h("span", {}, p.share_percent > 5 ? `explains ${digits(p.share_percent, 2)} % of the residual's variance on blocks it was not drawn from` : "explains next to nothing")), placePlot(p));
+    const strong = found.places.filter((p) => p.share_percent > 5 && (found.error.balances[p.balance].ratio ?? 9) > 1.2), rest = found.places.filter((p) => !strong.includes(p));
+    const figure = (p) => h("figure", { class: "card place" }, h("figcaption", {}, `${p.balance} balance against ${p.title}`, h("span", {}, p.share_percent > 1 ? `explains ${digits(p.share_percent, 2)} % of the residual's variance on blocks it was not drawn from` : "explains next to nothing")), placePlot(p));
     return [
       h("div", { class: "row between head" }, h("div", {}, heading("Where does the model fail?")), button("What is missing? Diagnose", () => run("diagnose", {}, "diagnose"), { kind: "primary", id: "diagnose" })),
       state.note ? h("p", { class: "note small" }, state.note) : null,
@@ -185,7 +185,7 @@ function fileCard(f) {
 
 /* The guess is shown; it is used when the user confirms it. */
 function columnMap(f) {
-  const guessed = Object.fromEntries(f.guess.map((g) => [g.column, g])), same = app.state.files.filter((o) => o.status === "columns" && o.names.join() === f.names.join()).length;
+  const guessed = Object.fromEntries(f.guess.map((g) => [g.column, g])), used = f.guess.map((g) => g.column), same = app.state.files.filter((o) => o.status === "columns" && used.every((c) => o.names.includes(c))).length;
   const rows = f.names.map((name, k) => {
     const g = guessed[name] || {}, id = `map-${f.id}-${k}`;
     const channel = h("select", { id: `${id}-channel`, "aria-label": `Channel of column ${name}` }, h("option", { value: "" }, "not used"), app.config.channels.map((c) => h("option", { value: c, selected: c === g.channel }, c.replace(/_/g, " "))));

@@ -1,0 +1,154 @@
+"""Layers, lint, documentation and import cost of the packages."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import inspect
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+LAYERS = ("casadi_models", "identification", "irj_fmu", "workbench")
+LIBRARIES = LAYERS[:3]
+HEAVY = ("control", "matplotlib", "scipy.signal", "fmpy", "h5py", "pyarrow", "asammdf", "pandas", "starlette", "uvicorn")
+
+
+@cache
+def trees() -> dict[Path, ast.Module]:
+    return {f: ast.parse(f.read_text(encoding="utf-8")) for layer in LAYERS for f in sorted((ROOT / layer).rglob("*.py"))}
+
+
+def layer_of(path: Path) -> str:
+    return path.relative_to(ROOT).parts[0]
+
+
+def imported(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((node.lineno, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            yield node.lineno, node.module
+
+
+def test_imports_point_downwards_also_inside_functions() -> None:
+    wrong = []
+    for path, tree in trees().items():
+        allowed = LAYERS[: LAYERS.index(layer_of(path)) + 1]
+        for line, name in imported(tree):
+            top = name.partition(".")[0]
+            if top in LAYERS and top not in allowed:
+                wrong.append(f"{path.relative_to(ROOT)}:{line} imports {name}")
+    assert wrong == []
+
+
+def test_physics_imports_casadi_and_numpy_only() -> None:
+    allowed = {"casadi", "numpy", "casadi_models", "control", *sys.stdlib_module_names}
+    wrong = [
+        f"{path.relative_to(ROOT)}:{line} {name}"
+        for path, tree in trees().items() if layer_of(path) == "casadi_models"
+        for line, name in imported(tree) if name.partition(".")[0] not in allowed
+    ]  # fmt: skip
+    assert wrong == []  # control: inside linearize, whose result is a control.StateSpace
+
+
+def test_no_bare_except_star_import_print_or_mutable_default() -> None:
+    wrong = []
+    for path, tree in trees().items():
+        for node in ast.walk(tree):
+            bare = isinstance(node, ast.ExceptHandler) and node.type is None
+            star = isinstance(node, ast.ImportFrom) and any(alias.name == "*" for alias in node.names)
+            printed = (
+                layer_of(path) in LIBRARIES and isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print"
+            )  # fmt: skip
+            mutable = isinstance(node, ast.FunctionDef) and any(isinstance(d, ast.List | ast.Dict | ast.Set) for d in node.args.defaults)
+            if bare or star or printed or mutable:
+                wrong.append(f"{path.relative_to(ROOT)}:{getattr(node, 'lineno', 0)}")
+    assert wrong == []
+
+
+@pytest.mark.parametrize("tool", [("ruff", "check", "--no-cache", "."), ("lint-imports", "--no-cache")], ids=["ruff", "import-linter"])
+def test_lint(tool: tuple[str, ...]) -> None:
+    program = Path(sys.executable).with_name(tool[0])
+    if not program.exists():
+        pytest.skip(f"{tool[0]} is not installed beside this Python; .ci/run installs it")
+    done = subprocess.run([program, *tool[1:]], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
+
+
+# --- documentation ---------------------------------------------------------------------------------------------------
+
+
+def public(tree: ast.Module) -> Iterator[tuple[str, ast.AST]]:
+    for node in tree.body:
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) and not node.name.startswith("_"):
+            yield node.name, node
+            if isinstance(node, ast.ClassDef):
+                for inner in node.body:
+                    overload = isinstance(inner, ast.FunctionDef) and any("overload" in ast.dump(d) for d in inner.decorator_list)
+                    if isinstance(inner, ast.FunctionDef) and not inner.name.startswith("_") and not overload:
+                        yield f"{node.name}.{inner.name}", inner
+
+
+def test_every_public_name_is_documented() -> None:
+    missing = []
+    for path, tree in trees().items():
+        if not ast.get_docstring(tree):
+            missing.append(str(path.relative_to(ROOT)))
+        if path.name.startswith("_"):
+            continue
+        for name, node in public(tree):
+            if not ast.get_docstring(node):  # type: ignore[arg-type]
+                missing.append(f"{path.relative_to(ROOT)}: {name}")
+    assert missing == []
+
+
+def exported() -> list[tuple[str, str]]:
+    return [(package, name) for package in ("identification", "casadi_models") for name in importlib.import_module(package).__all__]
+
+
+OWN = {"self", "cls"}
+
+
+@pytest.mark.parametrize(("package", "name"), exported())
+def test_every_argument_of_an_exported_name_is_in_its_docstring(package: str, name: str) -> None:
+    thing = getattr(importlib.import_module(package), name)
+    if not callable(thing) or (inspect.isclass(thing) and issubclass(thing, Exception)):
+        return
+    text = inspect.getdoc(thing) or ""
+    arguments = [a for a in inspect.signature(thing).parameters if a not in OWN]
+    if len(arguments) > 1 and not (name == "effect" and "Effect" in text):
+        assert [a for a in arguments if a not in text] == []
+
+
+# --- cost of importing -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("module", ["identification", "casadi_models", "workbench.cli"])
+def test_importing_does_not_pull_heavy_packages(module: str) -> None:
+    code = f"import sys, json, {module}; print(json.dumps([m for m in {HEAVY!r} if m in sys.modules]))"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+    assert json.loads(done.stdout) == []
+
+
+def test_package_data_is_declared() -> None:
+    """What is not Python inside a package must be named in pyproject.toml, or an installed copy lacks it."""
+    import tomllib
+
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
+    missing = []
+    for layer in LAYERS:
+        globbed = {f for pattern in declared.get(layer, []) for f in (ROOT / layer).glob(pattern)}
+        for file in (ROOT / layer).rglob("*"):
+            if file.is_file() and file.suffix not in (".py", ".pyc") and "__pycache__" not in file.parts and file not in globbed:
+                missing.append(str(file.relative_to(ROOT)))
+    assert missing == []
+    assert importlib.util.find_spec("workbench") is not None
