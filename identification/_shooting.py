@@ -153,7 +153,8 @@ def substeps_for(model: JointModel, values: Mapping[str, float], data: Windows) 
             fastest = max(fastest, float(np.abs(np.linalg.eigvals(found)).max()))
     count = max(1, math.ceil(fastest * data.dt / STABLE))
     if count > MOST_SUBSTEPS:
-        raise InputError(f"output-error refinement: the model moves at {fastest:.3g} 1/s, too fast for samples of {data.dt:.3g} s; record faster or use the weak-form fit")
+        speed = f"the model moves at {fastest:.3g} 1/s, too fast for samples of {data.dt:.3g} s"
+        raise InputError(f"output-error refinement: {speed}; record faster or use the weak-form fit")
     return count
 
 

@@ -61,7 +61,7 @@ class Readings:
     """
 
     def __init__(self, declare: Declare, clock: Any, sample_time: float) -> None:
-        self._declare, self._clock = declare, clock
+        self._declare, self._clock = declare, clock + 1e-3 * sample_time  # rounding of the clock
         self._sample = ca.floor(clock / sample_time + 0.5)
         self._seed = declare("sensor.seed", "", 1.0, "Seed of the noise, a whole number.", 0.0)
         self._count = 0

@@ -152,7 +152,7 @@ def test_harmonic_drives_follow_their_own_model(name: str, configuration: str, t
 
 def test_memory_of_a_displacement(tmp_path: Path) -> None:
     """Hysteresis moves step by step: co-simulation only, equal to the model's loop to the order of its step."""
-    model = thesis.model_2b().add("hysteresis").with_values({"hysteresis_torque_1": 8.0, "hysteresis_torque_2": 4.0})
+    model = thesis.model_2b().add("hysteresis").with_values({"hysteresis_torque_1": 20.0, "hysteresis_torque_2": 10.0})
     path = built(tmp_path, model, name="loop")
     drive = 120 * np.sin(2 * np.pi * 2 * STEP * np.arange(500))
     expected = simulate(model, drive, STEP, substeps=20).readings

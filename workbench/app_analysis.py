@@ -30,8 +30,8 @@ from workbench.session import StepEntry
 FloatArray = npt.NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
-QUICK_TRAIN: Final = 100.0
-QUICK_HELD_OUT: Final = 50.0
+QUICK_TRAIN: Final = 60.0
+QUICK_HELD_OUT: Final = 30.0
 """Seconds of record that a click fits and judges at once; longer records are taken in windows [s]."""
 
 
@@ -83,6 +83,7 @@ class Analysis:
         self.solution: Solution | None = None
         self.trials: dict[str, Trial] = {}
         self._rows: Rows | None = None
+        self._solved: dict[str, Solution] = {}
         self._prepared: dict[str, tuple[Solution, Solution, StepEntry]] = {}
 
     @property
@@ -95,14 +96,16 @@ class Analysis:
     def model_of(self, effects: Sequence[str], virtual_work: bool) -> JointModel:
         """The model with these labels, in the form that the records carry."""
         labels = tuple(label for label in effects if label != HOLD_DELAY)
-        made = prepared_model(replace(self.joint, model_name="hd1", effects=labels, virtual_work=virtual_work), self._train[0])
-        return made
+        return prepared_model(replace(self.joint, model_name="hd1", effects=labels, virtual_work=virtual_work), self._train[0])
 
     def restore(self, step: StepEntry) -> None:
         """Make the solution of a step of the ledger current again."""
-        model = self.model_of(step.effects, step.virtual_work)
-        self.solution = solve(model, self.data, start=step.values, iterations=1)
-        self.trials = {}
+        known = self._solved.get(_mark(step))
+        if known is None:
+            model = self.model_of(step.effects, step.virtual_work)
+            known = solve(model, self.data, start=step.values, iterations=1)
+            self._solved[_mark(step)] = known
+        self.solution, self.trials = known, {}
 
     # --- verbs ------------------------------------------------------------------------------------------------------
 
@@ -284,10 +287,18 @@ class Analysis:
         train = assess(now.model, data, data.train, now.values)
         held = assess(now.model, data, data.held_out, now.values)
         key = label.partition("@")[0].partition("#")[0] if label else None
-        return StepEntry(
+        entry = StepEntry(
             action, tuple(now.model.effects), {k: float(v) for k, v in now.values.items()}, clean(train.as_json()), clean(held.as_json()),
             key, label, EFFECTS[key].title if key in EFFECTS else None, now.model.virtual_work, self.whole, round(time.perf_counter() - began, 3),
         )  # fmt: skip
+        if data is self.data:
+            self._solved[_mark(entry)] = now
+        return entry
+
+
+def _mark(step: StepEntry) -> str:
+    """What tells one fitted model from another."""
+    return repr((step.effects, step.virtual_work, sorted(step.values.items())))
 
 
 def _share(records: list[Record], seconds: float) -> list[Record]:

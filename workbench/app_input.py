@@ -127,9 +127,8 @@ def set_joint(live: Live, body: Mapping[str, Any]) -> dict[str, Any]:
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{source}: not valid TOML ({error})") from None
     changed = live.change_input(lambda s: replace(s, joint_text=text, joint_source=source))
-    made = {f.id: live.examine(f) for f in changed.files if f.status != "ready" or joint.kind == "linear" or joint.columns}
-    again = {f.id: live.examine(f) for f in changed.files if f.id not in made}
-    live.change(lambda s: replace(s, files=tuple({**made, **again}.get(f.id, f) for f in s.files)))
+    made = {f.id: live.examine(f) for f in changed.files}
+    live.change(lambda s: replace(s, files=tuple(made.get(f.id, f) for f in s.files)))
     return {"ok": True, "files": [{"id": f.id, "status": f.status} for f in live.state.files]}
 
 

@@ -134,7 +134,9 @@ def plot_time(record: Record) -> FloatArray:
     return out
 
 
-def decimated(time: FloatArray, columns: Sequence[FloatArray], points: int, window: tuple[float, float] | None = None) -> tuple[FloatArray, list[FloatArray], bool]:
+def decimated(
+    time: FloatArray, columns: Sequence[FloatArray], points: int, window: tuple[float, float] | None = None
+) -> tuple[FloatArray, list[FloatArray], bool]:
     """Smallest and largest value of each bucket, so that no spike is lost; every sample where they are few.
 
     Parameters

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 from urllib.parse import quote
 
@@ -41,7 +41,7 @@ def _series(live: Live, query: Query) -> dict[str, Any]:
     names = [n for n in str(query.get("channels", "")).split(",") if n] or list(record.channels)[:1]
     values = [record[n] for n in names]
     stamps, columns, full = decimated(plot_time(record), values, _points(query), _window(query))
-    return {"time": _numbers(stamps), "series": [{"name": n, "unit": record.unit(n), "values": _numbers(c)} for n, c in zip(names, columns, strict=True)], "full": full}
+    return _drawn(stamps, names, [record.unit(n) for n in names], columns, full)
 
 
 def _balance(live: Live, query: Query) -> dict[str, Any]:
@@ -50,8 +50,12 @@ def _balance(live: Live, query: Query) -> dict[str, Any]:
     time, measured, model = analysis.balance_series(str(query.get("balance", "")))
     stamps, columns, full = decimated(time, [measured, model, measured - model], _points(query), _window(query))
     unit = "N" if analysis.joint.kind == "linear" else "N.m"
-    names = ("measured", "model", "residual")
-    return {"time": _numbers(stamps), "series": [{"name": n, "unit": unit, "values": _numbers(c)} for n, c in zip(names, columns, strict=True)], "full": full}
+    return _drawn(stamps, ("measured", "model", "residual"), [unit] * 3, columns, full)
+
+
+def _drawn(stamps: Any, names: Sequence[str], units: Sequence[str], columns: Sequence[Any], full: bool) -> dict[str, Any]:
+    series = [{"name": n, "unit": u, "values": _numbers(c)} for n, u, c in zip(names, units, columns, strict=True)]
+    return {"time": _numbers(stamps), "series": series, "full": full}
 
 
 def _points(query: Query) -> int:
@@ -104,7 +108,8 @@ def _named(live: Live) -> str:
 
 
 def _download(content: str, name: str, kind: str) -> Response:
-    return Response(content, media_type=kind, headers={"content-disposition": f"attachment; filename*=UTF-8''{quote(name)}", "cache-control": "no-store"})
+    headers = {"content-disposition": f"attachment; filename*=UTF-8''{quote(name)}", "cache-control": "no-store"}
+    return Response(content, media_type=kind, headers=headers)
 
 
 def _joint_file(live: Live, query: Query) -> Response:
