@@ -127,7 +127,9 @@ def clicks(page: Any) -> dict[str, Any]:
         began = time.perf_counter()
         page.click(selector)
         page.wait_for_function("n => app.state.steps.length !== n && !app.state.job", arg=count, timeout=120_000)
-        page.wait_for_function("() => document.querySelector('#headline').dataset.text.startsWith(digits(app.state.steps.at(-1).held_out.relative_error_percent))")
+        page.wait_for_function(
+            "() => document.querySelector('#headline').dataset.text.startsWith(digits(app.state.steps.at(-1).held_out.relative_error_percent))"
+        )
         out[f"click_{name}_s"] = time.perf_counter() - began
         out[f"error_{name}"] = headline(page)
     return out

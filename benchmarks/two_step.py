@@ -73,7 +73,7 @@ def table(seeds: int) -> None:
     """20 seeds, two trajectories, two and three nonlinear parameters: how often the best known fit is reached."""
     for exponent in (False, True):
         print(f"\n{'three' if exponent else 'two'} nonlinear parameters, 1 % noise, {seeds} seeds")
-        print("trajectory  method               equal   strict  evaluations (median, max)  seconds  repeated >= 0")
+        print("trajectory  method               equal   strict  evaluations (median, max)  seconds  negative coefficient")
         for name, w in trajectories().items():
             rows: dict[str, list[tuple[float, int, float, bool]]] = {}
             for seed in range(seeds):

@@ -41,7 +41,9 @@ class Client:
     def __init__(self, port: int) -> None:
         self.port = port
 
-    def raw(self, method: str, path: str, body: bytes | Iterator[bytes] | None = None, headers: dict[str, str] | None = None) -> tuple[int, dict[str, str], bytes]:
+    def raw(
+        self, method: str, path: str, body: bytes | Iterator[bytes] | None = None, headers: dict[str, str] | None = None
+    ) -> tuple[int, dict[str, str], bytes]:
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)
         try:
             connection.request(method, path, body, {"X-IRJ": "1", **(headers or {})})
@@ -217,7 +219,9 @@ def test_session_identifiers_cannot_be_guessed_or_listed(client: Client, root: P
     assert all(folder.stat().st_mode & 0o077 == 0 for folder in root.glob("*/files"))
 
 
-@pytest.mark.parametrize(("given", "safe"), [("../../etc/passwd", "passwd"), ("..\\x.csv", "x.csv"), (".hidden", "hidden"), ("", "record"), ("a\x00b.csv", "a_b.csv"), ("ü.csv", "_.csv")])
+@pytest.mark.parametrize(("given", "safe"), [
+    ("../../etc/passwd", "passwd"), ("..\\x.csv", "x.csv"), (".hidden", "hidden"), ("", "record"), ("a\x00b.csv", "a_b.csv"), ("ü.csv", "_.csv"),
+])  # fmt: skip
 def test_names_of_uploads_are_made_safe(given: str, safe: str) -> None:
     assert safe_name(given) == safe
 
@@ -567,7 +571,8 @@ def test_files_of_the_command_line_are_in_the_session(tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(content)
     identifier = with_files(tmp_path / "sessions", sorted(tmp_path.glob("demo*")))
     state = Session(tmp_path / "sessions" / identifier).load()
-    assert [(f.name, f.role, f.status) for f in state.files] == [("demo_test.csv", "held_out", "ready"), ("demo_train1.csv", "train", "ready"), ("demo_train2.csv", "train", "ready")]
+    found = [(f.name, f.role, f.status) for f in state.files]
+    assert found == [("demo_test.csv", "held_out", "ready"), ("demo_train1.csv", "train", "ready"), ("demo_train2.csv", "train", "ready")]
     assert state.joint_text == JOINT
     with pytest.raises(InputError, match="there is no such file"):
         with_files(tmp_path / "sessions", ["missing.csv"])

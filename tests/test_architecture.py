@@ -113,7 +113,7 @@ def test_every_public_name_is_documented() -> None:
 
 CONTRACT = {
     "identification": (
-        "read", "fit", "compare", "diagnose", "improve", "load_joint", "Record", "Fit", "mcs", "moesp", "RecursiveLeastSquares", "TwoStep",
+        "read", "fit", "compare", "diagnose", "improve", "Record", "Fit", "mcs", "moesp", "RecursiveLeastSquares", "TwoStep",
         "FaultDetector",
     ),
     "casadi_models": ("JointModel", "Effect", "Parameter", "effect"),

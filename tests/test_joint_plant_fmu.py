@@ -109,7 +109,7 @@ def test_directional_derivatives(ts: Path) -> None:
         for n in known:
             reference = [names[n].valueReference]
             value = instance.call("getReal", reference)[0]
-            step = 1e-6 * max(abs(value), 1e-3)
+            step = 1e-6 * max(abs(value), 0.1)
             sides = []
             for sign in (1, -1):
                 instance.call("setReal", reference, [value + sign * step])
@@ -158,8 +158,9 @@ def test_memory_of_a_displacement(tmp_path: Path) -> None:
     expected = simulate(model, drive, STEP, substeps=20).readings
     found = run(path, ["link_position"], 499, inputs={"p.tau_m": held(drive / model.gear_ratio)})
     without = simulate(model.with_values({"hysteresis_torque_1": 0.0, "hysteresis_torque_2": 0.0}), drive, STEP).readings
-    assert np.abs(without[:, 2] - expected[:, 2]).max() > 1e-3
-    assert np.abs(found["p.link_position"] - expected[:, 2]).max() < 2e-5
+    visible = np.abs(without[:, 2] - expected[:, 2]).max()
+    assert visible > 5e-4
+    assert np.abs(found["p.link_position"] - expected[:, 2]).max() < 1e-2 * visible
     with Fmu(path) as fmu:
         assert fmu.description.modelExchange is None
 

@@ -123,7 +123,7 @@ def set_joint(live: Live, body: Mapping[str, Any]) -> dict[str, Any]:
     else:
         text = toml_text(_from_form(body, _previous(live.state.joint_text)))
     try:
-        joint = parse_joint(tomllib.loads(text), source)
+        parse_joint(tomllib.loads(text), source)
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{source}: not valid TOML ({error})") from None
     changed = live.change_input(lambda s: replace(s, joint_text=text, joint_source=source))

@@ -124,8 +124,9 @@ def _made(live: Live, name: str) -> Response:
     path = folder_of(live) / name
     if not path.is_file():
         raise InputError(f"no {name} yet; make it on the Export page")
+    stem = _named(live) + (f"_{path.stem}" if path.suffix == ".fmu" else "")
     return FileResponse(
-        path, filename=f"{_named(live)}{'_' + path.stem if path.suffix == '.fmu' else ''}{path.suffix}", media_type="application/octet-stream", headers={"cache-control": "no-store"}
+        path, filename=f"{stem}{path.suffix}", media_type="application/octet-stream", headers={"cache-control": "no-store"}
     )
 
 

@@ -35,9 +35,14 @@ function ticks(low, high, most = 5) {
   return out;
 }
 
+/* Width of a picture in its own units: as wide as it will be drawn on a phone, so that its text stays readable. */
+function pictureWidth(most) {
+  return Math.max(280, Math.min(most, document.documentElement.clientWidth - 70));
+}
+
 /* One place: mean residual with its 95 % band, one curve or one per direction of motion. */
 function placePlot(place) {
-  const W = 420, H = 250, L = 58, R = 14, T = 12, B = 44;
+  const W = pictureWidth(420), H = 250, L = 58, R = 14, T = 12, B = 44;
   const xs = place.branches.flatMap((b) => b.centre), ys = place.branches.flatMap((b) => [...b.low, ...b.high, ...b.mean]).filter((v) => v != null);
   let [x0, x1] = [Math.min(...xs), Math.max(...xs)], [y0, y1] = [Math.min(0, ...ys), Math.max(0, ...ys)];
   const means = place.branches.flatMap((b) => b.mean), top = Math.max(...means.map(Math.abs)) * 2.2 || 1;
@@ -67,7 +72,7 @@ function placePlot(place) {
 
 /* The falling staircase: held-out error after each step. */
 function staircase(steps) {
-  const W = 640, H = 270, L = 54, R = 16, T = 26, B = 46, n = steps.length;
+  const W = pictureWidth(640), H = 270, L = 54, R = 16, T = 26, B = 46, n = steps.length;
   const errors = steps.map((s) => s.held_out.relative_error_percent), top = Math.max(...errors) * 1.12 || 1, w = (W - L - R) / Math.max(n, 2);
   const Y = (v) => T + (1 - v / top) * (H - T - B), X = (k) => L + k * w;
   const out = svg("svg", { viewBox: `0 0 ${W} ${H}`, role: "img", "aria-label": "Error on held-out records: " + steps.map((s, k) => `${stepName(s)} ${digits(errors[k])} percent`).join(", ") });

@@ -132,7 +132,7 @@ const views = {
       h("div", { class: "two" }, h("figure", { class: "card", id: "staircase" }, h("figcaption", {}, "The falling staircase"), staircase(steps)),
         h("div", { class: "card" }, h("h2", {}, "In the model now"), h("ul", { class: "plain" }, inside.map((e) => h("li", {}, h("div", { class: "row between" }, effectTitle(e), button("Remove", () => run("remove", { label: e }), { kind: "quiet", label: `Remove ${effectTitle(e)}`, off: e === "transmission_compliance" && inside.includes("structural_damping") })))))),
       ),
-      h("div", { class: "card scroll" }, h("table", {}, h("caption", {}, "Ledger"), h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Step"), h("th", { scope: "col", class: "num" }, "Held-out error"), h("th", { scope: "col", class: "num" }, "Fit"), h("th", { scope: "col", class: "num" }, "VAF"), Object.keys(last.held_out.balances).map((b) => h("th", { scope: "col", class: "num" }, `${b}: × floor`)))),
+      h("div", { class: "card scroll", tabindex: "0", role: "region", "aria-label": "Ledger" }, h("table", {}, h("caption", {}, "Ledger"), h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Step"), h("th", { scope: "col", class: "num" }, "Held-out error"), h("th", { scope: "col", class: "num" }, "Fit"), h("th", { scope: "col", class: "num" }, "VAF"), Object.keys(last.held_out.balances).map((b) => h("th", { scope: "col", class: "num" }, `${b}: × floor`)))),
         h("tbody", {}, steps.map((s, k) => h("tr", { class: k === steps.length - 1 ? "now" : null }, h("td", {}, stepName(s)), h("td", { class: "num" }, `${digits(s.held_out.relative_error_percent)} %`), h("td", { class: "num" }, `${digits(s.held_out.fit_percent)} %`), h("td", { class: "num" }, `${digits(s.held_out.vaf_percent, 4)} %`), Object.keys(last.held_out.balances).map((b) => h("td", { class: "num" }, s.held_out.balances[b] ? digits(s.held_out.balances[b].ratio) : "–"))))))),
       h("div", { class: "card" }, h("h2", {}, "By hand"), h("div", { class: "row" }, add, button("Add", () => run("add", { label: $("add-label").value }), { id: "add-by-hand", label: "Add the chosen effect" }), button("Run the whole loop", () => run("improve", {}, "ledger"), { id: "improve" })), h("p", { class: "small soft" }, "The whole loop diagnoses and adds until nothing is left to name; it starts from the start model again.")),
     ];
@@ -140,10 +140,11 @@ const views = {
 
   async parameters(state) {
     const table = await get("/view/parameters"), rows = Object.entries(table).filter(([, p]) => !p.nuisance);
-    const band = (p) => p.stderr == null ? "–" : `${digits(p.value - 1.96 * p.stderr, 4)} … ${digits(p.value + 1.96 * p.stderr, 4)}`;
+    const enough = (p) => (p.stderr > 0 && p.value ? Math.min(9, Math.max(2, 2 + Math.floor(Math.log10(Math.abs(p.value))) - Math.floor(Math.log10(p.stderr)))) : 4);
+    const band = (p) => p.stderr == null ? "–" : `${digits(p.value - 1.96 * p.stderr, enough(p))} … ${digits(p.value + 1.96 * p.stderr, enough(p))}`;
     const flags = (p) => [p.at_bound && h("span", { class: "tag warn" }, "at its bound"), p.identifiable === false && h("span", { class: "tag warn" }, "not identified"), p.correlation && Math.abs(p.correlation.value) > 0.95 && h("span", { class: "tag warn" }, `tied to ${p.correlation.with.replace(/_/g, " ")}`)].filter(Boolean);
     return [heading("Parameters", "Standard errors come from the scatter between blocks of the records. All values are referred to the link."),
-      h("div", { class: "card scroll" }, h("table", {}, h("thead", {}, h("tr", {}, ["Parameter", "Value", "± std. error", "95 % band", "Unit", "Side", "Flags"].map((t, k) => h("th", { scope: "col", class: k > 0 && k < 4 ? "num" : null }, t)))),
+      h("div", { class: "card scroll", tabindex: "0", role: "region", "aria-label": "Table of parameters" }, h("table", {}, h("thead", {}, h("tr", {}, ["Parameter", "Value", "± std. error", "95 % band", "Unit", "Side", "Flags"].map((t, k) => h("th", { scope: "col", class: k > 0 && k < 4 ? "num" : null }, t)))),
         h("tbody", {}, rows.map(([name, p]) => h("tr", {}, h("td", {}, name.replace(/_/g, " "), h("div", { class: "small soft" }, p.meaning)), h("td", { class: "num" }, digits(p.value, 5)), h("td", { class: "num" }, digits(p.stderr, 2)), h("td", { class: "num" }, band(p)), h("td", {}, unit(p.unit)), h("td", {}, p.side), h("td", {}, h("div", { class: "row" }, flags(p).length ? flags(p) : h("span", { class: "soft" }, "–"))))))))];
   },
 
@@ -175,7 +176,7 @@ function fileCard(f) {
   const s = f.summary || {}, bad = f.findings.filter((x) => x.severity !== "ok"), fine = f.findings.filter((x) => x.severity === "ok");
   const role = h("select", { id: `role-${f.id}`, "aria-label": `Role of ${f.name}`, onchange: (e) => act(async () => { await post(`/file/${f.id}`, { role: e.target.value }); await refresh(); }) }, [["train", "Fit"], ["held_out", "Held out"]].map(([v, t]) => h("option", { value: v, selected: f.role === v }, t)));
   return h("section", { class: "card", "aria-label": f.name }, h("div", { class: "row between" },
-    h("div", {}, h("h2", {}, f.name), f.status === "ready" ? h("p", { class: "soft small" }, `${plural(s.samples, "sample")}, ${digits(s.duration, 4)} s, every ${digits(1000 * s.dt, 3)} ms${s.segments > 1 ? `, ${s.segments} stretches` : ""}. ${f.role === "held_out" ? "Held out" : "Fit"}: ${f.role_reason}.`) : null),
+    h("div", {}, h("h2", {}, f.name), f.status === "ready" ? h("p", { class: "soft small" }, `${plural(s.samples, "sample")}, ${digits(s.duration, 4)} s, every ${digits(1000 * s.dt, 3)} ms${s.segments > 1 ? `, ${s.segments} stretches` : ""}. ${f.role_reason.charAt(0).toUpperCase()}${f.role_reason.slice(1)}.`) : null),
     h("div", { class: "row" }, f.status === "ready" ? role : null, button("Remove", () => act(async () => { await call("DELETE", `${base()}/file/${f.id}`); await refresh(); }), { kind: "quiet", label: `Remove ${f.name}` }))),
     f.status === "refused" ? h("p", { class: "bad" }, f.message) : null,
     f.status === "columns" ? columnMap(f) : null,
