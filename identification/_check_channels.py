@@ -76,6 +76,7 @@ def check_stuck(record: Record) -> list[Finding]:
     """Find stretches in which a channel stands still while another one of the same joint moves."""
     findings = []
     movers = [c for c in ("motor_position", "link_position", "motor_velocity", "link_velocity") if record.has(c)]
+    whole = {m: span(record[m]) or 1.0 for m in movers}
     for channel in (*_EFFORT, *movers):
         if not record.has(channel) or span(record[channel]) == 0.0:
             continue
@@ -88,7 +89,7 @@ def check_stuck(record: Record) -> list[Finding]:
             piece = slice(int(starts[k]), int(starts[k] + lengths[k]))
             if record.segment[piece.start] != record.segment[piece.stop - 1]:
                 continue
-            moved = max(span(record[m][piece]) / (span(record[m]) or 1.0) for m in kindred)
+            moved = max(span(record[m][piece]) / whole[m] for m in kindred)
             if moved > 0.1 and (worst is None or moved > worst[0]):
                 worst = (moved, piece.start, piece.stop)
         if worst is not None:

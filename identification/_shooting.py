@@ -57,12 +57,12 @@ class Windows:
     @property
     def count(self) -> int:
         """Number of windows."""
-        return self.measured.shape[0]
+        return int(self.measured.shape[0])
 
     @property
     def length(self) -> int:
         """Samples in a window."""
-        return self.measured.shape[2]
+        return int(self.measured.shape[2])
 
     def every(self, stride: int) -> Windows:
         """One window in `stride`."""

@@ -242,9 +242,9 @@ def schur(gram: FloatArray, states: int) -> tuple[FloatArray, FloatArray, FloatA
     scores : (windows, parameters) array
         What each window adds to `right`.
     """
-    back = np.linalg.solve(_ridged(gram[:, :states, :states]), gram[:, :states, states:])
-    rest = gram[:, states:, states:] - gram[:, states:, :states] @ back
-    whole = rest.sum(axis=0)
+    back: FloatArray = np.asarray(np.linalg.solve(_ridged(gram[:, :states, :states]), gram[:, :states, states:]), dtype=np.float64)
+    rest: FloatArray = gram[:, states:, states:] - gram[:, states:, :states] @ back
+    whole: FloatArray = rest.sum(axis=0)
     return whole[:-1, :-1], whole[:-1, -1], back, rest[:, :-1, -1]
 
 

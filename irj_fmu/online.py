@@ -3,113 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final, final
 
 import numpy as np
 import numpy.typing as npt
 
-from casadi_models import JointModel
 from identification.errors import InputError
 from identification.joint_file import Joint
 from identification.recursive import RecursiveLeastSquares, Settings
-from identification.sensing import Sensing, adapt
 
-from .rows import SOURCES, RowMaker, linear_parameters
+from .first_window import least_range, least_squares
+from .online_options import OnlineOptions, estimated_parameters, held_parameters, prepared
+from .rows import SOURCES, RowMaker
 from .state_bytes import pack, unpack
-from .watch import DRIVE, Q_L, Q_M, READINGS, SAMPLED, TAU, W_L, W_M, Watch
+from .verdict import CONSTANT, FAULT_TEXT, MISSING, NONE, SCALED, implausible, plant_alarm, scale_limits, scores
+from .watch import DRIVE, Q_L, Q_M, SAMPLED, TAU, W_L, W_M, Watch
 
 if TYPE_CHECKING:
     from identification.fault import FaultDetector
 
 FloatArray = npt.NDArray[np.float64]
 
-BALANCES: Final = ("motor", "link", "transmission")
-NONE, MISSING, CONSTANT, SCALED = 0, 10, 20, 30
-CURRENT_OR_FRICTION, PLANT = 7, 8
-FAULT_TEXT: Final = (
-    "0 none; 1 to 6 sensor failed: motor current, motor position, motor velocity, link position, link velocity, "
-    "torque; 7 current sensor or motor friction; 8 the joint changed; 11 to 16 reading missing, 21 to 26 reading "
-    "constant while the joint moves, 31 to 36 reading of wrong scale, in the same order"
-)
 _RESIDUAL_SECONDS: Final = 2.0
-
-
-@final
-@dataclass(frozen=True)
-class OnlineOptions:
-    """Tuning of the online estimator.
-
-    Attributes
-    ----------
-    has_link, has_torque : bool
-        Whether there are a link encoder and a torque sensor.
-    warm_up : float
-        First window, from which the recursion starts [s]; 7 s in the thesis.
-    drift, alarm_drift : float
-        Forgetting: drift of a parameter as a share of its prior range per sqrt(s), in calm and in an alarm.
-    floor_share : float
-        A balance's floor is never below this share of the torque it balances.
-    detect : bool
-        Run the fault detector; it needs an elastic joint whose values are known.
-    """
-
-    has_link: bool = True
-    has_torque: bool = True
-    warm_up: float = 7.0
-    drift: float = 3e-3
-    alarm_drift: float = 1.0
-    floor_share: float = 1e-3
-    detect: bool = True
-
-
-def sensing_of(model: JointModel, options: OnlineOptions) -> Sensing:
-    """Balances that the joint's sensors allow.
-
-    Raises
-    ------
-    InputError
-        Where the model is elastic and there is no link encoder.
-    """
-    common: dict[str, Any] = {"both_positions": options.has_link, "has_drive": True, "has_temperature": False}
-    if options.has_torque:
-        found = ["motor", *(["link"] if options.has_link else [])]
-        if model.is_elastic:
-            if not options.has_link:
-                raise InputError(f"{model.name}: an elastic model needs the link position; use a rigid one (hd1, hd2)")
-            found.append("transmission")
-        return Sensing(tuple(found), has_torque=True, **common)
-    if model.is_elastic:
-        if not options.has_link:
-            raise InputError(f"{model.name}: an elastic model needs the link position; use a rigid one (hd1, hd2)")
-        return Sensing(("sum", "deflection"), has_torque=False, **common)
-    return Sensing(("axis",), has_torque=False, **common)
-
-
-def prepared(joint: Joint, options: OnlineOptions) -> tuple[JointModel, Sensing]:
-    """The joint's model adapted to its sensors, known values filled in."""
-    model = joint.model()
-    sensing = sensing_of(model, options)
-    model = adapt(model, sensing, joint.known)
-    known = {k: v.value for k, v in joint.known.items() if v.value is not None and k in model.parameter_names}
-    return model.with_values(known), sensing
-
-
-def held_parameters(joint: Joint) -> frozenset[str]:
-    """Parameters the estimator leaves alone: known ones, delays, and kinematic errors.
-
-    A kinematic error multiplies the stiffness, so that one of the two must be held; it is the geometry.
-    """
-    delays = {"drive_delay", "torque_sensor_delay", "link_position_sensor_delay"}
-    model = joint.model()
-    geometry = {n for t in model.terms if t.place == "torsion" for n in t.names}
-    return frozenset(k for k, v in joint.known.items() if v.value is not None) | delays | geometry
-
-
-def estimated_parameters(joint: Joint, options: OnlineOptions | None = None) -> tuple[str, ...]:
-    """Names of the parameters that an estimator of this joint follows, in the order of ``theta[k]``."""
-    model, sensing = prepared(joint, options or OnlineOptions())
-    return linear_parameters(model, sensing, held_parameters(joint))
 
 
 @final
@@ -145,12 +61,12 @@ class OnlineEstimator:
         self.rows = RowMaker(self.model, self.sensing, dt, held_parameters(joint))
         self.names, self.balances = self.rows.names, self.rows.balances
         self._units = {p.name: p for p in self.model.parameters}
+        has_link = self.options.has_link
+        self.present = (True, True, True, has_link, has_link, self.options.has_torque)
         used: list[bool] = np.any(self.rows.uses, axis=0).tolist()
         self._needs = [False] * 6
         for k, reading in enumerate(SAMPLED):
-            self._needs[reading] = used[k]
-        present = [True, True, True, self.options.has_link, self.options.has_link, self.options.has_torque]
-        self.present = tuple(present)
+            self._needs[reading] = used[k] and self.present[reading]
         self.watch = Watch(dt, self.present)
         self._detector_state, self._margin = detector_state, 1.0
         self.detector = self._make_detector() if self.options.detect else None
@@ -227,14 +143,9 @@ class OnlineEstimator:
 
     def set_fault_margin(self, factor: float) -> None:
         """Multiply the fault detector's limits."""
-        from identification._fault_structured import StructuredRule
-
-        rule = self.detector._rule if self.detector is not None and factor != self._margin else None
-        if not isinstance(rule, StructuredRule):
-            return
-        residuals = rule.residuals
-        residuals.limits = [limit * factor / self._margin for limit in residuals.limits]
-        self._margin = factor
+        if self.detector is not None and factor != self._margin:
+            scale_limits(self.detector, factor / self._margin)
+            self._margin = factor
 
     @property
     def delay(self) -> float:
@@ -368,7 +279,8 @@ class OnlineEstimator:
         """Weights (rows, balances) from the shares (rows, 2) and the size of the residuals (balances,)."""
         level = np.array([float(np.abs(theta[which]).sum()) if which else 0.0 for which in self._friction])
         doubt = (shares * level)[:, None, :] * self._feels
-        return np.asarray(1.0 / np.sqrt(1.0 + np.sum(doubt**2, axis=2) / size**2), dtype=np.float64)
+        found: FloatArray = 1.0 / np.sqrt(1.0 + np.sum(doubt**2, axis=2) / size**2)
+        return found
 
     def _begin(self) -> None:
         """Start the recursion from the collected rows."""
@@ -377,11 +289,11 @@ class OnlineEstimator:
         shares = np.array([row[2] for row in self._collected])
         weight = np.ones_like(y)
         for _ in range(3):
-            first = self._least_squares(y * weight, h * weight[:, :, None])
+            first = least_squares(y * weight, h * weight[:, :, None])
             size = 1.5 * np.median(np.abs(y - h @ first), axis=0)
             weight = self._weight_of(shares, first, np.maximum(size, 1e-9 * float(np.max(np.abs(y)))))
         y, h = y * weight, h * weight[:, :, None]
-        self._scale = np.maximum(np.maximum(np.abs(first), np.abs(self.theta)), self._least(h, y))
+        self._scale = np.maximum(np.maximum(np.abs(first), np.abs(self.theta)), least_range(h, y))
         self.estimator = self._recursion(self.theta)
         started = self.estimator.startup(y, h, limit=1e-6)
         self.estimator.release()
@@ -402,27 +314,6 @@ class OnlineEstimator:
             rank_seconds=8.0,
         )  # fmt: skip
         return RecursiveLeastSquares(values, self._scale, outputs=len(self.balances), names=self.names, settings=settings)
-
-    @staticmethod
-    def _least(h: FloatArray, y: FloatArray) -> FloatArray:
-        """Smallest prior range: what moves the balances by a hundredth of their torque."""
-        size = np.sqrt(np.mean(h**2, axis=(0, 1)))
-        level = float(np.sqrt(np.mean(y**2))) or 1.0
-        return np.where(size > 0, 0.01 * level / np.maximum(size, 1e-300), 1.0)
-
-    @staticmethod
-    def _least_squares(y: FloatArray, h: FloatArray) -> FloatArray:
-        """Least squares with columns of equal size and balances of equal residual."""
-        count = h.shape[2]
-        weight = np.ones(y.shape[1])
-        theta = np.zeros(count)
-        for _ in range(2):
-            rows = (h * weight[:, None]).reshape(-1, count)
-            size = np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
-            theta = np.linalg.lstsq(rows / size, (y * weight).ravel(), rcond=1e-9)[0] / size
-            left = np.sqrt(np.mean((y - h @ theta) ** 2, axis=0))
-            weight = 1.0 / np.maximum(left, 1e-12 + 1e-9 * float(np.max(np.abs(y))))
-        return theta
 
     def retune(self, options: OnlineOptions) -> None:
         """Take up other forgetting bounds and floors while running; the estimate stays."""
@@ -459,56 +350,18 @@ class OnlineEstimator:
             for i, failed in enumerate(detector._rule.failed):
                 if failed and not found:
                     found = 1 + i
-            self._plant(len(detector.events))
-            self._scores()
+            self.plant_alarm = plant_alarm(detector, self.dt)
+            self.score = scores(detector)
         for flags, code in ((watch.constant, CONSTANT), (watch.scaled, SCALED)):
             for i in range(6):
                 if flags[i] and not found:
                     found = code + 1 + i
-        found = found or self._implausible() or self.plant_alarm
+        if not found and self.estimator is not None and self.is_fitted:
+            found = implausible(self.names, self.theta, self.sigma, self.joint.fitted)
+        found = found or self.plant_alarm
         if found != self.fault and found:
             self.events.append(f"fault {found}")
         self.fault = found
-
-    def _plant(self, count: int) -> None:
-        """Take the detector's newest verdict on the joint itself."""
-        detector = self.detector
-        if detector is None or not count:
-            return
-        last = detector.events[-1]
-        recent = detector._rule.k - last.sample < round(5.0 / self.dt)
-        codes = {"CURRENT_OR_FRICTION": CURRENT_OR_FRICTION, "PLANT": PLANT}
-        self.plant_alarm = codes.get(last.verdict.name, NONE) if recent else NONE
-
-    def _scores(self) -> None:
-        from identification._fault_structured import PARITY_SENSORS, StructuredRule
-
-        rule = self.detector._rule if self.detector is not None else None
-        if not isinstance(rule, StructuredRule):
-            return
-        residuals = rule.residuals
-        limits, values = residuals.limits, residuals.values
-        score = [0.0] * 6
-        for parity, sensors in enumerate(PARITY_SENSORS):
-            rows = range(4 * parity, 4 * parity + 4) if parity < 4 else range(16, len(values))
-            worst = max(abs(values[j]) / limits[j] if limits[j] > 0 else 0.0 for j in rows)
-            for s in sensors:
-                score[s] = max(score[s], worst)
-        for i, failed in enumerate(rule.failed):
-            score[i] = max(1.0, score[i]) if failed else score[i]
-        self.score = score
-
-    def _implausible(self) -> int:
-        """Inertias far from those of a fitted joint: the scale of torque or current is wrong."""
-        if self.estimator is None or not self.is_fitted:
-            return NONE
-        for name, code in (("link_inertia", SCALED + 1 + TAU), ("motor_inertia", SCALED + 1 + DRIVE)):
-            if name in self.names and name in self.joint.fitted:
-                i = self.names.index(name)
-                before, now, spread = self.joint.fitted[name], float(self.theta[i]), float(self.sigma[i])
-                if not before / 3 < now < 3 * before and abs(now - before) > 5 * spread:
-                    return code
-        return NONE
 
     # --- state -------------------------------------------------------------------------------------------------------
 
@@ -559,4 +412,4 @@ class OnlineEstimator:
         self.plant_alarm, self.events = plain["plant"], list(plain["events"])
 
 
-__all__ = ["BALANCES", "FAULT_TEXT", "READINGS", "OnlineEstimator", "OnlineOptions", "estimated_parameters", "prepared", "sensing_of"]
+__all__ = ["FAULT_TEXT", "OnlineEstimator", "OnlineOptions", "estimated_parameters", "held_parameters", "prepared"]

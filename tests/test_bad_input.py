@@ -63,8 +63,7 @@ def said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Say:
 
 def improve_message(said: Say, tmp_path: Path, table: Mapping[str, FloatArray], joint: str = JOINT) -> str:
     path = write_csv(tmp_path / "run.csv", table)
-    line = said("improve", str(path), "--joint", "J.toml", joint=joint)
-    return line
+    return said("improve", str(path), "--joint", "J.toml", joint=joint)
 
 
 def renamed(old: str, new: str) -> Table:

@@ -24,12 +24,12 @@ RATIO = 160.0
 TURN = 2 * np.pi / 360
 
 ELASTIC = {
-    "motor_inertia": 4.6, "link_inertia": 10.0, "stiffness": 1.5e4, "structural_damping": 32.0, "gravity_torque": 100.0,
+    "motor_inertia": 4.6, "link_inertia": 10.0, "stiffness": 1.5e4, "structural_damping": 32.0, "gravity_torque": -100.0,
     "motor_viscous": 12.0, "link_viscous": 4.0, "motor_coulomb": 15.0, "link_coulomb": 2.0,
     "motor_smoothing_velocity": 0.02, "link_smoothing_velocity": 0.02,
 }  # fmt: skip
 RIGID = {
-    "inertia": 14.0, "gravity_torque": 100.0, "motor_viscous": 12.0, "motor_coulomb": 15.0, "motor_smoothing_velocity": 0.02,
+    "inertia": 14.0, "gravity_torque": -100.0, "motor_viscous": 12.0, "motor_coulomb": 15.0, "motor_smoothing_velocity": 0.02,
 }  # fmt: skip
 
 

@@ -97,9 +97,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run `irj`; returns the exit code: 0 done, 1 a check failed, 2 unusable input, 130 interrupted."""
     given = list(sys.argv[1:] if argv is None else argv)
     parser = _parser()
-    arguments, arguments.rest = parser.parse_known_args(given)
-    if arguments.rest and arguments.module != "fmi":
-        parser.error(f"unrecognized arguments: {' '.join(arguments.rest)}")
+    arguments, rest = parser.parse_known_args(given)
+    arguments.rest = rest
+    if rest and arguments.module != "fmi":
+        parser.error(f"unrecognized arguments: {' '.join(rest)}")
     arguments.command = shlex.join(["irj", *given])
     try:
         check_outputs(arguments)

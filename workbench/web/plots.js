@@ -85,7 +85,7 @@ function staircase(steps) {
     const name = stepName(steps[k]), room = Math.max(8, Math.floor(w / 6.2));
     out.append(svg("text", { x: X(k) + w / 2, y: H - B + 17, "text-anchor": "middle" }, name.length > room ? name.slice(0, room - 1) + "…" : name, svg("title", {}, name)));
   });
-  out.append(svg("text", { x: L, y: 12 }, "error on held-out records, % of the measured torque"));
+  out.append(svg("text", { x: 4, y: 12 }, "held-out error, % of the measured torque"));
   return out;
 }
 

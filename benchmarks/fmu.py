@@ -1,0 +1,181 @@
+"""Cost of the FMUs per step under fmpy, and of a batch: ``python benchmarks/fmu.py [estimator plant batch]``.
+
+estimator   set six readings, step 1 ms, get all estimates and health; without and with fault detection
+plant       set the current, step 1 ms, get five readings; the same plant written in pythonfmu beside it
+batch       1000 runs of a plant over a parameter, against a plain loop of fmpy's simulate_fmu, in the same run
+"""
+
+from __future__ import annotations
+
+import ctypes
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from irj_fmu.build import Request, build
+from irj_fmu.fleet import Batch, run_fleet
+from irj_fmu.host import Fmu, Instance
+from irj_fmu.joint_plant import PlantOptions, plant_spec
+from irj_fmu.package import SlaveSpec, package_slave
+from irj_fmu.plant import build_plant
+from irj_fmu.reference import reference_joint, start_of
+from irj_fmu.signals import Table
+
+STEP = 1e-3
+_PYTHON_PLANT = '''
+"""The irj_ts plant in plain Python: classical Runge-Kutta, two steps per millisecond."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from irj_fmu.slave_base import TableSlave
+from irj_fmu.variables import Value, Variable
+
+V = VALUES
+
+
+class PythonPlant(TableSlave):
+    variables = (
+        Variable("i_m", "A", 0.0, causality="input"),
+        *(Variable(n, causality="output") for n in ("motor_position", "motor_velocity", "link_position", "link_velocity", "link_torque")),
+    )
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.x = (0.0, 0.0, 0.0, 0.0)
+
+    def slope(self, x: tuple[float, ...], drive: float) -> tuple[float, ...]:
+        q, w, link, rate = x
+        d = q - link
+        torque = V["stiffness"] * d + V["cubic_stiffness"] * d * d * d
+        decay = math.exp(-abs(w) / V["motor_smooth_stribeck_velocity"])
+        motor = V["motor_added_spring"] * q + (V["motor_viscous"] + V["motor_smooth_stribeck"] * decay) * w
+        motor += V["motor_coulomb"] * math.tanh(w / V["motor_smoothing_velocity"])
+        load = V["link_viscous"] * rate + (V["link_cyclic_torque_sine"] - V["gravity_torque"]) * math.sin(link)
+        return (w, (drive - torque - motor) / V["motor_inertia"], rate, (torque - load) / V["link_inertia"])
+
+    def process(self, time: float, step: float, inputs: Mapping[str, Value]) -> Mapping[str, Value]:
+        drive, x, h = V["torque_per_current"] * float(inputs["i_m"]), self.x, step / 2
+        for _ in range(2):
+            k1 = self.slope(x, drive)
+            k2 = self.slope(tuple(a + h / 2 * b for a, b in zip(x, k1)), drive)
+            k3 = self.slope(tuple(a + h / 2 * b for a, b in zip(x, k2)), drive)
+            k4 = self.slope(tuple(a + h * b for a, b in zip(x, k3)), drive)
+            x = tuple(a + h / 6 * (b + 2 * c + 2 * d + e) for a, b, c, d, e in zip(x, k1, k2, k3, k4))
+        self.x = x
+        return {"motor_position": x[0], "motor_velocity": x[1], "link_position": x[2], "link_velocity": x[3],
+                "link_torque": V["stiffness"] * (x[0] - x[2])}
+'''
+
+
+def timed(path: Path, inputs: list[str], outputs: list[str], table: np.ndarray[Any, Any], skip: int, **parameters: Any) -> tuple[float, float, float]:
+    """Median, mean processor time and 99 % quantile of set + step + get [us], raw calls of fmpy on buffers made once."""
+    with Fmu(path) as fmu, Instance(fmu) as instance:
+        instance.begin(0.0, parameters)
+        instance.ready()
+        raw, write, reads = instance.raw, instance.blocks(inputs)[0], instance.blocks(outputs)
+        spent, used = np.empty(len(table)), 0.0
+        step = ctypes.c_double(STEP)
+        for k, row in enumerate(table.tolist()):
+            write.values[:] = row
+            if k == skip:
+                used = time.thread_time()
+            begin = time.perf_counter()
+            raw.fmi2SetReal(raw.component, write.references, len(inputs), write.values)
+            raw.fmi2DoStep(raw.component, k * STEP, step, 1)
+            for block in reads:
+                getattr(raw, f"fmi2Get{block.type}")(raw.component, block.references, len(block.names), block.values)
+            spent[k] = time.perf_counter() - begin
+        used = (time.thread_time() - used) / (len(table) - skip)
+    spent = spent[skip:] * 1e6
+    return float(np.median(spent)), used * 1e6, float(np.quantile(spent, 0.99))
+
+
+def readings(count: int) -> np.ndarray[Any, Any]:
+    """Readings of the irj_ts joint with sensor noise, (count, 6)."""
+    from casadi_models.simulate import simulate
+
+    joint = reference_joint("irj_ts")
+    t = STEP * np.arange(count)
+    drive = 250 * np.sin(2 * np.pi * 0.4 * t) + 60 * np.sin(2 * np.pi * 1.7 * t)
+    found = simulate(joint.model().with_values({"gravity_torque": -105.0}), drive, STEP).readings
+    table = np.column_stack([drive / (joint.torque_per_current or 1.0), found])
+    table[:, 1:3] *= joint.gear_ratio
+    noise: np.ndarray[Any, Any] = np.random.default_rng(1).normal(size=table.shape) * [2e-3, 3e-4, 0.1, 2e-6, 1e-3, 0.05]
+    return table + noise
+
+
+def estimator(folder: Path) -> None:
+    """Cost of the estimator with twelve parameters and three balances."""
+    from identification.joint_file import toml_text
+
+    joint = replace(reference_joint("irj_ts"), name="bench")
+    path = folder / "bench.toml"
+    for about, held in (("without fault detection", start_of(joint)), ("with fault detection", joint)):
+        path.write_text(toml_text(held, {k: {"value": v, "unit": "", "side": ""} for k, v in held.fitted.items()}), encoding="utf-8")
+        (made,) = build("estimator", Request(held, path, folder))
+        with Fmu(made) as fmu:
+            names = [n for n in fmu.variables if n.startswith(("theta[", "ratio."))] + ["health", "fault"]
+        low, mean, top = timed(made, ["i_m", "q_m", "w_m", "q_l", "w_l", "tau_l"], names, readings(20000), 8000)
+        print(f"estimator {about}: set + step + get({len(names)}) median {low:.1f} us, mean {mean:.1f} us of processor time, 99 % {top:.0f} us (wanted: 60)")
+
+
+def plant(folder: Path) -> None:
+    """Cost of the plant in C and of the same plant in Python."""
+    joint = reference_joint("irj_ts")
+    made = build_plant(plant_spec(joint, PlantOptions(name="bench_plant")), folder / "bench_plant.fmu")
+    module = folder / "python_plant.py"
+    module.write_text(_PYTHON_PLANT.replace("VALUES", repr({**joint.fitted, "torque_per_current": joint.torque_per_current})))
+    slow = package_slave(SlaveSpec("python_plant", "python_plant", "PythonPlant", (module,)), folder / "python_plant.fmu", shim=False).path
+    outputs = ["motor_position", "motor_velocity", "link_position", "link_velocity", "link_torque"]
+    current = 15 * np.sin(2 * np.pi * 0.4 * STEP * np.arange(20000))[:, None]
+    found = {about: timed(path, ["i_m"], outputs, current, 1000) for about, path in (("C", made), ("pythonfmu", slow))}
+    for about, (low, mean, top) in found.items():
+        print(f"plant in {about}: set + step + get(5) median {low:.1f} us, mean {mean:.1f} us of processor time, 99 % {top:.0f} us")
+    print(f"plant: {found['pythonfmu'][1] / found['C'][1]:.1f} times faster in C (wanted: 2; C under 12 us)")
+
+
+def batch(folder: Path, runs: int = 1000, naive: int = 100) -> None:
+    """A batch against the naive loop: same FMU, same runs, same results."""
+    from fmpy import simulate_fmu
+
+    joint = reference_joint("irj_ts")
+    made = build_plant(plant_spec(joint, PlantOptions(name="bench_batch")), folder / "bench_batch.fmu")
+    t = 1e-2 * np.arange(101)
+    current = 15 * np.sin(2 * np.pi * 0.4 * t)
+    values = np.linspace(1e4, 4e4, runs)
+    signal = np.array(list(zip(t, current, strict=True)), dtype=[("time", "f8"), ("i_m", "f8")])
+    begin = time.perf_counter()
+    kept = [
+        simulate_fmu(str(made), stop_time=1.0, output_interval=1e-2, fmi_type="CoSimulation", input=signal,
+                     start_values={"stiffness": float(v)}, output=["link_position"])["link_position"][-1]
+        for v in values[:: runs // naive]
+    ]  # fmt: skip
+    slow = (time.perf_counter() - begin) / len(kept)
+    cases = [{"stiffness": float(v)} for v in values]
+    begin = time.perf_counter()
+    found = run_fleet(Batch(made, cases, ["link_position"], {"i_m": Table(t, current, hold=True)}, step=1e-2, stop=1.0, chunk=50))
+    fast = (time.perf_counter() - begin) / runs
+    print(f"batch of {runs}: {1 / fast:.0f} runs/s, naive loop {1 / slow:.0f} runs/s ({len(kept)} of them): {slow / fast:.1f} times (wanted: 4)")
+    apart = np.abs(found.signals["link_position"][:: runs // naive, -1] - np.array(kept)).max()
+    print(f"largest difference at the end: {apart:.1e} rad (the naive loop ramps the input where the batch holds it)")
+
+
+def main() -> None:
+    """Run what is named, or everything."""
+    parts = {"estimator": estimator, "plant": plant, "batch": batch}
+    with tempfile.TemporaryDirectory() as folder:
+        for name in sys.argv[1:] or parts:
+            parts[name](Path(folder))
+
+
+if __name__ == "__main__":
+    main()
