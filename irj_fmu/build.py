@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import importlib.util
 import json
 import os
@@ -123,8 +124,10 @@ _Maker = Callable[[Request, Path], list[tuple[Path, str]]]
 def _makers(kind: str) -> list[_Maker]:
     table: dict[str, list[_Maker]] = {
         "estimator": [_estimator], "plant": [_plant], "native": [_native], "ssp": [_ssp],
-        "all": [_estimator, _plant, _controlled, _native, _ssp],
+        "all": [_estimator, _plant, _controlled, _ssp],
     }  # fmt: skip
+    if importlib.util.find_spec("irj_fmu.native") is not None:
+        table["all"].append(_native)
     return table[kind]
 
 
@@ -238,10 +241,9 @@ def detector_state(joint: Joint, options: object, healthy: Sequence[Path], dt: f
 
 
 def _native(request: Request, folder: Path) -> list[tuple[Path, str]]:
-    try:
-        from .native import build_native
-    except ImportError:
-        raise InputError("the native estimator is not part of this installation; build `estimator` instead") from None
+    if importlib.util.find_spec("irj_fmu.native") is None:
+        raise InputError("the native estimator is not part of this version; build `estimator` instead")
+    build_native = importlib.import_module("irj_fmu.native").build_native
     _compiler(request)
     name = f"{_base(request)}_native"
     path = build_native(request.joint, folder / f"{name}.fmu", cc=request.cc, target=request.target)

@@ -26,6 +26,11 @@ if TYPE_CHECKING:
 FloatArray = npt.NDArray[np.float64]
 
 _RESIDUAL_SECONDS: Final = 2.0
+_PLAIN: Final = (
+    "_end", "_since", "_rows", "_started", "_lost", "_last_good", "fault", "score", "readings", "plant_alarm", "events",
+)  # fmt: skip
+_ARRAYS: Final = ("_buffer", "theta", "sigma", "residual", "floor", "ratio", "_square", "_torque", "_scale")
+"""What changes from sample to sample, besides rows, watch, recursion and detector."""
 
 
 @final
@@ -367,16 +372,8 @@ class OnlineEstimator:
 
     def state(self) -> bytes:
         """Everything the estimator will use again, as bytes."""
-        plain = {
-            "end": self._end, "since": self._since, "rows": self._rows, "started": self._started, "lost": self._lost,
-            "last_good": self._last_good, "fault": self.fault, "score": self.score, "readings": self.readings,
-            "plant": self.plant_alarm, "events": self.events,
-        }  # fmt: skip
-        arrays = {
-            "buffer": self._buffer, "theta": self.theta, "sigma": self.sigma, "residual": self.residual,
-            "floor": self.floor, "ratio": self.ratio, "square": self._square, "torque": self._torque,
-            "scale": self._scale, "watch": self.watch.numbers(),
-        }  # fmt: skip
+        plain = {name: getattr(self, name) for name in _PLAIN}
+        arrays = {name: getattr(self, name) for name in _ARRAYS} | {"watch": self.watch.numbers()}
         if self._collected:
             arrays |= {key: np.array([row[i] for row in self._collected]) for i, key in enumerate(("y", "h", "shares"))}
         arrays.update({f"row{i}": values for i, values in enumerate(self.rows.numbers())})
@@ -388,13 +385,12 @@ class OnlineEstimator:
     def restore(self, state: bytes) -> None:
         """Take up a state of an estimator of the same joint and options."""
         plain, arrays, parts = unpack(state)
-        if arrays["theta"].shape != self.theta.shape or arrays["buffer"].shape != self._buffer.shape:
+        if arrays["theta"].shape != self.theta.shape or arrays["_buffer"].shape != self._buffer.shape:
             raise InputError("restore: the state is of another joint or sample time; give one of this estimator")
-        self._restore_plain(plain)
-        self._buffer = arrays["buffer"]
-        self.theta, self.sigma, self.residual = arrays["theta"], arrays["sigma"], arrays["residual"]
-        self.floor, self.ratio, self._scale = arrays["floor"], arrays["ratio"], arrays["scale"]
-        self._square, self._torque = arrays["square"], arrays["torque"]
+        for name in _PLAIN:
+            setattr(self, name, plain[name])
+        for name in _ARRAYS:
+            setattr(self, name, arrays[name])
         self.watch.load(arrays["watch"])
         self._collected = list(zip(arrays["y"], arrays["h"], arrays["shares"], strict=True)) if "y" in arrays else []
         self.rows.load([arrays[f"row{i}"] for i in range(len(self.rows.numbers()))])
@@ -403,13 +399,6 @@ class OnlineEstimator:
             self.estimator.restore(parts["rls"])
         if self.detector is not None and "detector" in parts:
             self.detector.restore(parts["detector"])
-
-    def _restore_plain(self, plain: Mapping[str, Any]) -> None:
-        self._end, self._since, self._rows = plain["end"], plain["since"], plain["rows"]
-        self._started, self._lost = plain["started"], list(plain["lost"])
-        self._last_good, self.readings = list(plain["last_good"]), list(plain["readings"])
-        self.fault, self.score = plain["fault"], list(plain["score"])
-        self.plant_alarm, self.events = plain["plant"], list(plain["events"])
 
 
 __all__ = ["FAULT_TEXT", "OnlineEstimator", "OnlineOptions", "estimated_parameters", "held_parameters", "prepared"]

@@ -149,18 +149,14 @@ def recording(model: JointModel, joint: Joint, seconds: float, rate: float, seed
     progress_bar("done", 1.0)
     if not np.all(np.isfinite(rows)):
         raise InputError(f"{joint.name}: the simulation diverges; check the values in the joint file")
-    drive, rows[:, 4], rows[:, 2] = (
-        _late(model, place, time, channel)
-        for place, channel in (("drive", drive), ("torque_sensor", rows[:, 4]), ("link_position_sensor", rows[:, 2]))
-    )  # fmt: skip
-    return _read_off(model, joint, time, drive, rows, warm, rng)
+    return _read_off(model, joint, time, _late_drive(model, time, drive), rows, warm, rng)
 
 
-def _late(model: JointModel, place: str, time: FloatArray, channel: FloatArray) -> FloatArray:
-    """A channel as a late logger writes it: the simulation itself knows no rate of a reading."""
+def _late_drive(model: JointModel, time: FloatArray, drive: FloatArray) -> FloatArray:
+    """The drive as a late logger writes it; delays of the sensors are in the model's readings already."""
     values = dict(zip(model.parameter_names, model.value_vector(), strict=True))
-    late = sum(values[n] for t in model.terms if t.effect.key == "channel_delay" and t.place == place for n in t.names)
-    return np.interp(time - late, time, channel) if late else channel
+    late = sum(values[n] for t in model.terms if t.effect.key == "channel_delay" and t.place == "drive" for n in t.names)
+    return np.interp(time - late, time, drive) if late else drive
 
 
 def _read_off(
