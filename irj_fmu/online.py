@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Final, final
+from typing import TYPE_CHECKING, Final, final
 
 import numpy as np
 import numpy.typing as npt
@@ -152,11 +152,6 @@ class OnlineEstimator:
             scale_limits(self.detector, factor / self._margin)
             self._margin = factor
 
-    @property
-    def delay(self) -> float:
-        """Age of the newest row [s]."""
-        return self.rows.timing.delay
-
     def update(self, time: float, readings: Sequence[float], valid: Sequence[bool], *, enable: bool = True) -> bool:
         """Take one sample.
 
@@ -278,7 +273,8 @@ class OnlineEstimator:
     def _weights(self) -> FloatArray:
         """Rows at a reversal count less: there friction may take any value between its limits."""
         size = np.maximum(np.maximum(self.floor, np.sqrt(self._square)), 1e-12)
-        return self._weight_of(self._shares()[None], self.theta, size)[0]
+        found: FloatArray = self._weight_of(self._shares()[None], self.theta, size)[0]
+        return found
 
     def _weight_of(self, shares: FloatArray, theta: FloatArray, size: FloatArray) -> FloatArray:
         """Weights (rows, balances) from the shares (rows, 2) and the size of the residuals (balances,)."""
@@ -387,10 +383,8 @@ class OnlineEstimator:
         plain, arrays, parts = unpack(state)
         if arrays["theta"].shape != self.theta.shape or arrays["_buffer"].shape != self._buffer.shape:
             raise InputError("restore: the state is of another joint or sample time; give one of this estimator")
-        for name in _PLAIN:
-            setattr(self, name, plain[name])
-        for name in _ARRAYS:
-            setattr(self, name, arrays[name])
+        for name in (*_PLAIN, *_ARRAYS):
+            setattr(self, name, plain[name] if name in plain else arrays[name])
         self.watch.load(arrays["watch"])
         self._collected = list(zip(arrays["y"], arrays["h"], arrays["shares"], strict=True)) if "y" in arrays else []
         self.rows.load([arrays[f"row{i}"] for i in range(len(self.rows.numbers()))])

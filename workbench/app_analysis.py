@@ -289,7 +289,8 @@ class Analysis:
         key = label.partition("@")[0].partition("#")[0] if label else None
         entry = StepEntry(
             action, tuple(now.model.effects), {k: float(v) for k, v in now.values.items()}, clean(train.as_json()), clean(held.as_json()),
-            key, label, EFFECTS[key].title if key in EFFECTS else None, now.model.virtual_work, self.whole, round(time.perf_counter() - began, 3),
+            key, label, EFFECTS[key].title if key is not None and key in EFFECTS else None, now.model.virtual_work, self.whole,
+            round(time.perf_counter() - began, 3),
         )  # fmt: skip
         if data is self.data:
             self._solved[_mark(entry)] = now

@@ -56,7 +56,7 @@ def _record(seed: int) -> bytes:
     model = build("hd3", GEAR_RATIO, effects=labels)
     names = set(model.parameter_names)
     model = model.with_values({k: v for k, v in VALUES.items() if k in names})
-    time = np.arange(round(DURATION / DT)) * DT
+    time: npt.NDArray[np.float64] = np.arange(round(DURATION / DT)).astype(np.float64) * DT
     run = Follower(model, DT, controller=Controller(25.0, 0.9)).run(_triangle(time, seed))
     rng = np.random.default_rng(seed + 100)
     step_motor, step_link = 2 * np.pi / 9000, 2 * np.pi / 100_000

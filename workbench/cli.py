@@ -43,6 +43,7 @@ def _parser() -> argparse.ArgumentParser:
 
     demo = verb("demo", "loop", "the main job on embedded data: a simulated joint with a hidden effect")
     demo.add_argument("--report", default="irj-demo.html", metavar="FILE", help="where the report goes (default irj-demo.html)")
+    demo.add_argument("--picture", metavar="FILE.svg", help="draw the falling error and the place of the residual")
     checked = verb("check", "records", "check records before a fit", records=True)
     checked.add_argument("--joint", metavar="J", help="joint file: column map and gear ratio")
     fitted = verb("fit", "loop", "fit the joint's model", records=True, joint=True)
@@ -54,6 +55,7 @@ def _parser() -> argparse.ArgumentParser:
     improved = verb("improve", "loop", "name what is missing, add it, watch the error fall", records=True, joint=True)
     improved.add_argument("--held-out", nargs="+", metavar="REC", default=[], help="records the fit must not see")
     improved.add_argument("--report", metavar="FILE", help="write the HTML report")
+    improved.add_argument("--picture", metavar="FILE.svg", help="draw the falling error and the place of the residual")
     improved.add_argument("-o", "--output", metavar="FILE", help="write the improved joint file")
     improved.add_argument("--max-steps", type=int, default=6, help="most effects to add (default 6)")
     report = verb("report", "loop", "the improve loop, written as one HTML file", records=True, joint=True)

@@ -54,7 +54,7 @@ def needed(record: Record, joint: Joint | None) -> tuple[str, ...]:
     return ("motor_current",)
 
 
-OUTPUTS: Final = ("json", "output", "report", "truth")
+OUTPUTS: Final = ("json", "output", "report", "truth", "picture")
 
 
 def check_outputs(arguments: Namespace) -> None:

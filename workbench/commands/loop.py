@@ -37,6 +37,7 @@ def run_improve(arguments: Namespace) -> int:
     data, found, records = improve_files(arguments.records, arguments.held_out, arguments.joint, max_additions=arguments.max_steps)
     _print_improvement(found)
     _write_improvement(found, records, arguments.report, arguments.output, arguments.command)
+    _write_picture(found, arguments.picture)
     write_json(arguments.json, data)
     return 0
 
@@ -58,6 +59,7 @@ def run_demo(arguments: Namespace) -> int:
         data, found, records = improve_files([names["train.npz"]], [names["held_out.npz"]], names["joint.toml"])
     _print_improvement(found)
     _write_improvement(found, records, arguments.report, None, arguments.command)
+    _write_picture(found, arguments.picture)
     write_json(arguments.json, data)
     return 0
 
@@ -70,6 +72,14 @@ def _write_improvement(found: Improvement, records: Sequence[Record], report: st
     if output:
         write_text(output, joint_text(found.joint, found.steps[-1].solution, found.data))
         print(f"joint file: {output}")
+
+
+def _write_picture(found: Improvement, path: str | None) -> None:
+    if path:
+        from workbench.picture import improvement_picture
+
+        write_text(path, improvement_picture(found))
+        print(f"picture: {path}")
 
 
 def _print_improvement(found: Improvement) -> None:

@@ -1,0 +1,52 @@
+"""A small cut of the hidden-effect campaign (the whole: python -m tests.hidden_effect.campaign)."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.hidden_effect.generator import generate_case
+from tests.hidden_effect.scoring import score
+from workbench.cli import improve_json
+
+pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="the generator's C integrator needs gcc")
+
+
+def judged(folder: Path, effect: str | None, seed: int, **options: Any) -> tuple[Any, dict[str, Any]]:
+    generate_case(effect, seed, folder=folder, **options)
+    train, held = ([folder / f"{n}{i}.csv" for i in ("", "2")] for n in ("train", "test"))
+    result = improve_json(train, held, folder / "joint.toml")
+    return score(json.loads((folder / "truth.json").read_text()), result), result
+
+
+@pytest.mark.parametrize(
+    ("effect", "options"),
+    [
+        ("stribeck", {}), ("cubic_stiffness", {"dirt": True}), ("load_dependent_friction", {}), ("hysteresis", {}),
+        ("torque_sensor_offset", {}), ("added_spring", {"size": 0.2}), ("torque_ripple", {}), ("asymmetric_viscous", {"dirt": True}),
+    ],
+)  # fmt: skip
+def test_hidden_effect_is_in_the_set_and_nothing_else_is_claimed(tmp_path: Path, effect: str, options: dict[str, Any]) -> None:
+    found, result = judged(tmp_path, effect, 4001, **options)
+    assert found.in_set == 1, result["claims"]
+    assert found.extra == 0, result["claims"]
+    assert result["ranking"][0]["effect"] in {n for c in result["claims"] for n in c["effects"]}
+
+
+@pytest.mark.parametrize(("seed", "dirt"), [(4002, False), (4003, False), (4004, True)])
+def test_nothing_is_claimed_where_nothing_is_hidden(tmp_path: Path, seed: int, dirt: bool) -> None:
+    _, result = judged(tmp_path, None, seed, dirt=dirt)
+    assert result["claims"] == []
+
+
+@pytest.mark.parametrize("kind", ["local_bump", "odd_order"])
+def test_what_is_outside_the_library_is_located_and_not_named(tmp_path: Path, kind: str) -> None:
+    found, result = judged(tmp_path, kind, 4005)
+    assert result["claims"] == []
+    assert result["verdict"] == "unexplained"
+    assert found.balance_right
+    assert found.axis_right
