@@ -34,12 +34,13 @@ Potential = Law
 Rate = Callable[[tuple[Expression, ...], LocalSignals, SimpleNamespace], tuple[Expression, ...]]
 Update = Callable[[tuple[Expression, ...], Expression, LocalSignals, SimpleNamespace], tuple[Expression, ...]]
 
+# the side the values are referred to, not the place where the effect acts: the name says that
 PLACE_SIDE: Final[dict[str, Side]] = {
-    "motor": "motor",
+    "motor": "link",
     "link": "link",
-    "transmission": "gear",
-    "torsion": "gear",
-    "drive": "motor",
+    "transmission": "link",
+    "torsion": "link",
+    "drive": "link",
     "torque_sensor": "sensor",
     "motor_position_sensor": "sensor",
     "link_position_sensor": "sensor",

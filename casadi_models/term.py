@@ -15,7 +15,7 @@ from .signals import Expression
 INERTIAS: Final = {
     "motor_inertia": Parameter(
         "motor_inertia", "kg.m2", 1.0, 1e-12, math.inf,
-        "inertia of rotor and wave generator, times the ratio squared", "motor",
+        "inertia of rotor and wave generator, times the ratio squared", "link",
     ),
     "link_inertia": Parameter(
         "link_inertia", "kg.m2", 1.0, 1e-12, math.inf, "inertia of the link with its payload", "link"
@@ -62,6 +62,6 @@ def smoothing(place: str) -> Parameter:
     return Parameter(
         f"{place}_smoothing_velocity", "rad/s", 1e-3, 1e-9, math.inf,
         f"velocity over which {place}-side friction changes its sign (nuisance)",
-        "motor" if place == "motor" else "link",
+        "link",
         grid=(0.0003, 0.001, 0.003, 0.01, 0.03), scale="velocity",
     )  # fmt: skip

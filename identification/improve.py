@@ -19,6 +19,7 @@ from identification.lines import Line, find_lines
 from identification.locate import Unexplained, locate
 from identification.parameters import parameter_table
 from identification.record import Record
+from identification.weak import kernel
 
 MAX_ADDITIONS: Final = 6
 RATIO_LIMIT: Final = 1.5
@@ -207,6 +208,9 @@ class _Loop:
         steps = [self._step(None, None, solve(model, self.data))]
         claims: list[Claim] = []
         self.progress("ranking the library", 0.15)
+        why = not_identifiable(self.data)
+        if why:
+            return self._without_answer(steps, why)
         base = make_base(steps[-1].solution, self.data)
         first = ranking = rank(base)
         late = False
@@ -242,6 +246,14 @@ class _Loop:
             base = make_base(steps[-1].solution, self.data)
             ranking = rank(base)
         return self._finish(first, ranking, base, claims, steps)
+
+    def _without_answer(self, steps: list[Step], why: str) -> Improvement:
+        """The records cannot carry the question: the start model and the reason."""
+        ratios = dict(steps[0].held_out.balances)
+        return Improvement(
+            self.joint, self.data, tuple(steps), (), (), None, (), (), "not_identifiable", why, ratios, (),
+            excitation_warnings(self.data), (),
+        )  # fmt: skip
 
     def _confirmed(self, ranking: Ranking, base: Base, now: Step) -> Ranking:
         """A candidate that fails on held-out records in its linear form only is judged by a whole fit."""
@@ -400,6 +412,22 @@ def _verdict(
     if claims:
         return "complete", f"Missing: {names}; with it {fall}, and what is left looks like measurement noise."
     return "nothing_missing", "The model explains the records down to their measurement noise: nothing is missing that these records could show."
+
+
+def not_identifiable(data: Dataset) -> str:
+    """Why the training records cannot show what is missing; empty where they can."""
+    import numpy as np
+
+    speed = np.concatenate([w.smooth["motor_velocity"] for w in data.train])
+    top = float(np.quantile(np.abs(speed), 0.99))
+    grid = data.train[0].grid
+    still = 5 * data.noise.get("motor_position", 0.0) * float(np.linalg.norm(kernel(grid.pointwise, grid.dt, 1)))
+    if top <= still:
+        return "The joint does not move in the training records: record a motion with reversals at several speeds."
+    moving = np.sign(speed[np.abs(speed) > 0.02 * top])
+    if not np.any(moving > 0) or not np.any(moving < 0):
+        return "The motor never reverses in the training records: friction cannot be told from offsets; record reversals."
+    return ""
 
 
 def excitation_warnings(data: Dataset) -> tuple[str, ...]:

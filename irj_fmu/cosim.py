@@ -218,12 +218,9 @@ def _rows(plant: Joint, names: Sequence[str], found: Trajectory) -> list[Row]:
         if n in joined[1:] or n not in true:
             continue
         group = joined if n in joined else (n,)
-        rows.append(
-            Row(
-                plant.name, " - ".join(group), units[n], _difference(true, group), _difference(last, group),
-                min(spread[g] for g in group), _limit(n),
-            )
-        )  # fmt: skip
+        value = _difference(true, group)
+        limit = _limit(n) if value else None
+        rows.append(Row(plant.name, " - ".join(group), units[n], value, _difference(last, group), min(spread[g] for g in group), limit))
     return rows
 
 

@@ -245,7 +245,7 @@ class Estimator(TableSlave):
         score = at["fault_score[1]"]
         values[score : score + 6] = estimator.score
         values[at["n_rows"]] = estimator.made
-        values[at["alarm"]] = estimator.alarm
+        values[at["alarm"]] = estimator.estimator is not None and estimator.estimator.alarm
         for text in estimator.events[self._told :]:
             self._report(text)
         self._told = len(estimator.events)

@@ -141,11 +141,6 @@ class OnlineEstimator:
         """Rows so far."""
         return self._rows
 
-    @property
-    def alarm(self) -> bool:
-        """True while the recursion follows a change."""
-        return self.estimator is not None and self.estimator.alarm
-
     def set_fault_margin(self, factor: float) -> None:
         """Multiply the fault detector's limits."""
         if self.detector is not None and factor != self._margin:
@@ -263,6 +258,8 @@ class OnlineEstimator:
         for b in range(len(on)):
             self.estimator.enable(b, bool(on[b]))
         self.theta = self.estimator.update(y * weight, h * weight[:, None])
+        noise = self.estimator._ready("noise").part("fast", "noise")
+        np.maximum(noise, self._least() ** 2, out=noise)
         return True
 
     def _shares(self) -> FloatArray:
@@ -337,8 +334,13 @@ class OnlineEstimator:
         self._ratios()
 
     def _ratios(self) -> None:
-        least = self.options.floor_share * np.sqrt(self._torque)
-        self.ratio = np.sqrt(self._square) / np.maximum(np.maximum(self.floor, least), 1e-12)
+        self.ratio = np.sqrt(self._square) / self._least()
+
+    def _least(self) -> FloatArray:
+        """What counts as noise at least: the floor, and a share of the torque balanced [N.m]."""
+        share = self.options.floor_share * np.sqrt(self._torque)
+        found: FloatArray = np.maximum(np.maximum(self.floor, share), 1e-12)
+        return found
 
     def _judge(self, good: list[bool]) -> None:
         """The most severe fault now, and the scores."""

@@ -236,6 +236,8 @@ class RowMaker:
         columns = np.array(self._place).T
         self._index, self._flat = columns[0], columns[1] * len(SOURCES) + columns[2]
         self._speeds = [_NAMES.index("motor_velocity"), _NAMES.index("link_velocity")]
+        smooth = dict(zip(self.model.parameter_names, self.model.value_vector(), strict=True))
+        self._sharp = [2 * min(smooth.get(f"{place}_smoothing_velocity", 0.0), _SHARP) for place in ("motor", "link")]
         self._velocity_gain = float(np.linalg.norm(kernel(t.pointwise, t.dt, 1)))
 
     def _slope_function(self, expressions: Mapping[str, Any], signals: Any, p: Any) -> Any:
@@ -310,9 +312,8 @@ class RowMaker:
         """Share of the kernel in which a side stands still or turns round, as far as its noise lets one see."""
         if not self.needed:
             return 0.0
-        values = dict(zip(self.model.parameter_names, self.model.value_vector(), strict=True))
-        slow = max(3 * noise * self._velocity_gain, 2 * min(values.get(f"{place}_smoothing_velocity", 0.0), _SHARP))
-        speed = self._speed[:, 0 if place == "motor" else 1]
+        side = 0 if place == "motor" else 1
+        slow, speed = max(3 * noise * self._velocity_gain, self._sharp[side]), self._speed[:, side]
         still = np.abs(speed) < slow
         still[1:] |= speed[1:] * speed[:-1] < 0
         return float(self._weights @ still)

@@ -214,9 +214,9 @@ def test_units_of_a_linear_axis() -> None:
 def test_parameters_say_their_side() -> None:
     model = model_ts()
     sides = {p.name: p.side for p in model.parameters}
-    assert sides["motor_coulomb"] == "motor"
-    assert sides["link_viscous"] == "link"
-    assert sides["stiffness"] == "gear"
+    # the side a value is referred to: everything but a sensor's own error is link-referred
+    assert set(sides.values()) == {"link"}
+    assert {p.side for p in model_ts().add("torque_sensor_gain").parameters} == {"link", "sensor"}
     assert all(p.meaning and p.unit for p in model.parameters)
 
 

@@ -112,6 +112,14 @@ def test_demo_writes_its_report_into_the_current_folder(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["irj-demo.html"]
 
 
+def test_report_keeps_a_part_of_the_record_back_and_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    target, result = tmp_path / "page.html", tmp_path / "r.json"
+    assert main(["report", str(DEMO / "train.npz"), "--joint", str(DEMO / "joint.toml"), "-o", str(target), "--json", str(result)]) == 0
+    assert "irj report " in target.read_text()
+    assert "the last 30 % of each training record" in data(tmp_path, "r.json")["records"]["note"]
+    assert str(target) in capsys.readouterr().out
+
+
 def test_improved_joint_file_is_a_joint_file_with_the_true_values(demo: Path, capsys: pytest.CaptureFixture[str]) -> None:
     better = load_joint(demo / "better.toml")
     assert f"{HIDDEN}@motor" in better.effects
@@ -137,7 +145,7 @@ def test_fit_prints_values_with_errors_and_writes_a_joint_file(tmp_path: Path, c
     assert f"relative error {found['train']['relative_error_percent']:.3f} %" in text
     stiffness = next(line for line in text.splitlines() if line.split()[:1] == ["stiffness"])
     assert "+-" in stiffness
-    assert "N.m/rad (gear side)" in stiffness
+    assert "N.m/rad (gear)" in stiffness
     assert load_joint(target).fitted["stiffness"] == pytest.approx(found["parameters"]["stiffness"]["value"], rel=1e-9)
     assert "warnings" in found
 

@@ -12,6 +12,6 @@ def run_app(arguments: Namespace) -> int:
     try:
         from workbench.app import serve
     except ImportError as error:
-        raise InputError(f"the page needs {error.name}; install it with: pip install 'irj[app]'") from None
+        raise InputError(f"the page needs {(error.name or 'starlette').partition('.')[0]}; install it with: pip install 'irj[app]'") from None
     serve(arguments.files, arguments.port, not arguments.no_browser)
     return 0
