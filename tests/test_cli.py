@@ -145,7 +145,7 @@ def test_fit_prints_values_with_errors_and_writes_a_joint_file(tmp_path: Path, c
     assert f"relative error {found['train']['relative_error_percent']:.3f} %" in text
     stiffness = next(line for line in text.splitlines() if line.split()[:1] == ["stiffness"])
     assert "+-" in stiffness
-    assert "N.m/rad (gear)" in stiffness
+    assert "N.m/rad (link side)" in stiffness
     assert load_joint(target).fitted["stiffness"] == pytest.approx(found["parameters"]["stiffness"]["value"], rel=1e-9)
     assert "warnings" in found
 

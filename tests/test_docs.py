@@ -55,7 +55,7 @@ def test_figures_of_the_guide_are_what_fit_compare_and_diagnose_print() -> None:
     guide = " ".join((ROOT / "docs" / "guide.md").read_text(encoding="utf-8").split())
     train, held_out, joint = str(DEMO / "train.npz"), str(DEMO / "held_out.npz"), str(DEMO / "joint.toml")
     fitted = run("fit", train, "--joint", joint)
-    values = {line.split()[0]: float(line.split()[1]) for line in fitted.splitlines() if "+-" in line and "values" not in line}
+    values = {name: float(value) for name, value in re.findall(r"^  (\w+) +(\S+) \+- \S+ ", fitted, re.MULTILINE) if name != "value"}
     coulomb, viscous = re.findall(r"comes out at (\S+) Nm and the viscous coefficient at (\S+) Nms/rad", guide)[0]
     assert values["motor_coulomb"] == pytest.approx(float(coulomb), rel=0.03)
     assert values["motor_viscous"] == pytest.approx(float(viscous), rel=0.03)

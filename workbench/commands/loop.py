@@ -126,13 +126,13 @@ def run_fit(arguments: Namespace) -> int:
 
 
 def _print_parameters(parameters: Mapping[str, Mapping[str, Any]]) -> None:
-    print("  values referred to the link, +- standard error, in brackets the part of the joint they belong to")
+    print("  value +- standard error, in brackets the side it is referred to")
     for name, p in parameters.items():
         if p["nuisance"]:
             continue
         error = f" +- {p['stderr']:.2g}" if p["stderr"] is not None else ""
         flags = "".join([" at its bound" * bool(p["at_bound"]), " not identifiable" * (not p["identifiable"])])
-        print(f"  {name:<28} {p['value']:.6g}{error} {p['unit']} ({p['side']}){flags}")
+        print(f"  {name:<28} {p['value']:.6g}{error} {p['unit']} ({p['side']} side){flags}")
 
 
 def run_compare(arguments: Namespace) -> int:

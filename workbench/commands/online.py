@@ -139,9 +139,10 @@ def _result(
 
 
 def _print_track(result: dict[str, Any]) -> None:
-    print(f"{result['record']}: {len(result['parameters'])} parameters followed: last value +- standard deviation, referred to the link, and the first value")
+    print(f"{result['record']}: {len(result['parameters'])} parameters followed")
+    print("  last value +- standard deviation, in brackets the side it is referred to, and the first value")
     for name, p in result["parameters"].items():
-        print(f"  {name:<28} {p['value']:.6g} +- {p['sigma']:.2g} {p['unit']} ({p['side']}), first {p['history'][0]:.6g}")
+        print(f"  {name:<28} {p['value']:.6g} +- {p['sigma']:.2g} {p['unit']} ({p['side']} side), first {p['history'][0]:.6g}")
     print("  residual over floor: " + ", ".join(f"{b} {r:.3g}" for b, r in result["ratio"].items()))
     if not result["detector"]:
         print("  sensor faults were not looked for: that needs an elastic joint file with fitted values (`irj fit -o`)")
