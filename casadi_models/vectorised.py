@@ -1,7 +1,7 @@
 """Evaluate a CasADi SX function on many points at once by running its instructions on numpy arrays.
 
 The same expression graph, another interpreter: one numpy operation per instruction in place of one
-virtual-machine step per instruction and point. Measured by `benchmarks/vectorised.py`.
+virtual-machine step per instruction and point.
 """
 
 from __future__ import annotations

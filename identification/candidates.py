@@ -24,9 +24,6 @@ IntArray = npt.NDArray[np.int64]
 FOLDS: Final = 4
 FEW_BLOCKS: Final = 32
 """Below this many blocks up to ten folds are used, so that no fold takes a whole kind of motion away."""
-OTHER_FORMS: Final = frozenset({"smooth_stribeck"})
-"""Second forms of an effect that is tried already."""
-
 DISPLACEMENT: Final = frozenset({"hysteresis", "backlash", "soft_windup"})
 """Laws of a displacement that also make sense on the position of an axis without gear."""
 
@@ -102,7 +99,7 @@ def offered(model: JointModel, data: Dataset, *, late: bool = False) -> tuple[li
     one_sided = sensing.one_sided
     direct = one_sided and not sensing.both_positions and abs(data.joint.gear_ratio) == 1.0
     for effect in EFFECTS.values():
-        if effect.key in OTHER_FORMS or (effect.key in LATE and not late):
+        if not effect.candidate or (effect.key in LATE and not late):
             continue
         why = _why_not(effect, model, data)
         if why:
