@@ -6,6 +6,7 @@ diagnosis candidate, FMU variable, row of the documentation) follows from it.
 
 from __future__ import annotations
 
+import difflib
 import importlib
 import importlib.util
 import pkgutil
@@ -158,12 +159,15 @@ class Registry(Mapping[str, Effect]):
 
     def __init__(self) -> None:
         self._effects: dict[str, Effect] = {}
+        self._loaded: dict[Path, tuple[str, ...]] = {}
 
     def __getitem__(self, key: str) -> Effect:
         try:
             return self._effects[key]
         except KeyError:
-            raise KeyError(f"unknown effect {key!r}; known: {', '.join(sorted(self._effects))}") from None
+            near = difflib.get_close_matches(str(key), self._effects, 1)
+            hint = f" (did you mean {near[0]!r}?)" if near else ""
+            raise KeyError(f"unknown effect {key!r}{hint}; known: {', '.join(sorted(self._effects))}") from None
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._effects)
@@ -178,13 +182,25 @@ class Registry(Mapping[str, Effect]):
         self._effects[effect.key] = effect
 
     def load(self, path: Path) -> tuple[str, ...]:
-        """Run a user's Python file that declares effects; returns the new keys."""
-        before = set(self._effects)
+        """Run a user's Python file that declares effects; returns its keys.
+
+        A file that is loaded again replaces what it declared before; one that fails leaves nothing behind.
+        """
+        where = path.resolve()
         spec = importlib.util.spec_from_file_location(f"irj_user_effects_{path.stem}", path)
         if spec is None or spec.loader is None:
             raise ValueError(f"{path}: not a Python file")
-        spec.loader.exec_module(importlib.util.module_from_spec(spec))
-        return tuple(sorted(set(self._effects) - before))
+        kept = dict(self._effects)
+        for key in self._loaded.get(where, ()):
+            del self._effects[key]
+        before = set(self._effects)
+        try:
+            spec.loader.exec_module(importlib.util.module_from_spec(spec))
+        except BaseException:
+            self._effects = kept
+            raise
+        self._loaded[where] = tuple(sorted(set(self._effects) - before))
+        return self._loaded[where]
 
 
 EFFECTS: Final = Registry()

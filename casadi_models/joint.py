@@ -133,6 +133,11 @@ class JointModel:
         return self.has("transmission_compliance")
 
     @property
+    def structure(self) -> tuple[object, ...]:
+        """All that shapes the equations, without the values: equal for models that differ in values only."""
+        return (self.gear_ratio, self.terms, self.inertias, self.kind, self.virtual_work, self.load_from, self.clamped_link)
+
+    @property
     def effects(self) -> tuple[str, ...]:
         """Labels of the effects in the model."""
         return tuple(t.label for t in self.terms)

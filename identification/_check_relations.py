@@ -9,6 +9,7 @@ import numpy as np
 
 from identification._check_channels import quantum, span
 from identification._finding import Finding
+from identification.noise import noise_level
 
 if TYPE_CHECKING:
     from identification.record import FloatArray, Record
@@ -18,6 +19,8 @@ _CORRELATION: Final = 0.9
 _RATIO_TOLERANCE: Final = 0.02
 _VELOCITY_TOLERANCE: Final = 0.05
 _LONGEST: Final = 1 << 18
+_STILL: Final = 12.0
+"""Span of a position, in noise levels, below which it stands still."""
 
 _FACTORS: Final = (
     (180.0 / math.pi, "degrees were taken for radians in the position, or radians for degrees in the velocity"),
@@ -47,8 +50,9 @@ def check_motion(record: Record) -> list[Finding]:
         position = _integral(record, record[channel])
     side = channel.partition("_")[0]
     whole = span(position)
-    if whole == 0.0 or not math.isfinite(whole):
-        return [Finding("refuse", "no_motion", f"{record.name}: {channel} shows no motion: move the joint", channel)]
+    still = max(_STILL * noise_level(position, tuple(record.segments())), 3.0 * (quantum(position) or 0.0))
+    if whole <= still or not math.isfinite(whole):
+        return [Finding("refuse", "no_motion", f"{record.name}: {channel} does not move: record a motion with reversals", channel)]
     forth = back = 0.0
     for part in record.segments():
         piece = position[part]

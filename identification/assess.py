@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from casadi_models import JointModel
-from identification.balances import Balances
+from identification.balances import balances_of
 from identification.engine import Dataset, floors, references, rms, row_weights, stack
 from identification.weak import WeakRecord
 
@@ -78,7 +78,7 @@ class Error:
 
 def assess(model: JointModel, data: Dataset, records: Sequence[WeakRecord], values: Mapping[str, float]) -> Error:
     """Error of a model with the given values on prepared records."""
-    balances = Balances(model, data.sensing, wrt=())
+    balances = balances_of(model, data.sensing, wrt=())
     residual = stack(balances, records, values).residual
     measured = references(data, records)
     floor = floors(model, data, values)

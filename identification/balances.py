@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from typing import Any, Final, final
 
@@ -67,9 +69,11 @@ class Balances:
     sensing : Sensing
     wrt : sequence of str, optional
         Parameters whose Jacobian columns are wanted; all by default.
+    columns_only : bool
+        The residual itself is not wanted and reads zero.
     """
 
-    def __init__(self, model: JointModel, sensing: Sensing, wrt: Sequence[str] | None = None) -> None:
+    def __init__(self, model: JointModel, sensing: Sensing, wrt: Sequence[str] | None = None, *, columns_only: bool = False) -> None:
         self.model = model
         self.sensing = sensing
         self.names: tuple[str, ...] = model.parameter_names
@@ -81,7 +85,7 @@ class Balances:
         columns = [self.names.index(n) for n in self.wrt]
         stacked: list[Expression] = []
         for r in expressions.values():
-            stacked += [r, *(ca.vertsplit(ca.jacobian(r, parameters)[:, columns].T) if columns else [])]
+            stacked += [ca.SX(1, 1) if columns_only else r, *(ca.vertsplit(ca.jacobian(r, parameters)[:, columns].T) if columns else [])]
         out: Any = ca.vertcat(*stacked)
         self.balances = tuple(expressions)
         slopes = ca.jacobian(out, signals)
@@ -108,7 +112,8 @@ class Balances:
         own = [expressions[b] for b in self.balances]
         sources = ca.vertcat(*(signals[_NAMES.index(n)] for n in _DIRECT))
         self._slopes = ca.Function("slopes", [signals, e.memory, parameters], [ca.densify(ca.jacobian(ca.vertcat(*own), sources))])
-        self._memory = Memory(model) if e.memory_terms else None
+        remembers = bool(e.memory_terms) and ca.jacobian_sparsity(rest, e.memory).nnz() > 0
+        self._memory = Memory(model) if remembers else None
         self._size = out.shape[0]
 
     def point_values(self, data: WeakRecord, values: Mapping[str, float]) -> FloatArray:
@@ -178,6 +183,25 @@ class Balances:
                     if n not in out[b] and size > 0:
                         out[b][n] = size * (np.sign(float(np.mean(cube[i, :, k]))) or 1.0)
         return out
+
+
+_KEPT: Final = 96
+"""Compiled balances that a thread keeps."""
+
+_kept = threading.local()
+
+
+def balances_of(model: JointModel, sensing: Sensing, wrt: Sequence[str] | None = None, *, columns_only: bool = False) -> Balances:
+    """:class:`Balances` of a model whatever its values, built once per thread and structure."""
+    key = (model.structure, sensing, None if wrt is None else tuple(wrt), columns_only)
+    cache: OrderedDict[object, Balances] = _kept.__dict__.setdefault("balances", OrderedDict())
+    if key in cache:
+        cache.move_to_end(key)
+        return cache[key]
+    made = cache[key] = Balances(model, sensing, wrt, columns_only=columns_only)
+    while len(cache) > _KEPT:
+        cache.popitem(last=False)
+    return made
 
 
 @final

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from casadi_models import EFFECTS, Effect, JointModel
 from casadi_models.effect import Place
-from identification.balances import Balances
+from identification.balances import Balances, balances_of
 from identification.engine import Dataset, Solution, Stacked, row_weights, stack
 from identification.sensing import Sensing
 from identification.weak import WeakRecord
@@ -228,7 +228,7 @@ def make_base(solution: Solution, data: Dataset) -> Base:
     """Evaluate and project the base model on training and held-out rows."""
     model = solution.model
     free = [n for n in solution.free if n not in solution.at_bound or n.endswith("_smoothing_velocity")]
-    balances = Balances(model, data.sensing, wrt=free)
+    balances = balances_of(model, data.sensing, wrt=free)
     train = stack(balances, data.train, solution.values)
     r, j, block, balance = flatten(train, balances.balances)
     weight = np.concatenate([solution.weights[b] for b in balances.balances])
@@ -345,7 +345,7 @@ def try_candidate(candidate: Candidate, base: Base) -> Trial | NotTestable | Non
     Trial, NotTestable (columns inside the base), or None (no column at all, or an unphysical sign).
     """
     data = base.data
-    balances = Balances(candidate.model, data.sensing, wrt=candidate.amplitudes)
+    balances = balances_of(candidate.model, data.sensing, wrt=candidate.amplitudes, columns_only=True)
     best: tuple[float, dict[str, float], FloatArray] | None = None
     inside = 0.0
     lows = np.array([{p.name: p for p in candidate.model.parameters}[n].low for n in candidate.amplitudes])
@@ -506,7 +506,7 @@ def _held_out_drop(
 
 def _wald(full: FloatArray, base: Base, delta: FloatArray, p: int) -> float:
     """p-value of the amplitudes, scores clustered by block."""
-    from scipy.stats import f as f_distribution
+    from scipy.special import fdtrc
 
     c = full[:, p:-1]
     q = base.orthonormal
@@ -522,4 +522,4 @@ def _wald(full: FloatArray, base: Base, delta: FloatArray, p: int) -> float:
     covariance = inverse @ (scores.T @ scores) @ inverse * len(blocks) / (len(blocks) - 1)
     d = delta[p:][active]
     statistic = float(d @ np.linalg.pinv(covariance, rcond=1e-12) @ d) / len(active)
-    return float(f_distribution.sf(statistic, len(active), len(blocks) - len(active)))
+    return float(fdtrc(len(active), len(blocks) - len(active), statistic))

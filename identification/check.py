@@ -16,6 +16,7 @@ from identification._check_channels import (
     check_stuck,
 )
 from identification._check_relations import check_delay, check_motion, check_ratio, check_velocity, measured_ratio
+from identification._check_torque import check_torque
 from identification._check_time import check_sampling, check_size, check_stamps, gap_limit, gaps
 from identification._finding import SEVERITIES, Finding, rank
 from identification.errors import InputError
@@ -30,11 +31,13 @@ __all__ = ["SEVERITIES", "Finding", "check", "gate", "measured_ratio", "repair",
 SHORTEST_PIECE: Final = 8
 
 
-def check(record: Record, gear_ratio: float | None = None, needs: Sequence[str] = ()) -> tuple[Finding, ...]:
+def check(
+    record: Record, gear_ratio: float | None = None, needs: Sequence[str] = (), torque_per_current: float | None = None
+) -> tuple[Finding, ...]:
     """Check a record before it is used.
 
     Time (finite, increasing, repeated stamps, gaps, jitter, unit), channels (NaN, constant, stuck, saturated,
-    quantised) and their relations (motion, reversal, velocity against position, gear ratio, delay).
+    quantised) and their relations (motion, reversal, velocity against position, gear ratio, delay, link torque against drive).
 
     Parameters
     ----------
@@ -44,6 +47,8 @@ def check(record: Record, gear_ratio: float | None = None, needs: Sequence[str] 
         theta_motor / theta_link, signed; compared with what the positions show.
     needs : sequence of str
         Channels the model cannot do without.
+    torque_per_current : float, optional
+        Link-referred torque per current [N.m/A]; with it the link torque is compared with the drive.
 
     Returns
     -------
@@ -71,7 +76,10 @@ def check(record: Record, gear_ratio: float | None = None, needs: Sequence[str] 
         return rank(findings)
     findings += check_sampling(record)
     findings += check_constant(record, gear_ratio)
-    findings += check_motion(record)
+    motion = check_motion(record)
+    findings += motion
+    if any(finding.severity == "refuse" for finding in motion):
+        return rank(findings)
     usable = repair(record) if any(finding.severity == "repair" for finding in findings) else record
     if len(usable) >= 2:
         findings += check_stuck(record)
@@ -80,6 +88,8 @@ def check(record: Record, gear_ratio: float | None = None, needs: Sequence[str] 
         findings += check_velocity(usable, gear_ratio)
         findings += check_ratio(usable, gear_ratio)
         findings += check_delay(usable)
+        if not any(finding.severity == "refuse" for finding in findings):
+            findings += check_torque(usable, gear_ratio, torque_per_current)
     return rank(findings)
 
 
@@ -98,13 +108,13 @@ def require(findings: Sequence[Finding]) -> None:
 
 
 def gate(
-    record: Record, gear_ratio: float | None = None, needs: Sequence[str] = ()
+    record: Record, gear_ratio: float | None = None, needs: Sequence[str] = (), torque_per_current: float | None = None
 ) -> tuple[Record, tuple[Finding, ...]]:
     """Check a record, refuse what cannot be used, repair the rest.
 
     Parameters
     ----------
-    record, gear_ratio, needs
+    record, gear_ratio, needs, torque_per_current
         As in `check`.
 
     Returns
@@ -117,7 +127,7 @@ def gate(
     InputError
         If a finding refuses the record.
     """
-    findings = check(record, gear_ratio, needs)
+    findings = check(record, gear_ratio, needs, torque_per_current)
     require(findings)
     repaired = repair(record) if any(finding.severity == "repair" for finding in findings) else record
     return repaired, findings

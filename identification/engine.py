@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from casadi_models import JointModel
-from identification.balances import Balances
+from identification.balances import Balances, balances_of
 from identification.errors import InputError
 from identification.joint_file import Joint, Known
 from identification.noise import noise_level
@@ -24,6 +24,9 @@ IntArray = npt.NDArray[np.int64]
 
 CLAIM_KERNEL: Final = 0.06
 ONE_SIDED_KERNEL: Final = 0.2
+POINTWISE_KERNELS: Final = (0.01, 0.014, 0.02, 0.03)
+VELOCITY_NOISE: Final = 2e-3
+"""Noise of a pointwise velocity, as a share of the record's speed, that is small enough."""
 
 
 @final
@@ -101,13 +104,30 @@ def weak_record(record: Record, joint: Joint, sensing: Sensing, length: float, f
     if inside.any() and np.ptp(steps[inside]) > 0.02 * float(np.median(steps[inside])):
         record = record.resampled()
     length = max(length, 8 * record.dt)
+    signals, segments = signals_of(record, joint, sensing), tuple(record.segments())
+    longest = length / 2 if length <= CLAIM_KERNEL else 0.06
     made = prepare(
-        record.time, signals_of(record, joint, sensing), tuple(record.segments()), length=length,
-        pointwise=max(length / 2 if length <= CLAIM_KERNEL else 0.06, 6 * record.dt), first_block=first_block,
+        record.time, signals, segments, length=length, first_block=first_block,
+        pointwise={c: pointwise_kernel(x, segments, record.dt, longest) for c, x in signals.items() if c in POSITION_CHAINS},
     )  # fmt: skip
     if made.rows < 8:
         raise InputError(f"{record.name}: {len(record)} samples in {record.duration:.3g} s are too few for a kernel of {length:.3g} s; give a longer record")
     return made
+
+
+def pointwise_kernel(position: FloatArray, segments: tuple[slice, ...], dt: float, longest: float) -> float:
+    """Shortest kernel whose velocity noise does not matter beside the velocities of the record [s].
+
+    A long kernel rounds off reversals, and the laws of friction at low speed then fit the rounding.
+    """
+    lag = max(1, round(POINTWISE_KERNELS[-1] / dt))
+    change = np.concatenate([np.abs(position[s][lag:] - position[s][:-lag]) for s in segments if s.stop - s.start > lag] or [np.zeros(1)])
+    fast = float(np.quantile(change, 0.99)) / (lag * dt)
+    noise = noise_level(position, segments)
+    for length in POINTWISE_KERNELS:
+        if 6 * dt <= length < longest and noise * float(np.linalg.norm(kernel(length, dt, 1))) <= VELOCITY_NOISE * fast:
+            return length
+    return max(longest, 6 * dt)
 
 
 def _ranges(data: Sequence[WeakRecord], clamped: bool) -> dict[str, float]:
@@ -123,7 +143,7 @@ def _ranges(data: Sequence[WeakRecord], clamped: bool) -> dict[str, float]:
 
 def floors(model: JointModel, data: Dataset, values: Mapping[str, float], kernel_data: WeakRecord | None = None) -> dict[str, float]:
     """RMS that measurement noise alone would leave in each balance."""
-    balances = Balances(model, data.sensing, wrt=())
+    balances = balances_of(model, data.sensing, wrt=())
     grid = (kernel_data or data.train[0]).grid
     out = {}
     for balance, entering in balances.coefficients(values, kernel_data or data.train[0]).items():
@@ -245,7 +265,7 @@ def row_weights(
     """1/sigma of each row: rows that hang on where exactly friction changes its sign count less."""
     names = [n for n in balances.names if n.endswith("_smoothing_velocity")]
     doubled = {**values, **{n: 2 * values[n] for n in names}}
-    bare = Balances(balances.model, data.sensing, wrt=())
+    bare = balances_of(balances.model, data.sensing, wrt=())
     here = stack(bare, records, values).residual
     there = stack(bare, records, doubled).residual if names else here
     stuck = _standstill(balances.model, data, values, records)
@@ -268,7 +288,7 @@ def _standstill(model: JointModel, data: Dataset, values: Mapping[str, float], r
         shares = []
         for w in records:
             grid = w.grid
-            slow = 3 * data.noise[source] * float(np.linalg.norm(kernel(grid.pointwise, grid.dt, 1)))
+            slow = 3 * data.noise[source] * grid.velocity_gain(source)
             shares.append(w.average((np.abs(w.points[f"{place}_velocity"]) < slow).astype(float)))
         held = level * np.concatenate(shares)
         for b in balances:
@@ -299,7 +319,7 @@ def solve(model: JointModel, data: Dataset, *, iterations: int = 15, start: Mapp
     shapes = {p.name for p in model.parameters if p.is_shape}
     frozen_shapes: set[str] = set()
     free = [n for n in model.parameter_names if n not in fixed and n not in frozen_shapes]
-    balances = Balances(model, data.sensing, wrt=free)
+    balances = balances_of(model, data.sensing, wrt=free)
     memory_shapes = _memory_shapes(model, free)
     for n in free:
         low, high = limits[n]
@@ -312,12 +332,12 @@ def solve(model: JointModel, data: Dataset, *, iterations: int = 15, start: Mapp
     values, _ = _steps(balances, data, values, linear_only, limits, sigma, {}, 3, memory_shapes)
     values = _best_start(balances, data, values, free, limits, memory_shapes)
     for _ in range(2):
-        residual = stack(Balances(model, data.sensing, wrt=()), data.train, values).residual
+        residual = stack(balances_of(model, data.sensing, wrt=()), data.train, values).residual
         floor = floors(model, data, values)
         sigma = {b: max(rms(residual[b]), floor[b], 1e-12) for b in residual}
         weights = row_weights(balances, data, values, sigma, data.train)
         values, used = _steps(balances, data, values, free, limits, sigma, weights, iterations, memory_shapes)
-    residual = stack(Balances(model, data.sensing, wrt=()), data.train, values).residual
+    residual = stack(balances_of(model, data.sensing, wrt=()), data.train, values).residual
     floor = floors(model, data, values)
     sigma = {b: max(rms(residual[b]), floor[b], 1e-12) for b in residual}
     weights = row_weights(balances, data, values, sigma, data.train)
@@ -343,7 +363,7 @@ def _best_start(
     sigma = {b: max(floor[b], 1e-12) for b in floor}
     reference = trials[-1]
     weights = row_weights(balances, data, reference, sigma, data.train)
-    bare = Balances(balances.model, data.sensing, wrt=())
+    bare = balances_of(balances.model, data.sensing, wrt=())
     best: tuple[float, dict[str, float]] | None = None
     for trial in trials:
         fitted, _ = _steps(balances, data, trial, free, limits, sigma, weights, 6, memory_shapes)
@@ -372,7 +392,7 @@ def _jacobian(
     jacobian = {b: np.array(j[:, columns]) for b, j in stacked.jacobian.items()}
     numeric = [n for n in memory_shapes if n in free]
     if numeric:
-        bare = Balances(balances.model, data.sensing, wrt=())
+        bare = balances_of(balances.model, data.sensing, wrt=())
         for n in numeric:
             step = 1e-2 * values[n]
             moved = stack(bare, data.train, {**values, n: values[n] + step}).residual
@@ -401,7 +421,7 @@ def _steps(
     now = dict(values)
     parameters = {p.name: p for p in balances.model.parameters}
     logs = np.array([parameters[n].is_shape and parameters[n].scale != "absolute" for n in free])
-    bare = Balances(balances.model, data.sensing, wrt=())
+    bare = balances_of(balances.model, data.sensing, wrt=())
 
     def scaled(residual: Mapping[str, FloatArray]) -> FloatArray:
         return np.concatenate([residual[b] * (weights[b] if b in weights else 1 / sigma[b]) for b in balances.balances])

@@ -19,7 +19,6 @@ from identification.lines import Line, find_lines
 from identification.locate import Unexplained, locate
 from identification.parameters import parameter_table
 from identification.record import Record
-from identification.weak import kernel
 
 MAX_ADDITIONS: Final = 6
 RATIO_LIMIT: Final = 1.5
@@ -27,6 +26,10 @@ HOLD_DELAY: Final = "channel_delay@drive"
 """In every model with a commanded drive: the hold of the logged command is not an effect."""
 
 EXPLAINED_SHARE: Final = 0.5
+SPOILT_RATIO: Final = 1.3
+"""Ratio to the floor above which a balance that has risen by a fifth counts as spoilt by an addition."""
+RISE_LIMIT: Final = 1.02
+"""Rise of the relative held-out error that an addition may cause."""
 SWAP_GAIN: Final = 3.0
 
 Progress = Callable[[str, float], None]
@@ -202,6 +205,13 @@ class _Loop:
         self.joint, self.data, self.progress = joint, data, progress
         self._train, self._held = train, held
         self.refused: set[str] = set()
+        self._solved: dict[tuple[object, ...], Solution] = {}
+
+    def _solve(self, model: JointModel, start: Mapping[str, float]) -> Solution:
+        """A fit made once per model: a candidate that was confirmed is not fitted again when it is added."""
+        if model.structure not in self._solved:
+            self._solved[model.structure] = solve(model, self.data, start=start)
+        return self._solved[model.structure]
 
     def run(self, model: JointModel, max_additions: int) -> Improvement:
         self.progress("fitting the start model", 0.05)
@@ -233,10 +243,10 @@ class _Loop:
                 break
             self.progress(f"adding {best.key}", 0.2 + 0.6 * len(claims) / max_additions)
             before = steps[-1]
-            solution = solve(best.candidate.model, self.data, start={**before.solution.values, **best.values})
+            solution = self._solve(best.candidate.model, {**before.solution.values, **best.values})
             after = self._step(best.key, best.candidate.label, solution)
             drop = held_drop(before.held_out, after.held_out, claim.balance)
-            if drop < 2.0:
+            if drop < 2.0 or made_worse(before.held_out, after.held_out):
                 self.refused.add(best.candidate.label)
                 continue
             claims.append(replace(claim, held_out_drop_percent=drop))
@@ -260,7 +270,7 @@ class _Loop:
         trial = nearly(ranking, base, frozenset(self.refused))
         if trial is None:
             return ranking
-        solution = solve(trial.candidate.model, self.data, start={**now.solution.values, **trial.values})
+        solution = self._solve(trial.candidate.model, {**now.solution.values, **trial.values})
         after = assess(solution.model, self.data, self.data.held_out, solution.values)
         drop = held_drop(now.held_out, after, trial.balance)
         if drop < HELD_OUT_DROP:
@@ -393,6 +403,12 @@ class _Loop:
         return True
 
 
+def made_worse(before: Error, after: Error) -> bool:
+    """True where the error as a whole rises on held-out records, or a balance that was fine is spoilt."""
+    spoilt = any(e.ratio > max(1.2 * before.balances[b].ratio, SPOILT_RATIO) for b, e in after.balances.items())
+    return spoilt or after.relative_error_percent > RISE_LIMIT * before.relative_error_percent
+
+
 def held_drop(before: Error, after: Error, balance: str) -> float:
     """Fall of a balance's RMS in percent."""
     old = before.balances[balance].rms
@@ -421,7 +437,7 @@ def not_identifiable(data: Dataset) -> str:
     speed = np.concatenate([w.smooth["motor_velocity"] for w in data.train])
     top = float(np.quantile(np.abs(speed), 0.99))
     grid = data.train[0].grid
-    still = 5 * data.noise.get("motor_position", 0.0) * float(np.linalg.norm(kernel(grid.pointwise, grid.dt, 1)))
+    still = 5 * data.noise.get("motor_position", 0.0) * grid.velocity_gain("motor_position")
     if top <= still:
         return "The joint does not move in the training records: record a motion with reversals at several speeds."
     moving = np.sign(speed[np.abs(speed) > 0.02 * top])

@@ -11,7 +11,7 @@ from typing import Any, Final, final
 import numpy as np
 import numpy.typing as npt
 
-from identification.balances import Balances
+from identification.balances import balances_of
 from identification.engine import Dataset, Solution, floors, row_weights, stack
 from identification.weak import WeakRecord
 
@@ -118,7 +118,7 @@ def find_lines(solution: Solution, kernels: Sequence[Dataset], most: int = 4) ->
     """
     found: list[Line] = []
     for data in kernels:
-        balances = Balances(solution.model, data.sensing, wrt=())
+        balances = balances_of(solution.model, data.sensing, wrt=())
         train = stack(balances, data.train, solution.values).residual
         held = stack(balances, data.held_out, solution.values).residual if data.held_out else None
         floor = floors(solution.model, data, solution.values)

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from identification.assess import Error
-from identification.balances import Balances
+from identification.balances import balances_of
 from identification.engine import Dataset, Solution, stack
 from identification.lines import Line
 from identification.weak import WeakRecord
@@ -108,7 +108,7 @@ def table_r2(residual: FloatArray, index: IntArray, block: IntArray, size: int, 
 
 def locate(solution: Solution, data: Dataset, error: Error, lines: Sequence[Line], threshold: float) -> list[Unexplained]:
     """For every balance over its floor: the axis, order or frequency that holds most of the rest."""
-    balances = Balances(solution.model, data.sensing, wrt=())
+    balances = balances_of(solution.model, data.sensing, wrt=())
     residual = stack(balances, data.train, solution.values).residual
     block = np.concatenate([w.block for w in data.train])
     signals = axes(data.train, data.sensing.has_torque, data.joint.kind)

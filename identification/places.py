@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from casadi_models.parameter import LINEAR_UNITS
-from identification.balances import Balances
+from identification.balances import balances_of
 from identification.engine import Dataset, Solution, stack
 from identification.locate import axes as signals_of_rows
 from identification.locate import table_r2
@@ -310,7 +310,7 @@ def _strength(b: Branch) -> float:
 def residuals(solution: Solution, data: Dataset, records: Sequence[WeakRecord] | None = None) -> dict[str, FloatArray]:
     """Residual of every balance on the rows of records (the held-out ones where none are given)."""
     chosen = tuple(records if records is not None else (data.held_out or data.train))
-    balances = Balances(solution.model, data.sensing, wrt=())
+    balances = balances_of(solution.model, data.sensing, wrt=())
     return dict(stack(balances, chosen, solution.values).residual)
 
 

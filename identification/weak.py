@@ -102,8 +102,8 @@ class Grid:
         Contiguous stretches that are long enough.
     half : int
         Samples left out at either end of a stretch.
-    pointwise : float
-        Kernel length of the velocities inside nonlinear laws [s].
+    pointwise : mapping of str to float
+        Kernel length of the derivatives inside nonlinear laws, by measured signal [s].
     """
 
     length: float
@@ -112,7 +112,11 @@ class Grid:
     step: int
     segments: tuple[slice, ...]
     half: int
-    pointwise: float = 0.03
+    pointwise: Mapping[str, float]
+
+    def velocity_gain(self, source: str) -> float:
+        """Noise of the pointwise velocity per noise of that position [1/s]."""
+        return float(np.linalg.norm(kernel(self.pointwise[source], self.dt, 1)))
 
     def correlate(self, values: FloatArray, weights: FloatArray) -> FloatArray:
         """Rows of a correlation of a full-rate signal with kernel weights."""
@@ -206,7 +210,7 @@ def prepare(
     segments: tuple[slice, ...],
     *,
     length: float = 0.06,
-    pointwise: float = 0.03,
+    pointwise: float | Mapping[str, float] = 0.03,
     block: float = 1.5,
     overlap: int = 4,
     first_block: int = 0,
@@ -221,8 +225,10 @@ def prepare(
         Measured signals (keys of :data:`POSITION_CHAINS`, ``temperature``), full rate, link-referred.
     segments : tuple of slice
         Contiguous stretches.
-    length, pointwise : float
-        Kernel of the balances and of the velocities inside nonlinear laws [s].
+    length : float
+        Kernel of the balances [s].
+    pointwise : float or mapping of str to float
+        Kernel of the derivatives inside nonlinear laws, one for all or by measured signal [s].
     block : float
         Length of the blocks that count as independent [s].
     overlap : int
@@ -233,13 +239,14 @@ def prepare(
     WeakRecord
     """
     dt = float(np.median(np.concatenate([np.diff(time[s]) for s in segments])))
+    short = dict.fromkeys(POSITION_CHAINS, pointwise) if isinstance(pointwise, int | float) else {**dict.fromkeys(POSITION_CHAINS, 0.03), **pointwise}
     step = max(1, round(0.002 / dt))
     stride = max(step, round(length / dt / overlap / step) * step)
     half = step * (max(2, round(length / (dt * step) / 2)) + 1)
-    reach = max(half, round(length / dt / 2) + 3, round(pointwise / dt / 2) + 5)
+    reach = max(half, round(length / dt / 2) + 3, round(max(short.values()) / dt / 2) + 5)
     half = step * int(np.ceil(reach / step))
     long_enough = tuple(s for s in segments if s.stop - s.start > 2 * half + stride)
-    grid = Grid(length, dt, stride, step, long_enough, half, pointwise)
+    grid = Grid(length, dt, stride, step, long_enough, half, short)
     averaged: dict[str, FloatArray] = {}
     points: dict[str, FloatArray] = {}
     smooth: dict[str, FloatArray] = {}
@@ -248,7 +255,7 @@ def prepare(
             continue
         for order, name in enumerate(chain):
             averaged[name] = grid.correlate(signals[source], differentiated_kernel(length, dt, order))
-            points[name], smooth[name] = _pointwise(signals[source], long_enough, pointwise, dt, order, step)
+            points[name], smooth[name] = _pointwise(signals[source], long_enough, short[source], dt, order, step)
     for name, values in (("temperature", signals.get("temperature")), ("time", time)):
         if values is not None:
             averaged[name] = grid.correlate(values, differentiated_kernel(length, dt, 0))

@@ -24,6 +24,17 @@ class _Parser(argparse.ArgumentParser):
         self.exit(2, f"irj: {message}; see `{self.prog} --help`\n")
 
 
+def _count(text: str) -> int:
+    """A number of additions: 0 or more."""
+    try:
+        value = int(text)
+    except ValueError:
+        value = -1
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"takes a whole number from 0 up, not {text!r}")
+    return value
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="irj", description="Tells which physics a geared joint's model is missing.")
     parser.add_argument("--version", action="version", version=f"irj {__version__}")
@@ -57,7 +68,7 @@ def _parser() -> argparse.ArgumentParser:
     improved.add_argument("--report", metavar="FILE", help="write the HTML report")
     improved.add_argument("--picture", metavar="FILE.svg", help="draw the falling error and the place of the residual")
     improved.add_argument("-o", "--output", metavar="FILE", help="write the improved joint file")
-    improved.add_argument("--max-steps", type=int, default=6, help="most effects to add (default 6)")
+    improved.add_argument("--max-steps", type=_count, default=6, metavar="N", help="most effects to add (default 6)")
     report = verb("report", "loop", "the improve loop, written as one HTML file", records=True, joint=True)
     report.add_argument("--held-out", nargs="+", metavar="REC", default=[], help="records the fit must not see")
     report.add_argument("-o", "--output", metavar="FILE", default="irj-report.html", help="the HTML file")

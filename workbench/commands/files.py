@@ -37,7 +37,8 @@ def open_records(paths: Sequence[str], joint: Joint | None) -> tuple[list[Record
     for path in paths:
         record = read(path, columns=joint.columns if joint is not None else None, kind=joint.kind if joint is not None else None)
         try:
-            record, findings = gate(record, joint.gear_ratio if joint is not None else None, needed(record, joint))
+            given = (joint.gear_ratio, needed(record, joint), joint.torque_per_current) if joint is not None else (None, needed(record, joint))
+            record, findings = gate(record, *given)
         except InputError as error:
             raise InputError(f"{path}: {str(error).removeprefix(record.name + ': ')}") from None
         warnings += [f"{path}: {f.message.removeprefix(record.name + ': ')}" for f in findings if f.severity in ("warn", "repair")]

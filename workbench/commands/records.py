@@ -16,7 +16,7 @@ def run_check(arguments: Namespace) -> int:
     out = {}
     for path in arguments.records:
         record = read(path, columns=joint.columns if joint else None, kind=joint.kind if joint else None)
-        findings = check(record, joint.gear_ratio if joint else None)
+        findings = check(record, joint.gear_ratio, torque_per_current=joint.torque_per_current) if joint else check(record)
         print(f"{path}: {len(record)} samples, {record.duration:.3g} s, channels {', '.join(record.channels)}")
         for finding in findings:
             print(f"  {finding.severity}: {finding.message}")

@@ -1,0 +1,120 @@
+"""Check of the torque channels against each other: unit, sign and scale of drive and link torque."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from identification._finding import Finding
+
+if TYPE_CHECKING:
+    from identification.record import FloatArray, Record
+
+_WINDOW: Final = 0.05
+"""Length over which the channels are averaged before they are compared [s]."""
+_PARTIAL: Final = 0.8
+"""Partial correlation from which the two torques are said to follow each other."""
+_REFUSE: Final = 6.0
+_REFUSE_PLAIN: Final = 20.0
+"""The same where a torque that is linear in the position cannot be told from the link torque."""
+_WARN: Final = 1.5
+
+_FACTORS: Final = (
+    (1e3, "a factor 1000: N.mm or mA were taken for N.m or A, or kN.m"),
+    (1e2, "a factor 100: N.cm was taken for N.m"),
+    (0.1129848, "inch-pounds were taken for N.m"),
+    (1.355818, "foot-pounds were taken for N.m"),
+)
+
+
+def check_torque(record: Record, gear_ratio: float | None, torque_per_current: float | None) -> list[Finding]:
+    """Compare the link torque with the drive torque, which it must follow with a slope near one.
+
+    Block averages of the drive are regressed on the link torque beside direction, velocity, acceleration and a
+    constant of the motor (inertia and friction); the slope of the torque is 1 in a joint with right units.
+
+    Parameters
+    ----------
+    record : Record
+    gear_ratio : float, optional
+        Refers `motor_torque` to the link.
+    torque_per_current : float, optional
+        Link-referred torque per current [N.m/A].
+
+    Returns
+    -------
+    list of Finding
+        Empty where the channels or the motion do not allow the comparison.
+    """
+    position = next((c for c in ("motor_position", "link_position") if record.has(c)), None)
+    if position is None or not record.has("link_torque") or record.kind != "rotary":
+        return []
+    if record.has("motor_torque") and gear_ratio is not None:
+        drive, name = record["motor_torque"] * gear_ratio, "motor_torque"
+    elif record.has("motor_current") and torque_per_current is not None:
+        drive, name = record["motor_current"] * torque_per_current, "motor_current"
+    else:
+        return []
+    sign = math.copysign(1.0, gear_ratio or 1.0) if position == "motor_position" else 1.0
+    found = _slope(record, drive, record[position] * sign)
+    if found is None:
+        return []
+    slope, partial, spring = found
+    if abs(partial) < _PARTIAL:
+        return []
+    limit = _REFUSE if spring else _REFUSE_PLAIN
+    said = f"{record.name}: the drive torque from {name} is {slope:.3g} times what link_torque says"
+    size = abs(slope)
+    if slope < 0:
+        advice = "the sign of one is reversed; set sign = -1 for the wrong one in [columns]"
+        return [Finding("refuse", "torque", f"{said}: {advice}", "link_torque")]
+    if max(size, 1 / size) > limit:
+        advice = "correct the unit or scale of link_torque in [columns], or torque_per_current and gear_ratio"
+        return [Finding("refuse", "torque", f"{said} ({_guess(size)}): {advice}", "link_torque")]
+    if max(size, 1 / size) > _WARN:
+        return [Finding("warn", "torque", f"{said}: check unit and scale of both, and torque_per_current", "link_torque")]
+    return [Finding("ok", "torque", f"{record.name}: link_torque follows the drive torque (factor {slope:.3g})", "link_torque")]
+
+
+def _guess(size: float) -> str:
+    for value, sentence in _FACTORS:
+        if any(0.6 < size / f < 1.6 for f in (value, 1 / value)):
+            return sentence
+    return "a unit or scale is wrong"
+
+
+def _slope(record: Record, drive: FloatArray, position: FloatArray) -> tuple[float, float, bool] | None:
+    """Slope of the drive on the link torque beside the motor's own terms, its partial correlation, and whether a spring is among these terms."""
+    parts = [_averages(record.time[s], drive[s], record["link_torque"][s], position[s]) for s in record.segments()]
+    rows = np.concatenate([p for p in parts if p is not None] or [np.empty((0, 7))])
+    if len(rows) < 30:
+        return None
+    both = rows[:, :2]
+    others = rows[:, 2:] / np.maximum(np.linalg.norm(rows[:, 2:], axis=0), 1e-300)
+    for spring in (True, False):
+        used = others if spring else others[:, :-1]
+        left = both - used @ np.linalg.lstsq(used, both, rcond=1e-9)[0]
+        (dd, td), (_, tt) = (left.T @ left).tolist()
+        if tt > 1e-3 * float(both[:, 1] @ both[:, 1]) and dd > 0.0:
+            partial = td / math.sqrt(tt * dd)
+            # geometric mean of both regressions: noise in either channel does not pull it to zero
+            return math.copysign(math.sqrt(dd / tt), partial), partial, spring
+    return None
+
+
+def _averages(time: FloatArray, drive: FloatArray, torque: FloatArray, position: FloatArray) -> FloatArray | None:
+    """Rows of block means: drive, torque, direction, velocity, acceleration, 1, position."""
+    if len(time) < 16:
+        return None
+    size = max(1, round(_WINDOW / float(np.median(np.diff(time)))))
+    count = len(time) // size
+    if count < 5:
+        return None
+    mean = [x[: count * size].reshape(count, size).mean(axis=1) for x in (time, drive, torque, position)]
+    t, q = mean[0], mean[3]
+    velocity = (q[2:] - q[:-2]) / (t[2:] - t[:-2])
+    acceleration = 2 * ((q[2:] - q[1:-1]) / (t[2:] - t[1:-1]) - (q[1:-1] - q[:-2]) / (t[1:-1] - t[:-2])) / (t[2:] - t[:-2])
+    slow = 0.02 * float(np.quantile(np.abs(velocity), 0.95)) or 1e-12
+    return np.column_stack([mean[1][1:-1], mean[2][1:-1], np.tanh(velocity / slow), velocity, acceleration, np.ones(count - 2), q[1:-1]])
