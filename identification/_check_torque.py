@@ -16,6 +16,8 @@ _WINDOW: Final = 0.05
 """Length over which the channels are averaged before they are compared [s]."""
 _PARTIAL: Final = 0.8
 """Partial correlation from which the two torques are said to follow each other."""
+_LEFT: Final = 0.02
+"""Share of the link torque's power that must be left beside a spring for the spring to be among the terms."""
 _REFUSE: Final = 6.0
 _REFUSE_PLAIN: Final = 20.0
 """The same where a torque that is linear in the position cannot be told from the link torque."""
@@ -25,7 +27,6 @@ _FACTORS: Final = (
     (1e3, "a factor 1000: N.mm or mA were taken for N.m or A, or kN.m"),
     (1e2, "a factor 100: N.cm was taken for N.m"),
     (0.1129848, "inch-pounds were taken for N.m"),
-    (1.355818, "foot-pounds were taken for N.m"),
 )
 
 
@@ -61,9 +62,7 @@ def check_torque(record: Record, gear_ratio: float | None, torque_per_current: f
     found = _slope(record, drive, record[position] * sign)
     if found is None:
         return []
-    slope, partial, spring = found
-    if abs(partial) < _PARTIAL:
-        return []
+    slope, spring = found
     limit = _REFUSE if spring else _REFUSE_PLAIN
     said = f"{record.name}: the drive torque from {name} is {slope:.3g} times what link_torque says"
     size = abs(slope)
@@ -74,19 +73,19 @@ def check_torque(record: Record, gear_ratio: float | None, torque_per_current: f
         advice = "correct the unit or scale of link_torque in [columns], or torque_per_current and gear_ratio"
         return [Finding("refuse", "torque", f"{said} ({_guess(size)}): {advice}", "link_torque")]
     if max(size, 1 / size) > _WARN:
-        return [Finding("warn", "torque", f"{said}: check unit and scale of both, and torque_per_current", "link_torque")]
+        return [Finding("warn", "torque", f"{said} ({_guess(size)}): check unit and scale of both, and torque_per_current", "link_torque")]
     return [Finding("ok", "torque", f"{record.name}: link_torque follows the drive torque (factor {slope:.3g})", "link_torque")]
 
 
 def _guess(size: float) -> str:
     for value, sentence in _FACTORS:
-        if any(0.6 < size / f < 1.6 for f in (value, 1 / value)):
+        if any(0.75 < size / f < 1.33 for f in (value, 1 / value)):
             return sentence
-    return "a unit or scale is wrong"
+    return "a unit or scale is wrong, or a strong torque is missing from the model"
 
 
-def _slope(record: Record, drive: FloatArray, position: FloatArray) -> tuple[float, float, bool] | None:
-    """Slope of the drive on the link torque beside the motor's own terms, its partial correlation, and whether a spring is among these terms."""
+def _slope(record: Record, drive: FloatArray, position: FloatArray) -> tuple[float, bool] | None:
+    """Slope of the drive on the link torque beside the motor's own terms, and whether a spring is among these; None without a clear relation."""
     parts = [_averages(record.time[s], drive[s], record["link_torque"][s], position[s]) for s in record.segments()]
     rows = np.concatenate([p for p in parts if p is not None] or [np.empty((0, 7))])
     if len(rows) < 30:
@@ -97,10 +96,12 @@ def _slope(record: Record, drive: FloatArray, position: FloatArray) -> tuple[flo
         used = others if spring else others[:, :-1]
         left = both - used @ np.linalg.lstsq(used, both, rcond=1e-9)[0]
         (dd, td), (_, tt) = (left.T @ left).tolist()
-        if tt > 1e-3 * float(both[:, 1] @ both[:, 1]) and dd > 0.0:
-            partial = td / math.sqrt(tt * dd)
+        if tt <= (_LEFT if spring else 1e-3) * float(both[:, 1] @ both[:, 1]) or dd <= 0.0:
+            continue
+        partial = td / math.sqrt(tt * dd)
+        if abs(partial) >= _PARTIAL:
             # geometric mean of both regressions: noise in either channel does not pull it to zero
-            return math.copysign(math.sqrt(dd / tt), partial), partial, spring
+            return math.copysign(math.sqrt(dd / tt), partial), spring
     return None
 
 

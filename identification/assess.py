@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from casadi_models import JointModel
 from identification.balances import balances_of
-from identification.engine import Dataset, floors, references, rms, row_weights, stack
+from identification.engine import Dataset, floors, references, rms, row_weights, stack, taking_part
 from identification.weak import WeakRecord
 
 FloatArray = npt.NDArray[np.float64]
@@ -79,10 +79,13 @@ class Error:
 def assess(model: JointModel, data: Dataset, records: Sequence[WeakRecord], values: Mapping[str, float]) -> Error:
     """Error of a model with the given values on prepared records."""
     balances = balances_of(model, data.sensing, wrt=())
-    residual = stack(balances, records, values).residual
-    measured = references(data, records)
+    whole = stack(balances, records, values).residual
+    rows = {b: taking_part(b, records) for b in balances.balances}
+    residual = {b: whole[b][rows[b]] for b in whole}
+    measured = {b: y[rows[b]] for b, y in references(data, records).items()}
     floor = floors(model, data, values)
     weights = row_weights(balances, data, values, {b: max(floor[b], 1e-12) for b in floor}, records)
+    weights = {b: w[rows[b]] for b, w in weights.items()}
     unit = "N.m" if model.kind == "rotary" else "N"
     errors = {
         b: BalanceError(

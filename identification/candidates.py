@@ -240,7 +240,7 @@ def make_base(solution: Solution, data: Dataset) -> Base:
     orthonormal = left[:, singular > 1e-9 * max(float(singular[0]) if len(singular) else 0.0, 1e-300)]
     rw = r * weight
     rw = rw - orthonormal @ (orthonormal.T @ rw)
-    shares = np.array([_effective_share(rw[balance == k]) for k in range(len(balances.balances))])
+    shares = np.array([_effective_share(rw[balance == k][train.taking[b]]) for k, b in enumerate(balances.balances)])
     if data.held_out:
         held = stack(balances, data.held_out, solution.values)
         hr, hj, _, hb = flatten(held, balances.balances)
@@ -257,11 +257,12 @@ def make_base(solution: Solution, data: Dataset) -> Base:
 
 
 def flatten(stacked: Stacked, balances: Sequence[str]) -> tuple[FloatArray, FloatArray, IntArray, IntArray]:
-    """Residual, Jacobian, block and balance number of all rows, one balance after the other."""
+    """Residual, Jacobian, block (-1 for rows that take no part) and balance number of all rows, one balance after the other."""
     r = np.concatenate([stacked.residual[b] for b in balances])
     j = np.concatenate([stacked.jacobian[b] for b in balances])
     size = len(stacked.block)
-    return r, j, np.tile(stacked.block, len(balances)), np.repeat(np.arange(len(balances)), size)
+    block = np.concatenate([np.where(stacked.taking[b], stacked.block, -1) for b in balances])
+    return r, j, block, np.repeat(np.arange(len(balances)), size)
 
 
 def _effective_share(residual: FloatArray) -> float:

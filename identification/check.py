@@ -16,8 +16,8 @@ from identification._check_channels import (
     check_stuck,
 )
 from identification._check_relations import check_delay, check_motion, check_ratio, check_velocity, measured_ratio
-from identification._check_torque import check_torque
 from identification._check_time import check_sampling, check_size, check_stamps, gap_limit, gaps
+from identification._check_torque import check_torque
 from identification._finding import SEVERITIES, Finding, rank
 from identification.errors import InputError
 

@@ -24,6 +24,7 @@ IntArray = npt.NDArray[np.int64]
 
 CLAIM_KERNEL: Final = 0.06
 ONE_SIDED_KERNEL: Final = 0.2
+LINK_BALANCES: Final = frozenset({"link", "sum", "axis"})
 POINTWISE_KERNELS: Final = (0.01, 0.014, 0.02, 0.03)
 VELOCITY_NOISE: Final = 2e-3
 """Noise of a pointwise velocity, as a share of the record's speed, that is small enough."""
@@ -85,6 +86,8 @@ def load_dataset(
     first = 0
     for record in (*train, *held_out):
         made = weak_record(record, joint, sensing, length, first)
+        if record.payload != train[0].payload:
+            made = replace(made, masked=_of_the_link(record, sensing))
         first = max(first, 1 + int(made.block.max(initial=first - 1)))
         prepared.append(made)
     count = len(train)
@@ -95,6 +98,14 @@ def load_dataset(
         joint, sensing, tuple(prepared[:count]), tuple(prepared[count:]), _ranges(prepared[:count], model.clamped_link), noise,
         tuple(r.name for r in train), tuple(r.name for r in held_out),
     )  # fmt: skip
+
+
+def _of_the_link(record: Record, sensing: Sensing) -> frozenset[str]:
+    """Balances with parameters of the link, which a record with another payload does not share."""
+    masked = frozenset(sensing.balances) & LINK_BALANCES
+    if masked == frozenset(sensing.balances):
+        raise InputError(f"{record.name}: a record with another payload needs link_torque or both positions: without them every balance holds the link's parameters")
+    return masked
 
 
 def weak_record(record: Record, joint: Joint, sensing: Sensing, length: float, first_block: int = 0) -> WeakRecord:
@@ -183,16 +194,24 @@ class Stacked:
     residual: Mapping[str, FloatArray]
     jacobian: Mapping[str, FloatArray]
     block: IntArray
+    taking: Mapping[str, npt.NDArray[np.bool_]]
 
 
 def stack(balances: Balances, records: Sequence[WeakRecord], values: Mapping[str, float]) -> Stacked:
-    """Evaluate the balances on records one after the other."""
+    """Evaluate the balances on records one after the other; rows that take no part are zero."""
     parts = [balances.evaluate(w, values) for w in records]
+    share = [{b: 0.0 if b in w.masked else 1.0 for b in balances.balances} for w in records]
     return Stacked(
-        {b: np.concatenate([p[b][0] for p in parts]) for b in balances.balances},
-        {b: np.concatenate([p[b][1] for p in parts]) for b in balances.balances},
+        {b: np.concatenate([p[b][0] * s[b] for p, s in zip(parts, share, strict=True)]) for b in balances.balances},
+        {b: np.concatenate([p[b][1] * s[b] for p, s in zip(parts, share, strict=True)]) for b in balances.balances},
         np.concatenate([w.block for w in records]),
+        {b: taking_part(b, records) for b in balances.balances},
     )
+
+
+def taking_part(balance: str, records: Sequence[WeakRecord]) -> npt.NDArray[np.bool_]:
+    """Which of the stacked rows of a balance are not masked."""
+    return np.concatenate([np.full(w.rows, balance not in w.masked) for w in records])
 
 
 @final
@@ -324,7 +343,6 @@ def solve(model: JointModel, data: Dataset, *, iterations: int = 15, start: Mapp
     for n in free:
         low, high = limits[n]
         values[n] = min(max(values[n], low), high)
-    floor = floors(model, data, {**values})
     # first pass without shapes: linear amplitudes from any start
     sigma = dict.fromkeys(balances.balances, 1.0)
     linear_only = [n for n in free if n not in shapes]
@@ -332,16 +350,19 @@ def solve(model: JointModel, data: Dataset, *, iterations: int = 15, start: Mapp
     values, _ = _steps(balances, data, values, linear_only, limits, sigma, {}, 3, memory_shapes)
     values = _best_start(balances, data, values, free, limits, memory_shapes)
     for _ in range(2):
-        residual = stack(balances_of(model, data.sensing, wrt=()), data.train, values).residual
-        floor = floors(model, data, values)
-        sigma = {b: max(rms(residual[b]), floor[b], 1e-12) for b in residual}
+        sigma = _sigmas(model, data, values)
         weights = row_weights(balances, data, values, sigma, data.train)
         values, used = _steps(balances, data, values, free, limits, sigma, weights, iterations, memory_shapes)
-    residual = stack(balances_of(model, data.sensing, wrt=()), data.train, values).residual
-    floor = floors(model, data, values)
-    sigma = {b: max(rms(residual[b]), floor[b], 1e-12) for b in residual}
+    sigma = _sigmas(model, data, values)
     weights = row_weights(balances, data, values, sigma, data.train)
     return _with_errors(model, balances, data, values, free, limits, weights, sigma, memory_shapes, used)
+
+
+def _sigmas(model: JointModel, data: Dataset, values: Mapping[str, float]) -> dict[str, float]:
+    """RMS of each balance on the training rows, at least its floor."""
+    residual = stack(balances_of(model, data.sensing, wrt=()), data.train, values).residual
+    floor = floors(model, data, values)
+    return {b: max(rms(r[taking_part(b, data.train)]), floor[b], 1e-12) for b, r in residual.items()}
 
 
 def _best_start(
@@ -398,7 +419,7 @@ def _jacobian(
             moved = stack(bare, data.train, {**values, n: values[n] + step}).residual
             for b in jacobian:
                 jacobian[b][:, list(free).index(n)] = (moved[b] - stacked.residual[b]) / step
-    return Stacked(stacked.residual, jacobian, stacked.block)
+    return Stacked(stacked.residual, jacobian, stacked.block, stacked.taking)
 
 
 def _check_moves(balances: Balances, data: Dataset, values: Mapping[str, float], free: Sequence[str]) -> None:

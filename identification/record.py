@@ -81,6 +81,9 @@ class Record:
         Number of the contiguous stretch a sample belongs to: never differentiate or integrate across a change.
     provenance : Provenance
         Source and repairs.
+    payload : str
+        What the link carries. Records with another payload than the first one share the motor's and the
+        transmission's parameters, not the link's.
 
     Raises
     ------
@@ -94,6 +97,7 @@ class Record:
     channels: Mapping[str, FloatArray]
     segment: IntArray
     provenance: Provenance = field(default_factory=Provenance)
+    payload: str = ""
 
     def __post_init__(self) -> None:
         time = np.ascontiguousarray(self.time, dtype=np.float64)
@@ -114,7 +118,7 @@ class Record:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle by value: records travel to worker processes."""
-        return Record, (self.name, self.kind, self.time, dict(self.channels), self.segment, self.provenance)
+        return Record, (self.name, self.kind, self.time, dict(self.channels), self.segment, self.provenance, self.payload)
 
     @classmethod
     def from_channels(

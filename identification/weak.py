@@ -157,6 +157,8 @@ class WeakRecord:
         Block of each row; -1 for a row that touches another block's samples.
     starts : (segments + 1,) int array
         First point of each segment.
+    masked : set of str
+        Balances that these rows do not take part in: those of a link with another payload.
     """
 
     grid: Grid
@@ -166,6 +168,7 @@ class WeakRecord:
     time: FloatArray
     block: IntArray
     starts: IntArray
+    masked: frozenset[str] = frozenset()
 
     def average(self, values: FloatArray) -> FloatArray:
         """Kernel average of values at the points, one row per row.

@@ -52,24 +52,32 @@ def _parser() -> argparse.ArgumentParser:
             sub.add_argument("--joint", metavar="J", required=True, help="joint file (TOML)")
         return sub
 
+    def other_payload(sub: argparse.ArgumentParser) -> None:
+        text = "training records of the same joint with another payload: they share motor and transmission, not the link"
+        sub.add_argument("--other-payload", nargs="+", metavar="REC", default=[], help=text)
+
     demo = verb("demo", "loop", "the main job on embedded data: a simulated joint with a hidden effect")
     demo.add_argument("--report", default="irj-demo.html", metavar="FILE", help="where the report goes (default irj-demo.html)")
     demo.add_argument("--picture", metavar="FILE.svg", help="draw the falling error and the place of the residual")
     checked = verb("check", "records", "check records before a fit", records=True)
     checked.add_argument("--joint", metavar="J", help="joint file: column map and gear ratio")
     fitted = verb("fit", "loop", "fit the joint's model", records=True, joint=True)
+    other_payload(fitted)
     fitted.add_argument("-o", "--output", metavar="FILE", help="write the fitted joint file")
     compared = verb("compare", "loop", "how far the model is from the records, and where", records=True, joint=True)
     compared.add_argument("--fit", dest="fit_records", nargs="+", metavar="REC", default=[], help="fit to these records and compare with REC")
     diagnosed = verb("diagnose", "loop", "rank what is missing", records=True, joint=True)
+    other_payload(diagnosed)
     diagnosed.add_argument("--held-out", nargs="+", metavar="REC", default=[], help="records the fit must not see")
     improved = verb("improve", "loop", "name what is missing, add it, watch the error fall", records=True, joint=True)
+    other_payload(improved)
     improved.add_argument("--held-out", nargs="+", metavar="REC", default=[], help="records the fit must not see")
     improved.add_argument("--report", metavar="FILE", help="write the HTML report")
     improved.add_argument("--picture", metavar="FILE.svg", help="draw the falling error and the place of the residual")
     improved.add_argument("-o", "--output", metavar="FILE", help="write the improved joint file")
     improved.add_argument("--max-steps", type=_count, default=6, metavar="N", help="most effects to add (default 6)")
     report = verb("report", "loop", "the improve loop, written as one HTML file", records=True, joint=True)
+    other_payload(report)
     report.add_argument("--held-out", nargs="+", metavar="REC", default=[], help="records the fit must not see")
     report.add_argument("-o", "--output", metavar="FILE", default="irj-report.html", help="the HTML file")
     listed = verb("effects", "library", "list the effect library, or one effect")

@@ -13,16 +13,17 @@ from identification.compare import compare
 from identification.diagnose import diagnose
 from identification.fit import fit, joint_text
 from identification.improve import Improvement, improve
+from identification.joint_file import Joint
 from identification.record import Record
 from workbench.commands.files import open_joint, open_records, progress_bar, write_json, write_text
 
 
 def improve_files(
-    train: Sequence[str], held_out: Sequence[str], joint_path: str, *, max_additions: int = 6
+    train: Sequence[str], held_out: Sequence[str], joint_path: str, *, other_payload: Sequence[str] = (), max_additions: int = 6
 ) -> tuple[dict[str, Any], Improvement, list[Record]]:
     """The loop on files: its JSON, the result and the records."""
     joint = open_joint(joint_path)
-    records, warnings = open_records(train, joint)
+    records, warnings = _training(train, other_payload, joint)
     held, more = open_records(held_out, joint)
     found = improve(records, joint, held, max_additions=max_additions, progress=progress_bar)
     progress_bar("done", 1.0)
@@ -32,9 +33,19 @@ def improve_files(
     return found.as_json(), found, [*records, *held]
 
 
+def _training(paths: Sequence[str], other_payload: Sequence[str], joint: Joint) -> tuple[list[Record], list[str]]:
+    """Training records, those with another payload marked, and the warnings."""
+    records, warnings = open_records(paths, joint)
+    marked, more = open_records(other_payload, joint)
+    return [*records, *(replace(r, payload="other") for r in marked)], [*warnings, *more]
+
+
 def run_improve(arguments: Namespace) -> int:
     """`irj improve`."""
-    data, found, records = improve_files(arguments.records, arguments.held_out, arguments.joint, max_additions=arguments.max_steps)
+    data, found, records = improve_files(
+        arguments.records, arguments.held_out, arguments.joint,
+        other_payload=arguments.other_payload, max_additions=arguments.max_steps,
+    )  # fmt: skip
     _print_improvement(found)
     _write_improvement(found, records, arguments.report, arguments.output, arguments.command)
     _write_picture(found, arguments.picture)
@@ -44,7 +55,7 @@ def run_improve(arguments: Namespace) -> int:
 
 def run_report(arguments: Namespace) -> int:
     """`irj report`."""
-    data, found, records = improve_files(arguments.records, arguments.held_out, arguments.joint)
+    data, found, records = improve_files(arguments.records, arguments.held_out, arguments.joint, other_payload=arguments.other_payload)
     print(found.reason)
     _write_improvement(found, records, arguments.output, None, arguments.command)
     write_json(arguments.json, data)
@@ -115,7 +126,7 @@ def _print_improvement(found: Improvement) -> None:
 def run_fit(arguments: Namespace) -> int:
     """`irj fit`."""
     joint = open_joint(arguments.joint)
-    records, warnings = open_records(arguments.records, joint)
+    records, warnings = _training(arguments.records, arguments.other_payload, joint)
     fitted = fit(joint, records)
     print(f"relative error {fitted.train.relative_error_percent:.3f} %, fit {fitted.train.fit_percent:.2f} %")
     _print_parameters(fitted.parameters)
@@ -151,7 +162,7 @@ def run_compare(arguments: Namespace) -> int:
 def run_diagnose(arguments: Namespace) -> int:
     """`irj diagnose`."""
     joint = open_joint(arguments.joint)
-    records, warnings = open_records(arguments.records, joint)
+    records, warnings = _training(arguments.records, arguments.other_payload, joint)
     held, more = open_records(arguments.held_out, joint)
     found = diagnose(fit(joint, records), held)
     for text in found.warnings:
