@@ -192,7 +192,7 @@ class Registry(Mapping[str, Effect]):
             raise ValueError(f"{path}: not a Python file")
         kept = dict(self._effects)
         for key in self._loaded.get(where, ()):
-            del self._effects[key]
+            self._effects.pop(key, None)
         before = set(self._effects)
         try:
             spec.loader.exec_module(importlib.util.module_from_spec(spec))

@@ -121,9 +121,9 @@ class HankelQR:
         self.method: Method = method
         self.window = block_rows if method == "ordinary" else 2 * block_rows
         self.rows = 0
-        self._weights = np.ones(outputs) if weights is None else np.array(weights, dtype=np.float64)
+        self.weights = np.ones(outputs) if weights is None else np.array(weights, dtype=np.float64)
         self._triangle = Triangle((inputs + outputs) * self.window)
-        self._order = self._column_order()
+        self.column_order = self._column_order()
         self._tail: FloatArray = np.empty((0, inputs + outputs), order="F")
         self._samples = self._records = 0
         self._low = np.full(inputs + outputs, np.inf)
@@ -158,7 +158,7 @@ class HankelQR:
         data: FloatArray = np.empty((kept + len(u), self.inputs + self.outputs), order="F")
         data[:kept] = self._tail
         data[kept:, : self.inputs] = u
-        np.multiply(y, self._weights, out=data[kept:, self.inputs :])
+        np.multiply(y, self.weights, out=data[kept:, self.inputs :])
         np.minimum(self._low, data[kept:].min(axis=0), out=self._low)
         np.maximum(self._high, data[kept:].max(axis=0), out=self._high)
         self._samples += len(u)
@@ -176,7 +176,7 @@ class HankelQR:
 
         The other's open record counts as closed.
         """
-        if self._settings() != other._settings() or not np.array_equal(self._weights, other._weights):
+        if self._settings() != other._settings() or not np.array_equal(self.weights, other.weights):
             raise InputError(
                 "accumulators with other channels, block rows, method or weights cannot be merged: make them alike"
             )
@@ -189,7 +189,7 @@ class HankelQR:
         """Return everything needed to go on later, as arrays (for `numpy.savez`)."""
         return {
             "settings": np.array(self._settings(), dtype=np.float64),
-            "weights": self._weights.copy(),
+            "weights": self.weights.copy(),
             "triangle": self._triangle.factor(),
             "tail": self._tail.copy(),
             "counts": np.array([self.rows, self._samples, self._records], dtype=np.float64),
@@ -198,7 +198,7 @@ class HankelQR:
 
     def restore(self, state: Mapping[str, FloatArray]) -> None:
         """Go back to what `state` returned, on an accumulator with the same settings."""
-        if tuple(state["settings"]) != self._settings() or not np.array_equal(state["weights"], self._weights):
+        if tuple(state["settings"]) != self._settings() or not np.array_equal(state["weights"], self.weights):
             raise InputError("the state has other channels, block rows, method or weights: make the accumulator alike")
         self._triangle = Triangle(self.columns)
         self._triangle.add(np.asarray(state["triangle"], dtype=np.float64))
@@ -230,7 +230,7 @@ class HankelQR:
         while done < total:
             view = self._triangle.room(total - done)
             count = len(view)
-            for column, (lag, channel) in enumerate(self._order):
+            for column, (lag, channel) in enumerate(self.column_order):
                 view[:, column] = data[done + lag : done + lag + count, channel]
             done += count
             self._triangle.commit(count)

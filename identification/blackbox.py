@@ -35,6 +35,9 @@ if TYPE_CHECKING:
 __all__ = ["BlackBox", "BlackBoxOutcome", "LinearCeiling", "Structure", "blackbox", "linear_ceiling"]
 
 Structure = Literal["arx", "armax", "oe", "bj"]
+Tried = Literal["static", "arx", "armax", "oe", "bj", "moesp"]
+# time constants of a model's free motion in a test record, at least
+_FADES = 10.0
 _Arrays = npt.ArrayLike | Sequence[npt.NDArray[np.generic]]
 
 
@@ -157,15 +160,20 @@ def linear_ceiling(
     y: _Arrays,
     dt: float = 1.0,
     *,
-    structures: Sequence[Structure | Literal["moesp"]] = ("arx", "oe", "moesp"),
+    structures: Sequence[Tried] = ("arx", "oe", "moesp"),
     orders: Sequence[int] = (2, 4, 6),
     fit_samples: int = 20_000,
+    test: tuple[_Arrays, _Arrays] | None = None,
 ) -> LinearCeiling:
     """Share of the output that a linear model without physics explains on held-out data.
 
     Models are fitted on the first half of each record, the best is chosen by
     its simulation of the third quarter, and its VAF is taken on the last quarter,
     which had no part in either. Initial states are estimated on every part.
+    With `test`, models are fitted on the whole of each record, and the VAF is that of
+    the one that simulates `test` best: a ceiling for all the models tried. Models whose
+    free motion fades slower than a tenth of a test record are then left out: with an
+    initial state of their own they would draw an oscillation that no input explains.
 
     Parameters
     ----------
@@ -173,12 +181,14 @@ def linear_ceiling(
         Inputs and outputs; a list holds one array per record. Remove offsets before.
     dt : float
         Sampling time in s.
-    structures : sequence of {"arx", "armax", "oe", "bj", "moesp"}
-        Model families tried.
+    structures : sequence of {"static", "arx", "armax", "oe", "bj", "moesp"}
+        Model families tried; "static" is ``y = B u``, of no order.
     orders : sequence of int
         Orders tried, each 1 to 20.
     fit_samples : int
-        Most samples of a record used to fit; the rest of the first half is left out.
+        Most samples of a record used to fit; later ones of the part to fit are left out.
+    test : tuple of two array_like or lists, optional
+        Inputs and outputs of held-out records.
 
     Returns
     -------
@@ -193,20 +203,24 @@ def linear_ceiling(
     if not structures or not orders:
         raise InputError("no structure or no order to try: give at least one of each")
     for structure in structures:
-        if structure not in (*get_args(Structure), "moesp"):
-            raise InputError(
-                f"structure {structure!r} is unknown: choose among {', '.join(get_args(Structure))}, moesp"
-            )
+        if structure not in get_args(Tried):
+            raise InputError(f"structure {structure!r} is unknown: choose among {', '.join(get_args(Tried))}")
     if any(not 1 <= order <= 20 for order in orders):
         raise InputError(f"orders are {tuple(orders)}: give 1 to 20")
-    early, late = _split(records, 0.5)
-    select, report = _split(late, 0.5)
+    if test is None:
+        early, late = _split(records, 0.5)
+        select, report = _split(late, 0.5)
+        slowest = 1.0
+    else:
+        early, select = records, list(whole_records(ArraySource(*test)))
+        report = select
+        slowest = 1.0 - _FADES / float(np.median([len(one) for one, _ in select]))
     early = [(one[:fit_samples], other[:fit_samples]) for one, other in early]
     results: list[tuple[float, str, FloatArray]] = []
-    for structure in structures:
-        for order in orders:
-            chosen_by, reported = _try(early, (select, report), structure, order, dt)
-            results.append((float(np.mean(chosen_by)), f"{structure} {order}", reported))
+    for structure, order in [(s, n) for s in structures for n in ((0,) if s == "static" else orders)]:
+        name = f"{structure} {order}" if order else structure
+        chosen_by, reported = _try(early, (select, report), (structure, order), slowest)
+        results.append((float(np.mean(chosen_by)), name, reported))
     stable = sorted((result for result in results if np.isfinite(result[0])), key=lambda result: -result[0])
     if not stable:
         raise InputError(
@@ -215,54 +229,63 @@ def linear_ceiling(
     return LinearCeiling(stable[0][2], stable[0][1], tuple((name, vaf) for vaf, name, _ in stable))
 
 
-def _try(
-    train: Records, parts: tuple[Records, Records], structure: Structure | Literal["moesp"], order: int, dt: float
-) -> tuple[FloatArray, FloatArray]:
-    """VAF of one model on the part that selects and on the part that reports."""
+def _try(train: Records, parts: tuple[Records, Records], model: tuple[Tried, int], slowest: float) -> tuple[FloatArray, FloatArray]:
+    """VAF of one model on the part that selects and on the part that reports; NaN where its spectral radius reaches `slowest`."""
+    structure, order = model
     if structure == "moesp":
-        return _try_moesp(train, parts, order)
-    model = _fit_all(train, parts[0], structure, order, 0, dt)
-    return model.vaf_percent, _vaf(parts[1], model.polynomials)
+        return _try_moesp(train, parts, order, slowest)
+    orders = Orders("arx" if structure == "static" else structure, order, 0, train[0][0].shape[1])
+    polynomials = tuple(fit[0] for fit in _fits(train, (*parts[0], *parts[1]), orders))
+    if max(one.spectral_radius for one in polynomials) >= slowest:
+        return np.full(len(polynomials), np.nan), np.full(len(polynomials), np.nan)
+    chosen_by = _vaf(parts[0], polynomials)
+    return chosen_by, chosen_by if parts[0] is parts[1] else _vaf(parts[1], polynomials)
 
 
-def _try_moesp(train: Records, parts: tuple[Records, Records], order: int) -> tuple[FloatArray, FloatArray]:
-    import warnings
-
+def _try_moesp(train: Records, parts: tuple[Records, Records], order: int, slowest: float) -> tuple[FloatArray, FloatArray]:
+    from identification._hankel_qr import HankelQR
     from identification._response_fit import ResponseFit
-    from identification.subspace import UnstableModelWarning, moesp
 
-    outputs = train[0][1].shape[1]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UnstableModelWarning)
-        sub = moesp(
-            [one for one, _ in train], [other for _, other in train], max(10, 2 * order), order, method="past_output"
-        )
-    vaf = []
-    for part in parts:
-        if sub.spectral_radius >= 1.0:
-            vaf.append(np.full(outputs, np.nan))
-            continue
-        fit = ResponseFit(sub.system.A, sub.system.C, train[0][0].shape[1])
+    inputs, outputs = train[0][0].shape[1], train[0][1].shape[1]
+    qr = HankelQR(inputs, outputs, max(10, 2 * order), "past_output")
+    for one, other in train:
+        qr.add(one, other)
+        qr.end_record()
+    factor = qr.factor()
+    a, c = factor.realise(factor.directions()[0], order)
+    if float(np.abs(np.linalg.eigvals(a)).max()) >= slowest:
+        return np.full(outputs, np.nan), np.full(outputs, np.nan)
+
+    def response(part: Records) -> ResponseFit:
+        fit = ResponseFit(a, c, inputs)
         for one, other in part:
             fit.add(one, other)
             fit.end_record()
-        states = fit.initial_states(sub.system.B, sub.system.D)
-        vaf.append(fit.vaf_percent(sub.system.B, sub.system.D, states))
-    return vaf[0], vaf[1]
+        return fit
+
+    solved = response(train).solve()
+    fits = [response(part) for part in (parts[:1] if parts[0] is parts[1] else parts)]
+    vaf = [fit.vaf_percent(solved.b, solved.d, fit.initial_states(solved.b, solved.d)) for fit in fits]
+    return vaf[0], vaf[-1]
 
 
-def _fit_all(train: Records, test: Records, structure: Structure, order: int, delay: int, dt: float) -> BlackBox:
-    import control
-
-    inputs, outputs = train[0][0].shape[1], train[0][1].shape[1]
-    orders = Orders(structure, order, delay, inputs)
+def _fits(train: Records, test: Records | tuple[tuple[FloatArray, FloatArray], ...], orders: Orders) -> list[tuple[Polynomials, bool]]:
+    """Polynomials of every output and whether a minimum was reached."""
     shortest = min(len(one) for one, _ in (*train, *test))
     if shortest < rows_needed(orders):
         raise InputError(
             f"a record leaves {shortest} samples after holding out, {rows_needed(orders)} are needed: "
             "record longer or lower the order"
         )
-    fits = [prediction_error_fit([(one, other[:, k]) for one, other in train], orders) for k in range(outputs)]
+    outputs = train[0][1].shape[1]
+    return [prediction_error_fit([(one, other[:, k]) for one, other in train], orders) for k in range(outputs)]
+
+
+def _fit_all(train: Records, test: Records, structure: Structure, order: int, delay: int, dt: float) -> BlackBox:
+    import control
+
+    inputs = train[0][0].shape[1]
+    fits = _fits(train, test, Orders(structure, order, delay, inputs))
     polynomials = tuple(fit[0] for fit in fits)
     radius = max(polynomial.spectral_radius for polynomial in polynomials)
     numerators = [[list(row) for row in polynomial.b] for polynomial in polynomials]

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from identification.assess import Error, assess
 from identification.balances import Balances
+from identification.ceiling import Ceiling, ceiling
 from identification.engine import load_dataset, stack
 from identification.fit import Fit
 from identification.places import Place, gather, places_of
@@ -33,6 +34,8 @@ class Comparison:
         Start and end of the second with the largest residual [s].
     whiteness : mapping of str to float
         Autocorrelation of each residual one kernel length later.
+    linear : Ceiling or None
+        What linear models without physics explain; None where not asked for, or where the records are too short.
     """
 
     name: str
@@ -40,6 +43,7 @@ class Comparison:
     places: tuple[Place, ...]
     worst_window: tuple[float, float]
     whiteness: dict[str, float]
+    linear: Ceiling | None = None
 
     def as_json(self) -> dict[str, Any]:
         """Errors and places as data."""
@@ -47,26 +51,32 @@ class Comparison:
             "record": self.name, **self.error.as_json(),
             "worst_window_s": list(self.worst_window), "whiteness": self.whiteness,
             "places": [p.as_json() for p in self.places],
+            "linear_ceiling": self.linear.as_json() if self.linear else None,
         }  # fmt: skip
 
     def __str__(self) -> str:
         ratios = ", ".join(f"{b} {e.ratio:.3g} times its floor" for b, e in self.error.balances.items())
         top = f"; fails most against {self.places[0].axis.replace('_', ' ')} ({self.places[0].balance} balance)" if self.places else ""
-        return f"{self.name}: fit {self.error.fit_percent:.3g} %, relative error {self.error.relative_error_percent:.3g} % ({ratios}){top}"
+        linear = f"\n{self.linear}" if self.linear else ""
+        return f"{self.name}: fit {self.error.fit_percent:.3g} %, relative error {self.error.relative_error_percent:.3g} % ({ratios}){top}{linear}"
 
     def _repr_html_(self) -> str:
+        from identification.ceiling import ceiling_html
         from identification.html import comparison_html
 
-        return comparison_html(self)
+        return comparison_html(self) + (f"<div>{ceiling_html(self.linear)}</div>" if self.linear else "")
 
 
-def compare(fitted: Fit, records: Record | Sequence[Record]) -> Comparison:
+def compare(fitted: Fit, records: Record | Sequence[Record], *, linear: bool = True) -> Comparison:
     """Compare a fitted model with records it may never have seen.
 
     Parameters
     ----------
     fitted : Fit
     records : Record or sequence of Record
+    linear : bool
+        Fit linear models without physics too, as a ceiling (see :mod:`identification.ceiling`). It takes a second or
+        two whatever the length of the records.
 
     Raises
     ------
@@ -82,10 +92,22 @@ def compare(fitted: Fit, records: Record | Sequence[Record]) -> Comparison:
     sigma = {b: max(error.balances[b].floor, 1e-12) for b in residual}
     power = sum((residual[b] / sigma[b]) ** 2 for b in residual)
     worst = _worst(time, np.asarray(power))
+    unseen = not any(_same(r, seen) for r in given for seen in fitted.records)
+    floor = {b: e.floor for b, e in error.balances.items()}
+    above = ceiling(fitted.data, data.train, residual, floor, unseen=unseen) if linear else None
     return Comparison(
         ", ".join(r.name for r in given), error, places, worst,
-        {b: _lagged(r) for b, r in residual.items()},
+        {b: _lagged(r) for b, r in residual.items()}, above,
     )  # fmt: skip
+
+
+def _same(one: Record, other: Record) -> bool:
+    """True where two records hold the same samples of the same files."""
+    if one is other:
+        return True
+    if not one.provenance.sha256 or one.provenance.sha256 != other.provenance.sha256:
+        return False
+    return len(one) == len(other) and bool(np.array_equal(one.time[[0, -1]], other.time[[0, -1]]))
 
 
 def _worst(time: FloatArray, power: FloatArray) -> tuple[float, float]:

@@ -104,7 +104,7 @@ def _of_the_link(record: Record, sensing: Sensing) -> frozenset[str]:
     """Balances with parameters of the link, which a record with another payload does not share."""
     masked = frozenset(sensing.balances) & LINK_BALANCES
     if masked == frozenset(sensing.balances):
-        raise InputError(f"{record.name}: a record with another payload needs link_torque or both positions: without them every balance holds the link's parameters")
+        raise InputError(f"{record.name}: a record with another payload needs link_torque or both positions, else every balance holds the link")
     return masked
 
 

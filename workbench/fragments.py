@@ -10,6 +10,8 @@ from typing import Any, Final
 from casadi_models import EFFECTS
 from casadi_models.parameter import LINEAR_UNITS
 from identification.assess import VERDICT_KERNELS
+from identification.bode_picture import bode_html
+from identification.ceiling import ceiling_html
 from identification.formats import interval, number, percent, pretty_unit, ratio, words
 from identification.html import BALANCES, table, text, title_of
 from identification.improve import RATIO_LIMIT, Improvement
@@ -241,6 +243,28 @@ def overlay_html(shown: Sequence[Overlay]) -> str:
         '<p class="note">The whole record; drag to choose a window.</p><div id="overlay-whole" class="chart"></div></div>'
         "<noscript><p>These three plots need scripts; every other part of this page does without.</p></noscript>"
     )
+
+
+def linear_html(plots: ReportPlots) -> str:
+    """What linear models without physics explain, beside the final model; empty where the records are too short."""
+    if plots.ceiling is None:
+        return ""
+    note = (
+        "Black boxes from the motion to the measured torque of each balance: static, ARX, output error and MOESP, of order 1 and 2. "
+        "They know no physics, but any linear law is within their reach."
+    )
+    return f"{ceiling_html(plots.ceiling)}<p class='note'>{note}</p>"
+
+
+def frequency_html(plots: ReportPlots) -> str:
+    """Frequency responses; empty where the records excite too little."""
+    if plots.bode is None:
+        return ""
+    said = (
+        "Measured on all the records. Neither model was fitted to these curves: the physical one was fitted to torque balances, "
+        "the subspace one to the signals in time. A peak is a resonance; the phase falls through it."
+    )
+    return f"<p>{said}</p>{bode_html(plots.bode)}"
 
 
 def provenance_html(improvement: Improvement, records: Sequence[Record], versions: Mapping[str, str], command: str | None, made: str) -> str:

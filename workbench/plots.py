@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Final, final
 
 import numpy as np
 import numpy.typing as npt
 
+from identification.ceiling import Ceiling, ceiling
 from identification.engine import Dataset, Solution, references
+from identification.errors import InputError
+from identification.frequency import Bode, bode_of
 from identification.improve import Improvement
 from identification.places import Place, Rows, gather, place, places_of, residuals
+from identification.record import Record
 from identification.weak import WeakRecord
 
 FloatArray = npt.NDArray[np.float64]
@@ -185,16 +190,29 @@ class ReportPlots:
     overlays : tuple of Overlay
     on_held_out : bool
         False where there are no held-out rows: the plots show training records.
+    ceiling : Ceiling or None
+        What linear models without physics explain of the same rows, beside the final model.
+    bode : Bode or None
+        Frequency responses; None where the records excite too little or were not handed over.
     """
 
     places: tuple[tuple[Place, Place | None], ...]
     additions: tuple[StepPlace, ...]
     overlays: tuple[Overlay, ...]
     on_held_out: bool
+    ceiling: Ceiling | None = None
+    bode: Bode | None = None
 
 
-def report_plots(improvement: Improvement) -> ReportPlots | None:
-    """Evaluate every step of an improvement on its held-out records; None where nothing was fitted."""
+def report_plots(improvement: Improvement, raw: Sequence[Record] = ()) -> ReportPlots | None:
+    """Evaluate every step of an improvement on its held-out records; None where nothing was fitted.
+
+    Parameters
+    ----------
+    improvement : Improvement
+    raw : sequence of Record
+        The records at full rate, for the frequency response.
+    """
     if not improvement.steps:
         return None
     data = improvement.data
@@ -210,7 +228,13 @@ def report_plots(improvement: Improvement) -> ReportPlots | None:
     additions = []
     for i, claim in enumerate(improvement.claims[: len(each) - 1]):
         additions.append(step_place(rows, improvement.steps[i + 1].added or claim.effects[0], claim.balance, each[i], each[i + 1]))
-    return ReportPlots(tuple(pairs), tuple(additions), tuple(overlays(data, records, names, start, final)), held)
+    last = improvement.steps[-1]
+    floor = {b: e.floor for b, e in last.held_out.balances.items()}
+    above = ceiling(data, records, final, floor, unseen=held)
+    response = None
+    with suppress(InputError):
+        response = bode_of(last.solution.model, data, raw)
+    return ReportPlots(tuple(pairs), tuple(additions), tuple(overlays(data, records, names, start, final)), held, above, response)
 
 
 def step_place(rows: Rows, effect: str, balance: str, before: Mapping[str, FloatArray], after: Mapping[str, FloatArray]) -> StepPlace:

@@ -88,7 +88,7 @@ def write_report(
 def render_report(improvement: Improvement, *, records: Sequence[Record] = (), command: str | None = None) -> str:
     """The report as text (see :func:`write_report`)."""
     result = improvement.as_json()
-    plots = report_plots(improvement)
+    plots = report_plots(improvement, records)
     name = improvement.joint.name
     sections = [s for s in _sections(improvement, result, plots) if s[2]]
     made = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
@@ -135,6 +135,8 @@ def _sections(improvement: Improvement, result: dict[str, Any], plots: ReportPlo
         ("additions", "Before and after each addition", fragments.additions_html(improvement, plots) if plots and plots.additions else ""),
         ("lines", "Lines", fragments.lines_html(improvement.lines)),
         ("unexplained", "What is left unexplained", fragments.unexplained_html(improvement) if result["steps"] else ""),
+        ("frequency", "Frequency response", fragments.frequency_html(plots) if plots else ""),
+        ("linear", "What a linear model would explain", fragments.linear_html(plots) if plots else ""),
         ("untested", "What these records cannot show", not_testable_html(result)),
         ("parameters", "Parameters", parameters_html(final, start) + _parameter_note() if final else ""),
     ]

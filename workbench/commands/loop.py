@@ -11,7 +11,7 @@ from typing import Any
 
 from identification.compare import compare
 from identification.diagnose import diagnose
-from identification.fit import fit, joint_text
+from identification.fit import Fit, fit, joint_text
 from identification.improve import Improvement, improve
 from identification.joint_file import Joint
 from identification.record import Record
@@ -128,12 +128,24 @@ def run_fit(arguments: Namespace) -> int:
     joint = open_joint(arguments.joint)
     records, warnings = _training(arguments.records, arguments.other_payload, joint)
     fitted = fit(joint, records)
+    if arguments.refine:
+        fitted = _refined(fitted)
     print(f"relative error {fitted.train.relative_error_percent:.3f} %, fit {fitted.train.fit_percent:.2f} %")
     _print_parameters(fitted.parameters)
     if arguments.output:
         write_text(arguments.output, fitted.to_joint_file())
     write_json(arguments.json, {**fitted.as_json(), "warnings": warnings})
     return 0
+
+
+def _refined(fitted: Fit) -> Fit:
+    """The fit refined by the error of its simulated outputs, and what that gained."""
+    from identification.output_error import refine
+
+    found = refine(fitted)
+    falls = ", ".join(f"{n} {found.before[n]:.3g} -> {found.after[n]:.3g}" for n in found.before)
+    print(f"output error in {found.windows} windows, RMS: {falls}")
+    return found.fit
 
 
 def _print_parameters(parameters: Mapping[str, Mapping[str, Any]]) -> None:
@@ -151,7 +163,7 @@ def run_compare(arguments: Namespace) -> int:
     joint = open_joint(arguments.joint)
     records, warnings = open_records(arguments.records, joint)
     basis = open_records(arguments.fit_records, joint)[0] if arguments.fit_records else records
-    comparison = compare(fit(joint, basis), records)
+    comparison = compare(fit(joint, basis), records, linear=not arguments.no_linear)
     print(comparison)
     for place in comparison.places[:5]:
         print(f"  {place.balance} balance against {place.title}: explains {max(place.share_percent, 0):.0f} % of what is left there")
