@@ -1,0 +1,124 @@
+"""Residuals of the balances over several records: stacked rows, their noise floors and their weights."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+import numpy.typing as npt
+
+from casadi_models import JointModel
+from identification.balances import Balances, balances_of
+from identification.dataset import Dataset
+from identification.weak import POSITION_CHAINS, WeakRecord, differentiated_kernel
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+
+@final
+@dataclass(frozen=True)
+class Stacked:
+    """Residual and Jacobian of several records, balance by balance."""
+
+    residual: Mapping[str, FloatArray]
+    jacobian: Mapping[str, FloatArray]
+    block: IntArray
+    taking: Mapping[str, npt.NDArray[np.bool_]]
+
+
+def stack(balances: Balances, records: Sequence[WeakRecord], values: Mapping[str, float]) -> Stacked:
+    """Evaluate the balances on records one after the other; rows that take no part are zero."""
+    parts = [balances.evaluate(w, values) for w in records]
+    share = [{b: 0.0 if b in w.masked else 1.0 for b in balances.balances} for w in records]
+    return Stacked(
+        {b: np.concatenate([p[b][0] * s[b] for p, s in zip(parts, share, strict=True)]) for b in balances.balances},
+        {b: np.concatenate([p[b][1] * s[b] for p, s in zip(parts, share, strict=True)]) for b in balances.balances},
+        np.concatenate([w.block for w in records]),
+        {b: taking_part(b, records) for b in balances.balances},
+    )
+
+
+def taking_part(balance: str, records: Sequence[WeakRecord]) -> npt.NDArray[np.bool_]:
+    """Which of the stacked rows of a balance are not masked."""
+    return np.concatenate([np.full(w.rows, balance not in w.masked) for w in records])
+
+
+def floors(model: JointModel, data: Dataset, values: Mapping[str, float], kernel_data: WeakRecord | None = None) -> dict[str, float]:
+    """RMS that measurement noise alone would leave in each balance."""
+    balances = balances_of(model, data.sensing, wrt=())
+    grid = (kernel_data or data.train[0]).grid
+    out = {}
+    for balance, entering in balances.coefficients(values, kernel_data or data.train[0]).items():
+        variance = 0.0
+        for source, chain in POSITION_CHAINS.items():
+            if source not in data.noise:
+                continue
+            weights: list[FloatArray] = [
+                entering[n] * differentiated_kernel(grid.length, grid.dt, o) for o, n in enumerate(chain) if n in entering
+            ]  # fmt: skip
+            if not weights:
+                continue
+            size = max(len(w) for w in weights)
+            combined = np.zeros(size)
+            for w in weights:
+                pad = (size - len(w)) // 2
+                combined[pad : size - pad] += w
+            variance += data.noise[source] ** 2 * float(np.sum(combined**2))
+        out[balance] = math.sqrt(variance)
+    return out
+
+
+def references(data: Dataset, records: Sequence[WeakRecord]) -> dict[str, FloatArray]:
+    """The measured torque of each balance, averaged: what the relative error refers to."""
+    names = {"link": "torque", "transmission": "torque"}
+    return {
+        b: np.concatenate([w.averaged[names.get(b, "drive")] for w in records])
+        for b in data.sensing.balances
+    }  # fmt: skip
+
+
+def row_weights(
+    balances: Balances, data: Dataset, values: Mapping[str, float], sigma: Mapping[str, float], records: Sequence[WeakRecord]
+) -> dict[str, FloatArray]:
+    """1/sigma of each row: rows that hang on where exactly friction changes its sign count less."""
+    names = [n for n in balances.names if n.endswith("_smoothing_velocity")]
+    doubled = {**values, **{n: 2 * values[n] for n in names}}
+    bare = balances_of(balances.model, data.sensing, wrt=())
+    here = stack(bare, records, values).residual
+    there = stack(bare, records, doubled).residual if names else here
+    stuck = _standstill(balances.model, data, values, records)
+    return {
+        b: 1 / np.sqrt(sigma[b] ** 2 + (here[b] - there[b]) ** 2 / 4 + stuck[b] ** 2) for b in here
+    }  # fmt: skip
+
+
+def _standstill(model: JointModel, data: Dataset, values: Mapping[str, float], records: Sequence[WeakRecord]) -> dict[str, FloatArray]:
+    """Friction torque that a standing joint may hold in either direction, averaged like a row [N.m]."""
+    zero = np.zeros(sum(w.rows for w in records))
+    out = dict.fromkeys(data.sensing.balances, zero)
+    for place, balances in (("motor", ("motor", "sum", "deflection", "axis")), ("link", ("link", "sum", "axis"))):
+        level = sum(
+            abs(values[n]) for t in model.terms if t.place == place and t.effect.key in ("coulomb", "stribeck") for n in t.names[:1]
+        )  # fmt: skip
+        source = f"{place}_position"
+        if not level or source not in data.noise:
+            continue
+        shares = []
+        for w in records:
+            grid = w.grid
+            slow = 3 * data.noise[source] * grid.velocity_gain(source)
+            shares.append(w.average((np.abs(w.points[f"{place}_velocity"]) < slow).astype(float)))
+        held = level * np.concatenate(shares)
+        for b in balances:
+            if b in out:
+                out[b] = np.hypot(out[b], held)
+    return out
+
+
+def rms(values: FloatArray) -> float:
+    """Root mean square."""
+    return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0
