@@ -13,12 +13,18 @@ from identification.candidates import LATE, Base, NotTestable, Trial, make_base
 from identification.claims import HELD_OUT_DROP, LADDER_STEP, Claim, Ranking, confusion_set, make_claim, minor_claims, nearly, rank, simplest
 from identification.engine import Dataset, Solution, load_dataset, prepared_model, solve
 from identification.errors import InputError
+from identification.excitation import excitation_warnings, not_identifiable
 from identification.formats import number
 from identification.joint_file import Joint
 from identification.lines import Line, find_lines
 from identification.locate import Unexplained, locate
 from identification.parameters import parameter_table
 from identification.record import Record
+
+__all__ = [
+    "HOLD_DELAY", "RATIO_LIMIT", "Improvement", "Step", "excitation_warnings", "held_drop", "improve", "ranked_json",
+    "visible_keys", "visible_labels", "with_held_out",
+]  # fmt: skip
 
 MAX_ADDITIONS: Final = 6
 RATIO_LIMIT: Final = 1.5
@@ -428,35 +434,3 @@ def _verdict(
     if claims:
         return "complete", f"Missing: {names}; with it {fall}, and what is left looks like measurement noise."
     return "nothing_missing", "The model explains the records down to their measurement noise: nothing is missing that these records could show."
-
-
-def not_identifiable(data: Dataset) -> str:
-    """Why the training records cannot show what is missing; empty where they can."""
-    import numpy as np
-
-    speed = np.concatenate([w.smooth["motor_velocity"] for w in data.train])
-    top = float(np.quantile(np.abs(speed), 0.99))
-    grid = data.train[0].grid
-    still = 5 * data.noise.get("motor_position", 0.0) * grid.velocity_gain("motor_position")
-    if top <= still:
-        return "The joint does not move in the training records: record a motion with reversals at several speeds."
-    moving = np.sign(speed[np.abs(speed) > 0.02 * top])
-    if not np.any(moving > 0) or not np.any(moving < 0):
-        return "The motor never reverses in the training records: friction cannot be told from offsets; record reversals."
-    return ""
-
-
-def excitation_warnings(data: Dataset) -> tuple[str, ...]:
-    """What the training records are too poor to show, said before the diagnosis."""
-    import numpy as np
-
-    out = []
-    speed = np.concatenate([w.smooth["motor_velocity"] for w in data.train])
-    top = float(np.quantile(np.abs(speed), 0.99)) or 1e-12
-    reversals = int(np.sum(np.diff(np.sign(speed[np.abs(speed) > 0.02 * top])) != 0))
-    if reversals < 4:
-        out.append(f"the motor reverses {reversals} times only: friction cannot be told from offsets; record more reversals")
-    levels = np.histogram(np.abs(speed) / top, bins=10, range=(0, 1))[0] / max(len(speed), 1)
-    if float(levels.max()) > 0.75 and int(np.argmax(levels)) > 2:
-        out.append("the training records run at one speed nearly all the time (triangle only): add a multisine record before trusting small claims")
-    return tuple(out)
