@@ -43,6 +43,8 @@ _BITS: Final = tuple(BIT_NAMES)
 _MOVED: Final = (20.0, 2e-3, 2e-2, 2e-3, 2e-2, 10.0)
 """A sensor is taken back only after its estimate has moved by this much, so that a stuck one is not taken back."""
 _ABSURD: Final = 1e9
+_LARGEST: Final = 1e6
+"""A reading beyond this is no place to start an estimate from."""
 
 
 @final
@@ -97,6 +99,8 @@ class StructuredRule:
     def update(self, reading: list[float]) -> list[float]:
         """One sample; gives the six readings with failed ones replaced."""
         core = self.core
+        if self.k < 0 and not any(-_ABSURD < value < _ABSURD for value in reading):
+            return [0.0] * 6  # nothing has been read yet
         self.k = k = self.k + 1
         if k == 0:
             core.start(np.array(reading))
@@ -108,6 +112,9 @@ class StructuredRule:
             reading = self._fill(reading)
         core.readings[:] = reading
         out = core.advance()
+        total = sum(out)
+        if total - total != 0.0:  # NaN or infinity
+            return self._begin_anew(reading)
         n = core.size
         if k == self.gate_until:
             core.open_gates(False)
@@ -129,6 +136,19 @@ class StructuredRule:
         if self.latched or True in self.failed:
             return self._replaced(used, out)
         return used
+
+    def _begin_anew(self, reading: list[float]) -> list[float]:
+        """Absurd readings have driven the estimate out of all bounds: start it and the residuals again."""
+        usable = [value if -_LARGEST < value < _LARGEST else 0.0 for value in reading]
+        self.core.start(np.array(usable))
+        scale = self.residuals.scale
+        self.residuals.clear()
+        self.residuals.scale = scale
+        for parity in range(len(PARITY_SENSORS)):
+            self.residuals.invalidate(parity, self.k + 1 + self.waits["settle_seconds"])
+        self._open_gates()
+        self._close()
+        return [u if failed else r for u, r, failed in zip(usable, reading, self.failed, strict=True)]
 
     def _replaced(self, used: list[float], out: list[float]) -> list[float]:
         """Readings to go on with: estimates for failed sensors, and for doubtful ones while a suspicion is open."""

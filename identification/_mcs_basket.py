@@ -53,18 +53,18 @@ class Basket:
         self.searches = 0
         self.calls = 0
 
-    def offer(self, f: float, x: Vector) -> bool:
+    def offer(self, f: float, x: tuple[float, ...]) -> bool:
         """Take a candidate; return whether a local search was made from it."""
-        if tuple(x) in self._tried or self._evaluate.failed(x):
+        if x in self._tried or self._evaluate.failed(x):
             return False
-        self._tried.add(tuple(x))
+        self._tried.add(x)
         if self._local is None:
-            self.minima.append(Minimum(f, x, False, False))
+            self.minima.append(Minimum(f, list(x), False, False))
             return False
         before = self._evaluate.count
         searched = False
         try:
-            start = self._survivor(f, x)
+            start = self._survivor(f, list(x))
             while start is not None:
                 searched = True
                 self.searches += 1

@@ -51,7 +51,10 @@ class Evaluator:
 
     def __call__(self, x: Vector) -> float:
         """Return the objective at `x`, clipped to the box."""
-        key = tuple([lo if c < lo else hi if c > hi else c for c, lo, hi in zip(x, self.low, self.high, strict=True)])
+        return self.inside(tuple([lo if c < lo else hi if c > hi else c for c, lo, hi in zip(x, self.low, self.high, strict=True)]))
+
+    def inside(self, key: tuple[float, ...]) -> float:
+        """Return the objective at a point that is known to lie in the box."""
         known = self._known.get(key)
         if known is not None:
             return known
@@ -80,9 +83,9 @@ class Evaluator:
         """Number of calls that gave no finite value."""
         return len(self._failed)
 
-    def failed(self, x: Vector) -> bool:
+    def failed(self, x: tuple[float, ...]) -> bool:
         """Return whether the objective was tried at `x` and was not finite."""
-        return tuple(x) in self._failed
+        return x in self._failed
 
     def _substitute(self) -> float:
         if self._worst == -math.inf:

@@ -194,7 +194,21 @@ class Experiment:
             Divide each column of phi by its norm before the singular values are taken (figure 3.16).
         limits : Limits, optional
         """
-        run = self.run(motion)
+        return self.judge(motion, self.run(motion), normalised=normalised, limits=limits)
+
+    def judge(
+        self, motion: Motion, run: Followed, *, normalised: bool = False, limits: Limits | None = None
+    ) -> Excitation:
+        """As :meth:`evaluate`, from a run that is there already: one run serves the full and the reduced model.
+
+        Parameters
+        ----------
+        motion : Motion
+        run : Followed
+            What :meth:`run` gave for it.
+        normalised, limits
+            As in :meth:`evaluate`.
+        """
         phi = self.matrix(run)
         plain = phi.reshape(-1, len(self.parameters))
         norm = np.linalg.norm(plain, axis=0)

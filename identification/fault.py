@@ -29,6 +29,8 @@ FloatArray = npt.NDArray[np.float64]
 
 _MAGIC: Final = b"FAULTD01"
 _HEAD: Final = struct.Struct("<8sIII")
+_MOTION: Final = 50.0
+"""Standard deviations of its noise by which a position must move in a calibration."""
 
 
 @final
@@ -92,7 +94,13 @@ class FaultDetector:
 
     def calibrate(self, readings: npt.ArrayLike) -> None:
         """Take the limits from healthy readings (n, 6), several representative motions, a minute or more."""
-        self._rule.calibrate(_table(readings, "calibrate"))
+        found = _table(readings, "calibrate")
+        core = self._rule.core
+        for i, name in enumerate(SENSORS):
+            least = _MOTION * float(core.noise[i]) if name.endswith("position") else 0.0
+            if len(found) >= 4 * self._rule.arm and np.ptp(found[:, i]) <= least and (name != "torque" or core.has_torque):
+                raise InputError(f"calibrate: {name} does not move; give a healthy record in which the joint moves and every sensor works")
+        self._rule.calibrate(found)
         self._reported = 0
 
     def update(self, readings: Sequence[float]) -> list[float]:
@@ -124,6 +132,11 @@ class FaultDetector:
     def failed(self) -> tuple[str, ...]:
         """Sensors that are replaced now."""
         return tuple(n for n, f in zip(SENSORS, self._rule.failed, strict=True) if f)
+
+    @property
+    def replaced(self) -> tuple[bool, ...]:
+        """For each of :data:`SENSORS`, whether its reading is replaced now."""
+        return tuple(self._rule.failed)
 
     @property
     def events(self) -> tuple[FaultEvent, ...]:

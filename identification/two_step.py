@@ -103,6 +103,9 @@ class TwoStep:
                 f"TwoStep.fit: y has shape {values.shape} and signals {rows.shape}; give (n, {self.model.outputs}) "
                 "and (n, channels)"
             )
+        for name, value in (start or {}).items():
+            if not np.isfinite(value):
+                raise InputError(f"TwoStep.fit: the start value of {name} is {value!r}; give a finite number")
         weights = self._weights if self._weights is not None else _spread(values)
         again = self._weights is None and self.model.outputs > 1
         first = replace(self.settings, freeze=False) if again else self.settings
@@ -200,7 +203,10 @@ class TwoStep:
         if self._samples % online.samples(0.25 * online.collect_seconds):
             return
         y, signals = window.last(window.count)
-        lost = linear_fit(self.model, y, signals, self.nonlinear, _spread(y), limit=online.rank_limit).lost
+        try:
+            lost = linear_fit(self.model, y, signals, self.nonlinear, _spread(y), limit=online.rank_limit).lost
+        except np.linalg.LinAlgError:
+            raise InputError("TwoStep.update: phi is not finite on the first window; check the model at these signals") from None
         if lost and self._samples < online.samples(online.collect_limit_seconds):
             self.events.append(Event(self._samples, self.mode, f"no rank yet: {', '.join(lost)}"))
             return

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -193,6 +195,45 @@ def test_current_and_motor_friction_are_reported_as_a_pair(
         assert events[0].sensors == ("current", "motor friction")
 
 
+@pytest.mark.parametrize(("kind", "size", "within"), [("noise", 50.0, 0.2), ("stuck", 0.0, 1.0), ("zero", 0.0, 0.2), ("spike", 300.0, 2.0),
+                                                       ("gain", 0.4, 0.5), ("drift", 10.0, 1.5), ("delay", 0.05, 1.5)])  # fmt: skip
+def test_every_kind_of_current_fault_is_reported(detector: FaultDetector, unseen: FloatArray, kind: str, size: float, within: float) -> None:
+    fault = Fault("current", kind, START, size)  # type: ignore[arg-type]
+    events = alarms(detector.run(inject(readings(unseen, 3), DT, [fault], seed=4)[:6000]))
+    assert events
+    assert {e.verdict for e in events} == {Verdict.CURRENT_OR_FRICTION}
+    assert 0 <= events[0].sample * DT - START <= within
+
+
+def test_missing_current_is_replaced_at_once(detector: FaultDetector, unseen: FloatArray) -> None:
+    events = alarms(detector.run(inject(readings(unseen, 3), DT, [Fault("current", "dropout", START)])[:4000]))
+    assert [(e.verdict, e.sensors, e.sample) for e in events] == [(Verdict.DROPOUT, ("current",), round(START / DT))]
+
+
+def test_page_of_the_campaign_holds_what_is_wanted() -> None:
+    """The figures in docs/faults.md, against the limits beside them; every sensor and kind has its curve."""
+    root = Path(__file__).resolve().parents[1]
+    page = (root / "docs" / "faults.md").read_text(encoding="utf-8")
+    figures = {what.strip(): figure for what, figure in re.findall(r"^\| ([^|]+) \| ([^|]+) \|", page, re.MULTILINE)}
+
+    def leading(what: str) -> float:
+        return float(figures[what].split()[0])
+
+    assert leading("healthy data") >= 1.0
+    assert leading("sensor alarms in it") <= leading("healthy data")
+    assert leading("detected") == leading("fault cases") >= 450
+    assert leading("every failed sensor and no other named") >= 0.95 * leading("fault cases")
+    assert leading("abrupt faults, median time to the named sensor") <= 20
+    assert leading("changes of the joint called a sensor fault") == 0
+    assert leading("error of the replaced link position over 40 s") <= 2e-4
+    assert leading("parameters with failed sensors, worst") <= 10.5
+    assert leading("added spring with failed sensors, worst") <= 1.0
+    for sensor in SENSORS:
+        for kind in set(KINDS) - {"stuck", "zero", "dropout"}:
+            assert re.search(rf"^\| {sensor.replace('_', ' ')} \| {kind} \|", page, re.MULTILINE), (sensor, kind)
+    assert (root / "docs" / "faults" / "sizes.svg").read_text(encoding="utf-8").count("<title>") == len(SENSORS) * (len(KINDS) - 3)
+
+
 @pytest.mark.parametrize(
     ("factors", "part"),
     [({"stiffness": 0.8, "cubic_stiffness": 0.8}, "stiffness"), ({"link_inertia": 1.2, "gravity_torque": 1.2}, "link")],
@@ -260,6 +301,43 @@ def test_any_nonsense_leaves_finite_outputs(detector: FaultDetector, unseen: Flo
     assert np.isfinite(track.reconstructed).all()
     assert np.isfinite(detector._rule.core.state).all()
     assert any(e.verdict is Verdict.DROPOUT for e in track.events)
+
+
+def test_absurd_readings_start_the_estimate_again(detector: FaultDetector, unseen: FloatArray) -> None:
+    """Positions of 1e8 rad drive the cubic spring out of the range of numbers; no output and no state ever is NaN."""
+    record = readings(unseen, 9)[:4000]
+    record[1700:1900] = 1e8
+    for k, row in enumerate(record.tolist()):
+        assert np.isfinite(detector.update(row)).all(), k
+        assert np.isfinite(detector._rule.core.state).all(), k
+    assert not np.isnan(detector._rule.numbers()).any()
+    assert np.isfinite(np.array(detector._rule.residuals.sums)).all()
+
+
+def test_nothing_begins_before_the_first_reading(detector: FaultDetector, unseen: FloatArray) -> None:
+    record = readings(unseen, 9)[:2000]
+    late = detector.run(np.vstack([np.full((5, 6), np.nan), record]))
+    assert [e.verdict for e in late.events] == [Verdict.ARMED]
+    assert np.array_equal(late.reconstructed[5:], record)
+
+
+@pytest.mark.parametrize("sensor", range(6))
+def test_calibration_with_a_dead_sensor_is_refused(plant: JointModel, unseen: FloatArray, sensor: int) -> None:
+    record = np.tile(readings(unseen, 9), (2, 1))
+    record[:, sensor] = 0.3
+    with pytest.raises(InputError, match=rf"calibrate: {SENSORS[sensor]} does not move; give a healthy record"):
+        FaultDetector(identified(plant), DT).calibrate(record)
+
+
+def test_calibration_at_standstill_is_refused(plant: JointModel) -> None:
+    noise = np.random.default_rng(1).normal(size=(8000, 6)) * [NOISE[s] for s in SENSORS]
+    with pytest.raises(InputError, match=r"calibrate: motor_position does not move"):
+        FaultDetector(identified(plant), DT).calibrate(noise)
+
+
+def test_replaced_flags_are_those_of_the_names(detector: FaultDetector, unseen: FloatArray) -> None:
+    detector.run(inject(readings(unseen, 8), DT, [Fault("link_position", "zero", START)])[:4000])
+    assert detector.failed == tuple(s for s, r in zip(SENSORS, detector.replaced, strict=True) if r) == ("link_position",)
 
 
 def test_state_and_restore_go_on_bit_by_bit(calibrated: FaultDetector, plant: JointModel, unseen: FloatArray) -> None:

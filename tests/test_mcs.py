@@ -598,7 +598,7 @@ def test_each_box_has_its_base_inside_and_its_value(name: str) -> None:
         assert np.all((lo <= box.x) & (box.x <= hi))
         assert box.f == JONES[name].fun(np.array(box.x))
         assert box.level >= 2
-        assert (box.level >= last) == any(box is other for other in search.tree.finished)
+        assert (box.level >= last) == (box in search.tree.finished())
 
 
 def test_neighbour_samples_follow_the_separable_correction() -> None:
@@ -684,10 +684,10 @@ def test_model_of_a_quadratic_is_exact(seed: int) -> None:
 def test_search_out_of_steps_admits_one_more_from_the_same_valley() -> None:
     evaluate = _evaluator(lambda x: float(((x - 0.11) ** 4).sum()), [-4.0, -4.0], [4.0, 4.0])
     basket = Basket(evaluate, LocalSearch(evaluate, [[True] * 2] * 2, 1, 2.2e-16))
-    assert basket.offer(evaluate([3.0, 2.0]), [3.0, 2.0])
+    assert basket.offer(evaluate([3.0, 2.0]), (3.0, 2.0))
     assert [minimum.converged for minimum in basket.minima] == [False]
-    assert basket.offer(evaluate([3.5, 2.5]), [3.5, 2.5])
-    assert not basket.offer(evaluate([2.5, 3.5]), [2.5, 3.5])
+    assert basket.offer(evaluate([3.5, 2.5]), (3.5, 2.5))
+    assert not basket.offer(evaluate([2.5, 3.5]), (2.5, 3.5))
     assert basket.searches == 2
     assert len(basket.minima) == 1
 

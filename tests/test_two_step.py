@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -13,6 +14,7 @@ import pytest
 
 from casadi_models.thesis import model_ts
 from identification._two_step_online import PortionedTask, Window
+from identification._varpro_search import Method
 from identification.errors import InputError
 from identification.two_step import (
     JOINT_CHANNELS,
@@ -303,6 +305,62 @@ def test_nan_and_standstill_leave_a_finite_state() -> None:
     still = run(two, np.full(500, 0.0), np.zeros(500))
     assert np.isfinite(still).all()
     assert np.isfinite(two.update([np.nan], [np.inf])).all()
+
+
+def _spoiled(kind: str) -> SeparableModel:
+    """The friction with columns that cannot be used."""
+
+    def columns(signals: FloatArray, eta: FloatArray) -> FloatArray:
+        if kind == "raises":
+            raise ZeroDivisionError("no torque")
+        good = numpy_model().columns(signals, eta)
+        return good[:, :2] if kind == "shape" else np.where(eta[0] < 0.02, np.nan, good) if kind == "partly" else good * np.nan
+
+    return replace(numpy_model(), columns=columns)
+
+
+@pytest.mark.parametrize("method", ["variable_projection", "alternating"])
+@pytest.mark.parametrize(
+    ("kind", "error", "words"),
+    [
+        ("raises", ZeroDivisionError, "no torque"),
+        ("nan", InputError, "phi is not finite at"),
+        ("partly", InputError, "phi is not finite at"),
+        ("shape", InputError, r"phi has shape \(2000, 1, 2\); give \(2000, 1, 3\)"),
+    ],
+)
+def test_a_model_that_raises_or_gives_nan_says_where(method: Method, kind: str, error: type[Exception], words: str) -> None:
+    with pytest.raises(error, match=words) as caught:
+        TwoStep(_spoiled(kind), method).fit(friction(SINE), SINE)
+    assert "\n" not in str(caught.value)
+    if kind == "raises" and method == "variable_projection":
+        assert caught.value.__notes__[0].startswith("mcs: raised by the objective at evaluation 1")
+
+
+def test_a_model_that_gives_nan_on_line_is_one_line() -> None:
+    y, w = online_data(6.0, 1.0, 1.0, 9.0)
+    two = TwoStep(_spoiled("nan"), online=ONLINE)
+    with pytest.raises(InputError, match=r"phi is not finite on the first window; check the model"):
+        run(two, y, w)
+
+
+@pytest.mark.parametrize("box", [(0.005, np.inf), (-np.inf, 0.5), (np.nan, 0.5), (0.5, 0.5), (0.1, 0.5)])
+def test_boxes_of_shapes_are_finite_and_hold_the_nominal_value(box: tuple[float, float]) -> None:
+    with pytest.raises(InputError, match=r"shape parameter w1: box .* give finite low < high with the nominal value inside"):
+        Shape("w1", *box, 0.05)
+
+
+@pytest.mark.parametrize("level", [0.0, 0.1])
+def test_a_constant_channel_is_a_named_outcome(level: float) -> None:
+    found = TwoStep(numpy_model()).fit(np.full(500, 3.0 * level), np.full(500, level))
+    assert found.outcome is TwoStepOutcome.RANK_DEFICIENT
+    assert found.unidentifiable == ("w1", "wS")
+    assert np.isfinite(list(found.values.values())).all()
+
+
+def test_a_start_that_is_nan_is_refused() -> None:
+    with pytest.raises(InputError, match=r"TwoStep\.fit: the start value of w1 is nan; give a finite number"):
+        TwoStep(numpy_model()).fit(friction(SINE), SINE, start={"w1": np.nan, "wS": 0.02})
 
 
 def test_a_window_without_rank_is_extended_and_named() -> None:

@@ -100,6 +100,11 @@ def _parser() -> argparse.ArgumentParser:
     tracked = verb("track", "online", "replay the online estimator with sensor-fault detection", records=True, joint=True)
     tracked.add_argument("--healthy", nargs="+", metavar="REC", default=[], help="records of the healthy joint: limits of the fault detector")
     tracked.add_argument("--fail-on-fault", action="store_true", help="exit with 1 where a fault is found")
+    tracked.add_argument("--report", metavar="FILE", help="write the HTML report")
+    tracked.add_argument(
+        "--inject", metavar="SENSOR:KIND:START[:SIZE[:END]]", action="append", default=[],
+        help="put a fault into the readings to see what is found, as link_position:stuck:9",
+    )  # fmt: skip
     planned = verb("plan", "online", "select a motion that makes the parameters identifiable", joint=True)
     planned.add_argument("-o", "--output", metavar="FILE", default="trajectory.csv", help="the motion as CSV (default trajectory.csv)")
     planned.add_argument("--max-position", type=float, metavar="DEG", default=85.0, help="half of the link's workspace [deg]")

@@ -88,10 +88,8 @@ STIFFNESS = 2e4
 def report(cases: Sequence[Case], command: str) -> str:
     """The table and its two figures."""
     hit, false = 100 * np.mean([c.found for c in cases]), sum(len(c.empty) for c in cases)
-    rows = [
-        f"| {c.balance} | {c.order:.3f} | {c.drop:.1f} | {', '.join(f'{x.order:.3f} ± {x.tolerance:.3f} ({x.balance})' for x in c.lines) or '-'} | {'yes' if c.found else '**no**'} |"
-        for c in cases
-    ]  # fmt: skip
+    said = [", ".join(f"{x.order:.3f} ± {x.tolerance:.3f} ({x.balance})" for x in c.lines) or "-" for c in cases]
+    rows = [f"| {c.balance} | {c.order:.3f} | {c.drop:.1f} | {s} | {'yes' if c.found else '**no**'} |" for c, s in zip(cases, said, strict=True)]
     return "\n".join([
         f"Printed by `{command}`.", "",
         f"Right order and balance: {hit:.0f} % of {len(cases)} joints (limit {LIMIT:.0f} %). Lines on the same joints without one: {false} (limit 0).", "",

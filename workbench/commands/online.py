@@ -4,45 +4,185 @@ from __future__ import annotations
 
 import math
 from argparse import Namespace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, final
 
 import numpy as np
+import numpy.typing as npt
 
 from identification.errors import InputError
 from workbench.commands.files import open_joint, open_records, progress_bar, write_bytes, write_json
 
 if TYPE_CHECKING:
     from identification.excite import Excitation, Selection
+    from identification.fault import Fault
     from identification.joint_file import Joint
     from identification.record import Record
     from irj_fmu.online import OnlineEstimator
 
-ROWS: Final = 12
-"""Rows of the table printed per record; the JSON holds a hundred."""
+FloatArray = npt.NDArray[np.float64]
+
+POINTS: Final = 400
+"""Points of the parameters' course kept per record."""
+AFTERMATH: Final = 2.0
+"""Seconds after a failure in which the look at the last second of readings still sees it."""
+UNESTIMATED: Final = "the parameters were not estimated: the first window needs some seconds in which every reading is good"
+READINGS: Final = ("motor current", "motor position", "motor velocity", "link position", "link velocity", "torque")
+
+
+@final
+@dataclass(frozen=True)
+class Replay:
+    """What the online estimator made of one record.
+
+    Attributes
+    ----------
+    record : Record
+        At even steps.
+    estimator : OnlineEstimator
+        After the last sample.
+    time, values, sigmas, ratios
+        Course of the estimate at some hundred points: (m,) [s], (m, parameters) twice, (m, balances).
+    events : tuple of dict
+        ``time``, ``fault``, ``text``.
+    healthy, readings, used : (n, 6) array
+        As recorded; with the faults tried on purpose, NaN where there is none; with failed ones replaced.
+        Link-referred SI.
+    failed : (n, 6) bool array
+        Where a reading is replaced.
+    tried : tuple of Fault
+    calibrated : bool
+        The detector's limits come from healthy records.
+    """
+
+    record: Record
+    estimator: OnlineEstimator
+    time: FloatArray
+    values: FloatArray
+    sigmas: FloatArray
+    ratios: FloatArray
+    events: tuple[dict[str, Any], ...]
+    healthy: FloatArray
+    readings: FloatArray
+    used: FloatArray
+    failed: npt.NDArray[np.bool_]
+    tried: tuple[Fault, ...] = ()
+    calibrated: bool = False
+
+    def spans(self, reading: int | None = None) -> list[tuple[float, float]]:
+        """Times [s] from which to which a reading is replaced; any reading where none is named."""
+        failed = self.failed.any(axis=1) if reading is None else self.failed[:, reading]
+        edges = np.flatnonzero(np.diff(failed.astype(np.int8), prepend=0, append=0))
+        time = self.record.time
+        return [(float(time[a]), float(time[min(b, len(time) - 1)])) for a, b in edges.reshape(-1, 2).tolist()]
+
+    def as_json(self) -> dict[str, Any]:
+        """Data of `track --json`."""
+        estimator = self.estimator
+        units = {p.name: p for p in estimator.model.parameters}
+        return {
+            "record": self.record.name, "time": self.time.tolist(), "detector": estimator.detector is not None, "calibrated": self.calibrated,
+            "events": list(self.events),
+            "replaced": [{"reading": name, "from": a, "to": b} for i, name in enumerate(READINGS) for a, b in self.spans(i)],
+            "ratio": dict(zip(estimator.balances, self.ratios[-1].tolist(), strict=True)) if len(self.time) else {},
+            "parameters": {
+                name: {"value": float(self.values[-1, i]), "sigma": float(self.sigmas[-1, i]), "unit": units[name].unit,
+                       "side": units[name].side, "history": self.values[:, i].tolist(), "sigma_history": self.sigmas[:, i].tolist()}
+                for i, name in enumerate(estimator.names) if len(self.time)
+            },
+        }  # fmt: skip
 
 
 def run_track(arguments: Namespace) -> int:
     """`irj track`: 1 where ``--fail-on-fault`` was given and a fault was found."""
     joint = open_joint(arguments.joint)
+    tried = [parse_fault(text) for text in getattr(arguments, "inject", None) or []]
     records, warnings = open_records(arguments.records, joint)
-    state = _healthy_state(arguments, joint, records[0])
-    found = [track(record, joint, state) for record in records]
-    for result in found:
+    healthy, more = open_records(arguments.healthy, joint)
+    state = limits(joint, records[0], healthy)
+    found = [replay(record, joint, state, tried) for record in records]
+    results = [made.as_json() for made in found]
+    for result in results:
         _print_track(result)
-    write_json(arguments.json, {"records": found, "warnings": warnings})
-    return 1 if arguments.fail_on_fault and any(r["events"] for r in found) else 0
+    write_json(arguments.json, {"records": results, "warnings": [*warnings, *more]})
+    page = getattr(arguments, "report", None)
+    if page:
+        from workbench.track_report import track_page
+
+        write_bytes(page, track_page(found, joint, command=getattr(arguments, "command", None), notes=[*warnings, *more]).encode())
+        print(f"{page}: report written")
+    return 1 if arguments.fail_on_fault and any(r["events"] for r in results) else 0
 
 
-def _healthy_state(arguments: Namespace, joint: Joint, record: Record) -> bytes | None:
-    from irj_fmu.build import detector_state
-    from irj_fmu.online import OnlineOptions
+def parse_fault(text: str) -> Fault:
+    """A fault to try, as ``SENSOR:KIND:START[:SIZE[:END]]``; size in the unit of the reading, times in s.
+
+    Raises
+    ------
+    InputError
+        One line that says how to write it.
+    """
+    from identification.fault import KINDS, SENSORS, Fault
+
+    parts = text.split(":")
+    how = f"write SENSOR:KIND:START[:SIZE[:END]], SENSOR one of {', '.join(SENSORS)}, KIND one of {', '.join(KINDS)}, as link_position:stuck:9"
+    try:
+        sensor, kind, *numbers = parts
+        start, size, end = (*map(float, numbers), *(0.0, math.inf)[max(len(numbers) - 1, 0):])
+    except ValueError:
+        raise InputError(f"--inject {text!r}: {how}") from None
+    if len(numbers) < 2 and kind not in ("stuck", "zero", "dropout"):
+        raise InputError(f"--inject {text!r}: {kind} needs a size; {how}")
+    try:
+        return Fault(sensor, kind, start, size, end)  # type: ignore[arg-type]
+    except InputError as error:
+        raise InputError(f"--inject {text!r}: {error}") from None
+
+
+def limits(joint: Joint, record: Record, healthy: Sequence[Record]) -> bytes | None:
+    """State of a fault detector with limits from healthy records; None without records.
+
+    Raises
+    ------
+    InputError
+        The joint is rigid or not fitted; a record has another sample time or lacks a channel.
+    """
+    if not healthy:
+        return None
+    from identification.fault import FaultDetector
+    from irj_fmu.online import OnlineOptions, prepared
 
     options = OnlineOptions(has_link=record.has("link_position"), has_torque=record.has("link_torque"))
-    return detector_state(joint, options, [Path(p) for p in arguments.healthy])
+    model, _ = prepared(joint, options)
+    if not joint.fitted or not model.is_elastic:
+        raise InputError(f"{joint.source or joint.name}: the fault detector needs an elastic joint with fitted values; make one with `irj fit -o`")
+    tables = []
+    for other in healthy:
+        if abs(other.dt - record.dt) > 0.01 * record.dt:
+            raise InputError(f"{other.name}: sampled every {other.dt:.4g} s, {record.name} every {record.dt:.4g} s; --healthy takes records of the same rate")
+        for channel in ("link_position", "link_torque"):
+            if record.has(channel) and not other.has(channel):
+                raise InputError(f"{other.name}: no {channel}, which {record.name} has; --healthy takes records with the same channels")
+        tables.append(np.array(online_readings(other.resampled(), joint)[0]))
+    detector = FaultDetector(model, record.resampled().dt, has_torque=options.has_torque)
+    detector.calibrate(np.concatenate(tables))
+    return detector.state()
 
 
 def track(record: Record, joint: Joint, detector_state: bytes | None = None) -> dict[str, Any]:
+    """Replay a record through the online estimator, sample by sample (see :func:`replay`).
+
+    Returns
+    -------
+    dict
+        ``record``, ``time``, ``parameters`` (name to value, sigma, unit, side, history), ``ratio`` (balance to residual
+        over floor), ``events``, ``detector`` (whether faults were looked for).
+    """
+    return replay(record, joint, detector_state).as_json()
+
+
+def replay(record: Record, joint: Joint, detector_state: bytes | None = None, tried: Sequence[Fault] = ()) -> Replay:
     """Replay a record through the online estimator, sample by sample.
 
     Parameters
@@ -53,42 +193,67 @@ def track(record: Record, joint: Joint, detector_state: bytes | None = None) -> 
         With fitted values the sensor-fault detector runs too.
     detector_state : bytes, optional
         Of a detector calibrated with healthy records.
+    tried : sequence of Fault
+        Faults put into the readings; their times count from the first sample.
 
-    Returns
-    -------
-    dict
-        ``record``, ``time``, ``parameters`` (name to value, sigma, unit, side, history), ``ratio`` (balance to residual
-        over floor), ``events``, ``detector`` (whether faults were looked for).
+    Raises
+    ------
+    InputError
+        The record is too short for the first window, or a fault begins after its end.
     """
+    from identification.fault import inject
     from irj_fmu.online import OnlineEstimator, OnlineOptions
 
     even = record.resampled()
+    for asked in tried:
+        if not 0 <= asked.start < even.duration:
+            raise InputError(f"{record.name}: a fault at {asked.start:g} s is asked for, the record is {even.duration:.4g} s long")
     options = OnlineOptions(has_link=record.has("link_position"), has_torque=record.has("link_torque"))
-    if not options.has_torque or not options.has_link:
-        detector_state = None
     estimator = OnlineEstimator(joint, even.dt, options, detector_state)
-    readings, valid = online_readings(even, joint)
-    every = max(1, len(even) // 100)
-    times: list[float] = []
-    history: list[list[float]] = []
+    table, there = online_readings(even, joint)
+    healthy = np.array(table)
+    readings = inject(healthy, even.dt, tried) if tried else healthy
+    valid = (np.isfinite(readings) & np.array(there)).tolist()
+    rows = np.nan_to_num(readings).tolist()
+    used, failed = readings.copy(), np.zeros(readings.shape, dtype=bool)
+    every = max(1, len(even) // POINTS)
+    course: list[tuple[float, FloatArray, FloatArray, FloatArray]] = []
     events: list[dict[str, Any]] = []
-    fault = 0
+    fault, detector = 0, estimator.detector
     for part in even.segments():
         estimator.reset()
+        before: tuple[bool, ...] = (False,) * len(READINGS)
+        quiet = [-math.inf] * len(READINGS)
         for k in range(part.start, part.stop):
             now = float(even.time[k])
-            estimator.update(now, readings[k], valid)
+            estimator.update(now, rows[k], valid[k])
+            codes = []
+            if detector is not None:
+                replaced = detector.replaced
+                used[k], failed[k] = estimator.readings, replaced
+                if replaced != before:
+                    codes = [i + (1 if valid[k][i] else 11) for i in range(len(READINGS)) if replaced[i] and not before[i]]
+                    quiet = [now + AFTERMATH if r or b else q for r, b, q in zip(replaced, before, quiet, strict=True)]
+                    before = replaced
             if estimator.fault != fault:
                 fault = estimator.fault
-                if fault:
-                    events.append({"time": now, "fault": fault, "text": fault_text(fault)})
+                # a reading that is replaced has been reported when that began
+                known = fault not in (7, 8) and (before[fault % 10 - 1] or now < quiet[fault % 10 - 1])
+                codes += [fault] if fault and not known else []
+            events += [{"time": now, "fault": code, "text": fault_text(code)} for code in codes]
             if (k + 1) % every == 0 and not estimator.warming_up:
-                times.append(now)
-                history.append(estimator.theta.tolist())
+                course.append((now, estimator.theta.copy(), estimator.sigma.copy(), estimator.ratio.copy()))
         progress_bar(f"tracking {record.name}", part.stop / len(even))
-    if estimator.warming_up:
-        raise InputError(f"{record.name}: {even.duration:.3g} s are too short for the first window of {options.warm_up:g} s; give a longer record")
-    return _result(even, estimator, times, history, events)
+    if not course and not events:
+        longest = max(part.stop - part.start for part in even.segments()) * even.dt
+        where = "are too short" if len(even.segments()) == 1 else f"in {len(even.segments())} pieces, the longest of {longest:.3g} s, are too short"
+        raise InputError(f"{record.name}: {even.duration:.3g} s {where} for the first window of {options.warm_up:g} s; give a longer record")
+    widths = ((), (len(estimator.names),), (len(estimator.names),), (len(estimator.balances),))
+    time, values, sigmas, ratios = (np.array([row[i] for row in course]).reshape(-1, *w) for i, w in enumerate(widths))
+    return Replay(
+        even, estimator, time, values, sigmas, ratios, tuple(events), healthy, readings, used, failed, tuple(tried),
+        estimator.detector is not None and detector_state is not None,
+    )  # fmt: skip
 
 
 def online_readings(record: Record, joint: Joint) -> tuple[list[list[float]], list[bool]]:
@@ -112,42 +277,33 @@ def online_readings(record: Record, joint: Joint) -> tuple[list[list[float]], li
 
 def fault_text(code: int) -> str:
     """What a fault code means, in words."""
-    names = ("motor current", "motor position", "motor velocity", "link position", "link velocity", "torque")
     if code == 7:
         return "motor current sensor failed or motor friction changed"
     if code == 8:
         return "the joint changed, the sensors agree with each other"
     kind, sensor = divmod(code, 10)
     what = ("sensor failed", "reading missing", "reading constant while the joint moves", "reading of wrong scale")[kind]
-    return f"{names[sensor - 1]}: {what}"
-
-
-def _result(
-    record: Record, estimator: OnlineEstimator, times: list[float], history: list[list[float]], events: list[dict[str, Any]]
-) -> dict[str, Any]:
-    units = {p.name: p for p in estimator.model.parameters}
-    table = np.array(history)
-    return {
-        "record": record.name, "time": times, "detector": estimator.detector is not None, "events": events,
-        "ratio": dict(zip(estimator.balances, estimator.ratio.tolist(), strict=True)),
-        "parameters": {
-            name: {"value": float(estimator.theta[i]), "sigma": float(estimator.sigma[i]), "unit": units[name].unit,
-                   "side": units[name].side, "history": table[:, i].tolist()}
-            for i, name in enumerate(estimator.names)
-        },
-    }  # fmt: skip
+    return f"{READINGS[sensor - 1]}: {what}"
 
 
 def _print_track(result: dict[str, Any]) -> None:
     print(f"{result['record']}: {len(result['parameters'])} parameters followed")
-    print("  last value +- standard deviation, in brackets the side it is referred to, and the first value")
+    if result["parameters"]:
+        print("  last value +- standard deviation, in brackets the side it is referred to, and the first value")
+    else:
+        print(f"  {UNESTIMATED}")
     for name, p in result["parameters"].items():
         print(f"  {name:<28} {p['value']:.6g} +- {p['sigma']:.2g} {p['unit']} ({p['side']} side), first {p['history'][0]:.6g}")
-    print("  residual over floor: " + ", ".join(f"{b} {r:.3g}" for b, r in result["ratio"].items()))
+    if result["ratio"]:
+        print("  residual over floor: " + ", ".join(f"{b} {r:.3g}" for b, r in result["ratio"].items()))
     if not result["detector"]:
         print("  sensor faults were not looked for: that needs an elastic joint file with fitted values (`irj fit -o`)")
     for event in result["events"]:
         print(f"  {event['time']:.3f} s: {event['text']}")
+    for span in result["replaced"]:
+        print(f"  {span['reading']} replaced from {span['from']:.3f} s to {span['to']:.3f} s")
+    if result["detector"] and not result["calibrated"]:
+        print("  limits of the fault detector are guesses: give records of the healthy joint with --healthy")
     if result["detector"] and not result["events"]:
         print("  no sensor fault")
 
