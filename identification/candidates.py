@@ -34,6 +34,9 @@ COLLINEAR: Final = 2e-3
 """Share of a candidate's columns outside the base below which it is not testable."""
 
 
+WARM_UP: Final = 15.0
+"""Shortest run in which a warm-up is looked for without a temperature channel [s]."""
+
 REFINE_SHARE: Final = 0.1
 """Share of the residual that a candidate must explain on its grid before its shape is refined."""
 
@@ -126,6 +129,11 @@ def offered(model: JointModel, data: Dataset, *, late: bool = False) -> tuple[li
     return out, refused
 
 
+def _shortest(data: Dataset) -> float:
+    """Length of the shortest training record [s]."""
+    return min(float(np.ptp(w.time)) for w in data.train)
+
+
 def _turns(data: Dataset) -> float:
     """Turns of the motor over the travel of the records."""
     return 2 * data.ranges["position"] * abs(data.joint.gear_ratio) / (2 * math.pi)
@@ -143,8 +151,8 @@ def _shown(place: str) -> str:
 def _why_not(effect: Effect, model: JointModel, data: Dataset) -> str:
     if effect.key == "transmission_losses" and (model.is_elastic or model.has("viscous") or model.has("coulomb")):
         return "its parts (Coulomb, viscous, cubic viscous, cyclic friction) are tried one by one"
-    if effect.key == "thermal_friction" and not data.sensing.has_temperature:
-        return "no temperature channel that changes; record the temperature over a warm-up"
+    if effect.key == "thermal_friction" and not data.sensing.has_temperature and _shortest(data) < WARM_UP:
+        return f"no temperature channel that changes, and a run shorter than {WARM_UP:g} s; record the temperature over a warm-up"
     if effect.needs_load and not data.sensing.has_torque and not model.has("gravity"):
         return "no torque sensor and no gravity in the model: the load is not known"
     if effect.key == "extra_inertia" and not any(n in data.joint.known for n in ("motor_inertia", "link_inertia")):

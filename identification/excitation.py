@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 
 from identification.dataset import Dataset
+from identification.weak import differentiated_kernel
+
+ATTENUATION: Final = 0.02
+"""Pull of a parameter towards zero that is worth a word."""
 
 
 def not_identifiable(data: Dataset) -> str:
@@ -32,4 +38,26 @@ def excitation_warnings(data: Dataset) -> tuple[str, ...]:
     levels = np.histogram(np.abs(speed) / top, bins=10, range=(0, 1))[0] / max(len(speed), 1)
     if float(levels.max()) > 0.75 and int(np.argmax(levels)) > 2:
         out.append("the training records run at one speed nearly all the time (triangle only): add a multisine record before trusting small claims")
+    pulled = {name: 100 * share / (1 + share) for name, share in attenuation(data).items() if share > ATTENUATION}
+    if pulled:
+        worst = ", ".join(f"{name} by about {share:.2g} %" for name, share in pulled.items())
+        out.append(f"noise of the positions lowers the {worst}: `irj fit --refine` takes that off, finer encoders avoid it")
     return tuple(out)
+
+
+def attenuation(data: Dataset) -> dict[str, float]:
+    """Share by which noise of the positions pulls a parameter towards zero.
+
+    Noise power over power of the averaged signal that the parameter multiplies (errors in variables).
+    """
+    grid, out = data.train[0].grid, {}
+    if {"motor_position", "link_position"} <= set(data.noise) and not data.sensing.clamped_link:
+        torsion = np.concatenate([w.averaged["motor_position"] - w.averaged["link_position"] for w in data.train])
+        noise = data.noise["motor_position"] ** 2 + data.noise["link_position"] ** 2
+        out["stiffness"] = float(np.sum(differentiated_kernel(grid.length, grid.dt, 0) ** 2)) * noise / max(float(np.var(torsion)), 1e-300)
+    for side in ("motor", "link"):
+        if f"{side}_position" in data.noise:
+            noise = float(np.sum(differentiated_kernel(grid.length, grid.dt, 2) ** 2)) * data.noise[f"{side}_position"] ** 2
+            power = float(np.var(np.concatenate([w.averaged[f"{side}_acceleration"] for w in data.train])))
+            out[f"{side} inertia"] = noise / max(power, 1e-300)
+    return out

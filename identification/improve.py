@@ -360,8 +360,16 @@ class _Loop:
         return Improvement(
             self.joint, self.data, tuple(steps), tuple(claims), minor, first, tuple(lines), tuple(where), verdict, reason, ratios,
             tuple(n for n in first.not_testable if n.effect not in {c for x in claims for c in x.effects}),
-            excitation_warnings(self.data), tuple(sorted(self.refused)),
+            (*excitation_warnings(self.data), *self._without_temperature(claims)), tuple(sorted(self.refused)),
         )  # fmt: skip
+
+    def _without_temperature(self, claims: Sequence[Claim]) -> tuple[str, ...]:
+        if self.data.sensing.has_temperature or not any("thermal_friction" in c.effects for c in claims):
+            return ()
+        return (
+            "no temperature was recorded: thermal friction is judged by the time since each run started, taken as a cold start; "
+            "its values are the change over one run, not per kelvin",
+        )
 
     def _line_kernels(self) -> list[float]:
         """The shortest kernel and one between it and that of the claims."""

@@ -15,7 +15,7 @@ from typing import Any, Final, final
 import numpy as np
 import numpy.typing as npt
 
-from identification._shooting import Shooting, cut_windows, substeps_for, weighted
+from identification._shooting import Shooting, Windows, cut_windows, substeps_for, weighted
 from identification.assess import assess
 from identification.engine import bounds_of, row_weights
 from identification.errors import InputError
@@ -26,8 +26,12 @@ FloatArray = npt.NDArray[np.float64]
 
 SMOOTHING_SHRINK: Final = 1.5
 """Factor by which a smoothing velocity may fall below its start: the steps were chosen for the start."""
+SOFTEST: Final = 12
+"""Doublings of the smoothing velocities at most."""
 FEW_WINDOWS: Final = 40
 """Windows of the first steps; all of them take the last ones."""
+SETTLED: Final = 1e-3
+"""Relative fall of the cost by initial states alone that is worth another step of the parameters."""
 ENOUGH: Final = 1e-5
 """Relative fall of the cost below which the iteration ends."""
 
@@ -130,11 +134,13 @@ def refine(fit: Fit, records: Record | Sequence[Record] | None = None, *, window
     model, limits = fit.model, bounds_of(fit.model, fit.joint.known, fit.data)
     free = tuple(n for n in fit.solution.free if n not in fit.solution.unidentified)
     start = {n: float(v) for n, v in fit.solution.values.items()}
-    for n in free:
-        low, high = limits[n]
-        limits[n] = (max(low, start[n] / SMOOTHING_SHRINK), high) if n.endswith("_smoothing_velocity") else (low, high)
     data = cut_windows(given, fit.joint, fit.data.sensing, window)
-    shooting = Shooting(model, free, data, substeps_for(model, start, data))
+    start, substeps = _followable(model, start, data)
+    limits = {
+        n: (max(low, start[n] / SMOOTHING_SHRINK), max(high, start[n])) if n.endswith("_smoothing_velocity") else (low, high)
+        for n, (low, high) in limits.items()
+    }
+    shooting = Shooting(model, free, data, substeps)
     state = _settled(shooting, start, data.start_states(model.is_elastic))
     first = replace(state)
     before = shooting.rms(state.products)
@@ -144,8 +150,8 @@ def refine(fit: Fit, records: Record | Sequence[Record] | None = None, *, window
         few = shooting.every(stride)
         part = _State(start, state.x0[::stride], state.products[:, ::stride])
         used = _iterate(few, part, limits, sigma, iterations)
-        near = _State(part.values, state.x0, shooting.evaluate(part.values, state.x0))
-        if near.projected(sigma, shooting.states) < state.cost(sigma):
+        near = _settled(shooting, part.values, _settled(shooting, part.values, state.x0).x0)
+        if near.cost(sigma) < state.cost(sigma):
             state = near
     for _ in range(2):
         # a channel is divided by the error of the model where that is above the noise
@@ -161,6 +167,17 @@ def refine(fit: Fit, records: Record | Sequence[Record] | None = None, *, window
         dict(zip(names, sigma.tolist(), strict=True)), math.sqrt(first.cost(sigma) / total), math.sqrt(state.cost(sigma) / total),
         used, data.count, data.count * data.length,
     )  # fmt: skip
+
+
+def _followable(model: Any, values: dict[str, float], data: Windows) -> tuple[dict[str, float], int]:
+    """Start values with friction smooth enough for the sample time, and the steps per sample."""
+    names = [n for n in values if n.endswith("_smoothing_velocity")]
+    for _ in range(SOFTEST):
+        try:
+            return values, substeps_for(model, values, data)
+        except InputError:
+            values = {**values, **{n: 2 * values[n] for n in names}}
+    return values, substeps_for(model, values, data)
 
 
 def _refuse(fit: Fit, records: Sequence[Record]) -> None:
@@ -215,7 +232,12 @@ def _iterate(
                 break
             state.damping = max(30 * state.damping, 1e-4)
         else:
-            return used
+            # windows whose own start state is off hold up the common step: their states first, one by one
+            near = _settled(shooting, state.values, state.x0)
+            if near.cost(sigma) >= (1 - SETTLED) * cost:
+                return used
+            state.x0, state.products, state.damping = near.x0, near.products, 1e-8
+            continue
         gained = cost - trial.cost(sigma)
         state.values, state.x0, state.products = trial.values, trial.x0, trial.products
         state.damping = max(state.damping / 10, 1e-10)

@@ -160,6 +160,17 @@ def signals_of(record: Record, joint: Joint, sensing: Sensing) -> dict[str, Floa
         out["link_position"] = np.asarray(link if link is not None else one)
     if sensing.has_torque:
         out["torque"] = np.asarray(record["link_torque"])
-    if sensing.has_temperature:
-        out["temperature"] = record["temperature"] - record["temperature"][0]
+    out["temperature"] = record["temperature"] - record["temperature"][0] if sensing.has_temperature else warm_up(record)
     return out
+
+
+def warm_up(record: Record) -> FloatArray:
+    """Stand-in for a temperature that was not recorded: 0 where a run starts, towards 1 at the end of the longest run.
+
+    Time counts anew where the stamps go back; the course is that of a first-order warm-up with a time constant of a third
+    of the longest run.
+    """
+    restart = np.concatenate([[0], np.flatnonzero(np.diff(record.time) < 0) + 1])
+    starts = np.repeat(record.time[restart], np.diff(np.append(restart, len(record.time))))
+    elapsed = record.time - starts
+    return np.asarray(1.0 - np.exp(-3.0 * elapsed / max(float(elapsed.max(initial=0.0)), 1e-9)), dtype=np.float64)

@@ -155,7 +155,7 @@ def test_diagnose_ranks_and_says_what_cannot_be_tested(tmp_path: Path, capsys: p
     assert main([*command, "--json", str(tmp_path / "d.json")]) == 0
     text = capsys.readouterr().out
     assert text.startswith("1. Stribeck effect  -")
-    assert "not testable: thermal_friction: " in text
+    assert "not testable: extra_inertia: " in text
     found = data(tmp_path, "d.json")
     assert found["claims"][0]["effects"] == [HIDDEN]
     assert found["ranking"][0]["effect"] == HIDDEN

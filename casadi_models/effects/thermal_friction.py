@@ -17,7 +17,7 @@ from ..signals import Expression, LocalSignals
         signed("thermal_viscous", "N.m.s/(rad.K)", "change of the viscous coefficient with temperature"),
     ),
     absence="the friction residual changes during the run while its shape stays",
-    excitation="a long run that repeats its first block at the end, with temperature recorded",
+    excitation="a long run that repeats its first block at the end, with temperature recorded; without that channel the time since a cold start stands in",
     source="A. C. Bittencourt, P. Axelsson 2014; L. Simoni et al. 2015",
     needs=("coulomb",),
     separate_by="a long run that repeats its first block when warm",
