@@ -1,29 +1,29 @@
-"""Run one FMU many times with different parameters, on any executor of `concurrent.futures`."""
+"""Run FMUs many times with different parameters, on any executor of `concurrent.futures`."""
 
 from __future__ import annotations
 
-import hashlib
-import json
 import multiprocessing
 import os
-import shutil
-import tempfile
-import threading
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor, wait
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import final
+from typing import Final, final
 
 import numpy as np
 
 from identification.errors import InputError
 
-from .host import Fmu, FmuError, Instance, Wiring, simulate_cs
+from .batch_store import Store
+from .batch_worker import FIGURES, Chunk, Done, empty, enter, run_chunk
+from .host import Fmu, FmuError, Number
 from .signals import FloatArray, Table
 
 Progress = Callable[[int, int], None]
-_LOCAL = threading.local()
+MOST: Final = 250_000_000
+"""Samples times variables of one run."""
+_PATIENCE: Final = 5
+"""Cases that may kill their process one after another before the FMU is given up."""
 
 
 @final
@@ -44,47 +44,60 @@ class Batch:
     step, stop : float
         Communication step and length in s.
     chunk : int
-        Runs that one worker takes at a time; also what a crash can lose.
+        Runs that one worker takes at a time; also what is run again after an interruption.
+    every : int
+        Keep every n-th sample, beginning with the first; the figures see all.
+    measured : mapping
+        Recorded variable to the signal it is compared with.
     """
 
     fmu: Path
-    cases: Sequence[Mapping[str, float]]
+    cases: Sequence[Mapping[str, Number | str]]
     record: Sequence[str]
     inputs: Mapping[str, Table] = field(default_factory=dict)
     step: float = 1e-3
     stop: float = 1.0
     chunk: int = 20
+    every: int = 1
+    measured: Mapping[str, Table] = field(default_factory=dict)
+
+    @property
+    def time(self) -> FloatArray:
+        """Times of the samples that are kept."""
+        times: FloatArray = self.step * np.arange(round(self.stop / self.step) + 1, dtype=np.float64)[:: self.every]
+        return times
 
 
 @final
 @dataclass(frozen=True)
 class FleetResult:
-    """Times, shape (n,), per recorded name an array of shape (cases, n), and by case what went wrong.
+    """Results of a batch.
 
-    The rows of a case in `errors` are NaN.
+    Attributes
+    ----------
+    time : array, shape (n,)
+    signals : mapping
+        By recorded name, shape (cases, n).
+    errors : mapping
+        By case what went wrong; its rows are NaN.
+    figures : mapping
+        By recorded name, shape (cases, len(FIGURES)): `irj_fmu.batch_worker.FIGURES`.
     """
 
     time: FloatArray
     signals: Mapping[str, FloatArray]
     errors: Mapping[int, str]
+    figures: Mapping[str, FloatArray]
 
 
 @final
 @dataclass(frozen=True)
-class _Chunk:
-    """One worker's portion; everything in it can be pickled."""
+class Part:
+    """Results of some cases of batch `batch`, from case `first` on."""
 
-    number: int
-    fmu: str
-    folder: str
-    cases: tuple[Mapping[str, float], ...]
-    record: tuple[str, ...]
-    inputs: Mapping[str, Table]
-    step: float
-    stop: float
-
-
-_Done = tuple[FloatArray, dict[int, str]]
+    batch: int
+    first: int
+    done: Done
 
 
 def run_fleet(
@@ -102,14 +115,14 @@ def run_fleet(
     batch : Batch
         The runs.
     executor : Executor or callable, optional
-        An executor, which is left open, or a function that makes one. By default a pool of processes. Only a
-        function (or the default) lets a run survive a process that dies.
+        An executor, which is left open, or a function that makes one. By default a pool of processes. A function
+        (or the default) lets a run survive a process that dies; so does an executor that heals itself, as Dask's.
     workers : int, optional
         Chunks under way at once; by default the number of processors.
     folder : Path, optional
         Where each chunk's result is kept. A run that is started again there goes on where it stopped.
     progress : callable, optional
-        Called with the runs done and all runs after each chunk.
+        Called with the runs done and all runs after each chunk, and at the start where some are done.
 
     Returns
     -------
@@ -123,125 +136,131 @@ def run_fleet(
     FmuError
         Where an executor that was handed over has died; what is done is in `folder`.
     """
-    if batch.chunk < 1 or not batch.cases:
-        raise InputError("batch: give at least one case and a chunk of at least 1")
-    count = round(batch.stop / batch.step)
-    extracted = tempfile.mkdtemp(prefix="irj-fleet-")
-    try:
-        chunks = _cut(batch, extracted)
-        store = _Store(batch, folder)
-        results = {chunk.number: found for chunk in chunks if (found := store.load(chunk)) is not None}
-        if len(results) < len(chunks):
-            with Fmu(batch.fmu) as fmu:
-                shutil.copytree(fmu.folder, extracted, dirs_exist_ok=True)
-            _Run(chunks, results, store, executor, workers or os.cpu_count() or 1, progress).go()
-    finally:
-        shutil.rmtree(extracted, ignore_errors=True)
-    values = np.concatenate([results[chunk.number][0] for chunk in chunks])
-    errors = {
-        chunk.number * batch.chunk + i: text for chunk in chunks for i, text in results[chunk.number][1].items()
-    }
-    signals = {name: values[:, :, i] for i, name in enumerate(batch.record)}
-    return FleetResult(batch.step * np.arange(count + 1, dtype=np.float64), signals, errors)
-
-
-def _cut(batch: Batch, extracted: str) -> list[_Chunk]:
-    cases = [dict(case) for case in batch.cases]
-    return [
-        _Chunk(
-            number, str(Path(batch.fmu).resolve()), extracted, tuple(cases[first : first + batch.chunk]),
-            tuple(batch.record), dict(batch.inputs), batch.step, batch.stop,
-        )
-        for number, first in enumerate(range(0, len(cases), batch.chunk))
-    ]  # fmt: skip
-
-
-def run_chunk(chunk: _Chunk) -> _Done:
-    """Run one chunk in a worker; a case that fails is noted and leaves NaN."""
-    count = round(chunk.stop / chunk.step)
-    values = np.full((len(chunk.cases), count + 1, len(chunk.record)), np.nan)
-    errors: dict[int, str] = {}
-    for i, case in enumerate(chunk.cases):
-        wiring = Wiring(
-            inputs={f"fmu.{name}": table for name, table in chunk.inputs.items()},
-            parameters={f"fmu.{name}": value for name, value in case.items()},
-            record=[f"fmu.{name}" for name in chunk.record],
-        )
-        try:
-            found = simulate_cs(_instance(chunk), wiring, step=chunk.step, stop=chunk.stop)
-        except FmuError as error:
-            errors[i] = str(error)
-            _drop()
-        else:
-            for j, name in enumerate(chunk.record):
-                values[i, :, j] = found[f"fmu.{name}"]
-    return values, errors
-
-
-def _instance(chunk: _Chunk) -> Instance:
-    """Return this worker's instance of the FMU, made at its first case."""
-    held: tuple[str, Fmu, Instance] | None = getattr(_LOCAL, "held", None)
-    if held is not None and held[0] == chunk.folder:
-        return held[2]
-    _drop()
-    shared = (Path(chunk.folder) / "modelDescription.xml").is_file()
-    fmu = Fmu(Path(chunk.folder if shared else chunk.fmu))
-    instance = Instance(fmu)
-    _LOCAL.held = (chunk.folder, fmu, instance)
-    return instance
-
-
-def _drop() -> None:
-    held: tuple[str, Fmu, Instance] | None = getattr(_LOCAL, "held", None)
-    _LOCAL.held = None
-    if held is not None:
-        held[2].close()
-        held[1].close()
+    parts = list(run_batches([batch], executor=executor, workers=workers, folder=folder, progress=progress).parts())
+    values = np.concatenate([part.done.values for part in parts])
+    figures = np.concatenate([part.done.figures for part in parts])
+    errors = {part.first + i: text for part in parts for i, text in sorted(part.done.errors.items())}
+    names = list(enumerate(batch.record))
+    return FleetResult(batch.time, {n: values[:, :, i] for i, n in names}, errors, {n: figures[:, i] for i, n in names})
 
 
 @final
-class _Store:
-    """The chunks' results on disk, under a fingerprint of the batch."""
+@dataclass(frozen=True)
+class Results:
+    """Where the results of :func:`run_batches` are.
 
-    def __init__(self, batch: Batch, folder: Path | None) -> None:
-        self.folder = folder
-        if folder is None:
-            return
-        digest = hashlib.sha256(Path(batch.fmu).read_bytes())
-        settings = [[dict(c) for c in batch.cases], list(batch.record), batch.step, batch.stop, batch.chunk]
-        digest.update(json.dumps(settings, sort_keys=True).encode())
-        for name in sorted(batch.inputs):
-            table = batch.inputs[name]
-            digest.update(name.encode() + table.time.tobytes() + table.values.tobytes() + bytes([table.hold]))
-        note = folder / "batch.sha256"
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            if not note.exists():
-                note.write_text(digest.hexdigest())
-            known = note.read_text()
-        except OSError as error:
-            raise InputError(f"{folder}: cannot keep results there ({error.strerror}); choose another") from error
-        if known != digest.hexdigest():
-            raise InputError(f"{folder}: holds results of another batch; choose an empty folder")
+    Attributes
+    ----------
+    pairs : tuple
+        Number of the batch, and chunk, in order.
+    store : Store
+    there : int
+        Runs that were there from an earlier start.
+    """
 
-    def load(self, chunk: _Chunk) -> _Done | None:
-        """Return a chunk's result where it is there and whole."""
-        if self.folder is None or not (path := self._path(chunk)).is_file():
-            return None
-        with np.load(path) as held:
-            return held["values"], {int(key): text for key, text in json.loads(str(held["errors"])).items()}
+    pairs: tuple[tuple[int, Chunk], ...]
+    store: Store
+    there: int
 
-    def save(self, chunk: _Chunk, done: _Done) -> None:
-        """Write a chunk's result; it appears when it is whole."""
-        if self.folder is None:
-            return
-        part = self._path(chunk).with_suffix(".part")
-        with part.open("wb") as stream:
-            np.savez_compressed(stream, values=done[0], errors=np.array(json.dumps(done[1])))
-        part.replace(self._path(chunk))
+    def parts(self) -> Iterator[Part]:
+        """Read the results in their order; with a folder no more than one chunk is in memory at a time."""
+        for which, chunk in self.pairs:
+            done = self.store.load(chunk)
+            if done is None:
+                raise InputError(f"{self.store.folder}: the result of chunk {chunk.number} has vanished; run again")
+            yield Part(which, chunk.first, done)
 
-    def _path(self, chunk: _Chunk) -> Path:
-        return Path(self.folder or "") / f"chunk-{chunk.number:06d}.npz"
+
+def run_batches(
+    batches: Sequence[Batch],
+    *,
+    executor: Executor | Callable[[], Executor] | None = None,
+    workers: int | None = None,
+    folder: Path | None = None,
+    progress: Progress | None = None,
+) -> Results:
+    """Run several batches together; arguments and errors are those of :func:`run_fleet`."""
+    for batch in batches:
+        check(batch)
+    with Store(batches, folder) as store:
+        pairs = _cut(batches, store.place, carry=isinstance(executor, Executor))
+        chunks = [chunk for _, chunk in pairs]
+        there = {chunk.number for chunk in chunks if store.load(chunk) is not None}
+        if len(there) < len(chunks):
+            for path, place in {chunk.fmu: chunk.folder for chunk in chunks}.items():
+                _extract(path, place)
+            _Run(chunks, there, store, executor, workers or os.cpu_count() or 1, progress).go()
+        return Results(tuple(pairs), store, sum(len(chunk.cases) for chunk in chunks if chunk.number in there))
+
+
+def check(batch: Batch) -> None:
+    """Refuse a batch that cannot run at all.
+
+    Raises
+    ------
+    InputError
+        Sizes, times, and names that the FMU does not have.
+    """
+    count = round(batch.stop / batch.step) if batch.step > 0 and np.isfinite([batch.stop, batch.step]).all() else 0
+    if batch.chunk < 1 or batch.every < 1 or not batch.cases:
+        raise InputError("batch: give at least one case, and chunk and every of at least 1")
+    if count < 1 or abs(count * batch.step - batch.stop) > 1e-6 * batch.step:
+        raise InputError(f"batch: {batch.stop:g} s is not a whole number of steps of {batch.step:g} s")
+    if count * max(1, len(batch.record)) > MOST:
+        raise InputError(f"batch: {count} samples of {len(batch.record)} variables do not fit into memory; take a longer step or fewer variables")
+    if not batch.record:
+        raise InputError("batch: record names no variable; name at least one")
+    with Fmu(batch.fmu) as fmu:
+        if fmu.description.coSimulation is None:
+            raise InputError(f"{fmu.path}: this FMU supports model exchange only; a batch needs co-simulation")
+        for name in dict.fromkeys((*batch.record, *batch.inputs, *batch.measured, *(n for case in batch.cases for n in case))):
+            fmu.variable(name)
+        for name in (*batch.record, *batch.inputs):
+            if fmu.variable(name).type == "String":
+                raise InputError(f"{fmu.path.name}: variable {name!r} is a String and cannot be a signal")
+        for name in batch.inputs:
+            if fmu.variable(name).causality != "input":
+                raise InputError(f"{fmu.path.name}: {name!r} is no input and cannot be fed; set it as a parameter")
+        for case in batch.cases:
+            for name, value in case.items():
+                _check_value(fmu, name, value)
+
+
+def _check_value(fmu: Fmu, name: str, value: Number | str) -> None:
+    variable = fmu.variable(name)
+    kind = variable.type
+    fits = isinstance(value, str) if kind == "String" else not isinstance(value, str | bool)
+    if kind == "Boolean":
+        fits = isinstance(value, bool) or value in (0, 1)
+    elif kind in ("Integer", "Enumeration"):
+        fits = not isinstance(value, str | bool) and float(value).is_integer()
+    if not fits:
+        raise InputError(f"{fmu.path.name}: {name} = {value!r} does not fit a variable of type {kind}")
+    if variable.variability == "constant" or (variable.causality not in ("parameter", "input") and variable.initial not in ("exact", "approx")):
+        raise InputError(f"{fmu.path.name}: {name!r} is worked out by the FMU and cannot be set")
+
+
+def _cut(batches: Sequence[Batch], extracted: Path, *, carry: bool) -> list[tuple[int, Chunk]]:
+    folders: dict[Path, Path] = {}
+    pairs: list[tuple[int, Chunk]] = []
+    for which, batch in enumerate(batches):
+        path = Path(batch.fmu).resolve()
+        place = folders.setdefault(path, extracted / f"{len(folders):04d}" / path.name)
+        content = path.read_bytes() if carry and path.is_file() else b""
+        cases = [dict(case) for case in batch.cases]
+        for first in range(0, len(cases), batch.chunk):
+            pairs.append((which, Chunk(
+                len(pairs), first, str(path), str(place), tuple(cases[first : first + batch.chunk]), tuple(batch.record), dict(batch.inputs),
+                dict(batch.measured), batch.step, batch.stop, batch.every, content,
+            )))  # fmt: skip
+    return pairs
+
+
+def _extract(path: str, folder: str) -> None:
+    import shutil
+
+    with Fmu(Path(path)) as fmu:
+        shutil.copytree(fmu.folder, folder)
 
 
 @final
@@ -250,36 +269,63 @@ class _Run:
 
     def __init__(
         self,
-        chunks: list[_Chunk],
-        results: dict[int, _Done],
-        store: _Store,
+        chunks: Sequence[Chunk],
+        there: set[int],
+        store: Store,
         executor: Executor | Callable[[], Executor] | None,
         workers: int,
         progress: Progress | None,
     ) -> None:
-        self.chunks, self.results, self.store, self.progress = chunks, results, store, progress
-        self.executor, self.workers = executor, workers
-        self.waiting = [chunk for chunk in chunks if chunk.number not in results]
-        self.suspects: list[_Chunk] = []
+        self.store, self.progress = store, progress
+        self.executor = executor
+        self.waiting = [chunk for chunk in chunks if chunk.number not in there]
+        self.workers = max(1, min(workers, len(self.waiting)))
+        self.deaths = 0
+        self.suspects: list[tuple[Chunk, str]] = []
         self.total = sum(len(chunk.cases) for chunk in chunks)
+        self.ready = sum(len(chunk.cases) for chunk in chunks if chunk.number in there)
+        if progress is not None and self.ready:
+            progress(self.ready, self.total)
 
     def go(self) -> None:
         """Run everything that is waiting, then what was under way when a process died, one at a time."""
         while self.waiting:
-            self._pool(self.waiting, self.workers, self.suspects)
+            self._pool(self.waiting, self.workers, self.suspects, self._done)
         while self.suspects:
-            died: list[_Chunk] = []
-            chunk = self.suspects.pop(0)
-            self._pool([chunk], 1, died)
+            chunk, _ = self.suspects.pop(0)
+            died = self._alone(chunk, self._done)
             if died:
-                text = "the process that ran this case died, twice"
-                shape = (len(chunk.cases), round(chunk.stop / chunk.step) + 1, len(chunk.record))
-                self._done(chunk, (np.full(shape, np.nan), dict.fromkeys(range(len(chunk.cases)), text)))
+                self._done(chunk, self._one_by_one(chunk) if len(chunk.cases) > 1 else empty(chunk, {0: died}))
 
-    def _pool(self, waiting: list[_Chunk], width: int, died: list[_Chunk]) -> None:
+    def _alone(self, chunk: Chunk, keep: Callable[[Chunk, Done], None]) -> str:
+        """Run one chunk with nothing beside it; what killed its process, or nothing."""
+        died: list[tuple[Chunk, str]] = []
+        self._pool([chunk], 1, died, keep)
+        return died[0][1] if died else ""
+
+    def _one_by_one(self, chunk: Chunk) -> Done:
+        """Run the cases of a chunk that has killed its process each alone, so that only the culprit is lost."""
+        found, errors = empty(chunk), {}
+        for i, case in enumerate(chunk.cases):
+            kept: list[Done] = []
+            died = self._alone(replace(chunk, cases=(case,)), lambda _, done, kept=kept: kept.append(done))  # type: ignore[misc]
+            if died:
+                errors[i] = died
+                self.deaths += 1
+                if self.deaths >= _PATIENCE and self.ready == 0:
+                    raise FmuError(f"{Path(chunk.fmu).name}: {self.deaths} of {self.deaths} cases have ended their process; try the FMU alone first")
+                continue
+            self.deaths = 0
+            found.values[i], found.figures[i] = kept[0].values[0], kept[0].figures[0]
+            if 0 in kept[0].errors:
+                errors[i] = kept[0].errors[0]
+        return Done(found.values, found.figures, errors)
+
+    def _pool(self, waiting: list[Chunk], width: int, died: list[tuple[Chunk, str]], keep: Callable[[Chunk, Done], None]) -> None:
         own = not isinstance(self.executor, Executor)
+        before = set(multiprocessing.active_children())
         pool = self._make(width)
-        under_way: dict[Future[_Done], _Chunk] = {}
+        under_way: dict[Future[Done], Chunk] = {}
         try:
             while waiting or under_way:
                 while waiting and len(under_way) < width:
@@ -287,14 +333,28 @@ class _Run:
                     under_way[pool.submit(run_chunk, chunk)] = chunk
                 finished, _ = wait(under_way, return_when=FIRST_COMPLETED)
                 for future in finished:
-                    chunk = under_way[future]
-                    self._done(chunk, future.result())
-                    del under_way[future]
-        except BrokenExecutor as error:
+                    error = future.exception()
+                    if isinstance(error, BrokenExecutor):
+                        raise error
+                    chunk = under_way.pop(future)
+                    if error is None:
+                        keep(chunk, future.result())
+                    else:  # the executor gave this chunk up
+                        died.append((chunk, f"the worker failed: {type(error).__name__}: {' '.join(str(error).split())}"))
+        except (BrokenExecutor, CancelledError) as error:
             if not own:
                 kept = self.store.folder or "nowhere, as no folder was named"
                 raise FmuError(f"the executor died; finished chunks are kept in {kept}; run again to go on") from error
-            died.extend(under_way.values())
+            for future, chunk in under_way.items():
+                if future.done() and not future.cancelled() and future.exception() is None:
+                    keep(chunk, future.result())
+                else:
+                    died.append((chunk, "the process that ran this case died, each time it was tried"))
+        except (KeyboardInterrupt, SystemExit):
+            if own:
+                for process in set(multiprocessing.active_children()) - before:
+                    process.terminate()
+            raise
         finally:
             for future in under_way:
                 future.cancel()
@@ -307,11 +367,16 @@ class _Run:
         if self.executor is not None:
             return self.executor()
         method = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
-        return ProcessPoolExecutor(width, mp_context=multiprocessing.get_context(method))
+        context = multiprocessing.get_context(method)
+        if method == "forkserver":  # what every worker imports is imported once
+            context.set_forkserver_preload(["irj_fmu.batch_worker", "fmpy.fmi2"])
+        return ProcessPoolExecutor(width, mp_context=context, initializer=enter)
 
-    def _done(self, chunk: _Chunk, done: _Done) -> None:
-        self.results[chunk.number] = done
+    def _done(self, chunk: Chunk, done: Done) -> None:
         self.store.save(chunk, done)
+        self.ready += len(chunk.cases)
         if self.progress is not None:
-            ready = sum(len(c.cases) for c in self.chunks if c.number in self.results)
-            self.progress(ready, self.total)
+            self.progress(self.ready, self.total)
+
+
+__all__ = ["FIGURES", "Batch", "FleetResult", "Part", "Progress", "Results", "check", "run_batches", "run_fleet"]

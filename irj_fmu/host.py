@@ -18,9 +18,11 @@ import numpy as np
 
 from identification.errors import InputError
 
+from .host_plan import Plan
 from .signals import Fault, FloatArray, Signal
 
 Number = float | int | bool
+_WARNING = 1
 _C_TYPES: dict[str, Any] = {"Real": ctypes.c_double, "Integer": ctypes.c_int, "Boolean": ctypes.c_int}
 
 
@@ -76,6 +78,21 @@ class Fmu:
             raise InputError(f"{self.path}: FMI {self.description.fmiVersion} is not supported; export it as FMI 2.0")
         self.variables: dict[str, Any] = {v.name: v for v in self.description.modelVariables}
 
+    def variable(self, name: str) -> Any:
+        """Return fmpy's description of a variable.
+
+        Raises
+        ------
+        InputError
+            Where there is none of this name.
+        """
+        if name not in self.variables:
+            import difflib
+
+            close = ", ".join(difflib.get_close_matches(name, self.variables, 3)) or "see its model description"
+            raise InputError(f"{self.path.name}: there is no variable {name!r}; did you mean: {close}")
+        return self.variables[name]
+
     def close(self) -> None:
         """Remove the extraction."""
         if self._temporary is not None:
@@ -91,13 +108,15 @@ class Fmu:
 
 @final
 @dataclass(frozen=True)
-class _Block:
-    """Variables of one type that are read or written by one call."""
+class Block:
+    """Variables of one type that are read or written by one call; `values` is a ctypes array."""
 
     names: tuple[str, ...]
     type: str
     references: Any
     values: Any
+    getter: Any
+    setter: Any
 
 
 @final
@@ -112,9 +131,18 @@ class Instance:
         Co-simulation or model exchange.
     name : str
         Instance name, which the log shows.
+    log : bool
+        Ask the FMU to log all it can; errors come without.
+
+    Raises
+    ------
+    InputError
+        Where the FMU does not support the kind.
+    FmuError
+        Where its library cannot be loaded or refuses to make an instance.
     """
 
-    def __init__(self, fmu: Fmu, kind: Literal["cs", "me"] = "cs", name: str = "fmu") -> None:
+    def __init__(self, fmu: Fmu, kind: Literal["cs", "me"] = "cs", name: str = "fmu", *, log: bool = False) -> None:
         from fmpy.fmi2 import FMU2Model, FMU2Slave
 
         part = fmu.description.coSimulation if kind == "cs" else fmu.description.modelExchange
@@ -124,15 +152,15 @@ class Instance:
         self.fmu, self.name = fmu, name
         self.messages: list[str] = []
         self._callbacks = _callbacks(self.messages)
-        self.raw: Any = (FMU2Slave if kind == "cs" else FMU2Model)(
-            guid=fmu.description.guid,
-            unzipDirectory=str(fmu.folder),
-            modelIdentifier=part.modelIdentifier,
-            instanceName=name,
-        )
         self._used = False
         self._open = False
-        self.call("instantiate", callbacks=self._callbacks)
+        try:
+            self.raw: Any = (FMU2Slave if kind == "cs" else FMU2Model)(
+                guid=fmu.description.guid, unzipDirectory=str(fmu.folder), modelIdentifier=part.modelIdentifier, instanceName=name
+            )
+        except Exception as error:
+            raise FmuError(f"{name} ({fmu.path.name}): its library cannot be loaded here, {error}") from error
+        self.call("instantiate", callbacks=self._callbacks, loggingOn=log)
         self._open = True
 
     def call(self, function: str, *args: Any, **kwargs: Any) -> Any:
@@ -140,8 +168,11 @@ class Instance:
         try:
             return getattr(self.raw, function)(*args, **kwargs)
         except Exception as error:
-            last = f": {self.messages[-1]}" if self.messages else ""
-            raise FmuError(f"{self.name} ({self.fmu.path.name}): {function} failed, {error}{last}") from error
+            raise self._refusal(function, str(error)) from error
+
+    def _refusal(self, function: str, why: str) -> FmuError:
+        last = f": {self.messages[-1]}" if self.messages else ""
+        return FmuError(f"{self.name} ({self.fmu.path.name}): {function} failed, {why}{last}")
 
     def begin(self, start: float = 0.0, parameters: Mapping[str, Number | str] | None = None, **options: Any) -> None:
         """Reset where it was used, set start values and enter initialization mode.
@@ -171,14 +202,9 @@ class Instance:
 
     def variable(self, name: str) -> Any:
         """Return fmpy's description of a variable."""
-        if name not in self.fmu.variables:
-            import difflib
+        return self.fmu.variable(name)
 
-            close = ", ".join(difflib.get_close_matches(name, self.fmu.variables, 3)) or "see its model description"
-            raise InputError(f"{self.fmu.path.name}: there is no variable {name!r}; did you mean: {close}")
-        return self.fmu.variables[name]
-
-    def blocks(self, names: Sequence[str]) -> list[_Block]:
+    def blocks(self, names: Sequence[str]) -> list[Block]:
         """Group variables by type for `read` and `write`."""
         groups: dict[str, list[str]] = {}
         for name in names:
@@ -188,23 +214,35 @@ class Instance:
                 raise InputError(f"{self.fmu.path.name}: variable {name!r} is a {kind} and cannot be a signal")
             groups.setdefault(kind, []).append(name)
         return [
-            _Block(
+            Block(
                 tuple(group),
                 kind,
                 (ctypes.c_uint * len(group))(*(self.variable(name).valueReference for name in group)),
                 (_C_TYPES[kind] * len(group))(),
+                getattr(self.raw.dll, f"fmi2Get{kind}"),
+                getattr(self.raw.dll, f"fmi2Set{kind}"),
             )
             for kind, group in groups.items()
         ]
 
-    def read(self, block: _Block) -> Any:
+    def read(self, block: Block) -> Any:
         """Fill the block's values from the FMU and return them."""
-        self.call(f"fmi2Get{block.type}", self.raw.component, block.references, len(block.names), block.values)
+        status = block.getter(self.raw.component, block.references, len(block.names), block.values)
+        if status > _WARNING:
+            raise self._refusal(f"get{block.type}", f"status {status}")
         return block.values
 
-    def write(self, block: _Block) -> None:
+    def write(self, block: Block) -> None:
         """Set the FMU's variables from the block's values."""
-        self.call(f"fmi2Set{block.type}", self.raw.component, block.references, len(block.names), block.values)
+        status = block.setter(self.raw.component, block.references, len(block.names), block.values)
+        if status > _WARNING:
+            raise self._refusal(f"set{block.type} of {', '.join(block.names[:6])}", f"status {status}")
+
+    def step(self, time: float, length: float) -> None:
+        """Do one communication step; a step that is discarded counts as refused."""
+        status = self.raw.dll.fmi2DoStep(self.raw.component, time, length, 1)
+        if status > _WARNING:
+            raise self._refusal(f"doStep at t = {time:g} s", f"status {status}")
 
     def close(self) -> None:
         """Free the instance."""
@@ -296,98 +334,24 @@ def simulate_cs(
     """
     if isinstance(instances, Instance):
         instances = {instances.name: instances}
-    count = round((stop - start) / step) if step > 0 else 0
+    count = round((stop - start) / step) if step > 0 and np.isfinite([start, stop, step]).all() else 0
     if count < 1 or abs(count * step - (stop - start)) > 1e-6 * step:
         raise InputError(f"co-simulation from {start:g} to {stop:g} s is not a whole number of steps of {step:g} s")
-    plan = _Plan(instances, wiring)
     time: FloatArray = start + step * np.arange(count + 1, dtype=np.float64)
-    table = np.empty((count + 1, len(wiring.record)))
+    plan = Plan(instances, wiring, time)
     for name, instance in instances.items():
         own = {key.partition(".")[2]: v for key, v in wiring.parameters.items() if key.partition(".")[0] == name}
         instance.begin(start, own, stopTime=stop)
-    plan.exchange(start)
+    plan.exchange(0)
     for instance in instances.values():
         instance.ready()
-    for i, now in enumerate(time):
-        plan.exchange(float(now))
-        plan.note(table[i])
+    members = list(instances.values())
+    for i, now in enumerate(time.tolist()):
+        plan.exchange(i)
+        plan.note(i)
         if i < count:
-            for instance in instances.values():
-                instance.call("doStep", float(now), step)
-    for instance in instances.values():
+            for instance in members:
+                instance.step(now, step)
+    for instance in members:
         instance.call("terminate")
-    return Trajectory(time, {name: table[:, i] for i, name in enumerate(wiring.record)})
-
-
-@final
-class _Plan:
-    """The reads and writes of one co-simulation, laid out once."""
-
-    def __init__(self, instances: Mapping[str, Instance], wiring: Wiring) -> None:
-        both = wiring.connections.keys() & wiring.inputs.keys()
-        if both:
-            raise InputError(f"input {min(both)!r} has both a connection and a function of time; leave one out")
-        fed = [*wiring.connections, *wiring.inputs]
-        for name in wiring.faults:
-            if name not in fed:
-                raise InputError(f"fault on {name!r}: nothing feeds this input; faults act on inputs that are fed")
-        for name in (*fed, *wiring.connections.values(), *wiring.record, *wiring.parameters):
-            _split(name, instances)
-        self.wiring = wiring
-        self.values: dict[str, float] = {}
-        wanted = {*wiring.connections.values()}
-        self.reads = _blocks(instances, sorted(wanted))
-        self.records = _blocks(instances, sorted({*wiring.record}))
-        self.writes = _blocks(instances, fed)
-
-    def exchange(self, time: float) -> None:
-        """Read the connected outputs and set all inputs that are fed."""
-        values, wiring = self.values, self.wiring
-        _read(self.reads, values)
-        for target, source in wiring.connections.items():
-            values[target] = values[source]
-        for target, signal in wiring.inputs.items():
-            values[target] = signal(time)
-        for target, fault in wiring.faults.items():
-            values[target] = fault(time, values[target])
-        for prefix, instance, block in self.writes:
-            for i, name in enumerate(block.names):
-                value = values[prefix + name]
-                block.values[i] = value if block.type == "Real" else int(value)
-            instance.write(block)
-
-    def note(self, row: FloatArray) -> None:
-        """Read the recorded variables into a row."""
-        _read(self.records, self.values)
-        for i, name in enumerate(self.wiring.record):
-            row[i] = self.values[name]
-
-
-_Place = tuple[str, Instance, _Block]
-
-
-def _split(name: str, instances: Mapping[str, Instance]) -> tuple[str, str]:
-    owner, _, variable = name.partition(".")
-    if owner not in instances or not variable:
-        raise InputError(f"{name!r}: write instance.variable, with one of the instances {', '.join(instances)}")
-    instances[owner].variable(variable)
-    return owner, variable
-
-
-def _blocks(instances: Mapping[str, Instance], names: Sequence[str]) -> list[_Place]:
-    grouped: dict[str, list[str]] = {}
-    for name in names:
-        owner, variable = _split(name, instances)
-        grouped.setdefault(owner, []).append(variable)
-    return [
-        (f"{owner}.", instances[owner], block)
-        for owner, variables in grouped.items()
-        for block in instances[owner].blocks(variables)
-    ]
-
-
-def _read(places: Sequence[_Place], values: dict[str, float]) -> None:
-    for prefix, instance, block in places:
-        instance.read(block)
-        for i, name in enumerate(block.names):
-            values[prefix + name] = block.values[i]
+    return Trajectory(time, {name: plan.table[:, i] for i, name in enumerate(wiring.record)})

@@ -50,11 +50,16 @@ class Table:
 
     def __call__(self, time: float) -> float:
         """Return the value at a time; at a sample the new one (the times carry rounding of up to 1e-9 of a step)."""
+        return float(self.sampled(np.array([time]))[0])
+
+    def sampled(self, times: FloatArray) -> FloatArray:
+        """Return the values at many times, shape (n,)."""
         if not self.hold:
-            return float(np.interp(time, self.time, self.values))
-        slack = 1e-9 * max(1.0, abs(time))
-        place = int(np.searchsorted(self.time, time + slack, side="right")) - 1
-        return float(self.values[max(place, 0)])
+            return np.interp(times, self.time, self.values)
+        slack = 1e-9 * np.maximum(1.0, np.abs(times))
+        places = np.searchsorted(self.time, times + slack, side="right") - 1
+        found: FloatArray = self.values[np.maximum(places, 0)]
+        return found
 
 
 def constant(value: float) -> Signal:

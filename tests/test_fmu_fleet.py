@@ -19,7 +19,7 @@ from test_fmu_plant import excitation, joint
 from identification.errors import InputError
 from irj_fmu import fleet
 from irj_fmu.fleet import Batch, run_fleet
-from irj_fmu.host import Fmu, Instance, Wiring, simulate_cs
+from irj_fmu.host import Fmu, FmuError, Instance, Wiring, simulate_cs
 from irj_fmu.plant import build_plant
 from irj_fmu.signals import Table
 from irj_fmu.ssp import PARAMETERS, System, multisine_source, write_ssp
@@ -108,23 +108,33 @@ ORIGINAL = fleet.run_chunk
 
 
 @pytest.mark.parametrize("kind", ["once", "always"])
-def test_a_dead_process_loses_one_chunk(
+def test_a_dead_process_loses_one_case(
     kind: str, batch: Batch, expected: FloatArray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:  # fmt: skip
-    """The chunk is tried again; where it kills the process again, its cases are NaN and all others are there."""
+    """The chunk is tried again; where it kills the process again, its cases run one by one and only the culprit is lost."""
     monkeypatch.setenv("IRJ_TEST_MARKER", str(tmp_path / f"marker.{kind}"))
     monkeypatch.setattr(fleet, "run_chunk", deadly)
     cases = [dict(case) for case in batch.cases]
     cases[4]["k"] = POISON
     found = run_fleet(replace(batch, cases=cases), executor=lambda: ProcessPoolExecutor(2), workers=2)
-    others = [0, 1, 2, 6, 7, 8, 9]
+    others = [0, 1, 2, 3, 5, 6, 7, 8, 9]
     np.testing.assert_array_equal(found.signals["q_l"][others], expected[others])
     if kind == "once":
         assert found.errors == {}
         assert np.isfinite(found.signals["q_l"]).all()
     else:
-        assert sorted(found.errors) == [3, 4, 5]
-        assert np.isnan(found.signals["q_l"][3:6]).all()
+        assert list(found.errors) == [4]
+        assert "died" in found.errors[4]
+        assert np.isnan(found.signals["q_l"][4]).all()
+
+
+def test_an_fmu_that_ends_every_process_is_given_up(batch: Batch, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("IRJ_TEST_MARKER", str(tmp_path / "marker.always"))
+    monkeypatch.setattr(fleet, "run_chunk", deadly)
+    many = replace(batch, cases=[{"k": POISON}] * 40, chunk=20)
+    with pytest.raises(FmuError, match=r"two_mass\.fmu: 5 of 5 cases have ended their process"):
+        run_fleet(many, executor=lambda: ProcessPoolExecutor(1), workers=1, folder=tmp_path / "kept")
+    assert not list((tmp_path / "kept").glob("chunk-*"))
 
 
 @pytest.fixture(scope="module")

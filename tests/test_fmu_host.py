@@ -143,6 +143,9 @@ def test_names_and_times_are_checked(plant: Fmu) -> None:
             simulate_cs(instance, Wiring(inputs={"plant.tau_n": constant(0)}), step=1e-3, stop=1.0)
         with pytest.raises(InputError, match="whole number of steps"):
             simulate_cs(instance, Wiring(), step=0.3, stop=1.0)
+        for stop in (float("nan"), float("inf"), -1.0, 0.0):
+            with pytest.raises(InputError, match="whole number of steps"):
+                simulate_cs(instance, Wiring(), step=0.1, stop=stop)
         with pytest.raises(InputError, match="nothing feeds"):
             simulate_cs(instance, Wiring(faults={"plant.tau_m": bias(0, 1)}), step=0.1, stop=1.0)
         with pytest.raises(InputError, match=r"instance\.variable"):
@@ -168,3 +171,27 @@ def test_table_holds_and_joins() -> None:
     assert all(Table(1e-3 * np.arange(1000), np.arange(1000.0))(i * 1e-3) == i for i in range(1000))
     with pytest.raises(InputError, match="increase"):
         Table(time[::-1], values)
+
+
+def test_log_is_on_request(toy: Fmu) -> None:
+    """The toy tells a reading that is not finite in its log, which a host gets where it asks for it."""
+    for log in (True, False):
+        with Instance(toy, name="toy", log=log) as instance:
+            simulate_cs(instance, Wiring(inputs={"toy.u": constant(float("nan"))}, record=("toy.health",)), step=1e-3, stop=0.005)
+            assert any("input not finite" in text for text in instance.messages) == log
+
+
+def test_an_integer_input_takes_no_nan(toy: Fmu) -> None:
+    with Instance(toy, name="toy") as instance:
+        with pytest.raises(InputError, match="NaN or infinity"):
+            simulate_cs(instance, Wiring(inputs={"toy.fail": constant(float("nan"))}), step=1e-3, stop=0.005)
+        wiring = Wiring(inputs={"toy.fail": constant(0.0)}, faults={"toy.fail": dropout(0.002)})
+        with pytest.raises(InputError, match="fed with nan"):
+            simulate_cs(instance, wiring, step=1e-3, stop=0.005)
+
+
+def test_a_fault_acts_once_on_a_table(plant: Fmu) -> None:
+    """The first point is exchanged before and after initialization; the bias must not add up."""
+    wiring = Wiring(inputs={"plant.tau_m": constant(1.0)}, faults={"plant.tau_m": bias(0.0, 2.0)}, record=("plant.tau_m",))
+    with Instance(plant, name="plant") as instance:
+        np.testing.assert_array_equal(simulate_cs(instance, wiring, step=1e-3, stop=0.01)["plant.tau_m"], np.full(11, 3.0))

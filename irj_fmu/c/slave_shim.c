@@ -5,12 +5,16 @@
  * shim_config.h (written by irj_fmu.package) gives INNER_LIBRARY and LIBPYTHON_CANDIDATES.
  */
 #include <dlfcn.h>
+#include <limits.h>
+#include <link.h>
 #include <pthread.h>
 #include <stdarg.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 #include <sys/stat.h>
+#include <unistd.h>
+#include <wchar.h>
 
 #include "fmi2Functions.h"
 #include "shim_config.h"
@@ -41,27 +45,86 @@ FUNCTIONS(DECLARE)
 
 static int open_python(const char *path) { return path && *path && dlopen(path, RTLD_NOW | RTLD_GLOBAL | RTLD_NODELETE) != NULL; }
 
+/* Embedded Python looks for its library beside the first python3 of PATH, which may be another installation: name the
+ * folder that this libpython belongs to. PYTHONHOME goes first; a libpython outside the usual layout is left alone. */
+static void set_home(void) {
+    static wchar_t home[4096];
+    const char *(*version)(void);
+    void (*set)(const wchar_t *);
+    char path[PATH_MAX], probe[PATH_MAX + 64], *slash;
+    const unsigned char *from;
+    wchar_t *to = home;
+    Dl_info info;
+    int major, minor;
+    *(void **)&version = dlsym(RTLD_DEFAULT, "Py_GetVersion");
+    *(void **)&set = dlsym(RTLD_DEFAULT, "Py_SetPythonHome");
+    if (!version || !set || (getenv("PYTHONHOME") && *getenv("PYTHONHOME")) || sscanf(version(), "%d.%d", &major, &minor) != 2) return;
+    if (!dladdr(*(void **)&version, &info) || !info.dli_fname || !realpath(info.dli_fname, path)) return;
+    do {
+        if (!(slash = strrchr(path, '/')) || slash == path) return;
+        *slash = 0;
+        snprintf(probe, sizeof probe, "%s/lib/python%d.%d/os.py", path, major, minor);
+    } while (access(probe, R_OK) != 0);
+    for (from = (const unsigned char *)path; *from && to < home + 4095; to++) { /* UTF-8 */
+        int more = *from >= 0xF0 ? 3 : *from >= 0xE0 ? 2 : *from >= 0xC0 ? 1 : 0;
+        *to = more ? *from & (0x3F >> more) : *from;
+        for (from++; more && (*from & 0xC0) == 0x80; more--) *to = (*to << 6) | (*from++ & 0x3F);
+    }
+    *to = 0;
+    set(home);
+}
+
+/* a host without a locale would give Python ASCII for file names */
+static void set_encoding(void) {
+    int *utf8 = (int *)dlsym(RTLD_DEFAULT, "Py_UTF8Mode");
+    if (utf8 && !getenv("PYTHONUTF8")) *utf8 = 1;
+}
+
 static int find_python(void) {
     static const char *const candidates[] = {LIBPYTHON_CANDIDATES, NULL};
     const char *named = getenv("IRJ_LIBPYTHON");
     int i;
     if (dlsym(RTLD_DEFAULT, "Py_IsInitialized")) return 1;
     if (named && *named) {
-        if (open_python(named)) return 1;
+        if (open_python(named)) return set_home(), set_encoding(), 1;
         snprintf(problem, sizeof problem, "IRJ_LIBPYTHON=%s cannot be loaded (%s)", named, dlerror());
         return 0;
     }
     for (i = 0; candidates[i]; i++)
-        if (open_python(candidates[i])) return 1;
+        if (open_python(candidates[i])) return set_home(), set_encoding(), 1;
     snprintf(problem, sizeof problem, "no libpython found; set IRJ_LIBPYTHON to the path of libpython3.x.so");
     return 0;
+}
+
+/* The interpreter must end before the static objects of the libraries its modules have loaded; what is registered
+ * last is called first, so the end is registered again whenever libraries have come since. */
+static void (*finalizer)(void);
+
+static void end_python(void) {
+    void (*end)(void) = finalizer;
+    finalizer = NULL;
+    if (end) end();
+}
+
+static int count_libraries(struct dl_phdr_info *info, size_t size, void *count) {
+    (void)size;
+    *(unsigned long long *)count = info->dlpi_adds;
+    return 1;
+}
+
+static void end_before_libraries(void) {
+    static unsigned long long known;
+    unsigned long long now = 0;
+    pthread_mutex_lock(&lock);
+    dl_iterate_phdr(count_libraries, &now);
+    if (finalizer && now != known && atexit(end_python) == 0) known = now;
+    pthread_mutex_unlock(&lock);
 }
 
 static int open_inner(void) {
     char path[4096];
     Dl_info info;
     void *library;
-    void (*finalizer)(void);
     const char *slash;
     if (!dladdr((void *)&open_inner, &info) || !info.dli_fname) return 0;
     slash = strrchr(info.dli_fname, '/');
@@ -79,7 +142,6 @@ static int open_inner(void) {
     }
     FUNCTIONS(RESOLVE)
     *(void **)&finalizer = dlsym(library, "finalizePythonInterpreter");
-    if (finalizer) atexit(finalizer);
     return 1;
 }
 
@@ -162,6 +224,7 @@ FMI2_Export fmi2Component fmi2Instantiate(fmi2String name, fmi2Type kind, fmi2St
         else forward_log(shim, name, fmi2Fatal, "logStatusFatal", problem);
     }
     free(path);
+    end_before_libraries();
     if (shim && shim->inner) return shim;
     free(shim);
     return NULL;
@@ -169,6 +232,7 @@ FMI2_Export fmi2Component fmi2Instantiate(fmi2String name, fmi2Type kind, fmi2St
 
 FMI2_Export void fmi2FreeInstance(fmi2Component c) {
     if (!c) return;
+    end_before_libraries();
     if (((Shim *)c)->dead) return; /* freeing it again would crash; the rest is left to the end of the process */
     inner_FreeInstance(((Shim *)c)->inner);
     free(c);
@@ -196,7 +260,6 @@ FORWARD(SetupExperiment, (fmi2Component c, fmi2Boolean has_tolerance, fmi2Real t
         has_tolerance, tolerance, start, has_stop, stop)
 FORWARD(EnterInitializationMode, (fmi2Component c))
 FORWARD(ExitInitializationMode, (fmi2Component c))
-FORWARD(Terminate, (fmi2Component c))
 FORWARD(Reset, (fmi2Component c))
 FORWARD(SetFMUstate, (fmi2Component c, fmi2FMUstate state), state)
 FORWARD(SerializedFMUstateSize, (fmi2Component c, fmi2FMUstate state, size_t *size), state, size)
@@ -207,6 +270,11 @@ FORWARD(SetRealInputDerivatives, (fmi2Component c, const fmi2ValueReference vr[]
 FORWARD(GetRealOutputDerivatives, (fmi2Component c, const fmi2ValueReference vr[], size_t n, const fmi2Integer order[], fmi2Real value[]), vr, n, order, value)
 FORWARD(DoStep, (fmi2Component c, fmi2Real t, fmi2Real h, fmi2Boolean no_rollback), t, h, no_rollback)
 FORWARD(CancelStep, (fmi2Component c))
+
+FMI2_Export fmi2Status fmi2Terminate(fmi2Component c) {
+    end_before_libraries();
+    return CALL(Terminate);
+}
 
 FMI2_Export fmi2Status fmi2FreeFMUstate(fmi2Component c, fmi2FMUstate *state) {
     fmi2Status status = fmi2OK;
