@@ -130,7 +130,7 @@ class _Driver:
         self.view: FloatArray = np.ctypeslib.as_array(self.dx)
         self.state: FloatArray = np.ctypeslib.as_array(self.x)
         self.nominal = np.ones(self.size)
-        self.step = 0.0
+        self.stepper: Stepper | None = None
 
     def start(self, time: float) -> FloatArray:
         """Initialize and return the state."""
@@ -176,10 +176,47 @@ class _Driver:
 
     def advance(self, begin: float, end: float, x: FloatArray) -> FloatArray:
         """Integrate over a segment in which no input jumps."""
-        if self.size == 0:
+        stepper = self.stepper
+        if stepper is None:
+            stepper = self.stepper = Stepper(self.instance.name, self.nominal, self.options.rtol, self.options.atol)
+        return stepper.advance(lambda time, state: self.slope(time, state, begin), begin, end, x)
+
+
+@final
+class Stepper:
+    """Dormand-Prince steps whose length carries over from one segment to the next.
+
+    Parameters
+    ----------
+    name : str
+        Of the model, for messages.
+    nominal : array, shape (n,)
+        Nominal values of the states.
+    rtol, atol : float
+        Relative tolerance, and absolute tolerance in units of the nominal values.
+    accepted : callable, optional
+        Called with time and state after each accepted step.
+    """
+
+    def __init__(
+        self, name: str, nominal: FloatArray, rtol: float, atol: float, accepted: Callable[[float, FloatArray], None] | None = None
+    ) -> None:
+        self.name, self.nominal, self.rtol, self.atol, self.accepted = name, nominal, rtol, atol, accepted
+        self.step = 0.0
+
+    def advance(self, slope: Callable[[float, FloatArray], FloatArray], begin: float, end: float, x: FloatArray) -> FloatArray:
+        """State at `end` of a segment in which no input jumps.
+
+        Raises
+        ------
+        FmuError
+            Where the derivative is not finite or not smooth, or the model is stiff.
+        """
+        size = len(self.nominal)
+        if size == 0:
             return x
-        k = np.empty((7, self.size))
-        k[0] = self.slope(begin, x, begin)
+        k = np.empty((7, size))
+        k[0] = slope(begin, x)
         now, step = begin, self.step or min(end - begin, 1e-6)
         for _ in range(_MAX_TRIALS):
             last = now + 1.01 * step >= end
@@ -187,19 +224,21 @@ class _Driver:
             new = x
             for stage in range(1, 7):
                 new = x + h * (_A[stage, :stage] @ k[:stage])
-                k[stage] = self.slope(now + _C[stage] * h, new, begin)
-            scale = self.options.atol * self.nominal + self.options.rtol * np.maximum(np.abs(x), np.abs(new))
+                k[stage] = slope(now + _C[stage] * h, new)
+            scale = self.atol * self.nominal + self.rtol * np.maximum(np.abs(x), np.abs(new))
             error = float(np.sqrt(np.mean((h * (_E @ k) / scale) ** 2)))
             if error <= 1:
                 factor = min(5.0, max(0.2, 0.9 * max(error, 1e-10) ** -0.2))
                 step = max(step, h * factor) if last and factor >= 1 else h * factor
                 now, x = now + h, new
                 k[0] = k[6]
+                if self.accepted is not None:
+                    self.accepted(now, x)
                 if last:
                     self.step = step
                     return x
             else:
                 step = h * (max(0.2, 0.9 * error**-0.2) if error < 1e10 else 0.1)
                 if not step > 1e-14 * (1 + abs(now)):
-                    raise FmuError(f"{self.instance.name}: the derivative is not finite or not smooth at t = {now:g} s")
-        raise FmuError(f"{self.instance.name}: more than {_MAX_TRIALS} steps up to t = {end:g} s; the model is stiff")
+                    raise FmuError(f"{self.name}: the derivative is not finite or not smooth at t = {now:g} s")
+        raise FmuError(f"{self.name}: more than {_MAX_TRIALS} steps up to t = {end:g} s; the model is stiff")

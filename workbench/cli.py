@@ -14,6 +14,7 @@ from typing import Any, NoReturn, final
 from identification import __version__
 from identification.errors import InputError
 from workbench.commands.files import check_outputs
+from workbench.commands.user_fmu import module_of
 
 
 @final
@@ -71,6 +72,7 @@ def _parser() -> argparse.ArgumentParser:
     diagnosed = verb("diagnose", "loop", "rank what is missing", records=True, joint=True)
     other_payload(diagnosed)
     diagnosed.add_argument("--held-out", nargs="+", metavar="REC", default=[], help="records the fit must not see")
+    diagnosed.add_argument("-o", "--output", metavar="FILE", help="write the joint file with the first claim added")
     improved = verb("improve", "loop", "name what is missing, add it, watch the error fall", records=True, joint=True)
     other_payload(improved)
     improved.add_argument("--held-out", nargs="+", metavar="REC", default=[], help="records the fit must not see")
@@ -133,7 +135,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         check_outputs(arguments)
         _register([*arguments.effects, *arguments.own_effects])
-        module = importlib.import_module(f"workbench.commands.{arguments.module}")
+        module = importlib.import_module(f"workbench.commands.{module_of(arguments)}")
         code = int(getattr(module, f"run_{arguments.verb}")(arguments))
         sys.stdout.flush()
         return code

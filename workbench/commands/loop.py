@@ -13,7 +13,7 @@ from identification.compare import compare
 from identification.diagnose import diagnose
 from identification.fit import Fit, fit, joint_text
 from identification.improve import Improvement, improve
-from identification.joint_file import Joint
+from identification.joint_file import Joint, toml_text
 from identification.record import Record
 from workbench.commands.files import open_joint, open_records, progress_bar, write_json, write_text
 
@@ -182,5 +182,10 @@ def run_diagnose(arguments: Namespace) -> int:
     print(found)
     for item in found.ranking.not_testable:
         print(f"not testable: {item.effect}: {item.why}")
+    if arguments.output and found.claims:
+        write_text(arguments.output, toml_text(replace(joint, effects=(*joint.effects, found.claims[0].label))))
+        print(f"joint file with {found.claims[0].label}: {arguments.output}")
+    elif arguments.output:
+        print(f"nothing significant is missing: {arguments.output} is not written")
     write_json(arguments.json, {**found.as_json(), "warnings": [*found.warnings, *warnings, *more]})
     return 0

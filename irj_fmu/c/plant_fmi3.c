@@ -1,0 +1,310 @@
+/* FMI 3.0 wrapper, model exchange, round a plant in generated C.
+ *
+ * plant_config.h and plant_model.c are those of plant_wrapper.c. Value references run x, dx, u, p, y without gaps;
+ * the time comes last. A plant with memory has no FMI 3.0 form.
+ */
+#include <stdarg.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "fmi3Functions.h"
+#include "plant_config.h"
+
+#define CASADI_SYMBOL_EXPORT static
+#include "plant_model.c"
+
+#define DIM(n) ((n) > 0 ? (n) : 1)
+
+enum { VR_DX = NX, VR_U = 2 * NX, VR_P = VR_U + NU, VR_Y = VR_P + NP, VR_TIME = VR_Y + NY };
+
+typedef enum { INSTANTIATED = 1, INITIALIZING, EVENTS, CONTINUOUS, TERMINATED } Phase;
+
+typedef struct { /* everything that changes; one copy of it is one FMU state */
+    char token[40];
+    Phase phase;
+    double t, x[DIM(NX)], u[DIM(NU)], p[DIM(NP)];
+} State;
+
+typedef struct {
+    State s;
+    fmi3InstanceEnvironment environment;
+    fmi3LogMessageCallback log;
+    int fresh;
+    double dx[DIM(NX)], y[DIM(NY)];
+    const double *arg[SZ_ARG];
+    double *res[SZ_RES];
+    double w[DIM(SZ_W)];
+    casadi_int iw[DIM(SZ_IW)];
+} Plant;
+
+typedef const fmi3ValueReference *References;
+typedef int (*Generated)(const casadi_real **, casadi_real **, casadi_int *, casadi_real *, int);
+
+static fmi3Status fail(Plant *m, const char *format, ...) {
+    char text[256];
+    va_list values;
+    va_start(values, format);
+    vsnprintf(text, sizeof text, format, values);
+    va_end(values);
+    if (m->log) m->log(m->environment, fmi3Error, "logStatusError", text);
+    return fmi3Error;
+}
+
+static void restart(State *s) {
+    memset(s, 0, sizeof *s);
+    memcpy(s->token, PLANT_GUID, strlen(PLANT_GUID));
+    s->phase = INSTANTIATED;
+    memcpy(s->x, start_x, sizeof s->x);
+    memcpy(s->u, start_u, sizeof s->u);
+    memcpy(s->p, start_p, sizeof s->p);
+}
+
+static void evaluate(Plant *m, Generated f, double *out) {
+    m->arg[0] = m->s.x; m->arg[1] = m->s.u; m->arg[2] = m->s.p; m->arg[3] = NULL;
+    m->res[0] = out;
+    f(m->arg, m->res, m->iw, m->w, 0);
+}
+
+static void refresh(Plant *m) {
+    if (m->fresh) return;
+    evaluate(m, model_f, m->dx);
+    evaluate(m, model_y, m->y);
+    m->fresh = 1;
+}
+
+/* ---- life cycle ----------------------------------------------------------- */
+
+const char *fmi3GetVersion(void) { return fmi3Version; }
+
+fmi3Instance fmi3InstantiateModelExchange(fmi3String name, fmi3String token, fmi3String resources, fmi3Boolean visible, fmi3Boolean logging,
+                                          fmi3InstanceEnvironment environment, fmi3LogMessageCallback log) {
+    Plant *m = calloc(1, sizeof *m);
+    (void)name; (void)resources; (void)visible; (void)logging;
+    if (!m) return NULL;
+    m->environment = environment;
+    m->log = log;
+    if (!token || strcmp(token, PLANT_GUID) != 0) {
+        fail(m, "instantiate: the token is not that of this library");
+        free(m);
+        return NULL;
+    }
+    restart(&m->s);
+    return m;
+}
+
+fmi3Instance fmi3InstantiateCoSimulation(fmi3String name, fmi3String token, fmi3String resources, fmi3Boolean visible, fmi3Boolean logging,
+                                         fmi3Boolean events, fmi3Boolean early, const fmi3ValueReference required[], size_t n,
+                                         fmi3InstanceEnvironment environment, fmi3LogMessageCallback log, fmi3IntermediateUpdateCallback update) {
+    return NULL;
+}
+
+fmi3Instance fmi3InstantiateScheduledExecution(fmi3String name, fmi3String token, fmi3String resources, fmi3Boolean visible, fmi3Boolean logging,
+                                               fmi3InstanceEnvironment environment, fmi3LogMessageCallback log, fmi3ClockUpdateCallback clock,
+                                               fmi3LockPreemptionCallback lock, fmi3UnlockPreemptionCallback unlock) {
+    return NULL;
+}
+
+void fmi3FreeInstance(fmi3Instance c) { free(c); }
+fmi3Status fmi3SetDebugLogging(fmi3Instance c, fmi3Boolean on, size_t n, const fmi3String categories[]) { return fmi3OK; }
+
+static fmi3Status change(Plant *m, Phase from, Phase to, const char *name) {
+    if (m->s.phase != from) return fail(m, "%s: called out of order", name);
+    m->s.phase = to;
+    return fmi3OK;
+}
+
+fmi3Status fmi3EnterInitializationMode(fmi3Instance c, fmi3Boolean has_tolerance, fmi3Float64 tolerance, fmi3Float64 start, fmi3Boolean has_stop, fmi3Float64 stop) {
+    ((Plant *)c)->s.t = start;
+    return change(c, INSTANTIATED, INITIALIZING, "enterInitializationMode");
+}
+fmi3Status fmi3ExitInitializationMode(fmi3Instance c) { return change(c, INITIALIZING, EVENTS, "exitInitializationMode"); }
+fmi3Status fmi3EnterEventMode(fmi3Instance c) { ((Plant *)c)->s.phase = EVENTS; return fmi3OK; }
+fmi3Status fmi3EnterContinuousTimeMode(fmi3Instance c) { ((Plant *)c)->s.phase = CONTINUOUS; return fmi3OK; }
+fmi3Status fmi3Terminate(fmi3Instance c) { ((Plant *)c)->s.phase = TERMINATED; return fmi3OK; }
+fmi3Status fmi3Reset(fmi3Instance c) {
+    restart(&((Plant *)c)->s);
+    ((Plant *)c)->fresh = 0;
+    return fmi3OK;
+}
+
+/* ---- variables ------------------------------------------------------------ */
+
+fmi3Status fmi3SetFloat64(fmi3Instance c, References vr, size_t n, const fmi3Float64 value[], size_t length) {
+    Plant *m = c;
+    size_t i;
+    if (length != n) return fail(m, "setFloat64: all variables are scalars");
+    for (i = 0; i < n; i++) {
+        const fmi3ValueReference v = vr[i];
+        if (v < VR_DX) m->s.x[v] = value[i];
+        else if (v >= VR_U && v < VR_P) m->s.u[v - VR_U] = value[i];
+        else if (v >= VR_P && v < VR_Y && (tunable_p[v - VR_P] || m->s.phase <= INITIALIZING)) m->s.p[v - VR_P] = value[i];
+        else return fail(m, "setFloat64: variable %u cannot be set in this mode", v);
+    }
+    m->fresh = 0;
+    return fmi3OK;
+}
+
+fmi3Status fmi3GetFloat64(fmi3Instance c, References vr, size_t n, fmi3Float64 value[], size_t length) {
+    Plant *m = c;
+    size_t i;
+    if (length != n) return fail(m, "getFloat64: all variables are scalars");
+    for (i = 0; i < n; i++) {
+        const fmi3ValueReference v = vr[i];
+        if (v < VR_DX) value[i] = m->s.x[v];
+        else if (v < VR_U) { refresh(m); value[i] = m->dx[v - VR_DX]; }
+        else if (v < VR_P) value[i] = m->s.u[v - VR_U];
+        else if (v < VR_Y) value[i] = m->s.p[v - VR_P];
+        else if (v < VR_TIME) { refresh(m); value[i] = m->y[v - VR_Y]; }
+        else if (v == VR_TIME) value[i] = m->s.t;
+        else return fail(m, "getFloat64: there is no variable %u", v);
+    }
+    return fmi3OK;
+}
+
+#define NO_VARIABLES(name) \
+    fmi3Status fmi3Get##name(fmi3Instance c, References vr, size_t n, fmi3##name value[], size_t length) { \
+        return n ? fail(c, "get" #name ": all variables are Float64") : fmi3OK; \
+    } \
+    fmi3Status fmi3Set##name(fmi3Instance c, References vr, size_t n, const fmi3##name value[], size_t length) { \
+        return n ? fail(c, "set" #name ": all variables are Float64") : fmi3OK; \
+    }
+NO_VARIABLES(Float32)
+NO_VARIABLES(Int8)
+NO_VARIABLES(UInt8)
+NO_VARIABLES(Int16)
+NO_VARIABLES(UInt16)
+NO_VARIABLES(Int32)
+NO_VARIABLES(UInt32)
+NO_VARIABLES(Int64)
+NO_VARIABLES(UInt64)
+NO_VARIABLES(Boolean)
+NO_VARIABLES(String)
+#define REFUSE(text) { return fail(c, text); }
+fmi3Status fmi3GetBinary(fmi3Instance c, References vr, size_t n, size_t sizes[], fmi3Binary v[], size_t k) REFUSE("there are no binary variables")
+fmi3Status fmi3SetBinary(fmi3Instance c, References vr, size_t n, const size_t sizes[], const fmi3Binary v[], size_t k) REFUSE("there are no binary variables")
+fmi3Status fmi3GetClock(fmi3Instance c, References vr, size_t n, fmi3Clock v[]) REFUSE("there are no clocks")
+fmi3Status fmi3SetClock(fmi3Instance c, References vr, size_t n, const fmi3Clock v[]) REFUSE("there are no clocks")
+
+fmi3Status fmi3GetDirectionalDerivative(fmi3Instance c, References unknown, size_t n, References known, size_t k, const fmi3Float64 seed[], size_t seeds,
+                                        fmi3Float64 out[], size_t outs) {
+    Plant *m = c;
+    double sx[DIM(NX)] = {0}, su[DIM(NU)] = {0}, sp[DIM(NP)] = {0}, dy[DIM(NY)], ddx[DIM(NX)];
+    size_t i;
+    if (seeds != k || outs != n) return fail(m, "getDirectionalDerivative: all variables are scalars");
+    for (i = 0; i < k; i++) {
+        const fmi3ValueReference v = known[i];
+        if (v < VR_DX) sx[v] += seed[i];
+        else if (v >= VR_U && v < VR_P) su[v - VR_U] += seed[i];
+        else if (v >= VR_P && v < VR_Y) sp[v - VR_P] += seed[i];
+        else if (v != VR_TIME) return fail(m, "getDirectionalDerivative: variable %u is neither state, input nor parameter", v);
+    }
+    m->arg[4] = sx; m->arg[5] = su; m->arg[6] = sp;
+    evaluate(m, model_df, ddx);
+    m->arg[4] = sx; m->arg[5] = su; m->arg[6] = sp;
+    evaluate(m, model_dy, dy);
+    for (i = 0; i < n; i++) {
+        const fmi3ValueReference v = unknown[i];
+        if (v >= VR_DX && v < VR_U) out[i] = ddx[v - VR_DX];
+        else if (v >= VR_Y && v < VR_TIME) out[i] = dy[v - VR_Y];
+        else return fail(m, "getDirectionalDerivative: variable %u is neither derivative nor output", v);
+    }
+    return fmi3OK;
+}
+
+fmi3Status fmi3GetAdjointDerivative(fmi3Instance c, References u, size_t n, References k, size_t nk, const fmi3Float64 seed[], size_t ns,
+                                    fmi3Float64 out[], size_t no) REFUSE("adjoint derivatives are not provided")
+fmi3Status fmi3GetNumberOfVariableDependencies(fmi3Instance c, fmi3ValueReference v, size_t *n) REFUSE("dependencies are not provided")
+fmi3Status fmi3GetVariableDependencies(fmi3Instance c, fmi3ValueReference v, size_t a[], fmi3ValueReference b[], size_t d[], fmi3DependencyKind e[],
+                                       size_t n) REFUSE("dependencies are not provided")
+
+/* ---- FMU state ------------------------------------------------------------ */
+
+fmi3Status fmi3GetFMUState(fmi3Instance c, fmi3FMUState *state) {
+    if (!*state) *state = malloc(sizeof(State));
+    if (!*state) return fail(c, "getFMUState: out of memory");
+    memcpy(*state, &((Plant *)c)->s, sizeof(State));
+    return fmi3OK;
+}
+fmi3Status fmi3SetFMUState(fmi3Instance c, fmi3FMUState state) {
+    memcpy(&((Plant *)c)->s, state, sizeof(State));
+    ((Plant *)c)->fresh = 0;
+    return fmi3OK;
+}
+fmi3Status fmi3FreeFMUState(fmi3Instance c, fmi3FMUState *state) {
+    if (state) { free(*state); *state = NULL; }
+    return fmi3OK;
+}
+fmi3Status fmi3SerializedFMUStateSize(fmi3Instance c, fmi3FMUState state, size_t *size) { *size = sizeof(State); return fmi3OK; }
+fmi3Status fmi3SerializeFMUState(fmi3Instance c, fmi3FMUState state, fmi3Byte bytes[], size_t size) {
+    if (size < sizeof(State)) return fail(c, "serializeFMUState: %lu bytes are too few", (unsigned long)size);
+    memcpy(bytes, state, sizeof(State));
+    return fmi3OK;
+}
+fmi3Status fmi3DeserializeFMUState(fmi3Instance c, const fmi3Byte bytes[], size_t size, fmi3FMUState *state) {
+    if (size != sizeof(State) || memcmp(bytes, PLANT_GUID, strlen(PLANT_GUID)) != 0) return fail(c, "deserializeFMUState: these bytes are not a state of this FMU");
+    if (!*state) *state = malloc(sizeof(State));
+    if (!*state) return fail(c, "deserializeFMUState: out of memory");
+    memcpy(*state, bytes, sizeof(State));
+    return fmi3OK;
+}
+
+/* ---- model exchange ------------------------------------------------------- */
+
+fmi3Status fmi3UpdateDiscreteStates(fmi3Instance c, fmi3Boolean *again, fmi3Boolean *stop, fmi3Boolean *nominals, fmi3Boolean *values, fmi3Boolean *planned, fmi3Float64 *next) {
+    *again = *stop = *nominals = *values = *planned = fmi3False;
+    *next = 0;
+    return fmi3OK;
+}
+fmi3Status fmi3EvaluateDiscreteStates(fmi3Instance c) { return fmi3OK; }
+fmi3Status fmi3CompletedIntegratorStep(fmi3Instance c, fmi3Boolean no_rollback, fmi3Boolean *event, fmi3Boolean *stop) {
+    *event = *stop = fmi3False;
+    return fmi3OK;
+}
+fmi3Status fmi3SetTime(fmi3Instance c, fmi3Float64 t) { ((Plant *)c)->s.t = t; return fmi3OK; }
+
+static fmi3Status check_length(Plant *m, size_t n) { return n == NX ? fmi3OK : fail(m, "the plant has %d states, not %lu", NX, (unsigned long)n); }
+
+fmi3Status fmi3SetContinuousStates(fmi3Instance c, const fmi3Float64 x[], size_t n) {
+    Plant *m = c;
+    if (check_length(m, n) != fmi3OK) return fmi3Error;
+    memcpy(m->s.x, x, n * sizeof *x);
+    m->fresh = 0;
+    return fmi3OK;
+}
+fmi3Status fmi3GetContinuousStates(fmi3Instance c, fmi3Float64 x[], size_t n) {
+    if (check_length(c, n) != fmi3OK) return fmi3Error;
+    memcpy(x, ((Plant *)c)->s.x, n * sizeof *x);
+    return fmi3OK;
+}
+fmi3Status fmi3GetContinuousStateDerivatives(fmi3Instance c, fmi3Float64 dx[], size_t n) {
+    if (check_length(c, n) != fmi3OK) return fmi3Error;
+    refresh(c);
+    memcpy(dx, ((Plant *)c)->dx, n * sizeof *dx);
+    return fmi3OK;
+}
+fmi3Status fmi3GetNominalsOfContinuousStates(fmi3Instance c, fmi3Float64 x[], size_t n) {
+    if (check_length(c, n) != fmi3OK) return fmi3Error;
+    memcpy(x, nominal_x, n * sizeof *x);
+    return fmi3OK;
+}
+fmi3Status fmi3GetEventIndicators(fmi3Instance c, fmi3Float64 z[], size_t n) { return n ? fail(c, "the plant has no event indicators") : fmi3OK; }
+fmi3Status fmi3GetNumberOfEventIndicators(fmi3Instance c, size_t *n) { *n = 0; return fmi3OK; }
+fmi3Status fmi3GetNumberOfContinuousStates(fmi3Instance c, size_t *n) { *n = NX; return fmi3OK; }
+
+/* ---- what other interfaces would need ------------------------------------- */
+
+fmi3Status fmi3EnterConfigurationMode(fmi3Instance c) REFUSE("there is nothing to configure")
+fmi3Status fmi3ExitConfigurationMode(fmi3Instance c) REFUSE("there is nothing to configure")
+fmi3Status fmi3GetIntervalDecimal(fmi3Instance c, References v, size_t n, fmi3Float64 a[], fmi3IntervalQualifier q[]) REFUSE("there are no clocks")
+fmi3Status fmi3GetIntervalFraction(fmi3Instance c, References v, size_t n, fmi3UInt64 a[], fmi3UInt64 b[], fmi3IntervalQualifier q[]) REFUSE("there are no clocks")
+fmi3Status fmi3GetShiftDecimal(fmi3Instance c, References v, size_t n, fmi3Float64 a[]) REFUSE("there are no clocks")
+fmi3Status fmi3GetShiftFraction(fmi3Instance c, References v, size_t n, fmi3UInt64 a[], fmi3UInt64 b[]) REFUSE("there are no clocks")
+fmi3Status fmi3SetIntervalDecimal(fmi3Instance c, References v, size_t n, const fmi3Float64 a[]) REFUSE("there are no clocks")
+fmi3Status fmi3SetIntervalFraction(fmi3Instance c, References v, size_t n, const fmi3UInt64 a[], const fmi3UInt64 b[]) REFUSE("there are no clocks")
+fmi3Status fmi3SetShiftDecimal(fmi3Instance c, References v, size_t n, const fmi3Float64 a[]) REFUSE("there are no clocks")
+fmi3Status fmi3SetShiftFraction(fmi3Instance c, References v, size_t n, const fmi3UInt64 a[], const fmi3UInt64 b[]) REFUSE("there are no clocks")
+fmi3Status fmi3EnterStepMode(fmi3Instance c) REFUSE("this FMU is for model exchange")
+fmi3Status fmi3GetOutputDerivatives(fmi3Instance c, References v, size_t n, const fmi3Int32 o[], fmi3Float64 a[], size_t k) REFUSE("this FMU is for model exchange")
+fmi3Status fmi3DoStep(fmi3Instance c, fmi3Float64 t, fmi3Float64 h, fmi3Boolean n, fmi3Boolean *a, fmi3Boolean *b, fmi3Boolean *d, fmi3Float64 *e) REFUSE("this FMU is for model exchange")
+fmi3Status fmi3ActivateModelPartition(fmi3Instance c, fmi3ValueReference v, fmi3Float64 t) REFUSE("this FMU is for model exchange")
