@@ -14,7 +14,7 @@ import sys
 import threading
 import time
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,13 +26,14 @@ pytest.importorskip("uvicorn")
 
 from identification.errors import InputError
 from workbench.app import _listen, create_app, with_files
-from workbench.app_demo import JOINT, demo_files
+from workbench.app_demo import demo_files
 from workbench.app_records import decimated, guessed_role, thinned
 from workbench.app_security import CSP
 from workbench.app_uploads import check_unpacked
 from workbench.session import Session, State, Store, safe_name, write_atomic
 
 LIMIT = 8_000_000
+JOINT = demo_files()["joint.toml"].decode()
 
 
 class Client:
@@ -68,19 +69,19 @@ class Client:
         status, _, answer = self.raw("PUT", f"{where}/files/{name}", body)
         return status, answer.decode()
 
-    def wait(self, where: str, limit: float = 60) -> dict[str, Any]:
+    def wait(self, where: str, limit: float = 60, *, settled: bool = True) -> dict[str, Any]:
         end = time.monotonic() + limit
         while time.monotonic() < end:
             state: dict[str, Any] = self.get(where)
-            if state["job"] is None:
+            if state["job"] is None and not (settled and state["steps"] and not state["steps"][-1]["settled"]):
                 return state
             time.sleep(0.02)
         pytest.fail("the job did not end")
 
-    def run(self, where: str, action: str, **body: Any) -> dict[str, Any]:
+    def run(self, where: str, action: str, *, settled: bool = True, **body: Any) -> dict[str, Any]:
         status, answer = self.post(f"{where}/run", {"action": action, **body})
         assert status == 202, answer
-        return self.wait(where)
+        return self.wait(where, settled=settled)
 
 
 class Server:
@@ -259,6 +260,48 @@ def test_a_stream_without_a_length_is_cut_at_the_limit(client: Client, root: Pat
     assert list(folder.iterdir()) == []
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc").exists(), reason="memory is read from /proc")
+def test_two_gigabytes_are_streamed_and_cut_at_the_limit(tmp_path: Path) -> None:
+    """Sent without a length: the server cannot know before it has the limit; its memory stays flat, its disk is clean after."""
+    code = f"from pathlib import Path\nfrom workbench.app import serve\nserve([], 0, False, root=Path({str(tmp_path)!r}))"
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+    process = subprocess.Popen([sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    try:
+        client = Client(int(process.stdout.readline().strip().rstrip("/").rsplit(":", 1)[1]))
+        for _ in range(100):
+            try:
+                where = client.session()
+                break
+            except OSError:
+                time.sleep(0.1)
+        sent: list[int] = []
+
+        def chunks() -> Iterator[bytes]:
+            block = b"0.001,1.0,2.0\n" * 75_000
+            while sum(sent) < 2 << 30:
+                sent.append(len(block))
+                yield block
+
+        try:
+            status, _, body = client.raw("PUT", f"{where}/files/big.csv", chunks())
+            assert status == 413
+            assert b"over the limit of 1,074 MB" in body
+        except (BrokenPipeError, ConnectionResetError):
+            pass
+        assert (1 << 30) <= sum(sent) < 1.1 * (1 << 30)
+        peak = int(next(line.split()[1] for line in Path(f"/proc/{process.pid}/status").read_text().splitlines() if line.startswith("VmHWM")))
+        assert peak < 300_000, f"{peak} kB"
+        time.sleep(0.3)
+        assert list((tmp_path / where.rsplit("/", 1)[1] / "files").iterdir()) == []
+        assert client.get(where)["files"] == []
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+
+
 def test_a_zip_bomb_is_not_unpacked(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
     """256 MB of zeros in 0.3 MB, against a limit of 64 MB; the limit itself is 2 GB."""
     monkeypatch.setattr("workbench.app_uploads.MAX_UNPACKED", 64_000_000)
@@ -341,14 +384,11 @@ def test_a_click_gives_the_numbers_of_the_library(client: Client, fitted: str, t
 
     for name, content in demo_files().items():
         (tmp_path / name).write_bytes(content)
-    train = [read(tmp_path / f"demo_train{k}.csv") for k in (1, 2)]
-    held = [read(tmp_path / "demo_test.csv")]
-    joint = load_joint(tmp_path / "demo.toml")
+    train, held, joint = [read(tmp_path / "train.npz")], [read(tmp_path / "held_out.npz")], load_joint(tmp_path / "joint.toml")
     start = fit(joint, train, held_out=held)
     better = fit(start.model.add("stribeck@motor"), train, joint=joint, held_out=held)
     state = client.get(fitted)
     assert state["diagnosis"]["claim"]["effects"] == ["stribeck"]
-    time.sleep(1.0)
     state = client.run(fitted, "add", label="stribeck@motor")
     errors = [s["held_out"]["relative_error_percent"] for s in state["steps"]]
     assert start.held_out is not None
@@ -379,7 +419,8 @@ def test_copied_code_gives_the_same_errors(client: Client, fitted: str, tmp_path
 
 def test_the_worst_window_and_the_places_come_with_the_comparison(client: Client, fitted: str) -> None:
     found = client.get(f"{fitted}/view/compare")
-    assert found["places"][0]["share_percent"] >= found["places"][-1]["share_percent"]
+    shares = [max(p["share_percent"], 0.0) for p in found["places"]]
+    assert shares == sorted(shares, reverse=True)
     low, high = found["worst"]["low"], found["worst"]["high"]
     assert 1.5 < high - low < 2.5
     whole = client.get(f"{fitted}/view/balance?balance=motor&points=60")
@@ -497,7 +538,7 @@ def test_a_changed_record_takes_the_fit_back(client: Client) -> None:
     state = client.run(where, "fit")
     assert "held out" in state["note"]
     assert client.raw("DELETE", f"{where}/file/{held['id']}")[0] == 200
-    assert len(client.get(where)["files"]) == 2
+    assert len(client.get(where)["files"]) == 1
 
 
 def test_a_restart_finds_everything(tmp_path: Path) -> None:
@@ -507,12 +548,13 @@ def test_a_restart_finds_everything(tmp_path: Path) -> None:
     server.client.run(where, "fit")
     server.client.run(where, "diagnose")
     before = server.client.run(where, "add", label="stribeck@motor")
+    value = server.client.get(f"{where}/view/parameters")["motor_stribeck_extra"]["value"]
     server.stop()
     server = Server(tmp_path)
     try:
         after = server.client.get(where)
         assert after["steps"] == before["steps"]
-        assert server.client.get(f"{where}/view/parameters")["motor_stribeck_extra"]["value"] == pytest.approx(11.0, rel=0.05)
+        assert server.client.get(f"{where}/view/parameters")["motor_stribeck_extra"]["value"] == pytest.approx(value, rel=1e-3)
         assert len(server.client.run(where, "undo")["steps"]) == 1
     finally:
         server.stop()
@@ -569,10 +611,10 @@ def test_a_killed_server_loses_nothing(tmp_path: Path) -> None:
 def test_files_of_the_command_line_are_in_the_session(tmp_path: Path) -> None:
     for name, content in demo_files().items():
         (tmp_path / name).write_bytes(content)
-    identifier = with_files(tmp_path / "sessions", sorted(tmp_path.glob("demo*")))
+    identifier = with_files(tmp_path / "sessions", [tmp_path / name for name in demo_files()])
     state = Session(tmp_path / "sessions" / identifier).load()
     found = [(f.name, f.role, f.status) for f in state.files]
-    assert found == [("demo_test.csv", "held_out", "ready"), ("demo_train1.csv", "train", "ready"), ("demo_train2.csv", "train", "ready")]
+    assert found == [("train.npz", "train", "ready"), ("held_out.npz", "held_out", "ready")]
     assert state.joint_text == JOINT
     with pytest.raises(InputError, match="there is no such file"):
         with_files(tmp_path / "sessions", ["missing.csv"])
@@ -624,6 +666,13 @@ def test_decimation_loses_no_spike_and_zooms_to_every_sample() -> None:
     np.testing.assert_array_equal(drawn, values[54_299:54_299 + len(drawn)])
 
 
+def test_decimation_keeps_the_order_of_a_slope() -> None:
+    time_ = np.arange(10_000) * 1e-3
+    for slope in (1.0, -1.0):
+        drawn = decimated(time_, [slope * time_], 100)[1][0]
+        assert (np.diff(slope * drawn) > 0).all()
+
+
 def test_thinning_spreads_windows_over_the_record() -> None:
     from identification.record import Record
 
@@ -641,6 +690,6 @@ def test_roles_are_guessed_from_names(name: str, role: str) -> None:
     assert guessed_role(name)[0] == role
 
 
-def test_the_demo_is_the_same_every_time() -> None:
-    made: Callable[[], dict[str, bytes]] = demo_files.__wrapped__
-    assert made() == demo_files()
+def test_the_demo_is_that_of_the_command_line() -> None:
+    folder = Path(__file__).parents[1] / "workbench" / "demo"
+    assert {name: (folder / name).read_bytes() for name in ("joint.toml", "train.npz", "held_out.npz")} == demo_files()

@@ -57,6 +57,7 @@ class Browser:
     page: Any
     shots: Path
     problems: list[str]
+    context: Any
     clicks: int = 0
 
     def click(self, selector: str) -> None:
@@ -64,9 +65,12 @@ class Browser:
         self.clicks += 1
 
     def idle(self, view: str) -> None:
+        """The view is there, no work runs, and the last step is the whole fit."""
         self.page.wait_for_function(
-            "v => document.querySelector('#main').dataset.view === v && document.querySelector('#job').hidden && !app.sent", arg=view, timeout=120_000
-        )
+            "v => document.querySelector('#main').dataset.view === v && document.querySelector('#job').hidden && !app.sent"
+            " && app.state.steps.every((s) => s.settled) && document.querySelector('#main').dataset.revision === String(app.state.revision)",
+            arg=view, timeout=120_000,
+        )  # fmt: skip
         self.page.wait_for_timeout(150)
 
     def shot(self, name: str) -> None:
@@ -84,12 +88,12 @@ def browser(tmp_path: Path) -> Iterator[Browser]:
     shots.mkdir(parents=True, exist_ok=True)
     with playwright_sync.sync_playwright() as play:
         chromium = play.chromium.launch(executable_path=str(CHROMIUM), args=["--no-sandbox"])
-        page = chromium.new_page(viewport={"width": 1280, "height": 860}, accept_downloads=True)
+        context = chromium.new_context(viewport={"width": 1280, "height": 860}, accept_downloads=True)
         problems: list[str] = []
-        page.on("pageerror", lambda e: problems.append(str(e)))
-        page.on("console", lambda m: problems.append(m.text) if m.type == "error" else None)
-        page.on("request", lambda r: problems.append(f"network: {r.url}") if not re.match(r"(http://127\.0\.0\.1:|data:|blob:)", r.url) else None)
-        yield Browser(page, shots, problems)
+        context.on("weberror", lambda e: problems.append(str(e.error)))
+        context.on("console", lambda m: problems.append(m.text) if m.type == "error" else None)
+        context.on("request", lambda r: problems.append(f"network: {r.url}") if not re.match(r"(http://127\.0\.0\.1:|data:|blob:)", r.url) else None)
+        yield Browser(context.new_page(), shots, problems, context)
         chromium.close()
     assert problems == []
 
@@ -251,9 +255,18 @@ def test_every_view_fits_a_phone_and_passes_axe(served: Served, browser: Browser
     browser.idle("diagnose")
     page.click("button.primary:has-text('Add')")
     browser.idle("ledger")
+    beside = (("replay", ("#replay-kind", "bias"), "#replay", "#timeline"), ("plan", ("#plan-label", "quadratic_drag@motor"), "#plan", "#best-motion"))
+    for view, select, button, made in beside:
+        page.click(f"#nav-{view}")
+        browser.idle(view)
+        serious += axe(page, f"{view}, empty")
+        page.select_option(*select)
+        page.click(button)
+        page.wait_for_selector(made, timeout=120_000)
+        browser.idle(view)
     for width in (1280, 375):
         page.set_viewport_size({"width": width, "height": 812})
-        for view in ("load", "model", "compare", "ledger", "parameters", "export"):
+        for view in ("load", "model", "compare", "ledger", "parameters", "replay", "plan", "export"):
             page.click(f"#nav-{view}")
             browser.idle(view)
             browser.shot(f"{colours}-{width}-{view}")
@@ -302,3 +315,194 @@ def test_the_keyboard_alone_reaches_the_falling_error(served: Served, browser: B
     press(".candidate button.primary")
     browser.idle("ledger")
     assert browser.error() < 0.5 * start
+
+
+# --- the views beside the loop ---------------------------------------------------------------------------------------
+
+
+def demo_with_the_effect(served: Served, browser: Browser) -> None:
+    page = browser.page
+    page.goto(served.address)
+    page.wait_for_selector("#demo")
+    page.click("#demo")
+    page.wait_for_selector("#fit", timeout=60_000)
+    page.click("#fit")
+    browser.idle("compare")
+    page.click("#diagnose")
+    browser.idle("diagnose")
+    page.click("button.primary:has-text('Add')")
+    browser.idle("ledger")
+
+
+def test_pattern_replay_and_plan_by_clicks(served: Served, browser: Browser, tmp_path: Path) -> None:
+    page = browser.page
+    demo_with_the_effect(served, browser)
+    browser.click("#nav-compare")
+    browser.idle("compare")
+    assert "No balance stands over the noise" in page.inner_text("#pattern")
+    assert page.locator("#pattern svg circle.s-was").count() == 1, "the motor balance moved, the others did not"
+    browser.click("#nav-replay")
+    browser.idle("replay")
+    page.select_option("#replay-kind", "stuck")
+    page.select_option("#replay-sensor", "torque")
+    page.fill("#replay-at", "9")
+    browser.click("#replay")
+    page.wait_for_selector("#timeline", timeout=60_000)
+    browser.idle("replay")
+    assert "torque: a sensor failed" in page.inner_text("#timeline").lower()
+    assert page.locator("#timeline svg rect.s-fail").count() == 1
+    assert page.locator(".spark").count() == len(page.evaluate("() => get('/view/replay').then((r) => Object.keys(r.last.parameters))"))
+    browser.click("#nav-plan")
+    browser.idle("plan")
+    assert "not be told" in page.inner_text("main").lower() or "cannot be shown" in page.inner_text("main").lower()
+    browser.click("#plan")
+    page.wait_for_selector("#best-motion", timeout=120_000)
+    browser.idle("plan")
+    with page.expect_download() as motion:
+        page.click("#get-motion")
+    motion.value.save_as(tmp_path / "motion.csv")
+    assert (tmp_path / "motion.csv").read_text().startswith("time_s,reference_position_rad")
+    page.reload()
+    browser.idle("plan")
+    assert page.locator("#best-motion").count() == 1
+
+
+def test_zoom_shows_every_row_and_where_it_is_in_the_record(served: Served, browser: Browser) -> None:
+    page = browser.page
+    demo_with_the_effect(served, browser)
+    browser.click("#nav-load")
+    browser.idle("load")
+    page.wait_for_selector(".plot .uplot")
+    points = int(page.get_attribute(".plot", "data-points"))
+    assert points < 8000
+    assert page.locator(".strip:visible").count() == 0
+    for _ in range(5):
+        page.click("button:has-text('Zoom in')")
+        page.wait_for_timeout(150)
+    page.wait_for_selector(".strip .u-select")
+    shown = page.evaluate("() => [app.plots[0].range, app.plots[0].host.dataset.points, app.plots[0].plot.root.getAttribute('aria-label')]")
+    assert int(shown[1]) == pytest.approx((shown[0][1] - shown[0][0]) / 0.0025, abs=4), "every sample of the window, 2.5 ms apart"
+    assert "every sample" in shown[2]
+    page.locator(".strip .u-over").scroll_into_view_if_needed()
+    box = page.locator(".strip .u-over").bounding_box()
+    page.mouse.move(box["x"] + 0.6 * box["width"], box["y"] + 20)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 0.8 * box["width"], box["y"] + 20, steps=4)
+    page.mouse.up()
+    page.wait_for_timeout(300)
+    low, high = page.evaluate("() => app.plots[0].range")
+    assert low == pytest.approx(12.0, abs=0.3)
+    assert high == pytest.approx(16.0, abs=0.3)
+    page.click("button:has-text('Whole record')")
+    page.wait_for_function("() => app.plots[0].range === null")
+    assert page.locator(".strip:visible").count() == 0
+
+
+@pytest.mark.parametrize("kind", ["npz", "squeezed.npz", "csv"])
+def test_a_preview_is_drawn_while_the_server_takes_the_file_in(served: Served, browser: Browser, tmp_path: Path, kind: str) -> None:
+    import numpy as np
+
+    page = browser.page
+    page.goto(served.address)
+    page.wait_for_selector("#files")
+    t = np.arange(60_000) * 1e-3
+    columns = {"time_s": t, "motor_position_rad": np.sin(t), "motor_current_A": np.where(t == t[33_333], 7.0, np.cos(t)).astype(np.float32)}
+    path = tmp_path / f"run.{kind}"
+    if kind == "csv":
+        np.savetxt(path, np.column_stack(list(columns.values())), delimiter=",", header=",".join(columns), comments="", fmt="%.6g")
+    else:
+        (np.savez_compressed if "squeezed" in kind else np.savez)(path, **columns)
+    held: list[Any] = []
+    page.route("**/files/*", lambda route: held.append(route))
+    page.set_input_files("#files", [path])
+    page.wait_for_selector("#preview .uplot", timeout=20_000)
+    browser.shot(f"preview-{kind}")
+    drawn = page.evaluate("() => app.preview.data.series[0].values")
+    stamps = page.evaluate("() => app.preview.data.time")
+    assert page.evaluate("() => app.preview.data.name") == "motor_position_rad"
+    np.testing.assert_allclose(max(drawn), 1.0, atol=1e-3)
+    assert all(a < b for a, b in zip(stamps[:-1], stamps[1:], strict=True))
+    near = np.abs(np.asarray(drawn) - np.sin(stamps))
+    assert near.max() < 0.2
+    held[0].continue_()
+    page.wait_for_selector("#series-file", timeout=20_000)
+    assert page.locator("#preview").count() == 0
+
+
+def test_an_upload_can_be_cancelled(served: Served, browser: Browser, tmp_path: Path) -> None:
+    page = browser.page
+    page.goto(served.address)
+    page.wait_for_selector("#files")
+    (tmp_path / "run.csv").write_text("time_s,motor_position_rad\n" + "".join(f"{k / 100},{k}\n" for k in range(500)))
+    page.route("**/files/*", lambda route: None)
+    page.set_input_files("#files", [tmp_path / "run.csv"])
+    page.wait_for_selector("#job:not([hidden])")
+    page.click("#cancel")
+    page.wait_for_selector("#error:not([hidden])")
+    assert "run.csv: cancelled; nothing was changed" in page.inner_text("#error-text")
+    assert page.is_hidden("#job")
+    assert page.evaluate("() => app.state.files.length") == 0
+    page.unroute("**/files/*")
+    browser.problems.clear()
+
+
+# --- what people do to a page ----------------------------------------------------------------------------------------
+
+
+def test_fifty_quick_clicks_and_two_tabs(served: Served, browser: Browser) -> None:
+    page = browser.page
+    page.goto(served.address)
+    page.click("#demo")
+    page.wait_for_selector("#fit:enabled", timeout=60_000)
+    page.evaluate("() => { const b = document.querySelector('#fit'); for (let k = 0; k < 50; k++) b.click(); }")
+    browser.idle("compare")
+    assert page.evaluate("() => app.state.steps.length") == 1
+    assert page.is_hidden("#error")
+    other = page.context.new_page()
+    other.goto(served.address + f"#session={page.evaluate('() => app.id')}")
+    other.wait_for_selector("#headline strong")
+    page.click("#nav-ledger")
+    browser.idle("ledger")
+    page.select_option("#add-label", "cubic_viscous@motor")
+    page.click("#add-by-hand")
+    other.wait_for_function("() => app.state.steps.length === 2 && app.state.steps[1].settled", timeout=60_000)
+    browser.idle("ledger")
+    assert other.inner_text("#headline strong") == page.inner_text("#headline strong")
+    other.click("#undo")
+    page.wait_for_function("() => app.state.steps.length === 1", timeout=60_000)
+    other.close()
+
+
+def test_a_tab_closed_in_the_middle_loses_nothing_and_a_stopped_server_is_said(served: Served, browser: Browser) -> None:
+    page = browser.page
+    page.goto(served.address)
+    page.click("#demo")
+    page.wait_for_selector("#fit", timeout=60_000)
+    page.click("#fit")
+    browser.idle("compare")
+    page.click("#diagnose")
+    page.wait_for_selector("#job:not([hidden])")
+    address = served.address + f"#session={page.evaluate('() => app.id')}&view=ledger"
+    page.close()
+    again = browser.page = browser.context.new_page()
+    again.goto(address)
+    again.wait_for_function("() => app.state && app.state.diagnosis && !app.state.job", timeout=60_000)
+    served.server.should_exit = True
+    again.wait_for_timeout(1800)
+    again.click("#add-by-hand")
+    again.wait_for_selector("#error:not([hidden])")
+    assert "the server does not answer; is it still running? What was done is kept" in again.inner_text("#error-text")
+    browser.problems.clear()
+
+
+def test_two_gigabytes_are_refused_before_they_are_sent(served: Served, browser: Browser, tmp_path: Path) -> None:
+    path = tmp_path / "big.csv"
+    with path.open("wb") as stream:
+        stream.truncate(2 << 30)
+    page = browser.page
+    page.goto(served.address)
+    page.wait_for_selector("#files")
+    page.set_input_files("#files", [path])
+    page.wait_for_selector("#error:not([hidden])")
+    assert "big.csv: 2147 MB is over the limit of 1074 MB" in page.inner_text("#error-text")
+    assert page.evaluate("() => app.state.files.length") == 0

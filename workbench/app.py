@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import importlib
 import json
 import os
 import secrets
@@ -40,6 +41,8 @@ PAGE: Final = {
     "/app.css": (WEB / "app.css", "text/css; charset=utf-8"),
     "/app.js": (WEB / "app.js", "text/javascript; charset=utf-8"),
     "/views.js": (WEB / "views.js", "text/javascript; charset=utf-8"),
+    "/more.js": (WEB / "more.js", "text/javascript; charset=utf-8"),
+    "/preview.js": (WEB / "preview.js", "text/javascript; charset=utf-8"),
     "/plots.js": (WEB / "plots.js", "text/javascript; charset=utf-8"),
     "/uPlot.js": (ASSETS / "uPlot.iife.min.js", "text/javascript; charset=utf-8"),
     "/uPlot.css": (ASSETS / "uPlot.min.css", "text/css; charset=utf-8"),
@@ -68,7 +71,7 @@ class Service:
             if identifier not in self.lives:
                 self.lives[identifier] = Live(self.store.open(identifier))
             self.lives.move_to_end(identifier)
-            spare = [k for k in self.lives if k != identifier and not self.lives[k].job and not self.lives[k].listeners]
+            spare = [k for k, live in self.lives.items() if k != identifier and not live.job and not live.listeners and live.worker.idle]
             for old in spare[: max(0, len(self.lives) - IN_MEMORY)]:
                 del self.lives[old]
             return self.lives[identifier]
@@ -326,9 +329,16 @@ def serve(
     config = uvicorn.Config(
         create_app(folder, port=port), log_level="warning", access_log=False, server_header=False, timeout_graceful_shutdown=1, ws="none",
     )  # fmt: skip
+    threading.Thread(target=_warm_up, daemon=True, name="warm up").start()
     if open_browser:
         threading.Timer(0.5, webbrowser.open, (address,)).start()
     uvicorn.Server(config).run(sockets=[listening])
+
+
+def _warm_up() -> None:
+    """Import what the first upload would wait for."""
+    for name in ("numpy.ma", "numpy.fft", "identification._guess", "scipy.sparse"):
+        importlib.import_module(name)
 
 
 def _listen(port: int) -> socket.socket:

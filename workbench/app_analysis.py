@@ -24,6 +24,7 @@ from identification.joint_file import Joint
 from identification.parameters import parameter_table
 from identification.places import Rows, gather, places_of
 from identification.record import Record
+from workbench.app_first import first_look
 from workbench.app_records import thinned
 from workbench.session import StepEntry
 
@@ -117,7 +118,7 @@ class Analysis:
         return self._entry("start", None, self.data, began)
 
     def add(self, label: str, hint: Mapping[str, Any] | None = None) -> StepEntry:
-        """Add an effect and fit again from where the fit stands.
+        """Add an effect: the whole fit where it was made ahead, else a first look that `settle` follows.
 
         Parameters
         ----------
@@ -137,19 +138,37 @@ class Analysis:
         if ready is not None and ready[0] is now:
             self.solution, self.trials = ready[1], {}
             return replace(ready[2], seconds=round(time.perf_counter() - began, 3))
-        solution = self._added(label, hint)
-        self.solution, self.trials = solution, {}
-        return self._entry("add", label, self.data, began)
+        model, start = self._with(label, hint)
+        return self._looked("add", label, model, start, began)
 
-    def prepare(self, label: str, wanted: Callable[[], bool]) -> None:
+    def prepare(self, label: str, hint: Mapping[str, Any] | None = None) -> None:
         """Fit a candidate ahead of the click, so that `add` has it at once."""
         began, now = time.perf_counter(), self._current()
-        made = self._added(label, None)
-        if wanted():
-            self._prepared = {k: v for k, v in self._prepared.items() if v[0] is now}
-            self._prepared[label] = (now, made, self._entry("add", label, self.data, began, made))
+        model, start = self._with(label, hint)
+        made = solve(model, self.data, start=start)
+        entry = self._entry("add", label, self.data, began, made)
+        self._prepared = {**{k: v for k, v in self._prepared.items() if v[0] is now}, label: (now, made, entry)}
 
-    def _added(self, label: str, hint: Mapping[str, Any] | None) -> Solution:
+    def settle(self, step: StepEntry) -> StepEntry:
+        """The whole fit of a step that was only looked at."""
+        began, now = time.perf_counter(), self._current()
+        made = solve(now.model, self.data, start=now.values)
+        entry = self._entry(step.action, step.label, self.data, began, made)
+        self.solution = made
+        return replace(entry, names=step.names, separate_by=step.separate_by)
+
+    def remove(self, label: str) -> StepEntry:
+        """Take an effect out of the model: a first look, as `add`."""
+        began = time.perf_counter()
+        now = self._current()
+        try:
+            model = now.model.drop(label)
+        except (KeyError, ValueError) as error:
+            raise InputError(f"{label}: {error.args[0]}") from None
+        return self._looked("remove", label, model, now.values, began)
+
+    def _with(self, label: str, hint: Mapping[str, Any] | None) -> tuple[JointModel, dict[str, float]]:
+        """The model with an effect, and the values to start from."""
         now = self._current()
         trial = self.trials.get(label)
         values = {**now.values, **(trial.values if trial else (hint or {}).get("values", {}))}
@@ -159,18 +178,13 @@ class Analysis:
             raise InputError(f"{label}: {error.args[0]}") from None
         if not trial and hint and "virtual_work" in hint:
             model = replace(model, virtual_work=bool(hint["virtual_work"]))
-        return solve(model, self.data, start=values)
+        return model, values
 
-    def remove(self, label: str) -> StepEntry:
-        """Take an effect out of the model and fit again."""
-        began = time.perf_counter()
-        now = self._current()
-        try:
-            model = now.model.drop(label)
-        except (KeyError, ValueError) as error:
-            raise InputError(f"{label}: {error.args[0]}") from None
-        self.solution, self.trials = solve(model, self.data, start=now.values), {}
-        return self._entry("remove", label, self.data, began)
+    def _looked(self, action: str, label: str, model: JointModel, start: Mapping[str, float], began: float) -> StepEntry:
+        made = first_look(model, self.data, self._current(), start)
+        entry = self._entry(action, label, self.data, began, made, whole=False)
+        self.solution, self.trials = made, {}
+        return entry
 
     def diagnose(self, progress: Progress) -> dict[str, Any]:
         """Try the whole library on the current model."""
@@ -282,15 +296,18 @@ class Analysis:
         where = {b: float(np.sum(r[k : k + width] ** 2)) / max(error.balances[b].floor, 1e-12) ** 2 for b, r in residual.items()}
         return {"low": float(stamps[k]), "high": float(stamps[min(k + width, len(stamps) - 1)]), "balance": max(where, key=lambda b: where[b])}
 
-    def _entry(self, action: str, label: str | None, data: Dataset, began: float, made: Solution | None = None) -> StepEntry:
+    def _entry(
+        self, action: str, label: str | None, data: Dataset, began: float, made: Solution | None = None, *, whole: bool = True
+    ) -> StepEntry:  # fmt: skip
+        """A step of the ledger; without `whole` a first look, judged on the held-out records only."""
         now = made or self._current()
-        train = assess(now.model, data, data.train, now.values)
+        train = clean(assess(now.model, data, data.train, now.values).as_json()) if whole else {}
         held = assess(now.model, data, data.held_out, now.values)
         key = label.partition("@")[0].partition("#")[0] if label else None
         entry = StepEntry(
-            action, tuple(now.model.effects), {k: float(v) for k, v in now.values.items()}, clean(train.as_json()), clean(held.as_json()),
+            action, tuple(now.model.effects), {k: float(v) for k, v in now.values.items()}, train, clean(held.as_json()),
             key, label, EFFECTS[key].title if key is not None and key in EFFECTS else None, now.model.virtual_work, self.whole,
-            round(time.perf_counter() - began, 3),
+            round(time.perf_counter() - began, 3), settled=whole,
         )  # fmt: skip
         if data is self.data:
             self._solved[_mark(entry)] = now

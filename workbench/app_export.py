@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Mapping
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from identification.errors import InputError
 from identification.improve import HOLD_DELAY
 from workbench.app_analysis import Progress
 from workbench.app_live import Live
 from workbench.app_report import improvement_of
-from workbench.session import FileEntry, State, write_atomic
+from workbench.session import FileEntry, State, StepEntry, write_atomic
 
 
 def session_code(state: State) -> str:
@@ -79,27 +86,68 @@ def fmu_available() -> bool:
     return importlib.util.find_spec("irj_fmu.build") is not None
 
 
-def report(live: Live, folder: Path, progress: Progress) -> Path:
+def report(live: Live, steps: Sequence[StepEntry], folder: Path, progress: Progress) -> Path:
     """Write the HTML report of the session into a folder."""
     from workbench.report import write_report
 
     analysis = live.analysis()
-    result = improvement_of(analysis, live.state.steps, progress)
+    result = improvement_of(analysis, steps, progress)
     progress("writing the report", 0.95)
     return write_report(result, folder / "report.html", records=analysis.records)
 
 
 def fmu(live: Live, folder: Path, progress: Progress, kind: str = "plant") -> Path:
-    """Build the FMU of the fitted joint (``plant``) or of its online estimator (``estimator``) into a folder."""
-    from identification.joint_file import load_joint
-    from irj_fmu.build import Request, build
+    """Build the FMU of the fitted joint (``plant``) or of its online estimator (``estimator``) into a folder.
 
+    The build has a process of its own: a cancelled one takes its compiler with it.
+    """
     source = folder / f"{kind}.toml"
     write_atomic(source, joint_file(live).encode())
     sensing = live.analysis().data.sensing
-    request = Request(joint=load_joint(source), source=source, out=folder / kind, has_link=sensing.both_positions, has_torque=sensing.has_torque)
+    arguments = [kind, "--joint", str(source), "--out", str(folder / kind)]
+    arguments += [] if sensing.both_positions else ["--no-link"]
+    arguments += [] if sensing.has_torque else ["--no-torque"]
     progress(f"building and trying the {kind} FMU", 0.3)
-    made = build(kind, request)
+    _apart("from irj_fmu.build import main; import sys; raise SystemExit(main(sys.argv[1:]))", arguments, folder)
     target = folder / f"{kind}.fmu"
-    next(path for path in made if path.suffix == ".fmu").replace(target)
+    made = sorted((folder / kind).glob("*.fmu"), key=lambda path: path.stat().st_mtime)
+    if not made:
+        raise InputError(f"{kind}: nothing was built; run: irj export {kind} --joint FILE")
+    made[-1].replace(target)
     return target
+
+
+def _apart(code: str, arguments: Sequence[str], folder: Path) -> None:
+    """Run Python code in a process group of its own; it ends when this thread is stopped.
+
+    Raises
+    ------
+    InputError
+        The last line it wrote, where it failed.
+    """
+    root = str(Path(__file__).resolve().parents[1])
+    paths = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
+    with tempfile.TemporaryFile(dir=folder) as said:
+        process = subprocess.Popen(
+            [sys.executable, "-c", code, *arguments], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=said,
+            env={**os.environ, "PYTHONPATH": paths}, start_new_session=True,
+        )  # fmt: skip
+        try:
+            while process.poll() is None:
+                time.sleep(0.05)
+        finally:
+            if process.poll() is None:
+                _end(process)
+        if process.returncode:
+            said.seek(0)
+            lines = said.read().decode(errors="replace").strip().splitlines()
+            raise InputError(lines[-1] if lines else f"the build ended with {process.returncode}")
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """End a process and what it started."""
+    if hasattr(os, "killpg"):
+        os.killpg(process.pid, signal.SIGKILL)
+    else:
+        process.kill()
+    process.wait()

@@ -35,8 +35,9 @@ def add_upload(live: Live, name: str, stored: str, size: int) -> dict[str, Any]:
         path.unlink()
         return set_joint(live, {"text": text, "source": name})
     role, reason = guessed_role(name)
-    entry = live.examine(FileEntry(secrets.token_hex(6), name, stored, role, reason, size))
+    entry = live.examine(FileEntry(secrets.token_hex(6), name, stored, role, reason, size), soon=True)
     live.change_input(lambda s: replace(s, files=(*s.files, entry)))
+    live.check_soon(entry)
     return {"id": entry.id, "status": entry.status, "message": entry.message}
 
 

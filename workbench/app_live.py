@@ -2,32 +2,30 @@
 
 from __future__ import annotations
 
-import ctypes
 import logging
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Final, final
 
 from identification.errors import InputError
 from identification.joint_file import Joint, parse_joint
 from identification.record import Record
 from workbench.app_analysis import Analysis, Progress
-from workbench.app_records import examined
+from workbench.app_records import checked, opened
+from workbench.app_work import CancelledError, Task, Worker
 from workbench.session import FileEntry, Session, State
 
 Change = Callable[[State], State]
 Work = Callable[[Progress], Change]
 Listener = Callable[[dict[str, Any]], None]
 
-PREPARED: Final = 3
-"""Best candidates that are fitted ahead of the click after a diagnosis."""
+SOON: Final = 200_000
+"""Samples above which a record is shown before it went through the check gate."""
+PATIENCE: Final = 0.5
+"""How long the check gate lets the first plot of a record go first [s]."""
 
 _LOG = logging.getLogger(__name__)
-
-
-class CancelledError(Exception):
-    """Raised inside a job that the user cancelled."""
 
 
 class BusyError(InputError):
@@ -43,13 +41,12 @@ class Job:
     text: str
     share: float = 0.0
     cancelled: bool = False
-    working: bool = True
-    thread: int = 0
-    lock: threading.Lock = field(default_factory=threading.Lock)
+    task: Task | None = None
+    change: Change | None = None
 
     def as_json(self) -> dict[str, Any]:
         """What the page shows."""
-        return {"action": self.action, "text": self.text, "share": self.share}
+        return {"action": self.action, "text": "cancelling" if self.cancelled else self.text, "share": self.share, "cancelled": self.cancelled}
 
 
 @final
@@ -60,6 +57,13 @@ class Live:
     ----------
     session : Session
         Its folder; everything here is made from it again after a restart.
+
+    Attributes
+    ----------
+    kept : mapping of str to (mark, value)
+        Costly results in memory, each with the mark of what it was made from.
+    seen : threading.Event
+        Set when the newest record was drawn: the check gate lets that go first.
     """
 
     def __init__(self, session: Session) -> None:
@@ -70,8 +74,14 @@ class Live:
         self.job: Job | None = None
         self.error: str | None = None
         self.listeners: set[Listener] = set()
+        self.worker = Worker(f"session {session.id[:6]}")
+        self.seen = threading.Event()
+        self.kept: dict[str, tuple[Any, Any]] = {}
         self._records: dict[str, Record] = {}
         self._analysis: Analysis | None = None
+        for entry in self.state.files:
+            if entry.status == "checking":
+                self._check_soon(entry.id)
 
     # --- state ------------------------------------------------------------------------------------------------------
 
@@ -94,6 +104,7 @@ class Live:
         """
         with self.lock:
             self._free()
+            self.worker.give_up()
             self._analysis = None
             return self.change(lambda s: change(s).without_fit())
 
@@ -132,18 +143,54 @@ class Live:
 
     # --- records and analysis ---------------------------------------------------------------------------------------
 
-    def examine(self, entry: FileEntry) -> FileEntry:
-        """Read and check an upload; keeps its record in memory."""
+    def examine(self, entry: FileEntry, *, soon: bool = False) -> FileEntry:
+        """Read and check an upload; keeps its record in memory.
+
+        Parameters
+        ----------
+        entry : FileEntry
+        soon : bool
+            A long record may come back with the status ``checking``, to be handed to `check_soon`: it can be looked at.
+        """
         joint = self._joint_or_none()
         columns = entry.columns or (joint.columns if joint else None)
-        made, record = examined(
-            entry, self.session.path_of(entry), joint.kind if joint else "rotary", joint.gear_ratio if joint else None, columns
-        )  # fmt: skip
+        made, record = opened(entry, self.session.path_of(entry), joint.kind if joint else "rotary", columns)
+        if record is not None and not (soon and len(record) > SOON):
+            made, record = checked(made, record, self.session.path_of(entry), joint.gear_ratio if joint else None)
         with self.lock:
             self._records.pop(entry.id, None)
             if record is not None:
                 self._records[entry.id] = record
         return made
+
+    def check_soon(self, entry: FileEntry) -> None:
+        """Run the check gate on a record that is shown already; jobs wait for it."""
+        if entry.status == "checking":
+            self._check_soon(entry.id)
+
+    def _check_soon(self, identifier: str) -> None:
+        self.seen.clear()
+        self.worker.submit(Task(lambda: self._check(identifier)))
+
+    def _check(self, identifier: str) -> None:
+        entry = next((f for f in self.state.files if f.id == identifier), None)
+        if entry is None or entry.status != "checking":
+            return
+        self.seen.wait(PATIENCE)
+        record, joint = self._records.get(identifier), self._joint_or_none()
+        try:
+            if record is None:
+                made = self.examine(entry)
+            else:
+                made, whole = checked(entry, record, self.session.path_of(entry), joint.gear_ratio if joint else None)
+                with self.lock:
+                    self._records.pop(identifier, None)
+                    if whole is not None:
+                        self._records[identifier] = whole
+        except Exception as problem:  # a record that cannot be checked must not be used, nor wait for ever
+            _LOG.exception("checking %s failed", entry.name)
+            made = replace(entry, status="refused", message=f"{entry.name}: cannot be checked ({type(problem).__name__}: {problem}); export it again")
+        self.change(lambda s: replace(s, files=tuple(replace(made, role=f.role, role_reason=f.role_reason) if f.id == identifier else f for f in s.files)))
 
     def record(self, identifier: str) -> Record:
         """The record of an upload, read again where it is not in memory.
@@ -194,8 +241,8 @@ class Live:
         if self.job is not None:
             raise BusyError(f"busy: {self.job.text}; wait for it or cancel it")
 
-    def start(self, action: str, text: str, work: Work, after: Callable[[Callable[[], bool]], None] | None = None) -> None:
-        """Run work in a thread of its own; its change is applied only if it came to its end.
+    def start(self, action: str, text: str, work: Work, after: Callable[[], None] | None = None) -> None:
+        """Run work in the session's thread; its change is applied only if it came to its end.
 
         Parameters
         ----------
@@ -203,7 +250,7 @@ class Live:
         work : callable
             ``work(progress) -> change of the state``.
         after : callable, optional
-            ``after(wanted)``: preparation for the next click, given up when a new job starts.
+            Called when the change is in the state: queues spare work for the next click.
 
         Raises
         ------
@@ -213,42 +260,54 @@ class Live:
         with self.lock:
             self._free()
             job = self.job = Job(action, text)
+            job.task = Task(lambda: self._run(job, work))
             self.error = None
-        threading.Thread(target=self._run, args=(job, work, after), daemon=True, name=f"job {action}").start()
+        self.seen.set()
         self.tell()
+        self.worker.submit(Task(lambda: self._guarded(job, after)))
 
-    def _run(self, job: Job, work: Work, after: Callable[[Callable[[], bool]], None] | None) -> None:
-        job.thread = threading.get_ident()
+    def ahead(self, work: Callable[[], None]) -> None:
+        """Queue spare work: given up when a job comes."""
 
-        def progress(text: str, share: float) -> None:
-            if job.cancelled:
-                raise CancelledError
-            job.text, job.share = text, share
-            self.tell()
+        def quiet() -> None:
+            try:
+                work()
+            except (InputError, ValueError, ArithmeticError):
+                _LOG.debug("preparing the next click failed", exc_info=True)
 
+        self.worker.submit(Task(quiet, spare=True))
+
+    def _guarded(self, job: Job, after: Callable[[], None] | None) -> None:
         made = self._analysis
         before = (made.solution, made.trials) if made is not None else None
-        change: Change | None = None
+        job.change = None
         error: str | None = None
         try:
-            change = work(progress)
+            if job.task is not None:
+                job.task.run()
         except CancelledError:
-            error = f"{job.action}: cancelled; nothing was changed"
+            job.cancelled = True
         except InputError as problem:
             error = str(problem)
         except Exception as problem:  # the page must get a sentence for whatever goes wrong in a fit
-            _LOG.exception("job %s failed", job.action)
+            if not job.cancelled:  # foreign code turns the request to stop into errors of its own
+                _LOG.exception("job %s failed", job.action)
             error = f"{job.action} failed ({type(problem).__name__}: {problem}); the state before it is kept"
-        with job.lock:
-            job.working = False
         if job.cancelled:
-            ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(job.thread), None)
-            change, error = None, f"{job.action}: cancelled; nothing was changed"
-        self._finish(job, change, error, before)
-        if change is not None and after is not None:
-            self._prepare(after)
+            job.change, error = None, f"{job.action}: cancelled; nothing was changed"
+        done = job.change is not None
+        self._finish(job.change, error, before)
+        if done and after is not None:
+            after()
 
-    def _finish(self, job: Job, change: Change | None, error: str | None, before: tuple[Any, Any] | None) -> None:
+    def _run(self, job: Job, work: Work) -> None:
+        def progress(text: str, share: float) -> None:
+            job.text, job.share = text, share
+            self.tell()
+
+        job.change = work(progress)
+
+    def _finish(self, change: Change | None, error: str | None, before: tuple[Any, Any] | None) -> None:
         with self.lock:
             if change is not None:
                 try:
@@ -263,23 +322,15 @@ class Live:
             self.job, self.error = None, error
         self.tell()
 
-    def _prepare(self, after: Callable[[Callable[[], bool]], None]) -> None:
-        revision = self.state.revision
-        try:
-            after(lambda: self.job is None and self.state.revision == revision)
-        except (InputError, ValueError, ArithmeticError):
-            _LOG.debug("preparing the next click failed", exc_info=True)
-
     def cancel(self) -> bool:
-        """Stop the running job at its next step; True where there was one."""
+        """Stop the running job at its next line of Python; True where there was one."""
         with self.lock:
             job = self.job
-        if job is None:
+        if job is None or job.task is None:
             return False
-        with job.lock:
-            job.cancelled = True
-            if job.working and job.thread:
-                ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(job.thread), ctypes.py_object(CancelledError))
+        job.cancelled = True
+        self.tell()
+        job.task.stop()
         return True
 
 

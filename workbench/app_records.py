@@ -35,16 +35,14 @@ def guessed_role(name: str) -> tuple[str, str]:
     return "train", "used for the fit"
 
 
-def examined(entry: FileEntry, path: Path, kind: str, ratio: float | None, columns: Mapping[str, Any] | None) -> tuple[FileEntry, Record | None]:
-    """Read a file and run the check gate; what is wrong is in the entry, not raised.
+def opened(entry: FileEntry, path: Path, kind: str, columns: Mapping[str, Any] | None) -> tuple[FileEntry, Record | None]:
+    """Read a file; what is wrong is in the entry, not raised. A record has the status ``checking`` until `checked`.
 
     Parameters
     ----------
     entry : FileEntry
     path : Path
     kind : {"rotary", "linear"}
-    ratio : float or None
-        Gear ratio, where it is known already.
     columns : mapping or None
         Column map: of the entry, else of the joint file.
     """
@@ -60,10 +58,24 @@ def examined(entry: FileEntry, path: Path, kind: str, ratio: float | None, colum
         return _unread(entry, path, kind, str(error)), None
     except (OSError, MemoryError, ValueError, ArithmeticError, LookupError) as error:
         return replace(entry, status="refused", message=f"{entry.name}: cannot be read ({error}); export it again", findings=()), None
+    return replace(entry, findings=(), summary=_summary(record), message="", status="checking", names=(), guess=()), record
+
+
+def checked(entry: FileEntry, record: Record, path: Path, ratio: float | None) -> tuple[FileEntry, Record | None]:
+    """Run the check gate on a record that `opened` gave; None where it is refused.
+
+    Parameters
+    ----------
+    entry : FileEntry
+    record : Record
+    path : Path
+    ratio : float or None
+        Gear ratio, where it is known already.
+    """
     findings = check(record, ratio)
     shown = tuple({"severity": f.severity, "code": f.code, "message": _plain(f.message, path, entry.name), "channel": f.channel} for f in findings)
     bad = next((f for f in findings if f.severity == "refuse"), None)
-    entry = replace(entry, findings=shown, summary=_summary(record), message="", status="ready", names=(), guess=())
+    entry = replace(entry, findings=shown, message="", status="ready")
     if bad is not None:
         return replace(entry, status="refused", message=_plain(bad.message, path, entry.name)), None
     return entry, repair(record) if any(f.severity == "repair" for f in findings) else record
@@ -107,19 +119,20 @@ def _plain(message: str, path: Path, name: str) -> str:
 
 
 def _summary(record: Record) -> dict[str, Any]:
+    spans = {c: _span(v) for c, v in record.channels.items() if c != "run"}
     return {
         "samples": len(record), "duration": round(record.duration, 6), "segments": len(record.segments()),
         "dt": record.dt if math.isfinite(record.dt) else None,
-        "channels": [
-            {"name": c, "unit": record.unit(c), "low": _finite(np.nanmin(v)), "high": _finite(np.nanmax(v))}
-            for c, v in record.channels.items() if c != "run" and len(v) and np.isfinite(v).any()
-        ],
+        "channels": [{"name": c, "unit": record.unit(c), "low": span[0], "high": span[1]} for c, span in spans.items() if span],
         "columns": list(record.provenance.columns), "notes": list(record.provenance.notes), "reader": record.provenance.reader,
     }  # fmt: skip
 
 
-def _finite(value: Any) -> float | None:
-    return float(value) if math.isfinite(value) else None
+def _span(values: FloatArray) -> tuple[float, float] | None:
+    """Smallest and largest finite value; None where there is none."""
+    if len(values) and not math.isfinite(float(values.min()) + float(values.max())):
+        values = values[np.isfinite(values)]
+    return (float(values.min()), float(values.max())) if len(values) else None
 
 
 def plot_time(record: Record) -> FloatArray:
@@ -137,7 +150,7 @@ def plot_time(record: Record) -> FloatArray:
 def decimated(
     time: FloatArray, columns: Sequence[FloatArray], points: int, window: tuple[float, float] | None = None
 ) -> tuple[FloatArray, list[FloatArray], bool]:
-    """Smallest and largest value of each bucket, so that no spike is lost; every sample where they are few.
+    """Smallest and largest value of each bucket, in their order, so that no spike is lost; every sample where they are few.
 
     Parameters
     ----------
@@ -167,9 +180,10 @@ def decimated(
     out = []
     for c in columns:
         part = c[:last]
+        low, high = np.minimum.reduceat(part, edges), np.maximum.reduceat(part, edges)
+        falls = part[edges] > part[np.append(edges[1:], last) - 1]
         both = np.empty(2 * points)
-        both[0::2] = np.minimum.reduceat(part, edges)
-        both[1::2] = np.maximum.reduceat(part, edges)
+        both[0::2], both[1::2] = np.where(falls, high, low), np.where(falls, low, high)
         out.append(both)
     return stamps, out, False
 

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any
+from functools import partial
+from typing import Any, Final
 
 from identification.errors import InputError
 from identification.improve import HOLD_DELAY, Improvement, improve
 from workbench import app_export
-from workbench.app_analysis import Analysis, Progress, clean
+from workbench.app_analysis import Progress, clean
 from workbench.app_input import folder_of
-from workbench.app_live import PREPARED, Change, Live, hint_for, with_step
+from workbench.app_live import Change, Live, hint_for, with_step
 from workbench.session import State, StepEntry
+
+PREPARED: Final = 6
+"""Best candidates that are fitted ahead of the click after a diagnosis."""
 
 
 def run(live: Live, action: str, body: Mapping[str, Any]) -> None:
@@ -27,12 +32,14 @@ def run(live: Live, action: str, body: Mapping[str, Any]) -> None:
     verbs: dict[str, tuple[str, Callable[[Progress], Change]]] = {
         "fit": ("fitting the start model", lambda p: _fit(live, p)),
         "diagnose": ("looking for what is missing", lambda p: _diagnose(live, p)),
-        "add": (f"adding {label}", lambda p: _add(live, label)),
-        "remove": (f"removing {label}", lambda p: _remove(live, label)),
+        "add": (f"adding {label}", lambda p: _add(live, label, p)),
+        "remove": (f"removing {label}", lambda p: _remove(live, label, p)),
         "undo": ("undoing", lambda p: _undo(live)),
         "redo": ("redoing", lambda p: _redo(live)),
         "confirm": ("fitting every sample", lambda p: _confirm(live, p)),
         "improve": ("running the whole loop", lambda p: _improve(live, p)),
+        "replay": ("replaying a record", lambda p: _replay(live, body, p)),
+        "plan": ("planning a motion", lambda p: _plan(live, body, p)),
         "report": ("writing the report", lambda p: _export(live, "report", p)),
         "plant": ("building the FMU of the joint", lambda p: _export(live, "plant", p)),
         "estimator": ("building the FMU of the estimator", lambda p: _export(live, "estimator", p)),
@@ -42,7 +49,7 @@ def run(live: Live, action: str, body: Mapping[str, Any]) -> None:
     if action in ("add", "remove") and not label:
         raise InputError(f"{action}: say which effect")
     text, work = verbs[action]
-    live.start(action, text, work, after=(lambda wanted: prefit(live, wanted)) if action == "diagnose" else None)
+    live.start(action, text, work, after=lambda: next_click(live))
 
 
 def _fit(live: Live, progress: Progress) -> Change:
@@ -53,28 +60,37 @@ def _fit(live: Live, progress: Progress) -> Change:
     return lambda s: replace(s.without_fit(), steps=(step,), note=analysis.note)
 
 
+def _settled(live: Live, progress: Progress) -> tuple[StepEntry, ...]:
+    """The ledger, its last step fitted wholly."""
+    steps = live.state.steps
+    if not steps or steps[-1].settled:
+        return steps
+    progress("finishing the fit", 0.05)
+    return (*steps[:-1], live.analysis().settle(steps[-1]))
+
+
 def _diagnose(live: Live, progress: Progress) -> Change:
     progress("preparing the records", 0.05)
     analysis = live.analysis()
-    begin: list[StepEntry] = []
-    if not live.state.steps:
-        begin.append(analysis.fit_start())
+    steps = _settled(live, progress) or (analysis.fit_start(),)
     found = analysis.diagnose(progress)
-    return lambda s: replace(s, steps=(*s.steps, *begin), diagnosis=found, note=analysis.note)
+    left = {key: found[key] for key in ("warnings", "not_testable")}
+    return lambda s: replace(s, steps=steps, diagnosis=found, note=analysis.note, left_open=left)
 
 
-def _add(live: Live, label: str) -> Change:
-    analysis = live.analysis()
-    step = analysis.add(label, hint_for(live.state, label))
+def _add(live: Live, label: str, progress: Progress) -> Change:
+    steps = _settled(live, progress)
+    step = live.analysis().add(label, hint_for(live.state, label))
     claim = (live.state.diagnosis or {}).get("claim")
     if claim and claim["label"] == label:
         step = replace(step, names=tuple(claim["effects"]), separate_by=claim["separate_by"])
-    return lambda s: with_step(s, step)
+    return lambda s: with_step(replace(s, steps=steps), step)
 
 
-def _remove(live: Live, label: str) -> Change:
+def _remove(live: Live, label: str, progress: Progress) -> Change:
+    steps = _settled(live, progress)
     step = live.analysis().remove(label)
-    return lambda s: with_step(s, step)
+    return lambda s: with_step(replace(s, steps=steps), step)
 
 
 def _undo(live: Live) -> Change:
@@ -96,9 +112,9 @@ def _redo(live: Live) -> Change:
 def _confirm(live: Live, progress: Progress) -> Change:
     if not live.state.steps:
         raise InputError("nothing to confirm: fit first")
-    last = live.state.steps[-1]
-    step = live.analysis().confirm(last, progress)
-    return lambda s: replace(s, steps=(*s.steps[:-1], step))
+    steps = _settled(live, progress)
+    step = live.analysis().confirm(steps[-1], progress)
+    return lambda s: replace(s, steps=(*steps[:-1], step))
 
 
 def _improve(live: Live, progress: Progress) -> Change:
@@ -113,13 +129,32 @@ def _improve(live: Live, progress: Progress) -> Change:
 
 
 def _export(live: Live, kind: str, progress: Progress) -> Change:
-    if not live.state.steps:
+    steps = _settled(live, progress)
+    if not steps:
         raise InputError("nothing to take home yet: fit first")
     if kind == "report":
-        app_export.report(live, folder_of(live), progress)
+        app_export.report(live, steps, folder_of(live), progress)
     else:
         app_export.fmu(live, folder_of(live), progress, kind)
-    return lambda s: s
+    return lambda s: replace(s, steps=steps)
+
+
+def _replay(live: Live, body: Mapping[str, Any], progress: Progress) -> Change:
+    from workbench import app_replay
+
+    asked = app_replay.request_of(body)
+    steps = _settled(live, progress)
+    app_replay.replay(live, steps, asked, folder_of(live), progress)
+    return lambda s: replace(s, steps=steps)
+
+
+def _plan(live: Live, body: Mapping[str, Any], progress: Progress) -> Change:
+    from workbench import app_plan
+
+    asked = app_plan.request_of(body)
+    steps = _settled(live, progress)
+    app_plan.plan(live, asked, folder_of(live), progress)
+    return lambda s: replace(s, steps=steps)
 
 
 def ledger(result: Improvement) -> tuple[StepEntry, ...]:
@@ -136,18 +171,38 @@ def ledger(result: Improvement) -> tuple[StepEntry, ...]:
     )  # fmt: skip
 
 
-def prefit(live: Live, wanted: Callable[[], bool]) -> None:
-    """Fit the best candidates ahead of the click, while nothing else is asked for."""
-    analysis: Analysis = live.analysis()
-    ranking = (live.state.diagnosis or {}).get("ranking", [])
-    labels = [r["label"] for r in ranking if r.get("significant")]
-    claim = (live.state.diagnosis or {}).get("claim")
-    if claim:
-        labels = list(dict.fromkeys([claim["label"], *labels]))
-    for label in labels[:PREPARED]:
-        if not wanted():
-            return
-        analysis.prepare(label, wanted)
+def next_click(live: Live) -> None:
+    """Queue what the next click will want: the whole fit of the last step, the best candidates."""
+    steps = live.state.steps
+    if steps and not steps[-1].settled:
+        live.ahead(lambda: settle(live))
+    diagnosis = live.state.diagnosis or {}
+    claim = diagnosis.get("claim")
+    ranked = [r["label"] for r in diagnosis.get("ranking", []) if r.get("significant")]
+    for label in list(dict.fromkeys([*([claim["label"]] if claim else []), *ranked]))[:PREPARED]:
+        live.ahead(partial(prepare, live, label))
+
+
+def prepare(live: Live, label: str) -> None:
+    """Fit a candidate ahead of the click."""
+    live.analysis().prepare(label, hint_for(live.state, label))
+
+
+def settle(live: Live) -> None:
+    """Put the whole fit of the last step in place of the first look."""
+    steps = live.state.steps
+    if steps and not steps[-1].settled:
+        made = live.analysis().settle(steps[-1])
+        live.change(lambda s: replace(s, steps=(*s.steps[:-1], made)) if s.steps == steps else s)
+
+
+def wait_settled(live: Live, seconds: float = 30.0) -> None:
+    """Wait until the last step is the whole fit: before its values are taken home."""
+    end = time.monotonic() + seconds
+    while live.state.steps and not live.state.steps[-1].settled and time.monotonic() < end:
+        if live.worker.idle and live.job is None:
+            live.ahead(lambda: settle(live))
+        time.sleep(0.02)
 
 
 def addable(live: Live) -> list[dict[str, Any]]:

@@ -14,11 +14,12 @@ from casadi_models import EFFECTS
 from casadi_models.transmission import MODELS
 from identification.channels import CHANNELS
 from identification.errors import InputError
-from workbench import app_export
+from workbench import app_export, app_plan, app_replay
 from workbench.app_input import folder_of, joint_form
 from workbench.app_live import Live
+from workbench.app_pattern import pattern
 from workbench.app_records import decimated, plot_time
-from workbench.app_verbs import addable
+from workbench.app_verbs import addable, wait_settled
 from workbench.session import safe_name
 
 Query = Mapping[str, Any]
@@ -41,6 +42,7 @@ def _series(live: Live, query: Query) -> dict[str, Any]:
     names = [n for n in str(query.get("channels", "")).split(",") if n] or list(record.channels)[:1]
     values = [record[n] for n in names]
     stamps, columns, full = decimated(plot_time(record), values, _points(query), _window(query))
+    live.seen.set()
     return _drawn(stamps, names, [record.unit(n) for n in names], columns, full)
 
 
@@ -83,7 +85,21 @@ def _numbers(values: Any) -> list[float | None]:
 
 
 def _compare(live: Live, query: Query) -> dict[str, Any]:
-    return live.analysis().compare()
+    analysis = live.analysis()
+    found = analysis.compare()
+    return {**found, "pattern": pattern(analysis, live.state.steps)}
+
+
+def _replay(live: Live, query: Query) -> dict[str, Any]:
+    return {"last": app_replay.stored(folder_of(live)), "sensors": app_replay.READINGS, "faults": app_replay.TRIED, "seconds": app_replay.MOST_SECONDS}
+
+
+def _plan(live: Live, query: Query) -> dict[str, Any]:
+    return {"last": app_plan.stored(folder_of(live)), "open": app_plan.open_questions(live.state), "limits": app_plan.LIMITS}
+
+
+def _motion(live: Live, query: Query) -> Response:
+    return _made(live, app_plan.MOTION)
 
 
 def _parameters(live: Live, query: Query) -> dict[str, Any]:
@@ -113,6 +129,7 @@ def _download(content: str, name: str, kind: str) -> Response:
 
 
 def _joint_file(live: Live, query: Query) -> Response:
+    wait_settled(live)
     return _download(app_export.joint_file(live), f"{_named(live)}.toml", "application/toml")
 
 
@@ -123,8 +140,8 @@ def _script(live: Live, query: Query) -> Response:
 def _made(live: Live, name: str) -> Response:
     path = folder_of(live) / name
     if not path.is_file():
-        raise InputError(f"no {name} yet; make it on the Export page")
-    stem = _named(live) + (f"_{path.stem}" if path.suffix == ".fmu" else "")
+        raise InputError(f"no {name} yet; make it on its page first")
+    stem = _named(live) + (f"_{path.stem}" if path.suffix in (".fmu", ".csv") else "")
     return FileResponse(
         path, filename=f"{stem}{path.suffix}", media_type="application/octet-stream", headers={"cache-control": "no-store"}
     )
@@ -145,5 +162,5 @@ def _estimator(live: Live, query: Query) -> Response:
 VIEWS: Final[Mapping[str, Callable[[Any, Query], Any]]] = {
     "config": _config, "series": _series, "balance": _balance, "compare": _compare, "parameters": _parameters, "library": _library,
     "joint": _joint, "code": _code, "joint.toml": _joint_file, "session.py": _script, "report.html": _report, 
-    "plant.fmu": _plant, "estimator.fmu": _estimator,
+    "plant.fmu": _plant, "estimator.fmu": _estimator, "replay": _replay, "plan": _plan, "motion.csv": _motion,
 }  # fmt: skip

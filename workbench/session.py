@@ -58,8 +58,8 @@ class FileEntry:
     role : {"train", "held_out"}
     role_reason : str
         Why it has this role, as the page says it.
-    status : {"ready", "columns", "refused"}
-        ``columns``: the column map must be confirmed first.
+    status : {"ready", "checking", "columns", "refused"}
+        ``checking``: can be looked at, the check gate runs; ``columns``: the column map must be confirmed first.
     message : str
     columns : mapping or None
         Column map that the user confirmed.
@@ -98,6 +98,8 @@ class StepEntry:
         What the diagnosis could not tell apart when it was added, and the run that would.
     exact : bool
         False while the values come from a part of the samples.
+    settled : bool
+        False while the values are those of the first look, before the whole fit.
     """
 
     action: str
@@ -113,6 +115,7 @@ class StepEntry:
     seconds: float = 0.0
     names: tuple[str, ...] = ()
     separate_by: str | None = None
+    settled: bool = True
 
 
 @final
@@ -130,6 +133,8 @@ class State:
         The ledger, and what undo took off it.
     diagnosis, improvement : mapping or None
         The ranking that belongs to the last step; the result of the whole loop.
+    left_open : mapping
+        What the last diagnosis, whatever was added since, could not test, and its warnings about the records.
     """
 
     revision: int = 0
@@ -142,10 +147,11 @@ class State:
     diagnosis: Mapping[str, Any] | None = None
     improvement: Mapping[str, Any] | None = None
     note: str = ""
+    left_open: Mapping[str, Any] = field(default_factory=dict)
 
     def without_fit(self) -> State:
         """The state before any fit: after a change of records or of the joint."""
-        return replace(self, steps=(), undone=(), diagnosis=None, improvement=None, note="")
+        return replace(self, steps=(), undone=(), diagnosis=None, improvement=None, note="", left_open={})
 
     def as_json(self) -> dict[str, Any]:
         """As written to ``state.json`` and sent to the page."""

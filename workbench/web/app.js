@@ -1,8 +1,8 @@
 "use strict";
 /* The page's state, its talk with the server, and what surrounds the views. */
-const VIEWS = [["load", "Load"], ["model", "Model"], ["compare", "Compare"], ["diagnose", "Diagnose"], ["ledger", "Improve"], ["parameters", "Parameters"], ["export", "Export"]];
+const VIEWS = [["load", "Load"], ["model", "Model"], ["compare", "Compare"], ["diagnose", "Diagnose"], ["ledger", "Improve"], ["parameters", "Parameters"], ["replay", "Replay"], ["plan", "Plan"], ["export", "Export"]];
 const $ = (id) => document.getElementById(id);
-const app = { id: null, config: null, state: null, view: "load", source: null, plots: [], cleanup: [], then: null, sent: false, drafts: {} };
+const app = { id: null, config: null, state: null, view: "load", source: null, plots: [], cleanup: [], then: null, sent: false, drafts: {}, preview: null, sending: null, upload: null };
 
 function h(tag, attributes, ...children) {
   const node = document.createElement(tag);
@@ -16,15 +16,28 @@ function h(tag, attributes, ...children) {
   return node;
 }
 
-async function call(method, path, body, raw) {
+async function call(method, path, body) {
   const options = { method, headers: { "X-IRJ": "1" } };
-  if (raw) options.body = raw;
-  else if (body) { options.body = JSON.stringify(body); options.headers["Content-Type"] = "application/json"; }
+  if (body) { options.body = JSON.stringify(body); options.headers["Content-Type"] = "application/json"; }
   let answer;
   try { answer = await fetch(path, options); } catch (error) { throw new Error("the server does not answer; is it still running? What was done is kept in the session folder."); }
   if (!answer.ok) throw new Error((await answer.text()) || `error ${answer.status}`);
   const type = answer.headers.get("content-type") || "";
   return type.includes("json") ? answer.json() : answer.text();
+}
+/* Send a file: with progress, and so that Cancel stops it. */
+function send(path, file, progress) {
+  return new Promise((resolve, reject) => {
+    const request = (app.sending = new XMLHttpRequest());
+    request.open("PUT", path);
+    request.setRequestHeader("X-IRJ", "1");
+    request.upload.onprogress = (e) => { if (e.lengthComputable) progress(e.loaded / e.total); };
+    request.onload = () => (request.status < 300 ? resolve() : reject(new Error(request.responseText || `error ${request.status}`)));
+    request.onerror = () => reject(new Error(`${file.name}: the server took no more of it; is it still running, and is there space on its disk?`));
+    request.onabort = () => reject(new Error(`${file.name}: cancelled; nothing was changed`));
+    request.onloadend = () => { app.sending = null; };
+    request.send(file);
+  });
 }
 const base = () => `/api/session/${app.id}`;
 const get = (path) => call("GET", base() + path);
@@ -50,7 +63,7 @@ function run(action, body, then) {
   });
 }
 
-function busy() { return Boolean(app.sent || (app.state && app.state.job)); }
+function busy() { return Boolean(app.sent || app.upload || (app.state && app.state.job)); }
 
 async function refresh() {
   const state = await get("");
@@ -83,15 +96,15 @@ function listen() {
 function surround() {
   const state = app.state;
   if (!state) return;
-  const fitted = state.steps.length > 0, ready = state.files.some((f) => f.status === "ready");
-  const usable = { load: true, model: true, compare: fitted, diagnose: fitted, ledger: fitted, parameters: fitted, export: Boolean(state.joint_text) };
-  const done = { load: ready, model: Boolean(state.joint_text), compare: fitted, diagnose: Boolean(state.diagnosis), ledger: state.steps.length > 1, parameters: false, export: false };
+  const fitted = state.steps.length > 0, ready = state.files.some((f) => ["ready", "checking"].includes(f.status));
+  const usable = { load: true, model: true, compare: fitted, diagnose: fitted, ledger: fitted, parameters: fitted, replay: fitted, plan: Boolean(state.joint_text), export: Boolean(state.joint_text) };
+  const done = { load: ready, model: Boolean(state.joint_text), compare: fitted, diagnose: Boolean(state.diagnosis), ledger: state.steps.length > 1, parameters: false, replay: false, plan: false, export: false };
   const list = $("nav");
   if (!list.children.length) VIEWS.forEach(([key, name], k) => list.append(h("li", {}, h("button", { type: "button", id: `nav-${key}`, onclick: () => open(key) }, h("span", { class: "count", "aria-hidden": "true" }, String(k + 1)), name))));
   for (const [key] of VIEWS) {
     const button = $(`nav-${key}`);
     button.disabled = !usable[key];
-    button.title = usable[key] ? "" : "after the first fit";
+    button.title = usable[key] ? "" : key === "plan" || key === "export" ? "once the joint is described" : "after the first fit";
     button.className = done[key] ? "done" : "";
     if (key === app.view) button.setAttribute("aria-current", "page"); else button.removeAttribute("aria-current");
   }
@@ -100,10 +113,11 @@ function surround() {
   if ($("headline").dataset.text !== headline) { $("headline").dataset.text = headline; $("headline").replaceChildren(...(last ? ["held-out error ", h("strong", {}, headline)] : [])); }
   $("undo").disabled = busy() || state.steps.length < 2;
   $("redo").disabled = busy() || !state.undone.length;
-  $("job").hidden = !state.job;
-  if (state.job) {
-    $("job-text").textContent = state.job.text + " …";
-    if (state.job.share > 0) $("job-bar").value = state.job.share; else $("job-bar").removeAttribute("value");
+  const job = app.upload || state.job;
+  $("job").hidden = !job;
+  if (job) {
+    $("job-text").textContent = job.text + " …"; $("cancel").disabled = Boolean(job.cancelled);
+    if (job.share > 0) $("job-bar").value = job.share; else $("job-bar").removeAttribute("value");
   }
   document.querySelectorAll("[data-work]").forEach((b) => { b.disabled = busy() || b.dataset.off === "1"; });
 }
@@ -141,12 +155,20 @@ async function upload(files) {
   const list = [...files].sort((a, b) => b.name.endsWith(".toml") - a.name.endsWith(".toml"));
   for (const file of list) {
     if (file.size > app.config.max_upload) { fail(new Error(`${file.name}: ${Math.round(file.size / 1e6)} MB is over the limit of ${Math.round(app.config.max_upload / 1e6)} MB; cut it, save it as NPZ, or start with: irj app FILE`)); continue; }
-    app.state.job = { text: `reading ${file.name}`, share: 0 };
+    app.upload = { text: `sending ${file.name}`, share: 0 };
     surround();
-    try { await call("PUT", `${base()}/files/${encodeURIComponent(file.name)}`, null, file); } catch (error) { fail(error); }
+    if (!app.preview && app.view === "load" && !app.state.files.length) {
+      const drawn = preview(file).then((data) => { if (data && app.upload && app.view === "load") { app.preview = { file: file.name, data }; render(false); } });
+      await Promise.race([drawn, new Promise((go) => setTimeout(go, 200))]);
+    }
+    const share = (value) => { app.upload = { text: `${value < 1 ? "sending" : "reading"} ${file.name}`, share: value < 1 ? value : 0 }; surround(); };
+    try { await send(`${base()}/files/${encodeURIComponent(file.name)}`, file, share); } catch (error) { fail(error); }
   }
-  app.state.job = null;
+  const had = app.preview;
+  app.upload = null;
+  app.preview = null;
   await refresh().catch(fail);
+  if (had && !app.state.files.length) render(false);
 }
 
 function theme(name) {
@@ -177,7 +199,7 @@ async function boot() {
   $("theme").addEventListener("click", () => { const next = document.documentElement.dataset.theme === "dark" ? "light" : "dark"; remembered("irj-theme", next); theme(next); render(false); });
   $("undo").addEventListener("click", () => run("undo"));
   $("redo").addEventListener("click", () => run("redo"));
-  $("cancel").addEventListener("click", () => post("/cancel").catch(fail));
+  $("cancel").addEventListener("click", () => (app.sending ? app.sending.abort() : post("/cancel").catch(fail)));
   $("fresh").addEventListener("click", () => act(fresh));
   $("error-close").addEventListener("click", clearError);
   addEventListener("dragover", (e) => { e.preventDefault(); document.querySelectorAll(".drop").forEach((d) => d.classList.add("over")); });

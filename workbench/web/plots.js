@@ -56,9 +56,9 @@ function placePlot(place) {
   for (const t of ticks(y0, y1, 4)) out.append(svg("path", { class: t === 0 ? "s-zero" : "s-grid", d: `M${L} ${Y(t)}H${W - R}` }), svg("text", { x: L - 6, y: Y(t) + 4, "text-anchor": "end" }, digits(t)));
   for (const t of ticks(x0, x1, 5)) out.append(svg("path", { class: "s-grid", d: `M${X(t)} ${T}V${H - B}` }), svg("text", { x: X(t), y: H - B + 16, "text-anchor": "middle" }, digits(t)));
   place.branches.forEach((b, k) => {
-    const known = b.centre.map((c, i) => i).filter((i) => b.low[i] != null);
-    if (known.length > 1) {
-      const d = known.map((i) => `${X(b.centre[i])} ${Y(b.high[i])}`).join("L") + "L" + known.slice().reverse().map((i) => `${X(b.centre[i])} ${Y(b.low[i])}`).join("L");
+    const runs = b.centre.reduce((all, c, i) => { if (b.low[i] == null) all.push([]); else all[all.length - 1].push(i); return all; }, [[]]).filter((run) => run.length > 1);
+    for (const run of runs) {
+      const d = run.map((i) => `${X(b.centre[i])} ${Y(b.high[i])}`).join("L") + "L" + run.slice().reverse().map((i) => `${X(b.centre[i])} ${Y(b.low[i])}`).join("L");
       out.append(svg("path", { class: k ? "s-band-2" : "s-band", d: `M${d}Z` }));
     }
     out.append(svg("path", { class: k ? "s-line-2" : "s-line", d: "M" + b.centre.map((c, i) => `${X(c)} ${Y(b.mean[i])}`).join("L") }));
@@ -95,49 +95,81 @@ function stepName(step) {
   return (step.action === "remove" ? "− " : "+ ") + (step.title || step.label || "") + place;
 }
 
-/* A series with min-max decimation on the server; a drag zooms and asks for the samples of the window. */
+/* A series with min-max decimation on the server; a drag zooms and asks for the samples of the window.
+   Zoomed in, a strip below shows the whole record and the window in it. */
 class SeriesPlot {
-  constructor(host, fetcher, { title, window: range } = {}) {
-    this.host = host; this.fetcher = fetcher; this.title = title || ""; this.range = range || null; this.asked = 0; this.plot = null;
-    this.observer = new ResizeObserver(() => { if (this.plot && host.clientWidth) this.plot.setSize({ width: host.clientWidth, height: this.height() }); });
+  constructor(host, fetcher, { title, local } = {}) {
+    this.host = host; this.fetcher = fetcher; this.title = title || ""; this.local = Boolean(local); this.range = null; this.asked = 0; this.plot = null; this.small = null; this.whole = null;
+    this.main = h("div"); this.strip = h("div", { class: "strip", hidden: true });
+    host.replaceChildren(this.main, this.strip);
+    this.observer = new ResizeObserver(() => {
+      if (this.plot && host.clientWidth) this.plot.setSize({ width: host.clientWidth, height: this.height() });
+      if (this.small && host.clientWidth) { this.small.setSize({ width: host.clientWidth, height: 74 }); this.mark(); }
+    });
     this.observer.observe(host);
   }
   height() { return this.host.clientWidth < 600 ? 220 : 300; }
+  forget() { this.whole = null; if (this.small) { this.small.destroy(); this.small = null; } }
   async show(range) {
     this.range = range || null;
-    const mine = ++this.asked;
-    const data = await this.fetcher(this.range, Math.max(200, Math.min(1600, Math.round(this.host.clientWidth || 800))));
+    const mine = ++this.asked, points = Math.max(200, Math.min(1600, Math.round(this.host.clientWidth || 800)));
+    const whole = this.whole || this.fetcher(null, points);
+    const [all, data] = await Promise.all([whole, this.range && !this.local ? this.fetcher(this.range, points) : whole]);
     if (mine !== this.asked || !this.host.isConnected) return;
-    if (!this.full) this.full = [data.time[0], data.time[data.time.length - 1]];
+    this.whole = all;
+    this.full = [all.time[0], all.time[all.time.length - 1]];
     this.draw(data);
+    this.overview(all);
   }
-  draw(data) {
+  colours() {
     const css = getComputedStyle(document.documentElement), colour = (name) => css.getPropertyValue(name).trim();
     const palette = { measured: "--measured", model: "--after", residual: "--before" }, cycle = ["--after", "--before", "--good", "--measured", "--warn"];
+    return { of: (s, k) => colour(palette[s.name] || cycle[k % cycle.length]), axis: { stroke: colour("--soft"), grid: { stroke: colour("--grid"), width: 1 }, ticks: { stroke: colour("--grid") } } };
+  }
+  picked(u) { if (u.select.width > 3) this.show([u.posToVal(u.select.left, "x"), u.posToVal(u.select.left + u.select.width, "x")]).catch(fail); }
+  draw(data) {
+    const { of, axis } = this.colours(), units = [...new Set(data.series.map((s) => s.unit))];
     if (this.plot) this.plot.destroy();
-    this.host.replaceChildren();
-    const axis = { stroke: colour("--soft"), grid: { stroke: colour("--grid"), width: 1 }, ticks: { stroke: colour("--grid") } };
-    const units = [...new Set(data.series.map((s) => s.unit))];
     const options = {
       width: this.host.clientWidth || 800, height: this.height(), legend: { live: true }, cursor: { drag: { x: true, y: false, setScale: false } },
       scales: { x: { time: false, range: this.range ? () => this.range : undefined } },
       series: [{ label: "time [s]", value: (u, v) => digits(v, 6) }, ...data.series.map((s, k) => ({
-        label: `${s.name.replace(/_/g, " ")} [${unit(s.unit)}]`, stroke: colour(palette[s.name] || cycle[k % cycle.length]), width: 1.3, scale: s.unit,
-        dash: s.name === "model" ? [6, 3] : undefined, value: (u, v) => digits(v, 4), points: { show: data.full && data.time.length < 200 },
+        label: s.name.replace(/_/g, " ") + (unit(s.unit) ? ` [${unit(s.unit)}]` : ""), stroke: of(s, k), width: 1.3, scale: s.unit,
+        dash: s.name === "model" ? [6, 3] : k % 2 && s.name !== "residual" ? [8, 3] : undefined, value: (u, v) => digits(v, 4), points: { show: data.full && data.time.length < 200 && !this.local },
       }))],
       axes: [{ ...axis, label: "time [s]", labelSize: 20, size: 40 }, ...units.map((u, k) => ({ ...axis, scale: u, side: k ? 1 : 3, label: unit(u), labelSize: 18, size: 58, grid: k ? { show: false } : axis.grid }))],
-      hooks: { setSelect: [(u) => { if (u.select.width > 3) this.show([u.posToVal(u.select.left, "x"), u.posToVal(u.select.left + u.select.width, "x")]); }] },
+      hooks: { setSelect: [(u) => this.picked(u)] },
     };
-    this.plot = new uPlot(options, [data.time, ...data.series.map((s) => s.values)], this.host);
+    this.plot = new uPlot(options, [data.time, ...data.series.map((s) => s.values)], this.main);
     this.host.dataset.points = String(data.time.length);
-    this.plot.over.addEventListener("dblclick", () => this.show(null));
+    this.plot.over.addEventListener("dblclick", () => this.show(null).catch(fail));
     this.plot.root.setAttribute("role", "img");
     this.plot.root.setAttribute("aria-label", `${this.title || "Series"} over time, ${data.full ? "every sample" : "smallest and largest value per pixel"}`);
+  }
+  overview(all) {
+    this.strip.hidden = !this.range;
+    if (!this.range) return;
+    if (!this.small) {
+      const { of, axis } = this.colours(), scales = Object.fromEntries([...new Set(all.series.map((s) => s.unit))].map((u) => [u, {}]));
+      this.small = new uPlot({
+        width: this.host.clientWidth || 800, height: 74, legend: { show: false }, cursor: { drag: { x: true, y: false, setScale: false }, points: { show: false }, y: false }, scales: { x: { time: false }, ...scales },
+        series: [{}, ...all.series.map((s, k) => ({ stroke: of(s, k), width: 1, scale: s.unit, points: { show: false } }))],
+        axes: [{ ...axis, size: 24 }, ...all.series.slice(0, 1).map((s) => ({ ...axis, scale: s.unit, size: 58, values: () => [] }))], hooks: { setSelect: [(u) => this.picked(u)] },
+      }, [all.time, ...all.series.map((s) => s.values)], this.strip);
+      this.small.root.setAttribute("role", "img");
+      this.small.root.setAttribute("aria-label", "The whole record; the shaded part is shown above");
+    }
+    this.mark();
+  }
+  mark() {
+    if (!this.small || !this.range) return;
+    const left = this.small.valToPos(this.range[0], "x"), right = this.small.valToPos(this.range[1], "x");
+    this.small.setSelect({ left, top: 0, width: Math.max(2, right - left), height: this.small.over.clientHeight }, false);
   }
   move(factor, shift = 0) {
     const [a, b] = this.range || this.full || [0, 1], c = (a + b) / 2 + shift * (b - a), half = ((b - a) * factor) / 2;
     const low = Math.max(this.full[0], c - half), high = Math.min(this.full[1], c + half);
-    this.show(high - low >= (this.full[1] - this.full[0]) * 0.999 ? null : [low, high]);
+    this.show(high - low >= (this.full[1] - this.full[0]) * 0.999 ? null : [low, high]).catch(fail);
   }
-  destroy() { this.observer.disconnect(); if (this.plot) this.plot.destroy(); }
+  destroy() { this.observer.disconnect(); if (this.plot) this.plot.destroy(); if (this.small) this.small.destroy(); }
 }

@@ -18,12 +18,13 @@ const views = {
   load(state) {
     const input = h("input", { type: "file", multiple: "", id: "files", "aria-label": "Measurement files and joint file", onchange: (e) => upload(e.target.files) });
     const drop = h("div", { class: "drop" }, h("h2", {}, "Drop measurement files here"), h("p", { class: "soft" }, "CSV, MAT, NPZ, HDF5, Parquet, MDF, ROS bag; a joint file (TOML) too. They stay on this machine."), input);
+    if (!state.files.length && app.preview) return [heading("Records"), previewCard()];
     if (!state.files.length) return [
       heading("Which physics is your joint model missing?", "Load records of a joint, fit a model, see where it fails, add the missing effect and watch the error fall."),
       h("div", { class: "first" }, drop, h("div", { class: "card" }, h("h2", {}, "No data at hand?"), h("p", {}, "The demo is a simulated harmonic-drive joint whose model lacks one effect. Find it in four clicks."),
         button("Try the demo", () => act(async () => { await post("/demo"); await refresh(); }), { kind: "primary", id: "demo" }))),
     ];
-    const ready = state.files.filter((f) => f.status === "ready");
+    const ready = state.files.filter((f) => ["ready", "checking"].includes(f.status));
     const next = state.joint_text
       ? button("Fit the start model", () => run("fit", {}, "compare"), { kind: "primary", id: "fit", off: !ready.length })
       : button("Next: describe the joint", () => open("model"), { kind: "primary", id: "to-model", work: false });
@@ -62,7 +63,7 @@ const views = {
         h("fieldset", {}, h("legend", {}, "Effects in it from the start"), h("div", { class: "checks" }, common.map((k) => box(k, effectTitle(k))), exact.map((k) => box(k, effectTitle(k)))),
           h("details", { open: others.some((e) => chosen.has(e.key)) }, h("summary", {}, `All others (${others.length})`), h("div", { class: "checks" }, others.map((e) => box(e.key, e.title))))),
         h("details", {}, h("summary", {}, "As joint file (TOML), with known values and column map"), h("label", { for: "joint-text" }, "Joint file"), h("textarea", { id: "joint-text", spellcheck: "false", value: text })))),
-      h("div", { class: "row" }, button("Save and fit", () => act(async () => { await save(); await refresh(); }).then(() => { if ($("error").hidden) run("fit", {}, "compare"); }), { kind: "primary", id: "save-fit", off: !state.files.some((f) => ["ready", "columns"].includes(f.status)) }),
+      h("div", { class: "row" }, button("Save and fit", () => act(async () => { await save(); await refresh(); }).then(() => { if ($("error").hidden) run("fit", {}, "compare"); }), { kind: "primary", id: "save-fit", off: !state.files.some((f) => ["ready", "checking", "columns"].includes(f.status)) }),
         button("Save", () => act(async () => { await save(); await refresh(); }), { id: "save" })));
     return [heading("Model", "What is known about the joint, and the model to start from. Everything else has a start value and bounds derived from the records."), node];
   },
@@ -73,20 +74,21 @@ const views = {
     let balance = found.worst.balance;
     const plot = new SeriesPlot(host, (range, points) => get(`/view/balance?balance=${balance}&points=${points}${range ? `&from=${range[0]}&to=${range[1]}` : ""}`), { title: "Measured torque, model and residual" });
     app.plots.push(plot);
-    later(() => plot.show(null).then(() => plot.show([found.worst.low, found.worst.high])).catch(fail));
-    const pick = h("select", { id: "balance", "aria-label": "Balance in the time plot", onchange: (e) => { balance = e.target.value; plot.show(plot.range).catch(fail); } }, balances.map((b) => h("option", { value: b, selected: b === balance }, `${b} balance`)));
+    later(() => plot.show([found.worst.low, found.worst.high]).catch(fail));
+    const pick = h("select", { id: "balance", "aria-label": "Balance in the time plot", onchange: (e) => { balance = e.target.value; plot.forget(); plot.show(plot.range).catch(fail); } }, balances.map((b) => h("option", { value: b, selected: b === balance }, `${b} balance`)));
     const strong = found.places.filter((p) => p.share_percent > 5 && (found.error.balances[p.balance].ratio ?? 9) > 1.2), rest = found.places.filter((p) => !strong.includes(p));
     const figure = (p) => h("figure", { class: "card place" }, h("figcaption", {}, `${p.balance} balance against ${p.title}`, h("span", {}, p.share_percent > 1 ? `explains ${digits(p.share_percent, 2)} % of the residual's variance on blocks it was not drawn from` : "explains next to nothing")), placePlot(p));
     return [
       h("div", { class: "row between head" }, h("div", {}, heading("Where does the model fail?")), button("What is missing? Diagnose", () => run("diagnose", {}, "diagnose"), { kind: "primary", id: "diagnose" })),
       state.note ? h("p", { class: "note small" }, state.note) : null,
       h("div", { class: "tiles" }, h("div", { class: "card" }, h("p", { class: "soft" }, "Held-out error"), h("div", { class: "figure", id: "held-out-error" }, `${digits(found.error.relative_error_percent)} %`), h("p", { class: "small soft" }, `of the measured torque is not explained, on records the fit did not see (${found.records.join(", ")}). On the fit's own: ${digits(last.train.relative_error_percent)} %.`)),
-        balances.map((b) => { const e = found.error.balances[b]; return h("div", { class: "card" }, h("p", { class: "soft" }, `${b} balance`), h("div", { class: "figure" }, digits(e.ratio), h("small", {}, " × noise floor")), h("p", { class: "small soft" }, `residual ${digits(e.rms)} ${unit(e.unit)} rms; noise alone would leave ${digits(e.floor)}. ${e.ratio < 1.5 ? "Down to the noise." : "There is something left."}`)); })),
+        balances.map((b) => { const e = found.error.balances[b]; return h("div", { class: "card" }, h("p", { class: "soft" }, `${b} balance`), h("div", { class: "figure" }, digits(e.ratio), h("small", {}, " × noise")), h("p", { class: "small soft" }, `residual ${digits(e.rms)} ${unit(e.unit)} rms; noise alone would leave ${digits(e.floor)}. ${e.ratio < 1.5 ? "Down to the noise." : "There is something left."}`)); })),
       h("h2", { class: "gap" }, strong.length ? "Places where the residual is not chance" : "No place stands out"),
       strong.length && first ? h("p", { class: "soft" }, `Line: mean residual; shade: 95 % band. The ${first.balance} balance fails most clearly against ${first.title}.`) : h("p", { class: "soft" }, "The residual looks alike everywhere: what is left is noise, or depends on something that was not measured."),
       h("div", { class: "grid" }, (strong.length ? strong : found.places.slice(0, 1)).map(figure)),
       h("details", {}, h("summary", {}, `Other places (${rest.length})`), h("div", { class: "grid" }, rest.map(figure))),
-      h("section", { class: "card gap" }, h("h2", {}, "In time, at the worst two seconds"), h("p", { class: "soft small" }, "Drag to zoom: up close every row is drawn. Double-click for the whole record."),
+      patternCard(found.pattern),
+      h("section", { class: "card gap" }, h("h2", {}, "In time, at the worst two seconds"), h("p", { class: "soft small" }, "Drag to zoom: up close every row is drawn. The strip below shows the whole record: drag across it to look elsewhere."),
         plotControls(plot, [pick, button("Worst window", () => plot.show([found.worst.low, found.worst.high]), { kind: "quiet", work: false })]), host),
     ];
   },
@@ -127,6 +129,7 @@ const views = {
       h("div", { class: "row between head" }, h("div", {}, heading(before ? (now < was ? `The error falls from ${digits(was)} to ${digits(now)} %` : `The error is ${digits(now)} %, from ${digits(was)} %`) : `The error is ${digits(now)} %`, "Each step is fitted to the training records and judged on records the fit did not see.")),
         h("div", { class: "row" }, button(steps.length > 1 ? "What else is missing?" : "What is missing? Diagnose", () => run("diagnose", {}, "diagnose"), { kind: "primary", id: "diagnose" }), button("Take it home", () => open("export"), { work: false, id: "to-export" }))),
       state.note ? h("p", { class: "note small" }, state.note) : null,
+      !last.settled ? h("p", { class: "note", id: "first-look", role: "status" }, "First look: two steps from the diagnosis. The whole fit follows by itself …") : null,
       !last.exact ? h("p", { class: "note" }, "Fitted and judged on a part of the samples. ", button("Confirm on every sample", () => run("confirm"), { kind: "quiet", id: "confirm" })) : null,
       story ? h("p", { class: "note", id: "verdict" }, h("strong", {}, story.verdict.replace(/_/g, " ") + ". "), story.reason) : null,
       h("div", { class: "two" }, h("figure", { class: "card", id: "staircase" }, h("figcaption", {}, "The falling staircase"), staircase(steps)),
@@ -173,12 +176,14 @@ function jointLine(state) {
 }
 
 function fileCard(f) {
+  const shown = ["ready", "checking"].includes(f.status);
   const s = f.summary || {}, bad = f.findings.filter((x) => x.severity !== "ok"), fine = f.findings.filter((x) => x.severity === "ok");
   const role = h("select", { id: `role-${f.id}`, "aria-label": `Role of ${f.name}`, onchange: (e) => act(async () => { await post(`/file/${f.id}`, { role: e.target.value }); await refresh(); }) }, [["train", "Fit"], ["held_out", "Held out"]].map(([v, t]) => h("option", { value: v, selected: f.role === v }, t)));
   return h("section", { class: "card", "aria-label": f.name }, h("div", { class: "row between" },
-    h("div", {}, h("h2", {}, f.name), f.status === "ready" ? h("p", { class: "soft small" }, `${plural(s.samples, "sample")}, ${digits(s.duration, 4)} s, every ${digits(1000 * s.dt, 3)} ms${s.segments > 1 ? `, ${s.segments} stretches` : ""}. ${f.role_reason.charAt(0).toUpperCase()}${f.role_reason.slice(1)}.`) : null),
-    h("div", { class: "row" }, f.status === "ready" ? role : null, button("Remove", () => act(async () => { await call("DELETE", `${base()}/file/${f.id}`); await refresh(); }), { kind: "quiet", label: `Remove ${f.name}` }))),
+    h("div", {}, h("h2", {}, f.name), shown ? h("p", { class: "soft small" }, `${plural(s.samples, "sample")}, ${digits(s.duration, 4)} s, every ${digits(1000 * s.dt, 3)} ms${s.segments > 1 ? `, ${s.segments} stretches` : ""}. ${f.role_reason.charAt(0).toUpperCase()}${f.role_reason.slice(1)}.`) : null),
+    h("div", { class: "row" }, shown ? role : null, button("Remove", () => act(async () => { await call("DELETE", `${base()}/file/${f.id}`); await refresh(); }), { kind: "quiet", label: `Remove ${f.name}` }))),
     f.status === "refused" ? h("p", { class: "bad" }, f.message) : null,
+    f.status === "checking" ? h("p", { class: "small soft", role: "status" }, "Going through the check gate …") : null,
     f.status === "columns" ? columnMap(f) : null,
     bad.length ? h("ul", { class: "findings" }, bad.map((x) => h("li", {}, h("span", { class: `tag ${SEVERITY[x.severity][0]}` }, SEVERITY[x.severity][1]), " ", x.message))) : null,
     f.status === "ready" ? h("details", {}, h("summary", {}, bad.length ? `Checked: ${fine.length} fine; columns` : "Checked, nothing to repair; columns"), h("ul", { class: "findings" }, s.columns.map((c) => h("li", {}, c)), s.notes.map((n) => h("li", {}, n)), fine.map((x) => h("li", {}, x.message)))) : null);
