@@ -2,11 +2,12 @@
 
     estimator   online estimator of the joint file's parameters (FMI 2.0 co-simulation)
     plant       the joint itself, open loop (FMI 2.0 model exchange and co-simulation)
-    native      the estimator's recursion in C, without Python in the host
+    native      the estimator in C, without Python in the host (FMI 2.0 co-simulation)
     ssp         source, plant and estimator as one system (SSP 1.0)
     all         everything above, and the plant with controller and sensors
 
-Options: --cc gcc|zig, --target TRIPLE|all, --controller, --sensors, --healthy RECORD; see ``--help``.
+Options: --cc gcc|zig, --target linux64|win64|darwin64|TRIPLE|all, --controller, --sensors, --healthy RECORD,
+--sample-time S (native); see ``--help``.
 Every FMU is checked by fmpy's ``validate_fmu`` and run in a fresh process before it appears in the folder.
 """
 

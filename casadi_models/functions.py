@@ -184,6 +184,19 @@ class JointFunctions:
         return ca.Function("step", [ca.vertcat(x, z), u, p, h], [new], ["x", "u", "p", "h"], ["x_next"])
 
     @cached_property
+    def memory_step(self) -> Any:
+        """(x, x_before, z, u, p, h) -> internal states z after their coordinates have moved from x_before to x in the time h.
+
+        x without the internal states; the step form of the declared memory.
+        """
+        x, z, u, p = self._symbols
+        where = ca.Function("where", [x, z, u, p], [ca.vertcat(*self._memory_coordinates)])
+        before, h = ca.SX.sym("before", x.shape[0]), ca.SX.sym("h")
+        steps = ca.vertsplit(where(x, z, u, p) - where(before, z, u, p))
+        moved = self._moved_memory(steps, h)
+        return ca.Function("memory_step", [x, before, z, u, p, h], [moved], ["x", "x_before", "z", "u", "p", "h"], ["z_next"])
+
+    @cached_property
     def outputs(self) -> Any:
         """(x, u, p) -> readings (motor position, velocity, link position, velocity, torque), sensor errors included.
 

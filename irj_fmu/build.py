@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import importlib
 import importlib.util
 import json
 import os
@@ -57,13 +56,15 @@ class Request:
     out : Path
         Folder of the results.
     cc, target : str, optional
-        See :func:`irj_fmu.plant.build_plant`.
+        See :func:`irj_fmu.plant.build_plant`; targets by the names of their folders as well, e.g. ``win64``.
     controller, sensors : bool
         Of the plant.
     healthy : tuple of Path
         Records of the healthy joint, from which the estimator's fault detector takes its limits.
     has_link, has_torque : bool
         Sensors of the joint.
+    sample_time : float
+        Of a native estimator, built in [s].
     """
 
     joint: Joint
@@ -76,6 +77,7 @@ class Request:
     healthy: tuple[Path, ...] = ()
     has_link: bool = True
     has_torque: bool = True
+    sample_time: float = 1e-3
 
 
 def build(kind: str, request: Request, say: Callable[[str], object] = lambda _text: None) -> list[Path]:
@@ -107,11 +109,11 @@ def build(kind: str, request: Request, say: Callable[[str], object] = lambda _te
         with tempfile.TemporaryDirectory(prefix=".build-", dir=request.out) as temporary:
             for maker in _makers(kind):
                 for path, note in maker(request, Path(temporary)):
-                    _check(path)
+                    ran = "smoke run passed" if _check(path) else "not run: it holds no library for this machine"
                     final_path = request.out / path.name
                     path.replace(final_path)
                     done.append(final_path)
-                    say(f"{final_path} ({note}; validated, smoke run passed)")
+                    say(f"{final_path} ({note}; validated, {ran})")
     finally:
         if made_folder and not any(request.out.iterdir()):
             request.out.rmdir()
@@ -124,10 +126,8 @@ _Maker = Callable[[Request, Path], list[tuple[Path, str]]]
 def _makers(kind: str) -> list[_Maker]:
     table: dict[str, list[_Maker]] = {
         "estimator": [_estimator], "plant": [_plant], "native": [_native], "ssp": [_ssp],
-        "all": [_estimator, _plant, _controlled, _ssp],
+        "all": [_estimator, _plant, _controlled, _ssp, _native],
     }  # fmt: skip
-    if importlib.util.find_spec("irj_fmu.native") is not None:
-        table["all"].append(_native)
     return table[kind]
 
 
@@ -151,11 +151,17 @@ def _base(request: Request) -> str:
     return identifier(request.joint.name)
 
 
-def _compiler(request: Request) -> None:
+def _compiler(request: Request) -> tuple[str, ...]:
+    """Targets of the request; there is a compiler for them."""
+    from .native_targets import native_targets
+
+    targets = native_targets(request.target)
     try:
-        find_compiler(None if request.target in (None, "all") else request.target, request.cc)
+        for target in (None,) if request.target in (None, "all") else targets:
+            find_compiler(target, request.cc)
     except InputError as error:
         raise InputError(_TRY if request.cc is None else str(error)) from None
+    return targets
 
 
 def _plant(request: Request, folder: Path) -> list[tuple[Path, str]]:
@@ -171,10 +177,10 @@ def _one_plant(request: Request, folder: Path, name: str, *, controller: bool, s
     from .plant import build_plant
     from .reference import Motion
 
-    _compiler(request)
+    targets = _compiler(request)
     motion = Motion() if controller else None
     spec = plant_spec(request.joint, PlantOptions(controller=controller, motion=motion, sensors=sensors, name=name))
-    path = build_plant(spec, folder / f"{name}.fmu", cc=request.cc, target=request.target)
+    path = build_plant(spec, folder / f"{name}.fmu", cc=request.cc, target=targets)
     kinds = "co-simulation" if spec.memory else "model exchange and co-simulation"
     return path, f"FMI 2.0 {kinds}, {len(spec.states) + len(spec.memory)} states, {len(spec.parameters)} parameters"
 
@@ -241,13 +247,16 @@ def detector_state(joint: Joint, options: object, healthy: Sequence[Path], dt: f
 
 
 def _native(request: Request, folder: Path) -> list[tuple[Path, str]]:
-    if importlib.util.find_spec("irj_fmu.native") is None:
-        raise InputError("the native estimator is not part of this version; build `estimator` instead")
-    build_native = importlib.import_module("irj_fmu.native").build_native
-    _compiler(request)
+    from .native import NativeSpec, build_native
+    from .online import OnlineOptions
+
+    targets = _compiler(request)
     name = f"{_base(request)}_native"
-    path = build_native(request.joint, folder / f"{name}.fmu", cc=request.cc, target=request.target)
-    return [(path, "FMI 2.0 co-simulation without Python")]
+    options = OnlineOptions(has_link=request.has_link, has_torque=request.has_torque)
+    state = detector_state(request.joint, options, request.healthy, request.sample_time)
+    spec = NativeSpec(request.joint, name, options, state, request.sample_time)
+    path = build_native(spec, folder / f"{name}.fmu", cc=request.cc, target=targets)
+    return [(path, f"FMI 2.0 co-simulation without Python, sample time {request.sample_time:g} s")]
 
 
 def _ssp(request: Request, folder: Path) -> list[tuple[Path, str]]:
@@ -282,17 +291,20 @@ def _package(name: str) -> Path:
 # --- checks ----------------------------------------------------------------------------------------------------------
 
 
-def _check(path: Path) -> None:
+def _check(path: Path) -> bool:
+    """Validate, and run where this machine can; False where it cannot."""
     if path.suffix == ".ssp":
         _run(path, [sys.executable, "-I", "-c", _SMOKE_SSP, str(path)])
-        return
+        return True
     from fmpy.validation import validate_fmu
 
     problems = validate_fmu(str(path))
     if problems:
         raise InputError(f"{path.name}: not a valid FMU: {problems[0]}")
-    if _runs_here(path):
-        _run(path, [sys.executable, "-I", "-c", _SMOKE, str(path), "0.001", "200"])
+    runs = _runs_here(path)
+    if runs:
+        _run(path, [sys.executable, "-I", "-c", _SMOKE, str(path), _step(path), "200"])
+    return runs
 
 
 _SMOKE_SSP: Final = """
@@ -302,6 +314,13 @@ found = read_ssd(sys.argv[1])
 if len(found.system.elements) < 2 or not found.system.connections:
     sys.exit("no components or connections")
 """
+
+
+def _step(path: Path) -> str:
+    """Step size that the FMU asks for."""
+    from fmpy import read_model_description
+
+    return str(read_model_description(str(path)).defaultExperiment.stepSize)
 
 
 def _runs_here(path: Path) -> bool:
@@ -330,15 +349,16 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--joint", required=True, type=Path, help="joint file (TOML), fitted or not")
     made.add_argument("--out", default=Path("dist"), type=Path, help="folder of the results (default: dist)")
     made.add_argument("--cc", help="C compiler: a command such as gcc, or zig for the ziglang package")
-    made.add_argument("--target", help="platform of plants: x86_64-linux-gnu, x86_64-windows-gnu, ..., or all")
+    made.add_argument("--target", help="platform of plants and native estimators: linux64, win64, darwin64, x86_64-linux-gnu, ..., or all")
+    made.add_argument("--sample-time", type=float, default=1e-3, metavar="S", help="native: time between two samples, built in (default: 0.001)")
     made.add_argument("--controller", action="store_true", help="plant: drive it by a position controller")
     made.add_argument("--sensors", action="store_true", help="plant: readings with noise, quantisation and faults as parameters")
     made.add_argument(
         "--healthy", nargs="+", default=[], type=Path, metavar="RECORD",
-        help="estimator: records of the healthy joint, for the limits of its fault detector",
+        help="estimators: records of the healthy joint, for the limits of its fault detector",
     )  # fmt: skip
-    made.add_argument("--no-link", action="store_true", help="estimator: the joint has no link encoder")
-    made.add_argument("--no-torque", action="store_true", help="estimator: the joint has no torque sensor")
+    made.add_argument("--no-link", action="store_true", help="estimators: the joint has no link encoder")
+    made.add_argument("--no-torque", action="store_true", help="estimators: the joint has no torque sensor")
     made.add_argument("--json", type=Path, metavar="FILE", help="write what was built as JSON")
     return made
 
@@ -351,6 +371,7 @@ def main(argv: Sequence[str]) -> int:
             joint=load_joint(arguments.joint), source=arguments.joint, out=arguments.out, cc=arguments.cc,
             target=arguments.target, controller=arguments.controller, sensors=arguments.sensors,
             healthy=tuple(arguments.healthy), has_link=not arguments.no_link, has_torque=not arguments.no_torque,
+            sample_time=arguments.sample_time,
         )  # fmt: skip
         done = build(arguments.kind, request, lambda text: sys.stdout.write(f"{text}\n"))
         if arguments.json is not None:

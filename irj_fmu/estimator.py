@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, cast
@@ -12,7 +12,7 @@ from identification.channels import channel_unit
 from identification.errors import InputError
 from identification.joint_file import Joint, load_joint
 
-from .online import FAULT_TEXT, OnlineEstimator, OnlineOptions, held_parameters, prepared
+from .online import FAULT_TEXT, OnlineEstimator, OnlineOptions, held_parameters, prepared, searched_parameters
 from .rows import linear_parameters
 from .slave_base import Health, TableSlave
 from .variables import Value, Variable
@@ -118,6 +118,33 @@ def _estimates(joint: Joint, names: tuple[str, ...], model: Any) -> list[Variabl
     return found
 
 
+def two_step_variables(joint: Joint, options: OnlineOptions) -> tuple[Variable, ...]:
+    """Variables of the two-step algorithm; they stand behind those of :func:`estimator_variables`."""
+    model, _ = prepared(joint, options)
+    known = {p.name: p for p in model.parameters}
+    values = dict(zip(model.parameter_names, model.value_vector(), strict=True))
+    fixed: dict[str, Any] = {"causality": "parameter"}
+    found = [
+        Variable("optimise", start=options.optimise, kind="boolean", description="Search the nonlinear parameters too (two-step algorithm).", **fixed),
+        Variable("portions", start=options.portions, minimum=1, kind="integer", description="Portions of a search per sample.", **fixed),
+        Variable("reoptimise_request", start=False, causality="input", kind="boolean", description="Set to true: search the nonlinear parameters now."),
+    ]  # fmt: skip
+    names = searched_parameters(joint, options)
+    for symbol, meaning in (("eta", "{0.meaning}."), ("sigma_eta", "standard deviation, 0 where it is held.")):
+        for i, name in enumerate(names, 1):
+            p = known[name]
+            start = values[name] if symbol == "eta" else 0.0
+            unit = "" if p.unit == "1" else p.unit
+            found.append(Variable(f"{symbol}[{i}]", unit, start, causality="output", description=f"{name}: {meaning.format(p)}"))
+    flags = (
+        ("reoptimise", "The linear parameters do not explain the residuals any more: the nonlinear ones want another search."),
+        ("searching", "A search for the nonlinear parameters runs, a portion per sample."),
+    )  # fmt: skip
+    found += [Variable(name, start=False, causality="output", kind="boolean", description=text) for name, text in flags]
+    found.append(Variable("n_searches", start=0, minimum=0, causality="output", kind="integer", description="Searches begun so far."))
+    return tuple(found)
+
+
 class Estimator(TableSlave):
     """Estimates a joint's parameters from its readings; see :class:`irj_fmu.online.OnlineEstimator`."""
 
@@ -130,22 +157,19 @@ class Estimator(TableSlave):
         self._fixed = load_options(folder / OPTIONS_FILE)
         detector = folder / DETECTOR_FILE
         self._detector_state = detector.read_bytes() if detector.is_file() else None
-        self.__dict__["variables"] = estimator_variables(self._packed, self._fixed)
+        self.__dict__["variables"] = (*estimator_variables(self._packed, self._fixed), *two_step_variables(self._packed, self._fixed))
         self._estimator: OnlineEstimator | None = None
         self._setup: tuple[Any, ...] = ()
-        self._lost: frozenset[int] = frozenset()
-        self._held: dict[int, Value] = {}
         self._told = 0
-        self._reset_before = False
+        self._shown: Any = None
+        self._reset_before = self._asked_before = False
         super().__init__(**kwargs)
         self._places()
 
     def _places(self) -> None:
         """Where inputs and outputs stand in the table."""
         drive = "i_m" if self._packed.torque_per_current is not None else "tau_m"
-        self._drive = drive
-        self._six = [self._index[n] for n in (drive, *READINGS[1:])]
-        self._flags = [self._index[f"valid.{n}"] for n in (drive, *READINGS[1:])]
+        self._first, self._flag = self._index[drive], self._index[f"valid.{drive}"]
         ratio = self._packed.gear_ratio
         per_unit = self._packed.torque_per_current if drive == "i_m" else ratio
         self._gains = [float(per_unit or 1.0), 1.0 / ratio, 1.0 / ratio, 1.0, 1.0, 1.0]
@@ -154,16 +178,18 @@ class Estimator(TableSlave):
         count = sum(1 for v in self.table if v.name.startswith("theta["))
         self._theta_at, self._sigma_at = self._index["theta[1]"], self._index["sigma[1]"]
         self._thetas = count
+        self._etas = sum(1 for v in self.table if v.name.startswith("eta["))
+        self._request, self._flags = self._index["reoptimise_request"], self._index["reoptimise"]
 
     # --- life --------------------------------------------------------------------------------------------------------
 
     def configure(self, parameters: Mapping[str, Value]) -> None:
         """Build the estimator where what it is built from has changed; take the tunable parameters over."""
-        setup = tuple(parameters[n] for n in ("sample_time", "joint_file", "warm_up", "detect"))
+        setup = tuple(parameters[n] for n in ("sample_time", "joint_file", "warm_up", "detect", "optimise", "portions"))
         options = replace(
             self._fixed, warm_up=float(parameters["warm_up"]), detect=bool(parameters["detect"]),
             drift=float(parameters["drift"]), alarm_drift=float(parameters["alarm_drift"]),
-            floor_share=float(parameters["floor_share"]),
+            floor_share=float(parameters["floor_share"]), optimise=bool(parameters["optimise"]), portions=int(parameters["portions"]),
         )  # fmt: skip
         if self._estimator is None or setup != self._setup:
             self._estimator = self._build(str(parameters["joint_file"]), float(parameters["sample_time"]), options)
@@ -187,38 +213,44 @@ class Estimator(TableSlave):
 
     def _sample(self, time: float, length: float) -> None:
         """Readings that are not finite count as missing; the others of that sample are used."""
-        values = self._values
-        lost = [i for i in self._reals if not math.isfinite(values[i])]  # type: ignore[arg-type, unused-ignore]
-        if not lost:
-            super()._sample(time, length)
+        if not self._due(time, length):
             return
-        names = ", ".join(self.table[i].name for i in lost)
-        self._report(f"input not finite: {names}; it counts as missing")
-        kept = {i: values[i] for i in lost}
-        for i in lost:
-            values[i] = self._held.get(i, 0.0)
-        self._lost = frozenset(lost)
-        try:
-            super()._sample(time, length)
-        finally:
-            self._lost = frozenset()
-            for i, value in kept.items():
-                values[i] = value
+        values = self._values
+        raw = [float(v) for v in values[self._first : self._first + 6]]
+        total = sum(raw)
+        lost = () if total - total == 0.0 else tuple(i for i, v in enumerate(raw) if not math.isfinite(v))
+        flags: list[Any] = values[self._flag : self._flag + 6]
+        if lost:
+            names = ", ".join(self.table[self._first + i].name for i in lost)
+            self._report(f"input not finite: {names}; it counts as missing")
+            raw = [0.0 if i in lost else v for i, v in enumerate(raw)]
+            flags = [bool(flag) and i not in lost for i, flag in enumerate(flags)]
+        health = self._take(time, raw, flags)
+        if lost:
+            health = Health.NUMERIC_TROUBLE
+        if self._too_long:
+            health = max(health, Health.STEP_MISMATCH)
+        values[2] = int(values[2]) + 1
+        values[1] = int(health)
 
     def process(self, time: float, step: float, inputs: Mapping[str, Value]) -> Mapping[str, Value]:
-        """Take one sample; see :class:`OnlineEstimator`."""
+        """Take one sample of finite readings given by name."""
+        raw = [float(inputs[v.name]) for v in self.table[self._first : self._first + 6]]
+        flags = [bool(inputs[v.name]) for v in self.table[self._flag : self._flag + 6]]
+        return {"health": int(self._take(time, raw, flags))}
+
+    def _take(self, time: float, raw: Sequence[float], flags: Sequence[Any]) -> Health:
+        """Give one sample of readings to the :class:`OnlineEstimator` and copy what it says into the outputs."""
         estimator = self._estimator
         if estimator is None:
             raise InputError("the estimator is not configured; see the first message of the log")
-        values, lost = self._values, self._lost
-        raw = [float(values[i]) for i in self._six]
-        gains = self._gains
+        values, gains = self._values, self._gains
         readings = [raw[0] * gains[0], raw[1] * gains[1], raw[2] * gains[2], raw[3], raw[4], raw[5]]
-        flags = [bool(values[i]) for i in self._flags]
-        if lost:
-            flags = [flag and i not in lost for flag, i in zip(flags, self._six, strict=True)]
-        else:
-            self._held = dict(zip(self._six, raw, strict=True))
+        request = bool(values[self._request])
+        if request != self._asked_before:
+            self._asked_before = request
+            if request and not estimator.reoptimise():
+                self._report("reoptimise_request: there are no nonlinear parameters to search")
         if estimator.update(time, readings, flags, enable=bool(values[self._enable])):
             self._publish()
         values[self._q_at], values[self._q_at + 1] = estimator.readings[Q_L], estimator.readings[W_L]
@@ -227,9 +259,9 @@ class Estimator(TableSlave):
             values[self._fault_at] = fault
             if fault:
                 self._report(f"fault {fault} at t = {time:g} s ({FAULT_TEXT})")
-        if lost or fault > 8:
-            return {"health": int(Health.NUMERIC_TROUBLE)}
-        return {"health": int(Health.WARMING_UP)} if estimator.warming_up else {}
+        if fault > 8:
+            return Health.NUMERIC_TROUBLE
+        return Health.WARMING_UP if estimator.warming_up else Health.OK
 
     def _publish(self) -> None:
         """Copy the estimates into the outputs."""
@@ -246,6 +278,13 @@ class Estimator(TableSlave):
         values[score : score + 6] = estimator.score
         values[at["n_rows"]] = estimator.made
         values[at["alarm"]] = estimator.estimator is not None and estimator.estimator.alarm
+        two, flag = estimator.two_step, self._flags
+        values[flag] = estimator.wanted
+        if two is not None:
+            values[flag + 1], values[flag + 2] = two.searching, two.searches
+            if two.eta is not self._shown:
+                self._shown = two.eta
+                values[flag - 2 * self._etas : flag] = [*two.eta.tolist(), *two.deviation.tolist()]
         for text in estimator.events[self._told :]:
             self._report(text)
         self._told = len(estimator.events)
@@ -284,9 +323,7 @@ def options_text(options: OnlineOptions) -> str:
     """The options as TOML."""
     from dataclasses import asdict
 
-    return "".join(
-        f"{name} = {str(value).lower() if isinstance(value, bool) else repr(float(value))}\n" for name, value in asdict(options).items()
-    )
+    return "".join(f"{name} = {str(value).lower() if isinstance(value, bool) else repr(value)}\n" for name, value in asdict(options).items())
 
 
-__all__ = ["DETECTOR_FILE", "JOINT_FILE", "OPTIONS_FILE", "Estimator", "estimator_variables", "load_options", "options_text"]
+__all__ = ["DETECTOR_FILE", "JOINT_FILE", "OPTIONS_FILE", "Estimator", "estimator_variables", "load_options", "options_text", "two_step_variables"]

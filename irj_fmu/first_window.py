@@ -1,9 +1,13 @@
-"""Least squares of the first window, before the recursion starts."""
+"""Least squares of the first window, before the recursion starts, and weights of rows."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import numpy.typing as npt
+
+from identification.recursive import RecursiveLeastSquares, Settings
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -34,3 +38,48 @@ def least_squares(y: FloatArray, h: FloatArray) -> FloatArray:
         left = np.sqrt(np.mean((y - h @ theta) ** 2, axis=0))
         weight = 1.0 / np.maximum(left, 1e-12 + 1e-9 * float(np.max(np.abs(y))))
     return theta
+
+
+def first_estimate(y: FloatArray, h: FloatArray, weight_of: Callable[[FloatArray, FloatArray], FloatArray]) -> tuple[FloatArray, FloatArray]:
+    """Least squares of the first window with weights that follow from it.
+
+    Parameters
+    ----------
+    y, h
+        As in :func:`least_range`.
+    weight_of : callable
+        (parameters, size of the residuals (balances,)) -> weights (rows, balances).
+
+    Returns
+    -------
+    parameters and weights
+    """
+    weight = np.ones_like(y)
+    for _ in range(3):
+        first = least_squares(y * weight, h * weight[:, :, None])
+        size = 1.5 * np.median(np.abs(y - h @ first), axis=0)
+        weight = weight_of(first, np.maximum(size, 1e-9 * float(np.max(np.abs(y)))))
+    return first, weight
+
+
+def reversal_weights(doubt: FloatArray, feels: FloatArray, size: FloatArray) -> FloatArray:
+    """Weights (rows, balances) of rows at a reversal, where friction may take any value between its limits.
+
+    Parameters
+    ----------
+    doubt : (rows, 2) array
+        Share of standstill times friction, of motor and link [N.m].
+    feels : (balances, 2) array
+        True where a balance holds that side's friction.
+    size : (balances,) array
+        Size of the residuals [N.m].
+    """
+    found: FloatArray = 1.0 / np.sqrt(1.0 + np.sum((doubt[:, None, :] * feels) ** 2, axis=2) / size**2)
+    return found
+
+
+def fast_recursion(outputs: int, names: tuple[str, ...], settings: Settings, values: FloatArray, scale: FloatArray) -> RecursiveLeastSquares:
+    """Recursive least squares, its step compiled where there is a compiler; the numbers are the same without."""
+    made = RecursiveLeastSquares(values, scale, outputs=outputs, names=names, settings=settings)
+    made.compile()
+    return made

@@ -2,35 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final, final
+from functools import partial
+from typing import Final, final
 
 import numpy as np
 import numpy.typing as npt
 
-from identification.errors import InputError
+from identification._triangle import single_thread
 from identification.joint_file import Joint
 from identification.recursive import RecursiveLeastSquares, Settings
+from identification.two_step import OnlineSettings
 
-from .first_window import least_range, least_squares
-from .online_options import OnlineOptions, estimated_parameters, held_parameters, prepared
-from .rows import SOURCES, RowMaker
-from .state_bytes import pack, unpack
-from .verdict import CONSTANT, FAULT_TEXT, MISSING, NONE, SCALED, implausible, plant_alarm, scale_limits, scores
+from .first_window import fast_recursion, first_estimate, least_range, reversal_weights
+from .guard import Guard
+from .online_options import OnlineOptions, estimated_parameters, held_parameters, prepared, searched_parameters
+from .rows import RowMaker
+from .samples import Samples
+from .supervision import advance, guarded, launch
+from .two_step_online import make_two_step
+from .verdict import FAULT_TEXT, NONE, implausible, make_detector, plant_alarm, scale_limits, scores, worst
 from .watch import DRIVE, Q_L, Q_M, SAMPLED, TAU, W_L, W_M, Watch
 
-if TYPE_CHECKING:
-    from identification.fault import FaultDetector
-
 FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
 
 _RESIDUAL_SECONDS: Final = 2.0
-_PLAIN: Final = (
-    "_end", "_since", "_rows", "_started", "_lost", "_last_good", "fault", "score", "readings", "plant_alarm", "events",
-)  # fmt: skip
-_ARRAYS: Final = ("_buffer", "theta", "sigma", "residual", "floor", "ratio", "_square", "_torque", "_scale")
-"""What changes from sample to sample, besides rows, watch, recursion and detector."""
+_STRAIN: Final = OnlineSettings()
+"""When residuals ask for another search of the nonlinear parameters."""
+_ALL: Final = [True] * 6
+_NONE_FAILED: Final = [False] * 6
 
 
 @final
@@ -65,17 +68,22 @@ class OnlineEstimator:
         self.model, self.sensing = prepared(joint, self.options)
         self.rows = RowMaker(self.model, self.sensing, dt, held_parameters(joint))
         self.names, self.balances = self.rows.names, self.rows.balances
-        self._units = {p.name: p for p in self.model.parameters}
+        self.guard = Guard(self.names, self.balances, self.rows.timing.stride * dt) if self.options.optimise else None
+        self._plain_rows, self.two_step = self.rows, make_two_step(joint, self.rows, self.options)
         has_link = self.options.has_link
         self.present = (True, True, True, has_link, has_link, self.options.has_torque)
+        self._all, self._whole = list(self.present), all(self.present)
         used: list[bool] = np.any(self.rows.uses, axis=0).tolist()
         self._needs = [False] * 6
         for k, reading in enumerate(SAMPLED):
             self._needs[reading] = used[k] and self.present[reading]
+        self.samples = Samples(self.rows.timing, self._needs)
         self.watch = Watch(dt, self.present)
-        self._detector_state, self._margin = detector_state, 1.0
-        self.detector = self._make_detector() if self.options.detect else None
+        self._margin = 1.0
+        self.detector = make_detector(self.model, dt, self.options, detector_state) if self.options.detect and self.is_fitted else None
+        self._confirm = replace(_STRAIN, sample_time=self.rows.timing.stride * dt).samples(_STRAIN.confirm_seconds)
         self._collect = max(2 * len(self.names), round(self.options.warm_up / (self.rows.timing.stride * dt)))
+        self._from_link = [b in ("link", "transmission") for b in self.balances]
         self._friction = [
             [self.names.index(p.name) for t in self.model.terms if t.place == place and t.effect.family == "friction"
              for p in t.parameters if p.unit == "N.m" and p.name in self.names]
@@ -88,31 +96,22 @@ class OnlineEstimator:
         self.reset()
         self._recursion(self.theta)  # its functions are made here and not inside a step
 
-    def _make_detector(self) -> FaultDetector | None:
-        if not (self.model.is_elastic and self.is_fitted):
-            return None
-        from identification.fault import FaultDetector
-
-        made = FaultDetector(self.model, self.dt, has_torque=self.options.has_torque)
-        if self._detector_state:
-            made.restore(self._detector_state)
-            made.reset()
-        return made
-
     # --- life --------------------------------------------------------------------------------------------------------
 
     def reset(self) -> None:
         """Before the first sample."""
-        t, count, n = self.rows.timing, len(self.balances), len(self.names)
+        count, n = len(self.balances), len(self.names)
+        self.rows = self._plain_rows
         self.rows.reset()
         self.watch.reset()
+        for part in (self.two_step, self.guard):
+            if part is not None:
+                part.reset()
         if self.detector is not None:
             self.detector.reset()
-        self._buffer = np.zeros((4 * t.window, len(SOURCES)))
-        self._end = self._since = self._rows = 0
-        self._started = False
+        self.samples.reset()
+        self._since = self._rows = self._strained = 0
         self._last_good = [0.0] * 6
-        self._lost = [0] * len(SOURCES)
         self._collected: list[tuple[FloatArray, FloatArray, FloatArray]] = []
         self.estimator: RecursiveLeastSquares | None = None
         self._scale = np.ones(n)
@@ -120,7 +119,7 @@ class OnlineEstimator:
         self.theta = np.array([values[name] for name in self.names])
         self.sigma = np.zeros(n)
         self.residual, self.floor, self.ratio = np.zeros(count), np.zeros(count), np.zeros(count)
-        self._square, self._torque = np.zeros(count), np.zeros(count)
+        self._square, self._torque, self.level = np.zeros(count), np.zeros(count), np.zeros(count)
         self.fault, self.score = NONE, [0.0] * 6
         self.plant_alarm = 0
         self.readings = [0.0] * 6
@@ -140,6 +139,18 @@ class OnlineEstimator:
     def made(self) -> int:
         """Rows so far."""
         return self._rows
+
+    @property
+    def wanted(self) -> bool:
+        """True where the residuals stay over their limit although the linear parameters follow."""
+        return self._strained >= self._confirm
+
+    def reoptimise(self) -> bool:
+        """Search the shapes as soon as there are rows enough; False where there are none."""
+        if self.two_step is None:
+            return False
+        self.two_step.ask()
+        return True
 
     def set_fault_margin(self, factor: float) -> None:
         """Multiply the fault detector's limits."""
@@ -166,12 +177,15 @@ class OnlineEstimator:
         bool
             True where a row was made.
         """
-        good = [bool(valid[i]) and self.present[i] for i in range(6)]
-        looked = self.watch.add(list(readings), good)
-        used = [float(readings[i]) if good[i] else self._last_good[i] for i in range(6)]
+        good = self._all if valid == _ALL else [bool(valid[i]) and self.present[i] for i in range(6)]
+        values = list(map(float, readings))
+        looked = self.watch.add(values, good)
+        used = values if good is self._all and self._whole else [v if g else held for v, g, held in zip(values, good, self._last_good, strict=True)]
         self._last_good = used
-        failed = self._detect(readings, good)
-        self._push(failed, good)
+        failed = self._detect(values, good)
+        q = self.readings if self.guard is None else used
+        self.samples.add((q[Q_M], q[Q_L] if self.present[Q_L] else q[Q_M], q[TAU], q[DRIVE]))
+        self.samples.mark(good, failed, self.watch, whole=good is self._all)
         made = False
         self._since += 1
         if self._since >= self.rows.timing.stride:
@@ -180,116 +194,112 @@ class OnlineEstimator:
             self._judge(good)
         if looked:
             self._floors()
+        if self.two_step is not None and self.two_step.searching and enable:
+            advance(self, self.two_step)
         return made
 
-    def _detect(self, readings: Sequence[float], good: list[bool]) -> list[bool]:
+    def _detect(self, readings: list[float], good: list[bool]) -> list[bool]:
         """Run the fault detector; readings with failed ones replaced go to `self.readings`."""
         detector = self.detector
         if detector is None:
             self.readings = list(self._last_good)
             if not good[Q_L]:
                 self.readings[Q_L], self.readings[W_L] = self._link_from_motor()
-            return [False] * 6
-        row = [float(readings[i]) if good[i] else float("nan") for i in range(6)]
+            return _NONE_FAILED
+        row = readings if good is self._all and self._whole else [v if g else math.nan for v, g in zip(readings, good, strict=True)]
         self.readings = detector.update(row)
-        return list(detector._rule.failed)
+        return detector._rule.failed
 
     def _link_from_motor(self) -> tuple[float, float]:
         """Link position and velocity from the motor, torsion taken off."""
         q = self._last_good
-        if not self.model.is_elastic or not self.options.has_torque:
-            return q[Q_M], q[W_M]
-        stiffness = dict(zip(self.names, self.theta.tolist(), strict=True)).get("stiffness", 0.0)
+        at = self.names.index("stiffness") if self.model.is_elastic and self.options.has_torque and "stiffness" in self.names else -1
+        stiffness = float(self.theta[at]) if at >= 0 else 0.0
         return (q[Q_M] - q[TAU] / stiffness if stiffness > 0 else q[Q_M]), q[W_M]
-
-    def _push(self, failed: list[bool], good: list[bool]) -> None:
-        t = self.rows.timing
-        if self._end == len(self._buffer):
-            keep = t.window
-            self._buffer[:keep] = self._buffer[-keep:].copy()
-            self._end = keep
-        q = self.readings
-        motor, link = q[Q_M], q[Q_L] if self.present[Q_L] else q[Q_M]
-        new = (motor, link, q[TAU], q[DRIVE])
-        if not self._started:
-            self._started = True
-            self._buffer[: t.window] = new
-            self._end = t.window
-        self._buffer[self._end] = new
-        self._end += 1
-        watch = self.watch
-        for k, reading in enumerate(SAMPLED):
-            bad = not good[reading] and self._needs[reading]
-            if bad or failed[reading] or watch.constant[reading] or watch.scaled[reading]:
-                self._lost[k] = t.window + t.stride
-            elif self._lost[k]:
-                self._lost[k] -= 1
 
     # --- rows --------------------------------------------------------------------------------------------------------
 
     def _row(self, time: float, enable: bool) -> bool:
-        window = self._buffer[self._end - self.rows.timing.window : self._end]
-        found = self.rows.make(window, time)
+        found = self.rows.make(self.samples.window, time)
         if found is None:
             return False
         y, h = found
         self._rows += 1
-        lost = np.array([count > 0 for count in self._lost])
-        on = ~(self.rows.uses & lost).any(axis=1)
+        on: BoolArray = ~np.any(self.rows.uses & self.samples.lost, axis=1)
+        shares = self._shares()
+        if self.two_step is not None:
+            self.two_step.keep(self.rows.new_points, self.rows.signals, shares, on)
         if self.estimator is None:
             if enable and on.all():
-                self._collected.append((y, h, self._shares()))
+                self._collected.append((y, h, shares))
                 if len(self._collected) >= self._collect:
-                    self._begin()
+                    with single_thread():
+                        self._begin()
             return True
         error = y - h @ self.theta
         self.residual = error
-        period = self.rows.timing.stride * self.dt
-        rate = period / _RESIDUAL_SECONDS
-        signals, weight = self.rows.signals, self._weights()
-        for b, balance in enumerate(self.balances):
-            if on[b]:
-                reference = signals[11] if balance in ("link", "transmission") else signals[1]
-                self._square[b] += rate * ((weight[b] * error[b]) ** 2 - self._square[b])
-                self._torque[b] += rate / 5 * (reference**2 - self._torque[b])
-        self._ratios()
-        if not enable or not on.any():
+        weight = self._weights(shares)
+        self._follow(error, weight, on)
+        least = self._ratios()
+        if not enable:
             return True
-        for b in range(len(on)):
-            self.estimator.enable(b, bool(on[b]))
-        self.theta = self.estimator.update(y * weight, h * weight[:, None])
+        if not on.any():
+            if self.guard is not None:
+                self.theta = self.guard.blind(self.estimator)
+            return True
+        for b, use in enumerate(on.tolist()):
+            self.estimator.enable(b, use)
+        theta = self.estimator.update(y * weight, h * weight[:, None])
         noise = self.estimator._ready("noise").part("fast", "noise")
-        np.maximum(noise, self._least() ** 2, out=noise)
+        np.maximum(noise, least**2, out=noise)
+        self.theta = theta if self.guard is None else guarded(self, self.guard, theta, weight * error, least, on)
+        over = on & (np.sqrt(self._square) > _STRAIN.error_limit * np.maximum(least, self.level))
+        self._strained = self._strained + 1 if over.any() else 0
+        if self.two_step is not None and self.two_step.due(self._strained) and not (self.guard and self.guard.several):
+            launch(self, self.two_step)
         return True
+
+    def _follow(self, error: FloatArray, weight: FloatArray, on: BoolArray) -> None:
+        """Mean squares of the weighted residuals and of the torques, over the last seconds."""
+        rate = self.rows.timing.stride * self.dt / _RESIDUAL_SECONDS
+        square, torque, signals = self._square.tolist(), self._torque.tolist(), self.rows.signals
+        motor, link = float(signals[1]) ** 2, float(signals[11]) ** 2
+        rows = zip(self._from_link, on.tolist(), weight.tolist(), error.tolist(), strict=True)
+        for b, (from_link, use, w, e) in enumerate(rows):
+            if use:
+                square[b] += rate * ((w * e) ** 2 - square[b])
+                torque[b] += rate / 5 * ((link if from_link else motor) - torque[b])
+        self._square[:], self._torque[:] = square, torque
 
     def _shares(self) -> FloatArray:
         """Share of the kernel in which motor and link stand still or turn round."""
         noise = self.watch.noise
-        return np.array([self.rows.standstill("motor", noise[Q_M]), self.rows.standstill("link", noise[Q_L])])
+        return self.rows.standstill(float(noise[Q_M]), float(noise[Q_L]))
 
-    def _weights(self) -> FloatArray:
+    def _weights(self, shares: FloatArray) -> FloatArray:
         """Rows at a reversal count less: there friction may take any value between its limits."""
-        size = np.maximum(np.maximum(self.floor, np.sqrt(self._square)), 1e-12)
-        found: FloatArray = self._weight_of(self._shares()[None], self.theta, size)[0]
+        theta = self.theta.tolist()
+        motor, link = (float(s) * sum(abs(theta[i]) for i in which) for s, which in zip(shares, self._friction, strict=True))
+        found = []
+        for (by_motor, by_link), size in zip(self._feels.tolist(), self._size().tolist(), strict=True):
+            doubt = (motor * motor if by_motor else 0.0) + (link * link if by_link else 0.0)
+            found.append(1.0 / math.sqrt(1.0 + doubt / (size * size)))
+        return np.array(found)
+
+    def _size(self) -> FloatArray:
+        """Size of the residuals now."""
+        found: FloatArray = np.maximum(np.maximum(self.floor, np.sqrt(self._square)), 1e-12)
         return found
 
     def _weight_of(self, shares: FloatArray, theta: FloatArray, size: FloatArray) -> FloatArray:
         """Weights (rows, balances) from the shares (rows, 2) and the size of the residuals (balances,)."""
         level = np.array([float(np.abs(theta[which]).sum()) if which else 0.0 for which in self._friction])
-        doubt = (shares * level)[:, None, :] * self._feels
-        found: FloatArray = 1.0 / np.sqrt(1.0 + np.sum(doubt**2, axis=2) / size**2)
-        return found
+        return reversal_weights(shares * level, self._feels, size)
 
     def _begin(self) -> None:
         """Start the recursion from the collected rows."""
-        y = np.array([row[0] for row in self._collected])
-        h = np.array([row[1] for row in self._collected])
-        shares = np.array([row[2] for row in self._collected])
-        weight = np.ones_like(y)
-        for _ in range(3):
-            first = least_squares(y * weight, h * weight[:, :, None])
-            size = 1.5 * np.median(np.abs(y - h @ first), axis=0)
-            weight = self._weight_of(shares, first, np.maximum(size, 1e-9 * float(np.max(np.abs(y)))))
+        y, h, shares = (np.array([row[i] for row in self._collected]) for i in range(3))
+        first, weight = first_estimate(y, h, partial(self._weight_of, shares))
         y, h = y * weight, h * weight[:, :, None]
         self._scale = np.maximum(np.maximum(np.abs(first), np.abs(self.theta)), least_range(h, y))
         self.estimator = self._recursion(self.theta)
@@ -301,17 +311,26 @@ class OnlineEstimator:
         self.sigma = self.estimator.deviation
         self._square = np.mean((y - h @ self.theta) ** 2, axis=0)
         signals = self.rows.signals
-        self._torque[:] = [signals[11] ** 2 if b in ("link", "transmission") else signals[1] ** 2 for b in self.balances]
+        self._torque[:] = [signals[11] ** 2 if from_link else signals[1] ** 2 for from_link in self._from_link]
         self._collected = []
         self._floors()
+        self.level = np.sqrt(self._square)
+        if self.guard is not None:
+            self.guard.start(self.estimator)
+        if self.two_step is not None and not self.two_step.known:
+            launch(self, self.two_step, first=True)
 
-    def _recursion(self, values: FloatArray) -> RecursiveLeastSquares:
+    def _factory(self) -> Callable[[FloatArray, FloatArray], RecursiveLeastSquares]:
+        """(values, scale) -> recursive least squares with the present options."""
         period = self.rows.timing.stride * self.dt
         settings = Settings(
             sample_time=period, drift=self.options.drift, alarm_drift=self.options.alarm_drift, window_seconds=2.0,
             rank_seconds=8.0,
         )  # fmt: skip
-        return RecursiveLeastSquares(values, self._scale, outputs=len(self.balances), names=self.names, settings=settings)
+        return partial(fast_recursion, len(self.balances), self.names, settings)
+
+    def _recursion(self, values: FloatArray) -> RecursiveLeastSquares:
+        return self._factory()(values, self._scale)
 
     def retune(self, options: OnlineOptions) -> None:
         """Take up other forgetting bounds and floors while running; the estimate stays."""
@@ -322,6 +341,8 @@ class OnlineEstimator:
             new.fast[:], new.slow[:] = old.fast, old.slow
             new.theta[:] = old.theta
             self.estimator = fresh
+            if self.guard is not None:
+                self.guard.start(fresh)
 
     # --- judgement ---------------------------------------------------------------------------------------------------
 
@@ -333,8 +354,10 @@ class OnlineEstimator:
         self.sigma = self.estimator.deviation
         self._ratios()
 
-    def _ratios(self) -> None:
-        self.ratio = np.sqrt(self._square) / self._least()
+    def _ratios(self) -> FloatArray:
+        least = self._least()
+        self.ratio = np.sqrt(self._square) / least
+        return least
 
     def _least(self) -> FloatArray:
         """What counts as noise at least: the floor, and a share of the torque balanced [N.m]."""
@@ -344,21 +367,11 @@ class OnlineEstimator:
 
     def _judge(self, good: list[bool]) -> None:
         """The most severe fault now, and the scores."""
-        found, watch = NONE, self.watch
-        for i in range(6):
-            if not good[i] and (self._needs[i] or (self.detector is not None and self.present[i])):
-                found = found or MISSING + 1 + i
         detector = self.detector
         if detector is not None:
-            for i, failed in enumerate(detector._rule.failed):
-                if failed and not found:
-                    found = 1 + i
-            self.plant_alarm = plant_alarm(detector, self.dt)
-            self.score = scores(detector)
-        for flags, code in ((watch.constant, CONSTANT), (watch.scaled, SCALED)):
-            for i in range(6):
-                if flags[i] and not found:
-                    found = code + 1 + i
+            self.plant_alarm, self.score = plant_alarm(detector, self.dt), scores(detector)
+        missing = [not g and (self._needs[i] or (detector is not None and self.present[i])) for i, g in enumerate(good)]
+        found = worst(missing, detector, self.watch)
         if not found and self.estimator is not None and self.is_fitted:
             found = implausible(self.names, self.theta, self.sigma, self.joint.fitted)
         found = found or self.plant_alarm
@@ -369,32 +382,16 @@ class OnlineEstimator:
     # --- state -------------------------------------------------------------------------------------------------------
 
     def state(self) -> bytes:
-        """Everything the estimator will use again, as bytes."""
-        plain = {name: getattr(self, name) for name in _PLAIN}
-        arrays = {name: getattr(self, name) for name in _ARRAYS} | {"watch": self.watch.numbers()}
-        if self._collected:
-            arrays |= {key: np.array([row[i] for row in self._collected]) for i, key in enumerate(("y", "h", "shares"))}
-        arrays.update({f"row{i}": values for i, values in enumerate(self.rows.numbers())})
-        parts = {} if self.estimator is None else {"rls": self.estimator.state()}
-        if self.detector is not None:
-            parts["detector"] = self.detector.state()
-        return pack(plain, arrays, parts)
+        """Everything the estimator will use again, as bytes; of a running search what it started from and how far it is."""
+        from .online_state import state
 
-    def restore(self, state: bytes) -> None:
-        """Take up a state of an estimator of the same joint and options."""
-        plain, arrays, parts = unpack(state)
-        if arrays["theta"].shape != self.theta.shape or arrays["_buffer"].shape != self._buffer.shape:
-            raise InputError("restore: the state is of another joint or sample time; give one of this estimator")
-        for name in (*_PLAIN, *_ARRAYS):
-            setattr(self, name, plain[name] if name in plain else arrays[name])
-        self.watch.load(arrays["watch"])
-        self._collected = list(zip(arrays["y"], arrays["h"], arrays["shares"], strict=True)) if "y" in arrays else []
-        self.rows.load([arrays[f"row{i}"] for i in range(len(self.rows.numbers()))])
-        self.estimator = self._recursion(self.theta) if "rls" in parts else None
-        if self.estimator is not None:
-            self.estimator.restore(parts["rls"])
-        if self.detector is not None and "detector" in parts:
-            self.detector.restore(parts["detector"])
+        return state(self)
+
+    def restore(self, saved: bytes) -> None:
+        """Take up a state of an estimator of the same joint and options; a running search is repeated up to where it was."""
+        from .online_state import restore
+
+        restore(self, saved)
 
 
-__all__ = ["FAULT_TEXT", "OnlineEstimator", "OnlineOptions", "estimated_parameters", "held_parameters", "prepared"]
+__all__ = ["FAULT_TEXT", "OnlineEstimator", "OnlineOptions", "estimated_parameters", "held_parameters", "prepared", "searched_parameters"]

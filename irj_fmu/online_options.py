@@ -11,6 +11,7 @@ from identification.joint_file import Joint
 from identification.sensing import Sensing, adapt
 
 from .rows import linear_parameters
+from .two_step_rows import shape_parameters
 
 
 @final
@@ -30,6 +31,11 @@ class OnlineOptions:
         A balance's floor is never below this share of the torque it balances.
     detect : bool
         Run the fault detector; it needs an elastic joint whose values are known.
+    optimise : bool
+        Search the shapes of friction and stiffness laws (two-step algorithm) where the linear parameters do not
+        explain the residuals, and after the first window where the joint file has no values for them.
+    portions : int
+        Portions of a search per sample.
     """
 
     has_link: bool = True
@@ -39,6 +45,8 @@ class OnlineOptions:
     alarm_drift: float = 1.0
     floor_share: float = 1e-3
     detect: bool = True
+    optimise: bool = True
+    portions: int = 1
 
 
 def sensing_of(model: JointModel, options: OnlineOptions) -> Sensing:
@@ -82,6 +90,13 @@ def held_parameters(joint: Joint) -> frozenset[str]:
     model = joint.model()
     geometry = {n for t in model.terms if t.place == "torsion" for n in t.names}
     return frozenset(k for k, v in joint.known.items() if v.value is not None) | delays | geometry
+
+
+def searched_parameters(joint: Joint, options: OnlineOptions | None = None) -> tuple[str, ...]:
+    """Names of the shape parameters that an estimator of this joint can search, in the order of ``eta[k]``."""
+    model, sensing = prepared(joint, options or OnlineOptions())
+    held = held_parameters(joint)
+    return shape_parameters(model, sensing, linear_parameters(model, sensing, held), held)
 
 
 def estimated_parameters(joint: Joint, options: OnlineOptions | None = None) -> tuple[str, ...]:

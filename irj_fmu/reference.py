@@ -165,3 +165,10 @@ class Motion:
         """Position and velocity at the beginning."""
         q, v, _ = self.expressions(0.0)
         return float(q), float(v)
+
+
+def selected_motion(joint: Joint) -> Motion:
+    """The built-in motion, fast enough to pass the velocity of a Stribeck law."""
+    top = 1.3  # rad/s, at speed 1
+    velocities = [v for k, v in joint.fitted.items() if k.endswith("stribeck_velocity")]
+    return Motion(speed=max(1.0, *(1.2 * v / top for v in velocities)) if velocities else 1.0)

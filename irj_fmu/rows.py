@@ -8,7 +8,6 @@ estimate the same. A row belongs to the instant `delay` before it is made.
 from __future__ import annotations
 
 from collections.abc import Container, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Final, final
 
 import casadi as ca
@@ -20,15 +19,16 @@ from identification.balances import residual_expressions
 from identification.sensing import Sensing
 from identification.weak import POSITION_CHAINS, differentiated_kernel, kernel
 
+from .timing import Timing
+
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 
 SOURCES: Final = ("motor_position", "link_position", "torque", "drive")
 """Signals that are sampled; the others follow from them on the kernel."""
 _NAMES: Final = Signals.names()
-_SHARP: Final = 2e-3
+SHARP: Final = 2e-3
 """A smoothing velocity above this is a law of its own, below it only stands for a jump [rad/s]."""
-_LENGTH, _OVERLAP, _POINT_STEP = 0.06, 4, 0.002
 
 
 def linear_parameters(model: JointModel, sensing: Sensing, held: Container[str] = ()) -> tuple[str, ...]:
@@ -54,55 +54,6 @@ def linear_parameters(model: JointModel, sensing: Sensing, held: Container[str] 
 
 
 @final
-@dataclass(frozen=True)
-class Timing:
-    """Kernel lengths in samples.
-
-    Attributes
-    ----------
-    dt : float
-        Sample time [s].
-    length, pointwise : float
-        Kernel of the balances, and of the velocities inside nonlinear laws [s].
-    step, stride : int
-        Samples between points, and between rows.
-    half, reach, point_half : int
-        Half the kernel in samples; samples a row lies back; half the kernel in points.
-    window : int
-        Samples that a row needs.
-    """
-
-    dt: float
-    length: float
-    pointwise: float
-    step: int
-    stride: int
-    half: int
-    reach: int
-    point_half: int
-    window: int
-
-    @staticmethod
-    def of(dt: float) -> Timing:
-        """The lengths that the off-line fit uses at this sample time."""
-        length = max(_LENGTH, 8 * dt)
-        pointwise = max(length / 2 if length <= _LENGTH else 0.06, 6 * dt)
-        step = max(1, round(_POINT_STEP / dt))
-        stride = max(step, round(length / dt / _OVERLAP / step) * step)
-        half = len(differentiated_kernel(length, dt, 3)) // 2
-        point_half = len(differentiated_kernel(length, dt * step, 0)) // 2
-        own = len(kernel(pointwise, dt, 3)) // 2
-        reach = max(half, point_half * step + own)
-        window = reach + max(half, point_half * step + own) + 1
-        return Timing(dt, length, pointwise, step, stride, half, reach, point_half, window)
-
-    @property
-    def delay(self) -> float:
-        """Time between a row's instant and the sample at which it is made [s]."""
-        return self.reach * self.dt
-
-
-@final
 class RowMaker:
     """Rows y = H theta of one model with one set of channels.
 
@@ -115,18 +66,25 @@ class RowMaker:
         Sample time [s].
     held : container of str
         Parameters that are known and not estimated.
+    shapes : sequence of str
+        Parameters that :meth:`set_shapes` may change; they start at the model's values.
 
     Attributes
     ----------
     names : tuple of str
         Parameters that are estimated.
-    balances : tuple of str
+    balances, shapes : tuple of str
     uses : (balances, sources) bool array
         Which sampled signals enter which balance.
     """
 
-    def __init__(self, model: JointModel, sensing: Sensing, dt: float, held: Container[str] = ()) -> None:
+    def __init__(
+        self, model: JointModel, sensing: Sensing, dt: float, held: Container[str] = (), shapes: Sequence[str] = ()
+    ) -> None:
         self.model, self.sensing, self.timing = model, sensing, Timing.of(dt)
+        self.shapes = tuple(shapes)
+        self.eta = ca.SX.sym("eta", len(self.shapes))
+        self.shape_values = np.array([self._value(n) for n in self.shapes])
         self.names = linear_parameters(model, sensing, held)
         expressions = residual_expressions(model, sensing)
         self.balances = tuple(expressions)
@@ -147,8 +105,14 @@ class RowMaker:
         self._slopes = self._slope_function(expressions, signals, p)
         self.reset()
 
+    def _value(self, name: str) -> float:
+        return float(self.model.value_vector()[self.model.parameter_names.index(name)])
+
     def _values(self) -> Any:
-        """Parameter vector with the estimated ones at zero."""
+        """Parameter vector with the estimated ones at zero, and symbols for the shapes."""
+        if self.shapes:
+            at = {n: self.eta[i] for i, n in enumerate(self.shapes)} | dict.fromkeys(self.names, 0.0)
+            return ca.vertcat(*(at.get(n, v) for n, v in zip(self.model.parameter_names, self.model.value_vector(), strict=True)))
         return ca.DM([
             0.0 if n in self.names else v
             for n, v in zip(self.model.parameter_names, self.model.value_vector(), strict=True)
@@ -161,9 +125,8 @@ class RowMaker:
         for row, column in zip(*slopes.sparsity().get_triplet(), strict=True):
             entry = slopes[row, column]
             linear[row, column] = not (ca.depends_on(entry, signals) or (memory.shape[0] and ca.depends_on(entry, memory)))
-        self.linear: FloatArray = np.array(
-            ca.Function("linear", [], [ca.densify(slopes * ca.DM(linear.astype(float)))])()["o0"]
-        )  # fmt: skip
+        self.linear_of = ca.Function("linear", [self.eta], [ca.densify(slopes * ca.DM(linear.astype(float)))])
+        self.linear: FloatArray = np.array(self.linear_of(self.shape_values))
         rest: list[Any] = []
         self.needed: list[int] = []
         for i in range(out.shape[0]):
@@ -172,10 +135,14 @@ class RowMaker:
             if not ca.simplify(left).is_zero():
                 self.needed.append(i)
                 rest.append(left)
-        self._point = self._point_function(ca.vertcat(*rest) if rest else ca.SX(0, 1), signals, memory, fixed)
+        self.laws = ca.vertcat(*rest) if rest else ca.SX(0, 1)
+        self._point = self._point_function(self.laws, signals, memory, fixed)
 
     def _point_function(self, rest: Any, signals: Any, memory: Any, fixed: Any) -> Any:
-        """(signals, smooth signals, coordinates before, memory before) -> laws, coordinates, memory, for the new points."""
+        """(signals, smooth signals, coordinates before, memory before) -> laws, coordinates, memory, for the new points.
+
+        With shapes they are the last input.
+        """
         e = self.model.equations
         coordinates = ca.vertcat(*(t[1] for t in e.memory_terms)) if e.memory_terms else ca.SX(0, 1)
         count = coordinates.shape[0]
@@ -186,7 +153,8 @@ class RowMaker:
                 moved.extend(term.effect.memory(z, steps[i], view, values))
         after = ca.vertcat(*moved) if moved else ca.SX(0, 1)
         p = e.parameters
-        one = ca.Function("one", [signals, memory, p], [ca.densify(rest)])
+        shapes = [self.eta] if self.shapes else []
+        one = ca.Function("one", [signals, memory, p, *shapes], [ca.densify(rest)])
         where = ca.Function("where", [signals, p], [ca.densify(coordinates)])
         move = ca.Function("move", [memory, steps, signals, p, e.clock], [ca.densify(after)])
         new = self.timing.stride // self.timing.step
@@ -198,8 +166,8 @@ class RowMaker:
             step = (here - at) * (started if k == 0 else 1)
             z = move(z, step, smooth[:, k], fixed, self.timing.dt * self.timing.step)
             at = here
-            rows.append(one(raw[:, k], z, fixed))
-        return ca.Function("points", [raw, smooth, before, held, started], [ca.horzcat(*rows), at, z])
+            rows.append(one(raw[:, k], z, fixed, *shapes))
+        return ca.Function("points", [raw, smooth, before, held, started, *shapes], [ca.horzcat(*rows), at, z])
 
     def _dependence(self, stacked: Any, signals: Any) -> BoolArray:
         used = ca.jacobian_sparsity(stacked, signals)
@@ -235,10 +203,20 @@ class RowMaker:
         ]  # fmt: skip
         columns = np.array(self._place).T
         self._index, self._flat = columns[0], columns[1] * len(SOURCES) + columns[2]
+        points = np.arange(new)[:, None]
+        self._to = (points * len(_NAMES) + columns[0]).ravel()
+        self._from = ((columns[1] * new + points) * len(SOURCES) + columns[2]).ravel()
+        sampled = [i for i, (_, order, _) in enumerate(self._place) if order == 0]
+        self._raw_to = (points * len(_NAMES) + columns[0][sampled]).ravel()
+        self._raw_from = (np.array(self._raw_at)[:, None] * len(SOURCES) + columns[2][sampled]).ravel()
         self._speeds = [_NAMES.index("motor_velocity"), _NAMES.index("link_velocity")]
-        smooth = dict(zip(self.model.parameter_names, self.model.value_vector(), strict=True))
-        self._sharp = [2 * min(smooth.get(f"{place}_smoothing_velocity", 0.0), _SHARP) for place in ("motor", "link")]
+        self._sharpen()
         self._velocity_gain = float(np.linalg.norm(kernel(t.pointwise, t.dt, 1)))
+
+    def _sharpen(self) -> None:
+        """Velocities below which a side counts as standing still."""
+        smooth = dict(zip(self.model.parameter_names, self.model.value_vector(), strict=True))
+        self._sharp = [2 * min(smooth.get(f"{place}_smoothing_velocity", 0.0), SHARP) for place in ("motor", "link")]
 
     def _slope_function(self, expressions: Mapping[str, Any], signals: Any, p: Any) -> Any:
         own = ca.vertcat(*expressions.values())
@@ -258,7 +236,7 @@ class RowMaker:
         self._in: list[FloatArray] = [np.zeros((new, len(_NAMES))), np.zeros((new, len(_NAMES))), np.zeros(count), np.zeros(states), np.zeros(1)]
         self._out: list[FloatArray] = [np.zeros((new, len(self.needed))), np.zeros(count), np.zeros(states)]
         buffer, self._trigger = self._point.buffer()
-        for i, item in enumerate(self._in):
+        for i, item in enumerate([*self._in, *([self.shape_values] if self.shapes else [])]):
             buffer.set_arg(i, memoryview(item))  # type: ignore[arg-type, unused-ignore]
         for i, item in enumerate(self._out):
             buffer.set_res(i, memoryview(item))  # type: ignore[arg-type, unused-ignore]
@@ -283,11 +261,10 @@ class RowMaker:
         """
         raw, smooth, before, held, started = self._in
         if self.needed:
-            found = (self._smoothing.reshape(-1, len(window)) @ window).reshape(self._orders, len(raw), len(SOURCES))
-            flat = found.transpose(1, 0, 2).reshape(len(raw), -1)
-            smooth[:, self._index] = flat[:, self._flat]
+            found = self._smoothing.reshape(-1, len(window)) @ window
+            smooth.ravel()[self._to] = found.ravel()[self._from]
             raw[:] = smooth
-            raw[:, self._index[[0, 4, 8, 10]]] = window[self._raw_at]
+            raw.ravel()[self._raw_to] = window.ravel()[self._raw_from]
             self._trigger()
             out, at, z = self._out
             before[:], held[:], started[0] = at, z, 1.0
@@ -308,15 +285,47 @@ class RowMaker:
         table = full.reshape(len(self.balances), self.width)
         return table[:, 0].copy(), -table[:, 1:]
 
-    def standstill(self, place: str, noise: float) -> float:
-        """Share of the kernel in which a side stands still or turns round, as far as its noise lets one see."""
+    @property
+    def new_points(self) -> FloatArray:
+        """Signals at the points that the last row has added, (points, signals); they stay as they are until the next row."""
+        return self._in[0]
+
+    def set_shapes(self, values: FloatArray) -> None:
+        """Take other values for the shapes."""
+        self.shape_values[:] = values
+        self.linear = np.array(self.linear_of(self.shape_values))
+        self.model = self.model.with_values(dict(zip(self.shapes, self.shape_values.tolist(), strict=True)))
+        self._sharpen()
+
+    def take_over(self, other: RowMaker, points: FloatArray) -> None:
+        """Go on where another maker of the same joint stands, with the laws of this one's shapes at the last points.
+
+        Parameters
+        ----------
+        other : RowMaker
+            Without internal states.
+        points : (n, signals) array
+            Signals at the last points, newest last; those that the kernel holds are enough.
+        """
+        self.made, self.signals, self._speed = other.made, other.signals.copy(), other._speed.copy()
+        raw = self._in[0]
+        new = len(raw)
+        for at in range(len(points) % new, len(points), new):
+            raw[:] = points[at : at + new]
+            self._trigger()
+            self._ring[:-new] = self._ring[new:].copy()
+            self._ring[-new:] = self._out[0]
+
+    def standstill(self, motor_noise: float, link_noise: float) -> FloatArray:
+        """Share of the kernel in which motor and link stand still or turn round, as far as their noise lets one see, (2,)."""
         if not self.needed:
-            return 0.0
-        side = 0 if place == "motor" else 1
-        slow, speed = max(3 * noise * self._velocity_gain, self._sharp[side]), self._speed[:, side]
+            return np.zeros(2)
+        gain, sharp, speed = self._velocity_gain, self._sharp, self._speed
+        slow = (max(3 * motor_noise * gain, sharp[0]), max(3 * link_noise * gain, sharp[1]))
         still = np.abs(speed) < slow
         still[1:] |= speed[1:] * speed[:-1] < 0
-        return float(self._weights @ still)
+        share = still.astype(np.float64)
+        return np.array([self._weights @ share[:, 0].copy(), self._weights @ share[:, 1].copy()])
 
     # --- noise -------------------------------------------------------------------------------------------------------
 

@@ -8,8 +8,9 @@ import math
 import sys
 import traceback
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from enum import IntEnum
+from operator import itemgetter
 from typing import Any, ClassVar
 from xml.etree.ElementTree import Element
 
@@ -20,6 +21,12 @@ from .model_description import Description, Entry, model_description
 from .variables import Kind, Value, Variable
 
 _SLACK = 1e-6
+_UNEVEN = 0.25
+"""Largest deviation of the time between two samples from ``sample_time``, as a share of it, that passes without a word."""
+_HOLD = 200
+"""Samples for which ``health`` remembers an uneven one."""
+_KNOWN = 64
+"""Lists of references whose kinds are looked at once and remembered."""
 
 
 class Health(IntEnum):
@@ -33,7 +40,7 @@ class Health(IntEnum):
 
 
 STANDARD = (
-    Variable("sample_time", "s", 1e-3, 1e-9, causality="parameter", description="Time between two samples."),
+    Variable("sample_time", "s", 1e-3, 1e-5, 1e3, causality="parameter", description="Time between two samples."),
     Variable(
         "health", start=0, minimum=0, maximum=4, causality="output", kind="integer",
         description="0 ok, 1 warming up, 2 numeric trouble or input not finite, 3 host step above sample_time, "
@@ -74,11 +81,15 @@ class TableSlave(Fmi2Slave):  # type: ignore[misc, unused-ignore]
         self._reals = [i for i, v in enumerate(self.table) if v.causality == "input" and v.kind == "real"]
         self._writable = [v.causality in ("input", "parameter") for v in self.table]
         self._tunable = [v.causality == "parameter" for v in self.table]
+        kinds: tuple[Kind, ...] = ("real", "integer", "boolean", "string")
+        self._inputs_of = {kind: frozenset(i for _, i in self._inputs if self._kinds[i] == kind) for kind in kinds}
+        self._known: dict[tuple[Kind, tuple[int, ...]], Any] = {}
         self._phase = 0
         self._changed = False
         self._configured: dict[str, Value] = {}
         self._start = self._last = math.nan
-        self._count = 0
+        self._count, self._step, self._too_long = 0, 0.0, False
+        self._uneven, self._expected = -math.inf, 0.0
         self._reported: set[str] = set()
         self._forget_path()
 
@@ -142,19 +153,28 @@ class TableSlave(Fmi2Slave):  # type: ignore[misc, unused-ignore]
     def _configure(self) -> None:
         self._changed = False
         self._configured = self.parameters()
+        for variable in self.table:
+            _in_range(variable, self._configured.get(variable.name))
         self.configure(self._configured)
 
     def do_step(self, current_time: float, step_size: float) -> bool:
         """Take a sample where one is due; always True."""
-        self._guarded(self._sample, current_time, step_size)
+        try:
+            self._sample(current_time, step_size)
+        except Exception as error:
+            self._failed(error)
         return True
 
     def _guarded(self, work: Any, *args: float) -> None:
         try:
             work(*args)
         except Exception as error:
-            self._values[self._index["health"]] = int(Health.INTERNAL_ERROR)
-            self._report(f"{type(error).__name__}: {error}\n{traceback.format_exc()}")
+            self._failed(error)
+
+    def _failed(self, error: Exception) -> None:
+        """Tell an exception by the output ``health`` and in the log."""
+        self._values[self._index["health"]] = int(Health.INTERNAL_ERROR)
+        self._report(f"{type(error).__name__}: {error}\n{traceback.format_exc()}")
 
     def _report(self, text: str, status: Any = Fmi2Status.warning) -> None:
         """Log a text once per instance."""
@@ -162,25 +182,37 @@ class TableSlave(Fmi2Slave):  # type: ignore[misc, unused-ignore]
             self._reported.add(text)
             self.log(text, status)
 
-    def _sample(self, time: float, length: float) -> None:
+    def _due(self, time: float, length: float) -> bool:
+        """True where the grid of ``sample_time`` has come; a tunable parameter that has changed is taken over then."""
         values = self._values
         period = float(values[0])
         if self._start != self._start:
             self._start = time
-        too_long = length > period * (1 + _SLACK)
+        self._too_long = length > period * (1 + _SLACK)
         due = self._start + self._count * period
-        if not too_long and time < due - period * _SLACK * 10:
-            return
+        if not self._too_long and time < due - period * _SLACK * 10:
+            return False
         if self._changed:
             self._configure()
-        step = period if self._last != self._last else time - self._last
+        self._step = period if self._last != self._last else time - self._last
         self._last = time
         self._count = math.floor((time - self._start) / period + 1e-3) + 1
-        health = Health.STEP_MISMATCH if too_long else Health.OK
-        if too_long:
+        if self._too_long:
             self._report(f"the host's step {length:g} s is longer than sample_time {period:g} s")
+        elif abs(self._step - self._expected) > _UNEVEN * period and self._expected > 0:
+            self._uneven = time
+            self._report(f"the host's steps of {length:g} s put samples {self._step:g} s apart, sample_time is {period:g} s; use steps that divide it")
+        self._expected = max(period, length)
+        self._too_long |= time < self._uneven + _HOLD * period
+        return True
+
+    def _sample(self, time: float, length: float) -> None:
+        if not self._due(time, length):
+            return
+        values = self._values
+        health = Health.STEP_MISMATCH if self._too_long else Health.OK
         if all(math.isfinite(values[i]) for i in self._reals):  # type: ignore[arg-type, unused-ignore]
-            outputs = self.process(time, step, {name: values[i] for name, i in self._inputs})
+            outputs = self.process(time, self._step, {name: values[i] for name, i in self._inputs})
             for name, value in outputs.items():
                 values[self._index[name]] = value
                 if value != value:
@@ -195,15 +227,27 @@ class TableSlave(Fmi2Slave):  # type: ignore[misc, unused-ignore]
 
     # -- variables ----------------------------------------------------------------------
 
-    def _get(self, references: list[int], kind: Kind) -> list[Any]:
-        kinds = self._kinds
-        for reference in references:
-            if kinds[reference] != kind:
-                raise TypeError(f"variable {self.table[reference].name} is {kinds[reference]}, not {kind}")
-        values = self._values
-        return [values[reference] for reference in references]
+    def _get(self, references: list[int], kind: Kind) -> Sequence[Any]:
+        key = (kind, tuple(references))
+        picked = self._known.get(key)
+        if picked is None:
+            for reference in references:
+                if self._kinds[reference] != kind:
+                    raise TypeError(f"variable {self.table[reference].name} is {self._kinds[reference]}, not {kind}")
+            if len(references) < 2:
+                return [self._values[reference] for reference in references]
+            picked = itemgetter(*references)
+            if len(self._known) < _KNOWN:
+                self._known[key] = picked
+        found: Sequence[Any] = picked(self._values)
+        return found
 
     def _set(self, references: list[int], new: list[Any], kind: Kind) -> None:
+        if all(map(self._inputs_of[kind].__contains__, references)) and len(new) == len(references):
+            values = self._values
+            for reference, value in zip(references, new, strict=True):
+                values[reference] = value
+            return
         for reference, value in zip(references, new, strict=True):
             variable = self.table[reference]
             if self._kinds[reference] != kind:
@@ -219,7 +263,7 @@ class TableSlave(Fmi2Slave):  # type: ignore[misc, unused-ignore]
 
     def get_real(self, vrs: list[int]) -> list[float]:
         """Return values by reference."""
-        return [float(value) for value in self._get(vrs, "real")]
+        return list(map(float, self._get(vrs, "real")))
 
     def get_integer(self, vrs: list[int]) -> list[int]:
         """Return values by reference."""
@@ -254,14 +298,14 @@ class TableSlave(Fmi2Slave):  # type: ignore[misc, unused-ignore]
     def _get_fmu_state(self) -> dict[str, Any]:
         return {
             "values": [_plain(value, kind) for value, kind in zip(self._values, self._kinds, strict=True)],
-            "clock": [float(self._start).hex(), float(self._last).hex(), self._count, self._phase, self._changed],
+            "clock": [*(float(t).hex() for t in (self._start, self._last, self._uneven, self._expected)), self._count, self._phase, self._changed],
             "state": bytes(self.get_state()),
         }
 
     def _set_fmu_state(self, state: dict[str, Any]) -> None:
         self._values = [_value(text, kind) for text, kind in zip(state["values"], self._kinds, strict=True)]
-        start, last, self._count, self._phase, self._changed = state["clock"]
-        self._start, self._last = float.fromhex(start), float.fromhex(last)
+        *times, self._count, self._phase, self._changed = state["clock"]
+        self._start, self._last, self._uneven, self._expected = map(float.fromhex, times)
         if self._phase and self._configured != self.parameters():
             self._guarded(self._configure)
         self._guarded(lambda: self.set_state(state["state"]))
@@ -288,6 +332,16 @@ class TableSlave(Fmi2Slave):  # type: ignore[misc, unused-ignore]
             options={"needsExecutionTool": "true", "canInterpolateInputs": "false"} | options,
         )  # fmt: skip
         return model_description(what, [Entry(variable) for variable in self.table])
+
+
+def _in_range(variable: Variable, value: Value | None) -> None:
+    """Refuse a number outside what the model description says."""
+    if value is None or variable.kind not in ("real", "integer"):
+        return
+    low = -math.inf if variable.minimum is None else variable.minimum
+    high = math.inf if variable.maximum is None else variable.maximum
+    if not low <= float(value) <= high or not math.isfinite(float(value)):
+        raise ValueError(f"parameter {variable.name} = {value:g} is not in {low:g} to {high:g}")
 
 
 def _plain(value: Value, kind: Kind) -> Value:

@@ -8,10 +8,13 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 import numpy.typing as npt
 
-from .watch import DRIVE, TAU
+from .watch import DRIVE, TAU, Watch
 
 if TYPE_CHECKING:
+    from casadi_models import JointModel
     from identification.fault import FaultDetector
+
+    from .online_options import OnlineOptions
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -23,6 +26,28 @@ FAULT_TEXT: Final = (
     "constant while the joint moves, 31 to 36 reading of wrong scale, in the same order"
 )
 _RECENT: Final = 5.0
+
+
+def worst(missing: Sequence[bool], detector: FaultDetector | None, watch: Watch) -> int:
+    """Code of the most severe fault of a reading; :data:`NONE` without one."""
+    failed = detector._rule.failed if detector is not None else []
+    for flags, code in ((missing, MISSING), (failed, 0), (watch.constant, CONSTANT), (watch.scaled, SCALED)):
+        if True in flags:
+            return code + 1 + list(flags).index(True)
+    return NONE
+
+
+def make_detector(model: JointModel, dt: float, options: OnlineOptions, state: bytes | None) -> FaultDetector | None:
+    """A fault detector with the limits of a calibrated one's `state`; None for a rigid joint."""
+    if not model.is_elastic:
+        return None
+    from identification.fault import FaultDetector
+
+    made = FaultDetector(model, dt, has_torque=options.has_torque)
+    if state:
+        made.restore(state)
+        made.reset()
+    return made
 
 
 def plant_alarm(detector: FaultDetector, dt: float) -> int:
@@ -42,12 +67,12 @@ def scores(detector: FaultDetector) -> list[float]:
     rule, score = detector._rule, [0.0] * 6
     if not isinstance(rule, StructuredRule):
         return score
-    limits, values = rule.residuals.limits, rule.residuals.values
+    shares = [abs(v) / limit if limit > 0 else 0.0 for v, limit in zip(rule.residuals.values, rule.residuals.limits, strict=True)]
     for parity, sensors in enumerate(PARITY_SENSORS):
-        rows = range(4 * parity, 4 * parity + 4) if parity < 4 else range(16, len(values))
-        worst = max(abs(values[j]) / limits[j] if limits[j] > 0 else 0.0 for j in rows)
+        most = max(shares[4 * parity : 4 * parity + 4] if parity < 4 else shares[16:])
         for sensor in sensors:
-            score[sensor] = max(score[sensor], worst)
+            if most > score[sensor]:
+                score[sensor] = most
     return [max(1.0, value) if failed else value for value, failed in zip(score, rule.failed, strict=True)]
 
 

@@ -52,6 +52,7 @@ class Watch:
         """Before the first sample."""
         self.rows = np.zeros((self.length, 6))
         self.count = 0
+        self._pending: list[list[float]] = []
         self.bad = np.zeros(6)
         self.noise = np.zeros(6)
         self.looks = np.zeros(6)
@@ -59,18 +60,23 @@ class Watch:
 
     def add(self, readings: list[float], valid: list[bool]) -> bool:
         """Take a sample; True where the second is full and has been looked at."""
-        at = self.count
-        self.rows[at] = readings
-        for i in range(6):
-            if not valid[i]:
-                self.bad[i] += 1
-        self.count = at + 1
+        self._pending.append(readings)
+        if False in valid:
+            self.bad += np.logical_not(valid)
+        self.count += 1
         if self.count < self.length:
             return False
+        self._write()
         self._look()
         self.count = 0
         self.bad[:] = 0
         return True
+
+    def _write(self) -> None:
+        """Put the samples that wait into the table: at once, which costs less than one by one."""
+        if self._pending:
+            self.rows[self.count - len(self._pending) : self.count] = self._pending
+            self._pending = []
 
     def _look(self) -> None:
         good = [self.present[i] and not self.bad[i] for i in range(6)]
@@ -108,11 +114,13 @@ class Watch:
 
     def numbers(self) -> FloatArray:
         """Everything that changes, as one array."""
+        self._write()
         flags = np.array([*self.constant, *self.scaled], dtype=np.float64)
         return np.concatenate([self.rows.ravel(), [self.count], self.bad, self.noise, self.looks, flags])
 
     def load(self, numbers: FloatArray) -> None:
         """Take up what :meth:`numbers` gave."""
+        self._pending = []
         size = self.rows.size
         self.rows[:] = numbers[:size].reshape(self.rows.shape)
         rest = numbers[size:]

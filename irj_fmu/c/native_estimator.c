@@ -1,0 +1,343 @@
+/* One sample of the estimator: irj_fmu.online.OnlineEstimator, and the sample grid and health of irj_fmu.slave_base. */
+
+/* A message that a host may use as a format; hosts in other languages get no further arguments. */
+static void write_log(Twin *m, fmi2Status status, const char *category, const char *format, va_list values) {
+    char text[768], escaped[2 * sizeof text];
+    int i, k = 0;
+    if (!m->host.logger) return;
+    vsnprintf(text, sizeof text, format, values);
+    for (i = 0; text[i]; i++) {
+        if (text[i] == '%') escaped[k++] = '%';
+        escaped[k++] = text[i];
+    }
+    escaped[k] = 0;
+    m->host.logger(m->host.componentEnvironment, m->name, status, category, escaped);
+}
+
+static void tell(Twin *m, int once, const char *format, ...) { /* a text once per instance */
+    va_list values;
+    if (!m->logging || m->told[once]) return;
+    m->told[once] = 1;
+    va_start(values, format);
+    write_log(m, fmi2Warning, "logStatusWarning", format, values);
+    va_end(values);
+}
+
+enum { HEALTH_OK, WARMING_UP, NUMERIC_TROUBLE, STEP_MISMATCH, INTERNAL_ERROR };
+enum { TELL_STEP = N_VARIABLES, TELL_SETUP, TELL_WINDOW, TELL_FAULT }; /* places in `told` after those of the variables */
+
+/* ---- life --------------------------------------------------------------------------------------------------------- */
+
+static void clear_estimator(Twin *m) {
+    State *s = &m->s;
+    int i;
+    clear_rows(m);
+    memset(&s->watch, 0, sizeof s->watch);
+    memset(&s->window, 0, sizeof s->window);
+    memset(s->last_good, 0, sizeof s->last_good);
+    memset(s->readings, 0, sizeof s->readings);
+    memset(s->lost, 0, sizeof s->lost);
+    memset(s->sigma, 0, sizeof s->sigma);
+    memset(s->score, 0, sizeof s->score);
+    for (i = 0; i < N_BALANCES; i++)
+        s->residual[i] = s->floor[i] = s->ratio[i] = s->square[i] = s->torque[i] = s->first_level[i] = 0;
+    for (i = 0; i < N_THETA; i++) {
+        s->theta[i] = fixed_theta[i];
+        s->scale[i] = 1;
+    }
+    s->rls.running = s->fault = s->plant_alarm = s->reoptimise = 0;
+    s->n_rows = s->strained = 0;
+    clear_recursion(s);
+    clear_detector(&s->detector);
+}
+
+static void publish(State *s) {
+    int i;
+    for (i = 0; i < N_THETA; i++) {
+        s->real[V_THETA + i] = s->theta[i];
+        s->real[V_SIGMA + i] = s->sigma[i];
+    }
+    for (i = 0; i < N_BALANCES; i++) {
+        s->real[residual_at[i]] = s->residual[i];
+        s->real[ratio_at[i]] = s->ratio[i];
+    }
+    for (i = 0; i < SENSORS; i++) s->real[V_SCORE + i] = s->score[i];
+    s->whole[V_N_ROWS] = (int)s->n_rows;
+    s->whole[V_ALARM] = s->rls.running && s->rls.fast[FAST_ALARM] > 0;
+    s->whole[V_REOPTIMISE] = s->reoptimise;
+}
+
+static double least(const State *s, int b) { /* what counts as noise at least */
+    return fmax(fmax(s->floor[b], s->floor_share * sqrt(s->torque[b])), 1e-12);
+}
+
+static void ratios(State *s) {
+    int b;
+    for (b = 0; b < N_BALANCES; b++) s->ratio[b] = sqrt(s->square[b]) / least(s, b);
+}
+
+static int configure(Twin *m) { /* take the parameters over; 0 where they ask for another build */
+    State *s = &m->s;
+    const double dt = s->real[V_SAMPLE_TIME], warm_up = s->real[V_WARM_UP];
+    double rows;
+    s->changed = 0;
+    if (!(fabs(dt - SAMPLE_TIME) <= 1e-9 * SAMPLE_TIME)) {
+        tell(m, TELL_SETUP, "sample_time %g s: this native estimator was built for %g s; build it again with --sample-time", dt, SAMPLE_TIME);
+        return 0;
+    }
+    if (s->text[TEXT_JOINT_FILE][0]) {
+        tell(m, TELL_SETUP, "joint_file %s: a native estimator holds its joint in compiled form; build it again with this file", s->text[TEXT_JOINT_FILE]);
+        return 0;
+    }
+    rows = rint(warm_up / ROW_PERIOD);
+    if (!(rows <= COLLECT)) {
+        tell(m, TELL_SETUP, "warm_up %g s: this native estimator has room for %g s", warm_up, COLLECT * ROW_PERIOD);
+        return 0;
+    }
+    if (s->whole[V_OPTIMISE]) tell(m, V_OPTIMISE, "optimise: a native estimator has no optimiser; its output reoptimise says when one is wanted");
+    if (!s->configured) {
+        s->warm_up = warm_up;
+        s->collect = (int)fmax(2 * N_THETA, rows);
+        s->detect = HAS_DETECTOR && s->whole[V_DETECT];
+        s->drift = s->real[V_DRIFT];
+        s->alarm_drift = s->real[V_ALARM_DRIFT];
+        s->floor_share = s->real[V_FLOOR_SHARE];
+        clear_estimator(m);
+        s->configured = 1;
+    }
+    s->floor_share = s->real[V_FLOOR_SHARE];
+    if (s->drift != s->real[V_DRIFT] || s->alarm_drift != s->real[V_ALARM_DRIFT]) {
+        s->drift = s->real[V_DRIFT];
+        s->alarm_drift = s->real[V_ALARM_DRIFT];
+        tune_recursion(s);
+    }
+    set_margin(&s->detector, s->real[V_FAULT_MARGIN]);
+    if (s->whole[V_RESET] && !s->reset_before) clear_estimator(m);
+    s->reset_before = s->whole[V_RESET];
+    publish(s);
+    return 1;
+}
+
+/* ---- a row -------------------------------------------------------------------------------------------------------- */
+
+static void floors(Twin *m) {
+    if (!m->s.rls.running) return;
+    noise_floor(m, m->s.floor);
+    deviations(&m->s);
+    ratios(&m->s);
+}
+
+static void shares(const State *s, double out[2]) {
+    out[0] = standstill(&s->rows, 0, s->watch.noise[Q_M]);
+    out[1] = standstill(&s->rows, 1, s->watch.noise[Q_L]);
+}
+
+static void collect_row(Twin *m) {
+    State *s = &m->s;
+    FirstWindow *f = &s->window;
+    int b;
+    memcpy(f->y[f->count], m->y, sizeof m->y);
+    memcpy(f->h[f->count], m->h, sizeof m->h);
+    shares(s, f->shares[f->count]);
+    if (++f->count < s->collect) return;
+    if (begin_recursion(m)) tell(m, TELL_WINDOW, "the first window does not determine every parameter");
+    floors(m);
+    for (b = 0; b < N_BALANCES; b++) s->first_level[b] = sqrt(s->square[b]);
+}
+
+static void recursive_step(Twin *m, const double weight[N_BALANCES], const int on[N_BALANCES]) {
+    State *s = &m->s;
+    Recursion *r = &s->rls;
+    double row[N_BALANCES * N_THETA], y[N_BALANCES];
+    int b, i;
+    for (b = 0; b < N_BALANCES; b++) {
+        r->config[CONFIG_ENABLED + b] = on[b];
+        y[b] = m->y[b] * weight[b];
+        for (i = 0; i < N_THETA; i++) row[b * N_THETA + i] = m->h[b * N_THETA + i] * weight[b];
+    }
+    m->arg[0] = r->fast; m->arg[1] = r->slow; m->arg[2] = r->config; m->arg[3] = y; m->arg[4] = row;
+    m->res[0] = m->fast_next; m->res[1] = m->theta_next; m->res[2] = NULL; m->res[3] = NULL;
+    rls_step(m->arg, m->res, m->iw, m->w, 0);
+    if (m->fast_next[FAST_DUE] != 0) {
+        m->arg[0] = m->fast_next; m->arg[1] = r->slow; m->arg[2] = r->config;
+        m->res[0] = r->fast; m->res[1] = m->slow_next;
+        rls_check(m->arg, m->res, m->iw, m->w, 0);
+        memcpy(r->slow, m->slow_next, sizeof r->slow);
+    } else {
+        memcpy(r->fast, m->fast_next, sizeof r->fast);
+    }
+    memcpy(s->theta, m->theta_next, sizeof s->theta);
+    for (b = 0; b < N_BALANCES; b++) r->fast[FAST_NOISE + b] = fmax(r->fast[FAST_NOISE + b], least(s, b) * least(s, b));
+}
+
+/* Errors that stay over their limit for longer than the linear parameters need to follow ask for the optimiser. */
+static void watch_strain(State *s, const int on[N_BALANCES]) {
+    int b, over = 0;
+    for (b = 0; b < N_BALANCES; b++)
+        if (on[b] && sqrt(s->square[b]) > ERROR_LIMIT * fmax(least(s, b), s->first_level[b])) over = 1;
+    s->strained = over ? s->strained + 1 : 0;
+    s->reoptimise = s->strained >= CONFIRM_ROWS;
+}
+
+/* Take a row; 0 until there is one. */
+static int take_row(Twin *m, double time, int enable) {
+    State *s = &m->s;
+    double error[N_BALANCES], weight[N_BALANCES], size[N_BALANCES], share[2];
+    int on[N_BALANCES], any = 0, all = 1, b, k;
+    if (!make_row(m, time)) return 0;
+    s->n_rows++;
+    for (b = 0; b < N_BALANCES; b++) {
+        on[b] = 1;
+        for (k = 0; k < SOURCES; k++)
+            if (uses[b][k] && s->lost[k]) on[b] = 0;
+        any |= on[b];
+        all &= on[b];
+    }
+    if (!s->rls.running) {
+        if (enable && all) collect_row(m);
+        return 1;
+    }
+    for (b = 0; b < N_BALANCES; b++) {
+        s->residual[b] = error[b] = error_of(m->y[b], m->h + b * N_THETA, s->theta);
+        size[b] = fmax(fmax(s->floor[b], sqrt(s->square[b])), 1e-12);
+    }
+    shares(s, share);
+    weight_of(share, s->theta, size, weight);
+    for (b = 0; b < N_BALANCES; b++) {
+        const double reference = s->rows.signals[reference_signal[b]], left = weight[b] * error[b];
+        if (!on[b]) continue;
+        s->square[b] += RESIDUAL_RATE * (left * left - s->square[b]);
+        s->torque[b] += RESIDUAL_RATE / 5 * (reference * reference - s->torque[b]);
+    }
+    ratios(s);
+    if (!enable || !any) return 1;
+    recursive_step(m, weight, on);
+    watch_strain(s, on);
+    return 1;
+}
+
+/* ---- judgement ---------------------------------------------------------------------------------------------------- */
+
+static int plant_verdict(const Fault *f) {
+    if (f->k - f->event_sample >= RECENT_SAMPLES) return 0;
+    return f->event == CURRENT_OR_FRICTION ? 7 : f->event == PLANT ? 8 : 0;
+}
+
+static int implausible(const State *s) { /* an inertia far from that of the fitted joint: a wrong scale of torque or current */
+    int i;
+    for (i = 0; i < N_INERTIAS; i++) {
+        const double before = inertia_before[i], now = s->theta[inertia_theta[i]], spread = s->sigma[inertia_theta[i]];
+        if (!(before / 3 < now && now < 3 * before) && fabs(now - before) > 5 * spread) return inertia_code[i];
+    }
+    return 0;
+}
+
+static void judge(State *s, const int good[SENSORS]) {
+    int found = 0, i;
+    for (i = 0; i < SENSORS && !found; i++)
+        if (!good[i] && (needs[i] || (s->detect && present[i]))) found = 11 + i;
+    if (s->detect) {
+        for (i = 0; i < SENSORS && !found; i++)
+            if (s->detector.failed[i]) found = 1 + i;
+        s->plant_alarm = plant_verdict(&s->detector);
+        scores(&s->detector, s->score);
+    }
+    for (i = 0; i < SENSORS && !found; i++)
+        if (s->watch.constant[i]) found = 21 + i;
+    for (i = 0; i < SENSORS && !found; i++)
+        if (s->watch.scaled[i]) found = 31 + i;
+    if (!found && s->rls.running) found = implausible(s);
+    s->fault = found ? found : s->plant_alarm;
+}
+
+/* ---- a sample ----------------------------------------------------------------------------------------------------- */
+
+/* Link position and velocity from the motor, torsion taken off. */
+static void link_from_motor(State *s) {
+    const double stiffness = STIFFNESS_THETA < 0 ? 0 : s->theta[STIFFNESS_THETA < 0 ? 0 : STIFFNESS_THETA];
+    s->readings[Q_L] = s->last_good[Q_M];
+    s->readings[W_L] = s->last_good[W_M];
+    if (LINK_FROM_TORSION && stiffness > 0) s->readings[Q_L] -= s->last_good[TAU] / stiffness;
+}
+
+static void push(State *s, const int good[SENSORS]) {
+    static const int reading[SOURCES] = {Q_M, Q_L, TAU, DRIVE};
+    const double *q = s->readings;
+    const double sample[SOURCES] = {q[Q_M], present[Q_L] ? q[Q_L] : q[Q_M], q[TAU], q[DRIVE]};
+    int k;
+    append_sample(&s->rows, sample);
+    for (k = 0; k < SOURCES; k++) {
+        const int i = reading[k], bad = (!good[i] && needs[i]) || (s->detect && s->detector.failed[i]);
+        if (bad || s->watch.constant[i] || s->watch.scaled[i]) s->lost[k] = WINDOW + STRIDE;
+        else if (s->lost[k]) s->lost[k]--;
+    }
+}
+
+/* Take a sample; 1 where a row was made. */
+static int update(Twin *m, double time, const double readings[SENSORS], const int good[SENSORS], int enable) {
+    State *s = &m->s;
+    const int looked = watch_sample(m, readings, good);
+    int made = 0, i;
+    for (i = 0; i < SENSORS; i++)
+        if (good[i]) s->last_good[i] = readings[i];
+    if (s->detect) {
+        detect_faults(m, readings, good, s->readings);
+    } else {
+        memcpy(s->readings, s->last_good, sizeof s->readings);
+        if (!good[Q_L]) link_from_motor(s);
+    }
+    push(s, good);
+    if (++s->rows.since >= STRIDE) {
+        s->rows.since = 0;
+        made = take_row(m, time, enable);
+        judge(s, good);
+    }
+    if (looked) floors(m);
+    return made;
+}
+
+static int process(Twin *m, double time) { /* gives the health */
+    State *s = &m->s;
+    double readings[SENSORS];
+    int good[SENSORS], lost = 0, i;
+    for (i = 0; i < SENSORS; i++) {
+        const double value = s->real[input_at[i]];
+        const int is_lost = !isfinite(value);
+        if (is_lost) tell(m, input_at[i], "input not finite: %s; it counts as missing", input_name[i]);
+        lost |= is_lost;
+        readings[i] = is_lost ? 0 : value * input_gain[i];
+        good[i] = s->whole[valid_at[i]] && !is_lost && present[i];
+    }
+    if (s->whole[V_REQUEST]) tell(m, V_REQUEST, "reoptimise_request: a native estimator has no optimiser");
+    if (update(m, time, readings, good, s->whole[V_ENABLE])) publish(s);
+    s->real[V_LINK_POSITION] = s->readings[Q_L];
+    s->real[V_LINK_POSITION + 1] = s->readings[W_L];
+    if (s->fault != s->whole[V_FAULT]) {
+        s->whole[V_FAULT] = s->fault;
+        if (s->fault) tell(m, TELL_FAULT + s->fault, "fault %d at t = %g s (%s)", s->fault, time, FAULT_TEXT);
+    }
+    if (lost || s->fault > 8) return NUMERIC_TROUBLE;
+    return s->rls.running ? HEALTH_OK : WARMING_UP;
+}
+
+/* A sample where the grid of sample_time has come; in smaller host steps between, the outputs hold. */
+static void sample(Twin *m, double time, double length) {
+    State *s = &m->s;
+    int too_long, health;
+    if (isnan(s->start)) s->start = time;
+    too_long = length > SAMPLE_TIME * (1 + 1e-6);
+    if (!too_long && time < s->start + s->samples * SAMPLE_TIME - SAMPLE_TIME * 1e-5) return;
+    if ((s->changed || !s->configured) && !configure(m)) {
+        s->whole[V_HEALTH] = INTERNAL_ERROR;
+        return;
+    }
+    if (!isfinite(time) || !isfinite(length)) {
+        s->whole[V_HEALTH] = INTERNAL_ERROR;
+        return;
+    }
+    s->samples = (Count)floor((time - s->start) / SAMPLE_TIME + 1e-3) + 1;
+    if (too_long) tell(m, TELL_STEP, "the host's step %g s is longer than sample_time %g s", length, SAMPLE_TIME);
+    health = process(m, time);
+    s->whole[V_HEALTH] = too_long && health < STEP_MISMATCH ? STEP_MISMATCH : health;
+    s->whole[V_N_SAMPLES]++;
+}

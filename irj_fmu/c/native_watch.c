@@ -1,0 +1,133 @@
+/* Checks of the readings that need no model, as irj_fmu.watch.Watch makes them. */
+
+/* The k-th smallest of n values goes to its place, smaller ones before it. */
+static double select_value(double v[], int n, int k) {
+    int low = 0, high = n - 1;
+    while (low < high) {
+        const int middle = low + (high - low) / 2;
+        const double a = v[low], b = v[middle], c = v[high];
+        const double pivot = fmax(fmin(a, b), fmin(fmax(a, b), c));
+        int i = low, j = high;
+        while (i <= j) {
+            while (v[i] < pivot) i++;
+            while (v[j] > pivot) j--;
+            if (i <= j) {
+                const double swap = v[i];
+                v[i++] = v[j];
+                v[j--] = swap;
+            }
+        }
+        if (k <= j) high = j;
+        else if (k >= i) low = i;
+        else break;
+    }
+    return v[k];
+}
+
+static double smallest(const double v[], int n) {
+    double found = v[0];
+    int i;
+    for (i = 1; i < n; i++) found = fmin(found, v[i]);
+    return found;
+}
+
+/* Standard deviation of white noise from fourth differences; identification.noise.noise_level. */
+static double noise_level(Twin *m, int sensor) {
+    const int n = WATCH - 4;
+    double *d = m->fourth, cut, gamma, below, above, mean = 0, variance = 0;
+    int i, pass, at, kept = 0;
+    for (i = 0; i < WATCH; i++) d[i] = m->s.watch.rows[i][sensor];
+    for (pass = 1; pass <= 4; pass++)
+        for (i = 0; i < WATCH - pass; i++) d[i] = d[i + 1] - d[i];
+    for (i = 0; i < n; i++) m->sorted[i] = fabs(d[i]);
+    cut = (n - 1) * 0.95;
+    at = (int)floor(cut);
+    gamma = cut - at;
+    below = select_value(m->sorted, n, at);
+    above = smallest(m->sorted + at + 1, n - at - 1);
+    cut = gamma >= 0.5 ? above - (above - below) * (1 - gamma) : below + (above - below) * gamma;
+    for (i = 0; i < n; i++)
+        if (fabs(d[i]) <= cut) { mean += d[i]; kept++; }
+    if (!kept) return 0;
+    mean /= kept;
+    for (i = 0; i < n; i++)
+        if (fabs(d[i]) <= cut) variance += (d[i] - mean) * (d[i] - mean);
+    return sqrt(variance / kept) / 0.87 / sqrt(70.0);
+}
+
+/* Least-squares slope of x against y about their means. */
+static double slope_of(const double x[], const double y[], int n) {
+    double mx = 0, my = 0, xy = 0, yy = 0;
+    int i;
+    for (i = 0; i < n; i++) { mx += x[i]; my += y[i]; }
+    mx /= n; my /= n;
+    for (i = 0; i < n; i++) { xy += (x[i] - mx) * (y[i] - my); yy += (y[i] - my) * (y[i] - my); }
+    return xy / fmax(yy, 1e-300);
+}
+
+/* Ratio of velocity reading to position reading, and of the two positions. */
+static void check_scales(Twin *m, const int good[SENSORS], const double spread[SENSORS]) {
+    Watch *w = &m->s.watch;
+    static const int pair[2][2] = {{Q_M, W_M}, {Q_L, W_L}};
+    double own[2] = {1, 1}, *travelled = m->sorted, *change = m->fourth;
+    int p, i;
+    for (p = 0; p < 2; p++) {
+        const int q = pair[p][0], v = pair[p][1];
+        double a = 0, b = 0;
+        if (!good[q] || !good[v] || !(spread[q] > SCALE_MOTION)) continue;
+        for (i = 0; i < WATCH - 1; i++) {
+            travelled[i] = a += 0.5 * SAMPLE_TIME * (w->rows[i + 1][v] + w->rows[i][v]);
+            change[i] = b += w->rows[i + 1][q] - w->rows[i][q];
+        }
+        own[p] = slope_of(travelled, change, WATCH - 1);
+        w->scaled[v] = fabs(own[p] - 1) > SCALE_ERROR;
+    }
+    if (good[Q_M] && good[Q_L] && fmax(spread[Q_M], spread[Q_L]) > SCALE_MOTION) {
+        int wrong, off_m = fabs(own[0] - 1) > SCALE_ERROR, off_l = fabs(own[1] - 1) > SCALE_ERROR;
+        for (i = 0; i < WATCH; i++) { travelled[i] = w->rows[i][Q_L]; change[i] = w->rows[i][Q_M]; }
+        wrong = fabs(slope_of(travelled, change, WATCH) - 1) > SCALE_ERROR;
+        w->scaled[Q_L] = wrong && off_l && !off_m;
+        w->scaled[Q_M] = wrong && !w->scaled[Q_L];
+        if (wrong) {
+            w->scaled[W_M] = w->scaled[W_M] && !w->scaled[Q_M];
+            w->scaled[W_L] = w->scaled[W_L] && !w->scaled[Q_L];
+        }
+    }
+}
+
+static void look(Twin *m) {
+    Watch *w = &m->s.watch;
+    double spread[SENSORS];
+    int good[SENSORS], moves, i, k;
+    for (i = 0; i < SENSORS; i++) {
+        double low = w->rows[0][i], high = low;
+        for (k = 1; k < WATCH; k++) { low = fmin(low, w->rows[k][i]); high = fmax(high, w->rows[k][i]); }
+        spread[i] = high - low;
+        good[i] = present[i] && !w->bad[i];
+    }
+    moves = fmax(good[Q_M] ? spread[Q_M] : 0, good[Q_L] ? spread[Q_L] : 0) > MOVED;
+    for (i = 0; i < SENSORS; i++) {
+        if (!good[i]) continue;
+        if (spread[i] > 0 || moves) w->constant[i] = spread[i] == 0;
+        if (spread[i] > 0) {
+            const double level = noise_level(m, i), square = w->noise[i] * w->noise[i];
+            if (w->looks[i] < NOISE_MEMORY) w->looks[i]++;
+            w->noise[i] = sqrt(square + (level * level - square) / w->looks[i]);
+        }
+    }
+    for (i = 0; i < SENSORS; i++) good[i] = good[i] && !w->constant[i];
+    check_scales(m, good, spread);
+}
+
+/* Take a sample; 1 where the second is full and has been looked at. */
+static int watch_sample(Twin *m, const double readings[SENSORS], const int good[SENSORS]) {
+    Watch *w = &m->s.watch;
+    int i;
+    memcpy(w->rows[w->count], readings, sizeof w->rows[0]);
+    for (i = 0; i < SENSORS; i++) w->bad[i] += !good[i];
+    if (++w->count < WATCH) return 0;
+    look(m);
+    w->count = 0;
+    memset(w->bad, 0, sizeof w->bad);
+    return 1;
+}

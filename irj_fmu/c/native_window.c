@@ -1,0 +1,266 @@
+/* Start of the recursion from the first window: irj_fmu.first_window, identification._startup, OnlineEstimator._begin. */
+
+/* Weights of the balances' rows at a reversal, where friction may take any value between its limits. */
+static void weight_of(const double shares[2], const double theta[N_THETA], const double size[N_BALANCES], double out[N_BALANCES]) {
+    double level[2] = {0, 0};
+    int b, i, place;
+    for (place = 0; place < 2; place++)
+        for (i = 0; i < N_THETA; i++)
+            if (is_friction[place][i]) level[place] += fabs(theta[i]);
+    for (b = 0; b < N_BALANCES; b++) {
+        double sum = 0;
+        for (place = 0; place < 2; place++)
+            if (feels[b][place]) sum += shares[place] * level[place] * (shares[place] * level[place]);
+        out[b] = 1 / sqrt(1 + sum / (size[b] * size[b]));
+    }
+}
+
+static double error_of(const double y, const double h[N_THETA], const double theta[N_THETA]) {
+    double sum = 0;
+    int i;
+    for (i = 0; i < N_THETA; i++) sum += h[i] * theta[i];
+    return y - sum;
+}
+
+/* The rows of the window with their weights, each balance reduced to a triangle of [h | y]. Gives the largest |y|. */
+static double reduce_window(Twin *m) {
+    const FirstWindow *f = &m->s.window;
+    double largest = 0;
+    int k, b, i;
+    for (b = 0; b < N_BALANCES; b++) {
+        for (k = 0; k < f->count; k++) {
+            const double weight = m->weight[k][b];
+            for (i = 0; i < N_THETA; i++) m->matrix[k][i] = f->h[k][b][i] * weight;
+            m->matrix[k][N_THETA] = f->y[k][b] * weight;
+            largest = fmax(largest, fabs(m->matrix[k][N_THETA]));
+        }
+        triangularise(m->matrix, f->count);
+        memcpy(m->triangle[b], m->matrix, sizeof m->triangle[b]);
+    }
+    return largest;
+}
+
+/* Sum of squares of a column of a balance: of a regressor, or of y. */
+static double column_square(const Twin *m, int b, int column) {
+    double sum = 0;
+    int i;
+    for (i = 0; i <= column; i++) sum += m->triangle[b][i][column] * m->triangle[b][i][column];
+    return sum;
+}
+
+/* Sum of squares of a balance's residual. */
+static double residual_square(const Twin *m, int b, const double theta[N_THETA]) {
+    double sum = 0;
+    int i, j;
+    for (i = 0; i < COLUMNS; i++) {
+        double left = m->triangle[b][i][N_THETA];
+        for (j = i; j < N_THETA; j++) left -= m->triangle[b][i][j] * theta[j];
+        sum += left * left;
+    }
+    return sum;
+}
+
+/* Triangle of all balances, columns times `scale`, rows times `weight`, y less what theta explains. */
+static void stack_balances(Twin *m, const double scale[N_THETA], const double weight[N_BALANCES], const double theta[N_THETA]) {
+    int b, i, j;
+    for (b = 0; b < N_BALANCES; b++)
+        for (i = 0; i < COLUMNS; i++) {
+            const double *from = m->triangle[b][i];
+            double *row = m->matrix[b * COLUMNS + i], left = from[N_THETA];
+            for (j = 0; j < N_THETA; j++) {
+                row[j] = from[j] * scale[j] * weight[b];
+                left -= from[j] * theta[j];
+            }
+            row[N_THETA] = left * weight[b];
+        }
+    triangularise(m->matrix, N_BALANCES * COLUMNS);
+}
+
+/* Least squares of the weighted window with columns of equal size and balances of equal residual. */
+static void least_squares(Twin *m, double theta[N_THETA]) {
+    const double largest = reduce_window(m), none[N_THETA] = {0};
+    double weight[N_BALANCES], size[N_THETA];
+    int pass, b, i;
+    for (b = 0; b < N_BALANCES; b++) weight[b] = 1;
+    for (pass = 0; pass < 2; pass++) {
+        for (i = 0; i < N_THETA; i++) {
+            size[i] = 0;
+            for (b = 0; b < N_BALANCES; b++) size[i] += weight[b] * weight[b] * column_square(m, b, i);
+            size[i] = 1 / fmax(sqrt(size[i]), 1e-300);
+        }
+        stack_balances(m, size, weight, none);
+        solve_all(m->matrix, 1e-9, theta);
+        for (i = 0; i < N_THETA; i++) theta[i] *= size[i];
+        for (b = 0; b < N_BALANCES; b++)
+            weight[b] = 1 / fmax(sqrt(residual_square(m, b, theta) / m->s.window.count), 1e-12 + 1e-9 * largest);
+    }
+}
+
+static double median(double v[], int n) {
+    const double upper = select_value(v, n, n / 2);
+    double lower = upper;
+    int i;
+    if (n % 2) return upper;
+    for (i = 0, lower = v[0]; i < n / 2; i++) lower = fmax(lower, v[i]);
+    return (lower + upper) / 2;
+}
+
+/* First parameters, with rows at reversals weighted down; leaves the triangles of the weighted window. */
+static void robust_fit(Twin *m, double first[N_THETA]) {
+    const FirstWindow *f = &m->s.window;
+    double size[N_BALANCES], largest = 0;
+    int pass, k, b;
+    for (k = 0; k < f->count; k++)
+        for (b = 0; b < N_BALANCES; b++) {
+            m->weight[k][b] = 1;
+            largest = fmax(largest, fabs(f->y[k][b]));
+        }
+    for (pass = 0; pass < 3; pass++) {
+        least_squares(m, first);
+        for (b = 0; b < N_BALANCES; b++) {
+            for (k = 0; k < f->count; k++) m->sorted[k] = fabs(error_of(f->y[k][b], f->h[k][b], first));
+            size[b] = fmax(1.5 * median(m->sorted, f->count), 1e-9 * largest);
+        }
+        for (k = 0; k < f->count; k++) weight_of(f->shares[k], first, size, m->weight[k]);
+    }
+    reduce_window(m);
+}
+
+/* Smallest prior range of each parameter: what moves the balances by a hundredth of their torque. */
+static void least_range(const Twin *m, double out[N_THETA]) {
+    const double rows = (double)m->s.window.count * N_BALANCES;
+    double level = 0;
+    int b, i;
+    for (b = 0; b < N_BALANCES; b++) level += column_square(m, b, N_THETA);
+    level = sqrt(level / rows);
+    if (level == 0) level = 1;
+    for (i = 0; i < N_THETA; i++) {
+        double size = 0;
+        for (b = 0; b < N_BALANCES; b++) size += column_square(m, b, i);
+        size = sqrt(size / rows);
+        out[i] = size > 0 ? 0.01 * level / fmax(size, 1e-300) : 1;
+    }
+}
+
+/* Variance of each balance's residual, kept above the rounding of the balance. */
+static void residual_variance(const Twin *m, const double theta[N_THETA], int parameters, double out[N_BALANCES]) {
+    const int count = m->s.window.count;
+    const double degrees = fmax(1, count - (double)parameters / N_BALANCES);
+    int b;
+    for (b = 0; b < N_BALANCES; b++)
+        out[b] = fmax(residual_square(m, b, theta) / degrees, 1e-24 * (column_square(m, b, N_THETA) / count) + 1e-30);
+}
+
+/* P in scaled parameters as U diag(d) U'. */
+static void factorise(double p[N_THETA][N_THETA], double d[N_THETA], double u[]) {
+    int i, j, k;
+    for (j = N_THETA - 1; j >= 0; j--) {
+        for (i = j; i >= 0; i--) {
+            double sum = p[i][j];
+            for (k = j + 1; k < N_THETA; k++) sum -= p[i][k] * p[j][k] * d[k];
+            if (i == j) { d[j] = fmax(sum, 1e-300); p[j][j] = 1; }
+            else { p[i][j] = sum / d[j]; u[j * (j - 1) / 2 + i] = p[i][j]; }
+        }
+    }
+}
+
+/* Start values and covariance by SVD, without the parameters that the window cannot carry. */
+static int start_values(Twin *m, const double theta0[N_THETA], const double scale[N_THETA], double theta[N_THETA]) {
+    static const Svd empty;
+    State *s = &m->s;
+    Recursion *r = &s->rls;
+    double ones[N_BALANCES], weight[N_BALANCES], step[N_THETA], p[N_THETA][N_THETA] = {{0}};
+    Svd d = empty;
+    int place[N_THETA], n = N_THETA, i, j, k, b;
+    for (b = 0; b < N_BALANCES; b++) ones[b] = 1;
+    stack_balances(m, scale, ones, theta0);
+    solve_all(m->matrix, WINDOW_LIMIT, step);
+    for (i = 0; i < N_THETA; i++) { theta[i] = theta0[i] + scale[i] * step[i]; place[i] = i; }
+    residual_variance(m, theta, N_THETA, weight);
+    for (b = 0; b < N_BALANCES; b++) weight[b] = 1 / sqrt(weight[b]);
+    stack_balances(m, scale, weight, theta0);
+    while (n) {
+        int worst = 0;
+        decompose(&d, m->matrix, place, n);
+        if (d.s[0] > 0 && d.s[n - 1] > WINDOW_LIMIT * d.s[0]) break;
+        for (i = 1; i < n; i++)
+            if (fabs(d.v[n - 1][i]) > fabs(d.v[n - 1][worst])) worst = i;
+        n--;
+        memmove(place + worst, place + worst + 1, (n - worst) * sizeof *place);
+    }
+    memcpy(theta, theta0, N_THETA * sizeof *theta);
+    for (i = 0; i < N_THETA; i++) p[i][i] = 1;
+    if (n) {
+        solve(&d, m->matrix, 0, step);
+        for (i = 0; i < n; i++) {
+            theta[place[i]] += scale[place[i]] * step[i];
+            for (j = 0; j < n; j++) {
+                double sum = 0;
+                for (k = 0; k < n; k++) sum += d.v[k][i] * d.v[k][j] / (1 + d.s[k] * d.s[k]);
+                p[place[i]][place[j]] = sum;
+            }
+        }
+    }
+    for (i = 0; i < N_THETA; i++)
+        for (j = 0; j < N_THETA; j++) p[i][j] *= start_config[CONFIG_START];
+    for (i = 0; i < N_THETA; i++) r->fast[FAST_THETA + i] = theta[i] / scale[i];
+    factorise(p, r->fast + FAST_D, r->fast + FAST_U);
+    residual_variance(m, theta, n, r->fast + FAST_NOISE);
+    return N_THETA - n;
+}
+
+/* Forgetting as the options say. */
+static void tune_recursion(State *s) {
+    int i;
+    for (i = 0; i < N_THETA; i++) {
+        const double calm = s->drift * s->drift * ROW_PERIOD, raised = s->alarm_drift * s->alarm_drift * ROW_PERIOD;
+        s->rls.config[CONFIG_WALK + i] = calm;
+        s->rls.config[CONFIG_WALK_ALARM + i] = fmax(calm, raised);
+    }
+}
+
+static void clear_recursion(State *s) {
+    int i;
+    memcpy(s->rls.config, start_config, sizeof start_config);
+    memcpy(s->rls.fast, start_fast, sizeof start_fast);
+    memcpy(s->rls.slow, start_slow, sizeof start_slow);
+    for (i = 0; i < N_THETA; i++) {
+        s->rls.config[CONFIG_SCALE + i] = s->scale[i];
+        s->rls.config[CONFIG_THETA0 + i] = s->theta[i];
+    }
+    tune_recursion(s);
+}
+
+/* Standard deviations of the estimate. */
+static void deviations(State *s) {
+    int i, j;
+    for (i = 0; i < N_THETA; i++) {
+        double sum = s->rls.fast[FAST_D + i];
+        for (j = i + 1; j < N_THETA; j++) {
+            const double u = s->rls.fast[FAST_U + j * (j - 1) / 2 + i];
+            sum += u * s->rls.fast[FAST_D + j] * u;
+        }
+        s->sigma[i] = sqrt(sum * (s->scale[i] * s->scale[i]));
+    }
+}
+
+/* Start the recursion from the collected rows; gives the number of parameters that they do not determine. */
+static int begin_recursion(Twin *m) {
+    State *s = &m->s;
+    double first[N_THETA], range[N_THETA];
+    int i, b, removed;
+    robust_fit(m, first);
+    least_range(m, range);
+    for (i = 0; i < N_THETA; i++) s->scale[i] = fmax(fmax(fabs(first[i]), fabs(s->theta[i])), range[i]);
+    clear_recursion(s);
+    removed = start_values(m, s->rls.config + CONFIG_THETA0, s->scale, s->theta);
+    for (i = 0; i < N_THETA; i++) s->theta[i] = s->rls.fast[FAST_THETA + i] * s->scale[i];
+    deviations(s);
+    for (b = 0; b < N_BALANCES; b++) {
+        s->square[b] = residual_square(m, b, s->theta) / s->window.count;
+        s->torque[b] = s->rows.signals[reference_signal[b]] * s->rows.signals[reference_signal[b]];
+    }
+    memset(&s->window, 0, sizeof s->window);
+    s->rls.running = 1;
+    return removed;
+}

@@ -1,0 +1,288 @@
+/* FMI 2.0 co-simulation of a native estimator: no Python in the host, no memory allocated in a step.
+ *
+ * native_config.h and native_model.c are written by irj_fmu.native_tables: sizes, tables, and CasADi's code of
+ *   rls_step, rls_check   identification._ud_codegen     points, slopes   irj_fmu.rows
+ *   sample_observer       identification._fault_core
+ * Value references are the positions in the variable table of irj_fmu.estimator, so that a host can exchange the two.
+ */
+#include <math.h>
+#include <stdarg.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "fmi2Functions.h"
+
+#define CASADI_SYMBOL_EXPORT static
+#include "native_model.c"
+#include "native_config.h"
+#include "native_state.h"
+#include "native_rows.c"
+#include "native_watch.c"
+#include "native_algebra.c"
+#include "native_window.c"
+#include "native_fault.c"
+#include "native_estimator.c"
+
+enum { REAL, INTEGER, BOOLEAN, STRING };
+enum { WRITABLE = 1, PARAMETER = 2, FIXED = 4 };
+
+static fmi2Status fail(Twin *m, const char *format, ...) {
+    va_list values;
+    va_start(values, format);
+    write_log(m, fmi2Error, "logStatusError", format, values);
+    va_end(values);
+    return fmi2Error;
+}
+
+static void restart(State *s) {
+    memset(s, 0, sizeof *s);
+    memcpy(s->guid, NATIVE_GUID, strlen(NATIVE_GUID));
+    s->phase = INSTANTIATED;
+    s->start = NAN;
+    memcpy(s->real, start_real, sizeof s->real);
+    memcpy(s->whole, start_whole, sizeof s->whole);
+    memcpy(s->detector.limits, fault_limit, sizeof s->detector.limits);
+    s->detector.margin = 1;
+}
+
+/* ---- life cycle --------------------------------------------------------------------------------------------------- */
+
+const char *fmi2GetTypesPlatform(void) { return fmi2TypesPlatform; }
+const char *fmi2GetVersion(void) { return fmi2Version; }
+
+fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String guid, fmi2String resources,
+                              const fmi2CallbackFunctions *functions, fmi2Boolean visible, fmi2Boolean logging) {
+    Twin *m = calloc(1, sizeof *m);
+    (void)resources; (void)visible;
+    if (!m) return NULL;
+    if (functions) m->host = *functions;
+    m->name = calloc(1, (name ? strlen(name) : 0) + 1);
+    if (m->name && name) strcpy(m->name, name);
+    m->logging = logging;
+    if (!m->name || type != fmi2CoSimulation || !guid || strcmp(guid, NATIVE_GUID) != 0) {
+        if (m->name) fail(m, "instantiate: %s", type != fmi2CoSimulation ? "co-simulation only" : "the GUID is not that of this library");
+        free(m->name);
+        free(m);
+        return NULL;
+    }
+    restart(&m->s);
+    return m;
+}
+
+void fmi2FreeInstance(fmi2Component c) {
+    if (!c) return;
+    free(((Twin *)c)->name);
+    free(c);
+}
+
+fmi2Status fmi2SetDebugLogging(fmi2Component c, fmi2Boolean on, size_t n, const fmi2String categories[]) {
+    (void)n; (void)categories;
+    ((Twin *)c)->logging = on;
+    return fmi2OK;
+}
+
+fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean has_tolerance, fmi2Real tolerance, fmi2Real start, fmi2Boolean has_stop, fmi2Real stop) {
+    Twin *m = c;
+    (void)has_tolerance; (void)tolerance; (void)has_stop; (void)stop;
+    if (m->s.phase != INSTANTIATED) return fail(m, "setupExperiment: only before initialization");
+    m->s.start = start;
+    return fmi2OK;
+}
+
+fmi2Status fmi2EnterInitializationMode(fmi2Component c) {
+    Twin *m = c;
+    if (m->s.phase != INSTANTIATED) return fail(m, "enterInitializationMode: called out of order");
+    m->s.phase = INITIALIZING;
+    return fmi2OK;
+}
+
+fmi2Status fmi2ExitInitializationMode(fmi2Component c) {
+    Twin *m = c;
+    if (m->s.phase != INITIALIZING) return fail(m, "exitInitializationMode: called out of order");
+    m->s.phase = STEPPING;
+    if (!configure(m)) m->s.whole[V_HEALTH] = INTERNAL_ERROR;
+    return fmi2OK;
+}
+
+fmi2Status fmi2Terminate(fmi2Component c) { ((Twin *)c)->s.phase = TERMINATED; return fmi2OK; }
+
+fmi2Status fmi2Reset(fmi2Component c) {
+    Twin *m = c;
+    restart(&m->s);
+    memset(m->told, 0, sizeof m->told);
+    return fmi2OK;
+}
+
+/* ---- variables ---------------------------------------------------------------------------------------------------- */
+
+static int is_kind(Twin *m, fmi2ValueReference v, int wanted) {
+    if (v < N_VARIABLES && kind[v] == wanted) return 1;
+    fail(m, v < N_VARIABLES ? "variable %u is of another type" : "there is no variable %u", v);
+    return 0;
+}
+
+static int may_set(Twin *m, fmi2ValueReference v) { /* 0: the value stays, and the log says so */
+    const int about = access[v];
+    if (m->s.phase < STEPPING || (about & WRITABLE && !(about & FIXED))) return 1;
+    tell(m, v, "variable %u cannot be set after initialization; it keeps its value", v);
+    return 0;
+}
+
+fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference vr[], size_t n, fmi2Real value[]) {
+    Twin *m = c;
+    size_t i;
+    for (i = 0; i < n; i++) {
+        if (!is_kind(m, vr[i], REAL)) return fmi2Error;
+        value[i] = m->s.real[vr[i]];
+    }
+    return fmi2OK;
+}
+
+fmi2Status fmi2SetReal(fmi2Component c, const fmi2ValueReference vr[], size_t n, const fmi2Real value[]) {
+    Twin *m = c;
+    size_t i;
+    for (i = 0; i < n; i++) {
+        if (!is_kind(m, vr[i], REAL)) return fmi2Error;
+        if (!may_set(m, vr[i])) continue;
+        if (access[vr[i]] & PARAMETER && m->s.real[vr[i]] != value[i]) m->s.changed = 1;
+        m->s.real[vr[i]] = value[i];
+    }
+    return fmi2OK;
+}
+
+#define WHOLE(type, wanted) \
+    fmi2Status fmi2Get##type(fmi2Component c, const fmi2ValueReference vr[], size_t n, fmi2##type value[]) { \
+        Twin *m = c; \
+        size_t i; \
+        for (i = 0; i < n; i++) { \
+            if (!is_kind(m, vr[i], wanted)) return fmi2Error; \
+            value[i] = m->s.whole[vr[i]]; \
+        } \
+        return fmi2OK; \
+    } \
+    fmi2Status fmi2Set##type(fmi2Component c, const fmi2ValueReference vr[], size_t n, const fmi2##type value[]) { \
+        Twin *m = c; \
+        size_t i; \
+        for (i = 0; i < n; i++) { \
+            const int new_value = wanted == BOOLEAN ? value[i] != 0 : value[i]; \
+            if (!is_kind(m, vr[i], wanted)) return fmi2Error; \
+            if (!may_set(m, vr[i])) continue; \
+            if (access[vr[i]] & PARAMETER && m->s.whole[vr[i]] != new_value) m->s.changed = 1; \
+            m->s.whole[vr[i]] = new_value; \
+        } \
+        return fmi2OK; \
+    }
+WHOLE(Integer, INTEGER)
+WHOLE(Boolean, BOOLEAN)
+
+fmi2Status fmi2GetString(fmi2Component c, const fmi2ValueReference vr[], size_t n, fmi2String value[]) {
+    Twin *m = c;
+    size_t i;
+    for (i = 0; i < n; i++) {
+        if (!is_kind(m, vr[i], STRING)) return fmi2Error;
+        value[i] = m->s.text[text_of[vr[i]]];
+    }
+    return fmi2OK;
+}
+
+fmi2Status fmi2SetString(fmi2Component c, const fmi2ValueReference vr[], size_t n, const fmi2String value[]) {
+    Twin *m = c;
+    size_t i;
+    for (i = 0; i < n; i++) {
+        char *place;
+        if (!is_kind(m, vr[i], STRING)) return fmi2Error;
+        if (!may_set(m, vr[i])) continue;
+        place = m->s.text[text_of[vr[i]]];
+        if (!value[i] || strlen(value[i]) >= MAX_TEXT) return fail(m, "setString: variable %u takes up to %d bytes", vr[i], MAX_TEXT - 1);
+        if (strcmp(place, value[i]) != 0) m->s.changed = 1;
+        strcpy(place, value[i]);
+    }
+    return fmi2OK;
+}
+
+fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2ValueReference unknown[], size_t n_unknown,
+                                        const fmi2ValueReference known[], size_t n_known, const fmi2Real seed[], fmi2Real out[]) {
+    (void)unknown; (void)n_unknown; (void)known; (void)n_known; (void)seed; (void)out;
+    return fail(c, "getDirectionalDerivative: not provided");
+}
+
+/* ---- FMU state ---------------------------------------------------------------------------------------------------- */
+
+fmi2Status fmi2GetFMUstate(fmi2Component c, fmi2FMUstate *state) {
+    if (!*state) *state = malloc(sizeof(State));
+    if (!*state) return fail(c, "getFMUstate: out of memory");
+    memcpy(*state, &((Twin *)c)->s, sizeof(State));
+    return fmi2OK;
+}
+
+fmi2Status fmi2SetFMUstate(fmi2Component c, fmi2FMUstate state) {
+    if (!state) return fail(c, "setFMUstate: there is no state");
+    memcpy(&((Twin *)c)->s, state, sizeof(State));
+    return fmi2OK;
+}
+
+fmi2Status fmi2FreeFMUstate(fmi2Component c, fmi2FMUstate *state) {
+    (void)c;
+    if (state) { free(*state); *state = NULL; }
+    return fmi2OK;
+}
+
+fmi2Status fmi2SerializedFMUstateSize(fmi2Component c, fmi2FMUstate state, size_t *size) {
+    (void)c; (void)state;
+    *size = sizeof(State);
+    return fmi2OK;
+}
+
+fmi2Status fmi2SerializeFMUstate(fmi2Component c, fmi2FMUstate state, fmi2Byte bytes[], size_t size) {
+    if (size < sizeof(State)) return fail(c, "serializeFMUstate: %lu bytes are too few", (unsigned long)size);
+    memcpy(bytes, state, sizeof(State));
+    return fmi2OK;
+}
+
+fmi2Status fmi2DeSerializeFMUstate(fmi2Component c, const fmi2Byte bytes[], size_t size, fmi2FMUstate *state) {
+    if (size != sizeof(State) || memcmp(bytes, NATIVE_GUID, strlen(NATIVE_GUID)) != 0)
+        return fail(c, "deSerializeFMUstate: these bytes are not a state of this FMU");
+    if (!*state) *state = malloc(sizeof(State));
+    if (!*state) return fail(c, "deSerializeFMUstate: out of memory");
+    memcpy(*state, bytes, sizeof(State));
+    return fmi2OK;
+}
+
+/* ---- co-simulation ------------------------------------------------------------------------------------------------ */
+
+fmi2Status fmi2DoStep(fmi2Component c, fmi2Real t, fmi2Real length, fmi2Boolean no_rollback) {
+    Twin *m = c;
+    (void)no_rollback;
+    if (m->s.phase != STEPPING) return fail(m, "doStep: called out of order");
+    sample(m, t, length);
+    return fmi2OK;
+}
+
+fmi2Status fmi2SetRealInputDerivatives(fmi2Component c, const fmi2ValueReference vr[], size_t n, const fmi2Integer order[], const fmi2Real value[]) {
+    (void)vr; (void)order; (void)value;
+    return n ? fail(c, "setRealInputDerivatives: not provided") : fmi2OK;
+}
+
+fmi2Status fmi2GetRealOutputDerivatives(fmi2Component c, const fmi2ValueReference vr[], size_t n, const fmi2Integer order[], fmi2Real value[]) {
+    (void)vr; (void)order; (void)value;
+    return n ? fail(c, "getRealOutputDerivatives: not provided") : fmi2OK;
+}
+
+fmi2Status fmi2CancelStep(fmi2Component c) { return fail(c, "cancelStep: doStep is never pending"); }
+
+#define NO_STATUS(function, type) \
+    fmi2Status function(fmi2Component c, const fmi2StatusKind what, type *value) { \
+        (void)what; (void)value; \
+        return fail(c, #function ": doStep is never pending"); \
+    }
+NO_STATUS(fmi2GetStatus, fmi2Status)
+NO_STATUS(fmi2GetRealStatus, fmi2Real)
+NO_STATUS(fmi2GetIntegerStatus, fmi2Integer)
+NO_STATUS(fmi2GetStringStatus, fmi2String)
+
+fmi2Status fmi2GetBooleanStatus(fmi2Component c, const fmi2StatusKind what, fmi2Boolean *value) {
+    if (what != fmi2Terminated) return fail(c, "getBooleanStatus: only 'terminated' is known");
+    *value = ((Twin *)c)->s.phase == TERMINATED;
+    return fmi2OK;
+}
