@@ -10,7 +10,8 @@ from typing import Any, Final, final
 import numpy as np
 
 from casadi_models import EFFECTS
-from identification.candidates import LATE, Base, Candidate, NotTestable, Trial, offered, try_candidate
+from identification.candidates import LATE, Candidate, NotTestable, offered
+from identification.trials import Base, Trial, try_candidate
 
 MAJOR_DROP: Final = 10.0
 HELD_OUT_DROP: Final = 5.0

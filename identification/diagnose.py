@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, final
 
-from identification.candidates import make_base
 from identification.claims import Claim, Ranking, make_claim, rank
 from identification.engine import Dataset, load_dataset, prepared_model, solve
 from identification.fit import Fit
 from identification.improve import excitation_warnings, ranked_json, with_held_out
 from identification.record import Record
+from identification.trials import make_base
 
 
 @final

@@ -14,12 +14,12 @@ from identification.formats import number, percent, pretty_unit, ratio, with_err
 from identification.pictures import bar, place_picture, staircase_picture
 
 if TYPE_CHECKING:
-    from identification.candidates import Trial
     from identification.compare import Comparison
     from identification.diagnose import Diagnosis
     from identification.fit import Fit
     from identification.improve import Improvement
     from identification.record import Record
+    from identification.trials import Trial
 
 HEADLINES: Final = {
     "complete": "Found what was missing",

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Final, final
+from dataclasses import replace
+from typing import Final, final
 
 from casadi_models import EFFECTS, JointModel
 from identification.assess import VERDICT_KERNELS, BalanceError, Error, assess
-from identification.candidates import LATE, Base, NotTestable, Trial, make_base
+from identification.candidates import LATE
 from identification.claims import HELD_OUT_DROP, LADDER_STEP, Claim, Ranking, confusion_set, make_claim, minor_claims, nearly, rank, simplest
 from identification.engine import Dataset, Solution, load_dataset, prepared_model, solve
 from identification.errors import InputError
 from identification.excitation import excitation_warnings, not_identifiable
 from identification.formats import number
+from identification.improvement import HOLD_DELAY, Improvement, Step, ranked_json, visible_keys, visible_labels
 from identification.joint_file import Joint
-from identification.lines import Line, find_lines
+from identification.lines import find_lines
 from identification.locate import Unexplained, locate
-from identification.parameters import parameter_table
 from identification.record import Record
+from identification.trials import Base, Trial, make_base, try_candidate
 
 __all__ = [
     "HOLD_DELAY", "RATIO_LIMIT", "Improvement", "Step", "excitation_warnings", "held_drop", "improve", "ranked_json",
@@ -28,8 +28,6 @@ __all__ = [
 
 MAX_ADDITIONS: Final = 6
 RATIO_LIMIT: Final = 1.5
-HOLD_DELAY: Final = "channel_delay@drive"
-"""In every model with a commanded drive: the hold of the logged command is not an effect."""
 
 EXPLAINED_SHARE: Final = 0.5
 SPOILT_RATIO: Final = 1.3
@@ -39,127 +37,6 @@ RISE_LIMIT: Final = 1.02
 SWAP_GAIN: Final = 3.0
 
 Progress = Callable[[str, float], None]
-
-
-@final
-@dataclass(frozen=True)
-class Step:
-    """One step of the loop: the model after an addition and its errors.
-
-    Attributes
-    ----------
-    added : str or None
-        Key of the effect that was added (None for the start model).
-    effects : tuple of str
-        Keys in the model.
-    train, held_out : Error
-    solution : Solution
-    """
-
-    added: str | None
-    effects: tuple[str, ...]
-    train: Error
-    held_out: Error
-    solution: Solution
-    label: str | None = None
-
-    def as_json(self, data: Dataset) -> dict[str, Any]:
-        """The shape of `improve --json`."""
-        return {
-            "added": self.added, "effects": list(self.effects), "labels": list(visible_labels(self.solution.model)),
-            "train": self.train.as_json(), "held_out": self.held_out.as_json(),
-            "parameters": parameter_table(self.solution, data),
-        }  # fmt: skip
-
-
-@final
-@dataclass(frozen=True)
-class Improvement:
-    """Result of the loop (see contract: `improve --json`).
-
-    Attributes
-    ----------
-    steps : tuple of Step
-        The start model and one per addition.
-    claims, minor : tuple of Claim
-    ranking : Ranking
-        The one before the first addition.
-    lines : tuple of Line
-    unexplained : tuple of Unexplained
-    verdict : {"complete", "nothing_missing", "unexplained", "not_identifiable"}
-    reason : str
-        One sentence that a reader understands.
-    """
-
-    joint: Joint
-    data: Dataset
-    steps: tuple[Step, ...]
-    claims: tuple[Claim, ...]
-    minor: tuple[Claim, ...]
-    ranking: Ranking | None
-    lines: tuple[Line, ...]
-    unexplained: tuple[Unexplained, ...]
-    verdict: str
-    reason: str
-    final_ratios: Mapping[str, BalanceError]
-    not_testable: tuple[NotTestable, ...] = ()
-    warnings: tuple[str, ...] = ()
-    refused: tuple[str, ...] = ()
-
-    @property
-    def added(self) -> tuple[str, ...]:
-        """Keys added, in order."""
-        return tuple(s.added for s in self.steps if s.added)
-
-    @property
-    def model(self) -> JointModel:
-        """The final model with its values."""
-        return self.steps[-1].solution.model
-
-    def _repr_html_(self) -> str:
-        from identification.html import improvement_html
-
-        return improvement_html(self)
-
-    def as_json(self) -> dict[str, Any]:
-        """The loop as data; held to improve.schema.json by a test."""
-        significant = self.ranking.significant if self.ranking else frozenset()
-        best = self.ranking.everything[0] if self.ranking and self.ranking.everything else None
-        return {
-            "records": {"train": list(self.data.train_names), "held_out": list(self.data.held_out_names), "note": self.data.note},
-            "steps": [s.as_json(self.data) for s in self.steps],
-            "added": list(self.added),
-            "claims": [c.as_json() for c in self.claims],
-            "minor": [c.as_json() for c in self.minor],
-            "lines": [line.as_json() for line in self.lines],
-            "ranking": [ranked_json(t, t.candidate.label in significant) for t in self.ranking.trials] if self.ranking else [],
-            "not_testable": [{"effect": n.effect, "why": n.why} for n in self.not_testable],
-            "verdict": self.verdict, "reason": self.reason,
-            "unexplained": [u.as_json() for u in self.unexplained],
-            "floor_ratio": {b: e.as_json() for b, e in self.final_ratios.items()},
-            "warnings": list(self.warnings), "best_candidate": best.key if best else None,
-        }  # fmt: skip
-
-
-def ranked_json(trial: Trial, significant: bool) -> dict[str, Any]:
-    """One row of the ranking."""
-    drop = trial.held_out_drop_percent if not math.isnan(trial.held_out_drop_percent) else trial.cv_drop_percent
-    return {
-        "effect": trial.key, "title": trial.candidate.effect.title, "balance": trial.balance,
-        "held_out_drop_percent": drop, "significant": significant,
-        "confusable_with": list(trial.candidate.effect.confused_with), "place": trial.candidate.place,
-        "cv_drop_percent": trial.cv_drop_percent, "gain_nats": trial.gain, "p_value": trial.p_value,
-    }  # fmt: skip
-
-
-def visible_labels(model: JointModel) -> tuple[str, ...]:
-    """Labels of the effects, without the nuisance delay of the drive."""
-    return tuple(label for label in model.effects if label != HOLD_DELAY)
-
-
-def visible_keys(model: JointModel) -> tuple[str, ...]:
-    """Keys of the effects in the model, each once."""
-    return tuple(dict.fromkeys(t.effect.key for t in model.terms if t.label != HOLD_DELAY))
 
 
 def improve(
@@ -403,8 +280,6 @@ class _Loop:
 
     def _same_sign(self, trial: Trial, solution: Solution) -> bool:
         """A minor effect must have the same sign at half and at double kernel."""
-        from identification.candidates import try_candidate
-
         for factor in (0.5, 2.0):
             data = self._at_kernel(self.data.kernel * factor)
             other = solve(solution.model, data, start=solution.values)

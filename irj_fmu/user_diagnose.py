@@ -11,7 +11,7 @@ import numpy as np
 
 from casadi_models import EFFECTS, JointModel
 from identification.assess import Error, assess
-from identification.candidates import Base, Candidate, NotTestable, make_base, offered
+from identification.candidates import Candidate, NotTestable, offered
 from identification.claims import Claim, Ranking, make_claim, rank
 from identification.diagnose import Diagnosis
 from identification.engine import Dataset, Solution, load_dataset, prepared_model, solve, weak_record
@@ -19,6 +19,7 @@ from identification.errors import InputError
 from identification.improve import excitation_warnings, with_held_out
 from identification.joint_file import Joint
 from identification.record import Record
+from identification.trials import Base, make_base
 
 from .signals import FloatArray
 from .user_correction import Correction, correction_of

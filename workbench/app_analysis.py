@@ -14,7 +14,6 @@ import numpy.typing as npt
 from casadi_models import EFFECTS, JointModel
 from identification.assess import Error, assess
 from identification.balances import Balances
-from identification.candidates import Trial, make_base
 from identification.claims import confusion_set, make_claim, rank, simplest
 from identification.engine import Dataset, Solution, load_dataset, prepared_model, references, solve, stack
 from identification.errors import InputError
@@ -24,6 +23,7 @@ from identification.joint_file import Joint
 from identification.parameters import parameter_table
 from identification.places import Rows, gather, places_of
 from identification.record import Record
+from identification.trials import Trial, make_base
 from workbench.app_first import first_look
 from workbench.app_records import thinned
 from workbench.session import StepEntry

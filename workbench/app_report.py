@@ -8,10 +8,10 @@ from dataclasses import replace
 from typing import Any
 
 from identification.assess import BalanceError, Error, assess
-from identification.candidates import make_base
 from identification.claims import Claim, Ranking, rank
 from identification.engine import Dataset, Solution, load_dataset, solve
 from identification.improve import HOLD_DELAY, Improvement, Step, _Loop, held_drop, visible_keys
+from identification.trials import make_base
 from workbench.app_analysis import Analysis, Progress
 from workbench.session import StepEntry
 

@@ -1,0 +1,144 @@
+"""What the improve loop gives back: steps, claims, verdict, and their shape as data."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final, final
+
+from casadi_models import JointModel
+from identification.assess import BalanceError, Error
+from identification.candidates import NotTestable
+from identification.claims import Claim, Ranking
+from identification.dataset import Dataset
+from identification.engine import Solution
+from identification.joint_file import Joint
+from identification.lines import Line
+from identification.locate import Unexplained
+from identification.parameters import parameter_table
+from identification.trials import Trial
+
+HOLD_DELAY: Final = "channel_delay@drive"
+"""In every model with a commanded drive: the hold of the logged command is not an effect."""
+
+
+@final
+@dataclass(frozen=True)
+class Step:
+    """One step of the loop: the model after an addition and its errors.
+
+    Attributes
+    ----------
+    added : str or None
+        Key of the effect that was added (None for the start model).
+    effects : tuple of str
+        Keys in the model.
+    train, held_out : Error
+    solution : Solution
+    """
+
+    added: str | None
+    effects: tuple[str, ...]
+    train: Error
+    held_out: Error
+    solution: Solution
+    label: str | None = None
+
+    def as_json(self, data: Dataset) -> dict[str, Any]:
+        """The shape of `improve --json`."""
+        return {
+            "added": self.added, "effects": list(self.effects), "labels": list(visible_labels(self.solution.model)),
+            "train": self.train.as_json(), "held_out": self.held_out.as_json(),
+            "parameters": parameter_table(self.solution, data),
+        }  # fmt: skip
+
+
+@final
+@dataclass(frozen=True)
+class Improvement:
+    """Result of the loop (see contract: `improve --json`).
+
+    Attributes
+    ----------
+    steps : tuple of Step
+        The start model and one per addition.
+    claims, minor : tuple of Claim
+    ranking : Ranking
+        The one before the first addition.
+    lines : tuple of Line
+    unexplained : tuple of Unexplained
+    verdict : {"complete", "nothing_missing", "unexplained", "not_identifiable"}
+    reason : str
+        One sentence that a reader understands.
+    """
+
+    joint: Joint
+    data: Dataset
+    steps: tuple[Step, ...]
+    claims: tuple[Claim, ...]
+    minor: tuple[Claim, ...]
+    ranking: Ranking | None
+    lines: tuple[Line, ...]
+    unexplained: tuple[Unexplained, ...]
+    verdict: str
+    reason: str
+    final_ratios: Mapping[str, BalanceError]
+    not_testable: tuple[NotTestable, ...] = ()
+    warnings: tuple[str, ...] = ()
+    refused: tuple[str, ...] = ()
+
+    @property
+    def added(self) -> tuple[str, ...]:
+        """Keys added, in order."""
+        return tuple(s.added for s in self.steps if s.added)
+
+    @property
+    def model(self) -> JointModel:
+        """The final model with its values."""
+        return self.steps[-1].solution.model
+
+    def _repr_html_(self) -> str:
+        from identification.html import improvement_html
+
+        return improvement_html(self)
+
+    def as_json(self) -> dict[str, Any]:
+        """The loop as data; held to improve.schema.json by a test."""
+        significant = self.ranking.significant if self.ranking else frozenset()
+        best = self.ranking.everything[0] if self.ranking and self.ranking.everything else None
+        return {
+            "records": {"train": list(self.data.train_names), "held_out": list(self.data.held_out_names), "note": self.data.note},
+            "steps": [s.as_json(self.data) for s in self.steps],
+            "added": list(self.added),
+            "claims": [c.as_json() for c in self.claims],
+            "minor": [c.as_json() for c in self.minor],
+            "lines": [line.as_json() for line in self.lines],
+            "ranking": [ranked_json(t, t.candidate.label in significant) for t in self.ranking.trials] if self.ranking else [],
+            "not_testable": [{"effect": n.effect, "why": n.why} for n in self.not_testable],
+            "verdict": self.verdict, "reason": self.reason,
+            "unexplained": [u.as_json() for u in self.unexplained],
+            "floor_ratio": {b: e.as_json() for b, e in self.final_ratios.items()},
+            "warnings": list(self.warnings), "best_candidate": best.key if best else None,
+        }  # fmt: skip
+
+
+def ranked_json(trial: Trial, significant: bool) -> dict[str, Any]:
+    """One row of the ranking."""
+    drop = trial.held_out_drop_percent if not math.isnan(trial.held_out_drop_percent) else trial.cv_drop_percent
+    return {
+        "effect": trial.key, "title": trial.candidate.effect.title, "balance": trial.balance,
+        "held_out_drop_percent": drop, "significant": significant,
+        "confusable_with": list(trial.candidate.effect.confused_with), "place": trial.candidate.place,
+        "cv_drop_percent": trial.cv_drop_percent, "gain_nats": trial.gain, "p_value": trial.p_value,
+    }  # fmt: skip
+
+
+def visible_labels(model: JointModel) -> tuple[str, ...]:
+    """Labels of the effects, without the nuisance delay of the drive."""
+    return tuple(label for label in model.effects if label != HOLD_DELAY)
+
+
+def visible_keys(model: JointModel) -> tuple[str, ...]:
+    """Keys of the effects in the model, each once."""
+    return tuple(dict.fromkeys(t.effect.key for t in model.terms if t.label != HOLD_DELAY))

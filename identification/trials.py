@@ -1,0 +1,372 @@
+"""Candidates tried on a fitted base: best shape by projection, block cross-validation, held-out drop."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final, final
+
+import numpy as np
+import numpy.typing as npt
+
+from identification.balances import Balances, balances_of
+from identification.candidates import Candidate, NotTestable, shape_grid
+from identification.engine import Dataset, Solution, Stacked, row_weights, stack
+from identification.weak import WeakRecord
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+FOLDS: Final = 4
+FEW_BLOCKS: Final = 32
+"""Below this many blocks up to ten folds are used, so that no fold takes a whole kind of motion away."""
+
+COLLINEAR: Final = 2e-3
+"""Share of a candidate's columns outside the base below which it is not testable."""
+
+REFINE_SHARE: Final = 0.1
+"""Share of the residual that a candidate must explain on its grid before its shape is refined."""
+
+KERNEL_SHARE: Final = 0.4
+"""Share of rows that count as independent under white noise: four rows per kernel length."""
+
+
+@final
+@dataclass(frozen=True)
+class Base:
+    """The fitted base with its weighted rows, projected once for all candidates.
+
+    Attributes
+    ----------
+    rows : mapping of str to (rows,) slice of the stacked vector
+    residual : (n,) array, weighted
+    jacobian : (n, p) array, weighted and scaled to unit columns
+    orthonormal : (n, r) array
+    block : (n,) int array
+    balance : (n,) int array
+    effective : mapping of str to float
+        Independent rows per balance, from the autocorrelation of the residual.
+    """
+
+    solution: Solution
+    data: Dataset
+    residual: FloatArray
+    jacobian: FloatArray
+    orthonormal: FloatArray
+    block: IntArray
+    balance: IntArray
+    weight: FloatArray
+    share: FloatArray
+    held_residual: FloatArray
+    held_jacobian: FloatArray
+    held_balance: IntArray
+    held_weight: FloatArray
+    names: tuple[str, ...]
+
+    @property
+    def balances(self) -> tuple[str, ...]:
+        """Balances in the order of their numbers."""
+        return self.data.sensing.balances
+
+
+def make_base(solution: Solution, data: Dataset) -> Base:
+    """Evaluate and project the base model on training and held-out rows."""
+    model = solution.model
+    free = [n for n in solution.free if n not in solution.at_bound or n.endswith("_smoothing_velocity")]
+    balances = balances_of(model, data.sensing, wrt=free)
+    train = stack(balances, data.train, solution.values)
+    r, j, block, balance = flatten(train, balances.balances)
+    weight = np.concatenate([solution.weights[b] for b in balances.balances])
+    jw = j * weight[:, None]
+    norms = np.linalg.norm(jw, axis=0)
+    alive = norms > 1e-12 * max(float(norms.max(initial=0.0)), 1e-300)
+    jw = jw[:, alive] / norms[alive]
+    left, singular, _ = np.linalg.svd(jw, full_matrices=False)
+    orthonormal = left[:, singular > 1e-9 * max(float(singular[0]) if len(singular) else 0.0, 1e-300)]
+    rw = r * weight
+    rw = rw - orthonormal @ (orthonormal.T @ rw)
+    shares = np.array([_effective_share(rw[balance == k][train.taking[b]]) for k, b in enumerate(balances.balances)])
+    if data.held_out:
+        held = stack(balances, data.held_out, solution.values)
+        hr, hj, _, hb = flatten(held, balances.balances)
+        rows = row_weights(balances, data, solution.values, solution.sigma, data.held_out)
+        held_weights = np.concatenate([rows[b] for b in balances.balances])
+        hj = hj[:, alive] * held_weights[:, None] / norms[alive]
+        hr = hr * held_weights
+    else:
+        hr, hj, hb, held_weights = np.empty(0), np.empty((0, int(alive.sum()))), np.empty(0, dtype=np.int64), np.empty(0)
+    return Base(
+        solution, data, rw, jw, orthonormal, block, balance, weight, shares, hr, hj, hb, held_weights,
+        tuple(n for n, a in zip(free, alive, strict=True) if a),
+    )  # fmt: skip
+
+
+def flatten(stacked: Stacked, balances: Sequence[str]) -> tuple[FloatArray, FloatArray, IntArray, IntArray]:
+    """Residual, Jacobian, block (-1 for rows that take no part) and balance number of all rows, one balance after the other."""
+    r = np.concatenate([stacked.residual[b] for b in balances])
+    j = np.concatenate([stacked.jacobian[b] for b in balances])
+    size = len(stacked.block)
+    block = np.concatenate([np.where(stacked.taking[b], stacked.block, -1) for b in balances])
+    return r, j, block, np.repeat(np.arange(len(balances)), size)
+
+
+def _effective_share(residual: FloatArray) -> float:
+    """Share of rows that count as independent (initial positive sequence of the autocorrelation)."""
+    x = residual - residual.mean()
+    power = float(x @ x)
+    if power <= 0:
+        return 1.0
+    total = 1.0
+    for lag in range(1, min(60, len(x) - 1)):
+        rho = float(x[:-lag] @ x[lag:]) / power
+        if rho < 0.05:
+            break
+        total += 2 * rho
+    return 1.0 / total
+
+
+def columns(candidate: Candidate, base: Base, shapes: Mapping[str, float], records: Sequence[WeakRecord], balances: Balances) -> FloatArray:
+    """Unweighted columns of the candidate's amplitudes at amplitude zero."""
+    values = {p.name: p.start for p in candidate.model.parameters}
+    values.update(base.solution.values)
+    values.update(dict.fromkeys(candidate.amplitudes, 0.0))
+    values.update(shapes)
+    stacked = stack(balances, records, values)
+    return np.concatenate([stacked.jacobian[b] for b in balances.balances])
+
+
+@final
+@dataclass(frozen=True)
+class Trial:
+    """A candidate at its best shape, tried on blocks and on held-out records.
+
+    Attributes
+    ----------
+    values : mapping
+        Shapes and amplitude estimates.
+    balance : str
+        Balance where it helps most.
+    gain : float
+        Cross-validated log-likelihood gain [nats].
+    cv_drop_percent, held_out_drop_percent : float
+        Fall of the RMS in the affected balance.
+    p_value : float
+        Cluster-robust Wald test over blocks.
+    block_score : (blocks,) array
+        Cross-validated log-likelihood of each block against the base [nats].
+    rms : (balances,) array
+        Cross-validated RMS of each balance, in sigmas of the base.
+    outside : float
+        Largest share of a column outside the base.
+    contribution : float
+        RMS of what the effect adds to its balance [N.m].
+    score : float
+        Log-likelihood gain if only the kernel's overlap tied the rows together: order of the ranking [nats].
+    """
+
+    candidate: Candidate
+    values: Mapping[str, float]
+    balance: str
+    gain: float
+    cv_drop_percent: float
+    held_out_drop_percent: float
+    p_value: float
+    block_score: FloatArray
+    rms: FloatArray
+    outside: float
+    contribution: float
+    score: float
+
+    @property
+    def key(self) -> str:
+        """Key of the effect."""
+        return self.candidate.effect.key
+
+
+def try_candidate(candidate: Candidate, base: Base) -> Trial | NotTestable | None:
+    """Best shape by projection, then block cross-validation and held-out drop.
+
+    Returns
+    -------
+    Trial, NotTestable (columns inside the base), or None (no column at all, or an unphysical sign).
+    """
+    data = base.data
+    balances = balances_of(candidate.model, data.sensing, wrt=candidate.amplitudes, columns_only=True)
+    best: tuple[float, dict[str, float], FloatArray] | None = None
+    inside = 0.0
+    lows = np.array([{p.name: p for p in candidate.model.parameters}[n].low for n in candidate.amplitudes])
+    q = base.orthonormal
+
+    def projected(shapes: dict[str, float]) -> tuple[float, FloatArray, float] | None:
+        raw = columns(candidate, base, shapes, data.train, balances)
+        c = raw * base.weight[:, None]
+        size = np.linalg.norm(c, axis=0)
+        if not np.all(np.isfinite(c)) or size.max(initial=0.0) <= 0:
+            return None
+        c = c / np.where(size > 0, size, 1.0)
+        outside = c - q @ (q.T @ c)
+        return _projected_gain(outside, base.residual, lows), raw, float(np.linalg.norm(outside, axis=0).max())
+
+    for shapes in shape_grid(candidate, data):
+        found = projected(shapes)
+        if found is None:
+            continue
+        inside = max(inside, found[2])
+        if best is None or found[0] > best[0]:
+            best = (found[0], shapes, found[1])
+    if best is None:
+        return None
+    if inside < COLLINEAR:
+        return NotTestable(candidate.effect.key, _collinear_reason(candidate))
+    if best[0] <= 0:
+        return None
+    parameters = {p.name: p for p in candidate.model.parameters}
+    limits = {
+        n: (parameters[n].grid[0] * data.ranges[parameters[n].scale] / 2, parameters[n].grid[-1] * data.ranges[parameters[n].scale] * 1.25)
+        for n in candidate.shapes if not n.endswith(("_exponent", "_order"))
+    }  # fmt: skip
+    if limits and best[0] > REFINE_SHARE * float(base.residual @ base.residual):
+        best = _refined(projected, best, limits)
+    return _score(candidate, base, balances, best[1], best[2], lows, inside)
+
+
+def _refined(
+    projected: Callable[[dict[str, float]], tuple[float, FloatArray, float] | None],
+    best: tuple[float, dict[str, float], FloatArray], limits: Mapping[str, tuple[float, float]],
+) -> tuple[float, dict[str, float], FloatArray]:  # fmt: skip
+    """Shape between the grid points: pattern search on a log scale."""
+    step = 0.5
+    for _ in range(5):
+        better = False
+        for name, (low, high) in limits.items():
+            for sign in (1.0, -1.0):
+                value = best[1][name] * math.exp(sign * step)
+                shapes = {**best[1], name: min(max(value, low), high)}
+                found = projected(shapes)
+                if found is not None and found[0] > best[0]:
+                    best, better = (found[0], shapes, found[1]), True
+                    break
+        if not better:
+            step /= 2.5
+    return best
+
+
+def _collinear_reason(candidate: Candidate) -> str:
+    names = ", ".join(candidate.effect.confused_with) or "what the model has already"
+    separate = f"; {candidate.effect.separate_by} would separate them" if candidate.effect.separate_by else ""
+    return f"on these records it cannot be told from {names}{separate}"
+
+
+def _signed_fit(gram: FloatArray, right: FloatArray, lows: FloatArray, first: int) -> FloatArray:
+    """Least squares from normal equations; amplitudes with a lower bound of zero that come out negative are left out."""
+    active = np.ones(len(right), dtype=bool)
+    out = np.zeros(len(right))
+    scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    g = gram / np.outer(scale, scale)
+    b = right / scale
+    for _ in range(len(lows) + 1):
+        index = np.flatnonzero(active)
+        part = np.linalg.lstsq(g[np.ix_(index, index)] + 1e-12 * np.eye(len(index)), b[index], rcond=1e-12)[0]
+        out[:] = 0.0
+        out[index] = part / scale[index]
+        wrong = [first + i for i, low in enumerate(lows) if low == 0.0 and active[first + i] and out[first + i] < 0]
+        if not wrong:
+            break
+        active[wrong] = False
+    return out
+
+
+def _projected_gain(outside: FloatArray, residual: FloatArray, lows: FloatArray) -> float:
+    """Fall of the weighted sum of squares when the projected columns are added (residual = base + J delta)."""
+    gram, right = outside.T @ outside, -(outside.T @ residual)
+    delta = _signed_fit(gram, right, lows, 0)
+    return float(2 * right @ delta - delta @ gram @ delta)
+
+
+def _score(
+    candidate: Candidate, base: Base, balances: Balances, shapes: Mapping[str, float], raw: FloatArray, lows: FloatArray, inside: float
+) -> Trial | None:
+    p = base.jacobian.shape[1]
+    count = len(base.balances)
+    size = np.linalg.norm(raw * base.weight[:, None], axis=0)
+    size = np.where(size > 0, size, 1.0)
+    full = np.column_stack([base.jacobian, raw * base.weight[:, None] / size, base.residual])
+    used = np.flatnonzero(base.block >= 0)
+    blocks = int(base.block.max()) + 1
+    grams = np.zeros((blocks, count, full.shape[1], full.shape[1]))
+    order = used[np.lexsort((base.balance[used], base.block[used]))]
+    cuts = np.flatnonzero(np.diff(base.block[order] * count + base.balance[order])) + 1
+    for rows in np.split(order, cuts):
+        x = full[rows]
+        grams[base.block[rows[0]], base.balance[rows[0]]] += x.T @ x
+    numbers = np.bincount(base.block[used] * count + base.balance[used], minlength=blocks * count).reshape(blocks, count)
+    total = grams.sum(axis=(0, 1))
+    sse0, sse1 = np.zeros((blocks, count)), np.zeros((blocks, count))
+    folds = FOLDS if blocks >= FEW_BLOCKS else max(1, min(blocks, 10))
+    fold = np.arange(blocks) % folds
+    for k in range(folds):
+        test = fold == k
+        train = total - grams[test].sum(axis=(0, 1)) if folds > 1 else total
+        plain = _signed_fit(train[:p, :p], -train[:p, -1], np.empty(0), p)
+        more = _signed_fit(train[:-1, :-1], -train[:-1, -1], lows, p)
+        sse0[test] = _quadratic(grams[test], np.concatenate([plain, np.zeros(len(lows)), [1.0]]))
+        sse1[test] = _quadratic(grams[test], np.concatenate([more, [1.0]]))
+    delta = _signed_fit(total[:-1, :-1], -total[:-1, -1], lows, p)
+    amplitude = delta[p:] / size
+    if not np.any(amplitude):
+        return None
+    per_balance0, per_balance1 = sse0.sum(axis=0), sse1.sum(axis=0)
+    rows_in = np.maximum(numbers.sum(axis=0), 1)
+    effective = rows_in * base.share
+    gains = effective / 2 * np.log(np.maximum(per_balance0, 1e-300) / np.maximum(per_balance1, 1e-300))
+    where = int(np.argmax(rows_in * np.log(np.maximum(per_balance0, 1e-300) / np.maximum(per_balance1, 1e-300))))
+    variance = np.maximum(per_balance1 / rows_in, 1e-300)
+    block_score = ((sse0 - sse1) / (2 * variance) * base.share).sum(axis=1)
+    held = _held_out_drop(candidate, base, balances, shapes, delta, size, where)
+    drop = 100 * (1 - math.sqrt(per_balance1[where] / max(per_balance0[where], 1e-300)))
+    return Trial(
+        candidate, {**shapes, **dict(zip(candidate.amplitudes, map(float, amplitude), strict=True))}, base.balances[where],
+        float(gains.sum()), drop, held, _wald(full, base, delta, p), block_score, np.sqrt(per_balance1 / rows_in), inside,
+        float(np.sqrt(np.mean((raw[base.balance == where] @ amplitude) ** 2))),
+        float(np.sum(KERNEL_SHARE * rows_in / 2 * np.log(np.maximum(per_balance0, 1e-300) / np.maximum(per_balance1, 1e-300)))),
+    )  # fmt: skip
+
+
+def _quadratic(grams: FloatArray, vector: FloatArray) -> FloatArray:
+    return np.asarray(np.maximum(np.einsum("kbij,i,j->kb", grams, vector, vector), 0.0))
+
+
+def _held_out_drop(
+    candidate: Candidate, base: Base, balances: Balances, shapes: Mapping[str, float], delta: FloatArray, size: FloatArray, where: int
+) -> float:
+    """Fall of the RMS of a balance on records that the fit never saw, in percent."""
+    if not len(base.held_residual):
+        return math.nan
+    p = base.jacobian.shape[1]
+    raw = columns(candidate, base, shapes, base.data.held_out, balances) * base.held_weight[:, None] / size
+    here = base.held_balance == where
+    before = base.held_residual[here]
+    after = before + base.held_jacobian[here] @ delta[:p] + raw[here] @ delta[p:]
+    return 100 * (1 - math.sqrt(float(after @ after) / max(float(before @ before), 1e-300)))
+
+
+def _wald(full: FloatArray, base: Base, delta: FloatArray, p: int) -> float:
+    """p-value of the amplitudes, scores clustered by block."""
+    from scipy.special import fdtrc
+
+    c = full[:, p:-1]
+    q = base.orthonormal
+    c = c - q @ (q.T @ c)
+    residual = full[:, -1] + full[:, :-1] @ delta
+    blocks = np.unique(base.block[base.block >= 0])
+    active = np.flatnonzero(delta[p:])
+    if not len(active) or len(blocks) <= len(active) + 1:
+        return 1.0
+    c = c[:, active]
+    scores = np.array([c[base.block == b].T @ residual[base.block == b] for b in blocks])
+    inverse = np.linalg.pinv(c.T @ c, rcond=1e-10)
+    covariance = inverse @ (scores.T @ scores) @ inverse * len(blocks) / (len(blocks) - 1)
+    d = delta[p:][active]
+    statistic = float(d @ np.linalg.pinv(covariance, rcond=1e-12) @ d) / len(active)
+    return float(fdtrc(len(active), len(blocks) - len(active), statistic))
