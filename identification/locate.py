@@ -19,8 +19,10 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
 BINS: Final = 24
-AXIS_R2: Final = 0.05
-PEAK: Final = 15.0
+AXIS_R2: Final = 0.15
+"""Share of the residual below which a variable is not said to hold it."""
+PEAK: Final = 10.0
+NEAR_PEAK: Final = 5.0
 LINEAR: Final = {"rad": "m", "rad/s": "m/s", "N.m": "N"}
 
 
@@ -181,4 +183,7 @@ def _peak(data: Dataset, balance: str, residual: dict[str, FloatArray] | Any) ->
     power = np.mean(spectra, axis=0)
     use = frequency > 1.5
     k = int(np.argmax(np.where(use, power, 0.0)))
-    return float(frequency[k]) if power[k] > PEAK * float(np.median(power[use])) else None
+    # a residual that is merely slow has its largest power at the lowest frequency: a peak stands over its own octaves too
+    near = use & (frequency > frequency[k] / 2) & (frequency < 2 * frequency[k]) & (np.abs(np.arange(len(power)) - k) > 2)
+    stands = power[k] > PEAK * float(np.median(power[use])) and near.any() and power[k] > NEAR_PEAK * float(np.median(power[near]))
+    return float(frequency[k]) if stands else None

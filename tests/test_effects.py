@@ -453,8 +453,10 @@ def test_user_effect_file_registers_and_simulates(tmp_path: Path, monkeypatch: p
     assert ends[1] < ends[0] - 0.05
     assert "felt_torque" in model.linear_parameters
     assert "felt_angle" not in model.linear_parameters
+    other = tmp_path / "felt_of_a_colleague.py"
+    other.write_text(source.read_text())
     with pytest.raises(ValueError, match="registered already"):
-        EFFECTS.load(source)
+        EFFECTS.load(other)
     with pytest.raises(ValueError, match="not a Python file"):
         EFFECTS.load(tmp_path / "felt.txt")
 
