@@ -18,9 +18,7 @@ _PARTIAL: Final = 0.8
 """Partial correlation from which the two torques are said to follow each other."""
 _LEFT: Final = 0.02
 """Share of the link torque's power that must be left beside a spring for the spring to be among the terms."""
-_REFUSE: Final = 6.0
-_REFUSE_PLAIN: Final = 20.0
-"""The same where a torque that is linear in the position cannot be told from the link torque."""
+_REFUSE: Final = 20.0
 _WARN: Final = 1.5
 
 _FACTORS: Final = (
@@ -62,32 +60,34 @@ def check_torque(record: Record, gear_ratio: float | None, torque_per_current: f
     found = _slope(record, drive, record[position] * sign)
     if found is None:
         return []
-    slope, spring = found
-    limit = _REFUSE if spring else _REFUSE_PLAIN
+    slope = found
     said = f"{record.name}: the drive torque from {name} is {slope:.3g} times what link_torque says"
     size = abs(slope)
     if slope < 0:
-        advice = "the sign of one is reversed; set sign = -1 for the wrong one in [columns]"
+        advice = "the sign of one is reversed; set sign = -1 for the wrong one in [columns], or reverse motor_constant"
         return [Finding("refuse", "torque", f"{said}: {advice}", "link_torque")]
-    if max(size, 1 / size) > limit:
-        advice = "correct the unit or scale of link_torque in [columns], or torque_per_current and gear_ratio"
-        return [Finding("refuse", "torque", f"{said} ({_guess(size)}): {advice}", "link_torque")]
+    guess = _guess(size)
+    if guess and max(size, 1 / size) > _REFUSE:
+        advice = "correct the unit or scale of link_torque in [columns], or motor_constant (torque_per_current) and gear_ratio in [joint]"
+        return [Finding("refuse", "torque", f"{said} ({guess}): {advice}", "link_torque")]
     if max(size, 1 / size) > _WARN:
-        return [Finding("warn", "torque", f"{said} ({_guess(size)}): check unit and scale of both, and torque_per_current", "link_torque")]
+        why = guess or "a scale is wrong, or a strong torque is missing from the model"
+        return [Finding("warn", "torque", f"{said} ({why}): check unit and scale of both, and motor_constant", "link_torque")]
     return [Finding("ok", "torque", f"{record.name}: link_torque follows the drive torque (factor {slope:.3g})", "link_torque")]
 
 
 def _guess(size: float) -> str:
+    """The unit that was probably mistaken; empty where the factor is none of the known ones."""
     for value, sentence in _FACTORS:
         if any(0.75 < size / f < 1.33 for f in (value, 1 / value)):
             return sentence
-    return "a unit or scale is wrong, or a strong torque is missing from the model"
+    return ""
 
 
-def _slope(record: Record, drive: FloatArray, position: FloatArray) -> tuple[float, bool] | None:
-    """Slope of the drive on the link torque beside the motor's own terms, and whether a spring is among these; None without a clear relation."""
+def _slope(record: Record, drive: FloatArray, position: FloatArray) -> float | None:
+    """Slope of the drive on the link torque beside the motor's own terms; None without a clear relation."""
     parts = [_averages(record.time[s], drive[s], record["link_torque"][s], position[s]) for s in record.segments()]
-    rows = np.concatenate([p for p in parts if p is not None] or [np.empty((0, 7))])
+    rows = np.concatenate([p for p in parts if p is not None] or [np.empty((0, 9))])
     if len(rows) < 30:
         return None
     both = rows[:, :2]
@@ -101,12 +101,12 @@ def _slope(record: Record, drive: FloatArray, position: FloatArray) -> tuple[flo
         partial = td / math.sqrt(tt * dd)
         if abs(partial) >= _PARTIAL:
             # geometric mean of both regressions: noise in either channel does not pull it to zero
-            return math.copysign(math.sqrt(dd / tt), partial), spring
+            return math.copysign(math.sqrt(dd / tt), partial)
     return None
 
 
 def _averages(time: FloatArray, drive: FloatArray, torque: FloatArray, position: FloatArray) -> FloatArray | None:
-    """Rows of block means: drive, torque, direction, velocity, acceleration, 1, position."""
+    """Rows of block means away from standstill: drive, torque, direction, powers of the velocity, acceleration, 1, position."""
     if len(time) < 16:
         return None
     size = max(1, round(_WINDOW / float(np.median(np.diff(time)))))
@@ -117,5 +117,8 @@ def _averages(time: FloatArray, drive: FloatArray, torque: FloatArray, position:
     t, q = mean[0], mean[3]
     velocity = (q[2:] - q[:-2]) / (t[2:] - t[:-2])
     acceleration = 2 * ((q[2:] - q[1:-1]) / (t[2:] - t[1:-1]) - (q[1:-1] - q[:-2]) / (t[1:-1] - t[:-2])) / (t[2:] - t[:-2])
-    slow = 0.02 * float(np.quantile(np.abs(velocity), 0.95)) or 1e-12
-    return np.column_stack([mean[1][1:-1], mean[2][1:-1], np.tanh(velocity / slow), velocity, acceleration, np.ones(count - 2), q[1:-1]])
+    moving = np.abs(velocity) > 0.05 * float(np.quantile(np.abs(velocity), 0.95))
+    steady = moving & np.roll(moving, 1) & np.roll(moving, -1) & (np.sign(velocity) == np.sign(np.roll(velocity, 1)))
+    away = np.sign(velocity)
+    table = [mean[1][1:-1], mean[2][1:-1], away, velocity, velocity * np.abs(velocity), velocity**3, acceleration, np.ones(count - 2), q[1:-1]]
+    return np.asarray(np.column_stack(table)[steady], dtype=np.float64)

@@ -138,7 +138,8 @@ class _Loop:
                 claims, steps = self._revise(claims, steps)
             base = make_base(steps[-1].solution, self.data)
             ranking = rank(base)
-        return self._finish(first, ranking, base, claims, steps)
+        left = ranking.best(frozenset(self.refused)) if len(claims) >= max_additions else None
+        return self._finish(first, ranking, base, claims, steps, left)
 
     def _without_answer(self, steps: list[Step], why: str) -> Improvement:
         """The records cannot carry the question: the start model and the reason."""
@@ -224,7 +225,7 @@ class _Loop:
             out.append(after)
         return kept, out
 
-    def _finish(self, first: Ranking, last: Ranking, base: Base, claims: list[Claim], steps: list[Step]) -> Improvement:
+    def _finish(self, first: Ranking, last: Ranking, base: Base, claims: list[Claim], steps: list[Step], left: Trial | None) -> Improvement:
         self.progress("looking at what is left", 0.85)
         solution = steps[-1].solution
         ratios = self._ratios(solution)
@@ -233,7 +234,7 @@ class _Loop:
         minor = tuple(self._minor(t, solution) for t in minor_claims(last, base) if self._same_sign(t, solution))
         error = replace(steps[-1].held_out, balances=ratios)
         where = locate(solution, self.data, error, lines, RATIO_LIMIT)
-        verdict, reason = _verdict(claims, where, ratios, steps)
+        verdict, reason = _verdict(claims, where, ratios, steps, left)
         return Improvement(
             self.joint, self.data, tuple(steps), tuple(claims), minor, first, tuple(lines), tuple(where), verdict, reason, ratios,
             tuple(n for n in first.not_testable if n.effect not in {c for x in claims for c in x.effects}),
@@ -305,12 +306,16 @@ def held_drop(before: Error, after: Error, balance: str) -> float:
 
 
 def _verdict(
-    claims: Sequence[Claim], where: Sequence[Unexplained], ratios: Mapping[str, BalanceError], steps: Sequence[Step]
+    claims: Sequence[Claim], where: Sequence[Unexplained], ratios: Mapping[str, BalanceError], steps: Sequence[Step], following: Trial | None
 ) -> tuple[str, str]:
     names = " and ".join(EFFECTS[c.effects[0]].title if len(c.effects) == 1 else "one of (" + ", ".join(c.effects) + ")" for c in claims)
     fall = f"the error on held-out data falls from {steps[0].held_out.relative_error_percent:.3g} % to {steps[-1].held_out.relative_error_percent:.3g} %"
     if where:
         left = ", ".join(f"{u.balance} ({number(ratios[u.balance].ratio, 2)} times its noise floor)" for u in where)
+        if following is not None:
+            found = f"Missing: {names}; {fall}. " if claims else ""
+            stop = f"Stopped at the limit of additions ({len(claims)}): {following.candidate.effect.title} would be the next."
+            return "unexplained", f"{found}{stop} Left over: {left}."
         if claims:
             return "unexplained", f"Missing: {names}; {fall}. Structure that is not in the library is left in: {left}."
         return "unexplained", f"No effect of the library explains what is left in: {left}."

@@ -15,7 +15,7 @@ from typing import Any, Final, final
 import numpy as np
 import numpy.typing as npt
 
-from identification._shooting import Shooting, Windows, cut_windows, substeps_for, weighted
+from identification._shooting import MOST_SUBSTEPS, Shooting, Windows, cut_windows, substeps_for, weighted
 from identification.assess import assess
 from identification.engine import bounds_of, row_weights
 from identification.errors import InputError
@@ -28,6 +28,8 @@ SMOOTHING_SHRINK: Final = 1.5
 """Factor by which a smoothing velocity may fall below its start: the steps were chosen for the start."""
 SOFTEST: Final = 12
 """Doublings of the smoothing velocities at most."""
+EASY_SUBSTEPS: Final = 4
+"""Steps per sample up to which friction counts as smooth enough: sharper, and Gauss-Newton steps stick at reversals."""
 FEW_WINDOWS: Final = 40
 """Windows of the first steps; all of them take the last ones."""
 SETTLED: Final = 1e-3
@@ -172,11 +174,14 @@ def refine(fit: Fit, records: Record | Sequence[Record] | None = None, *, window
 def _followable(model: Any, values: dict[str, float], data: Windows) -> tuple[dict[str, float], int]:
     """Start values with friction smooth enough for the sample time, and the steps per sample."""
     names = [n for n in values if n.endswith("_smoothing_velocity")]
-    for _ in range(SOFTEST):
+    for _ in range(SOFTEST if names else 0):
         try:
-            return values, substeps_for(model, values, data)
+            substeps = substeps_for(model, values, data)
         except InputError:
-            values = {**values, **{n: 2 * values[n] for n in names}}
+            substeps = MOST_SUBSTEPS + 1
+        if substeps <= EASY_SUBSTEPS:
+            return values, substeps
+        values = {**values, **{n: 2 * values[n] for n in names}}
     return values, substeps_for(model, values, data)
 
 

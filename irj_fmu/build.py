@@ -363,10 +363,20 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
+def _writable(path: Path, inputs: Sequence[Path]) -> None:
+    """Refuse a result file that cannot be written or would replace an input, before any work."""
+    if not path.absolute().parent.is_dir():
+        raise InputError(f"{path}: its folder does not exist; make it first")
+    if path.exists() and any(p.exists() and path.samefile(p) for p in inputs):
+        raise InputError(f"{path}: is an input of this command and would be lost; write somewhere else")
+
+
 def main(argv: Sequence[str]) -> int:
     """Build; 0 where everything was built, 2 with one line on unusable input."""
     arguments = parser().parse_args(argv)
     try:
+        if arguments.json is not None:
+            _writable(arguments.json, (arguments.joint, *arguments.healthy))
         request = Request(
             joint=load_joint(arguments.joint), source=arguments.joint, out=arguments.out, cc=arguments.cc,
             target=arguments.target, controller=arguments.controller, sensors=arguments.sensors,
@@ -380,6 +390,6 @@ def main(argv: Sequence[str]) -> int:
             except OSError as error:
                 raise InputError(f"{arguments.json}: cannot write there ({error.strerror})") from None
     except InputError as error:
-        sys.stderr.write(f"{error}\n")
+        sys.stderr.write(f"irj: {' '.join(str(error).split())}\n")
         return 2
     return 0

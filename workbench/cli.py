@@ -6,9 +6,12 @@ import argparse
 import importlib
 import os
 import shlex
+import signal
 import sys
+import threading
 from collections.abc import Sequence
 from pathlib import Path
+from types import FrameType
 from typing import Any, NoReturn, final
 
 from identification import __version__
@@ -55,7 +58,7 @@ def _parser() -> argparse.ArgumentParser:
 
     def other_payload(sub: argparse.ArgumentParser) -> None:
         text = "training records of the same joint with another payload: they share motor and transmission, not the link"
-        sub.add_argument("--other-payload", nargs="+", metavar="REC", default=[], help=text)
+        sub.add_argument("--other-payload", nargs="+", action="extend", metavar="REC", default=[], help=text)
 
     demo = verb("demo", "loop", "the main job on embedded data: a simulated joint with a hidden effect")
     demo.add_argument("--report", default="irj-demo.html", metavar="FILE", help="where the report goes (default irj-demo.html)")
@@ -67,22 +70,22 @@ def _parser() -> argparse.ArgumentParser:
     fitted.add_argument("--refine", action="store_true", help="refine by the error of the simulated outputs (slower, less bias by noise)")
     fitted.add_argument("-o", "--output", metavar="FILE", help="write the fitted joint file")
     compared = verb("compare", "loop", "how far the model is from the records, and where", records=True, joint=True)
-    compared.add_argument("--fit", dest="fit_records", nargs="+", metavar="REC", default=[], help="fit to these records and compare with REC")
+    compared.add_argument("--fit", dest="fit_records", nargs="+", action="extend", metavar="REC", default=[], help="fit to these records and compare with REC")
     compared.add_argument("--no-linear", action="store_true", help="leave out what linear models without physics would explain")
     diagnosed = verb("diagnose", "loop", "rank what is missing", records=True, joint=True)
     other_payload(diagnosed)
-    diagnosed.add_argument("--held-out", nargs="+", metavar="REC", default=[], help="records the fit must not see")
+    diagnosed.add_argument("--held-out", nargs="+", action="extend", metavar="REC", default=[], help="records the fit must not see")
     diagnosed.add_argument("-o", "--output", metavar="FILE", help="write the joint file with the first claim added")
     improved = verb("improve", "loop", "name what is missing, add it, watch the error fall", records=True, joint=True)
     other_payload(improved)
-    improved.add_argument("--held-out", nargs="+", metavar="REC", default=[], help="records the fit must not see")
+    improved.add_argument("--held-out", nargs="+", action="extend", metavar="REC", default=[], help="records the fit must not see")
     improved.add_argument("--report", metavar="FILE", help="write the HTML report")
     improved.add_argument("--picture", metavar="FILE.svg", help="draw the falling error and the place of the residual")
     improved.add_argument("-o", "--output", metavar="FILE", help="write the improved joint file")
     improved.add_argument("--max-steps", type=_count, default=6, metavar="N", help="most effects to add (default 6)")
     report = verb("report", "loop", "the improve loop, written as one HTML file", records=True, joint=True)
     other_payload(report)
-    report.add_argument("--held-out", nargs="+", metavar="REC", default=[], help="records the fit must not see")
+    report.add_argument("--held-out", nargs="+", action="extend", metavar="REC", default=[], help="records the fit must not see")
     report.add_argument("-o", "--output", metavar="FILE", default="irj-report.html", help="the HTML file")
     listed = verb("effects", "library", "list the effect library, or one effect")
     listed.add_argument("key", nargs="?", help="key of one effect")
@@ -100,7 +103,7 @@ def _parser() -> argparse.ArgumentParser:
     simulated.add_argument("--seed", type=int, default=0)
     simulated.add_argument("--motion", choices=("multisine", "triangle"), default="multisine")
     tracked = verb("track", "online", "replay the online estimator with sensor-fault detection", records=True, joint=True)
-    tracked.add_argument("--healthy", nargs="+", metavar="REC", default=[], help="records of the healthy joint: limits of the fault detector")
+    tracked.add_argument("--healthy", nargs="+", action="extend", metavar="REC", default=[], help="records of the healthy joint: limits of the fault detector")
     tracked.add_argument("--fail-on-fault", action="store_true", help="exit with 1 where a fault is found")
     tracked.add_argument("--report", metavar="FILE", help="write the HTML report")
     tracked.add_argument(
@@ -132,6 +135,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if rest and arguments.module != "fmi":
         parser.error(f"unrecognized arguments: {' '.join(rest)}")
     arguments.command = shlex.join(["irj", *given])
+    interrupted = _watched_interrupt()
     try:
         check_outputs(arguments)
         _register([*arguments.effects, *arguments.own_effects])
@@ -148,8 +152,29 @@ def main(argv: Sequence[str] | None = None) -> int:
         where = f"{error.filename}: " if error.filename else ""
         return _fail(f"{where}{error.strerror or error}; check the path, its permissions and the space on the disk")
     except KeyboardInterrupt:
-        print("\nirj: interrupted" if sys.stderr.isatty() else "irj: interrupted", file=sys.stderr)
-        return 130
+        return _interrupted()
+    except Exception:
+        if interrupted:  # compiled code may turn an interrupt into an error of its own
+            return _interrupted()
+        raise
+
+
+def _watched_interrupt() -> list[bool]:
+    """A list that is filled when the user interrupts; the interrupt itself is raised as ever."""
+    seen: list[bool] = []
+    if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+
+        def note(number: int, frame: FrameType | None) -> None:
+            seen.append(True)
+            signal.default_int_handler(number, frame)
+
+        signal.signal(signal.SIGINT, note)
+    return seen
+
+
+def _interrupted() -> int:
+    print("\nirj: interrupted" if sys.stderr.isatty() else "irj: interrupted", file=sys.stderr)
+    return 130
 
 
 def _register(files: Sequence[str]) -> None:

@@ -6,6 +6,7 @@ import json
 import math
 import os
 import sys
+import tomllib
 from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
@@ -64,8 +65,9 @@ def check_outputs(arguments: Namespace) -> None:
     The joint file may be written back in place by ``fit``, ``improve`` and ``add``.
     """
     inputs = [*_listed(arguments, "records"), *_listed(arguments, "held_out"), *_listed(arguments, "fit_records")]
-    inputs += _listed(arguments, "healthy")
+    inputs += [*_listed(arguments, "healthy"), *_listed(arguments, "other_payload"), *_listed(arguments, "effects"), *_listed(arguments, "own_effects")]
     joint = getattr(arguments, "joint", None)
+    inputs += _fmu_of(joint)
     named: dict[str, str] = {}
     for option in OUTPUTS:
         path = getattr(arguments, option, None)
@@ -85,6 +87,29 @@ def check_outputs(arguments: Namespace) -> None:
         if str(target) in named and not _special(target):
             raise InputError(f"{path}: given for two results; give each a file of its own")
         named[str(target)] = option
+
+
+def _fmu_of(joint: object) -> list[str]:
+    """The FMU that a joint file names as its model."""
+    try:
+        table = tomllib.loads(Path(str(joint)).read_text(encoding="utf-8-sig"))
+        return [str(Path(str(joint)).parent / str(table["model"]["fmu"]))]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
+
+
+def distinct(**groups: Sequence[str]) -> None:
+    """Refuse a record that is given in two roles: what the fit must not see, it must not see under another name either."""
+    seen: dict[tuple[int, int], tuple[str, str]] = {}
+    for role, paths in groups.items():
+        for path in paths:
+            if not Path(path).exists():
+                continue
+            found = Path(path).stat()
+            before = seen.setdefault((found.st_dev, found.st_ino), (role, path))
+            if before[0] != role:
+                said = " and as ".join(r.replace("_", " ") for r in (before[0], role))
+                raise InputError(f"{path}: given as {said} record; a record can have one role only, leave it out of one")
 
 
 def _listed(arguments: Namespace, name: str) -> list[str]:

@@ -15,13 +15,14 @@ from identification.fit import Fit, fit, joint_text
 from identification.improve import Improvement, improve
 from identification.joint_file import Joint, toml_text
 from identification.record import Record
-from workbench.commands.files import open_joint, open_records, progress_bar, write_json, write_text
+from workbench.commands.files import distinct, open_joint, open_records, progress_bar, write_json, write_text
 
 
 def improve_files(
     train: Sequence[str], held_out: Sequence[str], joint_path: str, *, other_payload: Sequence[str] = (), max_additions: int = 6
 ) -> tuple[dict[str, Any], Improvement, list[Record]]:
     """The loop on files: its JSON, the result and the records."""
+    distinct(training=train, other_payload=other_payload, held_out=held_out)
     joint = open_joint(joint_path)
     records, warnings = _training(train, other_payload, joint)
     held, more = open_records(held_out, joint)
@@ -125,6 +126,7 @@ def _print_improvement(found: Improvement) -> None:
 
 def run_fit(arguments: Namespace) -> int:
     """`irj fit`."""
+    distinct(training=arguments.records, other_payload=arguments.other_payload)
     joint = open_joint(arguments.joint)
     records, warnings = _training(arguments.records, arguments.other_payload, joint)
     fitted = fit(joint, records)
@@ -173,6 +175,7 @@ def run_compare(arguments: Namespace) -> int:
 
 def run_diagnose(arguments: Namespace) -> int:
     """`irj diagnose`."""
+    distinct(training=arguments.records, other_payload=arguments.other_payload, held_out=arguments.held_out)
     joint = open_joint(arguments.joint)
     records, warnings = _training(arguments.records, arguments.other_payload, joint)
     held, more = open_records(arguments.held_out, joint)

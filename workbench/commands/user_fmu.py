@@ -68,6 +68,9 @@ def _one_line(run: Callable[[Namespace], int]) -> Callable[[Namespace], int]:
 def _open(arguments: Namespace) -> tuple[UserModel, list[Record], list[str]]:
     from irj_fmu.user_file import load_user_joint
 
+    for option in ("other_payload", "refine"):
+        if getattr(arguments, option, None):
+            raise InputError(f"{arguments.joint}: its model is an FMU, which --{option.replace('_', '-')} does not work with; leave it out")
     model = load_user_joint(arguments.joint)
     for note in model.notes:
         print(f"irj: {note}", file=sys.stderr)
