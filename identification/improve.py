@@ -225,7 +225,7 @@ class _Loop:
             out.append(after)
         return kept, out
 
-    def _finish(self, first: Ranking, last: Ranking, base: Base, claims: list[Claim], steps: list[Step], left: Trial | None) -> Improvement:
+    def _finish(self, first: Ranking, last: Ranking, base: Base, claims: list[Claim], steps: list[Step], left: Trial | None = None) -> Improvement:
         self.progress("looking at what is left", 0.85)
         solution = steps[-1].solution
         ratios = self._ratios(solution)
