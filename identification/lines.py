@@ -17,7 +17,8 @@ from identification.weak import WeakRecord
 
 FloatArray = npt.NDArray[np.float64]
 
-PROMINENCE: Final = 20.0
+PROMINENCE: Final = 100.0
+"""Peak over the median of the scan. Lines that are worth 2 to 5 % of the residual stand 125 and more over it; bursts and a stiff mode up to 81."""
 HELD_OUT_DROP: Final = 0.2
 LOWEST_ORDER: Final = 0.25
 HIGHEST_ORDER: Final = 14.0
