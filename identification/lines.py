@@ -18,7 +18,9 @@ from identification.weak import WeakRecord
 FloatArray = npt.NDArray[np.float64]
 
 PROMINENCE: Final = 100.0
-"""Peak over the median of the scan. Lines that are worth 2 to 5 % of the residual stand 125 and more over it; bursts and a stiff mode up to 81."""
+TORSION_PROMINENCE: Final = 20.0
+"""Peak over the median of the scan. In the balances with the motor's acceleration bursts and a stiff mode stand up to 81 times
+over it, lines that are worth 2 to 5 % of the residual 125 and more; the transmission balance has no such rest."""
 HELD_OUT_DROP: Final = 0.2
 LOWEST_ORDER: Final = 0.25
 HIGHEST_ORDER: Final = 14.0
@@ -201,7 +203,7 @@ def _in_balance(balance: str, rows: _Rows, most: int) -> list[Line]:
         if not peaks:
             break
         order, prominence, weight = max(peaks, key=lambda x: x[1])
-        if prominence < PROMINENCE:
+        if prominence < (TORSION_PROMINENCE if balance == "transmission" else PROMINENCE):
             break
         sine, cosine, offset = _phase_fit(order, angle, left, weight)
         drop = _held_out_drop(rows, order, sine, cosine)
