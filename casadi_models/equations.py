@@ -8,7 +8,7 @@ are the true ones (simulation).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Final, final
 
@@ -62,6 +62,9 @@ class Equations:
         Share of the transmitted torque that motor and link feel (1 without kinematic error).
     inertia : mapping of str to expression
         Inertias of the model by name [kg.m2].
+    load_lag : expression
+        Where the link hangs on a compliance c and is not recorded: J_l c times the torque that the motor passes on [N.m.s2];
+        else zero. Its second derivative enters the balance of the axis (link angle eliminated from 2.41 and 2.42).
     memory_terms : tuple
         One :data:`MemoryTerm` per term with states, in the order of `memory`.
     """
@@ -83,6 +86,7 @@ class Equations:
     motor_lever: Expression
     link_lever: Expression
     inertia: Mapping[str, Expression]
+    load_lag: Expression
     memory_terms: tuple[MemoryTerm, ...]
 
 
@@ -240,16 +244,25 @@ def build_equations(model: JointModel, symbols: Symbols, *, sensors: bool) -> Eq
             local = builder.local(t, view)
             terms.append((t, local.position, symbols.memory[t], local, t.bound(symbols.parameters)))
     states = [z for zs in symbols.memory.values() for z in zs]
+    drive = s.drive + builder.total("drive", drive_view)
+    motor_resistance = builder.total("motor", view)
+    inertia = {n: symbols.parameters[n] for n in model.inertias}
+    lag, beyond = ca.SX(0), view
+    if model.lagging_load:
+        passed_on = drive - inertia["motor_inertia"] * s.motor_acceleration - motor_resistance
+        twisted = symbols.parameters["load_compliance"] * passed_on
+        lag = inertia["link_inertia"] * twisted
+        beyond = replace(view, signals=s.with_values(link_position=s.link_position - twisted))
     return Equations(
         signals=raw,
         parameters=ca.vertcat(*symbols.parameters.values()),
         memory=ca.vertcat(*states) if states else ca.SX(0, 1),
         clock=symbols.clock,
-        drive=s.drive + builder.total("drive", drive_view),
+        drive=drive,
         motor_acceleration=s.motor_acceleration,
         link_acceleration=s.link_acceleration,
-        motor_resistance=builder.total("motor", view),
-        link_resistance=builder.total("link", view),
+        motor_resistance=motor_resistance,
+        link_resistance=builder.total("link", beyond),
         transmitted=builder.total("transmission", view),
         torque=s.torque,
         torsion=torsion,
@@ -257,7 +270,8 @@ def build_equations(model: JointModel, symbols: Symbols, *, sensors: bool) -> Eq
         true_link_position=s.link_position,
         motor_lever=motor_lever,
         link_lever=link_lever,
-        inertia={n: symbols.parameters[n] for n in model.inertias},
+        inertia=inertia,
+        load_lag=lag,
         memory_terms=tuple(terms),
     )
 

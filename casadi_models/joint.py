@@ -21,7 +21,7 @@ from typing import Any, Final, final
 from .effect import EFFECTS
 from .equations import Equations, Symbols, build_equations, inverse_dynamics, linear_set, time_derivative
 from .parameter import Parameter
-from .term import INERTIAS, Term, smoothing
+from .term import INERTIAS, LOAD_COMPLIANCE, Term, smoothing
 
 __all__ = ["MEMORY_STEP", "Equations", "JointModel", "Term", "inverse_dynamics", "time_derivative"]
 
@@ -53,6 +53,8 @@ class JointModel:
         What presses the gear's teeth in load-dependent laws.
     clamped_link : bool
         True for a torque-against-displacement test: the torsion is the position itself.
+    lagging_load : bool
+        True for a geared joint seen from the motor side: the link hangs on a compliance and its position is not recorded.
     name : str
         Name in reports.
     """
@@ -65,6 +67,7 @@ class JointModel:
     virtual_work: bool = True
     load_from: str = "torque"
     clamped_link: bool = False
+    lagging_load: bool = False
     name: str = "joint"
 
     @staticmethod
@@ -135,7 +138,7 @@ class JointModel:
     @property
     def structure(self) -> tuple[object, ...]:
         """All that shapes the equations, without the values: equal for models that differ in values only."""
-        return (self.gear_ratio, self.terms, self.inertias, self.kind, self.virtual_work, self.load_from, self.clamped_link)
+        return (self.gear_ratio, self.terms, self.inertias, self.kind, self.virtual_work, self.load_from, self.clamped_link, self.lagging_load)
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -148,6 +151,8 @@ class JointModel:
     def parameters(self) -> tuple[Parameter, ...]:
         """All parameters: inertias, those of the terms, smoothing velocities; each once."""
         found: dict[str, Parameter] = {n: INERTIAS[n] for n in self.inertias}
+        if self.lagging_load:
+            found[LOAD_COMPLIANCE.name] = LOAD_COMPLIANCE
         for term in self.terms:
             found.update({p.name: p for p in term.parameters})
         for place in ("motor", "link"):

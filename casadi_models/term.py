@@ -24,6 +24,10 @@ INERTIAS: Final = {
 }  # fmt: skip
 """Inertias by name, all link-referred."""
 
+LOAD_COMPLIANCE: Final = Parameter(
+    "load_compliance", "rad/N.m", 0.0, 0.0, math.inf, "compliance between motor and link where the link position is not recorded", "link"
+)  # fmt: skip
+
 
 @final
 @dataclass(frozen=True)

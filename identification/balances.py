@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, final
 
 import casadi as ca
@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from casadi_models import JointModel, Signals
 from casadi_models.vectorised import Vectorised
+from identification._memory_kept import states_of
 from identification.sensing import Sensing
 from identification.weak import WeakRecord
 
@@ -58,6 +59,83 @@ def residual_expressions(model: JointModel, sensing: Sensing) -> dict[str, Expre
     return out
 
 
+def curved_expressions(model: JointModel, sensing: Sensing) -> dict[str, Expression]:
+    """What enters the balances by its second derivative in time [N.m.s2]: the lag of a load that is not recorded."""
+    e = model.equations
+    lag = e.load_lag / ca.jacobian(e.drive, e.signals.drive)
+    return {b: lag if b == "axis" else ca.SX(0) for b in sensing.balances} if model.lagging_load else {}
+
+
+@final
+class _Part:
+    """Expressions with their Jacobian, split into what is linear in the signals and the rest.
+
+    Parameters
+    ----------
+    model : JointModel
+    expressions : mapping of str to expression
+    columns : sequence of int
+        Parameters whose Jacobian columns are wanted, by their place in the vector.
+    columns_only : bool
+        The expressions themselves are not wanted and read zero.
+    """
+
+    def __init__(self, model: JointModel, expressions: Mapping[str, Expression], columns: Sequence[int], *, columns_only: bool) -> None:
+        e = model.equations
+        signals: Any = e.signals.vector()
+        parameters = e.parameters
+        stacked: list[Expression] = []
+        for r in expressions.values():
+            stacked += [ca.SX(1, 1) if columns_only else r, *(ca.vertsplit(ca.jacobian(r, parameters)[:, columns].T) if columns else [])]
+        out: Any = ca.vertcat(*stacked)
+        self._width = 1 + len(columns)
+        slopes = ca.jacobian(out, signals)
+        sparsity = ca.jacobian_sparsity(ca.vec(ca.densify(slopes)), ca.vertcat(signals, e.memory))
+        varying = np.zeros(slopes.shape[0] * slopes.shape[1], dtype=bool)
+        varying[list(set(sparsity.get_triplet()[0]))] = True
+        linear = ~varying.reshape(slopes.shape[1], slopes.shape[0]).T
+        present = np.zeros(slopes.shape, dtype=bool)
+        rows, cols = slopes.sparsity().get_triplet()
+        present[rows, cols] = True
+        linear &= present
+        keep = ca.DM(linear.astype(float))
+        self._linear = ca.Function("linear", [parameters], [ca.densify(slopes * keep)])
+        zeroed: list[Expression] = []
+        substitute: Any = ca.substitute
+        for i in range(out.shape[0]):
+            names: list[Any] = [signals[j] for j in range(len(_NAMES)) if linear[i, j]]
+            zeroed.append(substitute([out[i]], names, [ca.SX(0)] * len(names))[0] if names else out[i])
+        self.needed = [i for i, part in enumerate(zeroed) if not part.is_zero()]
+        rest = ca.vertcat(*(zeroed[i] for i in self.needed)) if self.needed else ca.SX(0, 1)
+        self._rest = Vectorised(ca.Function("rest", [signals, e.memory, parameters], [ca.densify(rest)]))
+        self.remembers = bool(e.memory_terms) and ca.jacobian_sparsity(rest, e.memory).nnz() > 0
+
+    def rows(
+        self, averaged: Mapping[str, FloatArray], average: Callable[[FloatArray], FloatArray], data: WeakRecord, memory: FloatArray, p: Sequence[float]
+    ) -> FloatArray:
+        """Averages (rows, expressions and columns) with the internal states given at the points."""
+        matrix = np.zeros((data.rows, len(_NAMES)))
+        for i, name in enumerate(_NAMES):
+            if name in averaged:
+                matrix[:, i] = averaged[name]
+        full: FloatArray = matrix @ np.array(self._linear(p)).T
+        if self.needed:
+            count = len(data.points["motor_position"])
+            points = np.zeros((len(_NAMES), count))
+            for i, name in enumerate(_NAMES):
+                if name in data.points:
+                    points[i] = data.points[name]
+            full[:, self.needed] += average(self._rest(count, points, memory, p).T)
+        return full
+
+    def slopes(self, balances: Sequence[str], p: Sequence[float]) -> dict[str, dict[str, float]]:
+        """By balance, the signals that enter it linearly and how strongly."""
+        linear = np.array(self._linear(p))
+        return {
+            b: {n: float(linear[i * self._width, j]) for j, n in enumerate(_NAMES) if linear[i * self._width, j]} for i, b in enumerate(balances)
+        }  # fmt: skip
+
+
 @final
 class Balances:
     """Residuals and their Jacobian of one model with one set of channels.
@@ -83,79 +161,38 @@ class Balances:
         parameters = e.parameters
         expressions = residual_expressions(model, sensing)
         columns = [self.names.index(n) for n in self.wrt]
-        stacked: list[Expression] = []
-        for r in expressions.values():
-            stacked += [ca.SX(1, 1) if columns_only else r, *(ca.vertsplit(ca.jacobian(r, parameters)[:, columns].T) if columns else [])]
-        out: Any = ca.vertcat(*stacked)
         self.balances = tuple(expressions)
-        slopes = ca.jacobian(out, signals)
-        sparsity = ca.jacobian_sparsity(ca.vec(ca.densify(slopes)), ca.vertcat(signals, e.memory))
-        varying = np.zeros(slopes.shape[0] * slopes.shape[1], dtype=bool)
-        varying[list(set(sparsity.get_triplet()[0]))] = True
-        linear = ~varying.reshape(slopes.shape[1], slopes.shape[0]).T
-        present = np.zeros(slopes.shape, dtype=bool)
-        rows, cols = slopes.sparsity().get_triplet()
-        present[rows, cols] = True
-        linear &= present
-        keep = ca.DM(linear.astype(float))
-        self._linear = ca.Function("linear", [parameters], [ca.densify(slopes * keep)])
-        zeroed: list[Expression] = []
-        substitute: Any = ca.substitute
-        for i in range(out.shape[0]):
-            names: list[Any] = [signals[j] for j in range(len(_NAMES)) if linear[i, j]]
-            zeroed.append(substitute([out[i]], names, [ca.SX(0)] * len(names))[0] if names else out[i])
-        self._has_rest = [not part.is_zero() for part in zeroed]
-        needed = [i for i, used in enumerate(self._has_rest) if used]
-        rest = ca.vertcat(*(zeroed[i] for i in needed)) if needed else ca.SX(0, 1)
-        self._needed = needed
-        self._rest = Vectorised(ca.Function("rest", [signals, e.memory, parameters], [ca.densify(rest)]))
+        curved = curved_expressions(model, sensing)
+        self._plain = _Part(model, expressions, columns, columns_only=columns_only)
+        self._curved = _Part(model, curved, columns, columns_only=columns_only) if curved else None
         own = [expressions[b] for b in self.balances]
         sources = ca.vertcat(*(signals[_NAMES.index(n)] for n in _DIRECT))
         self._slopes = ca.Function("slopes", [signals, e.memory, parameters], [ca.densify(ca.jacobian(ca.vertcat(*own), sources))])
-        remembers = bool(e.memory_terms) and ca.jacobian_sparsity(rest, e.memory).nnz() > 0
-        self._memory = Memory(model) if remembers else None
-        self._size = out.shape[0]
+        self._memory = Memory(model) if self._plain.remembers else None
 
-    def point_values(self, data: WeakRecord, values: Mapping[str, float]) -> FloatArray:
-        """The nonlinear parts at the points, (points, outputs that have one)."""
-        p = [float(values[n]) for n in self.names]
-        count = len(data.points["motor_position"])
-        if not self._needed:
-            return np.empty((count, 0))
-        matrix = np.zeros((len(_NAMES), count))
-        for i, name in enumerate(_NAMES):
-            if name in data.points:
-                matrix[i] = data.points[name]
-        memory = self.memory_values(data, values)
-        return self._rest(count, matrix, memory, p).T
+    def curved_coefficients(self, values: Mapping[str, float]) -> dict[str, dict[str, float]]:
+        """How strongly the second derivative of each averaged signal enters each residual."""
+        if self._curved is None:
+            return {}
+        return self._curved.slopes(self.balances, [float(values[n]) for n in self.names])
 
     def memory_values(self, data: WeakRecord, values: Mapping[str, float]) -> FloatArray:
-        """Internal states of displacement-memory effects at the points, (states, points)."""
-        states = self.model.equations.memory.shape[0]
+        """Internal states of displacement-memory effects at the points, (states, points); not to be written to."""
+        memory = self._memory
         count = len(data.points["motor_position"])
-        out = np.zeros((states, count))
-        if self._memory is None:
-            return out
+        if memory is None:
+            return np.zeros((self.model.equations.memory.shape[0], count))
         p = np.array([float(values[n]) for n in self.names])
-        matrix = np.zeros((len(_NAMES), count))
-        for i, name in enumerate(_NAMES):
-            if name in data.smooth:
-                matrix[i] = data.smooth[name]
-        where = self._memory.coordinates(count, matrix, p)
-        for first, last in zip(data.starts[:-1], data.starts[1:], strict=True):
-            out[:, first:last] = self._memory.follow(where[:, first:last], matrix[:, first:last], p, data.grid.dt * data.grid.step)
-        return out
+        law = (self.model.structure, tuple(p[memory.depends].tolist()))
+        return states_of(data, law, lambda: memory.along(data, p))
 
     def evaluate(self, data: WeakRecord, values: Mapping[str, float]) -> dict[str, tuple[FloatArray, FloatArray]]:
         """Residual (rows,) and Jacobian (rows, wrt) of every balance at the given parameter values."""
         p = [float(values[n]) for n in self.names]
-        averaged = np.zeros((data.rows, len(_NAMES)))
-        for i, name in enumerate(_NAMES):
-            if name in data.averaged:
-                averaged[:, i] = data.averaged[name]
-        full = averaged @ np.array(self._linear(p)).T
-        if self._needed:
-            full[:, self._needed] += data.average(self.point_values(data, values))
+        memory = self.memory_values(data, values)
+        full = self._plain.rows(data.averaged, data.average, data, memory, p)
+        if self._curved is not None:
+            full += self._curved.rows(data.curved, data.curve, data, memory, p)
         width = 1 + len(self.wrt)
         return {
             b: (full[:, i * width], full[:, i * width + 1 : (i + 1) * width]) for i, b in enumerate(self.balances)
@@ -164,13 +201,8 @@ class Balances:
     def coefficients(self, values: Mapping[str, float], data: WeakRecord) -> dict[str, dict[str, float]]:
         """How strongly each averaged signal enters each residual (for the noise floor); RMS over the record where it varies."""
         p = [float(values[n]) for n in self.names]
-        linear = np.array(self._linear(p))
-        width = 1 + len(self.wrt)
-        out = {
-            b: {n: float(linear[i * width, j]) for j, n in enumerate(_NAMES) if linear[i * width, j]}
-            for i, b in enumerate(self.balances)
-        }  # fmt: skip
-        if self._needed:
+        out = self._plain.slopes(self.balances, p)
+        if self._plain.needed:
             count = min(len(data.points["motor_position"]), 2000)
             pick = np.linspace(0, len(data.points["motor_position"]) - 1, count).astype(np.int64)
             matrix = np.array([data.points[n][pick] if n in data.points else np.zeros(count) for n in _NAMES])
@@ -222,6 +254,7 @@ class Memory:
             if term.effect.memory is not None:
                 moved.extend(term.effect.memory(z, steps[i], view, values))
         after = ca.vertcat(*moved)
+        self.depends = sorted(set(ca.jacobian_sparsity(ca.vertcat(*coordinates, after), e.parameters).get_triplet()[1]))
         self._states = int(e.memory.shape[0])
         self._used = sorted(set(ca.jacobian_sparsity(after, signals).get_triplet()[1]))
         kept = ca.vertcat(*(signals[i] for i in self._used)) if self._used else ca.SX(0, 1)
@@ -237,21 +270,40 @@ class Memory:
         for k in range(UNROLLED):
             state = one(state, many[:, k], aside[:, k], p, clock)
             trail.append(state)
-        self._stretch = ca.Function("stretch", [z0, many, aside, p, clock], [ca.horzcat(*trail)])
+        self._stretch = ca.Function("stretch", [z0, many, aside, p, clock], [ca.densify(ca.horzcat(*trail))])
+
+    def along(self, data: WeakRecord, p: FloatArray) -> FloatArray:
+        """States (states, points) at the points of a record; every segment begins at rest."""
+        count = len(data.points["motor_position"])
+        matrix = np.zeros((len(_NAMES), count))
+        for i, name in enumerate(_NAMES):
+            if name in data.smooth:
+                matrix[i] = data.smooth[name]
+        where = self.coordinates(count, matrix, p)
+        out = np.zeros((self._states, count))
+        for first, last in zip(data.starts[:-1], data.starts[1:], strict=True):
+            out[:, first:last] = self.follow(where[:, first:last], matrix[:, first:last], p, data.grid.dt * data.grid.step)
+        return out
 
     def follow(self, where: FloatArray, signals: FloatArray, p: FloatArray, step: float) -> FloatArray:
         """States (states, points) along coordinates (coordinates, points) `step` seconds apart, from rest at zero."""
         count = where.shape[1]
         out = np.zeros((self._states, count))
         steps = np.diff(where, axis=1, prepend=where[:, :1])
-        z = np.zeros(self._states)
+        # CasADi's own buffers: the conversion of every stretch would cost as much as the law
+        z, trail = np.zeros((1, self._states)), np.zeros((UNROLLED, self._states))
+        many, aside = np.zeros((UNROLLED, where.shape[0])), np.zeros((UNROLLED, len(self._used)))
+        given, run = self._stretch.buffer()
+        for i, array in enumerate((z, many, aside, np.ascontiguousarray(p, dtype=np.float64), np.array([step]))):
+            given.set_arg(i, array.data)
+        given.set_res(0, trail.data)
         for first in range(0, count, UNROLLED):
             last = min(first + UNROLLED, count)
-            many = np.zeros((where.shape[0], UNROLLED))
-            many[:, : last - first] = steps[:, first:last]
-            aside = np.zeros((len(self._used), UNROLLED))
-            aside[:, : last - first] = signals[self._used, first:last]
-            trail = np.array(self._stretch(z, many, aside, p, step))
-            out[:, first:last] = trail[:, : last - first]
-            z = trail[:, last - first - 1]
+            many[: last - first] = steps[:, first:last].T
+            many[last - first :] = 0.0
+            aside[: last - first] = signals[self._used, first:last].T
+            aside[last - first :] = 0.0
+            run()
+            out[:, first:last] = trail[: last - first].T
+            z[0] = trail[last - first - 1]
         return out

@@ -84,7 +84,7 @@ def offered(model: JointModel, data: Dataset, *, late: bool = False) -> tuple[li
     one_sided = sensing.one_sided
     direct = one_sided and not sensing.both_positions and abs(data.joint.gear_ratio) == 1.0
     for effect in EFFECTS.values():
-        if not effect.candidate or (effect.key in LATE and not late):
+        if not effect.candidate or (effect.key in LATE and not late) or (effect.key == "transmission_compliance" and model.lagging_load):
             continue
         why = _why_not(effect, model, data)
         if why:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, final
 
@@ -26,6 +26,8 @@ SET_RMS: Final = 1.5
 LARGEST_SET: Final = 4
 LATE_DROP: Final = 30.0
 """Fall of the RMS for effects with free dynamics of their own, which fit a little of anything."""
+UNSEEN_DROP: Final = 20.0
+"""Fall of the RMS where the link is not recorded: its motion leaves structure of 10 times the floor in the balance."""
 COMMON_DROP: Final = 4.0
 """Fall of the RMS that is enough for viscous and Coulomb friction and gravity: hardly a joint is without them."""
 PLAIN_FIRST: Final = 0.5
@@ -96,12 +98,26 @@ class Ranking:
         return left[0] if left else None
 
 
-def rank(base: Base, extra: Sequence[Candidate] = (), *, late: bool = False) -> Ranking:
-    """Try every candidate that the records can show on the fitted base (`late`: the costly ones too)."""
+def rank(base: Base, extra: Sequence[Candidate] = (), *, late: bool = False, progress: Callable[[str, float], None] | None = None) -> Ranking:
+    """Try every candidate that the records can show on the fitted base.
+
+    Parameters
+    ----------
+    base : Base
+    extra : sequence of Candidate
+        Beside those of the library.
+    late : bool
+        The costly ones too.
+    progress : callable, optional
+        ``progress(text, share)`` before each candidate.
+    """
     candidates, refused = offered(base.solution.model, base.data, late=late)
     trials: list[Trial] = []
     untestable = {n.effect: n for n in refused}
-    for candidate in (*candidates, *extra):
+    every = (*candidates, *extra)
+    for number, candidate in enumerate(every):
+        if progress is not None:
+            progress(f"trying {candidate.effect.title.lower()} ({number + 1} of {len(every)})", number / len(every))
         found = try_candidate(candidate, base)
         if isinstance(found, Trial):
             trials.append(found)
@@ -146,7 +162,8 @@ def _discoveries(trials: Sequence[Trial]) -> set[str]:
 
 def _major(trial: Trial, base: Base) -> bool:
     common = trial.key in COMMON
-    if trial.gain <= GAIN or trial.cv_drop_percent < (COMMON_DROP if common else MAJOR_DROP):
+    least = COMMON_DROP if common else UNSEEN_DROP if base.solution.model.lagging_load else MAJOR_DROP
+    if trial.gain <= GAIN or trial.cv_drop_percent < least:
         return False
     held = trial.held_out_drop_percent
     if not math.isnan(held) and held < (COMMON_DROP / 2 if common else HELD_OUT_DROP):

@@ -14,7 +14,7 @@ from identification.errors import InputError
 from identification.joint_file import Joint
 from identification.noise import noise_level
 from identification.record import Record
-from identification.sensing import Sensing, adapt, sense, signals_of
+from identification.sensing import Sensing, adapt, check_alike, sense, signals_of
 from identification.weak import POSITION_CHAINS, WeakRecord, kernel, prepare
 
 FloatArray = npt.NDArray[np.float64]
@@ -73,16 +73,13 @@ def load_dataset(
     InputError
         Too short; channels that do not fit the model; a record of training and held-out data without a common channel set.
     """
-    sensing = sense(train[0], model)
-    for record in (*train[1:], *held_out):
-        if sense(record, model).balances != sensing.balances:
-            raise InputError(f"{record.name}: has other channels than {train[0].name}; give records with the same channels")
-    alone = sensing.balances == ("axis",) and not sensing.both_positions and abs(joint.gear_ratio) != 1.0
+    sensing = check_alike([*train, *held_out], model)
+    alone = seen_from_the_motor(sensing, joint)
     length = kernel or (ONE_SIDED_KERNEL if alone else CLAIM_KERNEL)
     prepared: list[WeakRecord] = []
     first = 0
     for record in (*train, *held_out):
-        made = weak_record(record, joint, sensing, length, first)
+        made = weak_record(record, joint, sensing, length, first, curved=model.lagging_load)
         if record.payload != train[0].payload:
             made = replace(made, masked=_of_the_link(record, sensing))
         first = max(first, 1 + int(made.block.max(initial=first - 1)))
@@ -105,7 +102,12 @@ def _of_the_link(record: Record, sensing: Sensing) -> frozenset[str]:
     return masked
 
 
-def weak_record(record: Record, joint: Joint, sensing: Sensing, length: float, first_block: int = 0) -> WeakRecord:
+def seen_from_the_motor(sensing: Sensing, joint: Joint) -> bool:
+    """True for a geared joint of which only the drive side is recorded: the load hangs on a compliance nobody measures."""
+    return sensing.balances == ("axis",) and not sensing.both_positions and abs(joint.gear_ratio) != 1.0
+
+
+def weak_record(record: Record, joint: Joint, sensing: Sensing, length: float, first_block: int = 0, *, curved: bool = False) -> WeakRecord:
     """One record, resampled to uniform time where needed, averaged with the kernel."""
     steps = np.diff(record.time)
     inside = np.diff(record.segment) == 0
@@ -117,6 +119,7 @@ def weak_record(record: Record, joint: Joint, sensing: Sensing, length: float, f
     made = prepare(
         record.time, signals, segments, length=length, first_block=first_block,
         pointwise={c: pointwise_kernel(x, segments, record.dt, longest) for c, x in signals.items() if c in POSITION_CHAINS},
+        curved=curved,
     )  # fmt: skip
     if made.rows < 8:
         raise InputError(f"{record.name}: {len(record)} samples in {record.duration:.3g} s are too few for a kernel of {length:.3g} s; give a longer record")
@@ -156,4 +159,6 @@ def prepared_model(joint: Joint, record: Record) -> JointModel:
     adapted = adapt(model, sensing, joint.known)
     if sensing.has_drive and not record.has("motor_torque") and not adapted.has("channel_delay", "drive"):
         adapted = adapted.add("channel_delay@drive")
+    if seen_from_the_motor(sensing, joint) and sensing.has_drive and "inertia" not in joint.known:
+        adapted = replace(adapted, inertias=("motor_inertia", "link_inertia"), lagging_load=True)
     return adapted

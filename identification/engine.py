@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import final
 
@@ -18,8 +18,8 @@ from identification.joint_file import Known
 from identification.stacked import Stacked, floors, references, rms, row_weights, stack, taking_part
 
 __all__ = [
-    "Dataset", "Solution", "Stacked", "bounds_of", "floors", "load_dataset", "prepared_model", "references", "rms",
-    "row_weights", "solve", "stack", "starts", "taking_part", "weak_record",
+    "Dataset", "Solution", "Stacked", "bounds_of", "floors", "gauss_newton", "load_dataset", "memory_shapes_of", "prepared_model", "references",
+    "rms", "row_weights", "solve", "stack", "starts", "taking_part", "weak_record",
 ]  # fmt: skip
 
 FloatArray = npt.NDArray[np.float64]
@@ -89,8 +89,22 @@ def bounds_of(model: JointModel, known: Mapping[str, Known], data: Dataset) -> d
     return out
 
 
-def solve(model: JointModel, data: Dataset, *, iterations: int = 15, start: Mapping[str, float] | None = None) -> Solution:
+def solve(
+    model: JointModel, data: Dataset, *, iterations: int = 15, start: Mapping[str, float] | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> Solution:  # fmt: skip
     """Fit a model to the training rows by Levenberg-Marquardt steps on the weak form.
+
+    Parameters
+    ----------
+    model : JointModel
+    data : Dataset
+    iterations : int
+        At most so many in each of the two passes.
+    start : mapping of str to float, optional
+        Values to start from.
+    progress : callable, optional
+        ``progress(text, share)`` before each stage.
 
     Raises
     ------
@@ -107,22 +121,26 @@ def solve(model: JointModel, data: Dataset, *, iterations: int = 15, start: Mapp
     frozen_shapes: set[str] = set()
     free = [n for n in model.parameter_names if n not in fixed and n not in frozen_shapes]
     balances = balances_of(model, data.sensing, wrt=free)
-    memory_shapes = _memory_shapes(model, free)
+    memory_shapes = memory_shapes_of(model, free)
     for n in free:
         low, high = limits[n]
         values[n] = min(max(values[n], low), high)
+    tell = progress or (lambda text, share: None)
+    tell("start values", 0.0)
     # first pass without shapes: linear amplitudes from any start
     sigma = dict.fromkeys(balances.balances, 1.0)
     linear_only = [n for n in free if n not in shapes]
     _check_moves(balances, data, values, linear_only)
-    values, _ = _steps(balances, data, values, linear_only, limits, sigma, {}, 3, memory_shapes)
+    values, _ = gauss_newton(balances, data, values, linear_only, limits, sigma, {}, 3, memory_shapes)
     values = _best_start(balances, data, values, free, limits, memory_shapes)
-    for _ in range(2):
+    for number in range(2):
+        tell(("first pass", "second pass")[number], 0.2 + 0.35 * number)
         sigma = _sigmas(model, data, values)
         weights = row_weights(balances, data, values, sigma, data.train)
-        values, used = _steps(balances, data, values, free, limits, sigma, weights, iterations, memory_shapes)
+        values, used = gauss_newton(balances, data, values, free, limits, sigma, weights, iterations, memory_shapes)
     sigma = _sigmas(model, data, values)
     weights = row_weights(balances, data, values, sigma, data.train)
+    tell("standard errors", 0.9)
     return _with_errors(model, balances, data, values, free, limits, weights, sigma, memory_shapes, used)
 
 
@@ -155,7 +173,7 @@ def _best_start(
     bare = balances_of(balances.model, data.sensing, wrt=())
     best: tuple[float, dict[str, float]] | None = None
     for trial in trials:
-        fitted, _ = _steps(balances, data, trial, free, limits, sigma, weights, 6, memory_shapes)
+        fitted, _ = gauss_newton(balances, data, trial, free, limits, sigma, weights, 6, memory_shapes)
         residual = stack(bare, data.train, fitted).residual
         cost = sum(float(np.sum((residual[b] * weights[b]) ** 2)) for b in residual)
         if best is None or cost < best[0]:
@@ -163,7 +181,7 @@ def _best_start(
     return best[1] if best is not None else values
 
 
-def _memory_shapes(model: JointModel, free: Sequence[str]) -> tuple[str, ...]:
+def memory_shapes_of(model: JointModel, free: Sequence[str]) -> tuple[str, ...]:
     """Shape parameters that act through internal states only: differentiated numerically."""
     out = []
     for t in model.terms:
@@ -201,12 +219,32 @@ def _check_moves(balances: Balances, data: Dataset, values: Mapping[str, float],
         raise InputError(f"parameter {', '.join(truly)} moves no output of these records; give it a known value or add the channel that shows it")
 
 
-def _steps(
+def gauss_newton(
     balances: Balances, data: Dataset, values: Mapping[str, float], free: Sequence[str],
     limits: Mapping[str, tuple[float, float]], sigma: Mapping[str, float], weights: Mapping[str, FloatArray],
     iterations: int, memory_shapes: Sequence[str],
 ) -> tuple[dict[str, float], int]:  # fmt: skip
-    """Damped Gauss-Newton with bounds; shape parameters move on a log scale."""
+    """Damped Gauss-Newton with bounds; shape parameters move on a log scale.
+
+    Parameters
+    ----------
+    balances : Balances
+        With a Jacobian column for every one of `free`.
+    data : Dataset
+        Its training records are fitted.
+    values, free, limits
+        Start values of every parameter, the names that move, their bounds.
+    sigma, weights
+        Scale of each balance, and 1/sigma of each row where it is known.
+    iterations : int
+        At most so many.
+    memory_shapes : sequence of str
+        Those of `memory_shapes_of`: differentiated numerically.
+
+    Returns
+    -------
+    values, iterations used
+    """
     now = dict(values)
     parameters = {p.name: p for p in balances.model.parameters}
     logs = np.array([parameters[n].is_shape and parameters[n].scale != "absolute" for n in free])

@@ -51,7 +51,7 @@ def attenuation(data: Dataset) -> dict[str, float]:
     Noise power over power of the averaged signal that the parameter multiplies (errors in variables).
     """
     grid, out = data.train[0].grid, {}
-    if {"motor_position", "link_position"} <= set(data.noise) and not data.sensing.clamped_link:
+    if {"motor_position", "link_position"} <= set(data.noise) and data.sensing.both_positions and not data.sensing.clamped_link:
         torsion = np.concatenate([w.averaged["motor_position"] - w.averaged["link_position"] for w in data.train])
         noise = data.noise["motor_position"] ** 2 + data.noise["link_position"] ** 2
         out["stiffness"] = float(np.sum(differentiated_kernel(grid.length, grid.dt, 0) ** 2)) * noise / max(float(np.var(torsion)), 1e-300)

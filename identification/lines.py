@@ -29,6 +29,8 @@ PASS: Final = 0.8
 """Share of 1/kernel up to which a line counts (the kernel's -3 dB point is 0.93)."""
 
 NAMED_ORDERS: Final = (1.0, 2.0, 4.0)
+NAMED_WITHIN: Final = 0.5
+"""Distance to such an order in units of 2 pi / stroke: orders of lines are found to a tenth of it."""
 
 
 @final
@@ -210,7 +212,7 @@ def _in_balance(balance: str, rows: _Rows, most: int) -> list[Line]:
         if drop is not None and drop <= HELD_OUT_DROP:
             break
         tolerance = 2 * np.pi / stroke
-        named = any(abs(order - o) <= 2 * tolerance for o in NAMED_ORDERS)
+        named = any(abs(order - o) <= NAMED_WITHIN * tolerance for o in NAMED_ORDERS)
         names = ("kinematic_error",) if balance in ("transmission", "deflection") and named else ()
         if balance == "motor":
             names = ("torque_ripple",)

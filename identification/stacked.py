@@ -52,7 +52,9 @@ def floors(model: JointModel, data: Dataset, values: Mapping[str, float], kernel
     balances = balances_of(model, data.sensing, wrt=())
     grid = (kernel_data or data.train[0]).grid
     out = {}
+    curved = balances.curved_coefficients(values)
     for balance, entering in balances.coefficients(values, kernel_data or data.train[0]).items():
+        bent = curved.get(balance, {})
         variance = 0.0
         for source, chain in POSITION_CHAINS.items():
             if source not in data.noise:
@@ -60,6 +62,7 @@ def floors(model: JointModel, data: Dataset, values: Mapping[str, float], kernel
             weights: list[FloatArray] = [
                 entering[n] * differentiated_kernel(grid.length, grid.dt, o) for o, n in enumerate(chain) if n in entering
             ]  # fmt: skip
+            weights += [bent[n] * differentiated_kernel(grid.length, grid.dt, o + 2) for o, n in enumerate(chain) if n in bent]
             if not weights:
                 continue
             size = max(len(w) for w in weights)
@@ -107,11 +110,14 @@ def _standstill(model: JointModel, data: Dataset, values: Mapping[str, float], r
         source = f"{place}_position"
         if not level or source not in data.noise:
             continue
+        lag = values["link_inertia"] * values["load_compliance"] if model.lagging_load else 0.0
         shares = []
         for w in records:
             grid = w.grid
-            slow = 3 * data.noise[source] * grid.velocity_gain(source)
-            shares.append(w.average((np.abs(w.points[f"{place}_velocity"]) < slow).astype(float)))
+            slow = np.abs(w.points[f"{place}_velocity"]) < 3 * data.noise[source] * grid.velocity_gain(source)
+            shares.append(w.average(slow.astype(float)))
+            if lag:
+                shares[-1] = shares[-1] + lag * (np.abs(w.curving) @ slow.astype(float))
         held = level * np.concatenate(shares)
         for b in balances:
             if b in out:

@@ -8,7 +8,7 @@ nonlinear are evaluated at the samples (velocities from a shorter kernel) and th
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Final, final
 
@@ -26,6 +26,8 @@ POSITION_CHAINS: Final = {
     "drive": ("drive", "drive_rate"),
 }
 """Measured signals and the signals that follow from them by derivatives."""
+
+HIGHEST_DERIVATIVE: Final = 4
 
 
 def kernel(length: float, dt: float, order: int = 0) -> FloatArray:
@@ -74,6 +76,7 @@ def differentiated_kernel(length: float, dt: float, order: int) -> FloatArray:
         4 * a * c**3 * s,
         a**2 * (12 * c**2 * s**2 - 4 * c**4),
         a**3 * (24 * c * s**3 - 40 * c**3 * s),
+        a**4 * (24 * s**4 - 192 * c**2 * s**2 + 40 * c**4),
     )
     weights = np.asarray(shapes[order], dtype=float)
     unit = c**4 / np.sum(c**4)
@@ -159,6 +162,8 @@ class WeakRecord:
         First point of each segment.
     masked : set of str
         Balances that these rows do not take part in: those of a link with another payload.
+    curved : mapping of str to (rows,) array
+        Second derivative of the average of every signal where it was asked for.
     """
 
     grid: Grid
@@ -169,6 +174,7 @@ class WeakRecord:
     block: IntArray
     starts: IntArray
     masked: frozenset[str] = frozenset()
+    curved: Mapping[str, FloatArray] = field(default_factory=dict)
 
     def average(self, values: FloatArray) -> FloatArray:
         """Kernel average of values at the points, one row per row.
@@ -183,15 +189,27 @@ class WeakRecord:
         """
         return np.asarray(self.averaging @ values, dtype=np.float64)
 
+    def curve(self, values: FloatArray) -> FloatArray:
+        """Second derivative of the kernel average of values at the points (shapes as in :meth:`average`)."""
+        return np.asarray(self.curving @ values, dtype=np.float64)
+
     @cached_property
     def averaging(self) -> Any:
         """Sparse matrix (rows, points) of the kernel average."""
+        return self._sparse(0)
+
+    @cached_property
+    def curving(self) -> Any:
+        """Sparse matrix (rows, points) of the second derivative of the kernel average."""
+        return self._sparse(2)
+
+    def _sparse(self, order: int) -> Any:
         from scipy.sparse import csr_array
 
         grid = self.grid
         half = grid.half // grid.step
         stride = grid.stride // grid.step
-        weights = differentiated_kernel(grid.length, grid.dt * grid.step, 0)
+        weights = differentiated_kernel(grid.length, grid.dt * grid.step, order)
         own = len(weights) // 2
         centres = np.concatenate([
             np.arange(half, last - first - half, stride) + first
@@ -217,6 +235,7 @@ def prepare(
     block: float = 1.5,
     overlap: int = 4,
     first_block: int = 0,
+    curved: bool = False,
 ) -> WeakRecord:
     """Average a uniformly sampled record with the kernel.
 
@@ -236,6 +255,8 @@ def prepare(
         Length of the blocks that count as independent [s].
     overlap : int
         Rows per kernel length.
+    curved : bool
+        Second derivatives of the averages too.
 
     Returns
     -------
@@ -253,11 +274,14 @@ def prepare(
     averaged: dict[str, FloatArray] = {}
     points: dict[str, FloatArray] = {}
     smooth: dict[str, FloatArray] = {}
+    bent: dict[str, FloatArray] = {}
     for source, chain in POSITION_CHAINS.items():
         if source not in signals:
             continue
         for order, name in enumerate(chain):
             averaged[name] = grid.correlate(signals[source], differentiated_kernel(length, dt, order))
+            if curved and order + 2 <= HIGHEST_DERIVATIVE:
+                bent[name] = grid.correlate(signals[source], differentiated_kernel(length, dt, order + 2))
             points[name], smooth[name] = _pointwise(signals[source], long_enough, short[source], dt, order, step)
     for name, values in (("temperature", signals.get("temperature")), ("time", time)):
         if values is not None:
@@ -269,7 +293,7 @@ def prepare(
     counts = [len(range(0, s.stop - s.start, step)) for s in long_enough]
     return WeakRecord(
         grid, averaged, points, smooth, stamps, np.where(inside, blocks + first_block, -1),
-        np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        np.concatenate([[0], np.cumsum(counts)]).astype(np.int64), curved=bent,
     )  # fmt: skip
 
 

@@ -10,7 +10,8 @@ from typing import Any
 from identification.assess import BalanceError, Error, assess
 from identification.claims import Claim, Ranking, rank
 from identification.engine import Dataset, Solution, load_dataset, solve
-from identification.improve import HOLD_DELAY, Improvement, Step, _Loop, held_drop, visible_keys
+from identification.improve import HOLD_DELAY, Improvement, Loop, Step, held_drop, visible_keys
+from identification.record import Record
 from identification.trials import make_base
 from workbench.app_analysis import Analysis, Progress
 from workbench.session import StepEntry
@@ -19,6 +20,8 @@ from workbench.session import StepEntry
 def improvement_of(analysis: Analysis, entries: Sequence[StepEntry], progress: Progress) -> Improvement:
     """The session's steps as the result of a loop: with rankings, what is left, and a verdict.
 
+    On the samples that the ledger's last step stands on: windows of long records until it was confirmed.
+
     Parameters
     ----------
     analysis : Analysis
@@ -26,22 +29,27 @@ def improvement_of(analysis: Analysis, entries: Sequence[StepEntry], progress: P
         The ledger; a removed effect is left out of the path.
     progress : callable
     """
-    train, held = analysis.split
-    data = analysis.data if analysis.whole else load_dataset(train, held, analysis.joint, analysis.start_model)
+    train, held = records_of(analysis, entries)
+    data = analysis.data if train is analysis.quick[0] else load_dataset(train, held, analysis.joint, analysis.start_model)
     data = replace(data, note=analysis.note)
     progress("fitting the steps", 0.1)
     steps = _steps(analysis, data, entries)
     progress("ranking the library on the start model", 0.25)
     base = make_base(steps[0].solution, data)
-    first = last = rank(base)
+    first = last = rank(base, progress=lambda text, share: progress(f"{text}, start model", 0.25 + 0.25 * share))
     if len(steps) > 1:
         progress("ranking the library on the final model", 0.5)
         base = make_base(steps[-1].solution, data)
-        last = rank(base)
+        last = rank(base, progress=lambda text, share: progress(f"{text}, final model", 0.5 + 0.3 * share))
     named = {e.label: e for e in entries if e.action == "add"}
     claims = [_claim(before, after, first, named.get(after.label)) for before, after in zip(steps[:-1], steps[1:], strict=True)]
-    loop = _Loop(analysis.joint, data, train, held, progress)
-    return loop._finish(first, last, base, claims, steps)
+    loop = Loop(analysis.joint, data, train, held, progress)
+    return loop.finish(first, last, base, claims, steps)
+
+
+def records_of(analysis: Analysis, entries: Sequence[StepEntry]) -> tuple[list[Record], list[Record]]:
+    """Records of the fit and held-out records that the last step of the ledger stands on."""
+    return analysis.split if entries[-1].exact else analysis.quick
 
 
 def _steps(analysis: Analysis, data: Dataset, entries: Sequence[StepEntry]) -> list[Step]:
