@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import sys
 
-from irj_fmu.build import main
+from irj_fmu.build import script
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(script(sys.argv[1:]))

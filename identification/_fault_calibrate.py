@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -64,17 +65,19 @@ def default_limits(core: ObserverCore, settings: FaultSettings) -> list[float]:
     return found
 
 
-def calibrate(rule: StructuredRule, readings: FloatArray) -> None:
-    """Limits, noise of r1 and recovery limits from healthy readings (n, 6)."""
+def calibrate(rule: StructuredRule, pieces: Sequence[FloatArray]) -> None:
+    """Limits, noise of r1 and recovery limits from healthy readings, tables (n, 6) that need not follow each other."""
     core, settings, res = rule.core, rule.settings, rule.residuals
-    if len(readings) < 4 * rule.arm:
-        raise InputError(f"calibrate: {len(readings)} samples; give at least {4 * rule.arm} healthy ones")
-    if not np.isfinite(readings).all():
+    if not all(np.isfinite(p).all() for p in pieces):
         raise InputError("calibrate: the readings hold NaN or infinity; give a healthy record")
-    seen = watch(rule, readings)
+    pieces = [p for p in pieces if len(p) >= 2 * rule.arm] or list(pieces[:1])
+    count = sum(map(len, pieces))
+    if count < 4 * rule.arm:
+        raise InputError(f"calibrate: {count} samples; give at least {4 * rule.arm} healthy ones")
+    seen = watch(rule, pieces)
     if core.has_torque:
         core.tune(max(float(np.sqrt(np.mean(seen[:, 16] ** 2))), float(core.noise[TORQUE])))
-        seen = watch(rule, readings)
+        seen = watch(rule, pieces)
     low = floors(core, settings)
     top = np.max(np.abs(seen[:, :COUNT]), axis=0)
     res.limits = [max(f, settings.margin * float(t)) for f, t in zip(low, top, strict=True)]
@@ -87,8 +90,18 @@ def calibrate(rule: StructuredRule, readings: FloatArray) -> None:
     longest = max(round(WITHOUT_SECONDS / core.dt), 2 * rule.arm)
     for sensor in range(6):
         if sensor != TORQUE or core.has_torque:
-            _without(rule, sensor, readings[-longest:])
+            _without(rule, sensor, _last(pieces, longest))
     rule.reset()
+
+
+def _last(pieces: Sequence[FloatArray], most: int) -> list[FloatArray]:
+    """The last rows of all pieces together."""
+    kept: list[FloatArray] = []
+    for piece in reversed(pieces):
+        if most > 0:
+            kept.insert(0, piece[-most:])
+            most -= len(piece)
+    return kept
 
 
 def energy_peak(values: FloatArray, inverse: float, drift: float) -> float:
@@ -100,33 +113,36 @@ def energy_peak(values: FloatArray, inverse: float, drift: float) -> float:
     return peak
 
 
-def watch(rule: StructuredRule, readings: FloatArray, without: int | None = None) -> FloatArray:
-    """Values of all residuals over healthy readings after the start-up, and one column more.
+def watch(rule: StructuredRule, pieces: Sequence[FloatArray], without: int | None = None) -> FloatArray:
+    """Values of all residuals over healthy readings after the start-up of each piece, and one column more.
 
     With a sensor left out, the last column is how far its reading lies from the estimate.
     """
     res = rule.residuals
     kept = (res.limits, res.inverse, res.energy_limits)
     res.limits, res.inverse = [math.inf] * COUNT, [0.0] * len(res.inverse)
-    rule.reset()
     rule.calibrating = True
-    if without is not None:
-        rule.failed[without] = True
-        rule.exchange([without])
-    out = np.zeros((len(readings), COUNT + 1))
-    for k, row in enumerate(readings):
-        used = rule.update(row.tolist())
-        out[k, :COUNT] = res.values
+    seen = []
+    for readings in pieces:
+        rule.reset()
         if without is not None:
-            out[k, COUNT] = used[without] - row[without]
+            rule.failed[without] = True
+            rule.exchange([without])
+        out = np.zeros((len(readings), COUNT + 1))
+        for k, row in enumerate(readings):
+            used = rule.update(row.tolist())
+            out[k, :COUNT] = res.values
+            if without is not None:
+                out[k, COUNT] = used[without] - row[without]
+        seen.append(out[rule.arm :])
     rule.calibrating = False
     res.limits, res.inverse, res.energy_limits = kept
-    return out[rule.arm :]
+    return np.concatenate(seen)
 
 
-def _without(rule: StructuredRule, sensor: int, readings: FloatArray) -> None:
+def _without(rule: StructuredRule, sensor: int, pieces: Sequence[FloatArray]) -> None:
     """What healthy readings give while one of them is replaced: recovery limit, and wider residual limits."""
-    seen = np.max(np.abs(watch(rule, readings, sensor)), axis=0)
+    seen = np.max(np.abs(watch(rule, pieces, sensor)), axis=0)
     limits, margin = rule.residuals.limits, rule.settings.margin
     rule.recover_limits[sensor] = max(margin * float(seen[COUNT]), 6.0 * float(rule.core.noise[sensor]))
     for i in range(5):

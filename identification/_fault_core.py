@@ -26,6 +26,8 @@ NOISE: Final[Mapping[str, float]] = {
 link encoder 0.0036 deg, torque sensor 50 mNm); current: 15 bit over about 650 N.m; velocities are not printed there
 and are assumed."""
 
+ABSURD: Final = 1e9
+"""A reading beyond this (SI) counts as missing, as NaN and infinity do."""
 DISTURBANCE: Final = (50.0, 15.0)
 """Random walk of the unknown torque on motor and link that the observer allows [N.m/sqrt(s)]."""
 GATE: Final = 5.0
@@ -52,7 +54,7 @@ class ObserverCore:
         self._values = np.array(model.value_vector())
         self._substeps = self._choose_substeps()
         self.link_gain, self.motor_gain = self._link_gain(), self._motor_gain()
-        self._step, self._function = self._symbolic()
+        self._step, self.function = self._symbolic()
         self.torque_deviation = max(float(noise["torque"]), 1.0)
         self._gains: dict[tuple[bool, ...], FloatArray] = {}
         self.state = np.zeros(self.size)
@@ -60,8 +62,8 @@ class ObserverCore:
         self.used = np.ones(6)
         self.gain = np.zeros((5, self.size))
         self.gate = np.zeros(5)
-        self.out = np.zeros(self._function.size1_out(0))
-        self._buffer, self._trigger = self._function.buffer()
+        self.out = np.zeros(self.function.size1_out(0))
+        self._buffer, self._trigger = self.function.buffer()
         for i, item in enumerate((self.state, self.readings, self.used, self.gain, self.gate)):
             self._buffer.set_arg(i, item.data)
         self._buffer.set_res(0, self.out.data)
@@ -141,12 +143,12 @@ class ObserverCore:
         innovation = deviations.copy()
         innovation[1] *= 3.0
         innovation[3] *= 3.0
-        self._gates = GATE * innovation
-        self.gate[:] = self._gates
+        self.gates = GATE * innovation
+        self.gate[:] = self.gates
 
     def open_gates(self, is_open: bool) -> None:
         """Take innovations whole (after a replacement, so that the estimate settles), or cut them again."""
-        self.gate[:] = 1e9 if is_open else self._gates
+        self.gate[:] = 1e9 if is_open else self.gates
 
     def tune(self, torque_deviation: float) -> None:
         """Take the deviation of torque reading less spring torque from healthy data; gains follow."""

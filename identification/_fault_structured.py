@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Final, final
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy.typing as npt
 
 from identification._fault_calibrate import calibrate, default_limits, default_recovery
 from identification._fault_core import (
-    CURRENT,
+    ABSURD,
     LINK_POSITION,
     LINK_VELOCITY,
     MOTOR_POSITION,
@@ -28,23 +29,21 @@ from identification._fault_residuals import (
     MOTOR,
     MOTOR_JUMP,
     MOTOR_PARITY,
+    PARITY_SENSORS,
     TORSION,
     Residuals,
 )
+from identification._fault_return import begin_anew, take_back
 from identification._fault_types import FaultEvent, FaultSettings, Verdict
 
 FloatArray = npt.NDArray[np.float64]
 
-PARITY_SENSORS: Final = (
-    (LINK_POSITION, LINK_VELOCITY), (MOTOR_POSITION, MOTOR_VELOCITY), (LINK_VELOCITY, TORQUE),
-    (MOTOR_VELOCITY, TORQUE, CURRENT), (TORQUE, MOTOR_POSITION, LINK_POSITION),
-)  # fmt: skip
 _BITS: Final = tuple(BIT_NAMES)
-_MOVED: Final = (20.0, 2e-3, 2e-2, 2e-3, 2e-2, 10.0)
+_PLACE: Final = {bit: i for i, bit in enumerate(_BITS)}
+_PLACES: Final = [tuple(i for i, bit in enumerate(_BITS) if bits & bit) for bits in range(1 << len(_BITS))]
+"""Places of the bits that are set, for each set of bits."""
+MOVED: Final = (20.0, 2e-3, 2e-2, 2e-3, 2e-2, 10.0)
 """A sensor is taken back only after its estimate has moved by this much, so that a stuck one is not taken back."""
-_ABSURD: Final = 1e9
-_LARGEST: Final = 1e6
-"""A reading beyond this is no place to start an estimate from."""
 
 
 @final
@@ -54,7 +53,7 @@ class StructuredRule:
     def __init__(self, core: ObserverCore, settings: FaultSettings) -> None:
         self.core, self.settings = core, settings
         dt = core.dt
-        self.residuals = Residuals(dt, settings, has_torque=core.has_torque)
+        self.residuals = Residuals(core, settings)
         self.arm = max(2, round(settings.arm_seconds / dt))
         self.waits = {
             name: max(1, round(getattr(settings, name) / dt))
@@ -83,106 +82,90 @@ class StructuredRule:
         self.muted = 0
         self.good = [0] * 6
         self.low, self.high = [math.inf] * 6, [-math.inf] * 6
+        self.lost, self.there = [False] * 6, 0
         self.gate_until, self.cut = -1, 0
         self._use((True,) * 5 + (self.core.has_torque,))
 
     def _use(self, used: tuple[bool, ...]) -> None:
         self.core.set_used(used)
         self.gates: list[float] = [g if u else math.inf for g, u in zip(self.core.gate.tolist(), used[1:], strict=True)]
+        self.residuals.judged[:] = self.gates
 
-    def calibrate(self, readings: FloatArray) -> None:
-        """Limits, noise of r1 and recovery limits from healthy readings (n, 6)."""
-        calibrate(self, readings)
+    def scores(self) -> list[float]:
+        """For each reading, the largest residual that holds it over its limit; at least 1 where it has failed."""
+        return [max(1.0, share) if failed else share for share, failed in zip(self.residuals.shares, self.failed, strict=True)]
+
+    def calibrate(self, pieces: Sequence[FloatArray]) -> None:
+        """Limits, noise of r1 and recovery limits from healthy readings, tables (n, 6) that need not follow each other."""
+        calibrate(self, pieces)
 
     # --- one sample --------------------------------------------------------------------------------------------------
 
     def update(self, reading: list[float]) -> list[float]:
         """One sample; gives the six readings with failed ones replaced."""
-        core = self.core
-        if self.k < 0 and not any(-_ABSURD < value < _ABSURD for value in reading):
+        a, b, c, d, e, f = reading
+        top = ABSURD  # NaN and infinity are beyond it too
+        missing = not (-top < a < top and -top < b < top and -top < c < top and -top < d < top and -top < e < top and -top < f < top)
+        if missing and self.k < 0 and not any(-top < value < top for value in reading):
             return [0.0] * 6  # nothing has been read yet
         self.k = k = self.k + 1
-        if k == 0:
-            core.start(np.array(reading))
-        missing = False
-        for value in reading:
-            if not -_ABSURD < value < _ABSURD:  # NaN, infinity
-                missing = True
-        if missing:
+        if missing or True in self.lost:
             reading = self._fill(reading)
-        core.readings[:] = reading
-        out = core.advance()
-        total = sum(out)
+        if k == 0:
+            self.core.start(np.array(reading))
+        a, b, c, d, e, f, over, locked, total = self.residuals.step(k, reading)
         if total - total != 0.0:  # NaN or infinity
-            return self._begin_anew(reading)
-        n = core.size
+            return begin_anew(self, reading)
         if k == self.gate_until:
-            core.open_gates(False)
+            self.core.open_gates(False)
             self.gate_until = -1
         elif self.gate_until < 0 and not self.latched:
-            self._unlock(out)
-        used = out[n : n + 6]
-        drive, qm, vm, ql, vl, torque = used
-        motor, link, sprung = out[n + 11 : n + 14]
-        bits = self.residuals.step(k, (ql, qm, vl, vm), (vl, vm, link, motor), torque - sprung)
-        if k < self.arm:
-            return used
-        if k == self.arm:
+            self._unlock(locked=locked != 0.0)
+        used = [a, b, c, d, e, f]
+        if k <= self.arm:
+            if k < self.arm:
+                return used
             self.events.append(FaultEvent(k, k, Verdict.ARMED, (), ()))
-        if bits or self.latched:
+        if over or self.latched:
+            bits = int(over)
             self._suspect(bits & ~self.muted, bits)
-        if True in self.failed and not self.calibrating:
-            self._watch_recovery(reading, out)
-        if self.latched or True in self.failed:
-            return self._replaced(used, out)
+        is_failed = True in self.failed
+        if is_failed and not self.calibrating:
+            self._watch_recovery(reading, used)
+        if self.latched or is_failed:
+            return self._replaced(used, locked=locked != 0.0)
         return used
 
-    def _begin_anew(self, reading: list[float]) -> list[float]:
-        """Absurd readings have driven the estimate out of all bounds: start it and the residuals again."""
-        usable = [value if -_LARGEST < value < _LARGEST else 0.0 for value in reading]
-        self.core.start(np.array(usable))
-        scale = self.residuals.scale
-        self.residuals.clear()
-        self.residuals.scale = scale
-        for parity in range(len(PARITY_SENSORS)):
-            self.residuals.invalidate(parity, self.k + 1 + self.waits["settle_seconds"])
-        self._open_gates()
-        self._close()
-        return [u if failed else r for u, r, failed in zip(usable, reading, self.failed, strict=True)]
-
-    def _replaced(self, used: list[float], out: list[float]) -> list[float]:
+    def _replaced(self, used: list[float], *, locked: bool) -> list[float]:
         """Readings to go on with: estimates for failed sensors, and for doubtful ones while a suspicion is open."""
-        n, gate = self.core.size, self.gates
+        out, n, gate = self.core.out, self.core.size, self.gates
+        doubt = self.latched and locked
         for s in range(1, 6):
-            doubtful = self.latched and not -gate[s - 1] <= out[n + 5 + s] <= gate[s - 1]
-            if self.failed[s] or doubtful:
-                used[s] = out[n + 13 + s]
+            if self.failed[s] or (doubt and not -gate[s - 1] <= out[n + 5 + s] <= gate[s - 1]):
+                used[s] = float(out[n + 13 + s])
         return used
 
-    def _unlock(self, out: list[float]) -> None:
+    def _unlock(self, *, locked: bool) -> None:
         """Cut innovations must not hold the estimate off for long without a suspicion."""
-        a, b, c, d, e = out[self.core.size + 6 : self.core.size + 11]
-        ga, gb, gc, gd, ge = self.gates
-        if -ga <= a <= ga and -gb <= b <= gb and -gc <= c <= gc and -gd <= d <= gd and -ge <= e <= ge:
-            self.cut = 0
-            return
-        self.cut += 1
+        self.cut = self.cut + 1 if locked else 0
         if self.cut > self.waits["unlock"]:
-            self._open_gates()
+            self.open_gates()
 
-    def _open_gates(self) -> None:
+    def open_gates(self) -> None:
         self.core.open_gates(True)
         self.gate_until = self.k + self.waits["settle_seconds"]
         self.cut = 0
 
     def _fill(self, reading: list[float]) -> list[float]:
         """Missing readings: the sensor fails at once."""
-        gone = [i for i, v in enumerate(reading) if not -_ABSURD < v < _ABSURD]
+        gone = [i for i, v in enumerate(reading) if not -ABSURD < v < ABSURD]
         fresh = [i for i in gone if not self.failed[i] and not (i == TORQUE and not self.core.has_torque)]
         if fresh:
             self._fail(fresh, Verdict.DROPOUT, self.k)
         for i in gone:
             self.good[i] = 0
+        if True in self.lost:
+            take_back(self, reading, gone)
         return [0.0 if i in gone else v for i, v in enumerate(reading)]
 
     # --- isolation ---------------------------------------------------------------------------------------------------
@@ -195,23 +178,22 @@ class StructuredRule:
             if not self.latched:
                 self.opened = k
                 self.peak = 0.0
-            for i, bit in enumerate(_BITS):
-                if bits & bit:
-                    self.latest[i] = k
-                    if not self.latched & bit:
-                        self.first[i] = k
+            for i in _PLACES[bits]:
+                self.latest[i] = k
+            for i in _PLACES[bits & ~self.latched]:
+                self.first[i] = k
             self.latched |= bits
         if bits & TORSION:
-            self.peak = max(self.peak, abs(self.residuals.values[16]) / self.residuals.limits[16])
+            self.peak = max(self.peak, self.residuals.torsion)
         if self.latched:
             self._decide()
 
     def _age(self, bit: int) -> int:
         """Samples since a residual first passed its limit in this suspicion; -1 if it did not."""
-        return self.k - self.first[_BITS.index(bit)] if self.latched & bit else -1
+        return self.k - self.first[_PLACE[bit]] if self.latched & bit else -1
 
     def _since(self, bit: int) -> int:
-        return self.k - self.latest[_BITS.index(bit)]
+        return self.k - self.latest[_PLACE[bit]]
 
     def _decide(self) -> None:
         waits, latched = self.waits, self.latched
@@ -228,13 +210,15 @@ class StructuredRule:
         if found:
             self._fail(found, Verdict.SENSOR, self.opened)
             return
-        if parity and min(self._since(b) for b in (LINK_PARITY, MOTOR_PARITY) if parity & b) <= waits["quiet_seconds"]:
+        if parity and self.k - max([self.latest[i] for i in _PLACES[parity]]) <= waits["quiet_seconds"]:
             return
         self._decide_plant()
 
     def _side(self, parity: int, jump: int, position: int, velocity: int) -> list[int]:
         """Position, velocity or both of one side."""
         latched, wait = self.latched, self.waits["link_wait"]
+        if not latched & (parity | jump):
+            return []
         torsion = bool(latched & TORSION) if self.core.has_torque else bool(latched & LINK and latched & MOTOR)
         jumped = bool(latched & jump) and not self.failed[velocity] and self._age(jump) >= wait
         if latched & parity and self._age(parity) >= wait:
@@ -270,9 +254,9 @@ class StructuredRule:
     def _decide_plant(self) -> None:
         """What none of the sensors explains."""
         waits, latched, k = self.waits, self.latched, self.k
-        recent = max(k - self._since(b) for b in _BITS if latched & b)
+        recent = max([self.latest[i] for i in _PLACES[latched]])
         if k - recent > waits["quiet_seconds"]:
-            self._close()
+            self.close()
             return
         motor_only = latched & (MOTOR | MOTOR_JUMP) and not latched & ~(MOTOR | MOTOR_JUMP)
         if motor_only:
@@ -294,12 +278,12 @@ class StructuredRule:
         self.events.append(FaultEvent(self.k, self.opened, verdict, parts, self._names()))
         self.muted |= self.latched & (TORSION | LINK | MOTOR | LINK_JUMP | MOTOR_JUMP)
         self.plant_rest = self.k + self.waits["plant_rest_seconds"]
-        self._close()
+        self.close()
 
     def _names(self) -> tuple[str, ...]:
         return tuple(name for bit, name in BIT_NAMES.items() if self.latched & bit)
 
-    def _close(self) -> None:
+    def close(self) -> None:
         self.latched, self.opened = 0, -1
 
     # --- replacement and recovery ------------------------------------------------------------------------------------
@@ -309,6 +293,7 @@ class StructuredRule:
         self.events.append(FaultEvent(self.k, max(first, 0), verdict, names, self._names()))
         for s in sensors:
             self.failed[s] = True
+            self.lost[s] = verdict is Verdict.DROPOUT
             self.good[s] = 0
             self.low[s], self.high[s] = math.inf, -math.inf
         self.exchange(sensors)
@@ -324,28 +309,27 @@ class StructuredRule:
             self.residuals.scale[i] = 1.0 / (max(wide) * 1.5 ** (len(wide) - 1)) if wide else 1.0
         if any(self.failed[s] for s in PARITY_SENSORS[4]):
             self.residuals.scale[4] = 0.0  # r1 compares the estimate with itself
-        self._open_gates()
-        self._close()
+        self.open_gates()
+        self.close()
 
-    def _watch_recovery(self, reading: list[float], out: list[float]) -> None:
+    def _watch_recovery(self, reading: list[float], used: list[float]) -> None:
         """A failed sensor that agrees with the estimate over a moving stretch is used again."""
         back = []
-        n = self.core.size
         for s in range(6):
             if not self.failed[s]:
                 continue
-            estimate = out[n + s]
+            estimate = used[s]
             if abs(reading[s] - estimate) <= self.recover_limits[s] and reading[s] != 0.0:
                 self.good[s] += 1
                 self.low[s], self.high[s] = min(self.low[s], estimate), max(self.high[s], estimate)
-                if self.good[s] >= self.waits["recover_seconds"] and self.high[s] - self.low[s] > _MOVED[s]:
+                if self.good[s] >= self.waits["recover_seconds"] and self.high[s] - self.low[s] > MOVED[s]:
                     back.append(s)
             else:
                 self.good[s] = 0
                 self.low[s], self.high[s] = math.inf, -math.inf
         if back:
             for s in back:
-                self.failed[s] = False
+                self.failed[s] = self.lost[s] = False
             names = tuple(SENSORS[s] for s in back)
             self.events.append(FaultEvent(self.k, self.k, Verdict.RECOVERED, names, ()))
             self.exchange(back)
@@ -354,10 +338,10 @@ class StructuredRule:
 
     def numbers(self) -> list[float]:
         """Everything that changes, limits included, as floats."""
-        counters = [self.k, self.latched, self.opened, self.plant_rest, self.muted, self.gate_until, self.cut]
+        counters = [self.k, self.latched, self.opened, self.plant_rest, self.muted, self.gate_until, self.cut, self.there]
         res = self.residuals
         return [
-            *map(float, counters), self.peak, self.core.torque_deviation, *map(float, self.failed),
+            *map(float, counters), self.peak, self.core.torque_deviation, *map(float, self.failed), *map(float, self.lost),
             *map(float, self.first), *map(float, self.latest), *map(float, self.good), *self.low, *self.high,
             *self.recover_limits, *(v for row in self.widening for v in row), *res.limits,
             *res.inverse, *res.energy_limits, *self.core.state.tolist(),
@@ -374,10 +358,10 @@ class StructuredRule:
             return numbers[at - count : at]
 
         self.residuals.clear()
-        counters = [int(v) for v in take(7)]
-        self.k, self.latched, self.opened, self.plant_rest, self.muted, self.gate_until, self.cut = counters
+        counters = [int(v) for v in take(8)]
+        self.k, self.latched, self.opened, self.plant_rest, self.muted, self.gate_until, self.cut, self.there = counters
         self.peak, deviation = take(2)
-        self.failed = [v != 0.0 for v in take(6)]
+        self.failed, self.lost = [v != 0.0 for v in take(6)], [v != 0.0 for v in take(6)]
         self.first, self.latest = [int(v) for v in take(len(_BITS))], [int(v) for v in take(len(_BITS))]
         self.good = [int(v) for v in take(6)]
         self.low, self.high, self.recover_limits = take(6), take(6), take(6)

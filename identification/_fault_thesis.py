@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, final
 
@@ -9,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from identification._fault_core import (
+    ABSURD,
     LINK_POSITION,
     LINK_VELOCITY,
     MOTOR_POSITION,
@@ -21,7 +23,6 @@ from identification.errors import InputError
 
 FloatArray = npt.NDArray[np.float64]
 
-_ABSURD = 1e9
 
 
 @final
@@ -139,7 +140,7 @@ class ThesisRule:
         self.k = k = self.k + 1
         if k == 0:
             self.core.start(np.array(reading))
-        missing = [not -_ABSURD < v < _ABSURD for v in reading]
+        missing = [not -ABSURD < v < ABSURD for v in reading]
         clean = [0.0 if m else v for v, m in zip(reading, missing, strict=True)]
         predicted = self._predict(clean)
         out = list(reading)
@@ -174,18 +175,19 @@ class ThesisRule:
             self.plant = True
             self.events.append(FaultEvent(self.k, self.k, Verdict.PLANT, ("model",), ("4.6",)))
 
-    def calibrate(self, readings: FloatArray) -> None:
-        """Limits of (4.7) and (4.8) from healthy readings (n, 6)."""
-        self.reset()
+    def calibrate(self, pieces: Sequence[FloatArray]) -> None:
+        """Limits of (4.7) and (4.8) from healthy readings, tables (n, 6) that need not follow each other."""
         worst = [[0.0, 0.0], [0.0, 0.0]]
-        for row in readings.tolist():
-            self.k += 1
-            if self.k == 0:
-                self.core.start(np.array(row))
-            errors = self._errors(row, self._predict(row))
-            if self.k >= self.arm:
-                for i, pair in enumerate(errors):
-                    worst[i] = [max(a, b) for a, b in zip(worst[i], pair, strict=True)]
+        for readings in pieces:
+            self.reset()
+            for row in readings.tolist():
+                self.k += 1
+                if self.k == 0:
+                    self.core.start(np.array(row))
+                errors = self._errors(row, self._predict(row))
+                if self.k >= self.arm:
+                    for i, pair in enumerate(errors):
+                        worst[i] = [max(a, b) for a, b in zip(worst[i], pair, strict=True)]
         margin = self.settings.margin
         if self.settings.tolerance is None:
             self.limits = [margin * w[0] for w in worst]

@@ -70,6 +70,7 @@ class BoxTree:
 
     def __init__(self, evaluate: Evaluator, lists: list[Vector], start: list[int], last_level: int) -> None:
         self._evaluate = evaluate
+        self._known = evaluate.known
         self._lists = lists
         self._start = start
         self._last = last_level
@@ -313,7 +314,10 @@ class BoxTree:
             place = end if place < end else start if place > start else place
         if place == start or start + 0.1 * (place - start) == start:
             return False
-        f, found = box[0], self._evaluate.inside(box[_HEAD:at_x] + (place,) + box[at_x + 1 : self._y])
+        point = box[_HEAD:at_x] + (place,) + box[at_x + 1 : self._y]
+        f, found = box[0], self._known.get(point)
+        if found is None:
+            found = self._evaluate.inside(point)
         here_better = f <= found
         part = GOLDEN if here_better else 1.0 - GOLDEN
         cut = start + part * (place - start)

@@ -40,7 +40,8 @@ class Evaluator:
         self.high = high
         self._target = target
         self._limit = max_evaluations
-        self._known: dict[tuple[float, ...], float] = {}
+        self.known: dict[tuple[float, ...], float] = {}
+        """Value of every point asked for so far."""
         self._failed: set[tuple[float, ...]] = set()
         self._worst = -math.inf
         self.count = 0
@@ -55,7 +56,7 @@ class Evaluator:
 
     def inside(self, key: tuple[float, ...]) -> float:
         """Return the objective at a point that is known to lie in the box."""
-        known = self._known.get(key)
+        known = self.known.get(key)
         if known is not None:
             return known
         value = self._call(key)
@@ -71,7 +72,7 @@ class Evaluator:
                 self.best = value
                 self.best_x = list(key)
                 self.best_sweep = self.sweep
-        self._known[key] = value
+        self.known[key] = value
         if self.best <= self._target:
             raise SearchStopped(MCSOutcome.TARGET)
         if self.count >= self._limit:

@@ -359,7 +359,7 @@ def from_joint(model: JointModel, signals: FloatArray) -> SeparableModel:
     coefficients = tuple(n for n in model.linear_parameters if not (model.is_elastic and n == "link_inertia"))
     at = {p.name: p for p in model.parameters}
     nuisance = [n for n in model.parameter_names if n not in model.linear_parameters]
-    shapes = [_joint_shape(model, n, signals) for n in nuisance]
+    shapes = [joint_shape(model, n, signals) for n in nuisance]
     s, eta = ca.SX.sym("s", len(JOINT_CHANNELS)), ca.SX.sym("eta", len(shapes))
     values = model.value_vector()
     p = ca.vertcat(*(eta[nuisance.index(n)] if n in nuisance else v for n, v in zip(at, values, strict=True)))
@@ -376,7 +376,7 @@ def from_joint(model: JointModel, signals: FloatArray) -> SeparableModel:
     return from_casadi(function, declared, shapes, JOINT_CHANNELS)
 
 
-def _joint_shape(model: JointModel, name: str, signals: FloatArray) -> Shape:
+def joint_shape(model: JointModel, name: str, signals: FloatArray) -> Shape:
     """Search box of a shape parameter: its grid, widened, in units of the signal it is a fraction of."""
     p = next(q for q in model.parameters if q.name == name)
     reference = {

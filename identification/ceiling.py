@@ -101,9 +101,9 @@ class Ceiling:
         """What the two figures say together, a sentence."""
         physical, linear = 100.0 - self.physical_vaf_percent, max(100.0 - self.vaf_percent, self.noise_percent)
         if physical > ALIKE * linear:
-            return "A linear model without physics leaves less unexplained: something linear is missing in the physical model."
+            return "A linear model without physics leaves less of the variance unexplained: something linear is missing in the physical model."
         if ALIKE * physical < linear:
-            return "The physical model leaves less unexplained than any of them: its nonlinear laws earn their place."
+            return "The physical model leaves less of the variance unexplained than any of them: its nonlinear laws earn their place."
         return "The physical model explains as much as a linear one can; what is left is noise or nonlinear."
 
     def as_json(self) -> dict[str, Any]:
@@ -119,8 +119,9 @@ class Ceiling:
         each = ", ".join(f"{b} {left(c.vaf_percent)} against {left(c.physical_vaf_percent)} %" for b, c in self.balances.items())
         seen = "records neither was fitted to" if self.unseen else "records both were fitted to"
         return (
-            f"linear ceiling: the best of {self.tried} linear models without physics leaves {left(self.vaf_percent)} % of the torque "
-            f"unexplained, this model {left(self.physical_vaf_percent)} % ({each}; {rows}, {seen})"
+            f"linear ceiling: the best of {self.tried} linear models without physics leaves {left(self.vaf_percent)} % of the torque's "
+            f"variance unexplained, this model {left(self.physical_vaf_percent)} % (shares of variance, the square of a relative error: {each}; "
+            f"{rows}, {seen})"
         )
 
 
@@ -256,9 +257,9 @@ def ceiling_html(found: Ceiling) -> str:
     rows = [cells(f"{text(b)} balance", c, text(c.model)) for b, c in found.balances.items()]
     rows.append(cells("all", found, "–"))
     of = f"{found.rows} of {found.all_rows}" if found.rows < found.all_rows else str(found.rows)
-    head = ["balance", "this model leaves", "best linear model leaves", "noise alone leaves", "best linear model"]
+    head = ["balance", "variance this model leaves", "variance the best linear model leaves", "variance noise alone leaves", "best linear model"]
     caption = (
-        f"Variance of the measured torque left unexplained, {'unseen' if found.unseen else 'training'} records, {of} rows; "
-        f"{found.tried} linear models fitted to {found.fit_rows} training rows"
+        "Share of the variance of the measured torque left unexplained (the square of a relative error), "
+        f"{'unseen' if found.unseen else 'training'} records, {of} rows; {found.tried} linear models fitted to {found.fit_rows} training rows"
     )
     return f"<p>{text(found.meaning)}</p>{table(head, rows, caption)}"

@@ -295,8 +295,14 @@ def _fitting(unit: Any, wanted: str, counts: float | None, channel: str) -> str:
     try:
         check_unit(unit, wanted, counts, channel)
     except InputError as error:
-        raise InputError(f"[columns] {error}") from None
+        raise InputError(f"[columns] {error}{_other_kind(unit, wanted, channel)}") from None
     return unit
+
+
+def _other_kind(unit: str, wanted: str, channel: str) -> str:
+    """A hint where the unit is that of the channel of the other kind of axis."""
+    other = "linear" if channel_unit(channel, "rotary") == wanted else "rotary"
+    return f"; for a {other} axis give kind = {other!r} in [joint] first" if header_unit(unit.replace("/", "_"), channel_unit(channel, other)) else ""
 
 
 def _number(table: Mapping[str, Any], key: str, where: str) -> float | None:

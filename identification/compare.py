@@ -62,9 +62,9 @@ class Comparison:
 
     def _repr_html_(self) -> str:
         from identification.ceiling import ceiling_html
-        from identification.html import comparison_html
+        from identification.html import comparison_html, spaced
 
-        return comparison_html(self) + (f"<div>{ceiling_html(self.linear)}</div>" if self.linear else "")
+        return comparison_html(self) + (spaced(f"<div>{ceiling_html(self.linear)}</div>") if self.linear else "")
 
 
 def compare(fitted: Fit, records: Record | Sequence[Record], *, linear: bool = True) -> Comparison:

@@ -12,17 +12,19 @@ import numpy as np
 import numpy.typing as npt
 
 from casadi_models import JointModel
-from identification._fault_core import NOISE, SENSORS, ObserverCore
+from identification._fault_core import ABSURD, NOISE, SENSORS, ObserverCore
 from identification._fault_reconfigure import Reconfiguration
-from identification._fault_structured import StructuredRule
+from identification._fault_residuals import PARITY_SENSORS
+from identification._fault_structured import MOVED, StructuredRule
+from identification._fault_tables import DetectorTables
 from identification._fault_thesis import Predictor, ThesisRule, ThesisSettings
 from identification._fault_types import FaultEvent, FaultSettings, FaultTrack, Verdict
 from identification.errors import InputError
 from identification.fault_injector import ABRUPT, KINDS, Fault, inject
 
 __all__ = [
-    "ABRUPT", "KINDS", "NOISE", "SENSORS", "Fault", "FaultDetector", "FaultEvent", "FaultSettings", "FaultTrack",
-    "Reconfiguration", "ThesisSettings", "Verdict", "inject",
+    "ABRUPT", "ABSURD", "KINDS", "MOVED", "NOISE", "PARITY_SENSORS", "SENSORS", "DetectorTables", "Fault", "FaultDetector", "FaultEvent",
+    "FaultSettings", "FaultTrack", "Reconfiguration", "ThesisSettings", "Verdict", "inject",
 ]  # fmt: skip
 
 FloatArray = npt.NDArray[np.float64]
@@ -92,15 +94,30 @@ class FaultDetector:
         self._reported = 0
         self.on_event: Callable[[FaultEvent], object] | None = None
 
-    def calibrate(self, readings: npt.ArrayLike) -> None:
-        """Take the limits from healthy readings (n, 6), several representative motions, a minute or more."""
-        found = _table(readings, "calibrate")
+    def compile(self) -> bool:
+        """Load the compiled form of a sample now, building it where needed; the numbers stay the same bit by bit.
+
+        Returns
+        -------
+        bool
+            False where it stays interpreted: without a C compiler, and for the thesis rule.
+        """
+        return isinstance(self._rule, StructuredRule) and not self._rule.residuals.compile()
+
+    def calibrate(self, readings: npt.ArrayLike | Sequence[FloatArray]) -> None:
+        """Take the limits from healthy readings (n, 6), several representative motions, a minute or more.
+
+        A list of tables is one of recordings that do not follow each other: the detector starts anew with each.
+        """
+        several = isinstance(readings, list | tuple) and all(isinstance(r, np.ndarray) and r.ndim == 2 for r in readings)
+        pieces = [_table(r, "calibrate") for r in (readings if several else [readings])]  # type: ignore[union-attr]
+        found = np.concatenate(pieces)
         core = self._rule.core
         for i, name in enumerate(SENSORS):
             least = _MOTION * float(core.noise[i]) if name.endswith("position") else 0.0
             if len(found) >= 4 * self._rule.arm and np.ptp(found[:, i]) <= least and (name != "torque" or core.has_torque):
                 raise InputError(f"calibrate: {name} does not move; give a healthy record in which the joint moves and every sensor works")
-        self._rule.calibrate(found)
+        self._rule.calibrate(pieces)
         self._reported = 0
 
     def update(self, readings: Sequence[float]) -> list[float]:
@@ -142,6 +159,42 @@ class FaultDetector:
     def events(self) -> tuple[FaultEvent, ...]:
         """All events so far."""
         return tuple(self._rule.events)
+
+    @property
+    def last_event(self) -> FaultEvent | None:
+        """The newest event; None before the first one."""
+        events = self._rule.events
+        return events[-1] if events else None
+
+    @property
+    def sample(self) -> int:
+        """Number of the newest sample, from 0 on; -1 before the first one."""
+        return self._rule.k
+
+    def scores(self) -> list[float]:
+        """For each sensor, the largest residual that holds it over its limit; at least 1 where it has failed.
+
+        Zeros with the thesis rule.
+        """
+        return self._rule.scores() if isinstance(self._rule, StructuredRule) else [0.0] * len(SENSORS)
+
+    def scale_limits(self, factor: float) -> None:
+        """Multiply the limits of the residuals; nothing with the thesis rule."""
+        if isinstance(self._rule, StructuredRule):
+            residuals = self._rule.residuals
+            residuals.limits = [limit * factor for limit in residuals.limits]
+
+    def tables(self) -> DetectorTables:
+        """What a copy of the detector in another language is made of.
+
+        Raises
+        ------
+        InputError
+            With the thesis rule.
+        """
+        if not isinstance(self._rule, StructuredRule):
+            raise InputError("FaultDetector.tables: only the structured rule has tables; use method='structured'")
+        return DetectorTables.of(self._rule)
 
     @property
     def armed(self) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Literal, final
@@ -58,6 +59,12 @@ class Fault:
             raise InputError(f"fault: unknown sensor {self.sensor!r}; use one of {', '.join(SENSORS)}")
         if self.kind not in KINDS:
             raise InputError(f"fault: unknown kind {self.kind!r}; use one of {', '.join(KINDS)}")
+        if not (math.isfinite(self.start) and math.isfinite(self.size)) or math.isnan(self.end):
+            raise InputError(f"fault: start {self.start:g} s, size {self.size:g}, end {self.end:g} s; give finite numbers")
+        if self.start < 0:
+            raise InputError(f"fault: it starts at {self.start:g} s; give 0 s or later")
+        if (self.kind == "noise" and self.size < 0) or (self.kind == "delay" and self.size <= 0):
+            raise InputError(f"fault: {self.kind} of size {self.size:g}; give a size above 0, {'[s]' if self.kind == 'delay' else 'its standard deviation'}")
         if not self.start < self.end:
             raise InputError(f"fault: it starts at {self.start} s and ends at {self.end} s; give start < end")
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import html
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
@@ -69,6 +70,11 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], caption: str, *, c
     return f"<table{shape}><caption>{caption}</caption><thead><tr>{top}</tr></thead><tbody>{''.join(body)}</tbody></table>"
 
 
+def spaced(fragment: str) -> str:
+    """The fragment for a notebook, whose styles may set no space between the cells of a table."""
+    return re.sub(r"<(td|th)( [^>]*)?>", lambda m: f'<{m[1]}{m[2] or ""} style="padding:0.15em 0.7em;text-align:left">', fragment)
+
+
 def title_of(key: str) -> str:
     """Title of an effect of the library (the key as words where it is not in it), escaped."""
     from casadi_models import EFFECTS
@@ -78,10 +84,15 @@ def title_of(key: str) -> str:
 
 def verdict_html(result: Mapping[str, Any], level: int = 2) -> str:
     """Headline and sentence of an `improve --json` result."""
-    headline = HEADLINES.get(result["verdict"], words(result["verdict"]))
+    reason = text(result.get("reason", "")).replace(" %", "&nbsp;%")
+    return f"<h{level}>{text(headline(result))}</h{level}><p>{reason}</p>"
+
+
+def headline(result: Mapping[str, Any]) -> str:
+    """The verdict of an `improve --json` result in a few words."""
     if result["verdict"] == "unexplained" and result["claims"]:
-        headline = "Found a part of what is missing; something is left"
-    return f"<h{level}>{text(headline)}</h{level}><p>{text(result.get('reason', ''))}</p>"
+        return "Found a part of what is missing; something is left"
+    return HEADLINES.get(result["verdict"], words(result["verdict"]))
 
 
 def _ratios(balances: Mapping[str, Mapping[str, Any]], names: Sequence[str]) -> list[str]:
@@ -246,7 +257,7 @@ def fit_html(fit: Fit) -> str:
     out = error_html(fit.train.as_json(), f"{text(fit.joint.name)}, training records")
     if fit.held_out is not None:
         out += error_html(fit.held_out.as_json(), "held-out records")
-    return f"<div>{out}{parameters_html(fit.parameters)}</div>"
+    return spaced(f"<div>{out}{parameters_html(fit.parameters)}</div>")
 
 
 def comparison_html(comparison: Comparison) -> str:
@@ -254,7 +265,7 @@ def comparison_html(comparison: Comparison) -> str:
     pictures = [place_picture(p) for p in comparison.places[:SHOWN_PLACES]]
     low, high = comparison.worst_window
     window = f"<p>Worst window: {number(low)} s to {number(high)} s.</p>"
-    return f"<div>{error_html(comparison.error.as_json(), text(comparison.name))}{''.join(pictures)}{window}</div>"
+    return spaced(f"<div>{error_html(comparison.error.as_json(), text(comparison.name))}{''.join(pictures)}{window}</div>")
 
 
 def warnings_html(warnings: Sequence[str]) -> str:
@@ -265,7 +276,7 @@ def warnings_html(warnings: Sequence[str]) -> str:
 def diagnosis_html(diagnosis: Diagnosis) -> str:
     """A diagnosis: warnings, claim, ranking, not testable."""
     result = diagnosis.as_json()
-    return (
+    return spaced(
         f"<div>{warnings_html(result['warnings'])}{claims_html(result)}{ranking_html(result, diagnosis.ranking.trials, last=10)}"
         f"{not_testable_html(result)}</div>"
     )
@@ -275,7 +286,7 @@ def improvement_html(improvement: Improvement) -> str:
     """The loop: verdict, warnings, staircase, ledger, claims, parameters of the last step."""
     result = improvement.as_json()
     parameters = parameters_html(result["steps"][-1]["parameters"]) if result["steps"] else ""
-    return (
+    return spaced(
         f"<div>{verdict_html(result, 3)}{warnings_html(result['warnings'])}{staircase_html(result)}{ledger_html(result)}"
         f"{claims_html(result)}{parameters}</div>"
     )

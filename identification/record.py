@@ -320,13 +320,16 @@ class Record:
         )
 
     def _repr_html_(self) -> str:
+        from identification.formats import pretty_unit
+        from identification.html import spaced
+
         rows = "".join(
-            f"<tr><td>{key}</td><td>{self.unit(key)}</td><td>{_range(values)}</td></tr>"
+            f"<tr><td>{key}</td><td>{pretty_unit(self.unit(key))}</td><td>{_range(values)}</td></tr>"
             for key, values in self.channels.items()
         )
         size = f"{len(self)} samples, {self.duration:.6g} s, {len(self.segments())} segment(s)"
         head = f"{html.escape(self.name)}: {size}"
-        return f"<table><caption>{head}</caption><tr><th>channel</th><th>unit</th><th>range</th></tr>{rows}</table>"
+        return spaced(f"<table><caption>{head}</caption><tr><th>channel</th><th>unit</th><th>range</th></tr>{rows}</table>")
 
     def __repr__(self) -> str:
         return (

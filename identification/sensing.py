@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, final
 
@@ -100,6 +100,45 @@ def sense(record: Record, model: JointModel) -> Sensing:
             raise InputError(f"{record.name}: model is elastic but channel {missing} is missing; add it, or use a rigid model (hd1, hd2)")
         return Sensing(("sum", "deflection"), moving=moving, **common)
     return Sensing(("axis",), moving=moving, **common)
+
+
+def check_alike(records: Sequence[Record], model: JointModel, labels: Sequence[str] = ()) -> Sensing:
+    """What the first record lets one see, where the others let one see the same.
+
+    Parameters
+    ----------
+    records : sequence of Record
+    model : JointModel
+    labels : sequence of str
+        What the records are called in a message, such as their paths; their names by default.
+
+    Raises
+    ------
+    InputError
+        A record that misses a channel which the model needs, or has other channels than the first.
+    """
+    called = list(labels) or [r.name for r in records]
+    found: list[Sensing] = []
+    for record, label in zip(records, called, strict=True):
+        try:
+            found.append(sense(record, model))
+        except InputError as error:
+            raise InputError(f"{label}: {str(error).removeprefix(record.name + ': ')}") from None
+        if found[-1].balances != found[0].balances:
+            raise InputError(f"{label}: {_difference(record, records[0], called[0])}; give records with the same channels")
+    return found[0]
+
+
+def _difference(record: Record, first: Record, label: str) -> str:
+    """Which channel one of two records lacks."""
+    here, there = (any(r.has(c) for c in DRIVES) for r in (record, first))
+    if here != there:
+        what = f"drive channel ({', '.join(DRIVES)})"
+        return f"has a {what}, which {label} has not" if here else f"has no {what}, which {label} has"
+    for channel in ("link_torque", "motor_position", "link_position"):
+        if record.has(channel) != first.has(channel):
+            return f"has {channel}, which {label} has not" if record.has(channel) else f"has no {channel}, which {label} has"
+    return f"shows another torsion under its link_torque than {label}"
 
 
 def _twists(record: Record) -> bool:

@@ -18,6 +18,7 @@ from identification._varpro_model import (
     Shape,
     from_casadi,
     from_joint,
+    joint_shape,
     smooth_friction,
     velocity_box,
 )
@@ -28,7 +29,8 @@ from identification.recursive import RecursiveLeastSquares, Settings
 
 __all__ = [
     "JOINT_CHANNELS", "Coefficient", "Event", "Mode", "OnlineSettings", "SeparableModel", "Shape", "TwoStep",
-    "TwoStepFit", "TwoStepOutcome", "TwoStepSettings", "from_casadi", "from_joint", "smooth_friction", "velocity_box",
+    "TwoStepFit", "TwoStepOutcome", "TwoStepSettings", "from_casadi", "from_joint", "joint_shape", "smooth_friction",
+    "velocity_box",
 ]  # fmt: skip
 
 FloatArray = npt.NDArray[np.float64]

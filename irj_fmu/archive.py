@@ -47,6 +47,7 @@ def write_archive(out: Path, content: Mapping[str, bytes], suffix: str = ".fmu")
     if out.suffix != suffix:
         raise InputError(f"{out}: the file name must end in {suffix}")
     temporary: str | None = None
+    made = [folder for folder in out.parents if not folder.exists()]
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         handle, temporary = tempfile.mkstemp(prefix=f".{out.stem}-", suffix=".part", dir=out.parent)
@@ -59,12 +60,15 @@ def write_archive(out: Path, content: Mapping[str, bytes], suffix: str = ".fmu")
                 archive.writestr(entry, content[name])
         Path(temporary).chmod(0o666 & ~_umask())
         Path(temporary).replace(out)
-        temporary = None
+        temporary, made = None, []
     except OSError as error:
-        raise InputError(f"{out}: cannot write there ({error.strerror}); choose a writable folder") from error
+        raise InputError(f"{out}: cannot write there ({error.strerror}); choose a writable folder with space on its disk") from error
     finally:
         if temporary is not None:
             Path(temporary).unlink(missing_ok=True)
+        for folder in made:
+            if folder.is_dir() and not any(folder.iterdir()):
+                folder.rmdir()
     return out
 
 

@@ -3,31 +3,32 @@
 from __future__ import annotations
 
 import argparse
+import asyncio
 import contextlib
 import json
-import math
-import signal
+import re
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, NoReturn, final
+from typing import Any, Final, final
 
 from identification.errors import InputError
 
 from .batch_plan import plan
-from .batch_results import SUMMARY, Run, replace_file, runs_of, write_csv, write_npz, write_summary
+from .batch_results import SUMMARY, Run, runs_of, write_csv, write_npz, write_summary
 from .batch_store import lock
 from .batch_study import Study, load_study
+from .command_line import OneLineParser, check_output, counted, fail, keep_inputs, progress_bar, terminable, write_json
 from .fleet import Progress, run_batches
 from .host import FmuError
 
 Say = Callable[[str], object]
 PATIENCE: Final = 10.0
 """How long a Dask scheduler and its first worker may take to answer [s]."""
+_ADDRESS: Final = re.compile(r"[a-z]+://.+|[^/\\]+:\d+")
 
 
 @final
@@ -154,17 +155,9 @@ def _clear(chunks: Path) -> None:
 # --- command line ----------------------------------------------------------------------------------------------------
 
 
-@final
-class _Parser(argparse.ArgumentParser):
-    """Says what is wrong with the arguments in one line."""
-
-    def error(self, message: str) -> NoReturn:
-        self.exit(2, f"irj: {message}; see `{self.prog} --help`\n")
-
-
 def parser() -> argparse.ArgumentParser:
     """Arguments of ``irj batch``."""
-    made = _Parser(prog="irj batch", description="Run a study: many runs over models, records and parameters (docs/batch.md).")
+    made = OneLineParser(prog="irj batch", description="Run a study: many runs over models, records and parameters (docs/batch.md).")
     made.add_argument("study", type=Path, metavar="STUDY", help="study file (TOML)")
     made.add_argument("--jobs", type=int, metavar="N", help="processes (default: number of processors); with --dask, portions under way at once")
     made.add_argument("--dask", metavar="ADDRESS", help="run on a Dask cluster: address of its scheduler, or the path of a scheduler file")
@@ -180,36 +173,21 @@ def main(argv: Sequence[str]) -> int:
     """Run a study; 0 where it is done, 1 where a run failed and ``--fail-on-error`` was given, 2 with one line on unusable input."""
     arguments = parser().parse_args(argv)
     try:
-        with _terminable():
+        with terminable():
             return _main(arguments)
     except (InputError, FmuError) as error:
-        sys.stderr.write(f"irj: {' '.join(str(error).split())}\n")
-        return 2
-
-
-@contextlib.contextmanager
-def _terminable() -> Iterator[None]:
-    """Let SIGTERM end the workers, too."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
+        return fail(str(error))
 
 
 def _main(arguments: argparse.Namespace) -> int:
     if arguments.jobs is not None and arguments.jobs < 1:
         raise InputError(f"--jobs {arguments.jobs}: give at least 1")
-    if arguments.json is not None and not arguments.json.absolute().parent.is_dir():
-        raise InputError(f"{arguments.json}: its folder does not exist; make it first")
     study = load_study(arguments.study)
+    _check_results(arguments, study)
     if arguments.dry_run:
-        sizes = [f"{len(study.models)} models", f"{len(study.files)} records", f"{len(study.cases)} cases"]
+        sizes = [counted(len(study.models), "model"), counted(len(study.files), "record"), counted(len(study.cases), "case")]
         count = len(study.models) * max(1, len(study.files)) * len(study.cases)
-        sys.stdout.write(f"study {study.name}: {' x '.join(sizes)}, {count} runs where each record is one stretch\n")
+        sys.stdout.write(f"study {study.name}: {' x '.join(sizes)}, {counted(count, 'run')}{' where each record is one stretch' if study.files else ''}\n")
         return 0
     bar = _Bar()
     with _executor(arguments.dask) as (executor, workers):
@@ -219,8 +197,8 @@ def _main(arguments: argparse.Namespace) -> int:
         )  # fmt: skip
     new = len(found.runs) - found.there
     rate = f" in {found.seconds:.1f} s, {new / found.seconds:.0f} per s" if new and found.seconds > 0 else ""
-    there = f" ({found.there} were there)" if found.there else ""
-    sys.stdout.write(f"study {study.name}: {len(found.runs)} runs{there}, {new} run now{rate}, {len(found.failed)} failed\n")
+    there = f" ({found.there} {'was' if found.there == 1 else 'were'} there)" if found.there else ""
+    sys.stdout.write(f"study {study.name}: {counted(len(found.runs), 'run')}{there}, {new} run now{rate}, {len(found.failed)} failed\n")
     for run in found.failed[:5]:
         sys.stdout.write(f"  run {run.number} failed: {run.reason}\n")
     if len(found.failed) > 5:
@@ -228,17 +206,30 @@ def _main(arguments: argparse.Namespace) -> int:
     for path in (found.summary, found.results):
         if path is not None:
             sys.stdout.write(f"{path}\n")
-    if arguments.json is not None:
-        text = json.dumps(_report(study, found), indent=1) + "\n"
-        replace_file(arguments.json, lambda stream: stream.write(text.encode()))
+    write_json(arguments.json, _report(study, found))
     return 1 if arguments.fail_on_error and found.failed else 0
+
+
+def _check_results(arguments: argparse.Namespace, study: Study) -> None:
+    """Refuse results that cannot be written or would replace a file that the study reads."""
+    inputs = [study.source, *study.files, *(model.path for model in study.models), *([study.columns] if study.columns is not None else [])]
+    folder = arguments.out or default_folder(study.source)
+    results = [folder / name for name in (SUMMARY, *([] if study.format == "none" else [f"results.{study.format}"]))]
+    keep_inputs(results, inputs)
+    if arguments.json is None:
+        return
+    if arguments.json.absolute() in [path.absolute() for path in results]:
+        raise InputError(f"{arguments.json}: given for two results; give each a file of its own")
+    if arguments.json.absolute().parent != folder.absolute():  # that folder is made by the study
+        check_output(arguments.json, inputs)
+    keep_inputs([arguments.json], inputs)
 
 
 def _report(study: Study, found: StudyResult) -> dict[str, Any]:
     rows = [
         {
             "run": run.number, "model": run.model, "record": run.record or None, "parameters": run.parameters, "passed": run.passed,
-            "reason": run.reason or None, "figures": {name: v if math.isfinite(v) else None for name, v in run.figures.items()},
+            "reason": run.reason or None, "figures": dict(run.figures),
         }
         for run in found.runs
     ]  # fmt: skip
@@ -262,10 +253,11 @@ def _executor(address: str | None) -> Iterator[tuple[Executor | None, int | None
 
     for name in ("distributed", "distributed.client"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
-    is_file = Path(address).is_file()
+    place = _address(address)
     try:
-        client = Client(scheduler_file=address, timeout=PATIENCE) if is_file else Client(address, timeout=PATIENCE, set_as_default=False)
-    except (OSError, ValueError, TypeError) as error:
+        asyncio.run(_knock(place))
+        client = Client(place, timeout=PATIENCE, set_as_default=False)
+    except Exception as error:  # whatever a server of another kind answers
         raise InputError(f"--dask {address}: no scheduler answers there ({' '.join(str(error).split())[:120]})") from None
     with client:
         try:
@@ -277,6 +269,32 @@ def _executor(address: str | None) -> Iterator[tuple[Executor | None, int | None
         except Exception as error:  # whatever a worker without the package answers
             raise InputError(f"--dask {address}: its workers cannot import irj_fmu ({type(error).__name__}); install irj there") from None
         yield client.get_executor(pure=False), 2 * max(1, sum(client.nthreads().values()))
+
+
+def _address(given: str) -> str:
+    """The address that was given, or the one in a scheduler file; what is no address is refused before anything is started."""
+    from distributed.comm.registry import backends
+
+    is_file, found = Path(given).is_file(), given
+    if is_file:
+        try:
+            found = str(json.loads(Path(given).read_text(encoding="utf-8"))["address"])
+        except (OSError, ValueError, KeyError, TypeError):
+            raise InputError(f"--dask {given}: is not a scheduler file; give what `dask scheduler --scheduler-file` writes") from None
+    scheme, sign, _ = found.partition("://")
+    if not _ADDRESS.fullmatch(found) or (sign and scheme not in backends):
+        why = "that file holds no address" if is_file else "no such file, and no address"
+        raise InputError(f"--dask {given}: no scheduler answers there ({why} as tcp://host:8786)")
+    return found
+
+
+async def _knock(address: str) -> None:
+    """Shake hands with the scheduler: a client that cannot would tell of it once more when it is thrown away."""
+    from distributed.comm import connect
+    from distributed.security import Security
+
+    comm = await connect(address, timeout=PATIENCE, **Security().get_connection_args("client"))
+    await comm.close()
 
 
 def _probe() -> str:
@@ -299,10 +317,7 @@ class _Bar:
         spent = time.monotonic() - self.begin
         rate = (done - self.first) / spent if spent > 0 else 0.0
         rest = f", {(total - done) / rate:.0f} s to go" if rate > 0 and done < total else ""
-        filled = round(30 * done / total)
-        end = "\n" if done >= total else ""
-        sys.stderr.write(f"\r[{'#' * filled}{'.' * (30 - filled)}] {done} of {total} runs, {rate:.0f} per s{rest:<20}{end}")
-        sys.stderr.flush()
+        progress_bar(f"{done} of {counted(total, 'run')}, {rate:.0f} per s{rest:<20}", done / total)
 
 
 __all__ = ["StudyResult", "default_folder", "load_study", "main", "run_study"]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import math
-import os
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -14,10 +13,9 @@ from typing import IO, Any, Final, final
 
 import numpy as np
 
-from identification.errors import InputError
-
 from .batch_checks import Value
 from .batch_plan import Planned
+from .command_line import replace_file
 from .fleet import FIGURES, Part
 from .signals import FloatArray
 
@@ -162,23 +160,4 @@ def write_csv(planned: Sequence[Planned], parts: Parts, path: Path) -> None:
     replace_file(path, write)
 
 
-def replace_file(path: Path, write: Callable[[IO[bytes]], object]) -> None:
-    """Write a file that appears when it is whole.
-
-    Raises
-    ------
-    InputError
-        Where it cannot be written.
-    """
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        with part.open("wb") as stream:
-            write(stream)
-        part.replace(path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror or error}); check the folder, its permissions and the space on the disk") from None
-    finally:
-        part.unlink(missing_ok=True)
-
-
-__all__ = ["SUMMARY", "Run", "replace_file", "runs_of", "write_csv", "write_npz", "write_summary"]
+__all__ = ["SUMMARY", "Run", "runs_of", "write_csv", "write_npz", "write_summary"]

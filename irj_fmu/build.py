@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
-import json
 import os
 import subprocess
 import sys
@@ -12,16 +11,20 @@ import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, final
+from typing import TYPE_CHECKING, Final, final
 
 from identification.errors import InputError
 from identification.joint_file import Joint, load_joint
 
+from .command_line import OneLineParser, check_output, checkpoint, fail, keep_inputs, run_alone, write_json
 from .compiler import find_compiler
+
+if TYPE_CHECKING:
+    from .online import OnlineOptions
 
 KINDS: Final = ("estimator", "plant", "native", "ssp", "all")
 _TRY: Final = (
-    "no C compiler: the estimator still builds (`build_fmu.py estimator`), for Python hosts; plants, native estimators "
+    "no C compiler: the estimator still builds (`irj export estimator`), for Python hosts; plants, native estimators "
     "and systems need one: run `pip install ziglang`, or install gcc and pass --cc gcc"
 )
 _SMOKE: Final = """
@@ -65,6 +68,8 @@ class Request:
         Sensors of the joint.
     sample_time : float
         Of a native estimator, built in [s].
+    say : callable
+        Called with one sentence per doubt about a record.
     """
 
     joint: Joint
@@ -78,6 +83,7 @@ class Request:
     has_link: bool = True
     has_torque: bool = True
     sample_time: float = 1e-3
+    say: Callable[[str], object] = lambda _text: None
 
 
 def build(kind: str, request: Request, say: Callable[[str], object] = lambda _text: None) -> list[Path]:
@@ -103,7 +109,8 @@ def build(kind: str, request: Request, say: Callable[[str], object] = lambda _te
     """
     if kind not in KINDS:
         raise InputError(f"{kind!r} cannot be built; choose one of {', '.join(KINDS)}")
-    made_folder = _prepare(request.out)
+    keep_inputs([request.out / name for name in _names(kind, _base(request))], [request.source, *request.healthy])
+    made_folders = _prepare(request.out)
     done: list[Path] = []
     try:
         with tempfile.TemporaryDirectory(prefix=".build-", dir=request.out) as temporary:
@@ -114,9 +121,12 @@ def build(kind: str, request: Request, say: Callable[[str], object] = lambda _te
                     path.replace(final_path)
                     done.append(final_path)
                     say(f"{final_path} ({note}; validated, {ran})")
+    except OSError as error:
+        raise InputError(f"{request.out}: cannot write there ({error.strerror or error}); choose a writable folder with space on its disk") from None
     finally:
-        if made_folder and not any(request.out.iterdir()):
-            request.out.rmdir()
+        for folder in made_folders:
+            if not any(folder.iterdir()):
+                folder.rmdir()
     return done
 
 
@@ -131,14 +141,25 @@ def _makers(kind: str) -> list[_Maker]:
     return table[kind]
 
 
-def _prepare(out: Path) -> bool:
-    """Make the folder where it is missing; True where it was."""
-    missing = not out.exists()
+def _names(kind: str, base: str) -> list[str]:
+    """Files that a kind makes."""
+    every = {
+        "estimator": ["estimator.fmu"], "plant": ["plant.fmu"], "native": ["native.fmu"],
+        "all": ["estimator.fmu", "plant.fmu", "plant_controlled.fmu", "native.fmu"],
+    }  # fmt: skip
+    return [*(f"{base}_{end}" for end in every.get(kind, [])), *([f"{base}.ssp"] if kind in ("ssp", "all") else [])]
+
+
+def _prepare(out: Path) -> list[Path]:
+    """Make the folder where it is missing; the folders that were made, the innermost first."""
+    missing = [folder for folder in (out, *out.parents) if not folder.exists()]
     try:
         out.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile(prefix=".write-", dir=out):
             return missing
     except OSError as error:
+        for folder in filter(Path.is_dir, missing):
+            folder.rmdir()
         raise InputError(f"{out}: cannot write there ({error.strerror}); choose a writable folder with --out") from None
 
 
@@ -186,7 +207,7 @@ def _one_plant(request: Request, folder: Path, name: str, *, controller: bool, s
 
 
 def _estimator(request: Request, folder: Path) -> list[tuple[Path, str]]:
-    from .estimator import DETECTOR_FILE, JOINT_FILE, OPTIONS_FILE, options_text
+    from .estimator import DETECTOR_FILE, JOINT_FILE, OPTIONS_FILE, Estimator, options_text
     from .online import OnlineOptions, prepared
     from .package import SlaveSpec, package_slave
 
@@ -197,7 +218,7 @@ def _estimator(request: Request, folder: Path) -> list[tuple[Path, str]]:
     texts.mkdir(exist_ok=True)
     (texts / OPTIONS_FILE).write_text(options_text(options), encoding="utf-8")
     files = {JOINT_FILE: request.source, OPTIONS_FILE: texts / OPTIONS_FILE}
-    state = detector_state(request.joint, options, request.healthy)
+    state = _limits(request, options, Estimator.default_sample_time)
     if state is not None:
         (texts / DETECTOR_FILE).write_bytes(state)
         files[DETECTOR_FILE] = texts / DETECTOR_FILE
@@ -206,44 +227,11 @@ def _estimator(request: Request, folder: Path) -> list[tuple[Path, str]]:
     return [(packaged.path, f"FMI 2.0 co-simulation; {packaged.message}")]
 
 
-def detector_state(joint: Joint, options: object, healthy: Sequence[Path], dt: float = 1e-3) -> bytes | None:
-    """State of a fault detector calibrated with healthy records; None without records.
+def _limits(request: Request, options: OnlineOptions, dt: float) -> bytes | None:
+    """State of a fault detector that was calibrated with the healthy records; None without any."""
+    from .healthy import detector_state, read_healthy
 
-    Raises
-    ------
-    InputError
-        Where the joint is rigid or not fitted, or a record lacks a channel.
-    """
-    if not healthy:
-        return None
-    import numpy as np
-
-    from identification.fault import FaultDetector
-    from identification.read import read
-
-    from .online import OnlineOptions, prepared
-
-    if not isinstance(options, OnlineOptions):
-        raise InputError("detector_state: options must be OnlineOptions")
-    model, _ = prepared(joint, options)
-    if not joint.fitted or not model.is_elastic:
-        raise InputError(f"{joint.source or joint.name}: the fault detector needs an elastic joint with fitted values")
-    tables = []
-    for path in healthy:
-        record = read(path, columns=joint.columns)
-        ratio = joint.gear_ratio
-        drive = record["motor_current"] * (joint.torque_per_current or 1.0) if record.has("motor_current") else record["motor_torque"] * ratio
-        torque = record["link_torque"] if record.has("link_torque") else np.zeros(len(drive))
-        dt = record.dt
-        tables.append(
-            np.column_stack([
-                drive, record["motor_position"] / ratio, record["motor_velocity"] / ratio, record["link_position"],
-                record["link_velocity"], torque,
-            ])
-        )  # fmt: skip
-    detector = FaultDetector(model, dt, has_torque=options.has_torque)
-    detector.calibrate(np.concatenate(tables))
-    return detector.state()
+    return detector_state(request.joint, options, read_healthy(request.healthy, request.joint, request.say), dt, request.say)
 
 
 def _native(request: Request, folder: Path) -> list[tuple[Path, str]]:
@@ -253,7 +241,7 @@ def _native(request: Request, folder: Path) -> list[tuple[Path, str]]:
     targets = _compiler(request)
     name = f"{_base(request)}_native"
     options = OnlineOptions(has_link=request.has_link, has_torque=request.has_torque)
-    state = detector_state(request.joint, options, request.healthy, request.sample_time)
+    state = _limits(request, options, request.sample_time)
     spec = NativeSpec(request.joint, name, options, state, request.sample_time)
     path = build_native(spec, folder / f"{name}.fmu", cc=request.cc, target=targets)
     return [(path, f"FMI 2.0 co-simulation without Python, sample time {request.sample_time:g} s")]
@@ -307,8 +295,7 @@ def _check(path: Path) -> bool:
     return runs
 
 
-_SMOKE_SSP: Final = """
-import sys
+_SMOKE_SSP: Final = """import sys
 from fmpy.ssp.ssd import read_ssd
 found = read_ssd(sys.argv[1])
 if len(found.system.elements) < 2 or not found.system.connections:
@@ -331,6 +318,7 @@ def _runs_here(path: Path) -> bool:
 
 def _run(path: Path, command: Sequence[str]) -> None:
     """A fresh process in another folder."""
+    checkpoint()
     with tempfile.TemporaryDirectory(prefix="irj-smoke-") as elsewhere:
         environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
         done = subprocess.run(command, cwd=elsewhere, capture_output=True, text=True, check=False, env=environment)
@@ -342,20 +330,20 @@ def _run(path: Path, command: Sequence[str]) -> None:
 # --- command line ----------------------------------------------------------------------------------------------------
 
 
-def parser() -> argparse.ArgumentParser:
-    """Arguments of ``build_fmu.py``."""
-    made = argparse.ArgumentParser(prog="build_fmu.py", description="Build, validate and try the FMUs of a joint file.")
+def parser(prog: str = "build_fmu.py") -> argparse.ArgumentParser:
+    """Arguments of ``build_fmu.py`` and ``irj export``."""
+    made = OneLineParser(prog=prog, description="Build, validate and try the FMUs of a joint file.")
     made.add_argument("kind", choices=KINDS)
     made.add_argument("--joint", required=True, type=Path, help="joint file (TOML), fitted or not")
     made.add_argument("--out", default=Path("dist"), type=Path, help="folder of the results (default: dist)")
     made.add_argument("--cc", help="C compiler: a command such as gcc, or zig for the ziglang package")
     made.add_argument("--target", help="platform of plants and native estimators: linux64, win64, darwin64, x86_64-linux-gnu, ..., or all")
-    made.add_argument("--sample-time", type=float, default=1e-3, metavar="S", help="native: time between two samples, built in (default: 0.001)")
+    made.add_argument("--sample-time", type=float, metavar="S", help="native: time between two samples, built in (default: 0.001)")
     made.add_argument("--controller", action="store_true", help="plant: drive it by a position controller")
     made.add_argument("--sensors", action="store_true", help="plant: readings with noise, quantisation and faults as parameters")
     made.add_argument(
-        "--healthy", nargs="+", default=[], type=Path, metavar="RECORD",
-        help="estimators: records of the healthy joint, for the limits of its fault detector",
+        "--healthy", nargs="+", action="extend", default=[], type=Path, metavar="RECORD",
+        help="estimators: records of the healthy joint, for the limits of its fault detector; resampled to the estimator's step",
     )  # fmt: skip
     made.add_argument("--no-link", action="store_true", help="estimators: the joint has no link encoder")
     made.add_argument("--no-torque", action="store_true", help="estimators: the joint has no torque sensor")
@@ -363,33 +351,50 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-def _writable(path: Path, inputs: Sequence[Path]) -> None:
-    """Refuse a result file that cannot be written or would replace an input, before any work."""
-    if not path.absolute().parent.is_dir():
-        raise InputError(f"{path}: its folder does not exist; make it first")
-    if path.exists() and any(p.exists() and path.samefile(p) for p in inputs):
-        raise InputError(f"{path}: is an input of this command and would be lost; write somewhere else")
+_OF: Final = {  # options that only some kinds heed
+    "sample_time": ("native", "all"), "controller": ("plant", "all"), "sensors": ("plant", "ssp", "all"),
+    "healthy": ("estimator", "native", "ssp", "all"), "target": ("plant", "native", "ssp", "all"),
+}  # fmt: skip
 
 
-def main(argv: Sequence[str]) -> int:
+def _request(given: argparse.Namespace) -> Request:
+    """The request of checked arguments.
+
+    Raises
+    ------
+    InputError
+        An option that this kind does not heed; a result that would replace an input; an unusable joint file.
+    """
+    for option, kinds in _OF.items():
+        if getattr(given, option) not in (None, False, []) and given.kind not in kinds:
+            raise InputError(f"--{option.replace('_', '-')}: goes with {', '.join(kinds)}, not with {given.kind}; leave it out")
+    if given.sample_time is not None and not 1e-5 <= given.sample_time <= 1.0:
+        raise InputError(f"--sample-time {given.sample_time:g}: give 0.00001 to 1 s")
+    joint = load_joint(given.joint)
+    request = Request(
+        joint=joint, source=given.joint, out=given.out, cc=given.cc, target=given.target, controller=given.controller, sensors=given.sensors,
+        healthy=tuple(given.healthy), has_link=not given.no_link, has_torque=not given.no_torque,
+        sample_time=1e-3 if given.sample_time is None else given.sample_time, say=lambda text: sys.stderr.write(f"irj: {text}\n"),
+    )  # fmt: skip
+    if given.json is not None:
+        made = [request.out / name for name in _names(given.kind, _base(request))]
+        check_output(given.json, [request.source, *request.healthy])
+        if given.json.absolute() in [path.absolute() for path in made]:
+            raise InputError(f"{given.json}: given for two results; give each a file of its own")
+    return request
+
+
+def main(argv: Sequence[str], prog: str = "build_fmu.py") -> int:
     """Build; 0 where everything was built, 2 with one line on unusable input."""
-    arguments = parser().parse_args(argv)
+    given = parser(prog).parse_args(argv)
     try:
-        if arguments.json is not None:
-            _writable(arguments.json, (arguments.joint, *arguments.healthy))
-        request = Request(
-            joint=load_joint(arguments.joint), source=arguments.joint, out=arguments.out, cc=arguments.cc,
-            target=arguments.target, controller=arguments.controller, sensors=arguments.sensors,
-            healthy=tuple(arguments.healthy), has_link=not arguments.no_link, has_torque=not arguments.no_torque,
-            sample_time=arguments.sample_time,
-        )  # fmt: skip
-        done = build(arguments.kind, request, lambda text: sys.stdout.write(f"{text}\n"))
-        if arguments.json is not None:
-            try:
-                arguments.json.write_text(json.dumps({"built": [str(p) for p in done]}, indent=1), encoding="utf-8")
-            except OSError as error:
-                raise InputError(f"{arguments.json}: cannot write there ({error.strerror})") from None
+        done = build(given.kind, _request(given), lambda text: sys.stdout.write(f"{text}\n"))
+        write_json(given.json, {"built": [str(p) for p in done]})
     except InputError as error:
-        sys.stderr.write(f"irj: {' '.join(str(error).split())}\n")
-        return 2
+        return fail(str(error))
     return 0
+
+
+def script(argv: Sequence[str]) -> int:
+    """``build_fmu.py``: as :func:`main`; Ctrl-C and what the system refuses are one line, too."""
+    return run_alone(main, argv)

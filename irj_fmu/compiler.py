@@ -20,6 +20,8 @@ from typing import final
 
 from identification.errors import InputError
 
+from .command_line import checkpoint
+
 
 @final
 @dataclass(frozen=True)
@@ -99,9 +101,10 @@ def find_compiler(target: str | None = None, cc: str | None = None) -> list[str]
     if cc is not None and target != native:
         raise InputError(f"compiler {cc!r} builds for {native} only; leave `cc` out and run `pip install ziglang`")
     for candidate in (cc,) if cc is not None else (os.environ.get("CC") or "gcc", "gcc", "cc", "clang"):
-        words = candidate.split()
+        words = [candidate] if shutil.which(candidate) else candidate.split()  # a path may hold spaces
         if words and shutil.which(words[0]):
-            return words
+            own = any(sign and sign in words[0] for sign in (os.sep, os.altsep))
+            return [os.path.abspath(words[0]) if own else words[0], *words[1:]]  # it is started in another folder
     if cc is None and has_zig():
         return zig
     raise InputError(_NO_COMPILER.format(target=target))
@@ -146,6 +149,7 @@ def compile_library(
     InputError
         Where there is no compiler or it refuses the source.
     """
+    checkpoint()
     command = find_compiler(target, cc)
     place = TARGETS[target]
     flags = list(_FLAGS)
@@ -163,7 +167,7 @@ def compile_library(
         try:
             done = subprocess.run(
                 [*command, *flags, f"-I{header_folder()}", "-I.", main, "-o", library, *links],
-                cwd=folder, capture_output=True, text=True, check=False,
+                cwd=folder, capture_output=True, text=True, check=False, env={**os.environ, "TMPDIR": folder},
             )  # fmt: skip
         except OSError as error:
             raise InputError(f"compiler {command[0]!r} cannot be started ({error.strerror}); check `cc`") from error

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import math
 import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
@@ -13,9 +13,11 @@ from typing import Any, Final, final
 from identification.errors import InputError
 from identification.joint_file import Joint, load_joint, toml_text
 
-from .build import detector_state
-from .estimator import DETECTOR_FILE, JOINT_FILE, OPTIONS_FILE, options_text
-from .host import Fmu, Instance, Trajectory, Wiring, simulate_cs
+from .command_line import OneLineParser, check_output, counted, fail, progress_bar, write_json
+from .compiler import find_compiler
+from .estimator import DETECTOR_FILE, JOINT_FILE, OPTIONS_FILE, Estimator, options_text
+from .healthy import detector_state, read_healthy
+from .host import Fmu, FmuError, Instance, Trajectory, Wiring, simulate_cs
 from .joint_plant import PlantOptions, identifier, plant_spec
 from .online import OnlineOptions, estimated_parameters, prepared
 from .plant import build_plant
@@ -154,7 +156,7 @@ def make_pair(
     (texts / JOINT_FILE).write_text(toml_text(model, values), encoding="utf-8")
     (texts / OPTIONS_FILE).write_text(options_text(options), encoding="utf-8")
     files = {n: texts / n for n in (JOINT_FILE, OPTIONS_FILE)}
-    state = detector_state(model, options, healthy)
+    state = detector_state(model, options, read_healthy(healthy, model), Estimator.default_sample_time)
     if state is not None:
         (texts / DETECTOR_FILE).write_bytes(state)
         files[DETECTOR_FILE] = texts / DETECTOR_FILE
@@ -267,9 +269,7 @@ def table(rows: Sequence[Row]) -> str:
 
 def main(argv: Sequence[str]) -> int:
     """``irj cosim``: print the table of convergence; 0 where every limit holds, 1 where not, 2 on unusable input."""
-    import argparse
-
-    parser = argparse.ArgumentParser(prog="irj cosim", description="Co-simulate plants and estimators and compare.")
+    parser = OneLineParser(prog="irj cosim", description="Co-simulate plants and estimators and compare.")
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"reference joints: {', '.join(NAMES)} (default: all)")
     parser.add_argument("--joint", action="append", default=[], type=Path, help="a fitted joint file as a plant")
     parser.add_argument("--published", nargs=2, action="append", default=[], metavar=("FILE", "KEY"), help="a row of a table of published friction parameters")
@@ -278,21 +278,34 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the table as JSON")
     arguments = parser.parse_args(argv)
     try:
+        if arguments.json is not None:
+            check_output(arguments.json, [*arguments.joint, *(file for file, _ in arguments.published)])
+        setting = _setting(arguments.stop)
         joints = [load_joint(p) for p in arguments.joint] + [published_joint(Path(f), k) for f, k in arguments.published]
         names = arguments.names or (() if joints else NAMES)
         joints = [*(reference_joint(n) for n in names), *joints]
         for joint in joints:
             if not joint.fitted:
                 raise InputError(f"{joint.source}: has no fitted values; a plant needs them (run `irj fit` first)")
-        rows = convergence(joints, Setting(stop=arguments.stop), cc=arguments.cc)
+        find_compiler(None, arguments.cc)
+        progress_bar(f"0 of {counted(len(joints), 'joint')}", 0.0)
+        rows = convergence(joints, setting, cc=arguments.cc, progress=lambda done, total: progress_bar(f"{done} of {counted(total, 'joint')}", done / total))
         sys.stdout.write(table(rows) + "\n")
-        if arguments.json is not None:
-            content: list[dict[str, Any]] = [{**r.__dict__, "error_percent": r.error, "passed": r.passed} for r in rows]
-            arguments.json.write_text(json.dumps({"rows": content}, indent=1), encoding="utf-8")
-    except (InputError, OSError) as error:
-        sys.stderr.write(f"{error}\n")
-        return 2
+        content: list[dict[str, Any]] = [{**r.__dict__, "error_percent": r.error, "passed": r.passed} for r in rows]
+        write_json(arguments.json, {"rows": content})
+    except (InputError, FmuError) as error:
+        return fail(str(error))
     return 0 if all(r.passed for r in rows) else 1
+
+
+def _setting(stop: float) -> Setting:
+    """A run of this length."""
+    setting, first = Setting(stop=stop), OnlineOptions().warm_up
+    if not (math.isfinite(stop) and first < stop <= 1e5):
+        raise InputError(f"--stop {stop:g}: the estimator's first window takes {first:g} s; give a longer time in s, as 40")
+    if abs(round(stop / setting.step) * setting.step - stop) > 1e-6 * setting.step:
+        raise InputError(f"--stop {stop!r}: is not a whole number of steps of {setting.step:g} s; give as many")
+    return setting
 
 
 __all__ = ["Cosimulation", "Row", "Setting", "convergence", "cosimulate", "main", "make_pair", "table"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any, Final, cast
 
 from identification.channels import channel_unit
 from identification.errors import InputError
+from identification.fault import ABSURD
 from identification.joint_file import Joint, load_joint
 
 from .online import FAULT_TEXT, OnlineEstimator, OnlineOptions, held_parameters, prepared, searched_parameters
@@ -212,22 +212,11 @@ class Estimator(TableSlave):
     # --- a sample ----------------------------------------------------------------------------------------------------
 
     def _sample(self, time: float, length: float) -> None:
-        """Readings that are not finite count as missing; the others of that sample are used."""
+        """Readings that are no number or absurd count as missing; the others of that sample are used."""
         if not self._due(time, length):
             return
         values = self._values
-        raw = [float(v) for v in values[self._first : self._first + 6]]
-        total = sum(raw)
-        lost = () if total - total == 0.0 else tuple(i for i, v in enumerate(raw) if not math.isfinite(v))
-        flags: list[Any] = values[self._flag : self._flag + 6]
-        if lost:
-            names = ", ".join(self.table[self._first + i].name for i in lost)
-            self._report(f"input not finite: {names}; it counts as missing")
-            raw = [0.0 if i in lost else v for i, v in enumerate(raw)]
-            flags = [bool(flag) and i not in lost for i, flag in enumerate(flags)]
-        health = self._take(time, raw, flags)
-        if lost:
-            health = Health.NUMERIC_TROUBLE
+        health = self._take(time, values[self._first : self._first + 6], values[self._flag : self._flag + 6])
         if self._too_long:
             health = max(health, Health.STEP_MISMATCH)
         values[2] = int(values[2]) + 1
@@ -239,7 +228,7 @@ class Estimator(TableSlave):
         flags = [bool(inputs[v.name]) for v in self.table[self._flag : self._flag + 6]]
         return {"health": int(self._take(time, raw, flags))}
 
-    def _take(self, time: float, raw: Sequence[float], flags: Sequence[Any]) -> Health:
+    def _take(self, time: float, raw: Sequence[Any], flags: Sequence[Any]) -> Health:
         """Give one sample of readings to the :class:`OnlineEstimator` and copy what it says into the outputs."""
         estimator = self._estimator
         if estimator is None:
@@ -259,6 +248,10 @@ class Estimator(TableSlave):
             values[self._fault_at] = fault
             if fault:
                 self._report(f"fault {fault} at t = {time:g} s ({FAULT_TEXT})")
+        if estimator.unusable:
+            names = ", ".join(self.table[self._first + i].name for i in estimator.unusable)
+            self._report(f"input not finite or beyond {ABSURD:g} in SI units: {names}; it counts as missing")
+            return Health.NUMERIC_TROUBLE
         if fault > 8:
             return Health.NUMERIC_TROUBLE
         return Health.WARMING_UP if estimator.warming_up else Health.OK

@@ -8,7 +8,7 @@ from __future__ import annotations
 import ctypes
 import shutil
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -40,6 +40,19 @@ class Trajectory:
 
     def __getitem__(self, name: str) -> FloatArray:
         return self.signals[name]
+
+
+def near_names(name: str, known: Collection[str]) -> str:
+    """What to write in place of a name that an FMU does not have: near ones, else those there are."""
+    import difflib
+
+    close = difflib.get_close_matches(name, known, 3)
+    if close:
+        return f"did you mean: {', '.join(close)}"
+    if not known:
+        return "it has no variables at all"
+    first = [n for n in known if not n.startswith("der(")][:12]
+    return f"it has {', '.join(first)}{f' and {len(known) - len(first)} more' if len(known) > len(first) else ''}"
 
 
 @final
@@ -87,10 +100,7 @@ class Fmu:
             Where there is none of this name.
         """
         if name not in self.variables:
-            import difflib
-
-            close = ", ".join(difflib.get_close_matches(name, self.variables, 3)) or "see its model description"
-            raise InputError(f"{self.path.name}: there is no variable {name!r}; did you mean: {close}")
+            raise InputError(f"{self.path.name}: there is no variable {name!r}; {near_names(name, self.variables)}")
         return self.variables[name]
 
     def close(self) -> None:

@@ -17,10 +17,8 @@ from typing import Any, Final, final
 import numpy as np
 import numpy.typing as npt
 
-from identification._fault_core import ObserverCore
-from identification._fault_structured import _MOVED as MOVED_BEFORE_RECOVERY
-from identification._fault_structured import PARITY_SENSORS, StructuredRule
 from identification.errors import InputError
+from identification.fault import MOVED, PARITY_SENSORS, DetectorTables
 from identification.joint_file import Joint
 
 from . import watch as watch_settings
@@ -85,7 +83,7 @@ def _functions(made: OnlineEstimator) -> list[Any]:
     engine = made._recursion(made.theta)._ready("generate")
     found = [engine._formulas.step, engine._formulas.check, made.rows._point, made.rows._slopes]
     if made.detector is not None:
-        found.append(_core(made).function)
+        found.append(made.detector.tables().function)
     recursion = []
     for name, function in zip(("rls_step", "rls_check"), found[:2], strict=True):
         arguments = function.sx_in()
@@ -306,69 +304,37 @@ def _recursion_tables(header: _Header, made: OnlineEstimator) -> None:
     header.define("CONFIRM_ROWS", made._confirm)
 
 
-def _core(made: OnlineEstimator) -> _Core:
-    if made.detector is None or not isinstance(made.detector._rule, StructuredRule):
-        raise InputError("native estimator: only the structured fault detector has a C form")
-    return _Core(made.detector._rule, made.detector._rule.core)
-
-
-@final
-@dataclass(frozen=True)
-class _Core:
-    rule: StructuredRule
-    core: ObserverCore
-
-    @property
-    def function(self) -> Any:
-        return self.core._function
-
-    def gains(self) -> FloatArray:
-        """Gain of each set of readings 1 to 5 in use, (32, 5 * size); bit i of the row is reading i + 1."""
-        core = self.core
-        before = tuple(bool(v) for v in core.used)
-        found = np.zeros((32, 5 * core.size))
-        for rows in range(32):
-            used = tuple(bool(rows >> i & 1) for i in range(5))
-            if used[4] and not core.has_torque:
-                continue
-            core.set_used((True, *used))
-            found[rows] = core.gain.ravel()
-        core.set_used(before)
-        return found
-
-
 def _fault_tables(header: _Header, made: OnlineEstimator) -> None:
     header.define("HAS_DETECTOR", int(made.detector is not None))
     waits = ("link_wait", "torque_wait", "pair_wait", "plant_wait", "quiet_seconds", "recover_seconds", "settle_seconds", "plant_rest_seconds")
     keys = ("LINK", "TORQUE", "PAIR", "PLANT", "QUIET", "RECOVER", "SETTLE", "REST")
     header.whole("parity_sensors", (sum(1 << s for s in sensors) for sensors in PARITY_SENSORS))
-    header.doubles("moved", MOVED_BEFORE_RECOVERY)
+    header.doubles("moved", MOVED)
     if made.detector is None:
         _no_fault_tables(header, keys)
         return
-    held = _core(made)
-    rule, core, res = held.rule, held.core, held.rule.residuals
+    held: DetectorTables = made.detector.tables()
     for key, name in zip(keys, waits, strict=True):
-        header.define(f"WAIT_{key}", rule.waits[name])
-    header.define("WAIT_ARM", rule.arm)
-    header.define("HAS_TORQUE", int(core.has_torque))
-    header.define("N_OBSERVER", core.size)
-    header.define("N_OBSERVED", core._function.size1_out(0))
-    header.define("FAULT_RING", 1 << math.ceil(math.log2(res.lags[-1] + 2)))
-    header.define("FAULT_STIFFNESS", float(core.stiffness))
-    header.define("HALF_STEP", float(res.half))
-    header.define("MEAN_1", float(res.mean1))
-    header.define("MEAN_2", float(res.mean2))
-    header.define("ENERGY_DRIFT", float(res.drift))
-    header.whole("lag", res.lags)
-    header.doubles("fault_limit", res.limits)
-    header.doubles("energy_inverse", res.inverse)
-    header.doubles("energy_limit", res.energy_limits)
-    header.doubles("fault_noise", core.noise)
-    header.doubles("recover_limit", rule.recover_limits)
-    header.doubles("widening", rule.widening)
-    header.doubles("observer_gain", held.gains())
-    header.doubles("gate", core._gates)
+        header.define(f"WAIT_{key}", held.waits[name])
+    header.define("WAIT_ARM", held.waits["arm"])
+    header.define("HAS_TORQUE", int(held.has_torque))
+    header.define("N_OBSERVER", held.states)
+    header.define("N_OBSERVED", held.function.size1_out(0))
+    header.define("FAULT_RING", 1 << math.ceil(math.log2(held.lags[-1] + 2)))
+    header.define("FAULT_STIFFNESS", float(held.stiffness))
+    header.define("HALF_STEP", float(held.half))
+    header.define("MEAN_1", float(held.means[0]))
+    header.define("MEAN_2", float(held.means[1]))
+    header.define("ENERGY_DRIFT", float(held.drift))
+    header.whole("lag", held.lags)
+    header.doubles("fault_limit", held.limits)
+    header.doubles("energy_inverse", held.inverse)
+    header.doubles("energy_limit", held.energy_limits)
+    header.doubles("fault_noise", held.noise)
+    header.doubles("recover_limit", held.recover_limits)
+    header.doubles("widening", held.widening)
+    header.doubles("observer_gain", held.gains)
+    header.doubles("gate", held.gates)
 
 
 def _no_fault_tables(header: _Header, keys: Sequence[str]) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from identification._triangle import single_thread
+from identification.fault import ABSURD
 from identification.joint_file import Joint
 from identification.recursive import RecursiveLeastSquares, Settings
 from identification.two_step import OnlineSettings
@@ -19,11 +20,12 @@ from identification.two_step import OnlineSettings
 from .first_window import fast_recursion, first_estimate, least_range, reversal_weights
 from .guard import Guard
 from .online_options import OnlineOptions, estimated_parameters, held_parameters, prepared, searched_parameters
+from .row_check import LEAST, RowCheck
 from .rows import RowMaker
 from .samples import Samples
 from .supervision import advance, guarded, launch
 from .two_step_online import make_two_step
-from .verdict import FAULT_TEXT, NONE, implausible, make_detector, plant_alarm, scale_limits, scores, worst
+from .verdict import FAULT_TEXT, NONE, implausible, make_detector, plant_alarm, worst
 from .watch import DRIVE, Q_L, Q_M, SAMPLED, TAU, W_L, W_M, Watch
 
 FloatArray = npt.NDArray[np.float64]
@@ -33,7 +35,7 @@ _RESIDUAL_SECONDS: Final = 2.0
 _STRAIN: Final = OnlineSettings()
 """When residuals ask for another search of the nonlinear parameters."""
 _ALL: Final = [True] * 6
-_NONE_FAILED: Final = [False] * 6
+_NONE_FAILED: Final = (False,) * 6
 
 
 @final
@@ -56,6 +58,8 @@ class OnlineEstimator:
         Estimated parameters, values and standard deviations, link-referred SI.
     residual, floor, ratio : (balances,) array
         Residual of the last row, floor, and root mean square of the last seconds over the floor.
+    unusable : tuple of int
+        Readings of the last sample that were no number or beyond :data:`identification.fault.ABSURD`; they count as missing.
     fault, score
         See :data:`FAULT_TEXT`; how far each reading's residuals are from their limits (1: at the limit).
     """
@@ -93,6 +97,9 @@ class OnlineEstimator:
             [place in b or b in ("sum", "axis") or (b == "deflection" and place == "motor") for place in ("motor", "link")]
             for b in self.balances
         ])  # fmt: skip
+        rate = self.rows.timing.stride * dt / _RESIDUAL_SECONDS
+        self._check = RowCheck(len(self.balances), len(self.names), self._friction, self._feels, rate, _STRAIN.error_limit)
+        self._reference = [11 if from_link else 1 for from_link in self._from_link]
         self.reset()
         self._recursion(self.theta)  # its functions are made here and not inside a step
 
@@ -155,7 +162,7 @@ class OnlineEstimator:
     def set_fault_margin(self, factor: float) -> None:
         """Multiply the fault detector's limits."""
         if self.detector is not None and factor != self._margin:
-            scale_limits(self.detector, factor / self._margin)
+            self.detector.scale_limits(factor / self._margin)
             self._margin = factor
 
     def update(self, time: float, readings: Sequence[float], valid: Sequence[bool], *, enable: bool = True) -> bool:
@@ -166,7 +173,7 @@ class OnlineEstimator:
         time : float
             [s]
         readings : sequence of float
-            Drive torque, motor position and velocity, link position and velocity, torque; link-referred SI, finite.
+            Drive torque, motor position and velocity, link position and velocity, torque; link-referred SI.
         valid : sequence of bool
             False for a reading that is missing.
         enable : bool
@@ -177,8 +184,15 @@ class OnlineEstimator:
         bool
             True where a row was made.
         """
-        good = self._all if valid == _ALL else [bool(valid[i]) and self.present[i] for i in range(6)]
         values = list(map(float, readings))
+        a, b, c, d, e, f = values
+        top = ABSURD
+        self.unusable: tuple[int, ...] = ()
+        if not (-top < a < top and -top < b < top and -top < c < top and -top < d < top and -top < e < top and -top < f < top):
+            self.unusable = tuple(i for i, v in enumerate(values) if not -top < v < top)
+            values = [0.0 if i in self.unusable else v for i, v in enumerate(values)]
+            valid = [flag and i not in self.unusable for i, flag in enumerate(valid)]
+        good = self._all if valid == _ALL else [bool(valid[i]) and self.present[i] for i in range(6)]
         looked = self.watch.add(values, good)
         used = values if good is self._all and self._whole else [v if g else held for v, g, held in zip(values, good, self._last_good, strict=True)]
         self._last_good = used
@@ -198,7 +212,7 @@ class OnlineEstimator:
             advance(self, self.two_step)
         return made
 
-    def _detect(self, readings: list[float], good: list[bool]) -> list[bool]:
+    def _detect(self, readings: list[float], good: list[bool]) -> Sequence[bool]:
         """Run the fault detector; readings with failed ones replaced go to `self.readings`."""
         detector = self.detector
         if detector is None:
@@ -208,7 +222,7 @@ class OnlineEstimator:
             return _NONE_FAILED
         row = readings if good is self._all and self._whole else [v if g else math.nan for v, g in zip(readings, good, strict=True)]
         self.readings = detector.update(row)
-        return detector._rule.failed
+        return detector.replaced
 
     def _link_from_motor(self) -> tuple[float, float]:
         """Link position and velocity from the motor, torsion taken off."""
@@ -236,11 +250,13 @@ class OnlineEstimator:
                     with single_thread():
                         self._begin()
             return True
-        error = y - h @ self.theta
-        self.residual = error
-        weight = self._weights(shares)
-        self._follow(error, weight, on)
-        least = self._ratios()
+        check = self._check
+        check(
+            y, h, self.theta, shares, on, self.floor, self.level, self.rows.signals[self._reference], self._square, self._torque,
+            self.options.floor_share,
+        )  # fmt: skip
+        self.residual, self.ratio = check.error.copy(), check.ratio.copy()
+        self._square, self._torque = check.square.copy(), check.torque.copy()
         if not enable:
             return True
         if not on.any():
@@ -249,46 +265,23 @@ class OnlineEstimator:
             return True
         for b, use in enumerate(on.tolist()):
             self.estimator.enable(b, use)
-        theta = self.estimator.update(y * weight, h * weight[:, None])
+        theta = self.estimator.update(check.y, check.h)
         noise = self.estimator._ready("noise").part("fast", "noise")
-        np.maximum(noise, least**2, out=noise)
-        self.theta = theta if self.guard is None else guarded(self, self.guard, theta, weight * error, least, on)
-        over = on & (np.sqrt(self._square) > _STRAIN.error_limit * np.maximum(least, self.level))
-        self._strained = self._strained + 1 if over.any() else 0
+        np.maximum(noise, check.least**2, out=noise)
+        self._strained = self._strained + 1 if check.over.any() else 0
+        self.theta = theta if self.guard is None else guarded(self, self.guard, theta, check.weighted_error, check.least, on)
         if self.two_step is not None and self.two_step.due(self._strained) and not (self.guard and self.guard.several):
             launch(self, self.two_step)
         return True
-
-    def _follow(self, error: FloatArray, weight: FloatArray, on: BoolArray) -> None:
-        """Mean squares of the weighted residuals and of the torques, over the last seconds."""
-        rate = self.rows.timing.stride * self.dt / _RESIDUAL_SECONDS
-        square, torque, signals = self._square.tolist(), self._torque.tolist(), self.rows.signals
-        motor, link = float(signals[1]) ** 2, float(signals[11]) ** 2
-        rows = zip(self._from_link, on.tolist(), weight.tolist(), error.tolist(), strict=True)
-        for b, (from_link, use, w, e) in enumerate(rows):
-            if use:
-                square[b] += rate * ((w * e) ** 2 - square[b])
-                torque[b] += rate / 5 * ((link if from_link else motor) - torque[b])
-        self._square[:], self._torque[:] = square, torque
 
     def _shares(self) -> FloatArray:
         """Share of the kernel in which motor and link stand still or turn round."""
         noise = self.watch.noise
         return self.rows.standstill(float(noise[Q_M]), float(noise[Q_L]))
 
-    def _weights(self, shares: FloatArray) -> FloatArray:
-        """Rows at a reversal count less: there friction may take any value between its limits."""
-        theta = self.theta.tolist()
-        motor, link = (float(s) * sum(abs(theta[i]) for i in which) for s, which in zip(shares, self._friction, strict=True))
-        found = []
-        for (by_motor, by_link), size in zip(self._feels.tolist(), self._size().tolist(), strict=True):
-            doubt = (motor * motor if by_motor else 0.0) + (link * link if by_link else 0.0)
-            found.append(1.0 / math.sqrt(1.0 + doubt / (size * size)))
-        return np.array(found)
-
     def _size(self) -> FloatArray:
         """Size of the residuals now."""
-        found: FloatArray = np.maximum(np.maximum(self.floor, np.sqrt(self._square)), 1e-12)
+        found: FloatArray = np.maximum(np.maximum(self.floor, np.sqrt(self._square)), LEAST)
         return found
 
     def _weight_of(self, shares: FloatArray, theta: FloatArray, size: FloatArray) -> FloatArray:
@@ -310,8 +303,7 @@ class OnlineEstimator:
         self.theta = self.estimator.theta
         self.sigma = self.estimator.deviation
         self._square = np.mean((y - h @ self.theta) ** 2, axis=0)
-        signals = self.rows.signals
-        self._torque[:] = [signals[11] ** 2 if from_link else signals[1] ** 2 for from_link in self._from_link]
+        self._torque = self.rows.signals[self._reference] ** 2
         self._collected = []
         self._floors()
         self.level = np.sqrt(self._square)
@@ -354,22 +346,15 @@ class OnlineEstimator:
         self.sigma = self.estimator.deviation
         self._ratios()
 
-    def _ratios(self) -> FloatArray:
-        least = self._least()
-        self.ratio = np.sqrt(self._square) / least
-        return least
-
-    def _least(self) -> FloatArray:
-        """What counts as noise at least: the floor, and a share of the torque balanced [N.m]."""
+    def _ratios(self) -> None:
         share = self.options.floor_share * np.sqrt(self._torque)
-        found: FloatArray = np.maximum(np.maximum(self.floor, share), 1e-12)
-        return found
+        self.ratio = np.sqrt(self._square) / np.maximum(np.maximum(self.floor, share), LEAST)
 
     def _judge(self, good: list[bool]) -> None:
         """The most severe fault now, and the scores."""
         detector = self.detector
         if detector is not None:
-            self.plant_alarm, self.score = plant_alarm(detector, self.dt), scores(detector)
+            self.plant_alarm, self.score = plant_alarm(detector, self.dt), detector.scores()
         missing = [not g and (self._needs[i] or (detector is not None and self.present[i])) for i, g in enumerate(good)]
         found = worst(missing, detector, self.watch)
         if not found and self.estimator is not None and self.is_fitted:

@@ -19,6 +19,7 @@ from typing import final
 from identification.errors import InputError
 
 from .archive import content_guid, write_archive
+from .command_line import checkpoint
 from .compiler import compile_library, find_compiler, header_folder
 
 _HERE = Path(__file__).parent
@@ -255,6 +256,7 @@ def _describe(spec: SlaveSpec, resources: Mapping[str, bytes], guid: str) -> byt
             path = folder / name
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(code)
+        checkpoint()
         script = resources["slavemodule.txt"].decode()
         out = Path(temporary) / "out.xml"
         done = subprocess.run(

@@ -96,26 +96,32 @@ def published_joint(path: Path, name: str, *, link_inertia: float = 0.5, gravity
     try:
         table: dict[str, Any] = json.loads(Path(path).read_text(encoding="utf-8"))
         row = table[name]
-    except (OSError, json.JSONDecodeError) as error:
-        raise InputError(f"{path}: not a table of published parameters ({error})") from None
-    except KeyError:
-        raise InputError(f"{path}: no parameters {name!r}; there are {', '.join(sorted(table))}") from None
+        needed = {n: float(row[n]) for n in ("armature", "friction_viscous", "friction_base", "kt")}
+        needed |= {n: float(row[n]) for n in ("dtheta_stribeck", "alpha") if float(row.get("friction_stribeck", 0.0)) > 1e-3}
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); give the path of a table of published parameters") from None
+    except KeyError as error:
+        if name not in table:
+            raise InputError(f"{path}: no parameters {name!r}; there are {', '.join(sorted(table))}") from None
+        raise InputError(f"{path}: {name} has no {error.args[0]}; give a table with a row of numbers for each module") from None
+    except (ValueError, TypeError, AttributeError) as error:
+        raise InputError(f"{path}: not a table of published parameters ({error}); give the params.json of the set") from None
     digits = name.partition("/")[0].rpartition("_")[2]
     if not digits.isdigit():
         raise InputError(f"{name}: the module's name does not say its gear ratio")
     effects = ["viscous@motor", "coulomb@motor", "gravity"]
     values = {
-        "motor_inertia": float(row["armature"]), "link_inertia": link_inertia, "gravity_torque": gravity_torque,
-        "motor_viscous": float(row["friction_viscous"]), "motor_coulomb": float(row["friction_base"]),
+        "motor_inertia": needed["armature"], "link_inertia": link_inertia, "gravity_torque": gravity_torque,
+        "motor_viscous": needed["friction_viscous"], "motor_coulomb": needed["friction_base"],
     }  # fmt: skip
     if float(row.get("friction_stribeck", 0.0)) > 1e-3:
         effects.insert(2, "stribeck@motor")
         values |= {
             "motor_stribeck_extra": float(row["friction_stribeck"]),
-            "motor_stribeck_velocity": float(row["dtheta_stribeck"]), "motor_stribeck_exponent": min(2.0, max(0.5, float(row["alpha"]))),
+            "motor_stribeck_velocity": needed["dtheta_stribeck"], "motor_stribeck_exponent": min(2.0, max(0.5, needed["alpha"])),
         }  # fmt: skip
     joint = Joint(
-        name=name.replace("/", "_"), gear_ratio=float(digits), torque_per_current=float(row["kt"]), model_name="hd1",
+        name=name.replace("/", "_"), gear_ratio=float(digits), torque_per_current=needed["kt"], model_name="hd1",
         effects=tuple(effects),
     )  # fmt: skip
     return replace(joint, fitted=_all_values(joint, values))

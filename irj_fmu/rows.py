@@ -212,6 +212,12 @@ class RowMaker:
         self._speeds = [_NAMES.index("motor_velocity"), _NAMES.index("link_velocity")]
         self._sharpen()
         self._velocity_gain = float(np.linalg.norm(kernel(t.pointwise, t.dt, 1)))
+        self._middle = centre
+        self._flat_smoothing = self._smoothing.reshape(-1, size)
+        self._smooth_sum, self._average_sum = (
+            np.where(np.arange(len(table)) < plain, table.sum(axis=1), 0.0)[:, None] for table, plain in ((self._flat_smoothing, new), (self.averaging, 1))
+        )
+        self._still = _standstill(self._weights)
 
     def _sharpen(self) -> None:
         """Velocities below which a side counts as standing still."""
@@ -241,6 +247,12 @@ class RowMaker:
         for i, item in enumerate(self._out):
             buffer.set_res(i, memoryview(item))  # type: ignore[arg-type, unused-ignore]
         self._buffer = buffer
+        self._slow, self._share = np.zeros(2), np.zeros(2)
+        still, self._find_still = self._still.buffer()
+        for i, item in enumerate((self._speed, self._slow)):
+            still.set_arg(i, memoryview(item))  # type: ignore[arg-type, unused-ignore]
+        still.set_res(0, memoryview(self._share))  # type: ignore[arg-type, unused-ignore]
+        self._still_buffer = still
         self.rows_before_ready = -(-length // new)
         self.made = 0
         self.signals = np.zeros(len(_NAMES))
@@ -260,8 +272,11 @@ class RowMaker:
         (balances,) and (balances, parameters) array, or None until the kernel is filled.
         """
         raw, smooth, before, held, started = self._in
+        middle = window[self._middle]
+        apart = window - middle  # derivatives of a signal that stands still are zero then, and not rounding
         if self.needed:
-            found = self._smoothing.reshape(-1, len(window)) @ window
+            found = self._flat_smoothing @ apart
+            found += self._smooth_sum * middle
             smooth.ravel()[self._to] = found.ravel()[self._from]
             raw[:] = smooth
             raw.ravel()[self._raw_to] = window.ravel()[self._raw_from]
@@ -274,8 +289,9 @@ class RowMaker:
             self._speed[:-new] = self._speed[new:].copy()
             self._speed[-new:] = raw[:, self._speeds]
         self.made += 1
-        averaged = (self.averaging @ window).ravel()
-        self.signals[self._index] = averaged[self._flat]
+        averaged = self.averaging @ apart
+        averaged += self._average_sum * middle
+        self.signals[self._index] = averaged.ravel()[self._flat]
         self.signals[0] = time - self.timing.delay
         full = self.linear @ self.signals
         if self.needed:
@@ -307,7 +323,8 @@ class RowMaker:
         points : (n, signals) array
             Signals at the last points, newest last; those that the kernel holds are enough.
         """
-        self.made, self.signals, self._speed = other.made, other.signals.copy(), other._speed.copy()
+        self.made, self.signals = other.made, other.signals.copy()
+        self._speed[:] = other._speed
         raw = self._in[0]
         new = len(raw)
         for at in range(len(points) % new, len(points), new):
@@ -320,12 +337,10 @@ class RowMaker:
         """Share of the kernel in which motor and link stand still or turn round, as far as their noise lets one see, (2,)."""
         if not self.needed:
             return np.zeros(2)
-        gain, sharp, speed = self._velocity_gain, self._sharp, self._speed
-        slow = (max(3 * motor_noise * gain, sharp[0]), max(3 * link_noise * gain, sharp[1]))
-        still = np.abs(speed) < slow
-        still[1:] |= speed[1:] * speed[:-1] < 0
-        share = still.astype(np.float64)
-        return np.array([self._weights @ share[:, 0].copy(), self._weights @ share[:, 1].copy()])
+        gain, sharp = self._velocity_gain, self._sharp
+        self._slow[:] = max(3 * motor_noise * gain, sharp[0]), max(3 * link_noise * gain, sharp[1])
+        self._find_still()
+        return self._share.copy()
 
     # --- noise -------------------------------------------------------------------------------------------------------
 
@@ -365,3 +380,17 @@ class RowMaker:
         for target, values in zip(self.numbers()[:-1], arrays, strict=False):
             target[:] = values.reshape(target.shape)
         self.made = int(arrays[-1][0])
+
+
+def _standstill(weights: FloatArray) -> Any:
+    """(velocities at the points, (2, points), velocities that count as none) -> share of the kernel at rest or turning, (2,)."""
+    speed, slow = ca.SX.sym("speed", 2, len(weights)), ca.SX.sym("slow", 2)
+    shares = []
+    for side in range(2):
+        share = ca.SX(0)
+        for k, weight in enumerate(weights.tolist()):
+            now = speed[side, k]
+            still = ca.fabs(now) < slow[side]
+            share += weight * (ca.logic_or(still, now * speed[side, k - 1] < 0) if k else still)
+        shares.append(share)
+    return ca.Function("still", [speed, slow], [ca.vertcat(*shares)])

@@ -10,11 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from casadi_models import JointModel
-from identification._varpro_model import _joint_shape
 from identification._varpro_window import linear_fit, search_window, simplex_fit
 from identification.errors import InputError
 from identification.recursive import RecursiveLeastSquares
-from identification.two_step import JOINT_CHANNELS, OnlineSettings, SeparableModel, Shape, TwoStepFit, TwoStepSettings
+from identification.two_step import JOINT_CHANNELS, OnlineSettings, SeparableModel, Shape, TwoStepFit, TwoStepSettings, joint_shape
 
 from .first_window import least_range, least_squares
 from .two_step_rows import SIGNALS, RowWindow, ShapedBalances
@@ -140,7 +139,7 @@ def nothing(task: Task, text: str, *, good: bool) -> Found:
 def boxes(model: JointModel, names: Sequence[str], task: Task) -> tuple[Shape, ...]:
     """The shapes with boxes from the motion of the window; what a box does not hold is moved inside."""
     signals = task.window.signals[:, [SIGNALS.index(c) for c in JOINT_CHANNELS]]
-    return tuple(_joint_shape(model, n, signals) for n in names)
+    return tuple(joint_shape(model, n, signals) for n in names)
 
 
 def _before(

@@ -68,32 +68,38 @@ def load_user_joint(path: str | Path) -> UserModel:
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as a joint file ({error})") from None
-    for key in data:
+        why = error.strerror if isinstance(error, OSError) else str(error)
+        raise InputError(f"{path}: cannot be read as a joint file ({why}); give the path of a TOML file") from None
+    for key, value in data.items():
         if key not in _TABLES:
             raise InputError(f"{path}: unknown table [{key}]; with an FMU as the model there are [{'], ['.join(_TABLES)}]")
+        if not isinstance(value, Mapping):
+            raise InputError(f"{path}: {key} must be a table, as [{key}] on a line of its own")
     table = data.get("model")
     if not isinstance(table, Mapping):
         raise InputError(f"{path}: no [model] table; write [model] with fmu = \"file.fmu\"")
     for key in table:
         if key not in _KEYS:
             raise InputError(f"{path}: [model] has an unknown key {key!r}; known: {', '.join(_KEYS)}")
-    if not isinstance(table.get("fmu"), str):
+    if "fmu" not in table:
         raise InputError(f"{path}: [model] has no fmu; write fmu = \"file.fmu\"")
+    if not isinstance(table["fmu"], str) or not table["fmu"].strip():
+        raise InputError(f"{path}: [model] fmu = {_shown(table['fmu'])} is not the name of an FMU; write fmu = \"file.fmu\"")
     rest = {k: v for k, v in data.items() if k in ("joint", "columns")}
     joint = parse_joint({**rest, "joint": {**rest.get("joint", {}), "model": "hd1"}}, str(path))
     fmu = path.parent / table["fmu"]
     fitted = {str(k): _value(v, f"{path}: [fitted] {k}") for k, v in data.get("fitted", {}).items()}
+    channels, bounds, start = _pairs(table, "channels", path), _bounds(table, path), _pairs(table, "start", path)
+    window, hold = _number(table.get("window"), f"{path}: [model] window"), _flag(table.get("hold", True), path)
     try:
-        model = load_user_model(
-            fmu, _pairs(table, "channels", path), _bounds(table, path), start=_pairs(table, "start", path), joint=joint,
-            window=_number(table.get("window"), f"{path}: [model] window"), hold=_flag(table.get("hold", True), path),
-            kind=table.get("kind"),
-        )  # fmt: skip
+        model = load_user_model(fmu, channels, bounds, start=start, joint=joint, window=window, hold=hold, kind=table.get("kind"))
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     outside = _outside(table.get("outside", []), joint, fitted, path)
-    return replace(model, correction=outside).with_values(fitted)
+    made = replace(model, correction=outside)
+    strangers = [k for k in fitted if k not in made.values and not k.startswith(PREFIX)]
+    note = f"{path}: [fitted] {', '.join(strangers)}: [model.parameters] has no such name; the value is left out"
+    return replace(made, notes=(*made.notes, note) if strangers else made.notes).with_values(fitted)
 
 
 def _value(entry: Any, where: str) -> float:
@@ -115,6 +121,18 @@ def _number(value: Any, where: str) -> float | None:
     return found
 
 
+def _scale(value: Any, where: str) -> float:
+    found = _finite(value, where)
+    if found == 0:
+        raise InputError(f"{where} = 0 would leave nothing of it; give variable / channel, or leave the scale out")
+    return found
+
+
+def _shown(value: Any) -> str:
+    """A value as it stands in a joint file."""
+    return _text(value) if isinstance(value, str) else str(value).lower() if isinstance(value, bool) else repr(value)
+
+
 def _flag(value: Any, path: Path) -> bool:
     if not isinstance(value, bool):
         raise InputError(f"{path}: [model] hold = {value!r}; use true or false")
@@ -130,8 +148,11 @@ def _pairs(table: Mapping[str, Any], name: str, path: Path) -> dict[str, Any]:
             other = entry.get(_ENTRY[name])
             if not isinstance(other, str) or set(entry) - {_ENTRY[name], "scale"}:
                 raise InputError(f"{where} must be a name or a table with {_ENTRY[name]} and scale")
-            found[key] = (other, _finite(entry["scale"], f"{where} scale")) if "scale" in entry else other
-        elif isinstance(entry, str) or (name == "start" and isinstance(entry, bool | int | float)):
+            found[key] = (other, _scale(entry["scale"], f"{where} scale")) if "scale" in entry else other
+        elif isinstance(entry, str) or (name == "start" and isinstance(entry, bool)):
+            found[key] = entry
+        elif name == "start" and isinstance(entry, int | float):
+            _finite(entry, where)
             found[key] = entry
         else:
             raise InputError(f"{where} = {entry!r}; give the name of a {_ENTRY[name]}")

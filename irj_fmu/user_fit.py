@@ -28,6 +28,7 @@ from .user_sensitivity import BlackBox, Simulator, scale_of, start_scale
 if TYPE_CHECKING:
     from .user_diagnose import UserDiagnosis
 
+Progress = Callable[[str, float], None]
 _MOVED: Final = 1e-9
 """A column smaller than this share of the output's own size moves nothing."""
 _ENOUGH: Final = 1e-5
@@ -105,7 +106,9 @@ class UserFit:
         return self.model.diagnose(self.records, held_out, progress)
 
 
-def fit(model: UserModel, records: Record | Sequence[Record], *, iterations: int = 25, exact: bool = True) -> UserFit:
+def fit(
+    model: UserModel, records: Record | Sequence[Record], *, iterations: int = 25, exact: bool = True, progress: Progress | None = None
+) -> UserFit:
     """Fit the parameters of a user's FMU to records.
 
     Parameters
@@ -116,6 +119,8 @@ def fit(model: UserModel, records: Record | Sequence[Record], *, iterations: int
         Gauss-Newton steps at most.
     exact : bool
         False: difference quotients even where exact derivatives are to be had.
+    progress : callable, optional
+        ``progress(text, share)``; how many steps are needed shows only at the end, so the share is a guess.
 
     Raises
     ------
@@ -127,15 +132,19 @@ def fit(model: UserModel, records: Record | Sequence[Record], *, iterations: int
     given = listed(records)
     if not model.values:
         raise InputError(f"{model.fmu.path.name}: no parameter to fit; name those that may move")
+    say = progress or (lambda _text, _share: None)
     windows = model.windows(given)
+    say(f"taking up {model.fmu.path.name}", 0.02)
     simulator, method = simulator_of(model, windows, exact)
     solver = Solver(model, windows, simulator, noise_of(model, given))
-    used = solver.solve(iterations)
+    used = solver.solve(iterations, say)
+    say("standard errors", 0.95)
     fitted = model.with_values(solver.values)
     stderr, correlation = solver.errors()
     bounds = model.bounds()
     at_bound = tuple(n for n in solver.names if any(abs(solver.values[n] - b) <= 1e-9 * max(abs(b), 1e-300) for b in bounds[n] if math.isfinite(b)))
     stderr = {n: None if n in at_bound else e for n, e in stderr.items()}
+    say("done", 1.0)
     return UserFit(
         fitted, stderr, tuple(n for n in model.values if n not in solver.names), at_bound, correlation, method, used,
         comparison_of(fitted, given, windows, solver.predicted), tuple(given),
@@ -213,7 +222,7 @@ class Solver:
         pairs = zip(self.windows, self.predicted if predicted is None else predicted, strict=True)
         return sum(float(np.sum(((w.outputs - y) / self.sigma) ** 2)) for w, y in pairs)
 
-    def solve(self, iterations: int) -> int:
+    def solve(self, iterations: int, say: Progress = lambda _text, _share: None) -> int:
         """Iterate to the end; the number of steps."""
         used = 0
         for last in (False, True):
@@ -224,6 +233,7 @@ class Solver:
                 self._drop_unmoved()
             for _ in range(max(1, iterations - used) if last else iterations):
                 used += 1
+                say(f"fitting, step {used}", 0.95 - 0.9 * 0.85**used)
                 if self._step() < _ENOUGH:
                     break
         return used

@@ -7,7 +7,6 @@ needed are looked up, so that a co-simulation FMU may lack those of model exchan
 from __future__ import annotations
 
 import ctypes
-import difflib
 import shutil
 import tempfile
 import weakref
@@ -20,7 +19,7 @@ import numpy as np
 
 from identification.errors import InputError
 
-from .host import FmuError, Number, _callbacks
+from .host import FmuError, Number, _callbacks, near_names
 from .signals import FloatArray
 
 Kind = Literal["me", "cs"]
@@ -62,7 +61,7 @@ class UserFmu:
 
         self.path = Path(path).resolve()
         if not self.path.exists():
-            raise InputError(f"{self.path}: there is no such FMU")
+            raise InputError(f"{self.path}: there is no such FMU; give its path, relative to the joint file or whole")
         try:
             if self.path.is_file():
                 folder = tempfile.mkdtemp(prefix="irj-user-")
@@ -71,9 +70,11 @@ class UserFmu:
                 self.folder = Path(folder)
             else:
                 self.folder = self.path
+            if not (self.folder / "modelDescription.xml").is_file():
+                raise InputError("it holds no modelDescription.xml; give an .fmu file")
             self.description: Any = read_model_description(str(self.folder))
         except Exception as error:
-            raise InputError(f"{self.path}: not a readable FMU ({error})") from error
+            raise InputError(f"{self.path}: not a readable FMU ({' '.join(str(error).split())})") from error
         if str(self.description.fmiVersion)[:2] not in ("2.", "3."):
             raise InputError(f"{self.path}: FMI {self.description.fmiVersion} is not supported; export it as FMI 2.0 or 3.0")
         self.version = int(self.description.fmiVersion[0])
@@ -104,8 +105,7 @@ class UserFmu:
     def variable(self, name: str) -> Any:
         """Return fmpy's description of a variable; an `InputError` suggests near names."""
         if name not in self.variables:
-            close = ", ".join(difflib.get_close_matches(name, self.variables, 3)) or "see its model description"
-            raise InputError(f"{self.path.name}: there is no variable {name!r}; did you mean: {close}")
+            raise InputError(f"{self.path.name}: there is no variable {name!r}; {near_names(name, self.variables)}")
         return self.variables[name]
 
     def real(self, name: str) -> Any:

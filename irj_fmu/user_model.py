@@ -254,6 +254,7 @@ def load_user_model(
     if kind is not None and kind not in ways:
         raise InputError(f"{fmu.path.name}: kind = {kind!r} is not possible; it has {', '.join(ways)}")
     starts, constants = _starts(fmu, start or {}, mapped, notes)
+    notes += _idle(fmu, inputs, {*constants, *(m.variable for m in starts)})
     return UserModel(
         fmu, joint, inputs, outputs, _parameters(fmu, parameters), starts, constants, window, hold, kind or ways[0], None, tuple(notes)
     )
@@ -276,6 +277,17 @@ def _mapped(fmu: UserFmu, channel: str, entry: str | tuple[str, float], kind: st
     if factor != 1.0:
         notes.append(f"{variable}: {unit} from {wanted} of {channel}, times {factor:.9g}")
     return Mapped(channel, variable, factor)
+
+
+def _idle(fmu: UserFmu, inputs: Sequence[Mapped], given: set[str]) -> list[str]:
+    """Inputs of the FMU that nothing drives, as notes."""
+    driven = {m.variable for m in inputs} | given
+    left = [v for v in fmu.variables.values() if v.causality == "input" and v.name not in driven]
+    return [
+        f"{fmu.path.name}: no channel drives its input {v.name}, which stays at {v.start if v.start is not None else 'its start value'}; "
+        "map it in [model.channels], or give it a number in [model.start]"
+        for v in left
+    ]  # fmt: skip
 
 
 def _starts(

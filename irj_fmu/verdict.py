@@ -30,7 +30,7 @@ _RECENT: Final = 5.0
 
 def worst(missing: Sequence[bool], detector: FaultDetector | None, watch: Watch) -> int:
     """Code of the most severe fault of a reading; :data:`NONE` without one."""
-    failed = detector._rule.failed if detector is not None else []
+    failed = detector.replaced if detector is not None else ()
     for flags, code in ((missing, MISSING), (failed, 0), (watch.constant, CONSTANT), (watch.scaled, SCALED)):
         if True in flags:
             return code + 1 + list(flags).index(True)
@@ -47,42 +47,18 @@ def make_detector(model: JointModel, dt: float, options: OnlineOptions, state: b
     if state:
         made.restore(state)
         made.reset()
+    made.compile()
     return made
 
 
 def plant_alarm(detector: FaultDetector, dt: float) -> int:
     """Code of the detector's newest verdict on the joint itself, for some seconds; 0 without one."""
-    if not detector.events:
+    last = detector.last_event
+    if last is None:
         return NONE
-    last = detector.events[-1]
     codes = {"CURRENT_OR_FRICTION": CURRENT_OR_FRICTION, "PLANT": PLANT}
-    recent = detector._rule.k - last.sample < round(_RECENT / dt)
+    recent = detector.sample - last.sample < round(_RECENT / dt)
     return codes.get(last.verdict.name, NONE) if recent else NONE
-
-
-def scores(detector: FaultDetector) -> list[float]:
-    """For each reading, the largest residual that holds it over its limit; at least 1 where it has failed."""
-    from identification._fault_structured import PARITY_SENSORS, StructuredRule
-
-    rule, score = detector._rule, [0.0] * 6
-    if not isinstance(rule, StructuredRule):
-        return score
-    shares = [abs(v) / limit if limit > 0 else 0.0 for v, limit in zip(rule.residuals.values, rule.residuals.limits, strict=True)]
-    for parity, sensors in enumerate(PARITY_SENSORS):
-        most = max(shares[4 * parity : 4 * parity + 4] if parity < 4 else shares[16:])
-        for sensor in sensors:
-            if most > score[sensor]:
-                score[sensor] = most
-    return [max(1.0, value) if failed else value for value, failed in zip(score, rule.failed, strict=True)]
-
-
-def scale_limits(detector: FaultDetector, factor: float) -> None:
-    """Multiply the detector's limits."""
-    from identification._fault_structured import StructuredRule
-
-    if isinstance(detector._rule, StructuredRule):
-        residuals = detector._rule.residuals
-        residuals.limits = [limit * factor for limit in residuals.limits]
 
 
 def implausible(names: Sequence[str], theta: FloatArray, sigma: FloatArray, fitted: Mapping[str, float]) -> int:

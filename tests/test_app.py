@@ -693,3 +693,20 @@ def test_roles_are_guessed_from_names(name: str, role: str) -> None:
 def test_the_demo_is_that_of_the_command_line() -> None:
     folder = Path(__file__).parents[1] / "workbench" / "demo"
     assert {name: (folder / name).read_bytes() for name in ("joint.toml", "train.npz", "held_out.npz")} == demo_files()
+
+
+def test_an_upload_is_answered_with_state_and_first_plot(client: Client) -> None:
+    """So that the page draws a long record without another question."""
+    where = client.session()
+    content = demo_files()["train.npz"]
+    status, answer = client.upload(where, "a.npz?points=300", content)
+    made = json.loads(answer)
+    assert status == 200
+    assert made["state"]["files"][0]["id"] == made["id"]
+    assert "stored" not in made["state"]["files"][0]
+    assert made["plot"] == client.get(f"{where}/view/series?file={made['id']}&points=300&channels={made['plot']['series'][0]['name']}")
+    assert made["state"]["revision"] == client.get(where)["revision"]
+    assert json.loads(client.upload(where, "b.npz", content)[1])["plot"] is None
+    unknown = json.loads(client.upload(where, "c.csv?points=300", b"a,b\n1,2\n3,4\n5,6\n")[1])
+    assert unknown["plot"] is None
+    assert unknown["state"]["files"][-1]["status"] == "columns"

@@ -425,7 +425,7 @@ def test_bad_arguments_are_one_line(folder: Path, capsys: pytest.CaptureFixture[
     for argv, text in (
         (["none.toml"], "none.toml"), ([str(folder)], "directory"), ([str(folder / "plant.fmu")], "text file"), ([str(path), "--jobs", "0"], "at least 1"),
         ([str(path), "-o", str(folder / "taken")], "writable folder"), ([str(path), "-o", str(folder / "taken" / "deeper")], "writable folder"),
-        ([str(path), "--json", str(folder / "no" / "a.json")], "does not exist"),
+        ([str(path), "--json", str(folder / "no" / "a.json")], "no such folder"),
     ):  # fmt: skip
         assert main(argv) == 2
         said = capsys.readouterr().err
@@ -456,7 +456,7 @@ def test_the_study_in_the_docs_is_one(tmp_path: Path, capsys: pytest.CaptureFixt
 
 def test_dry_run_counts(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([str(write(folder, count=12)), "--dry-run"]) == 0
-    assert "1 models x 0 records x 12 cases, 12 runs" in capsys.readouterr().out
+    assert "1 model x 0 records x 12 cases, 12 runs" in capsys.readouterr().out
     assert not (folder / "study-results").exists()
 
 

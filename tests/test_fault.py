@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -312,6 +312,45 @@ def test_absurd_readings_start_the_estimate_again(detector: FaultDetector, unsee
         assert np.isfinite(detector._rule.core.state).all(), k
     assert not np.isnan(detector._rule.numbers()).any()
     assert np.isfinite(np.array(detector._rule.residuals.sums)).all()
+
+
+@pytest.mark.parametrize("columns", [range(6), range(1, 6), (1, 2, 3, 4), (1, 3)])
+@pytest.mark.parametrize("count", [1, 50, 1000])
+def test_readings_are_taken_back_after_an_outage(detector: FaultDetector, unseen: FloatArray, columns: Sequence[int], count: int) -> None:
+    """Without any position the estimate drifts and can judge none: readings that were missing start it anew, 0.1 s after they are back."""
+    healthy = readings(unseen, 9)[: 3500 + count]
+    record = healthy.copy()
+    record[2000 : 2000 + count, list(columns)] = np.nan
+    track = detector.run(record)
+    back = 2000 + count + 100
+    assert track.failed[2000 : back - 1, list(columns)].all()
+    assert not track.failed[back:].any()
+    np.testing.assert_array_equal(track.reconstructed[back:], healthy[back:])
+    assert [e.verdict for e in alarms(track)] == [Verdict.DROPOUT, Verdict.RECOVERED]
+
+
+def test_a_sensor_that_failed_otherwise_stays_out_after_an_outage(detector: FaultDetector, unseen: FloatArray) -> None:
+    """Noise on the link velocity before all readings are missing: only the others are taken back."""
+    record = inject(readings(unseen, 9), DT, [Fault("link_velocity", "noise", 1.7, 0.5)])[:4000]
+    record[2500:2550] = np.nan
+    track = detector.run(record)
+    assert track.failed[2700:, 4].all()
+    assert not track.failed[2700:, [0, 1, 2, 3, 5]].any()
+    assert np.abs(track.reconstructed[2700:, 3] - unseen[2700:4000, 3]).max() < 1e-3
+
+
+def test_the_compiled_sample_has_the_same_bits(plant: JointModel, unseen: FloatArray) -> None:
+    """With a compiler and without: the same readings, events and state, through faults, an outage and absurd values."""
+    record = inject(readings(unseen, 9), DT, [Fault("link_position", "noise", 1.8, 0.1, 2.2), Fault("torque", "bias", 3.0, 30.0)])[:4500]
+    record[2600:2640] = np.nan
+    record[3700:3720, 2] = 1e8
+    plain, fast = (FaultDetector(identified(plant), DT) for _ in range(2))
+    if not fast.compile():
+        pytest.skip("no C compiler")
+    first, second = plain.run(record), fast.run(record)
+    np.testing.assert_array_equal(first.reconstructed, second.reconstructed)
+    assert first.events == second.events
+    assert plain.state() == fast.state()
 
 
 def test_nothing_begins_before_the_first_reading(detector: FaultDetector, unseen: FloatArray) -> None:

@@ -251,6 +251,46 @@ def test_equals_python_for_other_joints_and_sensors(case: str, tmp_path: Path) -
     assert found[-1, reals + names["Integer"].index("n_rows")] < found[4799, reals + names["Integer"].index("n_rows")]
 
 
+@pytest.mark.parametrize("column", [1, 3])
+def test_stuck_encoder_of_a_rigid_joint(column: int, tmp_path: Path) -> None:
+    """Derivatives of a reading that stands still are zero on both sides, not the rounding of large sums."""
+    spec = NativeSpec(start_of(reference_joint("irj1b")), "native", PLAIN)
+    readings = readings_of("irj1b", 6.0)
+    readings[4000:5500, column] = readings[4000, column]
+    found, expected, names = both(spec, build_native(spec, tmp_path / "native.fmu"), tmp_path / "python", readings, {"warm_up": 1.5})
+    reals = len(names["Real"])
+    assert largest(found, expected, reals) <= 1e-9
+    np.testing.assert_array_equal(found[:, reals:], expected[:, reals:])
+    assert 21 + column in expected[:, reals + names["Integer"].index("fault")]
+
+
+ABSURD = (1e300, -1e300, np.inf, -np.inf, np.nan, 1e12)
+ODD = (5e-324, -5e-324, 1e-310, -0.0)
+
+
+def test_absurd_readings_are_told_and_never_an_exception(spec: NativeSpec, fmu: Path, tmp_path: Path) -> None:
+    """Each reading at every absurd value, all at once, and in the first sample: health 2, a code, finite outputs, equal numbers."""
+    readings = readings_of("hd3", 10.5)
+    bad = np.zeros(len(readings), dtype=bool)
+    bad[0] = True
+    readings[0, 3], readings[0, 1] = 1e300, -np.inf
+    for i, value in enumerate((*ABSURD, *ODD)):
+        for column in range(6):
+            first = 3500 + 100 * (6 * i + column)
+            readings[first : first + 30, column] = value
+            bad[first : first + 30] = i < len(ABSURD)
+    readings[10_000:10_020], bad[10_000:10_020] = 1e300, True
+    found, expected, names = both(spec, fmu, tmp_path, readings, {"warm_up": 1.5})
+    reals = len(names["Real"])
+    assert largest(found, expected, reals) <= 1e-9
+    np.testing.assert_array_equal(found[:, reals:], expected[:, reals:])
+    assert np.isfinite(expected).all()
+    health, fault = (expected[:, reals + names["Integer"].index(n)] for n in ("health", "fault"))
+    assert set(health) == {0, 1, 2}
+    assert (health[bad] == 2).all()
+    assert set(range(11, 17)) <= set(fault[bad])
+
+
 def test_variables_are_those_of_the_python_estimator(spec: NativeSpec, tmp_path: Path) -> None:
     """Names, types, units, causality and description in the same order; only bounds of what is built in differ."""
     python = Python(spec, tmp_path, {}).slave.table
@@ -280,11 +320,11 @@ def test_cheaper_observer_has_the_same_values() -> None:
     detector = OnlineEstimator(reference_joint("hd4"), STEP, PLAIN).detector
     assert detector is not None
     core: Any = detector._rule.core
-    made, rng = cheaper(core._function, "made"), np.random.default_rng(0)
-    assert made.n_instructions() < core._function.n_instructions()
+    made, rng = cheaper(core.function, "made"), np.random.default_rng(0)
+    assert made.n_instructions() < core.function.n_instructions()
     for _ in range(20):
-        given = [0.1 * rng.normal(size=core._function.size_in(i)) for i in range(core._function.n_in())]
-        expected = np.array(core._function(*given))
+        given = [0.1 * rng.normal(size=core.function.size_in(i)) for i in range(core.function.n_in())]
+        expected = np.array(core.function(*given))
         np.testing.assert_allclose(np.array(made(*given)), expected, rtol=0, atol=1e-11 * np.max(np.abs(expected)))
 
 
@@ -328,6 +368,32 @@ def test_step_sizes(fmu: Path, table: FloatArray) -> None:
         assert "longer than sample_time" in double.log
         whole.step(table[0], float("nan"))
         assert whole.integer("health") == 4
+
+
+@pytest.mark.parametrize(
+    ("steps", "right"),
+    [((5e-4,), True), ((3e-4,), True), ((2e-3,), False), ((1.6e-2,), False), ((3.2e-2,), False), ((7e-4,), False), ((2e-4, 9e-4, 6e-4), False)],
+)
+def test_host_steps_are_right_or_told(steps: tuple[float, ...], right: bool, spec: NativeSpec, fmu: Path, table: FloatArray, tmp_path: Path) -> None:
+    """Steps that divide the sample time give its numbers; all others health 3, in every later step; Python and native alike."""
+    python = Python(spec, tmp_path, {}).slave
+    health = python._index["health"]
+    with Native(fmu) as native, Native(fmu) as exact:
+        time = 0.0
+        for k in range(1500):
+            row = table[min(round(time / STEP), len(table) - 1)]
+            length = steps[k % len(steps)]
+            native.step(row, time, length)
+            python.set_real(native.inputs, row.tolist())
+            python.do_step(time, length)
+            told = native.integer("health")
+            assert told == python._values[health]
+            assert right or told == 3 or k < 4 * len(steps)
+            time += length
+        if right:
+            exact.feed(table, 0, native.integer("n_samples"))
+            assert native.integer("health") == 1
+            assert steps != (5e-4,) or native.outputs() == exact.outputs()
 
 
 @pytest.mark.parametrize(

@@ -249,7 +249,7 @@ def test_healthy_record_says_so(joint: Joint, state: bytes) -> None:
         ("link_position:stuck", "SENSOR:KIND:START"),
         ("link_position:bias:9", "needs a size"),
         ("link_position:bias:nine:1", "SENSOR:KIND:START"),
-        ("link_position:bias:nan:1", "start < end"),
+        ("link_position:bias:nan:1", "give finite numbers"),
         ("link_position:stuck:9:0:8", "start < end"),
         ("link_position:stuck:9:0:8:7", "SENSOR:KIND:START"),
         ("thumb:stuck:9", "unknown sensor 'thumb'"),

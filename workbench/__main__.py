@@ -1,5 +1,6 @@
-"""`python -m workbench` is `irj`."""
+"""``python -m workbench`` is `irj`."""
 
-from workbench.cli import main
+from workbench.entry import main
 
-raise SystemExit(main())
+if __name__ == "__main__":
+    raise SystemExit(main())

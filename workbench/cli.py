@@ -3,29 +3,23 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib
 import os
 import shlex
 import signal
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import FrameType
-from typing import Any, NoReturn, final
+from typing import Any, TextIO, cast, final
 
 from identification import __version__
 from identification.errors import InputError
+from irj_fmu.command_line import STOPPED, OneLineParser, fail, stopped, system_refusal, terminable
 from workbench.commands.files import check_outputs
 from workbench.commands.user_fmu import module_of
-
-
-@final
-class _Parser(argparse.ArgumentParser):
-    """Says what is wrong with the arguments in one line."""
-
-    def error(self, message: str) -> NoReturn:
-        self.exit(2, f"irj: {message}; see `{self.prog} --help`\n")
 
 
 def _count(text: str) -> int:
@@ -39,8 +33,19 @@ def _count(text: str) -> int:
     return value
 
 
+def _port(text: str) -> int:
+    """A port: 0 for any that is free."""
+    try:
+        value = int(text)
+    except ValueError:
+        value = -1
+    if not 0 <= value <= 65535:
+        raise argparse.ArgumentTypeError(f"takes a port from 0 to 65535, not {text!r}")
+    return value
+
+
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(prog="irj", description="Tells which physics a geared joint's model is missing.")
+    parser = OneLineParser(prog="irj", description="Tells which physics a geared joint's model is missing.")
     parser.add_argument("--version", action="version", version=f"irj {__version__}")
     parser.add_argument("--effects", metavar="FILE.py", action="append", default=[], help="register your own effects from a Python file")
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
@@ -121,7 +126,7 @@ def _parser() -> argparse.ArgumentParser:
         verbs.add_parser(name, help=text, add_help=False).set_defaults(module="fmi", own_effects=[])
     app = verb("app", "page", "the page in your browser")
     app.add_argument("files", nargs="*", metavar="FILES")
-    app.add_argument("--port", type=int, default=0)
+    app.add_argument("--port", type=_port, default=0)
     app.add_argument("--no-browser", action="store_true")
     return parser
 
@@ -135,46 +140,90 @@ def main(argv: Sequence[str] | None = None) -> int:
     if rest and arguments.module != "fmi":
         parser.error(f"unrecognized arguments: {' '.join(rest)}")
     arguments.command = shlex.join(["irj", *given])
-    interrupted = _watched_interrupt()
+    STOPPED.clear()
+    with _watched_interrupt(), _patient_output():
+        try:
+            return _run(arguments)
+        except InputError as error:
+            return fail(str(error))
+        except OSError as error:
+            return fail(system_refusal(error))
+        except MemoryError as error:
+            return fail(f"not enough memory ({error}); give shorter or fewer records")
+        except KeyboardInterrupt:
+            STOPPED.append(signal.SIGINT)
+            return stopped()
+        except Exception:
+            if STOPPED:  # compiled code may turn an interrupt into an error of its own
+                return stopped()
+            raise
+        finally:
+            STOPPED.clear()
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    check_outputs(arguments)
+    _register([*arguments.effects, *arguments.own_effects])
+    module = importlib.import_module(f"workbench.commands.{module_of(arguments)}")
+    work = getattr(module, f"run_{arguments.verb}")
+    if arguments.module == "page":  # the server heeds signals itself
+        return int(work(arguments))
+    with terminable():
+        return int(work(arguments))
+
+
+@final
+class _Patient:
+    """Standard output whose reader may leave: what is still printed is dropped, and the work goes on to its end."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        """Write, or drop where nobody reads any more."""
+        return self._tried(lambda: self._stream.write(text)) or len(text)
+
+    def flush(self) -> None:
+        """Flush, or drop where nobody reads any more."""
+        self._tried(self._stream.flush)
+
+    def _tried(self, call: Callable[[], int | None]) -> int | None:
+        try:
+            return call()
+        except BrokenPipeError:  # the reader of our output has seen enough
+            os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
+            return None
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+@contextlib.contextmanager
+def _patient_output() -> Iterator[None]:
+    patient = _Patient(sys.stdout)
+    with contextlib.redirect_stdout(cast(TextIO, patient)):
+        try:
+            yield
+        finally:
+            patient.flush()
+
+
+@contextlib.contextmanager
+def _watched_interrupt() -> Iterator[None]:
+    """Note that the user interrupts; the interrupt itself is raised as ever."""
+    if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield
+        return
+
+    def note(number: int, frame: FrameType | None) -> None:
+        STOPPED.append(number)
+        signal.default_int_handler(number, frame)
+
+    signal.signal(signal.SIGINT, note)
     try:
-        check_outputs(arguments)
-        _register([*arguments.effects, *arguments.own_effects])
-        module = importlib.import_module(f"workbench.commands.{module_of(arguments)}")
-        code = int(getattr(module, f"run_{arguments.verb}")(arguments))
-        sys.stdout.flush()
-        return code
-    except InputError as error:
-        return _fail(str(error))
-    except BrokenPipeError:  # the reader of our output has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
-    except OSError as error:
-        where = f"{error.filename}: " if error.filename else ""
-        return _fail(f"{where}{error.strerror or error}; check the path, its permissions and the space on the disk")
-    except KeyboardInterrupt:
-        return _interrupted()
-    except Exception:
-        if interrupted:  # compiled code may turn an interrupt into an error of its own
-            return _interrupted()
-        raise
-
-
-def _watched_interrupt() -> list[bool]:
-    """A list that is filled when the user interrupts; the interrupt itself is raised as ever."""
-    seen: list[bool] = []
-    if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-
-        def note(number: int, frame: FrameType | None) -> None:
-            seen.append(True)
-            signal.default_int_handler(number, frame)
-
-        signal.signal(signal.SIGINT, note)
-    return seen
-
-
-def _interrupted() -> int:
-    print("\nirj: interrupted" if sys.stderr.isatty() else "irj: interrupted", file=sys.stderr)
-    return 130
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def _register(files: Sequence[str]) -> None:
@@ -188,11 +237,6 @@ def _register(files: Sequence[str]) -> None:
             EFFECTS.load(path)
         except Exception as error:  # a user's file may fail in any way
             raise InputError(f"{path}: cannot be used as effects ({type(error).__name__}: {error})") from None
-
-
-def _fail(text: str) -> int:
-    print("irj: " + " ".join(str(text).split()), file=sys.stderr)
-    return 2
 
 
 def improve_json(train: Sequence[str | Path], held_out: Sequence[str | Path], joint: str | Path) -> dict[str, Any]:

@@ -23,8 +23,10 @@ static void tell(Twin *m, int once, const char *format, ...) { /* a text once pe
     va_end(values);
 }
 
+#define UNEVEN 0.25 /* deviation of the time between samples, as a share of it, that passes without a word */
+#define UNEVEN_HOLD 200 /* samples for which health remembers it */
 enum { HEALTH_OK, WARMING_UP, NUMERIC_TROUBLE, STEP_MISMATCH, INTERNAL_ERROR };
-enum { TELL_STEP = N_VARIABLES, TELL_SETUP, TELL_WINDOW, TELL_FAULT }; /* places in `told` after those of the variables */
+enum { TELL_STEP = N_VARIABLES, TELL_SETUP, TELL_WINDOW, TELL_UNEVEN, TELL_FAULT }; /* places in `told` after those of the variables */
 
 /* ---- life --------------------------------------------------------------------------------------------------------- */
 
@@ -301,11 +303,11 @@ static int process(Twin *m, double time) { /* gives the health */
     double readings[SENSORS];
     int good[SENSORS], lost = 0, i;
     for (i = 0; i < SENSORS; i++) {
-        const double value = s->real[input_at[i]];
-        const int is_lost = !isfinite(value);
-        if (is_lost) tell(m, input_at[i], "input not finite: %s; it counts as missing", input_name[i]);
+        const double value = s->real[input_at[i]] * input_gain[i];
+        const int is_lost = !(value > -ABSURD && value < ABSURD);
+        if (is_lost) tell(m, input_at[i], "input not finite or beyond %g in SI units: %s; it counts as missing", ABSURD, input_name[i]);
         lost |= is_lost;
-        readings[i] = is_lost ? 0 : value * input_gain[i];
+        readings[i] = is_lost ? 0 : value;
         good[i] = s->whole[valid_at[i]] && !is_lost && present[i];
     }
     if (s->whole[V_REQUEST]) tell(m, V_REQUEST, "reoptimise_request: a native estimator has no optimiser");
@@ -324,6 +326,7 @@ static int process(Twin *m, double time) { /* gives the health */
 static void sample(Twin *m, double time, double length) {
     State *s = &m->s;
     int too_long, health;
+    double apart;
     if (isnan(s->start)) s->start = time;
     too_long = length > SAMPLE_TIME * (1 + 1e-6);
     if (!too_long && time < s->start + s->samples * SAMPLE_TIME - SAMPLE_TIME * 1e-5) return;
@@ -336,7 +339,16 @@ static void sample(Twin *m, double time, double length) {
         return;
     }
     s->samples = (Count)floor((time - s->start) / SAMPLE_TIME + 1e-3) + 1;
-    if (too_long) tell(m, TELL_STEP, "the host's step %g s is longer than sample_time %g s", length, SAMPLE_TIME);
+    apart = time - s->last;
+    s->last = time;
+    if (too_long) {
+        tell(m, TELL_STEP, "the host's step %g s is longer than sample_time %g s", length, SAMPLE_TIME);
+    } else if (s->expected > 0 && fabs(apart - s->expected) > UNEVEN * SAMPLE_TIME) {
+        s->uneven = time;
+        tell(m, TELL_UNEVEN, "the host's steps of %g s put samples %g s apart, sample_time is %g s; use steps that divide it", length, apart, SAMPLE_TIME);
+    }
+    s->expected = fmax(SAMPLE_TIME, length);
+    too_long |= time < s->uneven + UNEVEN_HOLD * SAMPLE_TIME;
     health = process(m, time);
     s->whole[V_HEALTH] = too_long && health < STEP_MISMATCH ? STEP_MISMATCH : health;
     s->whole[V_N_SAMPLES]++;

@@ -1,73 +1,9 @@
-/* Fault detector: identification._fault_structured and _fault_residuals on the observer that CasADi has written.
+/* Fault detector: identification._fault_structured on the observer that CasADi has written.
  *
  * Bits, waits, limits and signatures come from native_config.h. A verdict on the joint itself is kept as an event.
  */
-#define MASK (FAULT_RING - 1)
-#define ABSURD 1e9
 #define LARGEST 1e6   /* a reading beyond this is no place to start an estimate from */
 #define EXCHANGED 1e9 /* gates while the estimate settles */
-
-enum { LINK_PARITY = 1, MOTOR_PARITY = 2, TORSION = 4, LINK_JUMP = 8, MOTOR_JUMP = 16, LINK = 32, MOTOR = 64 };
-
-static const int residual_bit[RESIDUALS] = {
-    LINK_PARITY, LINK_PARITY, LINK_PARITY, LINK_PARITY, MOTOR_PARITY, MOTOR_PARITY, MOTOR_PARITY, MOTOR_PARITY,
-    LINK_JUMP, LINK, LINK, LINK, MOTOR_JUMP, MOTOR, MOTOR, MOTOR, TORSION, TORSION, TORSION};
-static const int energy_at[3] = {0, 4, 16};
-
-static int outside(double value, double limit) { return !(value >= -limit && value <= limit); }
-
-static int index_of(int bit) {
-    int i;
-    for (i = 0; bit >> (i + 1); i++) {}
-    return i;
-}
-
-/* ---- residuals ---------------------------------------------------------------------------------------------------- */
-
-static void invalidate(Fault *f, int parity, Count sample) {
-    f->valid[parity] = sample;
-    memset(f->energy, 0, sizeof f->energy);
-}
-
-/* One sample of the residuals; gives the bits of those over their limits. */
-static int residuals(Fault *f, const double positions[4], const double rates[4], double torsion) {
-    int bits = 0, i, j;
-    for (i = 0; i < 4; i++) {
-        const Count age = f->k - f->valid[i];
-        double now;
-        f->sums[i] += HALF_STEP * (rates[i] + f->last[i]);
-        f->last[i] = rates[i];
-        now = positions[i] - f->sums[i];
-        f->ring[i][f->k & MASK] = now;
-        for (j = 0; j < 4; j++) {
-            const double value = age >= lag[j] ? now - f->ring[i][(f->k - lag[j]) & MASK] : 0;
-            f->values[4 * i + j] = value;
-            if (outside(value * f->scale[i], f->limits[4 * i + j])) bits |= residual_bit[4 * i + j];
-        }
-    }
-    if (HAS_TORQUE) {
-        const Count age = f->k - f->valid[4];
-        const double weight = f->scale[4];
-        double now;
-        f->values[16] = torsion;
-        f->sums[4] = now = f->sums[4] + HALF_STEP * (torsion + f->last[4]);
-        f->last[4] = torsion;
-        f->ring[4][f->k & MASK] = now;
-        f->values[17] = age >= lag[1] ? (now - f->ring[4][(f->k - lag[1]) & MASK]) * MEAN_1 : 0;
-        f->values[18] = age >= lag[2] ? (now - f->ring[4][(f->k - lag[2]) & MASK]) * MEAN_2 : 0;
-        for (j = 16; j < RESIDUALS; j++)
-            if (outside(f->values[j] * weight, f->limits[j])) bits |= TORSION;
-    }
-    for (i = 0; i < 3; i++) {
-        const double value = f->values[energy_at[i]], grown = f->energy[i] + value * value * energy_inverse[i] - ENERGY_DRIFT;
-        f->energy[i] = fmax(0, fmin(grown, 1e9));
-        if (grown > 0 && grown > energy_limit[i]) {
-            bits |= residual_bit[energy_at[i]];
-            f->energy[i] = 0.5 * energy_limit[i];
-        }
-    }
-    return bits;
-}
 
 /* ---- replacement -------------------------------------------------------------------------------------------------- */
 
@@ -129,6 +65,7 @@ static void fail_sensors(Fault *f, int sensors, int verdict) {
     for (i = 0; i < SENSORS; i++)
         if (sensors & 1 << i) {
             f->failed[i] = 1;
+            f->lost[i] = verdict == DROPOUT;
             f->good[i] = 0;
             f->low[i] = INFINITY;
             f->high[i] = -INFINITY;
@@ -162,7 +99,7 @@ static void watch_recovery(Fault *f, const double reading[SENSORS], const double
     }
     if (!back) return;
     for (i = 0; i < SENSORS; i++)
-        if (back & 1 << i) f->failed[i] = 0;
+        if (back & 1 << i) f->failed[i] = f->lost[i] = 0;
     event(f, RECOVERED);
     exchange(f, back);
 }
@@ -311,22 +248,65 @@ static void start_observer(Fault *f, const double readings[SENSORS]) {
     for (i = 0; i < 4; i++) f->observer[i] = readings[i + 1];
 }
 
-/* Absurd readings have driven the estimate out of all bounds: start it and the residuals again. */
-static void begin_anew(Fault *f, const double reading[SENSORS], double used[SENSORS]) {
-    double usable[SENSORS];
+/* Observer at the readings, residuals without a past; their scales stay. */
+static void start_anew(Fault *f, const double readings[SENSORS]) {
     int i;
-    for (i = 0; i < SENSORS; i++) {
-        usable[i] = reading[i] > -LARGEST && reading[i] < LARGEST ? reading[i] : 0;
-        used[i] = f->failed[i] ? usable[i] : reading[i];
-    }
-    start_observer(f, usable);
+    start_observer(f, readings);
     memset(f->ring, 0, sizeof f->ring);
     memset(f->sums, 0, sizeof f->sums);
     memset(f->last, 0, sizeof f->last);
     memset(f->values, 0, sizeof f->values);
     for (i = 0; i < 5; i++) invalidate(f, i, f->k + 1 + WAIT_SETTLE);
+}
+
+static double usable(double reading) { return reading > -LARGEST && reading < LARGEST ? reading : 0; }
+
+/* Absurd readings have driven the estimate out of all bounds: start it and the residuals again. */
+static void begin_anew(Fault *f, const double reading[SENSORS], double used[SENSORS]) {
+    double start[SENSORS];
+    int i;
+    for (i = 0; i < SENSORS; i++) {
+        start[i] = usable(reading[i]);
+        used[i] = f->failed[i] ? start[i] : reading[i];
+    }
+    start_anew(f, start);
     open_gates(f);
     close_suspicion(f);
+}
+
+/* Use readings again that were missing, where no position is in use; identification._fault_return. */
+static void take_back(Fault *f, const double reading[SENSORS], int gone) {
+    static const int others[4][2] = {{Q_M, Q_L}, {Q_L, Q_M}, {W_M, W_L}, {W_L, W_M}};
+    const int here = (f->lost[Q_M] && !(gone & 1 << Q_M)) || (f->lost[Q_L] && !(gone & 1 << Q_L));
+    double start[SENSORS], kept[SENSORS];
+    int i, back = 0;
+    if (!here || !f->failed[Q_M] || !f->failed[Q_L]) {
+        f->there = 0;
+        return;
+    }
+    if (++f->there < WAIT_SETTLE) return;
+    for (i = 0; i < SENSORS; i++)
+        if (f->lost[i] && !(gone & 1 << i)) {
+            back |= 1 << i;
+            f->failed[i] = f->lost[i] = 0;
+        }
+    for (i = 0; i < SENSORS; i++) {
+        start[i] = usable(reading[i]);
+        kept[i] = f->failed[i] ? 0 : start[i];
+    }
+    for (i = 0; i < 4; i++)
+        if (f->failed[others[i][0]]) start[others[i][0]] = kept[others[i][1]];
+    start_anew(f, start);
+    event(f, RECOVERED);
+    f->there = 0;
+    exchange(f, back);
+}
+
+static int any_lost(const Fault *f) {
+    int i;
+    for (i = 0; i < SENSORS; i++)
+        if (f->lost[i]) return 1;
+    return 0;
 }
 
 /* The six readings with failed ones replaced go to `used`. */
@@ -346,12 +326,13 @@ static void detect_faults(Twin *m, const double readings[SENSORS], const int goo
         memset(used, 0, SENSORS * sizeof *used);
         return;
     }
-    if (++f->k == 0) start_observer(f, reading);
     for (i = 0; i < SENSORS; i++)
         if (gone & 1 << i) reading[i] = 0;
+    if (++f->k == 0) start_observer(f, reading);
     if (fresh) fail_sensors(f, fresh, DROPOUT);
     for (i = 0; i < SENSORS; i++)
         if (gone & 1 << i) f->good[i] = 0;
+    if (any_lost(f)) take_back(f, reading, gone);
     m->arg[0] = f->observer; m->arg[1] = reading; m->arg[2] = f->used; m->arg[3] = f->gain; m->arg[4] = f->gate;
     m->res[0] = m->observed;
 #if HAS_DETECTOR

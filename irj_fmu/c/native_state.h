@@ -8,6 +8,7 @@
 #define SENSORS 6
 #define RESIDUALS 19 /* four parities at four lags, then r1 and two means of it */
 #define BITS 7
+#define ABSURD 1e9   /* a reading beyond this (SI) counts as missing, as NaN and infinity do */
 
 enum { DRIVE, Q_M, W_M, Q_L, W_L, TAU };
 enum { NO_EVENT, ARMED, SENSOR, DROPOUT, CURRENT_OR_FRICTION, PLANT, RECOVERED };
@@ -45,14 +46,16 @@ typedef struct { /* StructuredRule and Residuals */
     double ring[5][FAULT_RING];
     Count valid[5], k, opened, plant_rest, gate_until, first[BITS], latest[BITS], event_sample;
     double peak, low[SENSORS], high[SENSORS], margin;
-    int failed[SENSORS], good[SENSORS], latched, muted, cut, event;
+    Count there;
+    int failed[SENSORS], lost[SENSORS], good[SENSORS], latched, muted, cut, event;
 } Fault;
 
 typedef struct {
     char guid[40];
     Phase phase;
     int changed, configured, reset_before, fault, plant_alarm;
-    double start, last_good[SENSORS], readings[SENSORS];
+    double start, last, uneven, expected; /* of the sample grid */
+    double last_good[SENSORS], readings[SENSORS];
     Count samples, n_rows;
     int lost[SOURCES];
     double theta[N_THETA], sigma[N_THETA], scale[N_THETA];

@@ -21,6 +21,7 @@
 #include "native_watch.c"
 #include "native_algebra.c"
 #include "native_window.c"
+#include "native_residuals.c"
 #include "native_fault.c"
 #include "native_estimator.c"
 
@@ -40,6 +41,7 @@ static void restart(State *s) {
     memcpy(s->guid, NATIVE_GUID, strlen(NATIVE_GUID));
     s->phase = INSTANTIATED;
     s->start = NAN;
+    s->uneven = -INFINITY;
     memcpy(s->real, start_real, sizeof s->real);
     memcpy(s->whole, start_whole, sizeof s->whole);
     memcpy(s->detector.limits, fault_limit, sizeof s->detector.limits);

@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-import json
-import math
 import os
 import sys
 import tomllib
 from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from identification.check import gate
 from identification.errors import InputError
 from identification.joint_file import Joint, load_joint
 from identification.read import read
 from identification.record import Record
-from identification.sensing import DRIVES
-from workbench.session import write_atomic
+from identification.sensing import DRIVES, check_alike
+from irj_fmu.command_line import check_output, is_special, progress_bar, replace_file, write_json
 
 
 def open_joint(path: str) -> Joint:
@@ -41,12 +39,22 @@ def open_records(paths: Sequence[str], joint: Joint | None) -> tuple[list[Record
             given = (joint.gear_ratio, needed(record, joint), joint.torque_per_current) if joint is not None else (None, needed(record, joint))
             record, findings = gate(record, *given)
         except InputError as error:
-            raise InputError(f"{path}: {str(error).removeprefix(record.name + ': ')}") from None
+            raise named(error, path, record) from None
         warnings += [f"{path}: {f.message.removeprefix(record.name + ': ')}" for f in findings if f.severity in ("warn", "repair")]
         records.append(record)
     for text in warnings:
         print(f"irj: {text}", file=sys.stderr)
     return records, warnings
+
+
+def alike(paths: Sequence[str], records: Sequence[Record], joint: Joint) -> None:
+    """Refuse records that do not let one see the same: one line that starts with the path."""
+    check_alike(records, joint.model(), paths)
+
+
+def named(error: InputError, path: str, record: Record) -> InputError:
+    """The error with the path of its record in place of the record's name."""
+    return InputError(f"{path}: {str(error).removeprefix(record.name + ': ')}")
 
 
 def needed(record: Record, joint: Joint | None) -> tuple[str, ...]:
@@ -71,20 +79,12 @@ def check_outputs(arguments: Namespace) -> None:
     named: dict[str, str] = {}
     for option in OUTPUTS:
         path = getattr(arguments, option, None)
-        if not path:
+        if path is None:
             continue
-        target = Path(path)
-        if target.is_dir():
-            raise InputError(f"{path}: is a folder; give the name of a file")
-        if not target.parent.is_dir():
-            raise InputError(f"{target.parent}: no such folder; make it first or write somewhere else")
-        if not os.access(target if _special(target) else target.parent, os.W_OK):
-            raise InputError(f"{path}: its folder is not writable; write somewhere else")
         in_place = option == "output" and arguments.verb in ("fit", "improve", "add")
-        for other in inputs + ([joint] if joint and not in_place else []):
-            if target.exists() and Path(other).exists() and target.samefile(other):
-                raise InputError(f"{path}: is an input of this command and would be lost; write somewhere else")
-        if str(target) in named and not _special(target):
+        check_output(path, inputs + ([joint] if joint and not in_place else []))
+        target = Path(os.path.realpath(path))
+        if str(target) in named and not is_special(target):
             raise InputError(f"{path}: given for two results; give each a file of its own")
         named[str(target)] = option
 
@@ -116,11 +116,6 @@ def _listed(arguments: Namespace, name: str) -> list[str]:
     return list(getattr(arguments, name, None) or [])
 
 
-def _special(path: Path) -> bool:
-    """A device or a pipe: written straight, not replaced."""
-    return path.exists() and not path.is_file()
-
-
 def write_bytes(path: str | Path, content: bytes) -> None:
     """Write a file in one piece: a reader sees the old one or the new one, never a part.
 
@@ -129,15 +124,7 @@ def write_bytes(path: str | Path, content: bytes) -> None:
     InputError
         The folder is missing or not writable; the disk is full.
     """
-    target = Path(os.path.realpath(path))
-    try:
-        if _special(Path(path)):
-            with Path(path).open("wb") as stream:
-                stream.write(content)
-        else:
-            write_atomic(target, content)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror or error}); check the folder, its permissions and the space on the disk") from None
+    replace_file(path, lambda stream: stream.write(content))
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -145,27 +132,6 @@ def write_text(path: str | Path, text: str) -> None:
     write_bytes(path, text.encode())
 
 
-def write_json(path: str | None, data: Any) -> None:
-    """Write a result as JSON, if asked for; numbers that are not finite become null."""
-    if path:
-        write_text(path, json.dumps(_finite(data), indent=1) + "\n")
-
-
-def _finite(data: Any) -> Any:
-    if isinstance(data, dict):
-        return {k: _finite(v) for k, v in data.items()}
-    if isinstance(data, list | tuple):
-        return [_finite(v) for v in data]
-    if hasattr(data, "item") and not isinstance(data, str):
-        data = data.item()
-    if isinstance(data, float) and not math.isfinite(data):
-        return None
-    return data
-
-
-def progress_bar(text: str, share: float) -> None:
-    """A line on the terminal that replaces itself; silent elsewhere."""
-    if sys.stderr.isatty():
-        width = round(30 * min(max(share, 0.0), 1.0))
-        end = "\n" if share >= 1 else ""
-        print(f"\r[{'#' * width}{'.' * (30 - width)}] {text:<40}", end=end, file=sys.stderr, flush=True)
+__all__ = [
+    "OUTPUTS", "alike", "check_outputs", "distinct", "named", "needed", "open_joint", "open_records", "progress_bar", "write_bytes", "write_json", "write_text",
+]  # fmt: skip

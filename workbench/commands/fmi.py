@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import tempfile
 from argparse import Namespace
@@ -11,34 +10,55 @@ from pathlib import Path
 from typing import Final
 
 from identification.errors import InputError
-from workbench.commands.files import open_joint, write_bytes, write_json
+from irj_fmu.command_line import OneLineParser, check_output, keep_inputs, replace_files
+from workbench.commands.files import open_joint, write_json
 
 CODE_KINDS: Final = ("c", "casadi")
+TAKES: Final = ("--joint", "--out", "--cc", "--target", "--sample-time", "--json")
+"""Options that take one word."""
 FUNCTIONS: Final = ("dynamics", "regressor", "jacobian", "energy")
 
 
 def run_export(arguments: Namespace) -> int:
     """`irj export [KIND] --joint J`: FMUs by irj_fmu.build, `c` and `casadi` here; `plant` without a kind."""
     from irj_fmu.build import KINDS, main
+    from irj_fmu.user_export import KINDS as OF_FMU
 
-    rest = list(arguments.rest)
-    if rest and rest[0] in CODE_KINDS:
-        return _export_code(rest)
-    asks = {"-h", "--help"} & set(rest)
-    if not asks and (not rest or rest[0].startswith("-")):
-        rest = ["plant", *rest]
-    elif not asks and rest[0] not in KINDS:
-        raise InputError(f"export: {rest[0]!r} cannot be built; choose one of {', '.join((*KINDS, *CODE_KINDS))}")
-    return int(main(rest))
+    every = (*KINDS, *CODE_KINDS, *OF_FMU)
+    kind, rest = _kind(list(arguments.rest), every)
+    if kind in CODE_KINDS:
+        return _export_code([kind, *rest])
+    if kind in OF_FMU and kind not in KINDS:
+        for i, word in enumerate(rest):
+            if word == "--joint" and i + 1 < len(rest):
+                open_joint(rest[i + 1])  # a file that cannot be read says so itself
+        raise InputError(f"export {kind}: goes with a joint file whose model is an FMU; give one with --joint (docs/user-fmu.md), or export plant")
+    if kind is not None and kind not in KINDS:
+        raise InputError(f"export: {kind!r} cannot be built; choose one of {', '.join((*KINDS, *CODE_KINDS))}")
+    asks = not kind and {"-h", "--help"} & set(rest)
+    return int(main(rest if asks else [kind or "plant", *rest], prog="irj export"))
+
+
+def _kind(rest: list[str], known: Sequence[str]) -> tuple[str | None, list[str]]:
+    """What is to be built, which may stand behind options, and the other words."""
+    if rest and not rest[0].startswith("-"):
+        return rest[0], rest[1:]
+    for i, word in enumerate(rest):
+        takes = i > 0 and rest[i - 1] in TAKES
+        if word in known and not takes:
+            return word, [*rest[:i], *rest[i + 1 :]]
+    return None, rest
 
 
 def _export_code(rest: Sequence[str]) -> int:
-    parser = argparse.ArgumentParser(prog=f"irj export {rest[0]}", description="Dynamics, regressor, Jacobian and energy of a joint as code.")
+    parser = OneLineParser(prog=f"irj export {rest[0]}", description="Dynamics, regressor, Jacobian and energy of a joint as code.")
     parser.add_argument("kind", choices=CODE_KINDS)
     parser.add_argument("--joint", required=True)
     parser.add_argument("--out", default="dist", help="folder of the results (default: dist)")
     parser.add_argument("--json", metavar="FILE")
     given = parser.parse_args(rest)
+    if given.json is not None:
+        check_output(given.json, [given.joint])
     files = export_code(given.kind, given.joint, Path(given.out))
     for path in files:
         print(path)
@@ -55,12 +75,10 @@ def export_code(kind: str, joint_path: str, folder: Path) -> list[Path]:
     import casadi as ca
 
     model = open_joint(joint_path).model()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be made ({error.strerror}); choose a writable folder with --out") from None
     functions = [getattr(model, name) for name in FUNCTIONS]
-    done = []
+    values = [
+        {"name": p.name, "value": v, "unit": p.unit, "side": p.side} for p, v in zip(model.parameters, model.value_vector(), strict=True)
+    ]  # fmt: skip
     with tempfile.TemporaryDirectory() as temporary:
         if kind == "c":
             code = ca.CodeGenerator("joint.c", {"with_header": True})
@@ -70,13 +88,10 @@ def export_code(kind: str, joint_path: str, folder: Path) -> list[Path]:
         else:
             for name, function in zip(FUNCTIONS, functions, strict=True):
                 function.save(str(Path(temporary) / f"{name}.casadi"))
-        for made in sorted(Path(temporary).iterdir()):
-            write_bytes(folder / made.name, made.read_bytes())
-            done.append(folder / made.name)
-    write_json(str(folder / "parameters.json"), [
-        {"name": p.name, "value": v, "unit": p.unit, "side": p.side} for p, v in zip(model.parameters, model.value_vector(), strict=True)
-    ])  # fmt: skip
-    return [*done, folder / "parameters.json"]
+        write_json(Path(temporary) / "parameters.json", values)
+        made = {path.name: path.read_bytes() for path in sorted(Path(temporary).iterdir())}
+    keep_inputs([folder / name for name in made], [joint_path])
+    return replace_files(folder, made)
 
 
 def run_cosim(arguments: Namespace) -> int:

@@ -15,7 +15,7 @@ from identification.fit import Fit, fit, joint_text
 from identification.improve import Improvement, improve
 from identification.joint_file import Joint, toml_text
 from identification.record import Record
-from workbench.commands.files import distinct, open_joint, open_records, progress_bar, write_json, write_text
+from workbench.commands.files import alike, distinct, open_joint, open_records, progress_bar, write_json, write_text
 
 
 def improve_files(
@@ -26,6 +26,7 @@ def improve_files(
     joint = open_joint(joint_path)
     records, warnings = _training(train, other_payload, joint)
     held, more = open_records(held_out, joint)
+    alike([*train, *other_payload, *held_out], [*records, *held], joint)
     found = improve(records, joint, held, max_additions=max_additions, progress=progress_bar)
     progress_bar("done", 1.0)
     for text in found.warnings:
@@ -129,6 +130,7 @@ def run_fit(arguments: Namespace) -> int:
     distinct(training=arguments.records, other_payload=arguments.other_payload)
     joint = open_joint(arguments.joint)
     records, warnings = _training(arguments.records, arguments.other_payload, joint)
+    alike([*arguments.records, *arguments.other_payload], records, joint)
     fitted = fit(joint, records)
     if arguments.refine:
         fitted = _refined(fitted)
@@ -165,6 +167,7 @@ def run_compare(arguments: Namespace) -> int:
     joint = open_joint(arguments.joint)
     records, warnings = open_records(arguments.records, joint)
     basis = open_records(arguments.fit_records, joint)[0] if arguments.fit_records else records
+    alike([*(arguments.fit_records or arguments.records), *arguments.records], [*basis, *records], joint)
     comparison = compare(fit(joint, basis), records, linear=not arguments.no_linear)
     print(comparison)
     for place in comparison.places[:5]:
@@ -179,6 +182,7 @@ def run_diagnose(arguments: Namespace) -> int:
     joint = open_joint(arguments.joint)
     records, warnings = _training(arguments.records, arguments.other_payload, joint)
     held, more = open_records(arguments.held_out, joint)
+    alike([*arguments.records, *arguments.other_payload, *arguments.held_out], [*records, *held], joint)
     found = diagnose(fit(joint, records), held)
     for text in found.warnings:
         print(f"irj: {text}", file=sys.stderr)

@@ -12,7 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 from identification.errors import InputError
-from workbench.commands.files import open_joint, open_records, progress_bar, write_bytes, write_json
+from irj_fmu.command_line import counted
+from irj_fmu.healthy import online_readings
+from workbench.commands.files import named, open_joint, open_records, progress_bar, write_bytes, write_json
 
 if TYPE_CHECKING:
     from identification.excite import Excitation, Selection
@@ -100,8 +102,13 @@ def run_track(arguments: Namespace) -> int:
     tried = [parse_fault(text) for text in getattr(arguments, "inject", None) or []]
     records, warnings = open_records(arguments.records, joint)
     healthy, more = open_records(arguments.healthy, joint)
-    state = limits(joint, records[0], healthy)
-    found = [replay(record, joint, state, tried) for record in records]
+    state = limits(joint, records[0], [r.renamed(path) for r, path in zip(healthy, arguments.healthy, strict=True)])
+    found = []
+    for path, record in zip(arguments.records, records, strict=True):
+        try:
+            found.append(replay(record, joint, state, tried))
+        except InputError as error:
+            raise named(error, path, record) from None
     results = [made.as_json() for made in found]
     for result in results:
         _print_track(result)
@@ -150,24 +157,17 @@ def limits(joint: Joint, record: Record, healthy: Sequence[Record]) -> bytes | N
     """
     if not healthy:
         return None
-    from identification.fault import FaultDetector
-    from irj_fmu.online import OnlineOptions, prepared
+    from irj_fmu.healthy import detector_state
+    from irj_fmu.online import OnlineOptions
 
     options = OnlineOptions(has_link=record.has("link_position"), has_torque=record.has("link_torque"))
-    model, _ = prepared(joint, options)
-    if not joint.fitted or not model.is_elastic:
-        raise InputError(f"{joint.source or joint.name}: the fault detector needs an elastic joint with fitted values; make one with `irj fit -o`")
-    tables = []
     for other in healthy:
-        if abs(other.dt - record.dt) > 0.01 * record.dt:
-            raise InputError(f"{other.name}: sampled every {other.dt:.4g} s, {record.name} every {record.dt:.4g} s; --healthy takes records of the same rate")
+        if other.dt > 1.01 * record.dt:
+            raise InputError(f"{other.name}: sampled every {other.dt:.4g} s, {record.name} every {record.dt:.4g} s; --healthy takes that rate or finer")
         for channel in ("link_position", "link_torque"):
             if record.has(channel) and not other.has(channel):
                 raise InputError(f"{other.name}: no {channel}, which {record.name} has; --healthy takes records with the same channels")
-        tables.append(np.array(online_readings(other.resampled(), joint)[0]))
-    detector = FaultDetector(model, record.resampled().dt, has_torque=options.has_torque)
-    detector.calibrate(np.concatenate(tables))
-    return detector.state()
+    return detector_state(joint, options, healthy, record.resampled().dt)
 
 
 def track(record: Record, joint: Joint, detector_state: bytes | None = None) -> dict[str, Any]:
@@ -256,25 +256,6 @@ def replay(record: Record, joint: Joint, detector_state: bytes | None = None, tr
     )  # fmt: skip
 
 
-def online_readings(record: Record, joint: Joint) -> tuple[list[list[float]], list[bool]]:
-    """Drive, motor position and velocity, link position and velocity, torque (link-referred SI), and which are there."""
-    from identification.sensing import drive_torque
-
-    count, ratio = len(record), joint.gear_ratio
-    motor = record["motor_position"] / ratio if record.has("motor_position") else record["link_position"]
-    link = record["link_position"] if record.has("link_position") else motor
-
-    def velocity(channel: str, scale: float, position: Any) -> Any:
-        return record[channel] / scale if record.has(channel) else np.gradient(position, record.time)
-
-    torque = record["link_torque"] if record.has("link_torque") else np.zeros(count)
-    table = np.column_stack([
-        drive_torque(record, joint), motor, velocity("motor_velocity", ratio, motor), link, velocity("link_velocity", 1.0, link), torque,
-    ])  # fmt: skip
-    has_link = record.has("link_position")
-    return table.tolist(), [True, True, True, has_link, has_link, record.has("link_torque")]
-
-
 def fault_text(code: int) -> str:
     """What a fault code means, in words."""
     if code == 7:
@@ -287,11 +268,11 @@ def fault_text(code: int) -> str:
 
 
 def _print_track(result: dict[str, Any]) -> None:
-    print(f"{result['record']}: {len(result['parameters'])} parameters followed")
     if result["parameters"]:
+        print(f"{result['record']}: {counted(len(result['parameters']), 'parameter')} followed")
         print("  last value +- standard deviation, in brackets the side it is referred to, and the first value")
     else:
-        print(f"  {UNESTIMATED}")
+        print(f"{result['record']}: {UNESTIMATED}")
     for name, p in result["parameters"].items():
         print(f"  {name:<28} {p['value']:.6g} +- {p['sigma']:.2g} {p['unit']} ({p['side']} side), first {p['history'][0]:.6g}")
     if result["ratio"]:
@@ -317,6 +298,9 @@ def run_plan(arguments: Namespace) -> int:
     model = joint.model()
     if not model.is_elastic:
         raise InputError(f"{arguments.joint}: plan simulates an elastic joint; set model = \"hd3\" (a rigid model is excited by any motion that reverses)")
+    for option in ("max_position", "max_speed", "max_torque"):
+        if not getattr(arguments, option) > 0:
+            raise InputError(f"--{option.replace('_', '-')} {getattr(arguments, option):g}: give a limit above 0")
     model = model.with_values(true_values(model, joint))
     limits = Limits(math.radians(arguments.max_position), math.radians(arguments.max_speed), arguments.max_torque)
     motions = [*triangular_grid(limit=min(math.radians(arguments.max_position) * 0.95, math.radians(80))), *sinusoidal_grid()]

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import sys
-from argparse import ArgumentParser, Namespace
-from collections.abc import Callable, Mapping
+from argparse import Namespace
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import wraps
 from pathlib import Path
@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 from identification.errors import InputError
 from identification.record import Record
-from workbench.commands.files import open_records, progress_bar, write_json, write_text
+from irj_fmu.command_line import OneLineParser, check_output, keep_inputs
+from workbench.commands.files import distinct, open_records, progress_bar, write_json, write_text
 
 if TYPE_CHECKING:
     from irj_fmu.user_compare import UserComparison
@@ -74,8 +75,19 @@ def _open(arguments: Namespace) -> tuple[UserModel, list[Record], list[str]]:
     model = load_user_joint(arguments.joint)
     for note in model.notes:
         print(f"irj: {note}", file=sys.stderr)
-    records, warnings = open_records(arguments.records, model.joint)
+    records, warnings = _records(arguments.records, model)
     return model, records, warnings
+
+
+def _records(paths: Sequence[str], model: UserModel) -> tuple[list[Record], list[str]]:
+    """Records that hold every channel which the joint file maps."""
+    records, warnings = open_records(paths, model.joint)
+    for path, record in zip(paths, records, strict=True):
+        for mapped in (*model.inputs, *model.outputs):
+            if not record.has(mapped.channel):
+                has = ", ".join(record.channels)
+                raise InputError(f"{path}: has no {mapped.channel}, which [model.channels] maps to {mapped.variable} (it has {has}); map what is there")
+    return records, warnings
 
 
 @_one_line
@@ -84,7 +96,7 @@ def run_fit(arguments: Namespace) -> int:
     from irj_fmu.user_file import user_joint_text
 
     model, records, warnings = _open(arguments)
-    fitted = model.fit(records)
+    fitted = model.fit(records, progress=progress_bar)
     print(fitted.method)
     _print_outputs(fitted.train)
     _print_parameters(fitted.parameters)
@@ -102,7 +114,7 @@ def run_compare(arguments: Namespace) -> int:
     """`irj compare REC --joint J` with an FMU as the model: as it is, or fitted to other records first."""
     model, records, warnings = _open(arguments)
     if arguments.fit_records:
-        model = model.fit(open_records(arguments.fit_records, model.joint)[0]).model
+        model = model.fit(_records(arguments.fit_records, model)[0], progress=progress_bar).model
     found = model.compare(records)
     _print_outputs(found)
     print(f"  fails most from {found.worst_window[0]:.4g} s to {found.worst_window[1]:.4g} s")
@@ -113,10 +125,11 @@ def run_compare(arguments: Namespace) -> int:
 @_one_line
 def run_diagnose(arguments: Namespace) -> int:
     """`irj diagnose REC --joint J` with an FMU as the model."""
+    distinct(training=arguments.records, held_out=arguments.held_out)
     model, records, warnings = _open(arguments)
-    held, more = open_records(arguments.held_out, model.joint)
+    held, more = _records(arguments.held_out, model)
     if model.parameters:
-        model = model.fit(records).model
+        model = model.fit(records, progress=progress_bar).model
     found = model.diagnose(records, held, progress=progress_bar)
     for text in found.diagnosis.warnings:
         print(f"irj: {text}", file=sys.stderr)
@@ -168,23 +181,32 @@ def run_add(arguments: Namespace) -> int:
 @_one_line
 def run_export(arguments: Namespace) -> int:
     """`irj export [pair|ssp] --joint J`: FMU and correction as one FMU, or as a system."""
+    from irj_fmu.compiler import find_compiler
     from irj_fmu.joint_plant import identifier
     from irj_fmu.user_export import KINDS, export_pair, export_system
     from irj_fmu.user_file import load_user_joint
 
-    parser = ArgumentParser(prog="irj export", description="A user's FMU with the effect that rides outside it.")
-    parser.add_argument("kind", choices=KINDS, nargs="?", default="pair")
+    parser = OneLineParser(prog="irj export", description="A user's FMU with the effect that rides outside it.")
+    parser.add_argument("kind", nargs="?", default="pair", help=f"{' or '.join(KINDS)} (default: pair)")
     parser.add_argument("--joint", required=True)
     parser.add_argument("--out", default=Path("dist"), type=Path, help="folder of the results (default: dist)")
     parser.add_argument("--cc", help="C compiler")
     parser.add_argument("--json", metavar="FILE")
     given = parser.parse_args(arguments.rest)
+    if given.kind not in KINDS:
+        raise InputError(f"export {given.kind}: the model of {given.joint} is an FMU, which goes out as {' or '.join(KINDS)}; write one of them")
     model = load_user_joint(given.joint)
     name = identifier(model.joint.name)
-    if given.kind == "pair":
-        path = export_pair(model, given.out / f"{name}_pair.fmu", cc=given.cc)
-    else:
-        path = export_system(model, given.out / f"{name}.ssp", cc=given.cc)
+    target = given.out / (f"{name}_pair.fmu" if given.kind == "pair" else f"{name}.ssp")
+    inputs = [given.joint, model.fmu.path]
+    keep_inputs([target], inputs)
+    if given.json is not None:
+        check_output(given.json, inputs)
+        if Path(given.json).absolute() == target.absolute():
+            raise InputError(f"{given.json}: given for two results; give each a file of its own")
+    if given.cc is not None:
+        find_compiler(None, given.cc)
+    path = export_pair(model, target, cc=given.cc) if given.kind == "pair" else export_system(model, target, cc=given.cc)
     print(path)
     write_json(given.json, {"built": [str(path)]})
     return 0

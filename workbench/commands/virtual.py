@@ -14,6 +14,7 @@ from casadi_models import JointModel
 from casadi_models.simulate import sampled_step
 from identification.errors import InputError
 from identification.joint_file import Joint
+from irj_fmu.command_line import is_special
 from workbench.commands.files import open_joint, progress_bar, write_bytes, write_json, write_text
 
 FloatArray = npt.NDArray[np.float64]
@@ -47,6 +48,10 @@ def run_simulate(arguments: Namespace) -> int:
     joint = open_joint(arguments.joint)
     if not 1 <= arguments.rate <= 1e5 or not 0.5 <= arguments.seconds <= 1e4:
         raise InputError("--rate takes 1 to 100000 samples per second and --seconds 0.5 to 10000")
+    if arguments.seed < 0:
+        raise InputError(f"--seed {arguments.seed}: give a whole number from 0 up")
+    if Path(arguments.output).suffix not in (".csv", ".npz") and not is_special(Path(arguments.output)):
+        raise InputError(f"{arguments.output}: a record is written as .csv or .npz; give such a name with -o")
     model = joint.model()
     for key in arguments.hide:
         try:
@@ -54,7 +59,7 @@ def run_simulate(arguments: Namespace) -> int:
         except (KeyError, ValueError) as error:
             raise InputError(f"--hide {key}: {error.args[0]}") from None
     try:
-        model = model.with_values({**true_values(model, joint), **_given(arguments.set)})
+        model = model.with_values({**true_values(model, joint), **_given(arguments.set, model)})
     except ValueError as error:
         raise InputError(f"--set: {error.args[0]}") from None
     _check_hidden(model, arguments.hide)
@@ -67,15 +72,19 @@ def run_simulate(arguments: Namespace) -> int:
     return 0
 
 
-def _given(pairs: Sequence[str]) -> dict[str, float]:
-    """Values of ``--set NAME=VALUE``."""
+def _given(pairs: Sequence[str], model: JointModel) -> dict[str, float]:
+    """Values of ``--set NAME=VALUE``, inside the bounds of the parameters."""
     out = {}
+    known = {p.name: p for p in model.parameters}
     for pair in pairs:
         name, _, value = pair.partition("=")
         try:
             out[name.strip()] = float(value)
         except ValueError:
             raise InputError(f"--set {pair}: give NAME=VALUE with a number, as motor_coulomb=20") from None
+        p = known.get(name.strip())
+        if p is not None and not (np.isfinite(out[p.name]) and p.low <= out[p.name] <= p.high):
+            raise InputError(f"--set {pair}: {p.name} lies between {p.low:g} and {p.high:g} {p.unit}; give such a value")
     return out
 
 
