@@ -63,7 +63,7 @@ class Equations:
     inertia : mapping of str to expression
         Inertias of the model by name [kg.m2].
     load_lag : expression
-        Where the link hangs on a compliance c and is not recorded: J_l c times the torque that the motor passes on [N.m.s2];
+        Where the link hangs on a compliance c and is not recorded: its inertia times c times the torque that the motor passes on [N.m.s2];
         else zero. Its second derivative enters the balance of the axis (link angle eliminated from 2.41 and 2.42).
     memory_terms : tuple
         One :data:`MemoryTerm` per term with states, in the order of `memory`.
@@ -249,9 +249,10 @@ def build_equations(model: JointModel, symbols: Symbols, *, sensors: bool) -> Eq
     inertia = {n: symbols.parameters[n] for n in model.inertias}
     lag, beyond = ca.SX(0), view
     if model.lagging_load:
-        passed_on = drive - inertia["motor_inertia"] * s.motor_acceleration - motor_resistance
+        swinging = model.swinging_inertia(symbols.parameters)
+        passed_on = drive - (sum(inertia.values()) - swinging) * s.motor_acceleration - motor_resistance
         twisted = symbols.parameters["load_compliance"] * passed_on
-        lag = inertia["link_inertia"] * twisted
+        lag = swinging * twisted
         beyond = replace(view, signals=s.with_values(link_position=s.link_position - twisted))
     return Equations(
         signals=raw,

@@ -21,7 +21,7 @@ from typing import Any, Final, final
 from .effect import EFFECTS
 from .equations import Equations, Symbols, build_equations, inverse_dynamics, linear_set, time_derivative
 from .parameter import Parameter
-from .term import INERTIAS, LOAD_COMPLIANCE, Term, smoothing
+from .term import INERTIAS, LOAD_COMPLIANCE, SWINGING_SHARE, Term, smoothing
 
 __all__ = ["MEMORY_STEP", "Equations", "JointModel", "Term", "inverse_dynamics", "time_derivative"]
 
@@ -140,6 +140,10 @@ class JointModel:
         """All that shapes the equations, without the values: equal for models that differ in values only."""
         return (self.gear_ratio, self.terms, self.inertias, self.kind, self.virtual_work, self.load_from, self.clamped_link, self.lagging_load)
 
+    def swinging_inertia(self, values: Mapping[str, Any]) -> Any:
+        """What hangs on the compliance of a lagging load [kg.m2], from numbers or symbols."""
+        return values["link_inertia"] if "link_inertia" in self.inertias else values["swinging_share"] * values["inertia"]
+
     @property
     def effects(self) -> tuple[str, ...]:
         """Labels of the effects in the model."""
@@ -153,6 +157,8 @@ class JointModel:
         found: dict[str, Parameter] = {n: INERTIAS[n] for n in self.inertias}
         if self.lagging_load:
             found[LOAD_COMPLIANCE.name] = LOAD_COMPLIANCE
+            if "link_inertia" not in self.inertias:
+                found[SWINGING_SHARE.name] = SWINGING_SHARE
         for term in self.terms:
             found.update({p.name: p for p in term.parameters})
         for place in ("motor", "link"):

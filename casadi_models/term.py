@@ -27,6 +27,9 @@ INERTIAS: Final = {
 LOAD_COMPLIANCE: Final = Parameter(
     "load_compliance", "rad/N.m", 0.0, 0.0, math.inf, "compliance between motor and link where the link position is not recorded", "link"
 )  # fmt: skip
+SWINGING_SHARE: Final = Parameter(
+    "swinging_share", "1", 0.5, 0.02, 1.0, "share of the inertia that hangs on that compliance", "link"
+)  # fmt: skip
 
 
 @final

@@ -159,6 +159,4 @@ def prepared_model(joint: Joint, record: Record) -> JointModel:
     adapted = adapt(model, sensing, joint.known)
     if sensing.has_drive and not record.has("motor_torque") and not adapted.has("channel_delay", "drive"):
         adapted = adapted.add("channel_delay@drive")
-    if seen_from_the_motor(sensing, joint) and sensing.has_drive and "inertia" not in joint.known:
-        adapted = replace(adapted, inertias=("motor_inertia", "link_inertia"), lagging_load=True)
-    return adapted
+    return replace(adapted, lagging_load=seen_from_the_motor(sensing, joint) and sensing.has_drive)

@@ -327,7 +327,7 @@ def _without_link(solution: Solution) -> tuple[str, ...]:
     """What stands in for the link position where it is not recorded."""
     if not solution.model.lagging_load:
         return ()
-    lag = solution.values["link_inertia"] * solution.values["load_compliance"]
+    lag = solution.model.swinging_inertia(solution.values) * solution.values["load_compliance"]
     swing = f"; with the motor held the link would swing at {1 / (2 * math.pi * math.sqrt(lag)):.3g} Hz" if lag > 0 else ""
     return (f"the link position is not recorded: the compliance between motor and link is fitted along{swing}; its motion leaves a rest over the noise",)
 

@@ -110,7 +110,7 @@ def _standstill(model: JointModel, data: Dataset, values: Mapping[str, float], r
         source = f"{place}_position"
         if not level or source not in data.noise:
             continue
-        lag = values["link_inertia"] * values["load_compliance"] if model.lagging_load else 0.0
+        lag = model.swinging_inertia(values) * values["load_compliance"] if model.lagging_load else 0.0
         shares = []
         for w in records:
             grid = w.grid

@@ -43,7 +43,7 @@ def test_the_link_is_eliminated_exactly() -> None:
     record, joint = swinging(STIFFNESS), bare_joint()
     model = prepared_model(joint, record)
     data = load_dataset([record], [], joint, model)
-    values = {**dict.fromkeys(model.parameter_names, 0.0), "motor_inertia": MOTOR, "link_inertia": LINK}
+    values = {**dict.fromkeys(model.parameter_names, 0.0), "inertia": MOTOR + LINK, "swinging_share": LINK / (MOTOR + LINK)}
     balances = Balances(model, data.sensing, wrt=())
     torque = float(np.std(data.train[0].averaged["drive"]))
     rigid = float(np.std(balances.evaluate(data.train[0], {**values, "load_compliance": 0.0})["axis"][0]))
@@ -56,8 +56,8 @@ def test_inertias_and_compliance_are_found_from_the_motor_side() -> None:
     record, joint = swinging(STIFFNESS), bare_joint()
     model = prepared_model(joint, record)
     found = solve(model, load_dataset([record], [], joint, model)).values
-    assert found["motor_inertia"] == pytest.approx(MOTOR, rel=0.02)
-    assert found["link_inertia"] == pytest.approx(LINK, rel=0.02)
+    assert found["inertia"] == pytest.approx(MOTOR + LINK, rel=1e-3)
+    assert found["swinging_share"] == pytest.approx(LINK / (MOTOR + LINK), rel=0.02)
     assert found["load_compliance"] == pytest.approx(1 / STIFFNESS, rel=0.02)
 
 
@@ -65,7 +65,7 @@ def test_a_rigid_joint_has_no_compliance_to_find() -> None:
     record, joint = swinging(1e12), bare_joint()
     model = prepared_model(joint, record)
     found = solve(model, load_dataset([record], [], joint, model)).values
-    assert found["motor_inertia"] + found["link_inertia"] == pytest.approx(MOTOR + LINK, rel=1e-6)
+    assert found["inertia"] == pytest.approx(MOTOR + LINK, rel=1e-6)
     assert found["load_compliance"] < 1e-3 / STIFFNESS
 
 

@@ -27,7 +27,7 @@ from workbench.app_input import add_upload, drop_upload, put_upload, set_joint, 
 from workbench.app_live import BusyError, Live
 from workbench.app_security import Guard, loopback_hosts
 from workbench.app_uploads import MAX_UPLOAD, TooLargeError, refuse_size, stream_to
-from workbench.app_views import VIEWS
+from workbench.app_views import VIEWS, first_plot
 from workbench.session import Store, safe_name
 
 IN_MEMORY: Final = 4
@@ -121,13 +121,18 @@ def _json(data: Any) -> Response:
     return JSONResponse(data, headers={"cache-control": "no-store"})
 
 
-async def _state(request: Request, live: Live) -> Response:
-    state = await run_in_threadpool(live.whole)
+def _public(live: Live) -> dict[str, Any]:
+    """The state as the page gets it: without values of parameters and names on the disk."""
+    state = live.whole()
     for step in state["steps"] + state["undone"]:
         step.pop("values")
     for entry in state["files"]:
         entry.pop("stored")
-    return _json(state)
+    return state
+
+
+async def _state(request: Request, live: Live) -> Response:
+    return _json(await run_in_threadpool(_public, live))
 
 
 async def _events(request: Request, live: Live) -> Response:
@@ -164,8 +169,15 @@ async def _upload(request: Request, live: Live, limit: int) -> Response:
     stored = f"{secrets.token_hex(4)}-{name}"
     path = live.session.files / stored
     size = await stream_to(path, request.stream(), limit)
+
+    def taken() -> Response:
+        """The record is in the session; with the state and, where the page names its width, the first plot: that saves it two questions."""
+        made = add_upload(live, name, stored, size)
+        plot = first_plot(live, str(made.get("id", "")), request.query_params) if "points" in request.query_params else None
+        return _json({**made, "plot": plot, "state": _public(live)})
+
     try:
-        return _json(await run_in_threadpool(add_upload, live, name, stored, size))
+        return await run_in_threadpool(taken)
     except InputError:
         path.unlink(missing_ok=True)
         raise
@@ -344,7 +356,7 @@ def _warm_up() -> None:
 def _listen(port: int) -> socket.socket:
     """A listening socket on the loopback interface, and on no other."""
     for candidate in [port] if port else [*range(8765, 8775), 0]:
-        listening = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        listening = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)  # with the protocol: else asyncio leaves Nagle's delay on
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             listening.bind(("127.0.0.1", candidate))

@@ -34,6 +34,8 @@ Progress = Callable[[str, float], None]
 QUICK_TRAIN: Final = 60.0
 QUICK_HELD_OUT: Final = 30.0
 """Seconds of record that a click fits and judges at once; longer records are taken in windows [s]."""
+USUAL_RATE: Final = 1000.0
+"""Records of fewer samples than the seconds above have at this rate are short, however long they last [1/s]."""
 
 
 def clean(value: Any) -> Any:
@@ -73,11 +75,12 @@ class Analysis:
         self.records = (*whole, *held)
         self._train, self._held = whole, held
         quick_train, quick_held = _share(whole, QUICK_TRAIN), _share(held, QUICK_HELD_OUT)
+        self._quick = quick_train, quick_held
         self.whole = quick_train is whole and quick_held is held
         if not self.whole:
             seconds = sum(r.duration for r in (*quick_train, *quick_held))
             total = sum(r.duration for r in self.records)
-            part = f"clicks fit {seconds:.0f} s of the {total:.0f} s of record, in windows spread over it; Confirm fits all of it"
+            part = f"fitted and judged on {seconds:.0f} s of the {total:.0f} s of record, in windows spread over it; Confirm takes every sample"
             self.note = f"{self.note}; {part}" if self.note else part
         self.start_model = prepared_model(joint, whole[0])
         self.data = load_dataset(quick_train, quick_held, joint, self.start_model)
@@ -91,6 +94,11 @@ class Analysis:
     def split(self) -> tuple[list[Record], list[Record]]:
         """Records of the fit and held-out records, every sample of them."""
         return self._train, self._held
+
+    @property
+    def quick(self) -> tuple[list[Record], list[Record]]:
+        """Records of the fit and held-out records as the clicks take them: windows of long ones."""
+        return self._quick
 
     # --- models -----------------------------------------------------------------------------------------------------
 
@@ -110,10 +118,10 @@ class Analysis:
 
     # --- verbs ------------------------------------------------------------------------------------------------------
 
-    def fit_start(self) -> StepEntry:
+    def fit_start(self, progress: Progress | None = None) -> StepEntry:
         """Fit the start model."""
         began = time.perf_counter()
-        self.solution = solve(self.start_model, self.data)
+        self.solution = solve(self.start_model, self.data, progress=progress)
         self.trials = {}
         return self._entry("start", None, self.data, began)
 
@@ -191,8 +199,8 @@ class Analysis:
         now = self._current()
         progress("projecting the model", 0.1)
         base = make_base(now, self.data)
-        progress(f"trying {len(EFFECTS)} effects in every place", 0.2)
-        ranking = rank(base)
+        ranking = rank(base, progress=lambda text, share: progress(text, 0.2 + 0.75 * share))
+        progress("telling them apart", 0.95)
         best = ranking.best()
         claim = None
         if best is not None:
@@ -222,7 +230,9 @@ class Analysis:
         data = load_dataset(self._train, self._held, self.joint, self.start_model)
         progress("fitting every sample", 0.4)
         now = self._current()
-        self.solution = solve(now.model, data, start=now.values, iterations=4)
+        self.solution = solve(
+            now.model, data, start=now.values, iterations=4, progress=lambda text, share: progress(f"fitting every sample, {text}", 0.4 + 0.5 * share)
+        )  # fmt: skip
         made = self._entry(step.action, step.label, data, began)
         self.restore(made)
         return replace(made, exact=True)
@@ -322,6 +332,6 @@ def _mark(step: StepEntry) -> str:
 def _share(records: list[Record], seconds: float) -> list[Record]:
     """Records thinned to `seconds` in all; the same list where they are short enough."""
     total = sum(r.duration for r in records)
-    if total <= 1.5 * seconds:
+    if total <= 1.5 * seconds or sum(map(len, records)) <= 1.5 * seconds * USUAL_RATE:
         return records
     return [thinned(r, seconds * r.duration / total) for r in records]

@@ -17,7 +17,7 @@ from identification.errors import InputError
 from identification.improve import HOLD_DELAY
 from workbench.app_analysis import Progress
 from workbench.app_live import Live
-from workbench.app_report import improvement_of
+from workbench.app_report import improvement_of, records_of
 from workbench.session import FileEntry, State, StepEntry, write_atomic
 
 
@@ -93,7 +93,8 @@ def report(live: Live, steps: Sequence[StepEntry], folder: Path, progress: Progr
     analysis = live.analysis()
     result = improvement_of(analysis, steps, progress)
     progress("writing the report", 0.95)
-    return write_report(result, folder / "report.html", records=analysis.records)
+    train, held = records_of(analysis, steps)
+    return write_report(result, folder / "report.html", records=(*train, *held))
 
 
 def fmu(live: Live, folder: Path, progress: Progress, kind: str = "plant") -> Path:

@@ -8,7 +8,7 @@ from typing import Final
 
 from casadi_models import JointModel
 from identification.balances import balances_of
-from identification.engine import Dataset, Solution, _memory_shapes, _steps, bounds_of, starts
+from identification.engine import Dataset, Solution, bounds_of, gauss_newton, memory_shapes_of, starts
 
 STEPS: Final = 2
 STEPS_MEMORY: Final = 1
@@ -42,7 +42,7 @@ def first_look(model: JointModel, data: Dataset, now: Solution, start: Mapping[s
         values[n] = min(max(values[n], limits[n][0]), limits[n][1])
     balances = balances_of(model, data.sensing, wrt=free)
     steps = STEPS_MEMORY if model.equations.memory_terms else STEPS
-    values, used = _steps(balances, data, values, free, limits, now.sigma, now.weights, steps, _memory_shapes(model, free))
+    values, used = gauss_newton(balances, data, values, free, limits, now.sigma, now.weights, steps, memory_shapes_of(model, free))
     kept = {k: float(v) for k, v in values.items()}
     return Solution(replace(model, values=kept), kept, dict.fromkeys(kept), tuple(free), now.weights, now.sigma, iterations=used)
 

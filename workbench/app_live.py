@@ -22,7 +22,7 @@ Listener = Callable[[dict[str, Any]], None]
 
 SOON: Final = 200_000
 """Samples above which a record is shown before it went through the check gate."""
-PATIENCE: Final = 0.5
+PATIENCE: Final = 0.15
 """How long the check gate lets the first plot of a record go first [s]."""
 
 _LOG = logging.getLogger(__name__)

@@ -8,6 +8,7 @@ from typing import Any, Final
 from identification.balances import balances_of
 from identification.html import BALANCES
 from identification.improve import RATIO_LIMIT
+from identification.sensing import DRIVES
 from identification.weak import POSITION_CHAINS
 from workbench.app_analysis import Analysis
 from workbench.fragments import pattern_of
@@ -29,13 +30,20 @@ def pattern(analysis: Analysis, steps: Sequence[StepEntry]) -> dict[str, Any]:
     start, now = _ratios(steps[0]), _ratios(steps[-1])
     hit, meaning = pattern_of(now)
     enters = _entering(analysis)
-    rows: list[dict[str, Any]] = [{"name": title, "balances": sorted(enters[source])} for source, title in READINGS.items() if enters.get(source)]
+    titles = {**READINGS, "drive": _drive(analysis)}
+    rows: list[dict[str, Any]] = [{"name": title, "balances": sorted(enters[source])} for source, title in titles.items() if enters.get(source)]
     for row in rows:
         row["shared"] = len(hit) > 1 and set(row["balances"]) == hit
     return {
         "sentence": f"{meaning}.", "limit": RATIO_LIMIT, "hit": sorted(hit), "kernel_ms": 1e3 * analysis.data.kernel, "readings": rows,
         "balances": [{"name": b, "compares": BALANCES.get(b, ""), "start": start.get(b), "now": r} for b, r in now.items()],
     }  # fmt: skip
+
+
+def _drive(analysis: Analysis) -> str:
+    """What the records have of the drive: its torque, its current or its voltage."""
+    first = analysis.split[0][0]
+    return next((c.replace("_", " ") for c in DRIVES if first.has(c)), READINGS["drive"])
 
 
 def _ratios(step: StepEntry) -> dict[str, float]:

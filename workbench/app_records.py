@@ -120,9 +120,10 @@ def _plain(message: str, path: Path, name: str) -> str:
 
 def _summary(record: Record) -> dict[str, Any]:
     spans = {c: _span(v) for c, v in record.channels.items() if c != "run"}
+    step = record.dt
     return {
         "samples": len(record), "duration": round(record.duration, 6), "segments": len(record.segments()),
-        "dt": record.dt if math.isfinite(record.dt) else None,
+        "dt": step if math.isfinite(step) else None,
         "channels": [{"name": c, "unit": record.unit(c), "low": span[0], "high": span[1]} for c, span in spans.items() if span],
         "columns": list(record.provenance.columns), "notes": list(record.provenance.notes), "reader": record.provenance.reader,
     }  # fmt: skip

@@ -16,9 +16,10 @@ import numpy.typing as npt
 from identification.errors import InputError
 from identification.joint_file import Joint, parse_joint
 from identification.record import Record
+from irj_fmu.healthy import online_readings
 from workbench.app_analysis import Progress, clean
 from workbench.app_live import Live
-from workbench.commands.online import fault_text, online_readings
+from workbench.commands.online import fault_text
 from workbench.session import StepEntry, write_atomic
 
 if TYPE_CHECKING:
@@ -155,12 +156,13 @@ def _limits(joint: Joint, options: OnlineOptions, healthy: Sequence[Record], dt:
         if left <= 0 or abs(record.dt - dt) > 0.01 * dt:
             continue
         even = record.take(np.arange(len(record)) < left, "for the limits of the fault detector").resampled()
-        tables.append(np.array(online_readings(even, joint)[0]))
+        table = np.array(online_readings(even, joint)[0])
+        tables += [table[piece] for piece in even.segments()]
         left -= len(even)
     if not tables:
         return None, "no record of the fit has the sample time of this one, so the detector's limits are guesses"
     detector = FaultDetector(model, dt, has_torque=options.has_torque)
-    detector.calibrate(np.concatenate(tables))
+    detector.calibrate(tables)
     return detector.state(), ""
 
 

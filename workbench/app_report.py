@@ -33,7 +33,7 @@ def improvement_of(analysis: Analysis, entries: Sequence[StepEntry], progress: P
     data = analysis.data if train is analysis.quick[0] else load_dataset(train, held, analysis.joint, analysis.start_model)
     data = replace(data, note=analysis.note)
     progress("fitting the steps", 0.1)
-    steps = _steps(analysis, data, entries)
+    steps = _steps(analysis, data, entries, judged_here=data.train is analysis.data.train)
     progress("ranking the library on the start model", 0.25)
     base = make_base(steps[0].solution, data)
     first = last = rank(base, progress=lambda text, share: progress(f"{text}, start model", 0.25 + 0.25 * share))
@@ -52,10 +52,11 @@ def records_of(analysis: Analysis, entries: Sequence[StepEntry]) -> tuple[list[R
     return analysis.split if entries[-1].exact else analysis.quick
 
 
-def _steps(analysis: Analysis, data: Dataset, entries: Sequence[StepEntry]) -> list[Step]:
+def _steps(analysis: Analysis, data: Dataset, entries: Sequence[StepEntry], *, judged_here: bool) -> list[Step]:
+    """The entries as steps; errors that were judged on these samples are kept as the page shows them."""
     if all(e.action != "remove" for e in entries):
         made = [_solved(analysis, data, e.effects, e.virtual_work, e.values) for e in entries]
-        return [_step(s, data, e.label, e if e.exact else None) for s, e in zip(made, entries, strict=True)]
+        return [_step(s, data, e.label, e if (e.exact or judged_here) and e.train else None) for s, e in zip(made, entries, strict=True)]
     final = entries[-1]
     start = [label for label in entries[0].effects if label in final.effects]
     added = [label for label in final.effects if label not in entries[0].effects]

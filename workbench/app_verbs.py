@@ -9,6 +9,7 @@ from functools import partial
 from typing import Any, Final
 
 from identification.errors import InputError
+from identification.html import headline
 from identification.improve import HOLD_DELAY, Improvement, improve
 from workbench import app_export
 from workbench.app_analysis import Progress, clean
@@ -55,8 +56,7 @@ def run(live: Live, action: str, body: Mapping[str, Any]) -> None:
 def _fit(live: Live, progress: Progress) -> Change:
     progress("preparing the records", 0.1)
     analysis = live.analysis()
-    progress("fitting the start model", 0.5)
-    step = analysis.fit_start()
+    step = analysis.fit_start(lambda text, share: progress(f"fitting the start model, {text}", 0.4 + 0.6 * share))
     return lambda s: replace(s.without_fit(), steps=(step,), note=analysis.note)
 
 
@@ -118,14 +118,15 @@ def _confirm(live: Live, progress: Progress) -> Change:
 
 
 def _improve(live: Live, progress: Progress) -> Change:
-    ready = [f for f in live.state.files if f.status == "ready"]
-    train = [live.record(f.id) for f in ready if f.role == "train"]
-    held = [live.record(f.id) for f in ready if f.role == "held_out"]
-    result = improve(train, live.joint(), held, progress=progress)
-    steps = ledger(result)
+    progress("preparing the records", 0.02)
+    analysis = live.analysis()
+    train, held = analysis.quick
+    result = improve(train, analysis.joint, held, progress=progress)
+    steps = ledger(result, exact=analysis.whole)
     live.analysis().restore(steps[-1])
     story = clean(result.as_json())
-    return lambda s: replace(s, steps=steps, undone=(), diagnosis=None, improvement=story, note=result.data.note)
+    story["headline"] = headline(story)
+    return lambda s: replace(s, steps=steps, undone=(), diagnosis=None, improvement=story, note=analysis.note)
 
 
 def _export(live: Live, kind: str, progress: Progress) -> Change:
@@ -157,15 +158,15 @@ def _plan(live: Live, body: Mapping[str, Any], progress: Progress) -> Change:
     return lambda s: replace(s, steps=steps)
 
 
-def ledger(result: Improvement) -> tuple[StepEntry, ...]:
-    """The steps of the whole loop as entries of the ledger."""
+def ledger(result: Improvement, *, exact: bool = True) -> tuple[StepEntry, ...]:
+    """The steps of the whole loop as entries of the ledger; not `exact` where it took windows of the records."""
     from casadi_models import EFFECTS
 
     return tuple(
         StepEntry(
             "add" if s.added else "start", tuple(s.solution.model.effects), {k: float(v) for k, v in s.solution.values.items()},
             clean(s.train.as_json()), clean(s.held_out.as_json()), s.added, s.label, EFFECTS[s.added].title if s.added else None,
-            s.solution.model.virtual_work, True,
+            s.solution.model.virtual_work, exact,
         )
         for s in result.steps
     )  # fmt: skip

@@ -38,12 +38,34 @@ def _config(live: Any, query: Query) -> dict[str, Any]:
 
 def _series(live: Live, query: Query) -> dict[str, Any]:
     """Channels of a record, decimated to the width of the plot."""
+    made = _decimated(live, query)
+    live.seen.set()
+    return made
+
+
+def _decimated(live: Live, query: Query) -> dict[str, Any]:
     record = live.record(str(query.get("file", "")))
     names = [n for n in str(query.get("channels", "")).split(",") if n] or list(record.channels)[:1]
     values = [record[n] for n in names]
     stamps, columns, full = decimated(plot_time(record), values, _points(query), _window(query))
-    live.seen.set()
     return _drawn(stamps, names, [record.unit(n) for n in names], columns, full)
+
+
+def first_plot(live: Live, file: str, query: Query) -> dict[str, Any] | None:
+    """What a page shows of a new record first, or None where the record cannot be looked at.
+
+    Parameters
+    ----------
+    live : Live
+    file : str
+        Identifier of the record.
+    query : mapping
+        ``points``: width of the plot.
+    """
+    entry = next((f for f in live.state.files if f.id == file), None)
+    if entry is None or entry.status not in ("ready", "checking"):
+        return None
+    return _decimated(live, {"file": file, "points": query.get("points", 600), "channels": entry.summary["channels"][0]["name"]})
 
 
 def _balance(live: Live, query: Query) -> dict[str, Any]:

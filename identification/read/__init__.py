@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import threading
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final, final
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
     from identification.read._table import Table
 
 __all__ = ["open_table", "read"]
+
+HASHED_BESIDE: Final = 4 << 20
+"""Files longer than this are hashed in a thread of their own while they are read [bytes]."""
 
 
 def read(
@@ -57,12 +61,13 @@ def read(
     raw, said = load_map(columns)
     axis = kind or said or "rotary"
     channel_unit("time", axis)
-    table = open_table(file)
-    chosen, notes = choose(raw, table.names, table.units, axis, str(file))
-    time, channels, run_notes = _load(table, chosen, axis, file)
+    with _Digest(file) as digest:
+        table = open_table(file)
+        chosen, notes = choose(raw, table.names, table.units, axis, str(file))
+        time, channels, run_notes = _load(table, chosen, axis, file)
     provenance = Provenance(
         paths=(str(file),),
-        sha256=(_digest(file),),
+        sha256=(digest.value(),),
         reader=table.reader,
         columns=tuple(entry.describe() for entry in chosen),
         notes=table.notes + notes + run_notes,
@@ -111,11 +116,56 @@ def _runs(values: npt.NDArray[Any]) -> tuple[npt.NDArray[np.float64], tuple[str,
     return (np.cumsum(changes) - 1).astype(np.float64), (f"{len(labels)} run(s): {shown}",)
 
 
-def _digest(path: Path) -> str:
-    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
-    digest = hashlib.sha256()
-    for file in files:
-        with file.open("rb") as stream:
-            while block := stream.read(1 << 20):
-                digest.update(block)
-    return digest.hexdigest()
+@final
+class _Digest:
+    """SHA-256 of a file, or of the files of a folder; a long one is hashed beside the reading."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._found: str | None = None
+        self._given_up = False
+        self._thread: threading.Thread | None = None
+
+    def __enter__(self) -> _Digest:
+        try:
+            long = self._path.is_file() and self._path.stat().st_size > HASHED_BESIDE
+        except OSError:
+            long = False  # `open_table` says what is wrong
+        if long:
+            self._thread = threading.Thread(target=self._hash, daemon=True, name="hash")
+            self._thread.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._given_up = error[0] is not None
+        if self._thread is not None:
+            self._thread.join()
+
+    def value(self) -> str:
+        """The digest; hashed here where it is not known yet.
+
+        Raises
+        ------
+        OSError
+            A file that cannot be read.
+        """
+        if self._thread is not None:
+            self._thread.join()
+        if self._found is None:
+            self._found = self._made()
+        return self._found
+
+    def _hash(self) -> None:
+        try:
+            self._found = self._made()
+        except OSError:
+            self._found = None  # raised by `value`, where somebody listens
+
+    def _made(self) -> str:
+        files = sorted(p for p in self._path.rglob("*") if p.is_file()) if self._path.is_dir() else [self._path]
+        digest = hashlib.sha256()
+        for file in files:
+            with file.open("rb") as stream:
+                while not self._given_up and (block := stream.read(1 << 20)):
+                    digest.update(block)
+        return digest.hexdigest()

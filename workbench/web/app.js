@@ -2,7 +2,7 @@
 /* The page's state, its talk with the server, and what surrounds the views. */
 const VIEWS = [["load", "Load"], ["model", "Model"], ["compare", "Compare"], ["diagnose", "Diagnose"], ["ledger", "Improve"], ["parameters", "Parameters"], ["replay", "Replay"], ["plan", "Plan"], ["export", "Export"]];
 const $ = (id) => document.getElementById(id);
-const app = { id: null, config: null, state: null, view: "load", source: null, plots: [], cleanup: [], then: null, sent: false, drafts: {}, preview: null, sending: null, upload: null };
+const app = { id: null, config: null, state: null, view: "load", source: null, plots: [], cleanup: [], then: null, sent: false, drafts: {}, preview: null, first: null, sending: null, upload: null };
 
 function h(tag, attributes, ...children) {
   const node = document.createElement(tag);
@@ -32,7 +32,7 @@ function send(path, file, progress) {
     request.open("PUT", path);
     request.setRequestHeader("X-IRJ", "1");
     request.upload.onprogress = (e) => { if (e.lengthComputable) progress(e.loaded / e.total); };
-    request.onload = () => (request.status < 300 ? resolve() : reject(new Error(request.responseText || `error ${request.status}`)));
+    request.onload = () => (request.status < 300 ? resolve(JSON.parse(request.responseText)) : reject(new Error(request.responseText || `error ${request.status}`)));
     request.onerror = () => reject(new Error(`${file.name}: the server took no more of it; is it still running, and is there space on its disk?`));
     request.onabort = () => reject(new Error(`${file.name}: cancelled; nothing was changed`));
     request.onloadend = () => { app.sending = null; };
@@ -65,8 +65,9 @@ function run(action, body, then) {
 
 function busy() { return Boolean(app.sent || app.upload || (app.state && app.state.job)); }
 
-async function refresh() {
-  const state = await get("");
+async function refresh() { adopt(await get("")); }
+
+function adopt(state) {
   if (app.state && state.id === app.state.id && state.revision < app.state.revision) return;
   const changed = !app.state || state.revision !== app.state.revision || state.id !== app.state.id;
   app.state = state;
@@ -89,6 +90,7 @@ function listen() {
     const ended = app.state.job && !news.job;
     app.state.job = news.job;
     surround();
+    if (app.upload && !ended && !news.error) return; /* the answer to the upload brings the state */
     if (news.revision !== app.state.revision || ended || news.error) refresh().catch(fail);
   };
 }
@@ -126,6 +128,8 @@ function open(view) {
   app.view = view;
   try { history.replaceState(null, "", `#session=${app.id}&view=${view}`); } catch (error) { location.hash = `session=${app.id}&view=${view}`; }
   surround();
+  const here = $(`nav-${view}`);
+  if (here) here.closest(".steps").scrollLeft = here.offsetLeft - here.closest(".steps").clientWidth / 2 + here.offsetWidth / 2; /* on a phone the steps are wider than the screen */
   render(true);
 }
 
@@ -157,12 +161,16 @@ async function upload(files) {
     if (file.size > app.config.max_upload) { fail(new Error(`${file.name}: ${Math.round(file.size / 1e6)} MB is over the limit of ${Math.round(app.config.max_upload / 1e6)} MB; cut it, save it as NPZ, or start with: irj app FILE`)); continue; }
     app.upload = { text: `sending ${file.name}`, share: 0 };
     surround();
-    if (!app.preview && app.view === "load" && !app.state.files.length) {
-      const drawn = preview(file).then((data) => { if (data && app.upload && app.view === "load") { app.preview = { file: file.name, data }; render(false); } });
-      await Promise.race([drawn, new Promise((go) => setTimeout(go, 200))]);
-    }
     const share = (value) => { app.upload = { text: `${value < 1 ? "sending" : "reading"} ${file.name}`, share: value < 1 ? value : 0 }; surround(); };
-    try { await send(`${base()}/files/${encodeURIComponent(file.name)}`, file, share); } catch (error) { fail(error); }
+    const look = !app.preview && app.view === "load" && !app.state.files.length && preview(file);
+    if (look) await Promise.race([look, new Promise((go) => setTimeout(go, 150))]); /* what it reads of the file first, what it draws beside the sending */
+    const sent = send(`${base()}/files/${encodeURIComponent(file.name)}?points=${plotPoints(($("main").clientWidth || 800) - 40)}`, file, share);
+    if (look) look.then((data) => { if (data && app.upload && app.view === "load" && !app.state.files.length) { app.preview = { file: file.name, data }; render(false); } });
+    try {
+      const made = await sent;
+      app.first = made.plot && { file: made.id, revision: made.state.revision, data: made.plot };
+      adopt(made.state);
+    } catch (error) { fail(error); }
   }
   const had = app.preview;
   app.upload = null;

@@ -42,7 +42,7 @@ function pictureWidth(most) {
 
 /* One place: mean residual with its 95 % band, one curve or one per direction of motion. */
 function placePlot(place) {
-  const W = pictureWidth(420), H = 250, L = 58, R = 14, T = 12, B = 44;
+  const legend = place.branches.length > 1 ? 16 : 0, W = pictureWidth(420), H = 250 + legend, L = 58, R = 14, T = 12 + legend, B = 44;
   const xs = place.branches.flatMap((b) => b.centre), ys = place.branches.flatMap((b) => [...b.low, ...b.high, ...b.mean]).filter((v) => v != null);
   let [x0, x1] = [Math.min(...xs), Math.max(...xs)], [y0, y1] = [Math.min(0, ...ys), Math.max(0, ...ys)];
   const means = place.branches.flatMap((b) => b.mean), top = Math.max(...means.map(Math.abs)) * 2.2 || 1;
@@ -63,7 +63,7 @@ function placePlot(place) {
     }
     out.append(svg("path", { class: k ? "s-line-2" : "s-line", d: "M" + b.centre.map((c, i) => `${X(c)} ${Y(b.mean[i])}`).join("L") }));
     b.centre.forEach((c, i) => out.append(k ? svg("rect", { class: "s-dot-2", x: X(c) - 2, y: Y(b.mean[i]) - 2, width: 4, height: 4 }) : svg("circle", { class: "s-dot", cx: X(c), cy: Y(b.mean[i]), r: 2.2 })));
-    if (place.branches.length > 1) out.append(svg("text", { class: "strong", x: W - R - 4, y: T + 12 + 14 * k, "text-anchor": "end" }, (k ? "▪ - - " : "● — ") + b.direction));
+    if (place.branches.length > 1) out.append(svg("text", { class: "strong", x: W - R - 120 * (1 - k), y: 14, "text-anchor": "end" }, (k ? "▪ - - " : "● — ") + b.direction));
   });
   out.append(svg("text", { x: (L + W - R) / 2, y: H - 8, "text-anchor": "middle" }, `${place.title}${unit(place.unit) ? ` [${unit(place.unit)}]` : ""}`));
   out.append(svg("text", { x: 14, y: (T + H - B) / 2, transform: `rotate(-90 14 ${(T + H - B) / 2})`, "text-anchor": "middle" }, `mean residual [${unit(place.residual_unit)}]`));
@@ -85,7 +85,7 @@ function staircase(steps) {
     const name = stepName(steps[k]), room = Math.max(8, Math.floor(w / 6.2));
     out.append(svg("text", { x: X(k) + w / 2, y: H - B + 17, "text-anchor": "middle" }, name.length > room ? name.slice(0, room - 1) + "…" : name, svg("title", {}, name)));
   });
-  out.append(svg("text", { x: 4, y: 12 }, "held-out error, % of the measured torque"));
+  out.append(svg("text", { x: 4, y: 12 }, `held-out error, % of the measured ${effort()}`));
   return out;
 }
 
@@ -94,6 +94,12 @@ function stepName(step) {
   const place = step.label && step.label.includes("@") ? ` (${step.label.split("@")[1].replace(/_/g, " ")})` : "";
   return (step.action === "remove" ? "− " : "+ ") + (step.title || step.label || "") + place;
 }
+
+/* What a balance is a sum of: torques, or forces of a linear axis. */
+const effort = () => (/^kind\s*=\s*"linear"/m.test(app.state.joint_text) ? "force" : "torque");
+const vaf = (v) => digits(v, v > 99.9 ? 5 : 4);
+
+const plotPoints = (width) => Math.max(200, Math.min(1600, Math.round(width)));
 
 /* A series with min-max decimation on the server; a drag zooms and asks for the samples of the window.
    Zoomed in, a strip below shows the whole record and the window in it. */
@@ -112,7 +118,7 @@ class SeriesPlot {
   forget() { this.whole = null; if (this.small) { this.small.destroy(); this.small = null; } }
   async show(range) {
     this.range = range || null;
-    const mine = ++this.asked, points = Math.max(200, Math.min(1600, Math.round(this.host.clientWidth || 800)));
+    const mine = ++this.asked, points = plotPoints(this.host.clientWidth || 800);
     const whole = this.whole || this.fetcher(null, points);
     const [all, data] = await Promise.all([whole, this.range && !this.local ? this.fetcher(this.range, points) : whole]);
     if (mine !== this.asked || !this.host.isConnected) return;

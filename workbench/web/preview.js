@@ -12,7 +12,7 @@ async function preview(file) {
 
 const isTime = (name) => /^(time|t)(_|\b|$)/i.test(name);
 
-/* Smallest and largest value of each bucket, so that no spike is lost. */
+/* Smallest and largest value of each bucket, so that no spike is lost; `time` gives the stamp of a sample. */
 function smallestAndLargest(time, values) {
   const n = values.length, step = Math.max(1, Math.ceil(n / PREVIEW_BUCKETS)), stamps = [], drawn = [];
   for (let a = 0; a < n; a += step) {
@@ -20,7 +20,7 @@ function smallestAndLargest(time, values) {
     let low = Infinity, high = -Infinity;
     for (let i = a; i < b; i++) { const v = values[i]; if (v < low) low = v; if (v > high) high = v; }
     if (low > high) continue;
-    const at = time ? time[a] : a, half = time ? time[Math.min(n - 1, a + (step >> 1))] : a + step / 2;
+    const at = time(a), half = time(Math.min(n - 1, a + (step >> 1)));
     const falls = values[a] > values[b - 1];
     stamps.push(at); drawn.push(falls ? high : low);
     if (step > 1 && half > at) { stamps.push(half); drawn.push(falls ? low : high); }
@@ -32,20 +32,20 @@ async function previewNpz(file) {
   const members = await zipMembers(file), names = members.map((m) => m.name.replace(/\.npy$/, ""));
   const stamp = names.findIndex(isTime), channel = names.findIndex((name, k) => k !== stamp && /current|torque|position|velocity/i.test(name));
   if (channel < 0) return null;
-  const [values, time] = await Promise.all([npyArray(file, members[channel]), stamp < 0 ? null : npyTime(file, members[stamp])]);
-  if (!values || (time && time.length !== values.length)) return null;
-  const made = smallestAndLargest(time, values);
-  return { name: names[channel], timed: Boolean(time), time: made.time, series: [{ name: names[channel], unit: "", values: made.values }], full: false };
+  const [values, time] = await Promise.all([npyArray(file, members[channel]), stamp < 0 ? { length: null, at: (k) => k } : npyTime(file, members[stamp])]);
+  if (!values || !time || (time.length !== null && time.length !== values.length)) return null;
+  const made = smallestAndLargest(time.at, values);
+  return { name: names[channel], timed: stamp >= 0, time: made.time, series: [{ name: names[channel], unit: "", values: made.values }], full: false };
 }
 
 async function zipMembers(file) {
-  const tail = new DataView(await file.slice(Math.max(0, file.size - 66000)).arrayBuffer());
+  const from = Math.max(0, file.size - 66000), raw = await file.slice(from).arrayBuffer(), tail = new DataView(raw);
   let end = tail.byteLength - 22;
   while (end >= 0 && tail.getUint32(end, true) !== 0x06054b50) end--;
   if (end < 0) return [];
   const first = tail.getUint32(end + 16, true), size = tail.getUint32(end + 12, true);
   if (first === 0xffffffff || size > 1e6) return [];
-  const list = new DataView(await file.slice(first, first + size).arrayBuffer()), out = [];
+  const list = new DataView(first >= from ? raw.slice(first - from, first - from + size) : await file.slice(first, first + size).arrayBuffer()), out = [];
   for (let p = 0; p + 46 <= list.byteLength && list.getUint32(p, true) === 0x02014b50;) {
     const name = list.getUint16(p + 28, true), extra = list.getUint16(p + 30, true), comment = list.getUint16(p + 32, true);
     out.push({ name: new TextDecoder().decode(new Uint8Array(list.buffer, list.byteOffset + p + 46, name)), method: list.getUint16(p + 10, true), packed: list.getUint32(p + 20, true), size: list.getUint32(p + 24, true), at: list.getUint32(p + 42, true) });
@@ -54,17 +54,20 @@ async function zipMembers(file) {
   return out;
 }
 
-/* Time: three samples of it where it runs evenly, else all of it. */
+/* Time as {length, at(sample)}: three samples of it where it runs evenly, else all of it. */
 async function npyTime(file, member) {
-  if (member.method !== 0 || member.packed === 0xffffffff || member.at === 0xffffffff) return npyArray(file, member);
-  const local = new DataView(await file.slice(member.at, member.at + 30).arrayBuffer()), begin = member.at + 30 + local.getUint16(26, true) + local.getUint16(28, true);
-  const head = await file.slice(begin, begin + 256).arrayBuffer(), made = npyHead(head);
-  if (!made || made.kind !== "f8") return npyArray(file, member);
-  const at = async (k) => new DataView(await file.slice(begin + made.at + 8 * k, begin + made.at + 8 * k + 8).arrayBuffer()).getFloat64(0, true);
+  const all = async () => { const values = await npyArray(file, member); return values && { length: values.length, at: (k) => values[k] }; };
+  if (member.method !== 0 || tooLong(member)) return all();
+  const raw = await file.slice(member.at, member.at + 2000).arrayBuffer(), from = bodyOf(raw), made = npyHead(raw.slice(from));
+  if (!made || made.kind !== "f8") return all();
+  const begin = member.at + from + made.at, at = async (k) => new DataView(await file.slice(begin + 8 * k, begin + 8 * k + 8).arrayBuffer()).getFloat64(0, true);
   const n = made.count, [a, b, c] = await Promise.all([at(0), at((n - 1) >> 1), at(n - 1)]), step = (c - a) / (n - 1);
-  if (!(step > 0) || Math.abs(b - a - step * ((n - 1) >> 1)) > step) return npyArray(file, member);
-  return Float64Array.from({ length: n }, (_, k) => a + step * k);
+  return step > 0 && Math.abs(b - a - step * ((n - 1) >> 1)) <= step ? { length: n, at: (k) => a + step * k } : all();
 }
+
+const tooLong = (member) => member.size > PREVIEW_BYTES || member.packed === 0xffffffff || member.at === 0xffffffff;
+/* Where the bytes of a member begin, after its local header. */
+function bodyOf(raw) { const head = new DataView(raw); return 30 + head.getUint16(26, true) + head.getUint16(28, true); }
 
 function npyHead(raw) {
   const view = new DataView(raw), long = view.getUint8(6) > 1, head = long ? 12 : 10, size = long ? view.getUint32(8, true) : view.getUint16(8, true);
@@ -74,15 +77,15 @@ function npyHead(raw) {
 }
 
 async function npyArray(file, member) {
-  if (member.size > PREVIEW_BYTES || member.packed === 0xffffffff || member.at === 0xffffffff) return null;
-  const local = new DataView(await file.slice(member.at, member.at + 30).arrayBuffer()), begin = member.at + 30 + local.getUint16(26, true) + local.getUint16(28, true);
-  const packed = file.slice(begin, begin + member.packed);
-  const raw = member.method === 0 ? await packed.arrayBuffer() : member.method === 8 ? await new Response(packed.stream().pipeThrough(new DecompressionStream("deflate-raw"))).arrayBuffer() : null;
-  if (!raw) return null;
-  const made = npyHead(raw);
+  if (tooLong(member)) return null;
+  const whole = await file.slice(member.at, Math.min(file.size, member.at + member.packed + 2000)).arrayBuffer(), begin = bodyOf(whole), end = begin + member.packed;
+  let raw = whole, from = begin;
+  if (member.method === 8) { raw = await new Response(new Blob([new Uint8Array(whole, begin, member.packed)]).stream().pipeThrough(new DecompressionStream("deflate-raw"))).arrayBuffer(); from = 0; }
+  else if (member.method !== 0 || whole.byteLength < end) return null;
+  const made = npyHead(raw.slice(from, from + 2000));
   if (!made) return null;
-  const body = made.at % 8 ? raw.slice(made.at) : raw, from = made.at % 8 ? 0 : made.at;
-  return made.kind === "f8" ? new Float64Array(body, from, made.count) : new Float32Array(body, from, made.count);
+  const at = from + made.at, kind = made.kind === "f8" ? Float64Array : Float32Array, aligned = at % 8 === 0;
+  return new kind(aligned ? raw : raw.slice(at), aligned ? at : 0, made.count);
 }
 
 async function previewCsv(file) {
@@ -100,7 +103,7 @@ async function previewCsv(file) {
       if (cells.length === names.length && Number.isFinite(t) && Number.isFinite(v) && !(t <= time[time.length - 1])) { time.push(t); values.push(v); }
     }
   }
-  const made = smallestAndLargest(time, values);
+  const made = smallestAndLargest((k) => time[k], values);
   return { name: names[channel], timed: true, time: made.time, series: [{ name: names[channel], unit: "", values: made.values }], full: false };
 }
 

@@ -2,6 +2,7 @@
 /* One function per view: from the state to the nodes of the main region. */
 const later = (f) => { (app.after = app.after || []).push(f); };
 const button = (text, onclick, { kind = "", id, off, work = true, label } = {}) => h("button", { type: "button", class: kind, id, onclick, "aria-label": label, "data-work": work ? "1" : null, "data-off": off ? "1" : null, disabled: Boolean(off) }, text);
+const sentence = (text, end = ".") => text.charAt(0).toUpperCase() + text.slice(1) + (text.endsWith(end) ? "" : end);
 const plural = (n, one, many) => `${n.toLocaleString("en")} ${n === 1 ? one : many || one + "s"}`;
 const effectTitle = (label) => { const e = app.config.effects.find((x) => x.key === label.split(/[@#]/)[0]); const p = label.includes("@") ? ` (${label.split("@")[1].replace(/_/g, " ")})` : ""; return (e ? e.title : label) + p; };
 const SEVERITY = { refuse: ["bad", "refused"], repair: ["warn", "repaired"], warn: ["warn", "check"], ok: ["good", "fine"] };
@@ -37,7 +38,12 @@ const views = {
 
   async model(state) {
     const { text, form } = await get("/view/joint");
-    const linear = form.kind === "linear", own = (m) => app.config.models[m] || [];
+    const own = (m) => app.config.models[m] || [];
+    const side = (k) => { /* the units of the drive, for a rotary or a linear axis */
+      const force = k === "linear";
+      return { torque_per_current: `${force ? "Force" : "Torque"} per current [${force ? "N/A" : "N·m/A"}], on the link side`, torque_per_voltage: `${force ? "Force" : "Torque"} per volt [${force ? "N/V" : "N·m/V"}], on the link side` };
+    };
+    const relabel = (k) => Object.entries(side(k)).forEach(([id, text]) => { document.querySelector(`label[for=${id}]`).textContent = text; });
     const field = (id, label, value, hint, more) => h("div", { class: "field" }, h("label", { for: id }, label), h("input", { id, value: value == null ? "" : String(value), "aria-describedby": `${id}-hint`, autocomplete: "off", ...more }), h("span", { class: "small soft", id: `${id}-hint` }, hint));
     const select = h("select", { id: "model" }, Object.keys(app.config.models).map((m) => h("option", { value: m, selected: (form.model || "hd1") === m }, MODEL_TITLES[m] ? `${m}: ${MODEL_TITLES[m]}` : m)));
     const chosen = new Set(form.effects || (text ? [] : ["viscous", "coulomb"])), common = ["viscous", "coulomb", "gravity"];
@@ -53,12 +59,12 @@ const views = {
     const node = h("form", { oninput: (e) => { if (e.target.id !== "joint-text") edited = true; }, onsubmit: (e) => e.preventDefault() },
       h("div", { class: "two" }, h("div", { class: "card" }, h("h2", {}, "The joint"),
         field("name", "Name", form.name || "joint", "As it appears in the report."),
-        h("fieldset", {}, h("legend", {}, "Kind"), h("div", { class: "row" }, ["rotary", "linear"].map((k) => h("label", { class: "check" }, h("input", { type: "radio", name: "kind", value: k, id: `kind-${k}`, checked: (form.kind || "rotary") === k }), k)))),
+        h("fieldset", {}, h("legend", {}, "Kind"), h("div", { class: "row" }, ["rotary", "linear"].map((k) => h("label", { class: "check" }, h("input", { type: "radio", name: "kind", value: k, id: `kind-${k}`, onchange: () => relabel(k), checked: (form.kind || "rotary") === k }), k)))),
         field("gear_ratio", "Gear ratio", form.gear_ratio ?? "", "Motor angle over link angle, with its sign: −160 where the link turns the other way. 1 where everything is measured on one side.", { inputmode: "decimal" }),
         h("fieldset", {}, h("legend", {}, "Drive: one of these, none where the torque itself is recorded"),
           field("motor_constant", "Motor constant [N·m/A], on the motor shaft", form.motor_constant, "From the motor's data sheet.", { inputmode: "decimal" }),
-          field("torque_per_current", `${linear ? "Force" : "Torque"} per current [${linear ? "N/A" : "N·m/A"}], on the link side`, form.torque_per_current, "Motor constant times gear ratio.", { inputmode: "decimal" }),
-          field("torque_per_voltage", `${linear ? "Force" : "Torque"} per volt [${linear ? "N/V" : "N·m/V"}], on the link side`, form.torque_per_voltage, "Where only a voltage or a controller output is recorded.", { inputmode: "decimal" }))),
+          field("torque_per_current", side(form.kind).torque_per_current, form.torque_per_current, "Motor constant times gear ratio.", { inputmode: "decimal" }),
+          field("torque_per_voltage", side(form.kind).torque_per_voltage, form.torque_per_voltage, "Where only a voltage or a controller output is recorded.", { inputmode: "decimal" }))),
       h("div", { class: "card" }, h("h2", {}, "The start model"), h("div", { class: "field" }, h("label", { for: "model" }, "Model"), select, h("span", { class: "small soft" }, "Start simple: the diagnosis says what is missing.")),
         h("fieldset", {}, h("legend", {}, "Effects in it from the start"), h("div", { class: "checks" }, common.map((k) => box(k, effectTitle(k))), exact.map((k) => box(k, effectTitle(k)))),
           h("details", { open: others.some((e) => chosen.has(e.key)) }, h("summary", {}, `All others (${others.length})`), h("div", { class: "checks" }, others.map((e) => box(e.key, e.title))))),
@@ -80,8 +86,8 @@ const views = {
     const figure = (p) => h("figure", { class: "card place" }, h("figcaption", {}, `${p.balance} balance against ${p.title}`, h("span", {}, p.share_percent > 1 ? `explains ${digits(p.share_percent, 2)} % of the residual's variance on blocks it was not drawn from` : "explains next to nothing")), placePlot(p));
     return [
       h("div", { class: "row between head" }, h("div", {}, heading("Where does the model fail?")), button("What is missing? Diagnose", () => run("diagnose", {}, "diagnose"), { kind: "primary", id: "diagnose" })),
-      state.note ? h("p", { class: "note small" }, state.note) : null,
-      h("div", { class: "tiles" }, h("div", { class: "card" }, h("p", { class: "soft" }, "Held-out error"), h("div", { class: "figure", id: "held-out-error" }, `${digits(found.error.relative_error_percent)} %`), h("p", { class: "small soft" }, `of the measured torque is not explained, on records the fit did not see (${found.records.join(", ")}). On the fit's own: ${digits(last.train.relative_error_percent)} %.`)),
+      state.note ? h("p", { class: "note small" }, sentence(state.note)) : null,
+      h("div", { class: "tiles" }, h("div", { class: "card" }, h("p", { class: "soft" }, "Held-out error"), h("div", { class: "figure", id: "held-out-error" }, `${digits(found.error.relative_error_percent)} %`), h("p", { class: "small soft" }, `of the measured ${effort()} is not explained, on records the fit did not see (${found.records.join(", ")}). On the fit's own: ${digits(last.train.relative_error_percent)} %.`)),
         balances.map((b) => { const e = found.error.balances[b]; return h("div", { class: "card" }, h("p", { class: "soft" }, `${b} balance`), h("div", { class: "figure" }, digits(e.ratio), h("small", {}, " × noise")), h("p", { class: "small soft" }, `residual ${digits(e.rms)} ${unit(e.unit)} rms; noise alone would leave ${digits(e.floor)}. ${e.ratio < 1.5 ? "Down to the noise." : "There is something left."}`)); })),
       h("h2", { class: "gap" }, strong.length ? "Places where the residual is not chance" : "No place stands out"),
       strong.length && first ? h("p", { class: "soft" }, `Line: mean residual; shade: 95 % band. The ${first.balance} balance fails most clearly against ${first.title}.`) : h("p", { class: "soft" }, "The residual looks alike everywhere: what is left is noise, or depends on something that was not measured."),
@@ -104,7 +110,7 @@ const views = {
       const key = d.claim && d.claim.label === r.label;
       return h("li", { class: `candidate${r.significant ? "" : " dim"}` }, h("span", { class: "rank" }, String(k + 1)),
         h("div", {}, h("h3", {}, r.title, " ", h("span", { class: "place" }, `· ${r.place.replace(/_/g, " ")}`)), h("p", { class: "small" }, `Without it ${r.absence}.`),
-          h("p", { class: "small soft" }, `${digits(r.contribution)} ${unit(d.unit)} rms in the ${r.balance} balance; p ${r.p_value < 1e-4 ? "< 0.0001" : "= " + digits(r.p_value, 2)}; ${digits(r.gain_nats)} nats.${r.confusable_with.length ? ` Often confused with ${r.confusable_with.map(effectTitle).join(", ")}.` : ""}`)),
+          h("p", { class: "small soft" }, `${digits(r.contribution)} ${unit(d.unit)} rms in the ${r.balance} balance; p ${r.p_value < 1e-4 ? "< 0.0001" : "= " + digits(r.p_value, 2)}; evidence ${digits(r.gain_nats)} (gain in log-likelihood).${r.confusable_with.length ? ` Often confused with ${r.confusable_with.map(effectTitle).join(", ")}.` : ""}`)),
         h("div", { class: "effect-size" }, h("p", { class: "small" }, drop > 0 ? `residual −${digits(drop, 2)} %` : "no fall"), h("span", { class: "bar", "aria-hidden": "true" }, bar)),
         h("div", { class: "act" }, button("Add", () => run("add", { label: r.label }, "ledger"), { kind: key ? "primary" : "", id: `add-${r.label.replace(/[@#]/g, "-")}`, label: `Add ${r.title}, ${r.place.replace(/_/g, " ")}` })));
     };
@@ -113,7 +119,7 @@ const views = {
       h("div", { class: "row between head" }, h("div", {}, heading("What is missing?")), again),
       claim ? h("div", { class: "card" }, h("p", { class: "figure", id: "claim" }, claim.effects.map(effectTitle).join(" or ")), h("p", {}, claim.effects.length > 1 ? `These records cannot tell the ${claim.effects.length} apart.${claim.separate_by ? ` ${claim.separate_by} would.` : ""}` : `The ${claim.balance} balance says so: with it the held-out residual there falls by ${digits(claim.held_out_drop_percent, 2)} %.`))
         : h("div", { class: "card" }, h("p", { class: "figure", id: "claim" }, "Nothing that these records show"), h("p", {}, "No effect of the library helps enough on held-out data to be told from chance.")),
-      d.warnings.map((w) => h("p", { class: "note small" }, w)),
+      d.warnings.map((w) => h("p", { class: "note small" }, sentence(w))),
       clear.length ? h("div", { class: "card" }, h("h2", {}, "Ranked effects"), h("p", { class: "soft small" }, "The bar is the fall of the residual on held-out records if the effect is added to the model as it stands. Falls do not add up: add one, then diagnose again."), h("ol", { class: "ranked" }, clear.map(row))) : null,
       faint.length ? h("details", { class: "card" }, h("summary", {}, `Not to be told from chance, or too small (${faint.length})`), h("ol", { class: "ranked" }, faint.map((r, k) => row(r, k + clear.length)))) : null,
       d.not_testable.length ? h("details", { class: "card" }, h("summary", {}, `Not testable with these records (${d.not_testable.length})`), h("ul", {}, d.not_testable.map((n) => h("li", {}, h("strong", {}, n.title), `: ${n.why}.`)))) : null,
@@ -128,15 +134,15 @@ const views = {
     return [
       h("div", { class: "row between head" }, h("div", {}, heading(before ? (now < was ? `The error falls from ${digits(was)} to ${digits(now)} %` : `The error is ${digits(now)} %, from ${digits(was)} %`) : `The error is ${digits(now)} %`, "Each step is fitted to the training records and judged on records the fit did not see.")),
         h("div", { class: "row" }, button(steps.length > 1 ? "What else is missing?" : "What is missing? Diagnose", () => run("diagnose", {}, "diagnose"), { kind: "primary", id: "diagnose" }), button("Take it home", () => open("export"), { work: false, id: "to-export" }))),
-      state.note ? h("p", { class: "note small" }, state.note) : null,
+      state.note && last.exact ? h("p", { class: "note small" }, sentence(state.note)) : null,
       !last.settled ? h("p", { class: "note", id: "first-look", role: "status" }, "First look: two steps from the diagnosis. The whole fit follows by itself …") : null,
-      !last.exact ? h("p", { class: "note" }, "Fitted and judged on a part of the samples. ", button("Confirm on every sample", () => run("confirm"), { kind: "quiet", id: "confirm" })) : null,
-      story ? h("p", { class: "note", id: "verdict" }, h("strong", {}, story.verdict.replace(/_/g, " ") + ". "), story.reason) : null,
+      !last.exact ? h("p", { class: "note" }, `${sentence(state.note || "fitted and judged on a part of the samples")} `, button("Confirm on every sample", () => run("confirm"), { kind: "quiet", id: "confirm" })) : null,
+      story ? h("p", { class: "note", id: "verdict" }, h("strong", {}, sentence(story.headline || story.verdict.replace(/_/g, " ")) + " "), sentence(story.reason)) : null,
       h("div", { class: "two" }, h("figure", { class: "card", id: "staircase" }, h("figcaption", {}, "The falling staircase"), staircase(steps)),
         h("div", { class: "card" }, h("h2", {}, "In the model now"), h("ul", { class: "plain" }, inside.map((e) => h("li", {}, h("div", { class: "row between" }, effectTitle(e), button("Remove", () => run("remove", { label: e }), { kind: "quiet", label: `Remove ${effectTitle(e)}`, off: e === "transmission_compliance" && inside.includes("structural_damping") })))))),
       ),
       h("div", { class: "card scroll", tabindex: "0", role: "region", "aria-label": "Ledger" }, h("table", {}, h("caption", {}, "Ledger"), h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Step"), h("th", { scope: "col", class: "num" }, "Held-out error"), h("th", { scope: "col", class: "num" }, "Fit"), h("th", { scope: "col", class: "num" }, "VAF"), Object.keys(last.held_out.balances).map((b) => h("th", { scope: "col", class: "num" }, `${b}: × floor`)))),
-        h("tbody", {}, steps.map((s, k) => h("tr", { class: k === steps.length - 1 ? "now" : null }, h("td", {}, stepName(s)), h("td", { class: "num" }, `${digits(s.held_out.relative_error_percent)} %`), h("td", { class: "num" }, `${digits(s.held_out.fit_percent)} %`), h("td", { class: "num" }, `${digits(s.held_out.vaf_percent, 4)} %`), Object.keys(last.held_out.balances).map((b) => h("td", { class: "num" }, s.held_out.balances[b] ? digits(s.held_out.balances[b].ratio) : "–"))))))),
+        h("tbody", {}, steps.map((s, k) => h("tr", { class: k === steps.length - 1 ? "now" : null }, h("td", {}, stepName(s)), h("td", { class: "num" }, `${digits(s.held_out.relative_error_percent)} %`), h("td", { class: "num" }, `${digits(s.held_out.fit_percent)} %`), h("td", { class: "num" }, `${vaf(s.held_out.vaf_percent)} %`), Object.keys(last.held_out.balances).map((b) => h("td", { class: "num" }, s.held_out.balances[b] ? digits(s.held_out.balances[b].ratio) : "–"))))))),
       h("div", { class: "card" }, h("h2", {}, "By hand"), h("div", { class: "row" }, add, button("Add", () => run("add", { label: $("add-label").value }), { id: "add-by-hand", label: "Add the chosen effect" }), button("Run the whole loop", () => run("improve", {}, "ledger"), { id: "improve" })), h("p", { class: "small soft" }, "The whole loop diagnoses and adds until nothing is left to name; it starts from the start model again.")),
     ];
   },
@@ -154,7 +160,7 @@ const views = {
   async export(state) {
     const { code } = await get("/view/code"), fitted = state.steps.length > 0;
     const link = (name, text, note) => h("div", { class: "card" }, h("h2", {}, text), h("p", { class: "soft" }, note), h("a", { class: "button primary", href: `${base()}/view/${name}`, download: "", id: `get-${name.replace(".", "-")}` }, "Download"));
-    const made = (action, name, text, note, on) => h("div", { class: "card" }, h("h2", {}, text), h("p", { class: "soft" }, note), on ? button(`Make the ${text}`, () => run(action, {}, () => { const a = h("a", { href: `${base()}/view/${name}`, download: "" }); document.body.append(a); a.click(); a.remove(); }), { kind: "primary", id: `make-${action}`, off: !fitted }) : h("p", { class: "small" }, "Not available in this installation."));
+    const made = (action, name, text, note, on) => h("div", { class: "card" }, h("h2", {}, sentence(text, "")), h("p", { class: "soft" }, note), on ? button(`Make the ${text}`, () => run(action, {}, () => { const a = h("a", { href: `${base()}/view/${name}`, download: "" }); document.body.append(a); a.click(); a.remove(); }), { kind: "primary", id: `make-${action}`, off: !fitted }) : h("p", { class: "small" }, "Not available in this installation."));
     const copied = h("span", { class: "small good", role: "status" });
     return [heading("Take it home"), h("div", { class: "grid" },
       link("joint.toml", "Joint file", fitted ? "The joint with its fitted values, standard errors and provenance. It is a joint file again." : "The joint as it was described; nothing is fitted yet."),
@@ -195,7 +201,7 @@ function columnMap(f) {
   const rows = f.names.map((name, k) => {
     const g = guessed[name] || {}, id = `map-${f.id}-${k}`;
     const channel = h("select", { id: `${id}-channel`, "aria-label": `Channel of column ${name}` }, h("option", { value: "" }, "not used"), app.config.channels.map((c) => h("option", { value: c, selected: c === g.channel }, c.replace(/_/g, " "))));
-    const box = (part, value, label) => h("input", { id: `${id}-${part}`, value, size: "9", "aria-label": `${label} of column ${name}`, autocomplete: "off" });
+    const box = (part, value, label) => h("input", { id: `${id}-${part}`, value, size: "9", placeholder: label, "aria-label": `${label} of column ${name}`, autocomplete: "off" });
     const parts = { channel, unit: box("unit", g.unit || "", "Unit"), scale: box("scale", g.scale && g.scale !== 1 ? String(g.scale) : "", "Scale"), sign: h("select", { id: `${id}-sign`, "aria-label": `Sign of column ${name}` }, h("option", { value: "1" }, "+"), h("option", { value: "-1", selected: g.sign === -1 }, "−")), counts: box("counts", "", "Counts per turn") };
     return { name, parts, node: h("tr", {}, h("td", {}, h("strong", {}, name)), h("td", {}, parts.channel), h("td", {}, parts.unit), h("td", {}, parts.scale), h("td", {}, parts.sign), h("td", {}, parts.counts), h("td", { class: "small soft" }, g.reason || "no guess")) };
   });
@@ -206,7 +212,7 @@ function columnMap(f) {
     await refresh();
     if (made.status !== "ready") throw new Error(made.message);
   });
-  return h("div", {}, h("p", { class: "note" }, f.message, ". This is a guess by name and unit: check it, then use it."), h("div", { class: "scroll" }, h("table", { class: "map-table" }, h("thead", {}, h("tr", {}, ["Column", "Channel", "Unit", "Scale", "Sign", "Counts/turn", "Why"].map((t) => h("th", { scope: "col" }, t)))), h("tbody", {}, rows.map((r) => r.node)))),
+  return h("div", {}, h("p", { class: "note" }, f.message.includes("no column is recognised") ? "The headers do not say which channel they are" : f.message, ". This is a guess by name and unit: check it, then use it."), h("div", { class: "scroll" }, h("table", { class: "map-table" }, h("thead", {}, h("tr", {}, ["Column", "Channel", "Unit", "Scale", "Sign", "Counts/turn", "Why"].map((t) => h("th", { scope: "col" }, t)))), h("tbody", {}, rows.map((r) => r.node)))),
     h("div", { class: "row gap" }, button(same > 1 ? `Use for all ${same} files with these columns` : "Use these columns", confirm, { kind: "primary", id: `use-${f.id}` })));
 }
 
@@ -214,7 +220,8 @@ function seriesCard(files) {
   const draft = app.drafts.series || (app.drafts.series = {});
   const file = files.find((f) => f.id === draft.file) || files[0], channels = file.summary.channels.map((c) => c.name);
   const channel = channels.includes(draft.channel) ? draft.channel : channels[0], host = h("div", { class: "plot" });
-  const plot = new SeriesPlot(host, (range, points) => get(`/view/series?file=${file.id}&channels=${channel}&points=${points}${range ? `&from=${range[0]}&to=${range[1]}` : ""}`), { title: `${channel} of ${file.name}` });
+  const sent = () => app.first && app.first.revision === app.state.revision && app.first.file === file.id && app.first.data.series[0].name === channel && app.first.data;
+  const plot = new SeriesPlot(host, (range, points) => (!range && sent() && Promise.resolve(sent())) || get(`/view/series?file=${file.id}&channels=${channel}&points=${points}${range ? `&from=${range[0]}&to=${range[1]}` : ""}`), { title: `${channel} of ${file.name}` });
   app.plots.push(plot);
   later(() => plot.show(null).catch(fail));
   const pick = (id, label, options, chosen, key) => h("select", { id, "aria-label": label, onchange: (e) => { draft[key] = e.target.value; render(false); } }, options.map(([v, t]) => h("option", { value: v, selected: v === chosen }, t)));
