@@ -111,8 +111,9 @@ def _sections(improvement: Improvement, result: dict[str, Any], plots: ReportPlo
     """Key, title and body of each section, in reading order; empty ones are left out by the caller."""
     trials = improvement.ranking.trials if improvement.ranking else ()
     where = "held-out records" if plots is not None and plots.on_held_out else "training records"
+    effort = "force" if improvement.joint.kind == "linear" else "torque"
     ledger = (
-        f"<div class='beside'>{staircase_html(result)}<div>{ledger_html(result)}</div></div><p class='note'>{_ledger_note(result)}</p>"
+        f"<div class='beside'>{staircase_html(result)}<div>{ledger_html(result)}</div></div><p class='note'>{_ledger_note(result, effort)}</p>"
     )
     ranked = ""
     if result["ranking"]:
@@ -129,7 +130,7 @@ def _sections(improvement: Improvement, result: dict[str, Any], plots: ReportPlo
     return [
         ("ledger", "How far the model is from the measurements", ledger if result["steps"] else ""),
         ("places", "Where the start model fails", fragments.places_html(improvement, plots) if plots else ""),
-        ("torque", "Measured and modelled torque", _overlay(plots, where) if plots else ""),
+        ("torque", f"Measured and modelled {effort}", _overlay(plots, where, effort) if plots else ""),
         ("pattern", "Physics or sensor?", fragments.pattern_html(improvement)),
         ("missing", "What is missing", claims_html(result) + fragments.minor_html(improvement) + ranked),
         ("additions", "Before and after each addition", fragments.additions_html(improvement, plots) if plots and plots.additions else ""),
@@ -138,7 +139,7 @@ def _sections(improvement: Improvement, result: dict[str, Any], plots: ReportPlo
         ("frequency", "Frequency response", fragments.frequency_html(plots) if plots else ""),
         ("linear", "What a linear model would explain", fragments.linear_html(plots) if plots else ""),
         ("untested", "What these records cannot show", not_testable_html(result)),
-        ("parameters", "Parameters", parameters_html(final, start) + _parameter_note() if final else ""),
+        ("parameters", "Parameters", parameters_html(final, start) + _parameter_note(effort) if final else ""),
     ]
 
 
@@ -164,27 +165,28 @@ def _tiles(result: dict[str, Any]) -> str:
     return f"<dl class='tiles'>{''.join(f'<div><dt>{k}</dt><dd>{v}</dd></div>' for k, v in tiles)}</dl>"
 
 
-def _ledger_note(result: dict[str, Any]) -> str:
+def _ledger_note(result: dict[str, Any], effort: str) -> str:
     note = text(result["records"].get("note") or "")
     return (
-        "Error: size of the residual torque as a share of the measured torque, over all balances. "
+        f"Error: size of the residual {effort} as a share of the measured {effort}, over all balances. "
         "Fit: 100 % is a perfect model, 0 % no better than a constant. "
         "÷ noise: residual over what measurement noise alone would leave; 1 × cannot be improved. The dotted line in the picture is that noise. "
         "Held-out records were not used to fit or to choose." + (f" Note: {note}." if note else "")
     )
 
 
-def _parameter_note() -> str:
+def _parameter_note(effort: str) -> str:
+    referred = "" if effort == "force" else "Torques, angles and inertias are referred to the link. "
     return (
-        "<p class='note'>Torques, angles and inertias are referred to the link. The standard error comes from the scatter between time blocks; "
+        f"<p class='note'>{referred}The standard error comes from the scatter between time blocks; "
         "a true value more than three standard errors away is unlikely if the model is complete. "
         "A value that stands at its bound, is not identifiable, or moves together with another one should not be read as physics.</p>"
     )
 
 
-def _overlay(plots: ReportPlots, where: str) -> str:
+def _overlay(plots: ReportPlots, where: str, effort: str) -> str:
     return (
-        f"<p>Torque of a balance on {where}, as measured and as the models give it. It opens on the window in which the start model is worst; "
+        f"<p>{effort.capitalize()} of a balance on {where}, as measured and as the models give it. It opens on the window in which the start model is worst; "
         f"the lowest plot shows the whole record: drag across it to choose another window.</p>{fragments.overlay_html(plots.overlays)}"
     )
 
