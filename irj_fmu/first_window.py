@@ -12,6 +12,10 @@ from identification.recursive import RecursiveLeastSquares, Settings
 FloatArray = npt.NDArray[np.float64]
 
 
+ABSENT = 1e-30
+"""Size under which a column holds nothing but rounding (a sensor that stands still from the first sample on)."""
+
+
 def least_range(h: FloatArray, y: FloatArray) -> FloatArray:
     """Smallest prior range of each parameter: what moves the balances by a hundredth of their torque.
 
@@ -22,7 +26,7 @@ def least_range(h: FloatArray, y: FloatArray) -> FloatArray:
     """
     size = np.sqrt(np.mean(h**2, axis=(0, 1)))
     level = float(np.sqrt(np.mean(y**2))) or 1.0
-    found: FloatArray = np.where(size > 0, 0.01 * level / np.maximum(size, 1e-300), 1.0)
+    found: FloatArray = np.where(size > ABSENT, 0.01 * level / np.maximum(size, ABSENT), 1.0)
     return found
 
 
@@ -33,8 +37,9 @@ def least_squares(y: FloatArray, h: FloatArray) -> FloatArray:
     theta = np.zeros(count)
     for _ in range(2):
         rows = (h * weight[:, None]).reshape(-1, count)
-        size = np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
-        theta = np.linalg.lstsq(rows / size, (y * weight).ravel(), rcond=1e-9)[0] / size
+        size = np.linalg.norm(rows, axis=0)
+        shrink = np.where(size > ABSENT, 1 / np.maximum(size, ABSENT), 0.0)
+        theta = np.linalg.lstsq(rows * shrink, (y * weight).ravel(), rcond=1e-9)[0] * shrink
         left = np.sqrt(np.mean((y - h @ theta) ** 2, axis=0))
         weight = 1.0 / np.maximum(left, 1e-12 + 1e-9 * float(np.max(np.abs(y))))
     return theta

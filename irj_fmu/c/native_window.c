@@ -1,5 +1,7 @@
 /* Start of the recursion from the first window: irj_fmu.first_window, identification._startup, OnlineEstimator._begin. */
 
+#define ABSENT 1e-30 /* size under which a column holds nothing but rounding */
+
 /* Weights of the balances' rows at a reversal, where friction may take any value between its limits. */
 static void weight_of(const double shares[2], const double theta[N_THETA], const double size[N_BALANCES], double out[N_BALANCES]) {
     double level[2] = {0, 0};
@@ -86,7 +88,7 @@ static void least_squares(Twin *m, double theta[N_THETA]) {
         for (i = 0; i < N_THETA; i++) {
             size[i] = 0;
             for (b = 0; b < N_BALANCES; b++) size[i] += weight[b] * weight[b] * column_square(m, b, i);
-            size[i] = 1 / fmax(sqrt(size[i]), 1e-300);
+            size[i] = sqrt(size[i]) > ABSENT ? 1 / sqrt(size[i]) : 0;
         }
         stack_balances(m, size, weight, none);
         solve_all(m->matrix, 1e-9, theta);
@@ -138,7 +140,7 @@ static void least_range(const Twin *m, double out[N_THETA]) {
         double size = 0;
         for (b = 0; b < N_BALANCES; b++) size += column_square(m, b, i);
         size = sqrt(size / rows);
-        out[i] = size > 0 ? 0.01 * level / fmax(size, 1e-300) : 1;
+        out[i] = size > ABSENT ? 0.01 * level / size : 1;
     }
 }
 
