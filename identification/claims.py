@@ -162,7 +162,7 @@ def _discoveries(trials: Sequence[Trial]) -> set[str]:
 
 def _major(trial: Trial, base: Base) -> bool:
     common = trial.key in COMMON
-    least = COMMON_DROP if common else UNSEEN_DROP if base.solution.model.lagging_load else MAJOR_DROP
+    least = COMMON_DROP if common else UNSEEN_DROP if base.solution.values.get("load_compliance", 0.0) > 0 else MAJOR_DROP
     if trial.gain <= GAIN or trial.cv_drop_percent < least:
         return False
     held = trial.held_out_drop_percent

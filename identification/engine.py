@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import final
+from typing import Final, final
 
 import numpy as np
 import numpy.typing as npt
@@ -55,6 +55,12 @@ class Solution:
     unidentified: tuple[str, ...] = ()
     correlation: Mapping[str, tuple[str, float]] = field(default_factory=dict)
     iterations: int = 0
+
+
+LEAST_SWING: Final = 0.05
+"""Fall of the RMS by which a link that swings unseen must show itself; else the joint is taken as rigid."""
+HIGHEST_SWING: Final = 4.0
+"""Highest frequency of such a link in units of 1/kernel (the kernel's -3 dB point is 0.93): faster ones are rigid to these rows."""
 
 
 def starts(model: JointModel, data: Dataset) -> dict[str, float]:
@@ -111,15 +117,39 @@ def solve(
     InputError
         A free parameter that moves no output.
     """
+    if not model.lagging_load or "load_compliance" in data.joint.known:
+        return _fitted(model, data, iterations, start or {}, progress)
+    tied = {**(start or {}), "load_compliance": 0.0}
+    rigid = _fitted(model, data, iterations, tied, progress, frozenset({"load_compliance", "swinging_share"}))
+    return _fitted(model, data, iterations, start or {}, progress) if _swings(rigid, data) else rigid
+
+
+def _swings(rigid: Solution, data: Dataset) -> bool:
+    """Whether an unseen link shows itself in the rows of a model that was fitted as rigid."""
+    model = rigid.model
+    free = [*rigid.free, "load_compliance", "swinging_share"]
+    free = [n for n in model.parameter_names if n in free]
+    balances = balances_of(model, data.sensing, wrt=free)
+    limits = bounds_of(model, data.joint.known, data)
+    values, _ = gauss_newton(balances, data, rigid.values, free, limits, rigid.sigma, rigid.weights, 6, memory_shapes_of(model, free))
+    sizes = [rms(stack(balances_of(model, data.sensing, wrt=()), data.train, v).residual["axis"]) for v in (rigid.values, values)]
+    lag = model.swinging_inertia(values) * values["load_compliance"]
+    return bool(lag * (2 * math.pi * HIGHEST_SWING / data.kernel) ** 2 > 1 and sizes[1] < (1 - LEAST_SWING) * sizes[0])
+
+
+def _fitted(
+    model: JointModel, data: Dataset, iterations: int, start: Mapping[str, float], progress: Callable[[str, float], None] | None,
+    held: frozenset[str] = frozenset(),
+) -> Solution:  # fmt: skip
+    """The fit itself; the parameters `held` keep their start values."""
     known = data.joint.known
     values = starts(model, data)
-    values.update({k: v for k, v in (start or {}).items() if k in values})
+    values.update({k: v for k, v in start.items() if k in values})
     fixed = {n: k.value for n, k in known.items() if k.value is not None and n in values}
     values.update({n: v for n, v in fixed.items() if v is not None})
     limits = bounds_of(model, known, data)
     shapes = {p.name for p in model.parameters if p.is_shape}
-    frozen_shapes: set[str] = set()
-    free = [n for n in model.parameter_names if n not in fixed and n not in frozen_shapes]
+    free = [n for n in model.parameter_names if n not in fixed and n not in held]
     balances = balances_of(model, data.sensing, wrt=free)
     memory_shapes = memory_shapes_of(model, free)
     for n in free:

@@ -325,11 +325,13 @@ class Loop:
 
 def _without_link(solution: Solution) -> tuple[str, ...]:
     """What stands in for the link position where it is not recorded."""
-    if not solution.model.lagging_load:
+    if not solution.values.get("load_compliance"):
         return ()
-    lag = solution.model.swinging_inertia(solution.values) * solution.values["load_compliance"]
-    swing = f"; with the motor held the link would swing at {1 / (2 * math.pi * math.sqrt(lag)):.3g} Hz" if lag > 0 else ""
-    return (f"the link position is not recorded: the compliance between motor and link is fitted along{swing}; its motion leaves a rest over the noise",)
+    swing = 1 / (2 * math.pi * math.sqrt(solution.model.swinging_inertia(solution.values) * solution.values["load_compliance"]))
+    return (
+        "the link position is not recorded: the compliance between motor and link is fitted along; "
+        f"with the motor held the link would swing at {swing:.3g} Hz; its motion leaves a rest over the noise",
+    )
 
 
 def made_worse(before: Error, after: Error) -> bool:

@@ -39,7 +39,7 @@ def least_squares(y: FloatArray, h: FloatArray) -> FloatArray:
         rows = (h * weight[:, None]).reshape(-1, count)
         size = np.linalg.norm(rows, axis=0)
         shrink = np.where(size > ABSENT, 1 / np.maximum(size, ABSENT), 0.0)
-        theta = np.linalg.lstsq(rows * shrink, (y * weight).ravel(), rcond=1e-9)[0] * shrink
+        theta = np.asarray(np.linalg.lstsq(rows * shrink, (y * weight).ravel(), rcond=1e-9)[0] * shrink, dtype=np.float64)
         left = np.sqrt(np.mean((y - h @ theta) ** 2, axis=0))
         weight = 1.0 / np.maximum(left, 1e-12 + 1e-9 * float(np.max(np.abs(y))))
     return theta

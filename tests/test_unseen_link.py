@@ -12,7 +12,10 @@ import pytest
 from identification.balances import Balances
 from identification.dataset import load_dataset, prepared_model
 from identification.engine import solve
+from identification.errors import InputError
+from identification.fit import fit
 from identification.joint_file import Joint
+from identification.output_error import refine
 from identification.record import Record
 from tests.hidden_effect.generator import generate_case
 from workbench.cli import improve_json
@@ -66,7 +69,13 @@ def test_a_rigid_joint_has_no_compliance_to_find() -> None:
     model = prepared_model(joint, record)
     found = solve(model, load_dataset([record], [], joint, model)).values
     assert found["inertia"] == pytest.approx(MOTOR + LINK, rel=1e-6)
-    assert found["load_compliance"] < 1e-3 / STIFFNESS
+    assert found["load_compliance"] == 0.0
+
+
+def test_refinement_says_that_it_cannot_simulate_an_unseen_link() -> None:
+    found = fit(bare_joint(), swinging(STIFFNESS))
+    with pytest.raises(InputError, match="needs link_position where the link swings"):
+        refine(found)
 
 
 @pytest.mark.parametrize(("effect", "seed"), [("stribeck", 1000), (None, 1003), ("quadratic_drag", 1000)])
