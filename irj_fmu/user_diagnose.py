@@ -147,7 +147,7 @@ def diagnose(
     balanced = balanced_records(model, every)
     joint = _outside_joint(model.joint)
     count = len(train)
-    outside = prepared_model(joint, balanced[0])
+    outside = replace(prepared_model(joint, balanced[0]), lagging_load=False)
     data = replace(load_dataset(balanced[:count], balanced[count:], joint, outside), note=note)
     solution = solve(outside, data)
     columns = []

@@ -37,6 +37,8 @@ def first_look(model: JointModel, data: Dataset, now: Solution, start: Mapping[s
     limits = bounds_of(model, known, data)
     shapes = {p.name for p in model.parameters if p.is_shape} - set(now.free)
     fixed = {n for n, k in known.items() if k.value is not None}
+    if now.values.get("load_compliance") == 0.0:
+        fixed |= {"load_compliance", "swinging_share"}
     free = [n for n in model.parameter_names if n not in fixed | shapes]
     for n in free:
         values[n] = min(max(values[n], limits[n][0]), limits[n][1])
