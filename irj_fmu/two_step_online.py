@@ -23,8 +23,8 @@ from .two_step_search import Found, Recursion, Task, nothing, search
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 
-_WINDOW: Final = 20.0
-"""Rows kept for a search [s]; a search on fewer is refined once there are so many."""
+_WINDOW: Final = 32.0
+"""Rows kept for a search [s]; a search on fewer is refined once there are half and all of so many."""
 _TUNING: Final = TwoStepSettings(max_evaluations=400)
 _PLAIN: Final = ("_rows", "_quiet_until", "_failures", "searches", "_asked", "_since", "_refine_at")
 _ARRAYS: Final = ("_signals", "_shares", "_on", "_points", "eta", "deviation")
@@ -149,8 +149,9 @@ class Reoptimiser:
             self._failures >= self.settings.passes,
         )  # fmt: skip
         self._asked = False
-        short = len(self.job.window.signals) < self._limit
-        self._refine_at = self._since + self._limit if short and not self.job.local else -1
+        kept = len(self.job.window.signals)
+        wanted = next((n for n in (self._limit // 2, self._limit) if kept < n), -1)
+        self._refine_at = self._since + wanted if wanted > 0 and not self.job.local else -1
         self.searches += 1
         self.mode = Mode.STARTING if first else Mode.REOPTIMISING
         self._begin(recursion)
