@@ -117,7 +117,7 @@ def test_finds_every_parameter(bench: Bench) -> None:
         "motor_stribeck_extra", "motor_stribeck_velocity", "motor_stribeck_exponent",
     ]  # fmt: skip
     assert [(r.name, r.error) for r in found.rows if not r.passed] == []
-    assert found.searches == 2  # the first window, and the refinement on the full one
+    assert found.searches == 3  # the first window, and the refinements on half of the full one and all of it
 
 
 def test_sits_out_a_failed_sensor(bench: Bench) -> None:
