@@ -248,7 +248,7 @@ def build_equations(model: JointModel, symbols: Symbols, *, sensors: bool) -> Eq
     motor_resistance = builder.total("motor", view)
     inertia = {n: symbols.parameters[n] for n in model.inertias}
     lag, beyond = ca.SX(0), view
-    if model.lagging_load:
+    if model.lagging_load and sensors:
         swinging = model.swinging_inertia(symbols.parameters)
         passed_on = drive - (sum(inertia.values()) - swinging) * s.motor_acceleration - motor_resistance
         twisted = symbols.parameters["load_compliance"] * passed_on
