@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -11,6 +13,12 @@ from identification.weak import differentiated_kernel
 
 ATTENUATION: Final = 0.02
 """Pull of a parameter towards zero that is worth a word."""
+
+FEWEST_REVERSALS: Final = 4
+"""Reversals of the motor below which the training records say little about friction."""
+
+DEGREES_LIKE: Final = 2.0
+"""Factor around 180/pi within which two records' motions look like one in degrees and one in radians."""
 
 
 def not_identifiable(data: Dataset) -> str:
@@ -32,9 +40,12 @@ def excitation_warnings(data: Dataset) -> tuple[str, ...]:
     out = []
     speed = np.concatenate([w.smooth["motor_velocity"] for w in data.train])
     top = float(np.quantile(np.abs(speed), 0.99)) or 1e-12
-    reversals = int(np.sum(np.diff(np.sign(speed[np.abs(speed) > 0.02 * top])) != 0))
-    if reversals < 4:
-        out.append(f"the motor reverses {reversals} times only: friction cannot be told from offsets; record more reversals")
+    unlike = unlike_units(data)
+    if unlike:
+        out.append(unlike)
+    few = few_reversals(data)
+    if few:
+        out.append(f"{few}: friction cannot be told from offsets; record more reversals")
     levels = np.histogram(np.abs(speed) / top, bins=10, range=(0, 1))[0] / max(len(speed), 1)
     if float(levels.max()) > 0.75 and int(np.argmax(levels)) > 2:
         out.append("the training records run at one speed nearly all the time (triangle only): add a multisine record before trusting small claims")
@@ -43,6 +54,32 @@ def excitation_warnings(data: Dataset) -> tuple[str, ...]:
         worst = ", ".join(f"{name} by about {share:.2g} %" for name, share in pulled.items())
         out.append(f"noise of the positions lowers the {worst}: `irj fit --refine` takes that off, finer encoders avoid it")
     return tuple(out)
+
+
+def unlike_units(data: Dataset) -> str:
+    """Whether one record moves about 57 times as far and as fast as another: degrees read as radians leave no other trace."""
+    moved = []
+    for name, record in zip((*data.train_names, *data.held_out_names), (*data.train, *data.held_out), strict=False):
+        velocity, position = record.smooth["motor_velocity"], record.smooth.get("motor_position", np.zeros(1))
+        moved.append((float(np.ptp(position)), float(np.quantile(np.abs(velocity), 0.99)), name))
+    if not moved:
+        return ""
+    small, large = min(moved), max(moved)
+    ways = (large[0] / max(small[0], 1e-300), large[1] / max(small[1], 1e-300))
+    if all(1 / DEGREES_LIKE < way * math.radians(1.0) < DEGREES_LIKE for way in ways):
+        moves = f"{large[2]} moves {ways[0]:.3g} times as far and {ways[1]:.3g} times as fast as {small[2]}"
+        return f"{moves}: are its positions in degrees? Set their unit in [columns]"
+    return ""
+
+
+def few_reversals(data: Dataset) -> str:
+    """How often the motor reverses in the training records where that is too seldom to name a friction effect, else empty."""
+    speeds = [w.smooth["motor_velocity"][a:b] for w in data.train for a, b in pairwise(w.starts)]
+    top = float(np.quantile(np.abs(np.concatenate(speeds)), 0.99)) or 1e-12
+    turns = sum(int(np.sum(np.diff(np.sign(v[np.abs(v) > 0.02 * top])) != 0)) for v in speeds)
+    if turns >= FEWEST_REVERSALS:
+        return ""
+    return f"the motor reverses {('not once', 'once only', 'twice only')[turns] if turns < 3 else f'{turns} times only'}"
 
 
 def attenuation(data: Dataset) -> dict[str, float]:

@@ -14,7 +14,7 @@ from identification.candidates import LATE
 from identification.claims import HELD_OUT_DROP, LADDER_STEP, Claim, Ranking, confusion_set, make_claim, minor_claims, nearly, rank, simplest
 from identification.engine import Dataset, Solution, load_dataset, prepared_model, solve
 from identification.errors import InputError
-from identification.excitation import excitation_warnings, not_identifiable
+from identification.excitation import excitation_warnings, few_reversals, not_identifiable
 from identification.formats import number
 from identification.improvement import HOLD_DELAY, Improvement, Step, ranked_json, visible_keys, visible_labels
 from identification.joint_file import Joint
@@ -264,7 +264,7 @@ class Loop:
         minor = tuple(self._minor(t, solution) for t in minor_claims(last, base) if self._same_sign(t, solution))
         error = replace(steps[-1].held_out, balances=ratios)
         where = locate(solution, self.data, error, lines, RATIO_LIMIT)
-        verdict, reason = _verdict(claims, where, ratios, steps, left)
+        verdict, reason = _verdict(claims, where, ratios, steps, left, few_reversals(self.data))
         return Improvement(
             self.joint, self.data, tuple(steps), tuple(claims), minor, first, tuple(lines), tuple(where), verdict, reason, ratios,
             tuple(n for n in first.not_testable if n.effect not in {c for x in claims for c in x.effects}),
@@ -347,8 +347,10 @@ def held_drop(before: Error, after: Error, balance: str) -> float:
 
 
 def _verdict(
-    claims: Sequence[Claim], where: Sequence[Unexplained], ratios: Mapping[str, BalanceError], steps: Sequence[Step], following: Trial | None
+    claims: Sequence[Claim], where: Sequence[Unexplained], ratios: Mapping[str, BalanceError], steps: Sequence[Step], following: Trial | None,
+    few: str,
 ) -> tuple[str, str]:
+    """Verdict and its sentence (`few`: that the motor reverses too seldom, which no library makes up for)."""
     names = " and ".join(EFFECTS[c.effects[0]].title if len(c.effects) == 1 else "one of (" + ", ".join(c.effects) + ")" for c in claims)
     fall = f"the error on held-out data falls from {steps[0].held_out.relative_error_percent:.3g} % to {steps[-1].held_out.relative_error_percent:.3g} %"
     if where:
@@ -357,6 +359,9 @@ def _verdict(
             found = f"Missing: {names}; {fall}. " if claims else ""
             stop = f"Stopped at the limit of additions ({len(claims)}): {following.candidate.effect.title} would be the next."
             return "unexplained", f"{found}{stop} Left over: {left}."
+        if few:
+            found = f"Missing: {names}; {fall}. " if claims else ""
+            return "unexplained", f"{found}Left over: {left}. {few[0].upper()}{few[1:]}, too seldom to name a friction effect: record more reversals."
         if claims:
             return "unexplained", f"Missing: {names}; {fall}. Structure that is not in the library is left in: {left}."
         return "unexplained", f"No effect of the library explains what is left in: {left}."

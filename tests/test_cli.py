@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -364,7 +365,7 @@ def test_interrupt_is_one_line_and_130(monkeypatch: pytest.MonkeyPatch, capsys: 
 
 
 def test_reader_that_has_seen_enough_is_no_error() -> None:
-    command = f"{sys.executable} -m workbench effects | head -n 1"
+    command = f"{shlex.quote(sys.executable)} -m workbench effects | head -n 1"
     done = subprocess.run(["bash", "-c", f"set -o pipefail; {command}"], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0
     assert done.stderr == ""

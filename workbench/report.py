@@ -159,7 +159,7 @@ def _tiles(result: dict[str, Any]) -> str:
     before = f"{percent(first['relative_error_percent'])} → " if len(result["steps"]) > 1 else ""
     tiles = [
         ("error on records the fit never saw", f"{before}{percent(last['relative_error_percent'])}"),
-        ("of that, measurement noise alone", percent(floor, 2)),
+        ("what measurement noise alone would leave", percent(floor, 2)),
         ("what is left, in units of the noise", names or "–"),
     ]
     return f"<dl class='tiles'>{''.join(f'<div><dt>{k}</dt><dd>{v}</dd></div>' for k, v in tiles)}</dl>"

@@ -1,0 +1,46 @@
+"""Records too poor for the question: the verdict says so and does not blame the library."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from identification import Record, improve, load_joint, read
+
+DEMO = Path(str(files("workbench") / "demo"))
+SHARED = Path(__file__).resolve().parents[2] / "shared" / "hidden_effect" / "stribeck"
+
+
+def turns(record: Record) -> int:
+    """Reversals counted on the noise-free side: extrema of the motor position that stand out of the noise."""
+    position = record["motor_position"][::50]
+    step = np.sign(np.diff(position)[np.abs(np.diff(position)) > 0.2 * np.max(np.abs(np.diff(position)))])
+    return int(np.sum(np.diff(step) != 0))
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="needs the shared recordings")
+def test_too_few_reversals_are_named_in_the_verdict() -> None:
+    joint = load_joint(DEMO / "joint.toml")
+    whole, held = read(SHARED / "train.csv"), read(SHARED / "test.csv")
+    poor = whole.take(slice(0, 3000))
+    assert turns(poor) == 1
+    found = improve([poor], joint, [held])
+    assert found.verdict == "unexplained"
+    assert found.reason.endswith("The motor reverses once only, too seldom to name a friction effect: record more reversals.")
+    assert "No effect of the library" not in found.reason
+    rich = improve([whole], joint, [held])
+    assert not any("reverses" in warning for warning in (*rich.warnings, rich.reason))
+
+
+def test_record_in_degrees_beside_one_in_radians_is_pointed_out() -> None:
+    joint = load_joint(DEMO / "joint.toml")
+    train, held = read(DEMO / "train.npz"), read(DEMO / "held_out.npz")
+    moved = ("motor_position", "motor_velocity", "link_position", "link_velocity")
+    degrees = train
+    for channel in moved:
+        degrees = degrees.with_channel(channel, np.rad2deg(train[channel]))
+    assert any(w.startswith("train moves ") and "are its positions in degrees?" in w for w in improve([degrees], joint, [held], max_additions=0).warnings)
+    assert not any("degrees" in w for w in improve([train], joint, [held], max_additions=0).warnings)
