@@ -185,9 +185,8 @@ def report(name: str, follower: Follower) -> None:
         unseen = [run(follower, m, 100 + k, kind) for k, m in enumerate(motions("unseen"))]
         for method in methods:
             head = f"{kind:<12} {method:<12}"
-            if kind == "sensor":
-                for order in range(1, HIGHEST + 1):
-                    print(line(f"{head} {'given':<10}", identify(seen, method, order), unseen, judged=False))
+            for order in range(1, HIGHEST + 1):
+                print(line(f"{head} {'given':<10}", identify(seen, method, order), unseen, judged=False))
             print(line(f"{head} {'automatic':<10}", identify(seen, method), unseen, judged=False))
             print(line(f"{head} {'best':<10}", best_stable(seen, method), unseen, judged=True))
 
