@@ -154,6 +154,15 @@ function render(moved) {
   }).catch(fail);
 }
 
+/* Draw the preview; resolves when it is on the screen. */
+async function showPreview(file, data) {
+  if (!app.upload || app.view !== "load" || app.state.files.length) return;
+  app.preview = { file: file.name, data };
+  render(false);
+  const frame = () => new Promise((go) => requestAnimationFrame(go));
+  await frame(); await frame();
+}
+
 async function upload(files) {
   clearError();
   const list = [...files].sort((a, b) => b.name.endsWith(".toml") - a.name.endsWith(".toml"));
@@ -163,9 +172,8 @@ async function upload(files) {
     surround();
     const share = (value) => { app.upload = { text: `${value < 1 ? "sending" : "reading"} ${file.name}`, share: value < 1 ? value : 0 }; surround(); };
     const look = !app.preview && app.view === "load" && !app.state.files.length && preview(file);
-    if (look) await Promise.race([look, new Promise((go) => setTimeout(go, 150))]); /* what it reads of the file first, what it draws beside the sending */
+    if (look) await Promise.race([look.then((data) => data && showPreview(file, data)), new Promise((go) => setTimeout(go, 400))]); /* the sending would share the machine with it */
     const sent = send(`${base()}/files/${encodeURIComponent(file.name)}?points=${plotPoints(($("main").clientWidth || 800) - 40)}`, file, share);
-    if (look) look.then((data) => { if (data && app.upload && app.view === "load" && !app.state.files.length) { app.preview = { file: file.name, data }; render(false); } });
     try {
       const made = await sent;
       app.first = made.plot && { file: made.id, revision: made.state.revision, data: made.plot };
