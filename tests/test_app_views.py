@@ -6,6 +6,7 @@ import csv
 import json
 import math
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -191,6 +192,20 @@ def test_a_thousand_stops_at_any_moment_leave_the_thread_alive() -> None:
     worker.submit(Task(lambda: last.append("still here")))
     until(lambda: bool(last))
     until(lambda: worker.idle)
+
+
+def test_a_profiler_works_beside_the_thread_of_a_session() -> None:
+    """A request to stop that is taken back keeps CPython 3.11 busy for ever once a profiler is on: none may be left by work that ended by itself."""
+    code = (
+        "import cProfile, threading, time\n"
+        "from workbench.app_work import Task, Worker\n"
+        "done, worker = threading.Event(), Worker('test')\n"
+        "worker.submit(Task(done.set)); done.wait()\n"
+        "while not worker.idle: time.sleep(0.01)\n"
+        "with cProfile.Profile(): [sorted([2, 1], key=abs) for _ in range(100)]\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parents[1], timeout=60, check=False, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_spare_work_gives_way_and_other_work_keeps_its_order() -> None:

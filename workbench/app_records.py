@@ -131,9 +131,10 @@ def _summary(record: Record) -> dict[str, Any]:
 
 def _span(values: FloatArray) -> tuple[float, float] | None:
     """Smallest and largest finite value; None where there is none."""
-    if len(values) and not math.isfinite(float(values.min()) + float(values.max())):
-        values = values[np.isfinite(values)]
-    return (float(values.min()), float(values.max())) if len(values) else None
+    if not len(values):
+        return None
+    low, high = float(values.min()), float(values.max())
+    return (low, high) if math.isfinite(low + high) else _span(values[np.isfinite(values)])
 
 
 def plot_time(record: Record) -> FloatArray:

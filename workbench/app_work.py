@@ -88,7 +88,7 @@ class Task:
 
     def _leave(self) -> None:
         with self._lock:
-            if self._thread:
+            if self._thread and self.stopped:  # CPython 3.11 under a profiler hangs on a request that was taken back
                 ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(self._thread), None)
             self._thread = 0
 
