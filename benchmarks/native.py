@@ -37,7 +37,7 @@ PLAIN = OnlineOptions(optimise=False)
 HOST = Path(__file__).resolve().parents[1] / "irj_fmu" / "c" / "native_host.c"
 
 
-def readings(key: str, seconds: float, seed: int) -> FloatArray:
+def readings_of(key: str, seconds: float, seed: int = 3) -> FloatArray:
     """Readings of a reference joint with the noise of real sensors, (samples, 6)."""
     time = STEP * np.arange(round(seconds / STEP) + 1)
     size = 1.0 if key.startswith("hd") else 0.4  # less friction to overcome
@@ -50,7 +50,7 @@ def readings(key: str, seconds: float, seed: int) -> FloatArray:
     return table + noise * np.array([2e-3, 3e-4, 0.1, 2e-6, 1e-3, 0.05])
 
 
-def hurt(table: FloatArray, *, stuck: bool) -> FloatArray:
+def hurt(table: FloatArray, *, stuck: bool = True) -> FloatArray:
     """Bias, dropout, gain, spike, drift, infinity, zero, noise, delay; two at a time; and a stuck motor encoder."""
     t, rng = table.copy(), np.random.default_rng(1)
     t[10_000:11_000, 3] += 0.01
@@ -77,7 +77,7 @@ def specification(key: str) -> NativeSpec:
         return NativeSpec(joint, "native", PLAIN)
     gear = joint.gear_ratio
     detector = FaultDetector(model, STEP)
-    detector.calibrate(readings(key, 30.0, 9) * np.array([joint.torque_per_current or gear, 1 / gear, 1 / gear, 1.0, 1.0, 1.0]))
+    detector.calibrate(readings_of(key, 30.0, 9) * np.array([joint.torque_per_current or gear, 1 / gear, 1 / gear, 1.0, 1.0, 1.0]))
     return NativeSpec(joint, "native", PLAIN, detector.state())
 
 
@@ -124,7 +124,7 @@ def measure(key: str, folder: Path, host: Path) -> None:
     known = {v.name: v.valueReference for v in description.modelVariables}
     inputs = [known[n] for n in ("i_m" if "i_m" in known else "tau_m", "q_m", "w_m", "q_l", "w_l", "tau_l")]
     outputs = [v.valueReference for v in description.modelVariables if v.causality == "output" and v.type == "Real"]
-    table = hurt(readings(key, 40.0, 3), stuck=spec.detector_state is not None)
+    table = hurt(readings_of(key, 40.0, 3), stuck=spec.detector_state is not None)
     table.tofile(folder / "readings.bin")
     (library,) = (p for p in (folder / "fmu" / "binaries").rglob("native.*") if p.suffix in (".so", ".dylib") or (os.name == "nt" and p.suffix == ".dll"))
     runs = [replay([str(host)], str(library), description.guid, folder, inputs, outputs) for _ in range(5)]

@@ -48,40 +48,25 @@ static void restart(State *s) {
     s->detector.margin = 1;
 }
 
-/* ---- life cycle --------------------------------------------------------------------------------------------------- */
+typedef Twin Instance;
+#define GUID NATIVE_GUID
+static void restored(Twin *m) { (void)m; }
+#include "fmi2_common.c"
 
-const char *fmi2GetTypesPlatform(void) { return fmi2TypesPlatform; }
-const char *fmi2GetVersion(void) { return fmi2Version; }
+/* ---- life cycle --------------------------------------------------------------------------------------------------- */
 
 fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String guid, fmi2String resources,
                               const fmi2CallbackFunctions *functions, fmi2Boolean visible, fmi2Boolean logging) {
-    Twin *m = calloc(1, sizeof *m);
+    Twin *m = instance(name, functions, logging);
     (void)resources; (void)visible;
     if (!m) return NULL;
-    if (functions) m->host = *functions;
-    m->name = calloc(1, (name ? strlen(name) : 0) + 1);
-    if (m->name && name) strcpy(m->name, name);
-    m->logging = logging;
-    if (!m->name || type != fmi2CoSimulation || !guid || strcmp(guid, NATIVE_GUID) != 0) {
-        if (m->name) fail(m, "instantiate: %s", type != fmi2CoSimulation ? "co-simulation only" : "the GUID is not that of this library");
-        free(m->name);
-        free(m);
+    if (type != fmi2CoSimulation || !guid || strcmp(guid, NATIVE_GUID) != 0) {
+        fail(m, "instantiate: %s", type != fmi2CoSimulation ? "co-simulation only" : "the GUID is not that of this library");
+        fmi2FreeInstance(m);
         return NULL;
     }
     restart(&m->s);
     return m;
-}
-
-void fmi2FreeInstance(fmi2Component c) {
-    if (!c) return;
-    free(((Twin *)c)->name);
-    free(c);
-}
-
-fmi2Status fmi2SetDebugLogging(fmi2Component c, fmi2Boolean on, size_t n, const fmi2String categories[]) {
-    (void)n; (void)categories;
-    ((Twin *)c)->logging = on;
-    return fmi2OK;
 }
 
 fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean has_tolerance, fmi2Real tolerance, fmi2Real start, fmi2Boolean has_stop, fmi2Real stop) {
@@ -92,13 +77,6 @@ fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean has_tolerance, fmi2R
     return fmi2OK;
 }
 
-fmi2Status fmi2EnterInitializationMode(fmi2Component c) {
-    Twin *m = c;
-    if (m->s.phase != INSTANTIATED) return fail(m, "enterInitializationMode: called out of order");
-    m->s.phase = INITIALIZING;
-    return fmi2OK;
-}
-
 fmi2Status fmi2ExitInitializationMode(fmi2Component c) {
     Twin *m = c;
     if (m->s.phase != INITIALIZING) return fail(m, "exitInitializationMode: called out of order");
@@ -106,8 +84,6 @@ fmi2Status fmi2ExitInitializationMode(fmi2Component c) {
     if (!configure(m)) m->s.whole[V_HEALTH] = INTERNAL_ERROR;
     return fmi2OK;
 }
-
-fmi2Status fmi2Terminate(fmi2Component c) { ((Twin *)c)->s.phase = TERMINATED; return fmi2OK; }
 
 fmi2Status fmi2Reset(fmi2Component c) {
     Twin *m = c;
@@ -209,48 +185,6 @@ fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2ValueReferenc
     return fail(c, "getDirectionalDerivative: not provided");
 }
 
-/* ---- FMU state ---------------------------------------------------------------------------------------------------- */
-
-fmi2Status fmi2GetFMUstate(fmi2Component c, fmi2FMUstate *state) {
-    if (!*state) *state = malloc(sizeof(State));
-    if (!*state) return fail(c, "getFMUstate: out of memory");
-    memcpy(*state, &((Twin *)c)->s, sizeof(State));
-    return fmi2OK;
-}
-
-fmi2Status fmi2SetFMUstate(fmi2Component c, fmi2FMUstate state) {
-    if (!state) return fail(c, "setFMUstate: there is no state");
-    memcpy(&((Twin *)c)->s, state, sizeof(State));
-    return fmi2OK;
-}
-
-fmi2Status fmi2FreeFMUstate(fmi2Component c, fmi2FMUstate *state) {
-    (void)c;
-    if (state) { free(*state); *state = NULL; }
-    return fmi2OK;
-}
-
-fmi2Status fmi2SerializedFMUstateSize(fmi2Component c, fmi2FMUstate state, size_t *size) {
-    (void)c; (void)state;
-    *size = sizeof(State);
-    return fmi2OK;
-}
-
-fmi2Status fmi2SerializeFMUstate(fmi2Component c, fmi2FMUstate state, fmi2Byte bytes[], size_t size) {
-    if (size < sizeof(State)) return fail(c, "serializeFMUstate: %lu bytes are too few", (unsigned long)size);
-    memcpy(bytes, state, sizeof(State));
-    return fmi2OK;
-}
-
-fmi2Status fmi2DeSerializeFMUstate(fmi2Component c, const fmi2Byte bytes[], size_t size, fmi2FMUstate *state) {
-    if (size != sizeof(State) || memcmp(bytes, NATIVE_GUID, strlen(NATIVE_GUID)) != 0)
-        return fail(c, "deSerializeFMUstate: these bytes are not a state of this FMU");
-    if (!*state) *state = malloc(sizeof(State));
-    if (!*state) return fail(c, "deSerializeFMUstate: out of memory");
-    memcpy(*state, bytes, sizeof(State));
-    return fmi2OK;
-}
-
 /* ---- co-simulation ------------------------------------------------------------------------------------------------ */
 
 fmi2Status fmi2DoStep(fmi2Component c, fmi2Real t, fmi2Real length, fmi2Boolean no_rollback) {
@@ -266,25 +200,5 @@ fmi2Status fmi2SetRealInputDerivatives(fmi2Component c, const fmi2ValueReference
     return n ? fail(c, "setRealInputDerivatives: not provided") : fmi2OK;
 }
 
-fmi2Status fmi2GetRealOutputDerivatives(fmi2Component c, const fmi2ValueReference vr[], size_t n, const fmi2Integer order[], fmi2Real value[]) {
-    (void)vr; (void)order; (void)value;
-    return n ? fail(c, "getRealOutputDerivatives: not provided") : fmi2OK;
-}
-
-fmi2Status fmi2CancelStep(fmi2Component c) { return fail(c, "cancelStep: doStep is never pending"); }
-
-#define NO_STATUS(function, type) \
-    fmi2Status function(fmi2Component c, const fmi2StatusKind what, type *value) { \
-        (void)what; (void)value; \
-        return fail(c, #function ": doStep is never pending"); \
-    }
-NO_STATUS(fmi2GetStatus, fmi2Status)
 NO_STATUS(fmi2GetRealStatus, fmi2Real)
-NO_STATUS(fmi2GetIntegerStatus, fmi2Integer)
-NO_STATUS(fmi2GetStringStatus, fmi2String)
 
-fmi2Status fmi2GetBooleanStatus(fmi2Component c, const fmi2StatusKind what, fmi2Boolean *value) {
-    if (what != fmi2Terminated) return fail(c, "getBooleanStatus: only 'terminated' is known");
-    *value = ((Twin *)c)->s.phase == TERMINATED;
-    return fmi2OK;
-}

@@ -78,42 +78,27 @@ static void restart(State *s) {
 
 #include "plant_integrator.c"
 
-/* ---- life cycle ----------------------------------------------------------- */
+typedef Plant Instance;
+#define GUID PLANT_GUID
+static void restored(Plant *m) { stale(m); }
+#include "fmi2_common.c"
 
-const char *fmi2GetTypesPlatform(void) { return fmi2TypesPlatform; }
-const char *fmi2GetVersion(void) { return fmi2Version; }
+/* ---- life cycle ----------------------------------------------------------- */
 
 fmi2Component fmi2Instantiate(fmi2String name, fmi2Type kind, fmi2String guid, fmi2String resources,
                               const fmi2CallbackFunctions *functions, fmi2Boolean visible, fmi2Boolean logging) {
-    Plant *m = calloc(1, sizeof *m);
+    Plant *m = instance(name, functions, logging);
     (void)resources; (void)visible;
     if (!m) return NULL;
-    if (functions) m->host = *functions;
-    m->name = calloc(1, (name ? strlen(name) : 0) + 1);
-    if (m->name && name) strcpy(m->name, name);
-    m->logging = logging;
-    if (!m->name || !guid || strcmp(guid, PLANT_GUID) != 0 || (kind == fmi2ModelExchange && NZ > 0)) {
-        if (m->name) fail(m, "instantiate: %s", kind == fmi2ModelExchange && NZ > 0 ? "this plant has memory and runs in co-simulation only"
-                                                                                     : "the GUID is not that of this library");
-        free(m->name);
-        free(m);
+    if (!guid || strcmp(guid, PLANT_GUID) != 0 || (kind == fmi2ModelExchange && NZ > 0)) {
+        fail(m, "instantiate: %s", kind == fmi2ModelExchange && NZ > 0 ? "this plant has memory and runs in co-simulation only"
+                                                                       : "the GUID is not that of this library");
+        fmi2FreeInstance(m);
         return NULL;
     }
     m->s.kind = kind;
     restart(&m->s);
     return m;
-}
-
-void fmi2FreeInstance(fmi2Component c) {
-    if (!c) return;
-    free(((Plant *)c)->name);
-    free(c);
-}
-
-fmi2Status fmi2SetDebugLogging(fmi2Component c, fmi2Boolean on, size_t n, const fmi2String categories[]) {
-    (void)n; (void)categories;
-    ((Plant *)c)->logging = on;
-    return fmi2OK;
 }
 
 fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean has_tolerance, fmi2Real tolerance, fmi2Real start, fmi2Boolean has_stop, fmi2Real stop) {
@@ -126,21 +111,12 @@ fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean has_tolerance, fmi2R
     return fmi2OK;
 }
 
-fmi2Status fmi2EnterInitializationMode(fmi2Component c) {
-    Plant *m = c;
-    if (m->s.phase != INSTANTIATED) return fail(m, "enterInitializationMode: called out of order");
-    m->s.phase = INITIALIZING;
-    return fmi2OK;
-}
-
 fmi2Status fmi2ExitInitializationMode(fmi2Component c) {
     Plant *m = c;
     if (m->s.phase != INITIALIZING) return fail(m, "exitInitializationMode: called out of order");
     m->s.phase = m->s.kind == fmi2ModelExchange ? EVENTS : STEPPING;
     return fmi2OK;
 }
-
-fmi2Status fmi2Terminate(fmi2Component c) { ((Plant *)c)->s.phase = TERMINATED; return fmi2OK; }
 
 fmi2Status fmi2Reset(fmi2Component c) {
     restart(&((Plant *)c)->s);
@@ -229,48 +205,6 @@ fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2ValueReferenc
     return fmi2OK;
 }
 
-/* ---- FMU state ------------------------------------------------------------ */
-
-fmi2Status fmi2GetFMUstate(fmi2Component c, fmi2FMUstate *state) {
-    if (!*state) *state = malloc(sizeof(State));
-    if (!*state) return fail(c, "getFMUstate: out of memory");
-    memcpy(*state, &((Plant *)c)->s, sizeof(State));
-    return fmi2OK;
-}
-
-fmi2Status fmi2SetFMUstate(fmi2Component c, fmi2FMUstate state) {
-    memcpy(&((Plant *)c)->s, state, sizeof(State));
-    stale(c);
-    return fmi2OK;
-}
-
-fmi2Status fmi2FreeFMUstate(fmi2Component c, fmi2FMUstate *state) {
-    (void)c;
-    if (state) { free(*state); *state = NULL; }
-    return fmi2OK;
-}
-
-fmi2Status fmi2SerializedFMUstateSize(fmi2Component c, fmi2FMUstate state, size_t *size) {
-    (void)c; (void)state;
-    *size = sizeof(State);
-    return fmi2OK;
-}
-
-fmi2Status fmi2SerializeFMUstate(fmi2Component c, fmi2FMUstate state, fmi2Byte bytes[], size_t size) {
-    if (size < sizeof(State)) return fail(c, "serializeFMUstate: %lu bytes are too few", (unsigned long)size);
-    memcpy(bytes, state, sizeof(State));
-    return fmi2OK;
-}
-
-fmi2Status fmi2DeSerializeFMUstate(fmi2Component c, const fmi2Byte bytes[], size_t size, fmi2FMUstate *state) {
-    if (size != sizeof(State) || memcmp(bytes, PLANT_GUID, strlen(PLANT_GUID)) != 0)
-        return fail(c, "deSerializeFMUstate: these bytes are not a state of this FMU");
-    if (!*state) *state = malloc(sizeof(State));
-    if (!*state) return fail(c, "deSerializeFMUstate: out of memory");
-    memcpy(*state, bytes, sizeof(State));
-    return fmi2OK;
-}
-
 /* ---- co-simulation --------------------------------------------------------- */
 
 fmi2Status fmi2DoStep(fmi2Component c, fmi2Real t, fmi2Real length, fmi2Boolean no_rollback) {
@@ -306,31 +240,10 @@ fmi2Status fmi2SetRealInputDerivatives(fmi2Component c, const fmi2ValueReference
     return fmi2OK;
 }
 
-fmi2Status fmi2GetRealOutputDerivatives(fmi2Component c, const fmi2ValueReference vr[], size_t n, const fmi2Integer order[], fmi2Real value[]) {
-    (void)vr; (void)order; (void)value;
-    return n ? fail(c, "getRealOutputDerivatives: not provided") : fmi2OK;
-}
-
-fmi2Status fmi2CancelStep(fmi2Component c) { return fail(c, "cancelStep: doStep is never pending"); }
-
-#define NO_STATUS(function, type) \
-    fmi2Status function(fmi2Component c, const fmi2StatusKind kind, type *value) { \
-        (void)kind; (void)value; \
-        return fail(c, #function ": doStep is never pending"); \
-    }
-NO_STATUS(fmi2GetStatus, fmi2Status)
-NO_STATUS(fmi2GetIntegerStatus, fmi2Integer)
-NO_STATUS(fmi2GetStringStatus, fmi2String)
 
 fmi2Status fmi2GetRealStatus(fmi2Component c, const fmi2StatusKind kind, fmi2Real *value) {
     if (kind != fmi2LastSuccessfulTime) return fail(c, "getRealStatus: only the last successful time is known");
     *value = ((Plant *)c)->s.t;
-    return fmi2OK;
-}
-
-fmi2Status fmi2GetBooleanStatus(fmi2Component c, const fmi2StatusKind kind, fmi2Boolean *value) {
-    if (kind != fmi2Terminated) return fail(c, "getBooleanStatus: only 'terminated' is known");
-    *value = ((Plant *)c)->s.phase == TERMINATED;
     return fmi2OK;
 }
 
