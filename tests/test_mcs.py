@@ -9,16 +9,14 @@ import importlib.util
 import inspect
 import math
 import statistics
-import sys
 from collections.abc import Callable
-from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.optimize import Bounds, direct
 
+from benchmarks import mcs as BENCH
 from identification._mcs_basket import Basket
 from identification._mcs_evaluate import Evaluator
 from identification._mcs_line import LineSearch
@@ -38,20 +36,6 @@ from identification._mcs_types import FloatArray
 from identification.errors import InputError
 from identification.mcs import MCSOptions, MCSOutcome, MCSProgress, MCSResult, mcs
 
-
-def _benchmark() -> ModuleType:
-    """The benchmark module: it holds the test functions, so that both use the same ones."""
-    path = Path(__file__).resolve().parents[1] / "benchmarks" / "mcs.py"
-    spec = importlib.util.spec_from_file_location("mcs_benchmark", path)
-    if spec is None or spec.loader is None:
-        raise FileNotFoundError(path)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-BENCH = _benchmark()
 JONES = {case.name: case for case in BENCH.JONES}
 CAMEL = JONES["C6"]
 SHEKEL = JONES["S5"]

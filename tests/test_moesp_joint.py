@@ -2,32 +2,15 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
-from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 
+from benchmarks import moesp_joint as BENCH
 from identification._excite_follow import Follower
 from identification.subspace import HankelQR, MoespOptions, moesp
 
-
-def _benchmark() -> ModuleType:
-    """The benchmark: it holds joints, trajectories and limits, so that both use the same ones."""
-    path = Path(__file__).resolve().parents[1] / "benchmarks" / "moesp_joint.py"
-    spec = importlib.util.spec_from_file_location("moesp_joint_benchmark", path)
-    if spec is None or spec.loader is None:
-        raise FileNotFoundError(path)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-BENCH = _benchmark()
 JOINTS = ("table_4_3", "table_4_6")
 
 

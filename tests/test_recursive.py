@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import copy
-import importlib.util
 import os
 import pickle
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
 
+from benchmarks import joint_regressor as joint
 from identification._compiler import CACHE_VARIABLE, COMPILER_VARIABLE, find_compiler
 from identification._recursive_engine import _library
 from identification.errors import InputError
@@ -35,18 +34,6 @@ def _data(samples: int, n: int = 4, m: int = 2, noise: float = 0.1, seed: int = 
     theta = rng.normal(size=n)
     h = rng.normal(size=(samples, m, n))
     return theta, h, h @ theta + noise * rng.standard_normal((samples, m))
-
-
-@pytest.fixture(scope="module")
-def joint() -> ModuleType:
-    path = ROOT / "benchmarks" / "joint_regressor.py"
-    spec = importlib.util.spec_from_file_location("joint_regressor", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["joint_regressor"] = module
-    spec.loader.exec_module(module)
-    return module
 
 
 # Closed forms
@@ -462,7 +449,7 @@ def test_parameters_that_move_together_are_frozen_one_by_one() -> None:
     np.testing.assert_allclose(estimator.theta, theta, atol=0.05)
 
 
-def test_joint_standstill_and_step(joint: ModuleType) -> None:
+def test_joint_standstill_and_step() -> None:
     record = joint.simulate(stiction=5.0)
     estimator = RecursiveLeastSquares(0.7 * joint.THETA, joint.SCALE, names=joint.NAMES)
     run = estimator.run(record.y, record.h)
