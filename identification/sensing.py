@@ -115,9 +115,13 @@ def check_alike(records: Sequence[Record], model: JointModel, labels: Sequence[s
     Raises
     ------
     InputError
-        A record that misses a channel which the model needs, or has other channels than the first.
+        A record that misses a channel which the model needs, or has other channels than the first; two that are the same.
     """
     called = list(labels) or [r.name for r in records]
+    for k, record in enumerate(records):
+        twin = next((label for other, label in zip(records[:k], called, strict=False) if _same_samples(record, other)), None)
+        if twin is not None:
+            raise InputError(f"{called[k]}: holds the same samples as {twin}; a run counts once, leave one of the two out")
     found: list[Sensing] = []
     for record, label in zip(records, called, strict=True):
         try:
@@ -127,6 +131,13 @@ def check_alike(records: Sequence[Record], model: JointModel, labels: Sequence[s
         if found[-1].balances != found[0].balances:
             raise InputError(f"{label}: {_difference(record, records[0], called[0])}; give records with the same channels")
     return found[0]
+
+
+def _same_samples(one: Record, other: Record) -> bool:
+    """True where every channel of two records is the same: one run given twice, perhaps under two names."""
+    if len(one) != len(other) or set(one.channels) != set(other.channels):
+        return False
+    return all(np.array_equal(values, other[channel], equal_nan=True) for channel, values in one.channels.items())
 
 
 def _difference(record: Record, first: Record, label: str) -> str:

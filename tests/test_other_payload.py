@@ -89,7 +89,7 @@ def test_the_links_parameters_are_those_of_the_first_payload() -> None:
 
 def test_another_payload_needs_a_balance_without_the_link() -> None:
     slow = ((0.07, 0.11), (0.15, 0.10), 0.8)
-    loaded = record("loaded", 1, True, *slow)
-    bare = replace(loaded, channels={c: x for c, x in loaded.channels.items() if not c.startswith("link")})
+    made = [record(name, seed, True, *slow) for name, seed in (("loaded", 1), ("unloaded", 3), ("held out", 5))]
+    bare = [replace(r, channels={c: x for c, x in r.channels.items() if not c.startswith("link")}) for r in made]
     with pytest.raises(InputError, match="unloaded: a record with another payload needs link_torque or both positions"):
-        improve([bare, replace(bare, name="unloaded", payload="none")], replace(JOINT, model_name="hd1"), [bare])
+        improve([bare[0], replace(bare[1], payload="none")], replace(JOINT, model_name="hd1"), [bare[2]])

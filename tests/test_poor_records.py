@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 from identification import Record, improve, load_joint, read
+from identification.errors import InputError
 
 DEMO = Path(str(files("workbench") / "demo"))
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "hidden_effect" / "stribeck"
@@ -44,3 +46,14 @@ def test_record_in_degrees_beside_one_in_radians_is_pointed_out() -> None:
         degrees = degrees.with_channel(channel, np.rad2deg(train[channel]))
     assert any(w.startswith("train moves ") and "are its positions in degrees?" in w for w in improve([degrees], joint, [held], max_additions=0).warnings)
     assert not any("degrees" in w for w in improve([train], joint, [held], max_additions=0).warnings)
+
+
+def test_a_run_given_twice_under_two_names_is_refused() -> None:
+    """Twice in the fit it would count as two runs; held out too, the fit would have seen what judges it."""
+    joint, train, held = load_joint(DEMO / "joint.toml"), read(DEMO / "train.npz"), read(DEMO / "held_out.npz")
+    copy = replace(train, name="copy")
+    for given in (([train, copy], [held]), ([train], [copy])):
+        with pytest.raises(InputError, match=r"^copy: holds the same samples as train; a run counts once, leave one of the two out$"):
+            improve(given[0], joint, given[1])
+    noisy = train.with_channel("motor_current", train["motor_current"] + 1e-9)
+    assert improve([train, replace(noisy, name="noisy")], joint, [held], max_additions=0).steps
