@@ -11,7 +11,6 @@ sample, with a failure put into them. The readings do not depend on the estimato
 from __future__ import annotations
 
 import ctypes
-import json
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -26,6 +25,7 @@ from identification.errors import InputError
 from identification.fault import KINDS, SENSORS, Fault, inject
 from identification.joint_file import Joint
 
+from .command_line import OneLineParser, check_output, fail, run_alone, write_json
 from .cosim import CHANNELS, LOOSE, Row, _rows, make_pair, start_state
 from .host import Fmu, Instance, Trajectory
 from .online import estimated_parameters, searched_parameters
@@ -210,9 +210,7 @@ def line(run: Run) -> str:
 
 def main(argv: Sequence[str]) -> int:
     """Print the table; 0 where every limit holds, 1 where not, 2 on unusable input."""
-    import argparse
-
-    parser = argparse.ArgumentParser(prog="python -m irj_fmu.convergence", description="Estimator FMU against reference plants, with sensor failures.")
+    parser = OneLineParser(prog="python -m irj_fmu.convergence", description="Estimator FMU against reference plants, with sensor failures.")
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"reference joints: {', '.join(NAMES)} (default: all)")
     parser.add_argument("--published", nargs="+", default=[], metavar=("FILE", "KEY"), help="rows of a table of published friction parameters")
     parser.add_argument("--start", choices=("start", "fitted", "both"), default="both", help="what the estimator knows")
@@ -222,6 +220,10 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write every parameter of every run as JSON")
     arguments = parser.parse_args(argv)
     try:
+        if arguments.json is not None:
+            check_output(arguments.json, arguments.published[:1])
+        if len(arguments.published) == 1:
+            raise InputError(f"{arguments.published[0]}: --published wants rows of the table, too, such as erob80_50/m1")
         joints = [published_joint(Path(arguments.published[0]), k) for k in arguments.published[1:]]
         names = arguments.names or (() if joints else NAMES)
         joints = [*(reference_joint(n) for n in names), *joints]
@@ -235,10 +237,9 @@ def main(argv: Sequence[str]) -> int:
                 sys.stdout.flush()
         sys.stdout.write(f"\n{sum(r.passed for r in runs)} of {len(runs)} runs within all limits.\n")
         if arguments.json is not None:
-            arguments.json.write_text(json.dumps({"runs": [_plain(r) for r in runs]}, indent=1), encoding="utf-8")
-    except (InputError, OSError) as error:
-        sys.stderr.write(f"{error}\n")
-        return 2
+            write_json(arguments.json, {"runs": [_plain(r) for r in runs]})
+    except InputError as error:
+        return fail(str(error))
     return 0 if all(r.passed for r in runs) else 1
 
 
@@ -248,4 +249,4 @@ def _plain(run: Run) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main(sys.argv[1:]))
+    raise SystemExit(run_alone(main, sys.argv[1:]))

@@ -370,3 +370,18 @@ def test_missing_effect_raises_its_balance(tmp_path: Path) -> None:
     assert max(complete.values()) < 2.0
     assert lacking["link"] < 2.0
     assert lacking["transmission"] < 2.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["nosuch"], "reference joint 'nosuch'"), (["--published", "nosuch", "a/m1"], "nosuch: cannot be read"),
+        (["--published", "x.json"], "x.json: --published wants rows"),
+        (["--kinds", "foo"], "argument --kinds: invalid choice: 'foo'"), (["irj1b", "--json", "/no/such/x.json"], "/no/such: no such folder"),
+    ],
+)  # fmt: skip
+def test_convergence_refuses_in_one_line(arguments: list[str], said: str) -> None:
+    command = [sys.executable, "-m", "irj_fmu.convergence", *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=Path(__file__).parents[1], timeout=60)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+    assert done.stderr.startswith(f"irj: {said}")
