@@ -140,7 +140,7 @@ class SeriesPlot {
       width: this.host.clientWidth || 800, height: this.height(), legend: { live: true }, cursor: { drag: { x: true, y: false, setScale: false } },
       scales: { x: { time: false, range: this.range ? () => this.range : undefined } },
       series: [{ label: "time [s]", value: (u, v) => digits(v, 6) }, ...data.series.map((s, k) => ({
-        label: s.name.replace(/_/g, " ") + (unit(s.unit) ? ` [${unit(s.unit)}]` : ""), stroke: of(s, k), width: 1, scale: s.unit,
+        label: s.name.replace(/_/g, " ") + (unit(s.unit) ? ` [${unit(s.unit)}]` : ""), stroke: of(s, k), width: data.time.length < 600 ? 1.5 : 1, scale: s.unit,
         dash: s.name === "model" ? [6, 3] : k % 2 && s.name !== "residual" ? [8, 3] : undefined, value: (u, v) => digits(v, 4), points: { show: data.full && data.time.length < 200 && !this.local },
       }))],
       axes: [{ ...axis, label: "time [s]", labelSize: 20, size: 40 }, ...units.map((u, k) => ({ ...axis, scale: u, side: k ? 1 : 3, label: unit(u), labelSize: 18, size: 58, grid: k ? { show: false } : axis.grid }))],
@@ -159,7 +159,7 @@ class SeriesPlot {
       const { of, axis } = this.colours(), scales = Object.fromEntries([...new Set(all.series.map((s) => s.unit))].map((u) => [u, {}]));
       this.small = new uPlot({
         width: this.host.clientWidth || 800, height: 74, legend: { show: false }, cursor: { drag: { x: true, y: false, setScale: false }, points: { show: false }, y: false }, scales: { x: { time: false }, ...scales },
-        series: [{}, ...all.series.map((s, k) => ({ stroke: of(s, k), width: 1, scale: s.unit, points: { show: false } }))],
+        series: [{}, ...all.series.map((s, k) => ({ stroke: of(s, k), width: data.time.length < 600 ? 1.5 : 1, scale: s.unit, points: { show: false } }))],
         axes: [{ ...axis, size: 24 }, ...all.series.slice(0, 1).map((s) => ({ ...axis, scale: s.unit, size: 58, values: () => [] }))], hooks: { setSelect: [(u) => this.picked(u)] },
       }, [all.time, ...all.series.map((s) => s.values)], this.strip);
       this.small.root.setAttribute("role", "img");
