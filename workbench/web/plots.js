@@ -159,7 +159,7 @@ class SeriesPlot {
       const { of, axis } = this.colours(), scales = Object.fromEntries([...new Set(all.series.map((s) => s.unit))].map((u) => [u, {}]));
       this.small = new uPlot({
         width: this.host.clientWidth || 800, height: 74, legend: { show: false }, cursor: { drag: { x: true, y: false, setScale: false }, points: { show: false }, y: false }, scales: { x: { time: false }, ...scales },
-        series: [{}, ...all.series.map((s, k) => ({ stroke: of(s, k), width: data.time.length < 600 ? 1.5 : 1, scale: s.unit, points: { show: false } }))],
+        series: [{}, ...all.series.map((s, k) => ({ stroke: of(s, k), width: 1, scale: s.unit, points: { show: false } }))],
         axes: [{ ...axis, size: 24 }, ...all.series.slice(0, 1).map((s) => ({ ...axis, scale: s.unit, size: 58, values: () => [] }))], hooks: { setSelect: [(u) => this.picked(u)] },
       }, [all.time, ...all.series.map((s) => s.values)], this.strip);
       this.small.root.setAttribute("role", "img");
