@@ -121,3 +121,11 @@ def test_a_fit_shows_how_far_it_is(place: Path, capsys: pytest.CaptureFixture[st
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
     assert main(command) == 0
     assert "fitting, step 1" in capsys.readouterr().err
+
+
+def test_check_knows_the_channels_that_the_fmu_wants(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    joint = str(place / "user.toml")
+    assert main(["check", str(place / "run.npz"), "--joint", joint]) == 0
+    assert "refuse" not in capsys.readouterr().out
+    assert main(["check", str(place / "bare.npz"), "--joint", joint]) == 1
+    assert "refuse: bare: has no motor_torque, which [model.channels] maps to torque" in capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""fit, compare, diagnose, add and export where the joint file's model is a user's FMU (``[model] fmu = "..."``)."""
+"""check, fit, compare, diagnose, add and export where the joint file's model is a user's FMU (``[model] fmu = "..."``)."""
 
 from __future__ import annotations
 
@@ -10,17 +10,19 @@ from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from identification.check import Finding
 from identification.errors import InputError
 from identification.record import Record
 from irj_fmu.command_line import OneLineParser, check_output, keep_inputs
 from workbench.commands.files import distinct, open_records, progress_bar, write_json, write_text
+from workbench.commands.records import checked
 
 if TYPE_CHECKING:
     from irj_fmu.user_compare import UserComparison
     from irj_fmu.user_diagnose import UserDiagnosis
     from irj_fmu.user_model import UserModel
 
-VERBS: Final = ("fit", "compare", "diagnose", "add", "export")
+VERBS: Final = ("check", "fit", "compare", "diagnose", "add", "export")
 
 
 def module_of(arguments: Namespace) -> str:
@@ -83,11 +85,25 @@ def _records(paths: Sequence[str], model: UserModel) -> tuple[list[Record], list
     """Records that hold every channel which the joint file maps."""
     records, warnings = open_records(paths, model.joint)
     for path, record in zip(paths, records, strict=True):
-        for mapped in (*model.inputs, *model.outputs):
-            if not record.has(mapped.channel):
-                has = ", ".join(record.channels)
-                raise InputError(f"{path}: has no {mapped.channel}, which [model.channels] maps to {mapped.variable} (it has {has}); map what is there")
+        for missing in _unmapped(record, model):
+            raise InputError(f"{path}: {missing}")
     return records, warnings
+
+
+def _unmapped(record: Record, model: UserModel) -> list[str]:
+    """What is wrong where a record lacks a channel that the joint file maps."""
+    has = ", ".join(record.channels)
+    lacking = [m for m in (*model.inputs, *model.outputs) if not record.has(m.channel)]
+    return [f"has no {m.channel}, which [model.channels] maps to {m.variable} (it has {has}); map what is there" for m in lacking]
+
+
+@_one_line
+def run_check(arguments: Namespace) -> int:
+    """`irj check REC --joint J` with an FMU as the model: the gate, and whether the mapped channels are there."""
+    from irj_fmu.user_file import load_user_joint
+
+    model = load_user_joint(arguments.joint)
+    return checked(arguments, model.joint, lambda r: [Finding("refuse", "unmapped", f"{r.name}: {text}") for text in _unmapped(r, model)])
 
 
 @_one_line
@@ -226,4 +242,4 @@ def _print_parameters(parameters: Mapping[str, Mapping[str, Any]]) -> None:
         print(f"  {name:<36} {p['value']:.6g}{error} {p['unit']}{flags}")
 
 
-__all__ = ["VERBS", "module_of", "run_add", "run_compare", "run_diagnose", "run_export", "run_fit"]
+__all__ = ["VERBS", "module_of", "run_add", "run_check", "run_compare", "run_diagnose", "run_export", "run_fit"]
