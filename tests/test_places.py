@@ -178,8 +178,9 @@ def test_axes_and_units_of_a_record(kind: str, ratio: float) -> None:
 
 def test_time_runs_on_over_records() -> None:
     record = swinging("rotary", 1.0, 50.0)
+    again = record.with_channel("motor_torque", 1.01 * record["motor_torque"])
     joint = Joint(gear_ratio=50.0, effects=("viscous",))
-    data = load_dataset([record, record], [], joint, prepared_model(joint, record))
+    data = load_dataset([record, again], [], joint, prepared_model(joint, record))
     time = running_time(data.train)
     assert np.all(np.diff(time) > 0)
     assert time[-1] == pytest.approx(2 * 24, abs=1.0)
