@@ -97,6 +97,8 @@ class Effect:
         True where the law, with parameters inside their bounds, never gives energy.
     periodic : bool
         True for a line at an order of the motor turn (own claim rule).
+    angular : bool
+        True for sine and cosine of the position: no law of a linear axis.
     separate_by : str
         The run that separates it from what it is confused with.
     candidate : bool
@@ -124,6 +126,7 @@ class Effect:
     needs_load: bool = False
     dissipative: bool = False
     periodic: bool = False
+    angular: bool = False
     separate_by: str = ""
     candidate: bool = True
 
@@ -225,6 +228,7 @@ def effect(
     needs_load: bool = False,
     dissipative: bool = False,
     periodic: bool = False,
+    angular: bool = False,
     separate_by: str = "",
     candidate: bool = True,
 ) -> Callable[[Law], Law]:
@@ -236,7 +240,7 @@ def effect(
                 key=key, title=title, family=family, acts_on=acts_on, parameters=parameters, law=law, absence=absence,
                 excitation=excitation, source=source, memory=memory, rate=rate, states=states, potential=potential,
                 confused_with=confused_with, needs=needs, needs_load=needs_load, dissipative=dissipative,
-                periodic=periodic, separate_by=separate_by, candidate=candidate,
+                periodic=periodic, angular=angular, separate_by=separate_by, candidate=candidate,
             )
         )  # fmt: skip
         return law

@@ -20,6 +20,8 @@ LINEAR_UNITS: Final = {
     "rad/s": "m/s",
     "kg.m2": "kg",
     "rad/(N.m)": "m/N",
+    "N.m/K": "N/K",
+    "N.m.s/(rad.K)": "N.s/(m.K)",
 }
 """Unit of the same parameter where the joint is a linear axis (`kind = "linear"`)."""
 

@@ -9,9 +9,12 @@ import numpy as np
 from identification._finding import Finding, at
 
 if TYPE_CHECKING:
+    import numpy.typing as npt
+
     from identification.record import FloatArray, IntArray, Record
 
 _NAN_LIMIT: Final = 0.2
+_BRIDGED: Final = 2
 _EFFORT: Final = ("motor_current", "motor_voltage", "motor_torque", "link_torque")
 _SIDE: Final = ("run", "temperature", "reference_position")
 _FEW_LEVELS: Final = 50
@@ -34,9 +37,23 @@ def check_nan(record: Record) -> list[Finding]:
             advice = "leave the channel out or export it again"
             findings.append(Finding("refuse", "nan", f"{where}: {advice}", channel, row))
         else:
-            advice = "the rows are dropped, the record is split there"
+            left = ~np.isfinite(values) & ~bridged_rows(~np.isfinite(values), record.segment)
+            dropped = "the rows are dropped, the record is split there"
+            advice = dropped if left.sum() == bad.size else "the holes of one or two rows are bridged by interpolation"
+            advice += f", in the other {int(left.sum())} {dropped}" if 0 < left.sum() < bad.size else ""
             findings.append(Finding("repair", "nan", f"{where}: {advice}", channel, row))
     return findings
+
+
+def bridged_rows(missing: npt.NDArray[np.bool_], segment: IntArray) -> npt.NDArray[np.bool_]:
+    """Rows of holes that are short enough to be bridged: one or two rows inside a segment."""
+    padded = np.concatenate([[False], missing, [False]])
+    edges = np.flatnonzero(np.diff(padded.astype(np.int8)))
+    out = np.zeros(missing.size, dtype=np.bool_)
+    for start, stop in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        inside = start > 0 and stop < missing.size and segment[start - 1] == segment[stop]
+        out[start:stop] = inside and stop - start <= _BRIDGED
+    return out
 
 
 def runs_of_equal(values: FloatArray) -> tuple[IntArray, IntArray]:

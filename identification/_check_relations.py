@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from identification._check_channels import quantum, span
-from identification._finding import Finding
+from identification._finding import Finding, at
 from identification.noise import noise_level
 
 if TYPE_CHECKING:
@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 _BLOCKS: Final = 200
 _CORRELATION: Final = 0.9
 _RATIO_TOLERANCE: Final = 0.02
+_RATIO_DOUBT: Final = 0.003
+"""Difference of the gear ratio, torsion taken off, from which a word is said: a harmonic drive with a tooth more differs by 0.6 %."""
+_WRAP: Final = 0.8
 _VELOCITY_TOLERANCE: Final = 0.05
 _LONGEST: Final = 1 << 18
 _STILL: Final = 12.0
@@ -35,6 +38,29 @@ _FACTORS: Final = (
     (1e-3, "a factor 1000 in the unit of position, velocity or time"),
 )
 _LINEAR_FACTORS: Final = _FACTORS[-2:]
+
+
+def check_wrapped(record: Record) -> list[Finding]:
+    """Refuse a position that jumps by its whole range: an encoder that wraps."""
+    findings = []
+    for channel in ("motor_position", "link_position"):
+        whole = span(record[channel]) if record.has(channel) else 0.0
+        if whole == 0.0:
+            continue
+        steps = np.where(np.diff(record.segment) == 0, np.diff(record[channel]), 0.0)
+        size = np.abs(steps[np.isfinite(steps)])
+        turn = record.kind == "rotary" and 0.9 < whole / (2.0 * math.pi) <= 1.0 + 1e-6
+        jumps = size > (0.5 if turn else _WRAP) * whole
+        if not jumps.any() or (not turn and float(np.quantile(size, 0.99)) > 0.2 * whole):
+            continue
+        row = int(np.argmax(np.abs(np.nan_to_num(steps))))
+        limit = "2 pi" if turn else f"about {whole:.4g} {record.unit(channel)}"
+        message = (
+            f"{record.name}: {channel} jumps by its whole range {int(jumps.sum())} time(s), as after {at(record, row)}: the encoder wraps "
+            f"at {limit}: unwrap it (numpy.unwrap) before the export"
+        )
+        findings.append(Finding("refuse", "wrapped", message, channel, row))
+    return findings
 
 
 def check_motion(record: Record) -> list[Finding]:
@@ -163,6 +189,20 @@ def measured_ratio(record: Record) -> tuple[float, float] | None:
     return ml / ll, ml / math.sqrt(ll * mm)
 
 
+def _rigid_ratio(record: Record) -> float | None:
+    """Slope of the motor position on the link position beside the torque that twists the joint; None without a torque sensor."""
+    if not record.has("link_torque"):
+        return None
+    columns = np.column_stack([record["link_position"], record["link_torque"], np.ones(len(record))])
+    good = np.isfinite(columns).all(axis=1) & np.isfinite(record["motor_position"])
+    sizes = np.linalg.norm(columns[good], axis=0)
+    if not sizes.all() or span(record["link_torque"]) == 0.0:
+        return None
+    scaled = columns[good] / sizes
+    found, _, rank, _ = np.linalg.lstsq(scaled, record["motor_position"][good], rcond=1e-6)
+    return float(found[0] / sizes[0]) if rank == 3 else None
+
+
 def check_ratio(record: Record, gear_ratio: float | None) -> list[Finding]:
     """Compare the gear ratio of the joint with the one the two positions show."""
     found = measured_ratio(record)
@@ -181,6 +221,11 @@ def check_ratio(record: Record, gear_ratio: float | None) -> list[Finding]:
     share = ratio / gear_ratio
     if abs(share - 1.0) <= _RATIO_TOLERANCE:
         message = f"{record.name}: the positions show a gear ratio of {ratio:.5g}, {gear_ratio:g} is given"
+        rigid = _rigid_ratio(record)
+        if rigid is not None and abs(rigid / gear_ratio - 1.0) > _RATIO_DOUBT:
+            advice = "check gear_ratio and the scale of both positions, a wrong one looks like a missing effect"
+            message = f"{record.name}: with the torsion taken off the positions show a gear ratio of {rigid:.5g}, {gear_ratio:g} is given: {advice}"
+            return [Finding("warn", "gear_ratio", message, "link_position")]
         return [Finding("ok", "gear_ratio", message, "link_position")]
     doubt = ""
     if abs(share + 1.0) <= _RATIO_TOLERANCE:

@@ -118,5 +118,5 @@ def check_sampling(record: Record) -> list[Finding]:
     if dt >= 0.5 or dt < 2e-6:
         unit = "ms" if dt >= 0.5 else "s"
         message = f"{record.name}: the sampling step is {dt:.4g} s: is time in {unit}? correct the unit of time"
-        findings.append(Finding("warn", "time_unit", message, "time"))
+        findings.append(Finding("refuse" if dt >= 0.5 else "warn", "time_unit", message, "time"))
     return findings

@@ -18,6 +18,8 @@ _PARTIAL: Final = 0.8
 """Partial correlation from which the two torques are said to follow each other."""
 _LEFT: Final = 0.02
 """Share of the link torque's power that must be left beside a spring for the spring to be among the terms."""
+_GIVEN: Final = 0.05
+"""Share of the work moved that a passive joint cannot give back over whole cycles."""
 _REFUSE: Final = 20.0
 _WARN: Final = 1.5
 
@@ -74,6 +76,40 @@ def check_torque(record: Record, gear_ratio: float | None, torque_per_current: f
         why = guess or "a scale is wrong, or a strong torque is missing from the model"
         return [Finding("warn", "torque", f"{said} ({why}): check unit and scale of both, and motor_constant", "link_torque")]
     return [Finding("ok", "torque", f"{record.name}: link_torque follows the drive torque (factor {slope:.3g})", "link_torque")]
+
+
+def check_work(record: Record, gear_ratio: float | None, torque_per_current: float | None) -> list[Finding]:
+    """Refuse a drive that takes energy out of a joint that comes back to where it was: its sign is reversed.
+
+    The work is that between the first and the last passage of the middle position in one direction, where what gravity
+    and springs store is the same again; friction can only use up energy.
+    """
+    motor = record.has("motor_position")
+    if not motor and not record.has("link_position"):
+        return []
+    position = record["motor_position"] / (gear_ratio or 1.0) if motor else record["link_position"]
+    if record.has("motor_torque"):
+        drive, name = record["motor_torque"] * (gear_ratio or 1.0), "motor_torque"
+    elif record.has("motor_current") and torque_per_current is not None:
+        drive, name = record["motor_current"] * torque_per_current, "motor_current"
+    else:
+        return []
+    net = whole = 0.0
+    for part in record.segments():
+        q, tau = position[part], drive[part]
+        middle = float(np.median(q))
+        passing = np.flatnonzero((q[:-1] < middle) & (q[1:] >= middle))
+        if len(passing) < 2 + 1:
+            continue
+        between = slice(int(passing[0]), int(passing[-1]) + 1)
+        power = 0.5 * (tau[between][1:] + tau[between][:-1]) * np.diff(q[between])
+        net += float(power.sum())
+        whole += float(np.abs(power).sum())
+    if whole == 0.0 or net >= -_GIVEN * whole:
+        return []
+    advice = "set sign = -1 for it in [columns], or reverse motor_constant"
+    message = f"{record.name}: {name} takes energy out of the joint over whole cycles ({net:.3g} of {whole:.3g} J moved): is its sign reversed? {advice}"
+    return [Finding("refuse", "work", message, name)]
 
 
 def _guess(size: float) -> str:

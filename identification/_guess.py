@@ -34,6 +34,13 @@ _WORDS: Final[Mapping[str, frozenset[str]]] = {
     "voltage": _set("u volt voltage vin ubus"),
     "temperature": _set("temp temperature tmp"),
 }
+_SIDE_STEMS: Final = {"motor": ("motor", "antrieb", "rotor"), "link": ("gelenk", "abtrieb", "last", "arm", "joint", "link")}
+_QUANTITY_STEMS: Final[Mapping[str, tuple[str, ...]]] = {
+    "velocity": ("geschwindigkeit", "drehzahl", "velocity", "speed"), "acceleration": ("beschleunigung", "acceleration"),
+    "position": ("position", "winkel", "lage", "angle"), "current": ("strom", "current"), "voltage": ("spannung", "voltage"),
+    "temperature": ("temperatur", "temperature"), "torque": ("moment", "torque"), "time": ("zeit",),
+}  # fmt: skip
+"""Compound words, as of German: the side at the front, the quantity at the end."""
 _FLAGS: Final = _set("enable enabled flag status state mode error fault deflection defl")
 _BY_UNIT: Final = ("position", "velocity", "acceleration", "current", "torque", "voltage", "temperature", "time")
 
@@ -89,7 +96,13 @@ def _assumed_unit(channel: str, kind: str) -> str:
 
 
 def _side(tokens: list[str]) -> str:
-    return next((side for side in ("reference", "motor", "link") if _SIDES[side] & set(tokens)), "")
+    words = next((side for side in ("reference", "motor", "link") if _SIDES[side] & set(tokens)), "")
+    return words or next((side for side, stems in _SIDE_STEMS.items() if any(t.startswith(stems) for t in tokens)), "")
+
+
+def _quantity(tokens: list[str]) -> str:
+    words = next((quantity for quantity, words in _WORDS.items() for token in tokens if token in words), "")
+    return words or next((quantity for quantity, stems in _QUANTITY_STEMS.items() if any(t.endswith(stems) for t in tokens)), "")
 
 
 def _guess_one(name: str, file_unit: str | None, kind: str) -> tuple[str, str, str, str]:
@@ -103,9 +116,9 @@ def _guess_one(name: str, file_unit: str | None, kind: str) -> tuple[str, str, s
     tokens = _tokens(rest)
     if _FLAGS & set(tokens):
         return "", "", "", ""
-    by_name = next((quantity for quantity, words in _WORDS.items() for token in tokens if token in words), "")
-    quantity = by_unit or by_name
-    return quantity, _side(tokens), unit, f"{quantity} by " + ("its unit" if by_unit else "its name, unit assumed")
+    own = _tokens(re.split(r"[/.](?=[^\W\d])", rest)[-1])
+    quantity = by_unit or _quantity(own) or _quantity(tokens)
+    return quantity, _side(own) or _side(tokens), unit, f"{quantity} by " + ("its unit" if by_unit else "its name, unit assumed")
 
 
 def guess_columns(

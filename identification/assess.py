@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from casadi_models import JointModel
 from identification.balances import balances_of
-from identification.engine import Dataset, floors, references, rms, row_weights, stack, taking_part
+from identification.engine import Dataset, floor_rows, references, rms, row_weights, stack, taking_part
 from identification.weak import WeakRecord
 
 FloatArray = npt.NDArray[np.float64]
@@ -83,14 +83,15 @@ def assess(model: JointModel, data: Dataset, records: Sequence[WeakRecord], valu
     rows = {b: taking_part(b, records) for b in balances.balances}
     residual = {b: whole[b][rows[b]] for b in whole}
     measured = {b: y[rows[b]] for b, y in references(data, records).items()}
-    floor = floors(model, data, values)
-    weights = row_weights(balances, data, values, {b: max(floor[b], 1e-12) for b in floor}, records)
+    floor = floor_rows(model, data, values, records)
+    weights = row_weights(balances, data, values, {b: np.maximum(floor[b], 1e-12) for b in floor}, records)
     weights = {b: w[rows[b]] for b, w in weights.items()}
+    floor = {b: f[rows[b]] for b, f in floor.items()}
     unit = "N.m" if model.kind == "rotary" else "N"
     errors = {
         b: BalanceError(
-            rms(residual[b] * weights[b]) / max(rms(weights[b]), 1e-300), floor[b],
-            rms(residual[b] * weights[b]) if floor[b] > 0 else math.inf, unit,
+            rms(residual[b] * weights[b]) / max(rms(weights[b]), 1e-300), rms(floor[b] * weights[b]) / max(rms(weights[b]), 1e-300),
+            rms(residual[b] * weights[b]) if np.any(floor[b] > 0) else math.inf, unit,
         )
         for b in balances.balances
     }  # fmt: skip

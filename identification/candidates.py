@@ -96,6 +96,9 @@ def offered(model: JointModel, data: Dataset, *, late: bool = False) -> tuple[li
         if one_sided and not sensing.both_positions:
             kept = ("transmission",) if direct and effect.key in DISPLACEMENT else ()
             places = [p for p in places if p in kept or p not in ("transmission", "torsion")]
+        if effect.angular and data.joint.kind == "linear":
+            refused.append(NotTestable(effect.key, "is a law of an angle; this axis is linear"))
+            continue
         if effect.periodic and (data.joint.kind == "linear" or _turns(data) < 2):
             places = []
         if not places:

@@ -9,15 +9,17 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from identification._check_channels import (
+    bridged_rows,
     check_constant,
     check_nan,
     check_quantisation,
     check_saturation,
     check_stuck,
 )
-from identification._check_relations import check_delay, check_motion, check_ratio, check_velocity, measured_ratio
+from identification._check_jumps import check_jumps
+from identification._check_relations import check_delay, check_motion, check_ratio, check_velocity, check_wrapped, measured_ratio
 from identification._check_time import check_sampling, check_size, check_stamps, gap_limit, gaps
-from identification._check_torque import check_torque
+from identification._check_torque import check_torque, check_work
 from identification._finding import SEVERITIES, Finding, rank
 from identification.errors import InputError
 
@@ -76,20 +78,23 @@ def check(
         return rank(findings)
     findings += check_sampling(record)
     findings += check_constant(record, gear_ratio)
-    motion = check_motion(record)
-    findings += motion
-    if any(finding.severity == "refuse" for finding in motion):
-        return rank(findings)
+    for gate_check in (check_wrapped, check_motion):
+        found = gate_check(record)
+        findings += found
+        if any(finding.severity == "refuse" for finding in found):
+            return rank(findings)
     usable = repair(record) if any(finding.severity == "repair" for finding in findings) else record
     if len(usable) >= 2:
         findings += check_stuck(record)
         findings += check_saturation(record)
         findings += check_quantisation(record)
+        findings += check_jumps(record)
         findings += check_velocity(usable, gear_ratio)
         findings += check_ratio(usable, gear_ratio)
         findings += check_delay(usable)
         if not any(finding.severity == "refuse" for finding in findings):
             findings += check_torque(usable, gear_ratio, torque_per_current)
+            findings += check_work(usable, gear_ratio, torque_per_current)
     return rank(findings)
 
 
@@ -137,7 +142,8 @@ def repair(record: Record) -> Record:
     """Repair a record by named rules, each noted in the provenance with its count and first row.
 
     ``drop_rows_without_time``, ``drop_repeated_stamps`` (the later row), ``interpolate_temperature``,
-    ``drop_nan_rows`` (and split there), ``split_at_gaps``, ``drop_short_pieces`` (under 8 samples).  Time that runs
+    ``bridge_nan_rows`` (holes of one or two rows, by interpolation), ``drop_nan_rows``
+    (and split there), ``split_at_gaps``, ``drop_short_pieces`` (under 8 samples).  Time that runs
     backwards is not repaired.
 
     Parameters
@@ -159,7 +165,7 @@ def repair(record: Record) -> Record:
         return record
     record = _drop(record, np.isfinite(record.time), "drop_rows_without_time")
     record = _drop_repeated(record)
-    record = _fill_temperature(record)
+    record = _bridge(_fill_temperature(record))
     finite = np.ones(len(record), dtype=np.bool_)
     for values in record.channels.values():
         finite &= np.isfinite(values)
@@ -209,6 +215,24 @@ def _fill_temperature(record: Record) -> Record:
     index = np.arange(values.size)
     note = f"interpolate_temperature: {int((~good).sum())} row(s), first row {int(np.argmin(good)) + 1}"
     return record.with_channel("temperature", np.interp(index, index[good], values[good]), note)
+
+
+def _bridge(record: Record) -> Record:
+    finite = np.ones(len(record), dtype=np.bool_)
+    for values in record.channels.values():
+        finite &= np.isfinite(values)
+    if finite.all():
+        return record
+    short = bridged_rows(~finite, record.segment)
+    if not short.any():
+        return record
+    channels = {}
+    for key, values in record.channels.items():
+        here, good = short & ~np.isfinite(values), np.isfinite(values)
+        channels[key] = values.copy()
+        channels[key][here] = np.interp(np.flatnonzero(here), np.flatnonzero(good), values[good]) if here.any() else []
+    note = f"bridge_nan_rows: {int(short.sum())} row(s), first row {int(np.argmax(short)) + 1}"
+    return replace(record, channels=channels, provenance=record.provenance.noted(note))
 
 
 def _drop_short(record: Record) -> Record:

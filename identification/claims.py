@@ -198,6 +198,16 @@ def confusion_set(best: Trial, trials: Sequence[Trial], base: Base) -> tuple[str
     return tuple(names)
 
 
+def shortened(names: Sequence[str], ranking: Ranking) -> tuple[str, ...]:
+    """A set of names with those that are not significant themselves left out where there are too many."""
+    significant = {t.key for t in ranking.everything if t.candidate.label in ranking.significant}
+    kept = [n for n in names if n in significant]
+    for name in names:
+        if name not in kept and len(kept) < LARGEST_SET:
+            kept.append(name)
+    return tuple(n for n in names if n in kept)
+
+
 def _still_helps(other: Trial, best: Trial) -> bool:
     """A name stays in the set only if it does a fair part of the work itself."""
     return other.cv_drop_percent >= 0.5 * best.cv_drop_percent and (

@@ -84,10 +84,11 @@ def compare(fitted: Fit, records: Record | Sequence[Record], *, linear: bool = T
         Records with other channels than those of the fit.
     """
     given = [records] if isinstance(records, Record) else list(records)
-    data = load_dataset(given, [], fitted.joint, fitted.model, kernel=fitted.data.kernel)
+    data = load_dataset(given, [], fitted.joint, fitted.model, kernel=fitted.data.kernel, like=fitted.data.sensing)
     error = assess(fitted.model, data, data.train, fitted.solution.values)
-    residual = stack(Balances(fitted.model, data.sensing, wrt=()), data.train, fitted.solution.values).residual
-    places = places_of(residual, gather(data))
+    stacked = stack(Balances(fitted.model, data.sensing, wrt=()), data.train, fitted.solution.values)
+    residual = stacked.residual
+    places = places_of({b: np.where(stacked.taking[b], r, np.nan) for b, r in residual.items()}, gather(data))
     time = np.concatenate([w.time for w in data.train])
     sigma = {b: max(error.balances[b].floor, 1e-12) for b in residual}
     power = sum((residual[b] / sigma[b]) ** 2 for b in residual)

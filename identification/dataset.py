@@ -64,9 +64,10 @@ class Dataset:
 
 
 def load_dataset(
-    train: Sequence[Record], held_out: Sequence[Record], joint: Joint, model: JointModel, *, kernel: float | None = None
-) -> Dataset:
-    """Prepare records for the balances that their common channels allow.
+    train: Sequence[Record], held_out: Sequence[Record], joint: Joint, model: JointModel, *, kernel: float | None = None,
+    like: Sensing | None = None,
+) -> Dataset:  # fmt: skip
+    """Prepare records for the balances that their common channels allow (`like`: temperature counts as in the records of a fit).
 
     Raises
     ------
@@ -74,6 +75,8 @@ def load_dataset(
         Too short; channels that do not fit the model; a record of training and held-out data without a common channel set.
     """
     sensing = check_alike([*train, *held_out], model)
+    if like is not None:
+        sensing = replace(sensing, temperature_origin=like.temperature_origin, longest_run=like.longest_run)
     alone = seen_from_the_motor(sensing, joint)
     length = kernel or (ONE_SIDED_KERNEL if alone else CLAIM_KERNEL)
     prepared: list[WeakRecord] = []
@@ -85,9 +88,15 @@ def load_dataset(
         first = max(first, 1 + int(made.block.max(initial=first - 1)))
         prepared.append(made)
     count = len(train)
+    for balance in sensing.balances:
+        if held_out and all(balance in made.masked for made in prepared[count:]):
+            raise InputError(
+                f"{held_out[0].name}: every held-out record has another payload than {train[0].name}, so none shows the {balance} balance; "
+                "give a held-out record with the same payload"
+            )
     signals = [signals_of(r, joint, sensing) for r in train]
     names = {c for s in signals for c in s if c in POSITION_CHAINS}
-    noise = {c: float(np.median([noise_level(s[c], tuple(r.segments())) for s, r in zip(signals, train, strict=True)])) for c in names}
+    noise = {c: float(np.median([noise_level(s[c], tuple(r.segments()), r.time) for s, r in zip(signals, train, strict=True)])) for c in names}
     return Dataset(
         joint, sensing, tuple(prepared[:count]), tuple(prepared[count:]), _ranges(prepared[:count], model.clamped_link), noise,
         tuple(r.name for r in train), tuple(r.name for r in held_out),
@@ -111,14 +120,16 @@ def weak_record(record: Record, joint: Joint, sensing: Sensing, length: float, f
     """One record, resampled to uniform time where needed, averaged with the kernel."""
     steps = np.diff(record.time)
     inside = np.diff(record.segment) == 0
+    signals, segments = signals_of(record, joint, sensing), tuple(record.segments())
+    noise = {c: noise_level(x, segments, record.time) for c, x in signals.items() if c in POSITION_CHAINS}
     if inside.any() and np.ptp(steps[inside]) > 0.02 * float(np.median(steps[inside])):
         record = record.resampled()
+        signals, segments = signals_of(record, joint, sensing), tuple(record.segments())
     length = max(length, 8 * record.dt)
-    signals, segments = signals_of(record, joint, sensing), tuple(record.segments())
     longest = length / 2 if length <= CLAIM_KERNEL else 0.06
     made = prepare(
         record.time, signals, segments, length=length, first_block=first_block,
-        pointwise={c: pointwise_kernel(x, segments, record.dt, longest) for c, x in signals.items() if c in POSITION_CHAINS},
+        pointwise={c: pointwise_kernel(signals[c], segments, record.dt, longest, level) for c, level in noise.items()},
         curved=curved,
     )  # fmt: skip
     if made.rows < 8:
@@ -126,7 +137,7 @@ def weak_record(record: Record, joint: Joint, sensing: Sensing, length: float, f
     return made
 
 
-def pointwise_kernel(position: FloatArray, segments: tuple[slice, ...], dt: float, longest: float) -> float:
+def pointwise_kernel(position: FloatArray, segments: tuple[slice, ...], dt: float, longest: float, noise: float) -> float:
     """Shortest kernel whose velocity noise does not matter beside the velocities of the record [s].
 
     A long kernel rounds off reversals, and the laws of friction at low speed then fit the rounding.
@@ -134,7 +145,6 @@ def pointwise_kernel(position: FloatArray, segments: tuple[slice, ...], dt: floa
     lag = max(1, round(POINTWISE_KERNELS[-1] / dt))
     change = np.concatenate([np.abs(position[s][lag:] - position[s][:-lag]) for s in segments if s.stop - s.start > lag] or [np.zeros(1)])
     fast = float(np.quantile(change, 0.99)) / (lag * dt)
-    noise = noise_level(position, segments)
     for length in POINTWISE_KERNELS:
         if 6 * dt <= length < longest and noise * float(np.linalg.norm(kernel(length, dt, 1))) <= VELOCITY_NOISE * fast:
             return length

@@ -15,10 +15,11 @@ from identification.balances import Balances, balances_of
 from identification.dataset import Dataset, load_dataset, prepared_model, weak_record
 from identification.errors import InputError
 from identification.joint_file import Known
-from identification.stacked import Stacked, floors, references, rms, row_weights, stack, taking_part
+from identification.stacked import Stacked, floor_rows, floors, references, rms, row_weights, stack, taking_part
+from identification.standard_errors import block_errors
 
 __all__ = [
-    "Dataset", "Solution", "Stacked", "bounds_of", "floors", "gauss_newton", "load_dataset", "memory_shapes_of", "prepared_model", "references",
+    "Dataset", "Solution", "Stacked", "bounds_of", "floor_rows", "floors", "gauss_newton", "load_dataset", "memory_shapes_of", "prepared_model", "references",
     "rms", "row_weights", "solve", "stack", "starts", "taking_part", "weak_record",
 ]  # fmt: skip
 
@@ -354,7 +355,7 @@ def _with_errors(
     limits: Mapping[str, tuple[float, float]], weights: Mapping[str, FloatArray], sigma: Mapping[str, float],
     memory_shapes: Sequence[str], used: int,
 ) -> Solution:  # fmt: skip
-    """Standard errors by the block sandwich; what cannot be identified is said."""
+    """Standard errors from blocks of time; what cannot be identified is said."""
     stacked = _jacobian(balances, data, values, free, memory_shapes)
     j = np.concatenate([stacked.jacobian[b] * weights[b][:, None] for b in balances.balances])
     r = np.concatenate([stacked.residual[b] * weights[b] for b in balances.balances])
@@ -373,18 +374,16 @@ def _with_errors(
     if len(index):
         scaled = j[:, index] / norms[index]
         inverse = np.linalg.pinv(scaled.T @ scaled, rcond=1e-12)
-        numbers = np.unique(block[block >= 0])
-        scores = np.array([scaled[block == k].T @ r[block == k] for k in numbers])
-        covariance = inverse @ (scores.T @ scores) @ inverse * len(numbers) / max(len(numbers) - 1, 1)
-        size = np.sqrt(np.maximum(np.diag(covariance), 0.0)) / norms[index]
+        errors = block_errors(scaled, r, block)
+        size = None if errors is None else errors / norms[index]
         spread = np.sqrt(np.maximum(np.diag(inverse), 1e-300))
         corr = inverse / np.outer(spread, spread)
         np.fill_diagonal(corr, 0.0)
         for k, i in enumerate(index.tolist()):
-            stderr[free[i]] = float(size[k])
+            stderr[free[i]] = None if size is None else float(size[k])
             other = int(np.argmax(np.abs(corr[k])))
             correlation[free[i]] = (free[int(index[other])], float(corr[k, other]))
-            weak = values[free[i]] != 0 and size[k] > abs(values[free[i]])
+            weak = size is not None and values[free[i]] != 0 and size[k] > abs(values[free[i]])
             if (spread[k] > 1e4 or weak) and not free[i].endswith("_smoothing_velocity"):
                 unidentified.append(free[i])
     kept = dict(values)

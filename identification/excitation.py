@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -49,7 +48,7 @@ def excitation_warnings(data: Dataset) -> tuple[str, ...]:
     levels = np.histogram(np.abs(speed) / top, bins=10, range=(0, 1))[0] / max(len(speed), 1)
     if float(levels.max()) > 0.75 and int(np.argmax(levels)) > 2:
         out.append("the training records run at one speed nearly all the time (triangle only): add a multisine record before trusting small claims")
-    pulled = {name: 100 * share / (1 + share) for name, share in attenuation(data).items() if share > ATTENUATION}
+    pulled = {name: 100 * min(share, 1.0) for name, share in attenuation(data).items() if share > ATTENUATION}
     if pulled:
         worst = ", ".join(f"{name} by about {share:.2g} %" for name, share in pulled.items())
         out.append(f"noise of the positions lowers the {worst}: `irj fit --refine` takes that off, finer encoders avoid it")
@@ -74,7 +73,7 @@ def unlike_units(data: Dataset) -> str:
 
 def few_reversals(data: Dataset) -> str:
     """How often the motor reverses in the training records where that is too seldom to name a friction effect, else empty."""
-    speeds = [w.smooth["motor_velocity"][a:b] for w in data.train for a, b in pairwise(w.starts)]
+    speeds = [w.smooth["motor_velocity"] for w in data.train]
     top = float(np.quantile(np.abs(np.concatenate(speeds)), 0.99)) or 1e-12
     turns = sum(int(np.sum(np.diff(np.sign(v[np.abs(v) > 0.02 * top])) != 0)) for v in speeds)
     if turns >= FEWEST_REVERSALS:
@@ -85,7 +84,7 @@ def few_reversals(data: Dataset) -> str:
 def attenuation(data: Dataset) -> dict[str, float]:
     """Share by which noise of the positions pulls a parameter towards zero.
 
-    Noise power over power of the averaged signal that the parameter multiplies (errors in variables).
+    Noise power over power of the averaged signal, noise included, that the parameter multiplies (errors in variables).
     """
     grid, out = data.train[0].grid, {}
     if {"motor_position", "link_position"} <= set(data.noise) and data.sensing.both_positions and not data.sensing.clamped_link:

@@ -147,7 +147,7 @@ def claims_html(result: Mapping[str, Any]) -> str:
             how = text(claim["separate_by"] or "a run that moves differently")
             line += f" These records cannot tell these names apart; what would: {how}."
         if claim.get("partial"):
-            line += " It explains less than half of what stands over the noise: the rest is not in the library."
+            line += " It explains only part of what is missing: structure is left in this balance that is not in the library."
         items.append(f"<li>{line}</li>")
     return f"<ul>{''.join(items)}</ul>" if items else "<p>No effect is claimed.</p>"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -11,17 +12,32 @@ from typing import Final, final
 from casadi_models import EFFECTS, JointModel
 from identification.assess import VERDICT_KERNELS, BalanceError, Error, assess
 from identification.candidates import LATE
-from identification.claims import HELD_OUT_DROP, LADDER_STEP, Claim, Ranking, confusion_set, make_claim, minor_claims, nearly, rank, simplest
+from identification.claims import (
+    COMMON,
+    HELD_OUT_DROP,
+    LADDER_STEP,
+    LARGEST_SET,
+    Claim,
+    Ranking,
+    confusion_set,
+    make_claim,
+    minor_claims,
+    nearly,
+    rank,
+    shortened,
+    simplest,
+)
 from identification.engine import Dataset, Solution, load_dataset, prepared_model, solve
 from identification.errors import InputError
 from identification.excitation import excitation_warnings, few_reversals, not_identifiable
-from identification.formats import number
 from identification.improvement import HOLD_DELAY, Improvement, Step, ranked_json, visible_keys, visible_labels
 from identification.joint_file import Joint
 from identification.lines import find_lines
-from identification.locate import Unexplained, locate
+from identification.locate import Unexplained, locate, spectral_peak
 from identification.record import Record
+from identification.rival_table import is_absorbed
 from identification.trials import Base, Trial, make_base, try_candidate
+from identification.verdict import verdict_of
 
 __all__ = [
     "HOLD_DELAY", "RATIO_LIMIT", "Improvement", "Step", "excitation_warnings", "held_drop", "improve", "ranked_json",
@@ -32,6 +48,8 @@ MAX_ADDITIONS: Final = 6
 RATIO_LIMIT: Final = 1.5
 
 EXPLAINED_SHARE: Final = 0.5
+LOCATED_SHARE: Final = 50.0
+"""Share of what is left that one variable must hold before a table over it is set against the claims [%]."""
 SPOILT_RATIO: Final = 1.3
 """Ratio to the floor above which a balance that has risen by a fifth counts as spoilt by an addition."""
 RISE_LIMIT: Final = 1.02
@@ -113,24 +131,26 @@ class Loop:
             return self._without_answer(steps, why)
         base = make_base(steps[-1].solution, self.data)
         first = ranking = rank(base, progress=self._within(0.15, 0.05))
-        late = False
+        late, unnamed, aside = False, None, set[str]()
         for _ in range(2 * max_additions):
             if len(claims) >= max_additions:
                 break
             ranking = self._confirmed(ranking, base, steps[-1])
-            best = ranking.best(frozenset(self.refused))
+            best = ranking.best(frozenset(self.refused | aside))
             may_move = not late and not self.data.sensing.one_sided
             if best is None and may_move and max(e.ratio for e in steps[-1].held_out.balances.values()) > RATIO_LIMIT:
                 late = True
                 ranking = rank(base, late=True)
-                best = ranking.best(frozenset(self.refused))
+                best = ranking.best(frozenset(self.refused | aside))
             if best is None:
                 break
             names = confusion_set(best, ranking.everything, base)
-            best = simplest(best, names, ranking, frozenset(self.refused))
-            claim = make_claim(best, ranking, base, names)
-            if len(claim.effects) > 4:
-                break
+            best = simplest(best, names, ranking, frozenset(self.refused | aside))
+            claim = make_claim(best, ranking, base, shortened(names, ranking))
+            if len(claim.effects) > LARGEST_SET:
+                unnamed = unnamed or claim
+                aside |= {t.candidate.label for t in ranking.everything if t.key in claim.effects}
+                continue
             self.progress(f"adding {best.key}", 0.2 + 0.6 * len(claims) / max_additions)
             told = self._told_apart(claim, claims, steps)
             if told is not None:
@@ -151,8 +171,10 @@ class Loop:
                 claims, steps = self._revise(claims, steps)
             base = make_base(steps[-1].solution, self.data)
             ranking = rank(base, progress=self._within(0.2 + 0.6 * len(claims) / max_additions, 0.0))
+        if unnamed is not None and not any(t.key in unnamed.effects and t.candidate.label in ranking.significant for t in ranking.everything):
+            unnamed = None  # an addition has taken it along
         left = ranking.best(frozenset(self.refused)) if len(claims) >= max_additions else None
-        return self.finish(first, ranking, base, claims, steps, left)
+        return self.finish(first, ranking, base, claims, steps, left, unnamed)
 
     def _without_answer(self, steps: list[Step], why: str) -> Improvement:
         """The records cannot carry the question: the start model and the reason."""
@@ -225,7 +247,7 @@ class Loop:
                     continue
                 renewed = make_claim(best, ranking, base, names)
                 self.refused.add(claim.label)
-                if len(renewed.effects) <= 4 and all(c.label != renewed.label for c in current):
+                if len(renewed.effects) <= LARGEST_SET and all(c.label != renewed.label for c in current):
                     current[position] = renewed
                     return self._replay(current, steps)
             if same is not None:
@@ -254,17 +276,21 @@ class Loop:
             out.append(after)
         return kept, out
 
-    def finish(self, first: Ranking, last: Ranking, base: Base, claims: list[Claim], steps: list[Step], left: Trial | None = None) -> Improvement:
+    def finish(
+        self, first: Ranking, last: Ranking, base: Base, claims: list[Claim], steps: list[Step], left: Trial | None = None,
+        unnamed: Claim | None = None,
+    ) -> Improvement:  # fmt: skip
         """The result for these steps and claims: lines, minor effects, where it still fails, verdict."""
         self.progress("looking at what is left", 0.85)
         solution = steps[-1].solution
         ratios = self._ratios(solution)
         lines = find_lines(solution, [self._at_kernel(k) for k in self._line_kernels()] + [self.data])
-        claims = [self._partial(c, steps[0], steps[-1], ratios) for c in claims]
         minor = tuple(self._minor(t, solution) for t in minor_claims(last, base) if self._same_sign(t, solution))
         error = replace(steps[-1].held_out, balances=ratios)
         where = locate(solution, self.data, error, lines, RATIO_LIMIT)
-        verdict, reason = _verdict(claims, where, ratios, steps, left, few_reversals(self.data))
+        claims = [self._partial(c, steps[0], steps[-1], where) for c in claims]
+        where = self._with_frequency(where, claims, steps)
+        verdict, reason = verdict_of(claims, where, ratios, steps, left, few_reversals(self.data), unnamed)
         return Improvement(
             self.joint, self.data, tuple(steps), tuple(claims), minor, first, tuple(lines), tuple(where), verdict, reason, ratios,
             tuple(n for n in first.not_testable if n.effect not in {c for x in claims for c in x.effects}),
@@ -298,13 +324,29 @@ class Loop:
             out.update({b: e for b, e in error.balances.items() if VERDICT_KERNELS[b] == length})
         return {b: out[b] for b in self.data.sensing.balances}
 
-    def _partial(self, claim: Claim, first: Step, last: Step, ratios: Mapping[str, BalanceError]) -> Claim:
-        """A claim that explains less than half of what stood over the floor is partial."""
+    def _partial(self, claim: Claim, first: Step, last: Step, where: Sequence[Unexplained]) -> Claim:
+        """A claim is partial where its balance stays over the floor and it explains less than half, or no more than a table over one variable."""
+        left = next((u for u in where if u.balance == claim.balance), None)
+        if left is None:
+            return claim
         before, after = first.held_out.balances[claim.balance], last.held_out.balances[claim.balance]
         over = before.rms**2 - before.floor**2
         share = (before.rms**2 - after.rms**2) / over if over > 0 else 1.0
-        over_floor = ratios[claim.balance].ratio > RATIO_LIMIT
-        return replace(claim, partial=over_floor and (share < EXPLAINED_SHARE or claim.effects[0] in LATE))
+        partial = share < EXPLAINED_SHARE or claim.effects[0] in LATE
+        if not partial and left.share_percent >= LOCATED_SHARE and claim.effects[0] not in COMMON:
+            partial = is_absorbed(claim, left, last.solution, self.data)
+        return replace(claim, partial=partial)
+
+    def _with_frequency(self, where: Sequence[Unexplained], claims: Sequence[Claim], steps: Sequence[Step]) -> list[Unexplained]:
+        """What is left around a mode that is named in part only sits at the frequency that stood out before the mode was added."""
+        out = list(where)
+        for claim in claims:
+            before = next((a for a, b in itertools.pairwise(steps) if b.label == claim.label), None)
+            for k, u in enumerate(out):
+                nowhere = u.axis is None and u.order is None and u.frequency_hz is None
+                if claim.partial and claim.effects[0] in LATE and u.balance == claim.balance and nowhere and before is not None:
+                    out[k] = replace(u, frequency_hz=spectral_peak(before.solution, self.data, u.balance))
+        return out
 
     def _minor(self, trial: Trial, solution: Solution) -> Claim:
         return Claim((trial.key,), trial.candidate.label, trial.balance, trial.held_out_drop_percent)
@@ -344,27 +386,3 @@ def held_drop(before: Error, after: Error, balance: str) -> float:
     """Fall of a balance's RMS in percent."""
     old = before.balances[balance].rms
     return 100 * (1 - after.balances[balance].rms / old) if old > 0 else 0.0
-
-
-def _verdict(
-    claims: Sequence[Claim], where: Sequence[Unexplained], ratios: Mapping[str, BalanceError], steps: Sequence[Step], following: Trial | None,
-    few: str,
-) -> tuple[str, str]:
-    """Verdict and its sentence (`few`: that the motor reverses too seldom, which no library makes up for)."""
-    names = " and ".join(EFFECTS[c.effects[0]].title if len(c.effects) == 1 else "one of (" + ", ".join(c.effects) + ")" for c in claims)
-    fall = f"the error on held-out data falls from {steps[0].held_out.relative_error_percent:.3g} % to {steps[-1].held_out.relative_error_percent:.3g} %"
-    if where:
-        left = ", ".join(f"{u.balance} ({number(ratios[u.balance].ratio, 2)} times its noise floor)" for u in where)
-        if following is not None:
-            found = f"Missing: {names}; {fall}. " if claims else ""
-            stop = f"Stopped at the limit of additions ({len(claims)}): {following.candidate.effect.title} would be the next."
-            return "unexplained", f"{found}{stop} Left over: {left}."
-        if few:
-            found = f"Missing: {names}; {fall}. " if claims else ""
-            return "unexplained", f"{found}Left over: {left}. {few[0].upper()}{few[1:]}, too seldom to name a friction effect: record more reversals."
-        if claims:
-            return "unexplained", f"Missing: {names}; {fall}. Structure that is not in the library is left in: {left}."
-        return "unexplained", f"No effect of the library explains what is left in: {left}."
-    if claims:
-        return "complete", f"Missing: {names}; with it {fall}, and what is left looks like measurement noise."
-    return "nothing_missing", "The model explains the records down to their measurement noise: nothing is missing that these records could show."

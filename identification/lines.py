@@ -28,6 +28,10 @@ BANDS: Final = tuple(np.geomspace(LOWEST_ORDER, HIGHEST_ORDER, 9))
 PASS: Final = 0.8
 """Share of 1/kernel up to which a line counts (the kernel's -3 dB point is 0.93)."""
 
+SECTORS: Final = 8
+"""Equal shares of the rows, along the stroke, in which a line is looked for once more."""
+EVEN: Final = 0.7
+"""Least amplitude in the middle one of the sectors, over that in the whole stroke: lines read 0.85 to 1.05, a burst in one place 0.05 to 0.5."""
 NAMED_ORDERS: Final = (1.0, 2.0, 4.0)
 NAMED_WITHIN: Final = 0.5
 """Distance to such an order in units of 2 pi / stroke: orders of lines are found to a tenth of it."""
@@ -124,8 +128,8 @@ def find_lines(solution: Solution, kernels: Sequence[Dataset], most: int = 4) ->
     found: list[Line] = []
     for data in kernels:
         balances = balances_of(solution.model, data.sensing, wrt=())
-        train = stack(balances, data.train, solution.values).residual
-        held = stack(balances, data.held_out, solution.values).residual if data.held_out else None
+        train = stack(balances, data.train, solution.values)
+        held = stack(balances, data.held_out, solution.values) if data.held_out else None
         floor = floors(solution.model, data, solution.values)
         sigma = {b: max(floor[b], 1e-12) for b in floor}
         weights = row_weights(balances, data, solution.values, sigma, data.train)
@@ -133,11 +137,14 @@ def find_lines(solution: Solution, kernels: Sequence[Dataset], most: int = 4) ->
         for balance in balances.balances:
             if balance == "link":
                 continue
+            use = train.taking[balance]
+            seen = held.taking[balance] if held is not None else np.zeros(0, dtype=np.bool_)
             rows = _Rows(
-                _angles(data.train, data), _angles(data.train, data, "motor_velocity"), data.kernel, train[balance], weights[balance],
-                _angles(data.held_out, data) if held is not None else None,
-                _angles(data.held_out, data, "motor_velocity") if held is not None else None,
-                None if held is None else held[balance], held_weights.get(balance),
+                _angles(data.train, data)[use], _angles(data.train, data, "motor_velocity")[use], data.kernel,
+                train.residual[balance][use], weights[balance][use],
+                _angles(data.held_out, data)[seen] if held is not None else None,
+                _angles(data.held_out, data, "motor_velocity")[seen] if held is not None else None,
+                None if held is None else held.residual[balance][seen], held_weights[balance][seen] if held is not None else None,
             )  # fmt: skip
             found += _in_balance(balance, rows, most)
     found = [line for line in found if not _echo(line, found)]
@@ -217,9 +224,19 @@ def _in_balance(balance: str, rows: _Rows, most: int) -> list[Line]:
         if balance == "motor":
             names = ("torque_ripple",)
         size = float(math.hypot(sine, cosine))
-        out.append(Line(float(order), tolerance, size, balance, prominence, names, drop or 0.0))
+        if _evenness(order, angle, left, weight) >= EVEN:
+            out.append(Line(float(order), tolerance, size, balance, prominence, names, drop or 0.0))
         left = left - sine * np.sin(order * angle) - cosine * np.cos(order * angle) - offset
     return out
+
+
+def _evenness(order: float, angle: FloatArray, residual: FloatArray, weight: FloatArray) -> float:
+    """Amplitude in phase with a line in the middle one of the sectors of the stroke: 1 for a line, 0 for a burst in one place."""
+    sine, cosine, _ = _phase_fit(order, angle, residual, weight)
+    edges = np.quantile(angle[weight > 0], np.linspace(0, 1, SECTORS + 1))
+    sector = np.clip(np.searchsorted(edges, angle, side="right") - 1, 0, SECTORS - 1)
+    local = [_phase_fit(order, angle[sector == k], residual[sector == k], weight[sector == k])[:2] @ (sine, cosine) for k in range(SECTORS)]
+    return float(np.median(local)) / max(float(sine**2 + cosine**2), 1e-300)
 
 
 def _spread(rows: _Rows) -> float:

@@ -111,18 +111,19 @@ def table_r2(residual: FloatArray, index: IntArray, block: IntArray, size: int, 
 def locate(solution: Solution, data: Dataset, error: Error, lines: Sequence[Line], threshold: float) -> list[Unexplained]:
     """For every balance over its floor: the axis, order or frequency that holds most of the rest."""
     balances = balances_of(solution.model, data.sensing, wrt=())
-    residual = stack(balances, data.train, solution.values).residual
-    block = np.concatenate([w.block for w in data.train])
+    stacked = stack(balances, data.train, solution.values)
     signals = axes(data.train, data.sensing.has_torque, data.joint.kind)
     out: list[Unexplained] = []
     for balance in balances.balances:
         if error.balances[balance].ratio <= threshold:
             continue
-        r = residual[balance] - residual[balance].mean()
-        found = [_axis(balance, name, values, unit, r, block, signals["motor_velocity"][0]) for name, (values, unit) in signals.items()]
+        use = stacked.taking[balance]
+        r = stacked.residual[balance][use] - stacked.residual[balance][use].mean()
+        block, velocity = stacked.block[use], signals["motor_velocity"][0][use]
+        found = [_axis(balance, name, values[use], unit, r, block, velocity) for name, (values, unit) in signals.items()]
         best = max(found, key=lambda u: u.share_percent)
         line = next((x for x in lines if x.balance == balance), None)
-        peak = _peak(data, balance, residual)
+        peak = _peak(data, stacked.residual[balance])
         size = error.balances[balance].rms
         if best.share_percent < 100 * AXIS_R2:
             best = Unexplained(balance, max(best.share_percent, 0.0), rms=size)
@@ -163,11 +164,14 @@ def _window(edges: FloatArray, power: FloatArray) -> tuple[float, float]:
     return float(edges[best[0]]), float(edges[best[1] + 1])
 
 
-def _peak(data: Dataset, balance: str, residual: dict[str, FloatArray] | Any) -> float | None:
-    """Frequency of a peak in the residual's spectrum that stands over its surroundings."""
+def spectral_peak(solution: Solution, data: Dataset, balance: str) -> float | None:
+    """Frequency of a peak [Hz] that stands over its surroundings in the spectrum of a balance's training residual, None where none does."""
+    return _peak(data, stack(balances_of(solution.model, data.sensing, wrt=()), data.train, solution.values).residual[balance])
+
+
+def _peak(data: Dataset, r: FloatArray) -> float | None:
     from scipy.signal import welch
 
-    r = residual[balance]
     first = 0
     spectra = []
     step = data.train[0].grid.dt * data.train[0].grid.stride

@@ -166,7 +166,7 @@ def gather(data: Dataset, records: Sequence[WeakRecord] | None = None) -> Rows:
             _motor_angle(put, data, chosen, values)
         elif name != "time":
             put(name, values, unit)
-    if all("temperature" in w.averaged for w in chosen):
+    if data.sensing.has_temperature:
         put("temperature", np.concatenate([w.averaged["temperature"] for w in chosen]), "K")
     put("time", running_time(chosen), "s")
     velocity = found["motor_velocity"][0]
@@ -279,13 +279,14 @@ def place(rows: Rows, residual: FloatArray, balance: str, axis: str, *, like: Pl
     ----------
     rows : Rows
     residual : (n,) array
+        NaN in rows that take no part.
     balance, axis : str
     like : Place, optional
         Take its bins and branches: for a comparison of two models.
     """
     a = rows.axes[axis]
-    r, values, block = residual[a.use], a.values[a.use], rows.block[a.use]
-    forward = rows.forward[a.use]
+    use = a.use & np.isfinite(residual)
+    r, values, block, forward = residual[use], a.values[use], rows.block[use], rows.forward[use]
     edges = like.edges if like is not None else bin_edges(values, through_zero=axis == "motor_velocity")
     size = len(edges) - 1
     index = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, size - 1).astype(np.int64)
@@ -308,10 +309,11 @@ def _strength(b: Branch) -> float:
 
 
 def residuals(solution: Solution, data: Dataset, records: Sequence[WeakRecord] | None = None) -> dict[str, FloatArray]:
-    """Residual of every balance on the rows of records (the held-out ones where none are given)."""
+    """Residual of every balance on the rows of records (the held-out ones where none are given); NaN where a record takes no part."""
     chosen = tuple(records if records is not None else (data.held_out or data.train))
     balances = balances_of(solution.model, data.sensing, wrt=())
-    return dict(stack(balances, chosen, solution.values).residual)
+    stacked = stack(balances, chosen, solution.values)
+    return {b: np.where(stacked.taking[b], r, np.nan) for b, r in stacked.residual.items()}
 
 
 def places(

@@ -84,6 +84,8 @@ class Record:
     payload : str
         What the link carries. Records with another payload than the first one share the motor's and the
         transmission's parameters, not the link's.
+    age : (n,) ndarray, optional
+        Time since the run of each sample began [s], for a record that was cut off a longer one (see `run_age`).
 
     Raises
     ------
@@ -98,6 +100,7 @@ class Record:
     segment: IntArray
     provenance: Provenance = field(default_factory=Provenance)
     payload: str = ""
+    age: FloatArray | None = None
 
     def __post_init__(self) -> None:
         time = np.ascontiguousarray(self.time, dtype=np.float64)
@@ -118,7 +121,7 @@ class Record:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle by value: records travel to worker processes."""
-        return Record, (self.name, self.kind, self.time, dict(self.channels), self.segment, self.provenance, self.payload)
+        return Record, (self.name, self.kind, self.time, dict(self.channels), self.segment, self.provenance, self.payload, self.age)
 
     @classmethod
     def from_channels(
@@ -221,6 +224,7 @@ class Record:
             time=self.time[selector],
             channels={key: values[selector] for key, values in self.channels.items()},
             segment=segment,
+            age=None if self.age is None else self.age[selector],
             provenance=self.provenance.noted(*notes),
         )
 
@@ -265,7 +269,16 @@ class Record:
         if first.all() or not first.any():
             raise InputError(f"record {self.name!r}: too short to split at {fraction:g}: give a longer record")
         label = f"{100 * fraction:g} % of the time" + (f" in each of {blocks} blocks" if blocks > 1 else "")
-        return self.take(first, f"split: first {label}"), self.take(~first, f"split: all but the first {label}")
+        whole = replace(self, age=self.run_age())
+        return whole.take(first, f"split: first {label}"), whole.take(~first, f"split: all but the first {label}")
+
+    def run_age(self) -> FloatArray:
+        """Time since the run of each sample began [s], shape (n,); a run begins with the record and where the stamps go back."""
+        if self.age is not None:
+            return self.age
+        restart = np.concatenate([[0], np.flatnonzero(np.diff(self.time) < 0) + 1])
+        starts = np.repeat(self.time[restart], np.diff(np.append(restart, len(self.time))))
+        return np.asarray(self.time - starts, dtype=np.float64)
 
     def with_channel(self, channel: str, values: npt.ArrayLike, note: str | None = None) -> Record:
         """Return the record with a channel added or replaced (SI values, shape (n,))."""
@@ -316,6 +329,9 @@ class Record:
             time=np.concatenate(times),
             channels=channels,
             segment=np.concatenate(segments),
+            age=None if self.age is None else np.concatenate([
+                np.interp(t, self.time[p], self.age[p]) for t, p in zip(times, self.segments(), strict=True)
+            ]),
             provenance=self.provenance.noted(note),
         )
 
@@ -392,4 +408,5 @@ def concat(records: Sequence[Record], name: str | None = None) -> Record:
             tuple(dict.fromkeys(line for record in records for line in record.provenance.columns)),
             tuple(notes),
         ),
+        age=None if all(record.age is None for record in records) else np.concatenate([record.run_age() for record in records]),
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final, final
+from typing import Any, Final, final
 
 import numpy as np
 import numpy.typing as npt
@@ -40,6 +40,10 @@ class Sensing:
     has_torque, has_drive, has_temperature : bool
     clamped_link : bool
         A torque-against-torsion test: the one position is the torsion.
+    temperature_origin : float
+        What the temperature of every record is counted from: the first sample of the first one.
+    longest_run : float
+        Of all records [s]: scale of the warm-up that stands in for a temperature.
     """
 
     balances: tuple[str, ...]
@@ -49,6 +53,8 @@ class Sensing:
     has_temperature: bool
     clamped_link: bool = False
     moving: str = "motor_position"
+    temperature_origin: float = 0.0
+    longest_run: float = 0.0
 
     @property
     def one_sided(self) -> bool:
@@ -56,6 +62,8 @@ class Sensing:
         return self.balances == ("axis",) or self.clamped_link
 
 
+TEMPERATURE_CHANGE: Final = 2.0
+"""Change of the temperature over the records that is worth the name [K]."""
 DRIVES: Final = ("motor_torque", "motor_current", "motor_voltage")
 
 
@@ -70,7 +78,7 @@ def sense(record: Record, model: JointModel) -> Sensing:
     drive = any(record.has(c) for c in DRIVES)
     torque = record.has("link_torque")
     motor, link = record.has("motor_position"), record.has("link_position")
-    temperature = record.has("temperature") and float(np.ptp(record["temperature"])) > 2.0
+    temperature = record.has("temperature") and float(np.ptp(record["temperature"])) > TEMPERATURE_CHANGE
     if not (motor or link):
         raise InputError(f"{record.name}: no motor_position and no link_position; add one of them or map it in [columns]")
     if not (drive or torque):
@@ -102,7 +110,7 @@ def sense(record: Record, model: JointModel) -> Sensing:
     return Sensing(("axis",), moving=moving, **common)
 
 
-def check_alike(records: Sequence[Record], model: JointModel, labels: Sequence[str] = ()) -> Sensing:
+def check_alike(records: Sequence[Record], model: JointModel, labels: Sequence[str] = (), *, once: bool = True) -> Sensing:
     """What the first record lets one see, where the others let one see the same.
 
     Parameters
@@ -111,6 +119,8 @@ def check_alike(records: Sequence[Record], model: JointModel, labels: Sequence[s
     model : JointModel
     labels : sequence of str
         What the records are called in a message, such as their paths; their names by default.
+    once : bool
+        Refuse a run that is given twice; False where records are compared with a fit that may have seen them.
 
     Raises
     ------
@@ -120,7 +130,7 @@ def check_alike(records: Sequence[Record], model: JointModel, labels: Sequence[s
     called = list(labels) or [r.name for r in records]
     for k, record in enumerate(records):
         twin = next((label for other, label in zip(records[:k], called, strict=False) if _same_samples(record, other)), None)
-        if twin is not None:
+        if once and twin is not None:
             raise InputError(f"{called[k]}: holds the same samples as {twin}; a run counts once, leave one of the two out")
     found: list[Sensing] = []
     for record, label in zip(records, called, strict=True):
@@ -130,7 +140,18 @@ def check_alike(records: Sequence[Record], model: JointModel, labels: Sequence[s
             raise InputError(f"{label}: {str(error).removeprefix(record.name + ': ')}") from None
         if found[-1].balances != found[0].balances:
             raise InputError(f"{label}: {_difference(record, records[0], called[0])}; give records with the same channels")
-    return found[0]
+    return replace(found[0], **_warmth(records))
+
+
+def _warmth(records: Sequence[Record]) -> dict[str, Any]:
+    """What all records have in common about temperature: whether it is recorded and changes, its origin, the longest run."""
+    recorded = all(r.has("temperature") for r in records)
+    values = np.concatenate([r["temperature"] for r in records]) if recorded else np.zeros(1)
+    return {
+        "has_temperature": recorded and float(np.ptp(values)) > TEMPERATURE_CHANGE,
+        "temperature_origin": float(values[0]),
+        "longest_run": max(float(r.run_age().max(initial=0.0)) for r in records),
+    }  # fmt: skip
 
 
 def _same_samples(one: Record, other: Record) -> bool:
@@ -210,17 +231,21 @@ def signals_of(record: Record, joint: Joint, sensing: Sensing) -> dict[str, Floa
         out["link_position"] = np.asarray(link if link is not None else one)
     if sensing.has_torque:
         out["torque"] = np.asarray(record["link_torque"])
-    out["temperature"] = record["temperature"] - record["temperature"][0] if sensing.has_temperature else warm_up(record)
+    out["temperature"] = record["temperature"] - sensing.temperature_origin if sensing.has_temperature else warm_up(record, sensing.longest_run)
     return out
 
 
-def warm_up(record: Record) -> FloatArray:
+def warm_up(record: Record, longest: float = 0.0) -> FloatArray:
     """Stand-in for a temperature that was not recorded: 0 where a run starts, towards 1 at the end of the longest run.
 
     Time counts anew where the stamps go back; the course is that of a first-order warm-up with a time constant of a third
     of the longest run.
+
+    Parameters
+    ----------
+    record : Record
+    longest : float
+        Longest run of all records that are judged together [s]; that of this record where it is longer.
     """
-    restart = np.concatenate([[0], np.flatnonzero(np.diff(record.time) < 0) + 1])
-    starts = np.repeat(record.time[restart], np.diff(np.append(restart, len(record.time))))
-    elapsed = record.time - starts
-    return np.asarray(1.0 - np.exp(-3.0 * elapsed / max(float(elapsed.max(initial=0.0)), 1e-9)), dtype=np.float64)
+    age = record.run_age()
+    return np.asarray(1.0 - np.exp(-3.0 * age / max(float(age.max(initial=0.0)), longest, 1e-9)), dtype=np.float64)

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from casadi_models import JointModel
 from identification.balances import Balances, balances_of
 from identification.dataset import Dataset
-from identification.weak import POSITION_CHAINS, WeakRecord, differentiated_kernel
+from identification.weak import POSITION_CHAINS, Grid, WeakRecord, differentiated_kernel
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -47,13 +47,29 @@ def taking_part(balance: str, records: Sequence[WeakRecord]) -> npt.NDArray[np.b
     return np.concatenate([np.full(w.rows, balance not in w.masked) for w in records])
 
 
-def floors(model: JointModel, data: Dataset, values: Mapping[str, float], kernel_data: WeakRecord | None = None) -> dict[str, float]:
-    """RMS that measurement noise alone would leave in each balance."""
+def floors(model: JointModel, data: Dataset, values: Mapping[str, float]) -> dict[str, float]:
+    """RMS that measurement noise alone would leave in each balance of the training records."""
+    rows = floor_rows(model, data, values, data.train)
+    return {b: rms(level[taking_part(b, data.train)]) for b, level in rows.items()}
+
+
+def floor_rows(model: JointModel, data: Dataset, values: Mapping[str, float], records: Sequence[WeakRecord]) -> dict[str, FloatArray]:
+    """Standard deviation that measurement noise alone gives each row of the balances: that of a record hangs on its sample time."""
+    known: dict[tuple[float, float], dict[str, float]] = {}
+    keys = [(w.grid.length, float(f"{w.grid.dt:.9g}")) for w in records]
+    for key, w in zip(keys, records, strict=True):
+        if key not in known:
+            known[key] = _floors_of(model, data, values, w.grid)
+    return {
+        b: np.concatenate([np.full(w.rows, known[key][b]) for key, w in zip(keys, records, strict=True)]) for b in data.sensing.balances
+    }  # fmt: skip
+
+
+def _floors_of(model: JointModel, data: Dataset, values: Mapping[str, float], grid: Grid) -> dict[str, float]:
     balances = balances_of(model, data.sensing, wrt=())
-    grid = (kernel_data or data.train[0]).grid
     out = {}
     curved = balances.curved_coefficients(values)
-    for balance, entering in balances.coefficients(values, kernel_data or data.train[0]).items():
+    for balance, entering in balances.coefficients(values, data.train[0]).items():
         bent = curved.get(balance, {})
         variance = 0.0
         for source, chain in POSITION_CHAINS.items():
@@ -85,9 +101,10 @@ def references(data: Dataset, records: Sequence[WeakRecord]) -> dict[str, FloatA
 
 
 def row_weights(
-    balances: Balances, data: Dataset, values: Mapping[str, float], sigma: Mapping[str, float], records: Sequence[WeakRecord]
-) -> dict[str, FloatArray]:
-    """1/sigma of each row: rows that hang on where exactly friction changes its sign count less."""
+    balances: Balances, data: Dataset, values: Mapping[str, float], sigma: Mapping[str, float] | Mapping[str, FloatArray],
+    records: Sequence[WeakRecord],
+) -> dict[str, FloatArray]:  # fmt: skip
+    """1/sigma of each row: rows that hang on where exactly friction changes its sign count less (`sigma`: of a balance, or of its rows)."""
     names = [n for n in balances.names if n.endswith("_smoothing_velocity")]
     doubled = {**values, **{n: 2 * values[n] for n in names}}
     bare = balances_of(balances.model, data.sensing, wrt=())

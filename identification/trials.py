@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from identification.balances import Balances, balances_of
 from identification.candidates import Candidate, NotTestable, shape_grid
-from identification.engine import Dataset, Solution, Stacked, row_weights, stack
+from identification.engine import Dataset, Solution, Stacked, bounds_of, row_weights, stack
 from identification.weak import WeakRecord
 
 FloatArray = npt.NDArray[np.float64]
@@ -43,6 +43,8 @@ class Base:
     residual : (n,) array, weighted
     jacobian : (n, p) array, weighted and scaled to unit columns
     orthonormal : (n, r) array
+    inward : (n, m) array
+        Like `jacobian`, for amplitudes that stand at a bound: a candidate may let them return from it.
     block : (n,) int array
     balance : (n,) int array
     effective : mapping of str to float
@@ -53,6 +55,7 @@ class Base:
     data: Dataset
     residual: FloatArray
     jacobian: FloatArray
+    inward: FloatArray
     orthonormal: FloatArray
     block: IntArray
     balance: IntArray
@@ -60,6 +63,7 @@ class Base:
     share: FloatArray
     held_residual: FloatArray
     held_jacobian: FloatArray
+    held_inward: FloatArray
     held_balance: IntArray
     held_weight: FloatArray
     names: tuple[str, ...]
@@ -74,13 +78,18 @@ def make_base(solution: Solution, data: Dataset) -> Base:
     """Evaluate and project the base model on training and held-out rows."""
     model = solution.model
     free = [n for n in solution.free if n not in solution.at_bound or n.endswith("_smoothing_velocity")]
-    balances = balances_of(model, data.sensing, wrt=free)
+    signs = _inward_signs(solution, data)
+    balances = balances_of(model, data.sensing, wrt=[*free, *signs])
     train = stack(balances, data.train, solution.values)
     r, j, block, balance = flatten(train, balances.balances)
     weight = np.concatenate([solution.weights[b] for b in balances.balances])
-    jw = j * weight[:, None]
+    towards = np.concatenate([np.ones(len(free)), list(signs.values())])
+    jw = j * towards * weight[:, None]
     norms = np.linalg.norm(jw, axis=0)
     alive = norms > 1e-12 * max(float(norms.max(initial=0.0)), 1e-300)
+    back = alive & (np.arange(len(norms)) >= len(free))
+    alive[len(free) :] = False
+    inward = jw[:, back] / norms[back]
     jw = jw[:, alive] / norms[alive]
     left, singular, _ = np.linalg.svd(jw, full_matrices=False)
     orthonormal = left[:, singular > 1e-9 * max(float(singular[0]) if len(singular) else 0.0, 1e-300)]
@@ -92,14 +101,24 @@ def make_base(solution: Solution, data: Dataset) -> Base:
         hr, hj, _, hb = flatten(held, balances.balances)
         rows = row_weights(balances, data, solution.values, solution.sigma, data.held_out)
         held_weights = np.concatenate([rows[b] for b in balances.balances])
-        hj = hj[:, alive] * held_weights[:, None] / norms[alive]
+        hj = hj * towards * held_weights[:, None]
+        hj, hi = hj[:, alive] / norms[alive], hj[:, back] / norms[back]
         hr = hr * held_weights
     else:
-        hr, hj, hb, held_weights = np.empty(0), np.empty((0, int(alive.sum()))), np.empty(0, dtype=np.int64), np.empty(0)
+        hr, hj, hi = np.empty(0), np.empty((0, int(alive.sum()))), np.empty((0, int(back.sum())))
+        hb, held_weights = np.empty(0, dtype=np.int64), np.empty(0)
     return Base(
-        solution, data, rw, jw, orthonormal, block, balance, weight, shares, hr, hj, hb, held_weights,
-        tuple(n for n, a in zip(free, alive, strict=True) if a),
+        solution, data, rw, jw, inward, orthonormal, block, balance, weight, shares, hr, hj, hi, hb, held_weights,
+        tuple(n for n, a in zip(free, alive, strict=False) if a),
     )  # fmt: skip
+
+
+def _inward_signs(solution: Solution, data: Dataset) -> dict[str, float]:
+    """Amplitudes at a bound, with the sign of the step back from it; the hold of a logged command is none of them."""
+    limits = bounds_of(solution.model, data.joint.known, data)
+    shapes = {p.name for p in solution.model.parameters if p.is_shape}
+    held = [n for n in solution.at_bound if n in solution.free and n not in shapes and n != "drive_delay"]
+    return {n: 1.0 if solution.values[n] - limits[n][0] < limits[n][1] - solution.values[n] else -1.0 for n in held}
 
 
 def flatten(stacked: Stacked, balances: Sequence[str]) -> tuple[FloatArray, FloatArray, IntArray, IntArray]:
@@ -197,6 +216,8 @@ def try_candidate(candidate: Candidate, base: Base) -> Trial | NotTestable | Non
     inside = 0.0
     lows = np.array([{p.name: p for p in candidate.model.parameters}[n].low for n in candidate.amplitudes])
     q = base.orthonormal
+    returning = base.inward.shape[1]
+    least = np.concatenate([np.zeros(returning), lows])
 
     def projected(shapes: dict[str, float]) -> tuple[float, FloatArray, float] | None:
         raw = columns(candidate, base, shapes, data.train, balances)
@@ -204,9 +225,9 @@ def try_candidate(candidate: Candidate, base: Base) -> Trial | NotTestable | Non
         size = np.linalg.norm(c, axis=0)
         if not np.all(np.isfinite(c)) or size.max(initial=0.0) <= 0:
             return None
-        c = c / np.where(size > 0, size, 1.0)
+        c = np.column_stack([base.inward, c / np.where(size > 0, size, 1.0)])
         outside = c - q @ (q.T @ c)
-        return _projected_gain(outside, base.residual, lows), raw, float(np.linalg.norm(outside, axis=0).max())
+        return _projected_gain(outside, base.residual, least), raw, float(np.linalg.norm(outside[:, returning:], axis=0).max())
 
     for shapes in shape_grid(candidate, data):
         found = projected(shapes)
@@ -228,7 +249,7 @@ def try_candidate(candidate: Candidate, base: Base) -> Trial | NotTestable | Non
     }  # fmt: skip
     if limits and best[0] > REFINE_SHARE * float(base.residual @ base.residual):
         best = _refined(projected, best, limits)
-    return _score(candidate, base, balances, best[1], best[2], lows, inside)
+    return _score(candidate, base, balances, best[1], best[2], least, inside)
 
 
 def _refined(
@@ -288,10 +309,11 @@ def _score(
     candidate: Candidate, base: Base, balances: Balances, shapes: Mapping[str, float], raw: FloatArray, lows: FloatArray, inside: float
 ) -> Trial | None:
     p = base.jacobian.shape[1]
+    own = p + base.inward.shape[1]
     count = len(base.balances)
     size = np.linalg.norm(raw * base.weight[:, None], axis=0)
     size = np.where(size > 0, size, 1.0)
-    full = np.column_stack([base.jacobian, raw * base.weight[:, None] / size, base.residual])
+    full = np.column_stack([base.jacobian, base.inward, raw * base.weight[:, None] / size, base.residual])
     used = np.flatnonzero(base.block >= 0)
     blocks = int(base.block.max()) + 1
     grams = np.zeros((blocks, count, full.shape[1], full.shape[1]))
@@ -308,12 +330,12 @@ def _score(
     for k in range(folds):
         test = fold == k
         train = total - grams[test].sum(axis=(0, 1)) if folds > 1 else total
-        plain = _signed_fit(train[:p, :p], -train[:p, -1], np.empty(0), p)
+        plain = _signed_fit(train[:own, :own], -train[:own, -1], lows[: own - p], p)
         more = _signed_fit(train[:-1, :-1], -train[:-1, -1], lows, p)
-        sse0[test] = _quadratic(grams[test], np.concatenate([plain, np.zeros(len(lows)), [1.0]]))
+        sse0[test] = _quadratic(grams[test], np.concatenate([plain, np.zeros(raw.shape[1]), [1.0]]))
         sse1[test] = _quadratic(grams[test], np.concatenate([more, [1.0]]))
     delta = _signed_fit(total[:-1, :-1], -total[:-1, -1], lows, p)
-    amplitude = delta[p:] / size
+    amplitude = delta[own:] / size
     if not np.any(amplitude):
         return None
     per_balance0, per_balance1 = sse0.sum(axis=0), sse1.sum(axis=0)
@@ -327,7 +349,7 @@ def _score(
     drop = 100 * (1 - math.sqrt(per_balance1[where] / max(per_balance0[where], 1e-300)))
     return Trial(
         candidate, {**shapes, **dict(zip(candidate.amplitudes, map(float, amplitude), strict=True))}, base.balances[where],
-        float(gains.sum()), drop, held, _wald(full, base, delta, p), block_score, np.sqrt(per_balance1 / rows_in), inside,
+        float(gains.sum()), drop, held, _wald(full, base, delta), block_score, np.sqrt(per_balance1 / rows_in), inside,
         float(np.sqrt(np.mean((raw[base.balance == where] @ amplitude) ** 2))),
         float(np.sum(KERNEL_SHARE * rows_in / 2 * np.log(np.maximum(per_balance0, 1e-300) / np.maximum(per_balance1, 1e-300)))),
     )  # fmt: skip
@@ -344,29 +366,35 @@ def _held_out_drop(
     if not len(base.held_residual):
         return math.nan
     p = base.jacobian.shape[1]
+    own = p + base.inward.shape[1]
     raw = columns(candidate, base, shapes, base.data.held_out, balances) * base.held_weight[:, None] / size
     here = base.held_balance == where
     before = base.held_residual[here]
-    after = before + base.held_jacobian[here] @ delta[:p] + raw[here] @ delta[p:]
+    after = before + base.held_jacobian[here] @ delta[:p] + base.held_inward[here] @ delta[p:own] + raw[here] @ delta[own:]
     return 100 * (1 - math.sqrt(float(after @ after) / max(float(before @ before), 1e-300)))
 
 
-def _wald(full: FloatArray, base: Base, delta: FloatArray, p: int) -> float:
+def _wald(full: FloatArray, base: Base, delta: FloatArray) -> float:
     """p-value of the amplitudes, scores clustered by block."""
     from scipy.special import fdtrc
 
-    c = full[:, p:-1]
+    p = base.jacobian.shape[1]
+    own = p + base.inward.shape[1]
     q = base.orthonormal
+    moving = base.inward[:, delta[p:own] > 0]
+    if moving.shape[1]:
+        q = np.column_stack([q, np.linalg.qr(moving - q @ (q.T @ moving))[0]])
+    c = full[:, own:-1]
     c = c - q @ (q.T @ c)
     residual = full[:, -1] + full[:, :-1] @ delta
     blocks = np.unique(base.block[base.block >= 0])
-    active = np.flatnonzero(delta[p:])
+    active = np.flatnonzero(delta[own:])
     if not len(active) or len(blocks) <= len(active) + 1:
         return 1.0
     c = c[:, active]
     scores = np.array([c[base.block == b].T @ residual[base.block == b] for b in blocks])
     inverse = np.linalg.pinv(c.T @ c, rcond=1e-10)
     covariance = inverse @ (scores.T @ scores) @ inverse * len(blocks) / (len(blocks) - 1)
-    d = delta[p:][active]
+    d = delta[own:][active]
     statistic = float(d @ np.linalg.pinv(covariance, rcond=1e-12) @ d) / len(active)
     return float(fdtrc(len(active), len(blocks) - len(active), statistic))

@@ -101,7 +101,7 @@ def test_rpm_taken_for_radians_per_second(said: Say, tmp_path: Path) -> None:
 
 def test_milliseconds_taken_for_seconds(said: Say, tmp_path: Path) -> None:
     line = improve_message(said, tmp_path, changed("time_s", good()["time_s"] * 1000))
-    assert "a factor 1000 in the unit of position, velocity or time" in line
+    assert "the sampling step is 2.5 s: is time in ms? correct the unit of time" in line
 
 
 def test_unit_of_another_dimension(said: Say, tmp_path: Path) -> None:

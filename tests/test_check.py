@@ -331,10 +331,31 @@ def test_wrong_gear_ratio_is_refused_with_the_one_the_data_show(given: float, sa
 
 
 def test_ratio_within_two_percent_passes_and_none_is_told() -> None:
-    assert found(check(record(), -160.0 * 1.015), "gear_ratio").severity == "ok"
+    assert found(check(record().without("link_torque"), -160.0 * 1.015), "gear_ratio").severity == "ok"
     assert "-160" in found(check(record()), "gear_ratio").message
     with pytest.raises(InputError, match="gear_ratio"):
         check(record(), 0.0)
+
+
+@pytest.mark.parametrize(("given", "severity"), [(-160.0, "ok"), (-161.0, "warn"), (-159.0, "warn")])
+def test_a_gear_ratio_a_tooth_off_is_said_where_a_torque_sensor_shows_the_torsion(given: float, severity: str) -> None:
+    finding = found(check(record(), given), "gear_ratio")
+    assert finding.severity == severity
+    assert "a gear ratio of -160" in finding.message
+
+
+def test_single_rows_without_a_number_are_bridged() -> None:
+    def spoil(a: dict[str, Array]) -> None:
+        a["link_torque"][[500, 900, 901, 2000]] = np.nan
+
+    whole, repaired = record(), repair(record(spoil))
+    assert len(repaired) == N
+    assert repaired.segments() == [slice(0, N)]
+    assert "bridge_nan_rows: 4 row(s), first row 501" in repaired.provenance.notes
+    assert "bridged by interpolation" in found(check(record(spoil), RATIO), "nan").message
+    beside = whole["link_torque"][[499, 501]]
+    assert repaired["link_torque"][500] == pytest.approx(beside.mean())
+    np.testing.assert_array_equal(np.delete(repaired["link_torque"], [500, 900, 901, 2000]), np.delete(whole["link_torque"], [500, 900, 901, 2000]))
 
 
 def test_positions_of_two_joints_are_refused() -> None:
@@ -361,12 +382,12 @@ def test_delay_is_measured(samples: int) -> None:
 
 def test_repair_keeps_every_untouched_value() -> None:
     def spoil(a: dict[str, Array]) -> None:
-        a["motor_current"][40] = np.inf
+        a["motor_current"][40:43] = np.inf
         a["time"][100] = a["time"][99]
         a["time"][3000:] += 1.0
 
     before, after = record(spoil), repair(record(spoil))
-    keep = np.setdiff1d(np.arange(N), [40, 100])
+    keep = np.setdiff1d(np.arange(N), [40, 41, 42, 100])
     for channel in before.channels:
         np.testing.assert_array_equal(after[channel], before[channel][keep])
     assert bad(check(after, RATIO)) == []
@@ -375,10 +396,10 @@ def test_repair_keeps_every_untouched_value() -> None:
 
 def test_short_pieces_are_dropped() -> None:
     def spoil(a: dict[str, Array]) -> None:
-        a["motor_current"][[100, 104]] = np.nan
+        a["motor_current"][[100, 101, 102, 106, 107, 108]] = np.nan
 
     after = repair(record(spoil))
-    assert [s.stop - s.start for s in after.segments()] == [100, N - 105]
+    assert [s.stop - s.start for s in after.segments()] == [100, N - 109]
     assert any(note.startswith("drop_short_pieces: 3 row(s)") for note in after.provenance.notes)
 
 

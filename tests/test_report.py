@@ -216,7 +216,7 @@ def test_sets_lines_rest_and_warnings_are_shown(improvement: Improvement) -> Non
     assert "<script>alert" not in text
     assert "cannot tell these names apart" in said
     assert "Next run: slow runs" in said
-    assert "less than half of what stands over the noise" in said
+    assert "only part of what is missing" in said
     assert "3.37 ± 0.02 per motor turn" in said
     assert "61 % of it depend on the link position, differently in the two directions of motion, mostly at 0.35 to 0.75 rad" in said
     assert "peaks at 11.7 Hz" in said

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import importlib
+import io
 import os
 import shlex
 import signal
@@ -134,6 +135,8 @@ def _parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run `irj`; returns the exit code: 0 done, 1 a check failed, 2 unusable input, 130 interrupted."""
     given = list(sys.argv[1:] if argv is None else argv)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # a terminal that lacks a sign must not cost the results
     parser = _parser()
     arguments, rest = parser.parse_known_args(given)
     arguments.rest = rest

@@ -35,9 +35,12 @@ PATTERNS: Final[Mapping[frozenset[str], str]] = {
     frozenset(("motor", "link")): "two physical effects, one on each side",
     frozenset(("sum",)): "a physical effect on the link side",
     frozenset(("deflection",)): "the transmission",
-    frozenset(("sum", "deflection")): "a physical effect on the motor side, or the current",
+    frozenset(("sum", "deflection")): "a physical effect on the motor side, the current, or a position sensor, which look alike without a torque sensor",
     frozenset(("axis",)): "physics or sensor alike: a single balance cannot tell the two apart",
 }
+
+
+WITHOUT_TRANSMISSION: Final = "the torque sensor, which both share, or two physical effects, one on each side"
 
 
 def pattern_of(ratios: Mapping[str, float], limit: float = RATIO_LIMIT) -> tuple[frozenset[str], str]:
@@ -56,6 +59,8 @@ def pattern_of(ratios: Mapping[str, float], limit: float = RATIO_LIMIT) -> tuple
         A sentence without its full stop; physics hits one balance, a sensor those that share its reading.
     """
     hit = frozenset(b for b, r in ratios.items() if r > limit)
+    if "transmission" not in ratios and hit == {"motor", "link"}:
+        return hit, f"The link and motor balances stand over the noise. This pattern points to {WITHOUT_TRANSMISSION}"
     if not hit:
         return hit, "No balance stands over the noise"
     names = " and ".join(sorted(hit))

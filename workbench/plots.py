@@ -160,6 +160,8 @@ def overlays(
         rows = slice(first, first + w.rows)
         first += w.rows
         for balance, residual in start.items():
+            if balance in w.masked:
+                continue
             m, before, after = measured[balance][rows], residual[rows], final[balance][rows]
             window = worst_window(w.time, before, WINDOW_KERNELS * data.kernel)
             size = float(np.sqrt(np.mean(before**2)))

@@ -5,10 +5,8 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-import os
 import platform
 import re
-import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -33,6 +31,7 @@ from identification.html import (
 )
 from identification.improve import Improvement
 from identification.record import Record
+from irj_fmu.command_line import replace_file
 from workbench import fragments
 from workbench.plots import ReportPlots, overlay_json, report_plots
 
@@ -50,7 +49,7 @@ def write_report(
     improvement : Improvement
         From :func:`identification.improve`.
     to : str or Path
-        The file; an existing one is replaced once the new one is complete.
+        The file; an existing one is replaced once the new one is complete, what a link points to likewise.
     records : sequence of Record
         The records as they were read: their file names and digests go into the provenance.
     command : str, optional
@@ -64,24 +63,13 @@ def write_report(
     Raises
     ------
     InputError
-        The folder does not exist or cannot be written.
+        The folder does not exist or cannot be written, or the disk is full.
     """
     path = Path(to)
     page = render_report(improvement, records=records, command=command)
     if path.is_dir():
         raise InputError(f"{path}: is a folder; give the name of a file, as {path / 'report.html'}")
-    name: str | None = None
-    try:
-        handle, name = tempfile.mkstemp(prefix=".report-", suffix=".html", dir=path.parent)
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(page)
-        os.chmod(name, 0o644)
-        os.replace(name, path)
-    except OSError as error:
-        if name is not None:
-            with suppress(OSError):
-                os.unlink(name)
-        raise InputError(f"{path}: cannot be written ({error.strerror or error}); give a folder that exists and may be written") from None
+    replace_file(path, lambda stream: stream.write(page.encode("utf-8", "backslashreplace")))
     return path
 
 
@@ -171,7 +159,7 @@ def _ledger_note(result: dict[str, Any], effort: str) -> str:
         f"Error: size of the residual {effort} as a share of the measured {effort}, over all balances. "
         "Fit: 100 % is a perfect model, 0 % no better than a constant. "
         "÷ noise: residual over what measurement noise alone would leave; 1 × cannot be improved. The dotted line in the picture is that noise. "
-        "Held-out records were not used to fit or to choose." + (f" Note: {note}." if note else "")
+        "The fit never saw the held-out records; they confirm or refuse each addition." + (f" Note: {note}." if note else "")
     )
 
 

@@ -21,6 +21,7 @@ from ..signals import Expression, LocalSignals
     absence="the friction band breathes with the position",
     excitation="long strokes in both directions",
     source="dissipative form of thesis eq. 2.80",
+    angular=True,
     needs=("coulomb",),
     confused_with=("load_dependent_friction",),
     separate_by="a run with another payload",

@@ -25,6 +25,7 @@ def _stored(s: LocalSignals, p: SimpleNamespace) -> Expression:
     absence="the residual follows sine and cosine of the position and does not change sign at a reversal",
     excitation="a long stroke, better without gravity",
     source="thesis eq. 2.81",
+    angular=True,
     potential=_stored,
     confused_with=("motor_constant_error", "added_spring", "gravity"),
     separate_by="a run without payload or with the axis horizontal",

@@ -22,6 +22,7 @@ def _stored(s: LocalSignals, p: SimpleNamespace) -> Expression:
     absence="the residual of the link follows the sine of its angle",
     excitation="a long slow swing",
     source="thesis eq. 2.82",
+    angular=True,
     potential=_stored,
     confused_with=("cyclic_torque", "added_spring", "torque_sensor_gain"),
     separate_by="a run without payload or with the axis horizontal",

@@ -24,6 +24,7 @@ def _stored(s: LocalSignals, p: SimpleNamespace) -> Expression:
     absence="the residual of the link follows the cosine of its angle",
     excitation="a long slow swing",
     source="field knowledge (unbalance phase)",
+    angular=True,
     potential=_stored,
     needs=("gravity",),
     confused_with=("torque_sensor_offset", "asymmetric_coulomb", "cyclic_torque"),

@@ -23,6 +23,7 @@ FloatColumn = npt.NDArray[np.float64]
 
 _HEAD_BYTES: Final = 1 << 17
 _HEAD_LINES: Final = 100
+_CLOCK: Final = re.compile(r"\d{4}-\d\d?-\d\d?|\d\d?:\d\d|\d\d?[./]\d\d?[./]\d{2,4}")
 _MISSING: Final = frozenset({"", "nan", "na", "n/a", "null", "none", "-nan", "#n/a"})
 _NUMBER: Final = re.compile(r"\s*[-+]?(\d+\.?\d*|\.\d+)([eEdD][-+]?\d+)?\s*$")
 _COMMA_NUMBER: Final = re.compile(r"\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*$")
@@ -299,10 +300,8 @@ def _number(cell: str, layout: _Layout, number: int, place: int) -> float:
     except ValueError:
         if text.lower() in _MISSING:
             return float("nan")
-        raise InputError(
-            f"{layout.path}, line {number}, column {layout.names[place]!r}: {text[:40]!r} is not a number: "
-            f"correct the cell or leave it empty"
-        ) from None
+        advice = "a date or a time of day: write seconds from the start of the record" if _CLOCK.search(text) else "correct the cell or leave it empty"
+        raise InputError(f"{layout.path}, line {number}, column {layout.names[place]!r}: {text[:40]!r} is not a number: {advice}") from None
 
 
 def _text(layout: _Layout, place: int) -> npt.NDArray[Any]:

@@ -47,9 +47,9 @@ def open_records(paths: Sequence[str], joint: Joint | None) -> tuple[list[Record
     return records, warnings
 
 
-def alike(paths: Sequence[str], records: Sequence[Record], joint: Joint) -> None:
-    """Refuse records that do not let one see the same: one line that starts with the path."""
-    check_alike(records, joint.model(), paths)
+def alike(paths: Sequence[str], records: Sequence[Record], joint: Joint, *, once: bool = True) -> None:
+    """Refuse records that do not let one see the same, or one run given twice: one line that starts with the path."""
+    check_alike(records, joint.model(), paths, once=once)
 
 
 def named(error: InputError, path: str, record: Record) -> InputError:
@@ -128,8 +128,8 @@ def write_bytes(path: str | Path, content: bytes) -> None:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a text file in one piece (see :func:`write_bytes`)."""
-    write_bytes(path, text.encode())
+    """Write a text file in one piece (see :func:`write_bytes`); a byte of a file name that is no UTF-8 becomes a question mark."""
+    write_bytes(path, text.encode("utf-8", "replace"))
 
 
 __all__ = [

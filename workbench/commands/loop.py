@@ -167,7 +167,8 @@ def run_compare(arguments: Namespace) -> int:
     joint = open_joint(arguments.joint)
     records, warnings = open_records(arguments.records, joint)
     basis = open_records(arguments.fit_records, joint)[0] if arguments.fit_records else records
-    alike([*(arguments.fit_records or arguments.records), *arguments.records], [*basis, *records], joint)
+    alike(arguments.records, records, joint)
+    alike([*(arguments.fit_records or arguments.records), *arguments.records], [*basis, *records], joint, once=False)
     comparison = compare(fit(joint, basis), records, linear=not arguments.no_linear)
     print(comparison)
     for place in comparison.places[:5]:

@@ -1,0 +1,52 @@
+"""The verdict of the loop and the sentence that a reader gets."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from casadi_models import EFFECTS
+from identification.assess import BalanceError
+from identification.claims import Claim
+from identification.formats import number
+from identification.improvement import Step
+from identification.locate import Unexplained
+from identification.trials import Trial
+
+
+def _remainder(claim: Claim, unit: str) -> str:
+    """A set of more names than help anybody."""
+    hint = f" {claim.separate_by[0].upper()}{claim.separate_by[1:]} would help." if claim.separate_by else ""
+    size = f"{number(claim.contribution, 2)} {unit} remain that cannot be named"
+    return f"In the {claim.balance} balance {size}: any of {', '.join(claim.effects)} explains it alike.{hint}"
+
+
+def _names(claims: Sequence[Claim]) -> str:
+    return " and ".join(EFFECTS[c.effects[0]].title if len(c.effects) == 1 else "one of (" + ", ".join(c.effects) + ")" for c in claims)
+
+
+def verdict_of(
+    claims: Sequence[Claim], where: Sequence[Unexplained], ratios: Mapping[str, BalanceError], steps: Sequence[Step], following: Trial | None,
+    few: str, unnamed: Claim | None = None,
+) -> tuple[str, str]:  # fmt: skip
+    """Verdict and its sentence (`few`: the motor reverses too seldom, which no library makes up for; `unnamed`: a set too large to be a name)."""
+    names, parts = _names([c for c in claims if not c.partial]), _names([c for c in claims if c.partial])
+    fall = f"the error on held-out data falls from {steps[0].held_out.relative_error_percent:.3g} % to {steps[-1].held_out.relative_error_percent:.3g} %"
+    if where:
+        left = ", ".join(f"{u.balance} ({number(ratios[u.balance].ratio, 2)} times its noise floor)" for u in where)
+        found = f"Missing: {names}; {fall}. " if names else f"{fall[0].upper()}{fall[1:]}. " if parts else ""
+        found += f"Only part of the structure is explained by: {parts}. " if parts else ""
+        if following is not None:
+            stop = f"Stopped at the limit of additions ({len(claims)}): {following.candidate.effect.title} would be the next."
+            return "unexplained", f"{found}{stop} Left over: {left}."
+        if unnamed is not None:
+            return "unexplained", f"{found}{_remainder(unnamed, ratios[unnamed.balance].unit)} Left over: {left}."
+        if few:
+            return "unexplained", f"{found}Left over: {left}. {few[0].upper()}{few[1:]}, too seldom to name a friction effect: record more reversals."
+        if claims:
+            return "unexplained", f"{found}Structure that is not in the library is left in: {left}."
+        return "unexplained", f"No effect of the library explains what is left in: {left}."
+    if unnamed is not None:
+        return "unexplained", (f"Missing: {names}; {fall}. " if claims else "") + _remainder(unnamed, ratios[unnamed.balance].unit)
+    if claims:
+        return "complete", f"Missing: {names}; with it {fall}, and what is left looks like measurement noise."
+    return "nothing_missing", "The model explains the records down to their measurement noise: nothing is missing that these records could show."
