@@ -51,10 +51,10 @@ def check_wrapped(record: Record) -> list[Finding]:
         size = np.abs(steps[np.isfinite(steps)])
         turn = record.kind == "rotary" and 0.9 < whole / (2.0 * math.pi) <= 1.0 + 1e-6
         jumps = size > (0.5 if turn else _WRAP) * whole
-        if not jumps.any() or (not turn and float(np.quantile(size, 0.99)) > 0.2 * whole):
+        if not jumps.any() or (not turn and float(np.quantile(size, 0.9)) > 0.2 * whole):
             continue
         row = int(np.argmax(np.abs(np.nan_to_num(steps))))
-        limit = "2 pi" if turn else f"about {whole:.4g} {record.unit(channel)}"
+        limit = "2 pi" if turn else f"about {whole:.3g} {record.unit(channel)}"
         message = (
             f"{record.name}: {channel} jumps by its whole range {int(jumps.sum())} time(s), as after {at(record, row)}: the encoder wraps "
             f"at {limit}: unwrap it (numpy.unwrap) before the export"

@@ -18,7 +18,7 @@ _PARTIAL: Final = 0.8
 """Partial correlation from which the two torques are said to follow each other."""
 _LEFT: Final = 0.02
 """Share of the link torque's power that must be left beside a spring for the spring to be among the terms."""
-_GIVEN: Final = 0.05
+_GIVEN: Final = 0.08
 """Share of the work moved that a passive joint cannot give back over whole cycles."""
 _REFUSE: Final = 20.0
 _WARN: Final = 1.5
@@ -81,8 +81,8 @@ def check_torque(record: Record, gear_ratio: float | None, torque_per_current: f
 def check_work(record: Record, gear_ratio: float | None, torque_per_current: float | None) -> list[Finding]:
     """Refuse a drive that takes energy out of a joint that comes back to where it was: its sign is reversed.
 
-    The work is that between the first and the last passage of the middle position in one direction, where what gravity
-    and springs store is the same again; friction can only use up energy.
+    The work is that between the first and the last passage of one position in one direction, where what gravity and
+    springs store is the same again; friction can only use up energy.
     """
     motor = record.has("motor_position")
     if not motor and not record.has("link_position"):
@@ -97,19 +97,26 @@ def check_work(record: Record, gear_ratio: float | None, torque_per_current: flo
     net = whole = 0.0
     for part in record.segments():
         q, tau = position[part], drive[part]
-        middle = float(np.median(q))
-        passing = np.flatnonzero((q[:-1] < middle) & (q[1:] >= middle))
-        if len(passing) < 2 + 1:
-            continue
-        between = slice(int(passing[0]), int(passing[-1]) + 1)
-        power = 0.5 * (tau[between][1:] + tau[between][:-1]) * np.diff(q[between])
-        net += float(power.sum())
-        whole += float(np.abs(power).sum())
+        power = 0.5 * (tau[1:] + tau[:-1]) * np.diff(q)
+        between = _cycles(q)
+        net += float(power[between].sum())
+        whole += float(np.abs(power[between]).sum())
     if whole == 0.0 or net >= -_GIVEN * whole:
         return []
     advice = "set sign = -1 for it in [columns], or reverse motor_constant"
     message = f"{record.name}: {name} takes energy out of the joint over whole cycles ({net:.3g} of {whole:.3g} J moved): is its sign reversed? {advice}"
     return [Finding("refuse", "work", message, name)]
+
+
+def _cycles(q: FloatArray) -> slice:
+    """Longest stretch between two passages of one position in one direction; empty without."""
+    best = slice(0, 0)
+    for level in np.quantile(q, (0.25, 0.5, 0.75)):
+        over = q >= level
+        for passing in (np.flatnonzero(~over[:-1] & over[1:]), np.flatnonzero(over[:-1] & ~over[1:])):
+            if len(passing) > 1 and passing[-1] - passing[0] > best.stop - best.start:
+                best = slice(int(passing[0]), int(passing[-1]))
+    return best
 
 
 def _guess(size: float) -> str:

@@ -88,9 +88,10 @@ def check(
         findings += check_stuck(record)
         findings += check_saturation(record)
         findings += check_quantisation(record)
-        findings += check_jumps(record)
+        jumps = check_jumps(record)
+        findings += jumps
         findings += check_velocity(usable, gear_ratio)
-        findings += check_ratio(usable, gear_ratio)
+        findings += [f for f in check_ratio(usable, gear_ratio) if f.severity != "warn" or not jumps]
         findings += check_delay(usable)
         if not any(finding.severity == "refuse" for finding in findings):
             findings += check_torque(usable, gear_ratio, torque_per_current)

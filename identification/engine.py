@@ -122,11 +122,21 @@ def solve(
         return _fitted(model, data, iterations, start or {}, progress)
     tied = {**(start or {}), "load_compliance": 0.0}
     rigid = _fitted(model, data, iterations, tied, progress, frozenset({"load_compliance", "swinging_share"}))
-    return _fitted(model, data, iterations, start or {}, progress) if _swings(rigid, data) else rigid
+    swinging = _swings(rigid, data)
+    if swinging is None:
+        return rigid
+    found = _fitted(model, data, iterations, start or {}, progress)
+    # a start far from the scale of the torques can end in no fit at all: then the rigid fit is where to begin
+    return found if _left(found, data) < _left(rigid, data) else _fitted(model, data, iterations, swinging, progress)
 
 
-def _swings(rigid: Solution, data: Dataset) -> bool:
-    """Whether an unseen link shows itself in the rows of a model that was fitted as rigid."""
+def _left(solution: Solution, data: Dataset) -> float:
+    """RMS of what a fit leaves on the training rows."""
+    return rms(stack(balances_of(solution.model, data.sensing, wrt=()), data.train, solution.values).residual["axis"])
+
+
+def _swings(rigid: Solution, data: Dataset) -> dict[str, float] | None:
+    """Values with a link that swings unseen, where it shows itself in the rows of a model that was fitted as rigid; else None."""
     model = rigid.model
     free = [*rigid.free, "load_compliance", "swinging_share"]
     free = [n for n in model.parameter_names if n in free]
@@ -135,7 +145,8 @@ def _swings(rigid: Solution, data: Dataset) -> bool:
     values, _ = gauss_newton(balances, data, rigid.values, free, limits, rigid.sigma, rigid.weights, 6, memory_shapes_of(model, free))
     sizes = [rms(stack(balances_of(model, data.sensing, wrt=()), data.train, v).residual["axis"]) for v in (rigid.values, values)]
     lag = model.swinging_inertia(values) * values["load_compliance"]
-    return bool(lag * (2 * math.pi * HIGHEST_SWING / data.kernel) ** 2 > 1 and sizes[1] < (1 - LEAST_SWING) * sizes[0])
+    slow = lag * (2 * math.pi * HIGHEST_SWING / data.kernel) ** 2 > 1
+    return values if slow and sizes[1] < (1 - LEAST_SWING) * sizes[0] else None
 
 
 def _fitted(

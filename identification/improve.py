@@ -50,6 +50,8 @@ RATIO_LIMIT: Final = 1.5
 EXPLAINED_SHARE: Final = 0.5
 LOCATED_SHARE: Final = 50.0
 """Share of what is left that one variable must hold before a table over it is set against the claims [%]."""
+HARDLY: Final = 90.0
+"""Relative error of the start model from which units and signs are doubted [%]."""
 SPOILT_RATIO: Final = 1.3
 """Ratio to the floor above which a balance that has risen by a fifth counts as spoilt by an addition."""
 RISE_LIMIT: Final = 1.02
@@ -294,12 +296,15 @@ class Loop:
         return Improvement(
             self.joint, self.data, tuple(steps), tuple(claims), minor, first, tuple(lines), tuple(where), verdict, reason, ratios,
             tuple(n for n in first.not_testable if n.effect not in {c for x in claims for c in x.effects}),
-            (*excitation_warnings(self.data), *self._without_temperature(claims), *_without_link(solution)), tuple(sorted(self.refused)),
+            (*_hardly_a_model(steps[0]), *excitation_warnings(self.data), *self._about_temperature(claims), *_without_link(solution)),
+            tuple(sorted(self.refused)),
         )  # fmt: skip
 
-    def _without_temperature(self, claims: Sequence[Claim]) -> tuple[str, ...]:
-        if self.data.sensing.has_temperature or not any("thermal_friction" in c.effects for c in claims):
+    def _about_temperature(self, claims: Sequence[Claim]) -> tuple[str, ...]:
+        if not any("thermal_friction" in c.effects for c in claims):
             return ()
+        if self.data.sensing.has_temperature:
+            return (f"the values of thermal friction count from {self.data.sensing.temperature_origin:.4g} K, the first sample of the first record",)
         return (
             "no temperature was recorded: thermal friction is judged by the time since each run started, taken as a cold start; "
             "its values are the change over one run, not per kelvin",
@@ -363,6 +368,14 @@ class Loop:
             if trial.values[name] * found.values[name] <= 0:
                 return False
         return True
+
+
+def _hardly_a_model(start: Step) -> tuple[str, ...]:
+    """A start model that explains next to nothing: what is claimed on top of it hangs in the air."""
+    error = start.train.relative_error_percent
+    if error < HARDLY:
+        return ()
+    return (f"the start model leaves {error:.3g} % of the measured torque unexplained: check units and signs in [columns], the motor constant and gear_ratio",)
 
 
 def _without_link(solution: Solution) -> tuple[str, ...]:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from identification import Record, improve, load_joint, read
-from identification.sensing import warm_up
+from identification.sensing import check_alike, signals_of, warm_up
 from tests.hidden_effect.generator import generate_case
 
 
@@ -19,6 +19,36 @@ def test_warm_up_starts_anew_with_each_run_and_not_at_a_gap() -> None:
     assert warm[180] == 0.0
     assert np.all(np.diff(warm[:180]) > 0)
     assert warm[179] == np.float64(1 - np.exp(-3.0))
+
+
+def test_a_part_of_a_run_is_as_warm_as_it_was_in_the_run() -> None:
+    time = np.arange(0, 40, 0.1)
+    whole = Record.from_channels(time, {"motor_position": time})
+    first, second = whole.split(0.7)
+    together = np.concatenate([warm_up(part, 39.9) for part in (first, second)])
+    np.testing.assert_allclose(together, warm_up(whole))
+    assert warm_up(first, 80.0)[-1] < warm_up(first)[-1]
+
+
+def test_temperature_counts_from_one_sample_for_all_records(tmp_path: Path) -> None:
+    folder = generate_case("thermal_friction", 0, folder=tmp_path / "case")
+    cold, hot = (read(folder / f"{n}.csv") for n in ("train", "train2"))
+    model = load_joint(folder / "joint.toml").model()
+    runs = [r.with_channel("temperature", np.full(len(r), level)) for r, level in ((cold, 293.0), (hot, 318.0))]
+    sensing = check_alike(runs, model)
+    assert sensing.has_temperature
+    joint = load_joint(folder / "joint.toml")
+    assert [float(signals_of(r, joint, sensing)["temperature"][0]) for r in runs] == [0.0, 25.0]
+    swapped = check_alike(runs[::-1], model)
+    assert [float(signals_of(r, joint, swapped)["temperature"][0]) for r in runs] == [-25.0, 0.0]
+    assert not check_alike([runs[0], hot], model).has_temperature
+
+
+def test_named_without_a_held_out_record(tmp_path: Path) -> None:
+    folder = generate_case("thermal_friction", 0, folder=tmp_path / "case")
+    found = improve([read(folder / "train.csv"), read(folder / "train2.csv")], load_joint(folder / "joint.toml"))
+    assert [c.effects for c in found.claims] == [("thermal_friction",)]
+    assert found.final_ratios["motor"].ratio < 1.15
 
 
 def test_named_from_the_time_since_the_start_and_said_so(tmp_path: Path) -> None:
