@@ -147,6 +147,10 @@ def parse_joint(data: Mapping[str, Any], source: str = "joint") -> Joint:
     )  # fmt: skip
     model = joint.model()
     known = {k: _known(k, v, ratio, model, source) for k, v in data.get("known", {}).items()}
+    for p in model.parameters:
+        found = joint.fitted.get(p.name, p.start)
+        if not p.low - 1e-9 <= found <= p.high + 1e-9:
+            raise InputError(f"{source}: [fitted] {p.name} = {found:g} lies outside its physical bounds {p.low:g} to {p.high:g} {p.unit}; correct it or fit again")
     return replace(joint, known=known)
 
 
@@ -188,6 +192,8 @@ def _known(name: str, entry: Any, ratio: float, model: JointModel, source: str) 
         raise InputError(f"{source}: [known] {name} has neither value nor low nor high")
     if values.get("low", -math.inf) > values.get("high", math.inf):
         raise InputError(f"{source}: [known] {name} has low above high; exchange them")
+    if "value" in values and not values.get("low", -math.inf) <= values["value"] <= values.get("high", math.inf):
+        raise InputError(f"{source}: [known] {name} has a value outside its own low and high; correct one of them")
     if name in parameters:
         p = parameters[name]
         if not all(p.low <= v <= p.high for k, v in values.items() if k == "value"):
