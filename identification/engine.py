@@ -14,6 +14,7 @@ from casadi_models import JointModel
 from identification.balances import Balances, balances_of
 from identification.dataset import Dataset, load_dataset, prepared_model, weak_record
 from identification.errors import InputError
+from identification.excitation import attenuation
 from identification.joint_file import Known
 from identification.stacked import Stacked, floor_rows, floors, references, rms, row_weights, stack, taking_part
 from identification.standard_errors import block_errors
@@ -366,7 +367,7 @@ def _with_errors(
     limits: Mapping[str, tuple[float, float]], weights: Mapping[str, FloatArray], sigma: Mapping[str, float],
     memory_shapes: Sequence[str], used: int,
 ) -> Solution:  # fmt: skip
-    """Standard errors from blocks of time; what cannot be identified is said."""
+    """Standard errors from blocks of time and from what noise of the positions takes off; what cannot be identified is said."""
     stacked = _jacobian(balances, data, values, free, memory_shapes)
     j = np.concatenate([stacked.jacobian[b] * weights[b][:, None] for b in balances.balances])
     r = np.concatenate([stacked.residual[b] * weights[b] for b in balances.balances])
@@ -386,7 +387,9 @@ def _with_errors(
         scaled = j[:, index] / norms[index]
         inverse = np.linalg.pinv(scaled.T @ scaled, rcond=1e-12)
         errors = block_errors(scaled, r, block)
-        size = None if errors is None else errors / norms[index]
+        pulled = {name.replace(" ", "_"): share for name, share in attenuation(data).items()}
+        biases = np.array([pulled.get(free[i], 0.0) * values[free[i]] for i in index])
+        size = None if errors is None else np.hypot(errors / norms[index], biases)
         spread = np.sqrt(np.maximum(np.diag(inverse), 1e-300))
         corr = inverse / np.outer(spread, spread)
         np.fill_diagonal(corr, 0.0)

@@ -85,6 +85,9 @@ def test_what_noise_takes_off_an_inertia_is_said() -> None:
         noisy.append(clean.with_channel("link_position", clean["link_position"] + size * rng.standard_normal(len(clean))))
     for spoilt in noisy:
         data = load_dataset([spoilt], [], JOINT, prepared_model(JOINT, spoilt))
-        lost = 1 - fit(JOINT, [spoilt]).solution.values["link_inertia"] / 3.0
-        assert attenuation(data)["link inertia"] == pytest.approx(lost, abs=0.04)
+        solution = fit(JOINT, [spoilt]).solution
+        found, error = solution.values["link_inertia"], solution.stderr["link_inertia"]
+        assert attenuation(data)["link inertia"] == pytest.approx(1 - found / 3.0, abs=0.04)
+        assert error is not None
+        assert abs(found - 3.0) < 3 * error
         assert any("link inertia by about" in w for w in excitation_warnings(data))

@@ -166,8 +166,9 @@ def _ledger_note(result: dict[str, Any], effort: str) -> str:
 def _parameter_note(effort: str) -> str:
     referred = "" if effort == "force" else "Torques, angles and inertias are referred to the link. "
     return (
-        f"<p class='note'>{referred}The standard error comes from the scatter between time blocks; "
-        "a true value more than three standard errors away is unlikely if the model is complete. "
+        f"<p class='note'>{referred}The standard error comes from the scatter between time blocks and, for inertias and "
+        "stiffness, from what noise of the positions takes off them; a true value more than three standard errors away is unlikely if the "
+        "model is complete. "
         "A value that stands at its bound, is not identifiable, or moves together with another one should not be read as physics.</p>"
     )
 
