@@ -388,7 +388,7 @@ def _with_errors(
         inverse = np.linalg.pinv(scaled.T @ scaled, rcond=1e-12)
         errors = block_errors(scaled, r, block)
         pulled = {name.replace(" ", "_"): share for name, share in attenuation(data).items()}
-        biases = np.array([pulled.get(free[i], 0.0) * values[free[i]] for i in index])
+        biases = np.array([pulled.get(free[i], 0.0) * values[free[i]] for i in index.tolist()])
         size = None if errors is None else np.hypot(errors / norms[index], biases)
         spread = np.sqrt(np.maximum(np.diag(inverse), 1e-300))
         corr = inverse / np.outer(spread, spread)

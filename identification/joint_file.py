@@ -150,7 +150,8 @@ def parse_joint(data: Mapping[str, Any], source: str = "joint") -> Joint:
     for p in model.parameters:
         found = joint.fitted.get(p.name, p.start)
         if not p.low - 1e-9 <= found <= p.high + 1e-9:
-            raise InputError(f"{source}: [fitted] {p.name} = {found:g} lies outside its physical bounds {p.low:g} to {p.high:g} {p.unit}; correct it or fit again")
+            bounds = f"{p.low:g} to {p.high:g} {p.unit}"
+            raise InputError(f"{source}: [fitted] {p.name} = {found:g} lies outside its physical bounds {bounds}; correct it or fit again")
     return replace(joint, known=known)
 
 
