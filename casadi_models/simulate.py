@@ -56,7 +56,7 @@ def simulate(
     x0 : array, optional
         Initial state; rest at zero by default.
     temperature : (n,) array, optional
-        Rise of temperature since the start [K].
+        Temperature above that from which the values of thermal friction count [K].
     """
     functions = model.functions
     size = len(functions.state_names) + len(functions.memory_names)

@@ -165,7 +165,7 @@ class _Builder:
         else:
             found = [Variable("tau_m", self._channel("motor_torque"), description="Motor torque on the motor shaft.")]
         if self.heated:
-            found.append(Variable("temperature", "K", description="Rise of temperature since the start."))
+            found.append(Variable("temperature", "K", description="Temperature above that from which the values of thermal friction count."))
         return found
 
     def _parameter(self, name: str, unit: str, start: float, description: str, low: float | None = None) -> Any:

@@ -1,4 +1,4 @@
-"""Friction that changes with temperature (the temperature signal counts from the start of the record)."""
+"""Friction that changes with temperature (the signal counts from the first sample of the first training record)."""
 
 from types import SimpleNamespace
 
