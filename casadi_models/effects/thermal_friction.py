@@ -23,5 +23,5 @@ from ..signals import Expression, LocalSignals
     separate_by="a long run that repeats its first block when warm",
 )
 def thermal_friction(s: LocalSignals, p: SimpleNamespace) -> Expression:
-    """Change of friction since the start of the record."""
+    """Change of friction with the temperature above the origin."""
     return (p.thermal_coulomb * s.direction + p.thermal_viscous * s.velocity) * s.temperature
