@@ -105,8 +105,8 @@ def _print_improvement(found: Improvement) -> None:
         print(f"{name:<32} {step.train.relative_error_percent:8.3f} {step.held_out.relative_error_percent:10.3f}   {ratios}")
     for claim in found.claims:
         names = claim.effects[0] if len(claim.effects) == 1 else "{" + ", ".join(claim.effects) + "}"
-        part = " (partial: structure is left that is not in the library)" if claim.partial else ""
-        print(f"missing: {names}, {claim.balance} balance, held-out RMS falls by {claim.held_out_drop_percent:.1f} %{part}")
+        said, rest = ("in part", "; structure is left that is not in the library") if claim.partial else ("missing", "")
+        print(f"{said}: {names}, {claim.balance} balance, held-out RMS falls by {claim.held_out_drop_percent:.1f} %{rest}")
         if claim.separate_by:
             print(f"  these cannot be told apart on these records; {claim.separate_by} would separate them")
     for claim in found.minor:
