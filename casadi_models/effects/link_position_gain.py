@@ -1,0 +1,26 @@
+"""Scale between the two positions: a wrong gear ratio, or the scale of an encoder."""
+
+from types import SimpleNamespace
+
+from ..effect import effect
+from ..parameter import signed
+from ..signals import Expression, LocalSignals
+
+
+@effect(
+    "link_position_gain",
+    title="wrong gear ratio or scale of a position",
+    family="sensor",
+    acts_on=("link_position_sensor",),
+    parameters=(
+        signed("link_position_gain", "1", "relative error: link reading = (1 + error) times motor reading / gear_ratio, without torsion"),
+    ),
+    absence="the transmission balance follows the link position",
+    excitation="a long stroke, better without gravity",
+    source="field knowledge",
+    confused_with=("cubic_stiffness", "torque_sensor_gain"),
+    separate_by="a slow run over a long stroke without payload: both positions over many turns",
+)
+def link_position_gain(s: LocalSignals, p: SimpleNamespace) -> Expression:
+    """True position minus reading."""
+    return -s.reading * p.link_position_gain / (1 + p.link_position_gain)
