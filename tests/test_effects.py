@@ -83,18 +83,20 @@ def accelerations(model: JointModel, dx: FloatArray) -> FloatArray:
     return dx[[1, 3]] if model.is_elastic else dx[[1]]
 
 
-def as_reading(model: JointModel, x: FloatArray, a: FloatArray) -> FloatArray:
-    """The state as late sensors of the link show it: true = reading + delay times its rate."""
-    out = x.copy()
+def as_reading(model: JointModel, x: FloatArray, a: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """State and accelerations as sensors of the link show them: true = reading + delay times its rate, or reading / (1 + gain)."""
+    out, rates = x.copy(), a.copy()
     if model.is_elastic:
-        delay = float(model.values.get("link_position_sensor_delay", 0.0))
+        delay, gain = (float(model.values.get(f"link_position_{n}", 0.0)) for n in ("sensor_delay", "gain"))
         out[3] = x[3] - delay * a[1]
         out[2] = x[2] - delay * out[3]
-    return out
+        out[2:] *= 1 + gain
+        rates[1] *= 1 + gain
+    return out, rates
 
 
-ONE_READING = [c for c in CASES if c.id != "channel_delay-link_position_sensor-rigid"]
-"""A late link encoder on a rigid joint: motor and link readings differ, one state cannot hold both."""
+ONE_READING = [c for c in CASES if c.id not in ("channel_delay-link_position_sensor-rigid", "link_position_gain-link_position_sensor-rigid")]
+"""A link encoder that is late or off in scale on a rigid joint: motor and link readings differ, one state cannot hold both."""
 
 
 @pytest.mark.parametrize(("key", "place", "elastic"), ONE_READING)
@@ -106,7 +108,7 @@ def test_regressor_reproduces_inverse_dynamics(key: str, place: str, elastic: bo
     for _ in range(5):
         x, u = random_state(model, rng), random_input(rng)
         a = accelerations(model, np.array(f.dynamics(x, u, p)).ravel())
-        y, rest = (np.array(v) for v in model.regressor(as_reading(model, x, a), a, u, p))
+        y, rest = (np.array(v) for v in model.regressor(*as_reading(model, x, a), u, p))
         expected = np.array([u[0], 0.0]) if elastic else u[:1]
         assert np.abs(y @ theta + rest.ravel() - expected).max() <= 1e-9 * max(1.0, np.abs(rest).max(), np.abs(y).max())
 
