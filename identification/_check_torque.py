@@ -82,10 +82,11 @@ def check_work(record: Record, gear_ratio: float | None, torque_per_current: flo
     """Refuse a drive that takes energy out of a joint that comes back to where it was: its sign is reversed.
 
     The work is that between the first and the last passage of one position in one direction, where what gravity and
-    springs store is the same again; friction can only use up energy.
+    springs store is the same again; friction can only use up energy. With a torque sensor the sign is `check_torque`'s: who
+    turns the joint from outside is measured then.
     """
     motor = record.has("motor_position")
-    if not motor and not record.has("link_position"):
+    if record.has("link_torque") or (not motor and not record.has("link_position")):
         return []
     position = record["motor_position"] / (gear_ratio or 1.0) if motor else record["link_position"]
     if record.has("motor_torque"):
