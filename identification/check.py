@@ -202,6 +202,7 @@ def _drop_repeated(record: Record) -> Record:
         time=record.time[keep],
         channels={key: values[keep] for key, values in record.channels.items()},
         segment=record.segment[keep],
+        age=None if record.age is None else record.age[keep],
         provenance=record.provenance.noted(note),
     )
 

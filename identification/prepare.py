@@ -288,6 +288,7 @@ def decimated(record: Record, factor: int = 10) -> Record:
         time=np.concatenate([record.time[part][::factor] for part in parts]),
         channels=channels,
         segment=np.concatenate([record.segment[part][::factor] for part in parts]),
+        age=None if record.age is None else np.concatenate([record.age[part][::factor] for part in parts]),
         provenance=record.provenance.noted(f"decimated by {factor}: Chebyshev I order 8, 0.05 dB, both ways"),
     )
 

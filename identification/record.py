@@ -115,6 +115,8 @@ class Record:
                 raise InputError(f"record {self.name!r}: channel {key} has shape {array.shape}, time has {time.shape}")
             channels[key] = _readonly(array)
         channel_unit("time", self.kind)
+        if self.age is not None and self.age.shape != time.shape:
+            raise InputError(f"record {self.name!r}: age has shape {self.age.shape}, time has {time.shape}")
         object.__setattr__(self, "time", _readonly(time))
         object.__setattr__(self, "segment", segment)
         object.__setattr__(self, "channels", MappingProxyType(channels))

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from identification.candidates import Candidate, offered
 from identification.claims import HELD_OUT_DROP, MAJOR_DROP, Claim
-from identification.engine import Dataset, Solution, solve
+from identification.engine import Dataset, Solution, solve, taking_part
 from identification.locate import BINS, Unexplained, axes, binned
 from identification.trials import Base, Trial, make_base, try_candidate
 
@@ -74,7 +74,8 @@ def beside_table(base: Base, left: Unexplained) -> Base:
         bins = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)
         direction = (signals["motor_velocity"][0] > 0).astype(np.int64)
         table = np.zeros((len(rows), 2 * BINS))
-        table[np.flatnonzero(rows == number), 2 * bins + direction] = weight[rows == number]
+        taking = taking_part(left.balance, records)
+        table[np.flatnonzero(rows == number), 2 * bins + direction] = weight[rows == number] * taking
         parts.append(table)
     return _with_columns(base, *parts)
 

@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from identification import Record, improve, load_joint, read
+from identification.check import repair
+from identification.prepare import decimated
 from identification.sensing import check_alike, signals_of, warm_up
 from tests.hidden_effect.generator import generate_case
 
@@ -27,6 +29,8 @@ def test_a_part_of_a_run_is_as_warm_as_it_was_in_the_run() -> None:
     first, second = whole.split(0.7)
     together = np.concatenate([warm_up(part, 39.9) for part in (first, second)])
     np.testing.assert_allclose(together, warm_up(whole))
+    thinned = repair(decimated(second, 4))
+    np.testing.assert_allclose(warm_up(thinned, 39.9), warm_up(whole)[280::4])
     assert warm_up(first, 80.0)[-1] < warm_up(first)[-1]
 
 
