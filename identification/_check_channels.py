@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from identification._check_time import gap_limit
 from identification._finding import Finding, at
 
 if TYPE_CHECKING:
@@ -37,7 +38,7 @@ def check_nan(record: Record) -> list[Finding]:
             advice = "leave the channel out or export it again"
             findings.append(Finding("refuse", "nan", f"{where}: {advice}", channel, row))
         else:
-            left = ~np.isfinite(values) & ~bridged_rows(~np.isfinite(values), record.segment)
+            left = ~np.isfinite(values) & ~bridged_rows(record)
             dropped = "the rows are dropped, the record is split there"
             advice = dropped if left.sum() == bad.size else "the holes of one or two rows are bridged by interpolation"
             advice += f", in the other {int(left.sum())} {dropped}" if 0 < left.sum() < bad.size else ""
@@ -45,14 +46,18 @@ def check_nan(record: Record) -> list[Finding]:
     return findings
 
 
-def bridged_rows(missing: npt.NDArray[np.bool_], segment: IntArray) -> npt.NDArray[np.bool_]:
-    """Rows of holes that are short enough to be bridged: one or two rows inside a segment."""
+def bridged_rows(record: Record) -> npt.NDArray[np.bool_]:
+    """Rows of holes that are short enough to be bridged: one or two rows, over all channels, inside a segment and beside no gap."""
+    missing = np.zeros(len(record), dtype=np.bool_)
+    for values in record.channels.values():
+        missing |= ~np.isfinite(values)
+    limit, segment = gap_limit(record), record.segment
     padded = np.concatenate([[False], missing, [False]])
     edges = np.flatnonzero(np.diff(padded.astype(np.int8)))
     out = np.zeros(missing.size, dtype=np.bool_)
     for start, stop in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-        inside = start > 0 and stop < missing.size and segment[start - 1] == segment[stop]
-        out[start:stop] = inside and stop - start <= _BRIDGED
+        inside = start > 0 and stop < missing.size and segment[start - 1] == segment[stop] and stop - start <= _BRIDGED
+        out[start:stop] = inside and float(np.diff(record.time[start - 1 : stop + 1]).max()) <= limit
     return out
 
 

@@ -12,6 +12,8 @@ from identification._finding import Finding, at
 from identification.noise import noise_level
 
 if TYPE_CHECKING:
+    import numpy.typing as npt
+
     from identification.record import FloatArray, Record
 
 _BLOCKS: Final = 200
@@ -20,6 +22,12 @@ _RATIO_TOLERANCE: Final = 0.02
 _RATIO_DOUBT: Final = 0.003
 """Difference of the gear ratio, torsion taken off, from which a word is said: a harmonic drive with a tooth more differs by 0.6 %."""
 _WRAP: Final = 0.8
+_AGAINST: Final = 0.3
+_OWN: Final = 0.03
+"""Share of the link's motion that must be left beside the torque for the two to be told apart."""
+_WIND_UP: Final = math.radians(5.0)
+_FEW_VALUES: Final = 8
+"""Values of a position that may stand still: a locked link whose encoder toggles."""
 _VELOCITY_TOLERANCE: Final = 0.05
 _LONGEST: Final = 1 << 18
 _STILL: Final = 12.0
@@ -50,17 +58,29 @@ def check_wrapped(record: Record) -> list[Finding]:
         steps = np.where(np.diff(record.segment) == 0, np.diff(record[channel]), 0.0)
         size = np.abs(steps[np.isfinite(steps)])
         turn = record.kind == "rotary" and 0.9 < whole / (2.0 * math.pi) <= 1.0 + 1e-6
-        jumps = size > (0.5 if turn else _WRAP) * whole
-        if not jumps.any() or (not turn and float(np.quantile(size, 0.9)) > 0.2 * whole):
+        far = np.flatnonzero(np.abs(np.nan_to_num(steps)) > (0.5 if turn else _WRAP) * whole)
+        if not far.size or (not turn and float(np.quantile(size, 0.9)) > 0.2 * whole) or np.unique(record[channel]).size < _FEW_VALUES:
+            continue
+        if float(np.mean(_against(np.nan_to_num(steps), far, whole))) < _AGAINST:
             continue
         row = int(np.argmax(np.abs(np.nan_to_num(steps))))
         limit = "2 pi" if turn else f"about {whole:.3g} {record.unit(channel)}"
         message = (
-            f"{record.name}: {channel} jumps by its whole range {int(jumps.sum())} time(s), as after {at(record, row)}: the encoder wraps "
+            f"{record.name}: {channel} jumps by its whole range {far.size} time(s), as after {at(record, row)}: the encoder wraps "
             f"at {limit}: unwrap it (numpy.unwrap) before the export"
         )
         findings.append(Finding("refuse", "wrapped", message, channel, row))
     return findings
+
+
+def _against(steps: FloatArray, far: npt.NDArray[np.intp], whole: float) -> npt.NDArray[np.bool_]:
+    """Which of the far steps run against the motion around them, as a wrap does; a quick move between two rests does not."""
+    around = np.zeros(far.size)
+    small = np.where(np.isin(np.arange(steps.size), far), 0.0, steps)
+    padded = np.pad(small, 2)
+    for shift in (0, 1, 3, 4):
+        around += padded[far + shift]
+    return np.asarray(around * np.sign(steps[far]) < -1e-3 * whole)
 
 
 def check_motion(record: Record) -> list[Finding]:
@@ -189,8 +209,24 @@ def measured_ratio(record: Record) -> tuple[float, float] | None:
     return ml / ll, ml / math.sqrt(ll * mm)
 
 
-def _rigid_ratio(record: Record) -> float | None:
-    """Slope of the motor position on the link position beside the torque that twists the joint; None without a torque sensor."""
+def _beside_torsion(record: Record, rigid: tuple[float, float, float], gear_ratio: float) -> Finding:
+    """What the gear ratio is with the torsion taken off: fine, or so far off that its own uncertainty does not explain it."""
+    ratio, doubt, _ = rigid
+    said = f"{record.name}: with the torsion taken off the positions show a gear ratio of {ratio:.5g}, {gear_ratio:g} is given"
+    if abs(ratio / gear_ratio - 1.0) <= max(_RATIO_DOUBT, doubt):
+        return Finding("ok", "gear_ratio", said, "link_position")
+    advice = "check gear_ratio and the scale of both positions, a wrong one looks like a missing effect"
+    return Finding("warn", "gear_ratio", f"{said}: {advice}", "link_position")
+
+
+def _rigid_ratio(record: Record) -> tuple[float, float, float] | None:
+    """Slope of the motor position on the link position beside the torque that twists the joint; None where they cannot be told apart.
+
+    Returns
+    -------
+    ratio, doubt, correlation
+        Doubt: what is left over the motion that counts, as a share of the ratio; correlation of the fit with the motor position.
+    """
     if not record.has("link_torque"):
         return None
     columns = np.column_stack([record["link_position"], record["link_torque"], np.ones(len(record))])
@@ -198,9 +234,16 @@ def _rigid_ratio(record: Record) -> float | None:
     sizes = np.linalg.norm(columns[good], axis=0)
     if not sizes.all() or span(record["link_torque"]) == 0.0:
         return None
-    scaled = columns[good] / sizes
-    found, _, rank, _ = np.linalg.lstsq(scaled, record["motor_position"][good], rcond=1e-6)
-    return float(found[0] / sizes[0]) if rank == 3 else None
+    scaled, motor = columns[good] / sizes, record["motor_position"][good]
+    found, _, rank, _ = np.linalg.lstsq(scaled, motor, rcond=1e-6)
+    others = scaled[:, 1:]
+    alone = scaled[:, 0] - others @ np.linalg.lstsq(others, scaled[:, 0], rcond=1e-9)[0]
+    own = float(np.linalg.norm(alone))
+    if rank < 3 or own < _OWN or found[0] == 0.0 or motor.std() == 0.0:
+        return None
+    left = float(np.linalg.norm(motor - scaled @ found))
+    correlation = math.sqrt(max(1.0 - (left / (motor.std() * math.sqrt(motor.size))) ** 2, 0.0))
+    return float(found[0] / sizes[0]), left / (abs(float(found[0])) * own), correlation
 
 
 def check_ratio(record: Record, gear_ratio: float | None) -> list[Finding]:
@@ -209,6 +252,11 @@ def check_ratio(record: Record, gear_ratio: float | None) -> list[Finding]:
     if found is None:
         return []
     ratio, correlation = found
+    if np.unique(record["link_position"]).size < _FEW_VALUES and span(record["motor_position"]) < _WIND_UP * abs(gear_ratio or 200.0):
+        return [Finding("warn", "gear_ratio", f"{record.name}: link_position hardly moves: fine if the link is locked, else check its sensor", "link_position")]
+    rigid = _rigid_ratio(record)
+    if gear_ratio is not None and rigid is not None and rigid[2] >= _CORRELATION and abs(rigid[0] / gear_ratio - 1.0) <= _RATIO_TOLERANCE:
+        return [_beside_torsion(record, rigid, gear_ratio)]
     if abs(correlation) < _CORRELATION:
         message = (
             f"{record.name}: motor_position and link_position do not move together (correlation {correlation:.2f}, "
@@ -221,11 +269,6 @@ def check_ratio(record: Record, gear_ratio: float | None) -> list[Finding]:
     share = ratio / gear_ratio
     if abs(share - 1.0) <= _RATIO_TOLERANCE:
         message = f"{record.name}: the positions show a gear ratio of {ratio:.5g}, {gear_ratio:g} is given"
-        rigid = _rigid_ratio(record)
-        if rigid is not None and abs(rigid / gear_ratio - 1.0) > _RATIO_DOUBT:
-            advice = "check gear_ratio and the scale of both positions, a wrong one looks like a missing effect"
-            message = f"{record.name}: with the torsion taken off the positions show a gear ratio of {rigid:.5g}, {gear_ratio:g} is given: {advice}"
-            return [Finding("warn", "gear_ratio", message, "link_position")]
         return [Finding("ok", "gear_ratio", message, "link_position")]
     doubt = ""
     if abs(share + 1.0) <= _RATIO_TOLERANCE:

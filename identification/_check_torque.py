@@ -104,7 +104,7 @@ def check_work(record: Record, gear_ratio: float | None, torque_per_current: flo
         whole += float(np.abs(power[between]).sum())
     if whole == 0.0 or net >= -_GIVEN * whole:
         return []
-    advice = "set sign = -1 for it in [columns], or reverse motor_constant"
+    advice = "set sign = -1 for it in [columns] or reverse motor_constant; a joint driven from outside needs a torque sensor"
     message = f"{record.name}: {name} takes energy out of the joint over whole cycles ({net:.3g} of {whole:.3g} J moved): is its sign reversed? {advice}"
     return [Finding("refuse", "work", message, name)]
 

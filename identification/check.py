@@ -78,8 +78,9 @@ def check(
         return rank(findings)
     findings += check_sampling(record)
     findings += check_constant(record, gear_ratio)
+    pieces = _split_at_gaps(record)
     for gate_check in (check_wrapped, check_motion):
-        found = gate_check(record)
+        found = gate_check(pieces)
         findings += found
         if any(finding.severity == "refuse" for finding in found):
             return rank(findings)
@@ -88,7 +89,7 @@ def check(
         findings += check_stuck(record)
         findings += check_saturation(record)
         findings += check_quantisation(record)
-        jumps = check_jumps(record)
+        jumps = check_jumps(pieces)
         findings += jumps
         findings += check_velocity(usable, gear_ratio)
         findings += [f for f in check_ratio(usable, gear_ratio) if f.severity != "warn" or not jumps]
@@ -171,14 +172,18 @@ def repair(record: Record) -> Record:
     for values in record.channels.values():
         finite &= np.isfinite(values)
     record = _drop(record, finite, "drop_nan_rows", "split there")
+    return _drop_short(_split_at_gaps(record))
+
+
+def _split_at_gaps(record: Record) -> Record:
     rows = gaps(record)
-    if rows.size:
-        limit = gap_limit(record)
-        cut = np.zeros(len(record), dtype=np.int64)
-        cut[rows] = 1
-        note = f"split_at_gaps: {rows.size} step(s) over {limit:.4g} s, first before row {rows[0] + 1}"
-        record = replace(record, segment=record.segment + np.cumsum(cut), provenance=record.provenance.noted(note))
-    return _drop_short(record)
+    if not rows.size:
+        return record
+    limit = gap_limit(record)
+    cut = np.zeros(len(record), dtype=np.int64)
+    cut[rows] = 1
+    note = f"split_at_gaps: {rows.size} step(s) over {limit:.4g} s, first before row {rows[0] + 1}"
+    return replace(record, segment=record.segment + np.cumsum(cut), provenance=record.provenance.noted(note))
 
 
 def _drop(record: Record, keep: np.typing.NDArray[np.bool_], rule: str, also: str = "") -> Record:
@@ -220,19 +225,15 @@ def _fill_temperature(record: Record) -> Record:
 
 
 def _bridge(record: Record) -> Record:
-    finite = np.ones(len(record), dtype=np.bool_)
-    for values in record.channels.values():
-        finite &= np.isfinite(values)
-    if finite.all():
-        return record
-    short = bridged_rows(~finite, record.segment)
+    short = bridged_rows(record)
     if not short.any():
         return record
+    clock = np.concatenate([[0.0], np.cumsum(np.maximum(np.diff(record.time), 0.0))])
     channels = {}
     for key, values in record.channels.items():
         here, good = short & ~np.isfinite(values), np.isfinite(values)
         channels[key] = values.copy()
-        channels[key][here] = np.interp(np.flatnonzero(here), np.flatnonzero(good), values[good]) if here.any() else []
+        channels[key][here] = np.interp(clock[here], clock[good], values[good]) if here.any() else []
     note = f"bridge_nan_rows: {int(short.sum())} row(s), first row {int(np.argmax(short)) + 1}"
     return replace(record, channels=channels, provenance=record.provenance.noted(note))
 
