@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from identification.check import check
+from identification.check import check, repair
 from identification.record import Record
+from identification.units import base_unit
 from tests.test_check import RATIO, Array, bad, found, record
 from tests.test_other_payload import FAST, PER_AMPERE
 from tests.test_other_payload import record as driven
@@ -74,3 +75,82 @@ def test_milliseconds_without_velocities_are_refused() -> None:
     finding = found(check(late, RATIO), "time_unit")
     assert finding.severity == "refuse"
     assert "is time in ms?" in finding.message
+
+
+# ---- what must pass
+
+
+def test_a_gap_is_neither_a_wrap_nor_a_slip() -> None:
+    whole = record()
+    keep = np.ones(len(whole), dtype=bool)
+    keep[1000:2400] = False
+    glued = Record.from_channels(whole.time[keep], {c: x[keep] for c, x in whole.channels.items()}, name="bench")
+    assert set(bad(check(glued, RATIO))) == {"gap"}
+
+
+def test_two_runs_at_different_places_are_no_wrap() -> None:
+    whole = record()
+    shift = np.where(np.arange(len(whole)) < 2500, 0.0, 40.0)
+    parts = {c: x + (shift if c == "link_position" else RATIO * shift if c == "motor_position" else 0.0) for c, x in whole.channels.items()}
+    late = np.where(np.arange(len(whole)) < 2500, 0.0, 24.0)
+    assert "wrapped" not in bad(check(Record.from_channels(whole.time + late, parts, name="bench"), RATIO))
+
+
+@pytest.mark.parametrize("dwell", [40, 100])
+def test_a_quick_move_between_rests_is_no_wrap(dwell: int) -> None:
+    def step(a: dict[str, Array]) -> None:
+        up = (np.arange(a["time"].size) // dwell) % 2
+        a["link_position"] = 6.0 * up + 1e-5 * np.sin(a["time"])
+        a["motor_position"] = RATIO * a["link_position"]
+
+    findings = check(record(step).without("motor_velocity", "link_velocity", "link_torque"), RATIO)
+    assert "wrapped" not in [f.code for f in findings]
+
+
+def test_a_soft_joint_passes_where_a_torque_sensor_shows_its_torsion() -> None:
+    def soften(a: dict[str, Array]) -> None:
+        a["motor_position"] = RATIO * (a["link_position"] + a["link_torque"] / 800.0)
+        a["motor_velocity"] = np.gradient(a["motor_position"], a["time"])
+
+    made = record(soften)
+    finding = found(check(made, RATIO), "gear_ratio")
+    assert finding.severity == "ok"
+    assert "with the torsion taken off the positions show a gear ratio of -160," in finding.message
+    assert found(check(made.without("link_torque"), RATIO), "gear_ratio").severity == "refuse"
+
+
+def test_a_locked_link_whose_encoder_toggles_is_allowed() -> None:
+    rng = np.random.default_rng(1)
+
+    def lock(a: dict[str, Array]) -> None:
+        a["link_position"] = 6.3e-5 * np.round(0.3 * rng.standard_normal(a["time"].size))
+        a["motor_position"] = RATIO * 0.003 * np.sin(a["time"])
+        del a["motor_velocity"], a["link_velocity"]
+
+    findings = check(record(lock), RATIO)
+    assert "refuse" not in {f.severity for f in findings}
+    assert "fine if the link is locked" in found(findings, "gear_ratio").message
+
+
+def test_a_coarse_link_encoder_raises_no_doubt_about_the_gear_ratio() -> None:
+    def coarse(a: dict[str, Array]) -> None:
+        a["link_position"] = np.round(a["link_position"] / 0.1) * 0.1
+        del a["link_velocity"]
+
+    assert found(check(record(coarse), RATIO), "gear_ratio").severity == "ok"
+
+
+def test_a_row_beside_a_gap_is_not_bridged_over_it() -> None:
+    whole = record()
+    keep = np.ones(len(whole), dtype=bool)
+    keep[1001:2400] = False
+    channels = {c: x[keep].copy() for c, x in whole.channels.items()}
+    channels["link_torque"][1000] = np.nan
+    mended = repair(Record.from_channels(whole.time[keep], channels, name="bench"))
+    assert len(mended) == int(keep.sum()) - 1
+    assert [s.stop - s.start for s in mended.segments()] == [1000, len(whole) - 2400]
+
+
+@pytest.mark.parametrize("unit", ["U/min", "1/min", "min^-1", "Upm"])
+def test_revolutions_per_minute_have_german_names_too(unit: str) -> None:
+    assert base_unit(unit) == base_unit("rpm")
