@@ -23,6 +23,8 @@ _RATIO_DOUBT: Final = 0.003
 """Difference of the gear ratio, torsion taken off, from which a word is said: a harmonic drive with a tooth more differs by 0.6 %."""
 _WRAP: Final = 0.8
 _AGAINST: Final = 0.3
+_NEAR, _MOVING = 5, 3e-4
+"""Steps on either side of a jump, and the share of the range that they must cover in all for a motion."""
 _OWN: Final = 0.03
 """Share of the link's motion that must be left beside the torque for the two to be told apart."""
 _WIND_UP: Final = math.radians(5.0)
@@ -77,10 +79,10 @@ def _against(steps: FloatArray, far: npt.NDArray[np.intp], whole: float) -> npt.
     """Which of the far steps run against the motion around them, as a wrap does; a quick move between two rests does not."""
     around = np.zeros(far.size)
     small = np.where(np.isin(np.arange(steps.size), far), 0.0, steps)
-    padded = np.pad(small, 2)
-    for shift in (0, 1, 3, 4):
+    padded = np.pad(small, _NEAR)
+    for shift in range(2 * _NEAR + 1):
         around += padded[far + shift]
-    return np.asarray(around * np.sign(steps[far]) < -1e-3 * whole)
+    return np.asarray(around * np.sign(steps[far]) < -_MOVING * whole)
 
 
 def check_motion(record: Record) -> list[Finding]:

@@ -25,6 +25,14 @@ def test_an_encoder_that_wraps_is_refused(channel: str, low: float) -> None:
     assert "wraps at 2 pi: unwrap it" in finding.message
 
 
+def test_a_slow_link_that_wraps_a_few_times_is_refused() -> None:
+    def wrap(a: dict[str, Array]) -> None:
+        a["link_position"] = np.mod(a["link_position"] + 0.3, 2 * np.pi)
+
+    finding = found(check(record(wrap), RATIO), "wrapped")
+    assert finding.channel == "link_position"
+
+
 def test_an_encoder_that_wraps_and_was_logged_slowly_is_refused() -> None:
     whole = record()
     slow = {c: x[::50] for c, x in whole.channels.items() if not c.endswith("velocity")}
