@@ -371,11 +371,15 @@ class Loop:
 
 
 def _hardly_a_model(start: Step) -> tuple[str, ...]:
-    """A start model that explains next to nothing: what is claimed on top of it hangs in the air."""
-    error = start.train.relative_error_percent
-    if error < HARDLY:
-        return ()
-    return (f"the start model leaves {error:.3g} % of the measured torque unexplained: check units and signs in [columns], the motor constant and gear_ratio",)
+    """A start model that explains next to nothing, or has no stiffness: what is claimed on top of it hangs in the air."""
+    error, out = start.train.relative_error_percent, []
+    if error >= HARDLY:
+        doubt = "check units and signs in [columns], the motor constant and gear_ratio"
+        out.append(f"the start model leaves {error:.3g} % of the measured torque unexplained: {doubt}")
+    if "stiffness" in start.solution.at_bound:
+        doubt = "check gear_ratio, the scale and the zero of both positions"
+        out.append(f"the stiffness went to zero: the difference of the two positions does not follow the torque: {doubt}")
+    return tuple(out)
 
 
 def _without_link(solution: Solution) -> tuple[str, ...]:

@@ -31,6 +31,17 @@ def test_a_scale_that_is_wrong_is_named_with_its_value(tmp_path: Path, effect: s
     assert found.steps[-1].held_out.relative_error_percent < 0.5 * found.steps[0].held_out.relative_error_percent
 
 
+def test_a_scale_that_leaves_no_stiffness_is_said(tmp_path: Path) -> None:
+    folder = generate_case(None, 3, folder=tmp_path / "case")
+    train, held = ([scaled(read(folder / f"{n}{i}.csv"), 1.01) for i in ("", "2")] for n in ("train", "test"))
+    joint = load_joint(folder / "joint.toml")
+    found = improve(train, joint, held, max_additions=0)
+    assert "stiffness" in found.steps[0].solution.at_bound
+    assert any("the stiffness went to zero" in w and "check gear_ratio" in w for w in found.warnings)
+    right = improve([scaled(r, 1 / 1.01) for r in train], joint, [scaled(r, 1 / 1.01) for r in held], max_additions=0)
+    assert not any("the stiffness went to zero" in w for w in right.warnings)
+
+
 def test_no_scale_is_named_where_none_is_wrong(tmp_path: Path) -> None:
     folder = generate_case("cubic_stiffness", 3, folder=tmp_path / "case")
     train, held = ([read(folder / f"{n}{i}.csv") for i in ("", "2")] for n in ("train", "test"))
