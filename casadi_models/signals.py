@@ -117,3 +117,8 @@ class LocalSignals:
     memory: tuple[Expression, ...]
     gear_ratio: Expression
     clock: Expression = math.nan
+
+
+def gain_error(reading: Expression, error: Expression) -> Expression:
+    """True value minus reading of a sensor that reads (1 + error) times the true value."""
+    return -reading * error / (1 + error)

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 _NAN_LIMIT: Final = 0.2
 _BRIDGED: Final = 2
+"""Rows of a hole that is bridged, at most."""
 _EFFORT: Final = ("motor_current", "motor_voltage", "motor_torque", "link_torque")
 _SIDE: Final = ("run", "temperature", "reference_position")
 _FEW_LEVELS: Final = 50
@@ -26,6 +27,7 @@ _STUCK_RUN: Final = 20
 def check_nan(record: Record) -> list[Finding]:
     """Find channels with values that are not finite."""
     findings = []
+    bridged = bridged_rows(record)
     for channel, values in record.channels.items():
         bad = np.flatnonzero(~np.isfinite(values))
         if not bad.size:
@@ -38,7 +40,7 @@ def check_nan(record: Record) -> list[Finding]:
             advice = "leave the channel out or export it again"
             findings.append(Finding("refuse", "nan", f"{where}: {advice}", channel, row))
         else:
-            left = ~np.isfinite(values) & ~bridged_rows(record)
+            left = ~np.isfinite(values) & ~bridged
             dropped = "the rows are dropped, the record is split there"
             advice = dropped if left.sum() == bad.size else "the holes of one or two rows are bridged by interpolation"
             advice += f", in the other {int(left.sum())} {dropped}" if 0 < left.sum() < bad.size else ""
@@ -51,10 +53,12 @@ def bridged_rows(record: Record) -> npt.NDArray[np.bool_]:
     missing = np.zeros(len(record), dtype=np.bool_)
     for values in record.channels.values():
         missing |= ~np.isfinite(values)
+    out = np.zeros(missing.size, dtype=np.bool_)
+    if not missing.any():
+        return out
     limit, segment = gap_limit(record), record.segment
     padded = np.concatenate([[False], missing, [False]])
     edges = np.flatnonzero(np.diff(padded.astype(np.int8)))
-    out = np.zeros(missing.size, dtype=np.bool_)
     for start, stop in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
         inside = start > 0 and stop < missing.size and segment[start - 1] == segment[stop] and stop - start <= _BRIDGED
         out[start:stop] = inside and float(np.diff(record.time[start - 1 : stop + 1]).max()) <= limit

@@ -22,12 +22,15 @@ _RATIO_TOLERANCE: Final = 0.02
 _RATIO_DOUBT: Final = 0.003
 """Difference of the gear ratio, torsion taken off, from which a word is said: a harmonic drive with a tooth more differs by 0.6 %."""
 _WRAP: Final = 0.8
+"""Share of a position's range from which one step counts as far."""
 _AGAINST: Final = 0.3
+"""Share of the far steps that must run against the motion around them: that of a wrap logged slowly is near a half."""
 _NEAR, _MOVING = 5, 3e-4
 """Steps on either side of a jump, and the share of the range that they must cover in all for a motion."""
 _OWN: Final = 0.03
 """Share of the link's motion that must be left beside the torque for the two to be told apart."""
 _WIND_UP: Final = math.radians(5.0)
+"""Motion of the motor, link-referred, that a locked link allows [rad]."""
 _FEW_VALUES: Final = 8
 """Values of a position that may stand still: a locked link whose encoder toggles."""
 _VELOCITY_TOLERANCE: Final = 0.05

@@ -52,12 +52,10 @@ def check_torque(record: Record, gear_ratio: float | None, torque_per_current: f
     position = next((c for c in ("motor_position", "link_position") if record.has(c)), None)
     if position is None or not record.has("link_torque") or record.kind != "rotary":
         return []
-    if record.has("motor_torque") and gear_ratio is not None:
-        drive, name = record["motor_torque"] * gear_ratio, "motor_torque"
-    elif record.has("motor_current") and torque_per_current is not None:
-        drive, name = record["motor_current"] * torque_per_current, "motor_current"
-    else:
+    given = _drive(record, gear_ratio, torque_per_current)
+    if given is None:
         return []
+    drive, name = given
     sign = math.copysign(1.0, gear_ratio or 1.0) if position == "motor_position" else 1.0
     found = _slope(record, drive, record[position] * sign)
     if found is None:
@@ -78,6 +76,15 @@ def check_torque(record: Record, gear_ratio: float | None, torque_per_current: f
     return [Finding("ok", "torque", f"{record.name}: link_torque follows the drive torque (factor {slope:.3g})", "link_torque")]
 
 
+def _drive(record: Record, gear_ratio: float | None, torque_per_current: float | None) -> tuple[FloatArray, str] | None:
+    """Drive torque referred to the link [N.m] and its channel, None where what refers it is not given."""
+    if record.has("motor_torque") and gear_ratio is not None:
+        return record["motor_torque"] * gear_ratio, "motor_torque"
+    if record.has("motor_current") and torque_per_current is not None:
+        return record["motor_current"] * torque_per_current, "motor_current"
+    return None
+
+
 def check_work(record: Record, gear_ratio: float | None, torque_per_current: float | None) -> list[Finding]:
     """Refuse a drive that takes energy out of a joint that comes back to where it was: its sign is reversed.
 
@@ -88,13 +95,12 @@ def check_work(record: Record, gear_ratio: float | None, torque_per_current: flo
     motor = record.has("motor_position")
     if record.has("link_torque") or (not motor and not record.has("link_position")):
         return []
-    position = record["motor_position"] / (gear_ratio or 1.0) if motor else record["link_position"]
-    if record.has("motor_torque"):
-        drive, name = record["motor_torque"] * (gear_ratio or 1.0), "motor_torque"
-    elif record.has("motor_current") and torque_per_current is not None:
-        drive, name = record["motor_current"] * torque_per_current, "motor_current"
-    else:
+    ratio = gear_ratio or 1.0  # work is the same on either side of the gear
+    given = _drive(record, ratio, torque_per_current)
+    if given is None:
         return []
+    position = record["motor_position"] / ratio if motor else record["link_position"]
+    drive, name = given
     net = whole = 0.0
     for part in record.segments():
         q, tau = position[part], drive[part]

@@ -229,11 +229,11 @@ def _bridge(record: Record) -> Record:
     if not short.any():
         return record
     clock = np.concatenate([[0.0], np.cumsum(np.maximum(np.diff(record.time), 0.0))])
-    channels = {}
+    channels = dict(record.channels)
     for key, values in record.channels.items():
-        here, good = short & ~np.isfinite(values), np.isfinite(values)
-        channels[key] = values.copy()
-        channels[key][here] = np.interp(clock[here], clock[good], values[good]) if here.any() else []
+        good = np.isfinite(values)
+        if not good.all():
+            channels[key] = np.where(short & ~good, np.interp(clock, clock[good], values[good]), values)
     note = f"bridge_nan_rows: {int(short.sum())} row(s), first row {int(np.argmax(short)) + 1}"
     return replace(record, channels=channels, provenance=record.provenance.noted(note))
 

@@ -88,7 +88,7 @@ def compare(fitted: Fit, records: Record | Sequence[Record], *, linear: bool = T
     error = assess(fitted.model, data, data.train, fitted.solution.values)
     stacked = stack(Balances(fitted.model, data.sensing, wrt=()), data.train, fitted.solution.values)
     residual = stacked.residual
-    places = places_of({b: np.where(stacked.taking[b], r, np.nan) for b, r in residual.items()}, gather(data))
+    places = places_of(stacked.shown, gather(data))
     time = np.concatenate([w.time for w in data.train])
     sigma = {b: max(error.balances[b].floor, 1e-12) for b in residual}
     power = sum((residual[b] / sigma[b]) ** 2 for b in residual)

@@ -128,12 +128,13 @@ def solve(
         return rigid
     found = _fitted(model, data, iterations, start or {}, progress)
     # a start far from the scale of the torques can end in no fit at all: then the rigid fit is where to begin
-    return found if _left(found, data) < _left(rigid, data) else _fitted(model, data, iterations, swinging, progress)
+    left = [_left(model, s.values, data) for s in (found, rigid)]
+    return found if left[0] < left[1] else _fitted(model, data, iterations, swinging, progress)
 
 
-def _left(solution: Solution, data: Dataset) -> float:
-    """RMS of what a fit leaves on the training rows."""
-    return rms(stack(balances_of(solution.model, data.sensing, wrt=()), data.train, solution.values).residual["axis"])
+def _left(model: JointModel, values: Mapping[str, float], data: Dataset) -> float:
+    """RMS of what these values leave on the training rows of the one balance of an axis."""
+    return rms(stack(balances_of(model, data.sensing, wrt=()), data.train, values).residual["axis"])
 
 
 def _swings(rigid: Solution, data: Dataset) -> dict[str, float] | None:
@@ -144,7 +145,7 @@ def _swings(rigid: Solution, data: Dataset) -> dict[str, float] | None:
     balances = balances_of(model, data.sensing, wrt=free)
     limits = bounds_of(model, data.joint.known, data)
     values, _ = gauss_newton(balances, data, rigid.values, free, limits, rigid.sigma, rigid.weights, 6, memory_shapes_of(model, free))
-    sizes = [rms(stack(balances_of(model, data.sensing, wrt=()), data.train, v).residual["axis"]) for v in (rigid.values, values)]
+    sizes = [_left(model, v, data) for v in (rigid.values, values)]
     lag = model.swinging_inertia(values) * values["load_compliance"]
     slow = lag * (2 * math.pi * HIGHEST_SWING / data.kernel) ** 2 > 1
     return values if slow and sizes[1] < (1 - LEAST_SWING) * sizes[0] else None

@@ -148,10 +148,9 @@ def parse_joint(data: Mapping[str, Any], source: str = "joint") -> Joint:
     model = joint.model()
     known = {k: _known(k, v, ratio, model, source) for k, v in data.get("known", {}).items()}
     for p in model.parameters:
-        found = joint.fitted.get(p.name, p.start)
-        if not p.low - 1e-9 <= found <= p.high + 1e-9:
+        if p.name in joint.fitted and not p.low - 1e-9 <= joint.fitted[p.name] <= p.high + 1e-9:
             bounds = f"{p.low:g} to {p.high:g} {p.unit}"
-            raise InputError(f"{source}: [fitted] {p.name} = {found:g} lies outside its physical bounds {bounds}; correct it or fit again")
+            raise InputError(f"{source}: [fitted] {p.name} = {joint.fitted[p.name]:g} lies outside its physical bounds {bounds}; correct it or fit again")
     return replace(joint, known=known)
 
 

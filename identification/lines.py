@@ -31,7 +31,7 @@ PASS: Final = 0.8
 SECTORS: Final = 8
 """Equal shares of the rows, along the stroke, in which a line is looked for once more."""
 EVEN: Final = 0.7
-"""Least amplitude in the middle one of the sectors, over that in the whole stroke: lines read 0.85 to 1.05, a burst in one place 0.05 to 0.5."""
+"""Least amplitude in the middle one of the sectors, over that in the whole stroke: near 1 for a line, near 0 for a burst in one place."""
 NAMED_ORDERS: Final = (1.0, 2.0, 4.0)
 NAMED_WITHIN: Final = 0.5
 """Distance to such an order in units of 2 pi / stroke: orders of lines are found to a tenth of it."""

@@ -312,8 +312,7 @@ def residuals(solution: Solution, data: Dataset, records: Sequence[WeakRecord] |
     """Residual of every balance on the rows of records (the held-out ones where none are given); NaN where a record takes no part."""
     chosen = tuple(records if records is not None else (data.held_out or data.train))
     balances = balances_of(solution.model, data.sensing, wrt=())
-    stacked = stack(balances, chosen, solution.values)
-    return {b: np.where(stacked.taking[b], r, np.nan) for b, r in stacked.residual.items()}
+    return stack(balances, chosen, solution.values).shown
 
 
 def places(

@@ -12,7 +12,7 @@ from identification.candidates import Candidate, offered
 from identification.claims import HELD_OUT_DROP, MAJOR_DROP, Claim
 from identification.engine import Dataset, Solution, solve, taking_part
 from identification.locate import BINS, Unexplained, axes, binned
-from identification.trials import Base, Trial, make_base, try_candidate
+from identification.trials import Base, Trial, make_base, span_of, try_candidate
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -84,8 +84,7 @@ def _with_columns(base: Base, table: FloatArray, held: FloatArray) -> Base:
     sizes = np.linalg.norm(table, axis=0)
     use = np.count_nonzero(table, axis=0) >= FEWEST_IN_BIN
     jacobian = np.column_stack([base.jacobian, table[:, use] / sizes[use]])
-    left, singular, _ = np.linalg.svd(jacobian, full_matrices=False)
-    orthonormal = left[:, singular > 1e-9 * singular[0]]
+    orthonormal = span_of(jacobian)
     return replace(
         base, jacobian=jacobian, orthonormal=orthonormal, residual=base.residual - orthonormal @ (orthonormal.T @ base.residual),
         held_jacobian=np.column_stack([base.held_jacobian, held[:, use] / sizes[use]]),

@@ -128,9 +128,9 @@ def check_alike(records: Sequence[Record], model: JointModel, labels: Sequence[s
         A record that misses a channel which the model needs, or has other channels than the first; two that are the same.
     """
     called = list(labels) or [r.name for r in records]
-    for k, record in enumerate(records):
+    for k, record in enumerate(records if once else ()):
         twin = next((label for other, label in zip(records[:k], called, strict=False) if _same_samples(record, other)), None)
-        if once and twin is not None:
+        if twin is not None:
             raise InputError(f"{called[k]}: holds the same samples as {twin}; a run counts once, leave one of the two out")
     found: list[Sensing] = []
     for record, label in zip(records, called, strict=True):

@@ -29,6 +29,11 @@ class Stacked:
     block: IntArray
     taking: Mapping[str, npt.NDArray[np.bool_]]
 
+    @property
+    def shown(self) -> dict[str, FloatArray]:
+        """Residuals for pictures: NaN in rows that take no part."""
+        return {b: np.where(self.taking[b], r, np.nan) for b, r in self.residual.items()}
+
 
 def stack(balances: Balances, records: Sequence[WeakRecord], values: Mapping[str, float]) -> Stacked:
     """Evaluate the balances on records one after the other; rows that take no part are zero."""

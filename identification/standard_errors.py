@@ -39,9 +39,9 @@ def block_errors(jacobian: FloatArray, residual: FloatArray, block: IntArray) ->
     if len(numbers) < FEWEST_BLOCKS:
         return None
     gram = jacobian.T @ jacobian
+    order = np.argsort(block, kind="stable")
     leave = []
-    for k in numbers:
-        rows = block == k
+    for rows in np.split(order, np.searchsorted(block[order], numbers))[1:]:
         part = jacobian[rows]
         left = np.linalg.pinv(gram - part.T @ part, rcond=1e-12, hermitian=True)
         leave.append(left @ (part.T @ residual[rows]))

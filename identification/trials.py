@@ -69,6 +69,11 @@ class Base:
     names: tuple[str, ...]
 
     @property
+    def parts(self) -> tuple[int, int]:
+        """Where a candidate's solution passes from free parameters to those at a bound, and from these to its own amplitudes."""
+        return self.jacobian.shape[1], self.jacobian.shape[1] + self.inward.shape[1]
+
+    @property
     def balances(self) -> tuple[str, ...]:
         """Balances in the order of their numbers."""
         return self.data.sensing.balances
@@ -91,8 +96,7 @@ def make_base(solution: Solution, data: Dataset) -> Base:
     alive[len(free) :] = False
     inward = jw[:, back] / norms[back]
     jw = jw[:, alive] / norms[alive]
-    left, singular, _ = np.linalg.svd(jw, full_matrices=False)
-    orthonormal = left[:, singular > 1e-9 * max(float(singular[0]) if len(singular) else 0.0, 1e-300)]
+    orthonormal = span_of(jw)
     rw = r * weight
     rw = rw - orthonormal @ (orthonormal.T @ rw)
     shares = np.array([_effective_share(rw[balance == k][train.taking[b]]) for k, b in enumerate(balances.balances)])
@@ -111,6 +115,12 @@ def make_base(solution: Solution, data: Dataset) -> Base:
         solution, data, rw, jw, inward, orthonormal, block, balance, weight, shares, hr, hj, hi, hb, held_weights,
         tuple(n for n, a in zip(free, alive, strict=False) if a),
     )  # fmt: skip
+
+
+def span_of(columns: FloatArray) -> FloatArray:
+    """Orthonormal columns that span the same space."""
+    left, singular, _ = np.linalg.svd(columns, full_matrices=False)
+    return np.asarray(left[:, singular > 1e-9 * max(float(singular[0]) if len(singular) else 0.0, 1e-300)], dtype=np.float64)
 
 
 def _inward_signs(solution: Solution, data: Dataset) -> dict[str, float]:
@@ -308,8 +318,7 @@ def _projected_gain(outside: FloatArray, residual: FloatArray, lows: FloatArray)
 def _score(
     candidate: Candidate, base: Base, balances: Balances, shapes: Mapping[str, float], raw: FloatArray, lows: FloatArray, inside: float
 ) -> Trial | None:
-    p = base.jacobian.shape[1]
-    own = p + base.inward.shape[1]
+    p, own = base.parts
     count = len(base.balances)
     size = np.linalg.norm(raw * base.weight[:, None], axis=0)
     size = np.where(size > 0, size, 1.0)
@@ -365,8 +374,7 @@ def _held_out_drop(
     """Fall of the RMS of a balance on records that the fit never saw, in percent."""
     if not len(base.held_residual):
         return math.nan
-    p = base.jacobian.shape[1]
-    own = p + base.inward.shape[1]
+    p, own = base.parts
     raw = columns(candidate, base, shapes, base.data.held_out, balances) * base.held_weight[:, None] / size
     here = base.held_balance == where
     before = base.held_residual[here]
@@ -378,8 +386,7 @@ def _wald(full: FloatArray, base: Base, delta: FloatArray) -> float:
     """p-value of the amplitudes, scores clustered by block."""
     from scipy.special import fdtrc
 
-    p = base.jacobian.shape[1]
-    own = p + base.inward.shape[1]
+    p, own = base.parts
     q = base.orthonormal
     moving = base.inward[:, delta[p:own] > 0]
     if moving.shape[1]:

@@ -40,7 +40,11 @@ PATTERNS: Final[Mapping[frozenset[str], str]] = {
 }
 
 
-WITHOUT_TRANSMISSION: Final = "the torque sensor, which both share, or two physical effects, one on each side"
+WITHOUT_TRANSMISSION: Final[Mapping[frozenset[str], str]] = {
+    **PATTERNS,
+    frozenset(("motor", "link")): "the torque sensor, which both share, or two physical effects, one on each side",
+}
+"""The same for joints without a transmission balance, which would tell a torque sensor from two effects."""
 
 
 def pattern_of(ratios: Mapping[str, float], limit: float = RATIO_LIMIT) -> tuple[frozenset[str], str]:
@@ -59,13 +63,11 @@ def pattern_of(ratios: Mapping[str, float], limit: float = RATIO_LIMIT) -> tuple
         A sentence without its full stop; physics hits one balance, a sensor those that share its reading.
     """
     hit = frozenset(b for b, r in ratios.items() if r > limit)
-    if "transmission" not in ratios and hit == {"motor", "link"}:
-        return hit, f"The link and motor balances stand over the noise. This pattern points to {WITHOUT_TRANSMISSION}"
     if not hit:
         return hit, "No balance stands over the noise"
     names = " and ".join(sorted(hit))
     noun = "balance stands" if len(hit) == 1 else "balances stand"
-    meaning = PATTERNS.get(hit, "several effects at once")
+    meaning = (PATTERNS if "transmission" in ratios else WITHOUT_TRANSMISSION).get(hit, "several effects at once")
     return hit, f"The {names} {noun} over the noise. This pattern points to {meaning}"
 
 

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 from ..effect import effect
 from ..parameter import signed
-from ..signals import Expression, LocalSignals
+from ..signals import Expression, LocalSignals, gain_error
 
 
 @effect(
@@ -23,4 +23,4 @@ from ..signals import Expression, LocalSignals
 )
 def link_position_gain(s: LocalSignals, p: SimpleNamespace) -> Expression:
     """True position minus reading."""
-    return -s.reading * p.link_position_gain / (1 + p.link_position_gain)
+    return gain_error(s.reading, p.link_position_gain)

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 from ..effect import effect
 from ..parameter import signed
-from ..signals import Expression, LocalSignals
+from ..signals import Expression, LocalSignals, gain_error
 
 
 @effect(
@@ -23,4 +23,4 @@ from ..signals import Expression, LocalSignals
 )
 def torque_sensor_gain(s: LocalSignals, p: SimpleNamespace) -> Expression:
     """True torque minus reading."""
-    return -s.reading * p.torque_sensor_gain / (1 + p.torque_sensor_gain)
+    return gain_error(s.reading, p.torque_sensor_gain)
