@@ -31,6 +31,7 @@ class Served:
     address: str
     root: Path
     server: Any
+    thread: threading.Thread
 
 
 @pytest.fixture
@@ -44,7 +45,7 @@ def served(tmp_path: Path) -> Iterator[Served]:
     server = uvicorn.Server(uvicorn.Config(create_app(tmp_path / "sessions", port=port), log_level="error", ws="none", timeout_graceful_shutdown=1))
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
     thread.start()
-    yield Served(f"http://127.0.0.1:{port}/", tmp_path / "sessions", server)
+    yield Served(f"http://127.0.0.1:{port}/", tmp_path / "sessions", server, thread)
     server.should_exit = True
     thread.join(10)
     listening.close()
@@ -370,8 +371,9 @@ def test_zoom_shows_every_row_and_where_it_is_in_the_record(served: Served, brow
     assert points < 8000
     assert page.locator(".strip:visible").count() == 0
     for _ in range(5):
+        drawn = page.evaluate("() => [app.plots[0].plot.root.dataset.seen = '1', app.plots[0].range && app.plots[0].range[0]][1]")
         page.click("button:has-text('Zoom in')")
-        page.wait_for_timeout(150)
+        page.wait_for_function("was => !app.plots[0].plot.root.dataset.seen && app.plots[0].range && app.plots[0].range[0] !== was", arg=drawn)
     page.wait_for_selector(".strip .u-select")
     shown = page.evaluate("() => [app.plots[0].range, app.plots[0].host.dataset.points, app.plots[0].plot.root.getAttribute('aria-label')]")
     assert int(shown[1]) == pytest.approx((shown[0][1] - shown[0][0]) / 0.0025, abs=4), "every sample of the window, 2.5 ms apart"
@@ -382,13 +384,13 @@ def test_zoom_shows_every_row_and_where_it_is_in_the_record(served: Served, brow
     page.mouse.down()
     page.mouse.move(box["x"] + 0.8 * box["width"], box["y"] + 20, steps=4)
     page.mouse.up()
-    page.wait_for_timeout(300)
+    page.wait_for_function("() => app.plots[0].range[0] < 12.3 && app.plots[0].range[0] > 11.7")
     low, high = page.evaluate("() => app.plots[0].range")
     assert low == pytest.approx(12.0, abs=0.3)
     assert high == pytest.approx(16.0, abs=0.3)
     page.click("button:has-text('Whole record')")
     page.wait_for_function("() => app.plots[0].range === null")
-    assert page.locator(".strip:visible").count() == 0
+    page.wait_for_selector(".strip", state="hidden")
 
 
 @pytest.mark.parametrize("kind", ["npz", "squeezed.npz", "csv"])
@@ -419,7 +421,7 @@ def test_a_preview_is_drawn_while_the_server_takes_the_file_in(served: Served, b
     assert near.max() < 0.2
     held[0].continue_()
     page.wait_for_selector("#series-file", timeout=20_000)
-    assert page.locator("#preview").count() == 0
+    page.wait_for_selector("#preview", state="detached")
 
 
 def test_an_upload_can_be_cancelled(served: Served, browser: Browser, tmp_path: Path) -> None:
@@ -433,7 +435,7 @@ def test_an_upload_can_be_cancelled(served: Served, browser: Browser, tmp_path: 
     page.click("#cancel")
     page.wait_for_selector("#error:not([hidden])")
     assert "run.csv: cancelled; nothing was changed" in page.inner_text("#error-text")
-    assert page.is_hidden("#job")
+    page.wait_for_selector("#job", state="hidden")
     assert page.evaluate("() => app.state.files.length") == 0
     page.unroute("**/files/*")
     browser.problems.clear()
@@ -460,7 +462,7 @@ def test_fifty_quick_clicks_and_two_tabs(served: Served, browser: Browser) -> No
     page.click("#add-by-hand")
     other.wait_for_function("() => app.state.steps.length === 2 && app.state.steps[1].settled", timeout=60_000)
     browser.idle("ledger")
-    assert other.inner_text("#headline strong") == page.inner_text("#headline strong")
+    other.wait_for_function("text => document.querySelector('#headline strong').innerText === text", arg=page.inner_text("#headline strong"))
     other.click("#undo")
     page.wait_for_function("() => app.state.steps.length === 1", timeout=60_000)
     other.close()
@@ -481,7 +483,8 @@ def test_a_tab_closed_in_the_middle_loses_nothing_and_a_stopped_server_is_said(s
     again.goto(address)
     again.wait_for_function("() => app.state && app.state.diagnosis && !app.state.job", timeout=60_000)
     served.server.should_exit = True
-    again.wait_for_timeout(1800)
+    while served.thread.is_alive():
+        again.wait_for_timeout(100)
     again.click("#add-by-hand")
     again.wait_for_selector("#error:not([hidden])")
     assert "the server does not answer; is it still running? What was done is kept" in again.inner_text("#error-text")

@@ -183,6 +183,7 @@ async function upload(files) {
   const had = app.preview;
   app.upload = null;
   app.preview = null;
+  surround(); /* the bar goes at once, also where the server does not answer any more */
   await refresh().catch(fail);
   if (had && !app.state.files.length) render(false);
 }
