@@ -79,9 +79,7 @@ def identify(joint: JointModel, follower: Follower, known_record: FloatArray) ->
     return rows
 
 
-def _errors(
-    detector: FaultDetector, record: FloatArray, joint: JointModel, offline: FloatArray, failed: tuple[str, ...], alternative: int
-) -> dict[str, float]:
+def _errors(detector: FaultDetector, record: FloatArray, joint: JointModel, offline: FloatArray, failed: tuple[str, ...], alternative: int) -> dict[str, float]:
     detector.reset()
     faults = [Fault(s, "noise", 20.0, 0.1) for s in failed]
     track = detector.run(inject(record, DT, faults, seed=3))

@@ -50,9 +50,7 @@ def detector_model(joint: JointModel) -> JointModel:
     """The joint with the errors an identification leaves."""
     rng = np.random.default_rng(7)
     values = dict(joint.values)
-    return joint.with_values(
-        {n: values[n] * (1 + e * rng.choice([-1.0, 1.0])) for n, e in ERRORS.items() if n in values}
-    )
+    return joint.with_values({n: values[n] * (1 + e * rng.choice([-1.0, 1.0])) for n, e in ERRORS.items() if n in values})
 
 
 def reference(seed: int, seconds: float) -> FloatArray:
@@ -70,9 +68,7 @@ def reference(seed: int, seconds: float) -> FloatArray:
             raw[first : first + len(t)] = -amplitude * shape
         else:
             period = rng.uniform(0.8, 6.0)
-            raw[first : first + len(t)] = rng.uniform(-0.5, 0.5) + speed * period / (2 * np.pi) * np.sin(
-                2 * np.pi * t / period
-            )
+            raw[first : first + len(t)] = rng.uniform(-0.5, 0.5) + speed * period / (2 * np.pi) * np.sin(2 * np.pi * t / period)
     from scipy.signal import lfilter
 
     w = 8.0
@@ -99,6 +95,7 @@ def clean_readings(run: Followed) -> FloatArray:
 
 def pairs() -> list[list[Fault]]:
     """Staggered, simultaneous and temporary faults of the link sensors, and one across the joint."""
+
     def noisy(sensor: str, start: float, end: float = float("inf")) -> Fault:
         return Fault(sensor, "noise", start, 0.1, end)
 

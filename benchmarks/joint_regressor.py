@@ -33,9 +33,18 @@ class JointRecord:
     truth: FloatArray
 
 
-def simulate(*, seconds: float = 80.0, rate: float = 1000.0, standstill: tuple[float, float] = (30.0, 50.0),
-             step_at: float = 60.0, step: float = 1.3, stiction: float = 0.0, quick: float = 0.05,
-             cutoff: float = 15.0, seed: int = 0) -> JointRecord:
+def simulate(
+    *,
+    seconds: float = 80.0,
+    rate: float = 1000.0,
+    standstill: tuple[float, float] = (30.0, 50.0),
+    step_at: float = 60.0,
+    step: float = 1.3,
+    stiction: float = 0.0,
+    quick: float = 0.05,
+    cutoff: float = 15.0,
+    seed: int = 0,
+) -> JointRecord:
     """Motion, standstill, motion; all parameters times `step` at `step_at`.
 
     Parameters
@@ -57,8 +66,7 @@ def simulate(*, seconds: float = 80.0, rate: float = 1000.0, standstill: tuple[f
     twist, twist_rate = _twist(carried, truth, dt)
     motor, motor_velocity = link + twist, velocity + twist_rate
     motor_acceleration = acceleration + np.gradient(twist_rate, dt)
-    drive = MOTOR_INERTIA * motor_acceleration + carried + truth[:, 3] * np.tanh(motor_velocity / SIGN_WIDTH) \
-        + truth[:, 4] * motor_velocity
+    drive = MOTOR_INERTIA * motor_acceleration + carried + truth[:, 3] * np.tanh(motor_velocity / SIGN_WIDTH) + truth[:, 4] * motor_velocity
     still = (time >= standstill[0] + 1.0) & (time < standstill[1])
     drive = drive + stiction * still
     root = np.sqrt(12.0)  # uniform quantisation noise
@@ -72,8 +80,7 @@ def simulate(*, seconds: float = 80.0, rate: float = 1000.0, standstill: tuple[f
     return JointRecord(time[lead:], _filtered(y, cutoff, dt)[lead:], _filtered(h, cutoff, dt)[lead:], truth[lead:])
 
 
-def _motion(time: FloatArray, standstill: tuple[float, float],
-            quick: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _motion(time: FloatArray, standstill: tuple[float, float], quick: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Link angle of three sines whose phase runs with a speed that falls smoothly to zero for the standstill."""
     dt = float(time[1] - time[0])
     ramp = np.clip(np.minimum(np.abs(time - standstill[0]), np.abs(time - standstill[1])), 0.0, 1.0)
@@ -109,8 +116,7 @@ def _filtered(signal: FloatArray, cutoff: float, dt: float) -> FloatArray:
     return found
 
 
-def _regression(motor: FloatArray, link: FloatArray, drive: FloatArray, torque: FloatArray,
-                dt: float) -> tuple[FloatArray, FloatArray]:
+def _regression(motor: FloatArray, link: FloatArray, drive: FloatArray, torque: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
     """Both torque balances, linear in the parameters."""
     motor_velocity, link_velocity = np.gradient(motor, dt), np.gradient(link, dt)
     twist, twist_rate = motor - link, motor_velocity - link_velocity

@@ -34,9 +34,7 @@ _SHEKEL_WIDTHS = np.array([0.1, 0.2, 0.2, 0.4, 0.4, 0.6, 0.3, 0.7, 0.5, 0.5])
 _HARTMAN_WEIGHTS = np.array([1.0, 1.2, 3.0, 3.2])
 _HARTMAN3 = np.array([[3, 10, 30], [0.1, 10, 35], [3, 10, 30], [0.1, 10, 35]])
 _HARTMAN3_PLACES = 1e-4 * np.array([[3689, 1170, 2673], [4699, 4387, 7470], [1091, 8732, 5547], [381.5, 5743, 8828]])
-_HARTMAN6 = np.array(
-    [[10, 3, 17, 3.5, 1.7, 8], [0.05, 10, 17, 0.1, 8, 14], [3, 3.5, 1.7, 10, 17, 8], [17, 8, 0.05, 10, 0.1, 14]]
-)
+_HARTMAN6 = np.array([[10, 3, 17, 3.5, 1.7, 8], [0.05, 10, 17, 0.1, 8, 14], [3, 3.5, 1.7, 10, 17, 8], [17, 8, 0.05, 10, 0.1, 14]])
 _HARTMAN6_PLACES = 1e-4 * np.array(
     [[1312, 1696, 5569, 124, 8283, 5886], [2329, 4135, 8307, 3736, 1004, 9991],
      [2348, 1451, 3522, 2883, 3047, 6650], [4047, 8828, 8732, 5743, 1091, 381]]
@@ -78,9 +76,7 @@ def six_hump_camel(x: FloatArray) -> float:
 def shubert(x: FloatArray) -> float:
     """Shubert's function in two coordinates: 760 local minima, 18 of them global."""
     a, b = x.tolist()
-    return sum(j * math.cos((j + 1) * a + j) for j in range(1, 6)) * sum(
-        j * math.cos((j + 1) * b + j) for j in range(1, 6)
-    )
+    return sum(j * math.cos((j + 1) * a + j) for j in range(1, 6)) * sum(j * math.cos((j + 1) * b + j) for j in range(1, 6))
 
 
 @final
@@ -187,10 +183,7 @@ def shifted_boxes(seeds: int) -> None:
         counts = [result.nfev for result in results]
         hits = sum(result.fun <= case.target for result in results)
         solved += hits
-        print(
-            f"{case.name:6}{hits:8}{statistics.median(counts):8.0f}{case.median:8}"
-            f"{statistics.mean(counts):8.0f}{max(counts):8}"
-        )
+        print(f"{case.name:6}{hits:8}{statistics.median(counts):8.0f}{case.median:8}{statistics.mean(counts):8.0f}{max(counts):8}")
     print(f"{'sum':6}{solved:8} of {25 * seeds * len(JONES)}\n")
 
 

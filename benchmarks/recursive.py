@@ -56,8 +56,10 @@ def cost() -> None:
         replay = best(lambda use=estimator: use.run(y, h), 20) / samples  # type: ignore[misc]
         if method == "random_walk":
             update_us = interpreted * 1e6
-        print(f"  {method:12s} update {interpreted * 1e6:5.2f} us (FunctionBuffer), {compiled * 1e6:5.2f} us (compiled); "
-              f"run {replay * 1e9:5.0f} ns = {1e-6 / replay:.2f} million samples/s  [{outcome.value}]")
+        print(
+            f"  {method:12s} update {interpreted * 1e6:5.2f} us (FunctionBuffer), {compiled * 1e6:5.2f} us (compiled); "
+            f"run {replay * 1e9:5.0f} ns = {1e-6 / replay:.2f} million samples/s  [{outcome.value}]"
+        )
     try:
         import padasip
     except ImportError:
@@ -73,16 +75,14 @@ def cost() -> None:
     theirs = best(others, 20) / 500 * 1e6
     estimator = RecursiveLeastSquares(np.zeros(n), np.ones(n), outputs=m)
     ours = best(lambda: estimator.run(y, h, compiled=True), 20) / samples * 1e6
-    print(f"  padasip RLS  {theirs:5.1f} us per sample (two scalar updates): run is {theirs / ours:.0f} times faster, "
-          f"update {theirs / update_us:.1f} times")
+    print(f"  padasip RLS  {theirs:5.1f} us per sample (two scalar updates): run is {theirs / ours:.0f} times faster, update {theirs / update_us:.1f} times")
 
 
 def agreement() -> None:
     """Interpreted and compiled, bit by bit."""
     record = joint.simulate(seconds=20.0, standstill=(8.0, 10.0), step_at=15.0)
     for method in METHODS:
-        pair = [RecursiveLeastSquares(0.7 * joint.THETA, joint.SCALE, method).run(record.y, record.h, compiled=compiled)
-                for compiled in (False, True)]
+        pair = [RecursiveLeastSquares(0.7 * joint.THETA, joint.SCALE, method).run(record.y, record.h, compiled=compiled) for compiled in (False, True)]
         same = np.array_equal(pair[0].theta, pair[1].theta)
         print(f"  {method:12s} interpreted and compiled trajectories equal bit by bit: {same}")
 
@@ -98,8 +98,10 @@ def endurance() -> None:
             run = estimator.run(record.y, record.h)
             worst = max(worst, float(np.abs((run.theta - joint.THETA) / joint.SCALE).max()))
         low = float(np.linalg.eigvalsh(estimator.covariance / np.outer(joint.SCALE, joint.SCALE)).min())
-        print(f"  {method:12s} finite {np.isfinite(run.theta).all()}, largest error on the way {worst:.2f} scales, "
-              f"at the end {np.abs(estimator.theta / joint.THETA - 1).max():.4f} relative, smallest eigenvalue of P {low:.1e}")
+        print(
+            f"  {method:12s} finite {np.isfinite(run.theta).all()}, largest error on the way {worst:.2f} scales, "
+            f"at the end {np.abs(estimator.theta / joint.THETA - 1).max():.4f} relative, smallest eigenvalue of P {low:.1e}"
+        )
 
 
 def standstill_and_step() -> None:
@@ -120,8 +122,7 @@ def seeds() -> None:
             at = 60_000 + 370 * seed
             record = joint.simulate(seed=seed, step_at=at * 1e-3, quick=quick)
             estimator = RecursiveLeastSquares(0.7 * joint.THETA, joint.SCALE)
-            print(f"  seed {seed} {outcome_line(record, estimator, at)}; batch LS of the 0.43 s after the step: "
-                  f"ka {batch_error(record, at):+.1%}")
+            print(f"  seed {seed} {outcome_line(record, estimator, at)}; batch LS of the 0.43 s after the step: ka {batch_error(record, at):+.1%}")
 
 
 def outcome_line(record: joint.JointRecord, estimator: RecursiveLeastSquares, at: int) -> str:
@@ -131,13 +132,14 @@ def outcome_line(record: joint.JointRecord, estimator: RecursiveLeastSquares, at
     still = slice(30_000, 50_000)
     drift = np.abs(run.theta[still] / run.theta[30_000] - 1.0).max()
     relative = np.abs(run.theta[still] / record.truth[still] - 1.0).max()
-    inside = np.abs(run.theta[at:at + 5000] / record.truth[at:at + 5000] - 1.0) < 0.05
+    inside = np.abs(run.theta[at : at + 5000] / record.truth[at : at + 5000] - 1.0) < 0.05
     times = []
     for name in ("k1", "ka", "coulomb_motor"):
         outside = np.flatnonzero(~inside[:, joint.NAMES.index(name)])
         times.append("> 5 s" if outside[-1] == 4999 else f"{(outside[-1] + 1) * 1e-3:.2f} s")
-    return (f"drift {drift:8.2%}, error {relative:8.2%}, inside 5 % for good after {', '.join(times)}; "
-            f"alarms {estimator.alarms}, resets {estimator.resets}{note}")
+    return (
+        f"drift {drift:8.2%}, error {relative:8.2%}, inside 5 % for good after {', '.join(times)}; alarms {estimator.alarms}, resets {estimator.resets}{note}"
+    )
 
 
 def batch_error(record: joint.JointRecord, at: int) -> float:

@@ -215,10 +215,7 @@ def from_disk(samples: int) -> None:
                 watcher.join()
                 name = f"{sub.order}" if order else f"({sub.order})"
                 error, extra = pole_error(sub.system.A), highest[0] - base
-                print(
-                    f"{method:>12} order {name:>4} {seconds:7.1f} s   extra {extra:6.1f} MB   "
-                    f"whole process {highest[0]:6.1f} MB   pole error {error:.2e}"
-                )
+                print(f"{method:>12} order {name:>4} {seconds:7.1f} s   extra {extra:6.1f} MB   whole process {highest[0]:6.1f} MB   pole error {error:.2e}")
 
 
 def main() -> None:

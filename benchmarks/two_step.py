@@ -1,7 +1,7 @@
 """Two-step identification: friction of table 4.6, and the time-variant test of section 4.3.4.2.
 
-    python benchmarks/two_step.py table [--seeds 20]
-    python benchmarks/two_step.py variant [--seeds 5]
+python benchmarks/two_step.py table [--seeds 20]
+python benchmarks/two_step.py variant [--seeds 5]
 """
 
 from __future__ import annotations

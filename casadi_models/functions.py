@@ -75,9 +75,7 @@ class JointFunctions:
             return (motor, link), torque
         one = [s.link_acceleration], [s.motor_acceleration]
         share = e.inertia.get("link_inertia", ca.SX(0))
-        right, carried = ca.substitute(
-            [e.drive - e.motor_resistance - e.link_resistance, share * s.link_acceleration + e.link_resistance], *one
-        )
+        right, carried = ca.substitute([e.drive - e.motor_resistance - e.link_resistance, share * s.link_acceleration + e.link_resistance], *one)
         right, carried = self._substituted(right, carried)
         inertia: Expression = sum(e.inertia.values())
         acceleration, torque = rigid_solution(right, carried, inertia, s.motor_acceleration, s.torque)
@@ -251,9 +249,7 @@ class JointFunctions:
         load = carried_torque(e) if elastic else self._carried_rigidly(e)
         reading = self._reading("torque_sensor", load, ca.SX(0))
         matrix, rest = ca.substitute([matrix, rest], [s.torque], [reading])
-        matrix, rest = ca.substitute(
-            self._substituted(matrix, rest), [s.motor_acceleration, s.link_acceleration], [a[0], a[elastic]]
-        )
+        matrix, rest = ca.substitute(self._substituted(matrix, rest), [s.motor_acceleration, s.link_acceleration], [a[0], a[elastic]])
         full = ca.vertcat(x, z)
         out = [ca.densify(matrix), ca.densify(rest)]
         return ca.Function("regressor", [full, a, u, p], out, ["x", "a", "u", "p"], ["Y", "rest"])

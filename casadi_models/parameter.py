@@ -90,8 +90,6 @@ def signed(name: str, unit: str, meaning: str) -> Parameter:
     return Parameter(name, unit, 0.0, -math.inf, math.inf, meaning)
 
 
-def shape(
-    name: str, unit: str, meaning: str, grid: tuple[float, ...], scale: Scale, *, start: float, low: float, high: float
-) -> Parameter:
+def shape(name: str, unit: str, meaning: str, grid: tuple[float, ...], scale: Scale, *, start: float, low: float, high: float) -> Parameter:
     """A shape parameter: enters nonlinearly, searched on a grid of fractions of a signal's range."""
     return Parameter(name, unit, start, low, high, meaning, grid=grid, scale=scale)

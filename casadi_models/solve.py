@@ -44,9 +44,7 @@ def carried_torque(e: Equations, carried: Expression | None = None) -> Expressio
     return found
 
 
-def rigid_solution(
-    right: Expression, carried: Expression, inertia: Expression, acceleration: Expression, torque: Expression
-) -> tuple[Expression, Expression]:
+def rigid_solution(right: Expression, carried: Expression, inertia: Expression, acceleration: Expression, torque: Expression) -> tuple[Expression, Expression]:
     """Acceleration a and torque into the link T of a rigid joint.
 
     Solves inertia * a = right(a, T) and T = carried(a, T) together.

@@ -120,10 +120,7 @@ def check_stuck(record: Record) -> list[Finding]:
                 worst = (moved, piece.start, piece.stop)
         if worst is not None:
             _, start, stop = worst
-            message = (
-                f"{record.name}: {channel} is stuck from {at(record, start)} to row {stop} while the joint moves: "
-                f"cut this time out or check the sensor"
-            )
+            message = f"{record.name}: {channel} is stuck from {at(record, start)} to row {stop} while the joint moves: cut this time out or check the sensor"
             findings.append(Finding("warn", "stuck", message, channel, start))
     return findings
 

@@ -112,10 +112,7 @@ def check_motion(record: Record) -> list[Finding]:
             forth = max(forth, float(np.max(piece - np.minimum.accumulate(piece))))
             back = max(back, float(np.max(np.maximum.accumulate(piece) - piece)))
     if min(forth, back) < max(0.02 * whole, 5.0 * (quantum(position) or 0.0)):
-        message = (
-            f"{record.name}: the {side} never reverses: friction cannot be told from gravity and offset; "
-            f"record a motion in both directions"
-        )
+        message = f"{record.name}: the {side} never reverses: friction cannot be told from gravity and offset; record a motion in both directions"
         return [Finding("warn", "no_reversal", message, channel)]
     return [Finding("ok", "reversal", f"{record.name}: the {side} moves in both directions", channel)]
 
@@ -177,10 +174,7 @@ def check_velocity(record: Record, gear_ratio: float | None) -> list[Finding]:
             findings.append(Finding("warn", "velocity_position", message, names[1]))
         elif abs(factor - 1.0) > _VELOCITY_TOLERANCE:
             why = _explain(factor, record.kind, gear_ratio)
-            message = (
-                f"{record.name}: {names[0]} changes {factor:.4g} times as fast as {names[1]} says ({why}): "
-                f"correct unit, sign or scale in [columns]"
-            )
+            message = f"{record.name}: {names[0]} changes {factor:.4g} times as fast as {names[1]} says ({why}): correct unit, sign or scale in [columns]"
             severity = "refuse" if abs(factor - 1.0) > 2.0 * _VELOCITY_TOLERANCE else "warn"
             findings.append(Finding(severity, "velocity_position", message, names[1]))
         else:
@@ -285,8 +279,7 @@ def check_ratio(record: Record, gear_ratio: float | None) -> list[Finding]:
     elif abs(ratio - 1.0) < _RATIO_TOLERANCE:
         doubt = " (both positions are on one side of the gear: gear_ratio = 1.0)"
     message = (
-        f"{record.name}: the positions show a gear ratio of {ratio:.5g}, {gear_ratio:g} is given{doubt}: "
-        f"correct gear_ratio, or sign and unit in [columns]"
+        f"{record.name}: the positions show a gear ratio of {ratio:.5g}, {gear_ratio:g} is given{doubt}: correct gear_ratio, or sign and unit in [columns]"
     )
     return [Finding("refuse", "gear_ratio", message, "link_position")]
 

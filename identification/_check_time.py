@@ -57,10 +57,7 @@ def check_stamps(record: Record) -> list[Finding]:
     row = int(repeated[0]) + 1
     share = repeated.size / len(record)
     if share > _REPEATED_LIMIT:
-        message = (
-            f"{record.name}: {100 * share:.0f} % of the stamps repeat the one before, first at {at(record, row)}: "
-            f"write time with more digits"
-        )
+        message = f"{record.name}: {100 * share:.0f} % of the stamps repeat the one before, first at {at(record, row)}: write time with more digits"
         return [Finding("refuse", "time_repeated", message, "time", row)]
     message = f"{record.name}: {repeated.size} repeated stamp(s), first at {at(record, row)}: the later row is dropped"
     return [Finding("repair", "time_repeated", message, "time", row)]

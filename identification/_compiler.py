@@ -23,8 +23,7 @@ CACHE_VARIABLE = "IDENTIFICATION_CACHE"
 COMPILER_VARIABLE = "IDENTIFICATION_CC"
 # No contraction to fused multiply-add: the compiled replay must equal the interpreted step. NaN keeps its meaning
 # (no -ffast-math). C90 lets CasADi's fmin and fmax become single instructions, hidden visibility lets them be inlined.
-_FLAGS = ("-O2", "-std=gnu90", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros",
-          "-fvisibility=hidden", "-shared")
+_FLAGS = ("-O2", "-std=gnu90", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fvisibility=hidden", "-shared")
 _TIMEOUT_SECONDS = 300.0
 
 

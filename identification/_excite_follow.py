@@ -63,9 +63,7 @@ class Follower:
         Runge-Kutta steps per sample.
     """
 
-    def __init__(
-        self, model: JointModel, dt: float, *, controller: Controller | None = None, substeps: int = 5
-    ) -> None:
+    def __init__(self, model: JointModel, dt: float, *, controller: Controller | None = None, substeps: int = 5) -> None:
         import casadi as ca
 
         from casadi_models.simulate import sampled_step

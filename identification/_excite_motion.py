@@ -107,9 +107,7 @@ def triangular(
     )  # fmt: skip
 
 
-def _half_cycle(
-    s: FloatArray, half: float, speed: float, reversal: float, limit: float
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _half_cycle(s: FloatArray, half: float, speed: float, reversal: float, limit: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """From -limit to limit: constant acceleration for reversal/2, constant speed, constant deceleration."""
     if reversal == 0:
         return np.full_like(s, speed), -limit + speed * s, np.zeros_like(s)
@@ -167,9 +165,7 @@ def sinusoidal(
     return Motion(t, position, velocity, acceleration, "sinusoidal", MappingProxyType(parameters))
 
 
-def _cycle(
-    s: FloatArray, speed: float, w: float, hold: float, amplitude: float, centre: float
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _cycle(s: FloatArray, speed: float, w: float, hold: float, amplitude: float, centre: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Periodic part from its lower turning point: quarter sine, hold, half sine, hold, quarter sine."""
     quarter = math.pi / (2 * w)
     half = 2 * quarter + hold
@@ -195,9 +191,7 @@ def _rendezvous_time(gap: float, speed: float) -> float:
     return c * abs(gap) / (speed * share)
 
 
-def _rendezvous(
-    t: FloatArray, start: float, gap: float, speed: float, lead: float
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _rendezvous(t: FloatArray, start: float, gap: float, speed: float, lead: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     c = _RENDEZVOUS_CONSTANTS
     tau = lead / c
     top = math.copysign(speed / (1 - math.exp(-c)), gap)

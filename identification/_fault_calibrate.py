@@ -82,10 +82,7 @@ def calibrate(rule: StructuredRule, pieces: Sequence[FloatArray]) -> None:
     top = np.max(np.abs(seen[:, :COUNT]), axis=0)
     res.limits = [max(f, settings.margin * float(t)) for f, t in zip(low, top, strict=True)]
     res.inverse = [1.0 / max(float(np.mean(seen[:, at] ** 2)), (low[at] / 8.0) ** 2) for at in ENERGY_RESIDUALS]
-    peaks = [
-        energy_peak(seen[:, at], inverse, settings.energy_drift)
-        for at, inverse in zip(ENERGY_RESIDUALS, res.inverse, strict=True)
-    ]
+    peaks = [energy_peak(seen[:, at], inverse, settings.energy_drift) for at, inverse in zip(ENERGY_RESIDUALS, res.inverse, strict=True)]
     res.energy_limits = [max(60.0, settings.energy_margin * peak) for peak in peaks]
     longest = max(round(WITHOUT_SECONDS / core.dt), 2 * rule.arm)
     for sensor in range(6):

@@ -110,9 +110,7 @@ class ObserverCore:
         motor = rates[1] + motor_gain * (drive + estimate[4] - carried)
         link = rates[3] + link_gain * (carried - estimate[4])
         following = ca.vertcat(step(after[:size], after[size:], drive), after[size:])
-        out = ca.vertcat(
-            following, drive + (1 - used[0]) * after[size], filled, innovation, motor, link, sprung, estimate
-        )
+        out = ca.vertcat(following, drive + (1 - used[0]) * after[size], filled, innovation, motor, link, sprung, estimate)
         return step, ca.Function("sample", [x, y, used, gain, gate], [ca.densify(out)])
 
     def _motor_gain(self) -> float:

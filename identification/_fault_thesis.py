@@ -24,7 +24,6 @@ from identification.errors import InputError
 FloatArray = npt.NDArray[np.float64]
 
 
-
 @final
 @dataclass(frozen=True)
 class ThesisSettings:

@@ -121,9 +121,7 @@ def _guess_one(name: str, file_unit: str | None, kind: str) -> tuple[str, str, s
     return quantity, _side(own) or _side(tokens), unit, f"{quantity} by " + ("its unit" if by_unit else "its name, unit assumed")
 
 
-def guess_columns(
-    names: Sequence[str], units: Mapping[str, str] | None = None, kind: str = "rotary"
-) -> tuple[Guess, ...]:
+def guess_columns(names: Sequence[str], units: Mapping[str, str] | None = None, kind: str = "rotary") -> tuple[Guess, ...]:
     """Propose a column map from names and units.
 
     Parameters

@@ -147,9 +147,7 @@ class HankelQR:
             If a value is NaN or infinite, or the shapes do not fit.
         """
         if u.ndim != 2 or y.ndim != 2 or u.shape[1] != self.inputs or y.shape[1] != self.outputs or len(u) != len(y):
-            raise InputError(
-                f"u has shape {u.shape} and y {y.shape}: give (samples, {self.inputs}) and (samples, {self.outputs})"
-            )
+            raise InputError(f"u has shape {u.shape} and y {y.shape}: give (samples, {self.inputs}) and (samples, {self.outputs})")
         if not len(u):
             return
         check_finite(u, f"record {self._records}: u", self._samples)
@@ -177,9 +175,7 @@ class HankelQR:
         The other's open record counts as closed.
         """
         if self._settings() != other._settings() or not np.array_equal(self.weights, other.weights):
-            raise InputError(
-                "accumulators with other channels, block rows, method or weights cannot be merged: make them alike"
-            )
+            raise InputError("accumulators with other channels, block rows, method or weights cannot be merged: make them alike")
         self._triangle.add(other._triangle.factor())
         self.rows += other.rows
         np.minimum(self._low, other._low, out=self._low)

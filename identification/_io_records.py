@@ -44,9 +44,7 @@ class ArraySource:
             raise InputError(f"u has {len(inputs)} records and y has {len(outputs)}: give as many of each")
         for index, (one, other) in enumerate(zip(inputs, outputs, strict=True)):
             if len(one) != len(other):
-                raise InputError(
-                    f"record {index}: u has {len(one)} samples and y has {len(other)}: cut both to the same time span"
-                )
+                raise InputError(f"record {index}: u has {len(one)} samples and y has {len(other)}: cut both to the same time span")
             if one.shape[1] != inputs[0].shape[1] or other.shape[1] != outputs[0].shape[1]:
                 raise InputError(f"record {index}: its channels differ from record 0: give all the same channels")
         self._inputs = inputs
@@ -108,8 +106,7 @@ class ChunkSource:
                 return
         if first < stop:
             raise InputError(
-                f"record {record} gave {first} samples when read again, {self.lengths[record]} before: "
-                "let its function start the reading anew at every call"
+                f"record {record} gave {first} samples when read again, {self.lengths[record]} before: let its function start the reading anew at every call"
             )
 
     def _chunks(self, record: int) -> Iterator[tuple[FloatArray, FloatArray]]:
@@ -124,10 +121,7 @@ def check_finite(values: FloatArray, name: str, first_sample: int) -> None:
     """Raise InputError at the first value that is NaN or infinite."""
     if not np.isfinite(values).all():
         row, channel = np.argwhere(~np.isfinite(values))[0]
-        raise InputError(
-            f"{name} channel {channel} holds {values[row, channel]} at sample {first_sample + row}: "
-            "repair or cut this part of the record"
-        )
+        raise InputError(f"{name} channel {channel} holds {values[row, channel]} at sample {first_sample + row}: repair or cut this part of the record")
 
 
 def check_varies(low: FloatArray, high: FloatArray, name: str) -> None:

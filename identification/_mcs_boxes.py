@@ -111,10 +111,7 @@ class BoxTree:
         """Evaluate along the lists and make the first boxes."""
         root_x = [places[s] for places, s in zip(self._lists, self._start, strict=True)]
         best = self._evaluate_lists(list(root_x))
-        opposite = [
-            lo if c - lo > hi - c else hi
-            for c, lo, hi in zip(root_x, self._evaluate.low, self._evaluate.high, strict=True)
-        ]
+        opposite = [lo if c - lo > hi - c else hi for c, lo, hi in zip(root_x, self._evaluate.low, self._evaluate.high, strict=True)]
         box: Leaf = (self._values[0][self._start[0]], 0, self._step, False, *root_x, *opposite, *[0] * (5 * self._n))
         level = 1
         spread = []
@@ -208,9 +205,7 @@ class BoxTree:
         lowest, highest, left = float("inf"), float("-inf"), True
         for j in range(1, last):
             at = places[j]
-            slope, curvature = slope_and_curvature(
-                at, values[j], places[j - 1], values[j - 1], places[j + 1], values[j + 1]
-            )
+            slope, curvature = slope_and_curvature(at, values[j], places[j - 1], values[j - 1], places[j + 1], values[j + 1])
             lo = (self._evaluate.low[i] if j == 1 else places[j - 1]) - at
             hi = (self._evaluate.high[i] if j == last - 1 else places[j + 1]) - at
             place, down = parabola_minimum(slope, curvature, lo, hi)

@@ -32,9 +32,7 @@ class Evaluator:
     every finite value so far, so that interpolation stays usable.
     """
 
-    def __init__(
-        self, fun: Callable[[FloatArray], Any], low: Vector, high: Vector, target: float, max_evaluations: int
-    ) -> None:
+    def __init__(self, fun: Callable[[FloatArray], Any], low: Vector, high: Vector, target: float, max_evaluations: int) -> None:
         self._fun = fun
         self.low = low
         self.high = high
@@ -106,6 +104,4 @@ class Evaluator:
             return float(value.item()) if isinstance(value, np.ndarray) else float(value)
         except (TypeError, ValueError):
             kind = f"an array of shape {value.shape}" if isinstance(value, np.ndarray) else f"{value!r}"
-            raise InputError(
-                f"mcs: the objective returned {kind} at x = {list(key)}; it must return one real number"
-            ) from None
+            raise InputError(f"mcs: the objective returned {kind} at x = {list(key)}; it must return one real number") from None

@@ -95,10 +95,7 @@ class LocalModel:
             Actual over predicted decrease; 0 without a decrease.
         """
         p = minimise_quadratic(self.g, self.hessian, low, high)
-        goal = [
-            min(max(c + s, lo), hi)
-            for c, s, lo, hi in zip(self.x, p, self._evaluate.low, self._evaluate.high, strict=True)
-        ]
+        goal = [min(max(c + s, lo), hi) for c, s, lo, hi in zip(self.x, p, self._evaluate.low, self._evaluate.high, strict=True)]
         p = [b - a for a, b in zip(self.x, goal, strict=True)]
         if not any(p):
             return False, 0.0
@@ -134,10 +131,7 @@ class LocalModel:
         if line.values[best] < self.f:
             alpha = line.alphas[best]
             self.f = line.values[best]
-            self.x = [
-                min(max(c + alpha * d, lo), hi)
-                for c, d, lo, hi in zip(self.x, p, self._evaluate.low, self._evaluate.high, strict=True)
-            ]
+            self.x = [min(max(c + alpha * d, lo), hi) for c, d, lo, hi in zip(self.x, p, self._evaluate.low, self._evaluate.high, strict=True)]
 
     def _sample(self, i: int, shift: float, k: int = -1, shift_k: float = 0.0) -> float:
         """Evaluate with one or two coordinates replaced and remember the best point seen."""
@@ -220,9 +214,7 @@ class LocalModel:
         """Expand the model around the best point seen."""
         if self._where is self.x:
             return
-        new = [
-            min(max(c, lo), hi) for c, lo, hi in zip(self._where, self._evaluate.low, self._evaluate.high, strict=True)
-        ]
+        new = [min(max(c, lo), hi) for c, lo, hi in zip(self._where, self._evaluate.low, self._evaluate.high, strict=True)]
         shift = [b - a for a, b in zip(self.x, new, strict=True)]
         for k in processed:
             row = self.hessian[k]
@@ -266,10 +258,7 @@ class LocalSearch:
         low, high = self._evaluate.low, self._evaluate.high
         n = len(start)
         # the point of the box with the smallest absolute values sets the scale of the first radius
-        radius = [
-            min(hi - lo, 0.25 * (1.0 + abs(c - min(max(0.0, lo), hi))))
-            for c, lo, hi in zip(start, low, high, strict=True)
-        ]
+        radius = [min(hi - lo, 0.25 * (1.0 + abs(c - min(max(0.0, lo), hi)))) for c, lo, hi in zip(start, low, high, strict=True)]
         model = LocalModel(self._evaluate, self._pattern, start, f_start)
         model.coordinate_search()
         x_old = model.x

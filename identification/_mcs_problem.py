@@ -94,19 +94,12 @@ def _bounds(bounds: Any) -> tuple[Vector, Vector]:
     for i, (lo, hi) in enumerate(pairs.tolist()):
         if not (math.isfinite(lo) and math.isfinite(hi)):
             raise InputError(
-                f"mcs: bounds of coordinate {i} are ({lo}, {hi}); the search needs finite bounds, "
-                "choose the range in which a solution makes sense"
+                f"mcs: bounds of coordinate {i} are ({lo}, {hi}); the search needs finite bounds, choose the range in which a solution makes sense"
             )
         if not lo < hi:
-            raise InputError(
-                f"mcs: bounds of coordinate {i} are ({lo}, {hi}); low must be below high, "
-                "leave a coordinate with a known value out of the search"
-            )
+            raise InputError(f"mcs: bounds of coordinate {i} are ({lo}, {hi}); low must be below high, leave a coordinate with a known value out of the search")
         if not math.isfinite(hi - lo) or hi - lo < max(_NARROWEST * max(abs(lo), abs(hi)), _TINY):
-            raise InputError(
-                f"mcs: bounds of coordinate {i} are ({lo}, {hi}); the width is beyond floating point, "
-                "shift or scale the coordinate"
-            )
+            raise InputError(f"mcs: bounds of coordinate {i} are ({lo}, {hi}); the width is beyond floating point, shift or scale the coordinate")
     return pairs[:, 0].tolist(), pairs[:, 1].tolist()
 
 
@@ -119,15 +112,11 @@ def _lists(start: Any, low: Vector, high: Vector) -> tuple[list[Vector], list[in
         if start == "inner":
             sixth = [(hi - lo) / 6.0 for lo, hi in zip(low, high, strict=True)]
             return [[lo + d, lo + 3.0 * d, hi - d] for lo, hi, d in zip(low, high, sixth, strict=True)], [1] * n
-        raise InputError(
-            f"mcs: options.start is {start!r}; give 'midpoint', 'inner', a point or one list per coordinate"
-        )
+        raise InputError(f"mcs: options.start is {start!r}; give 'midpoint', 'inner', a point or one list per coordinate")
     try:
         rows = [np.asarray(row, dtype=float) for row in start]
     except (TypeError, ValueError):
-        raise InputError(
-            "mcs: options.start cannot be read; give a point or one list of numbers per coordinate"
-        ) from None
+        raise InputError("mcs: options.start cannot be read; give a point or one list of numbers per coordinate") from None
     if len(rows) != n:
         raise InputError(f"mcs: options.start has {len(rows)} entries for {n} coordinates")
     if all(row.ndim == 0 for row in rows):

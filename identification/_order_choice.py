@@ -132,9 +132,7 @@ def _spans(lengths: tuple[int, ...], start: int, stop: int) -> list[tuple[int, i
     return spans
 
 
-def _fit(
-    source: Source, spans: list[tuple[int, int, int]], matrices: tuple[FloatArray, FloatArray], weights: FloatArray
-) -> ResponseFit:
+def _fit(source: Source, spans: list[tuple[int, int, int]], matrices: tuple[FloatArray, FloatArray], weights: FloatArray) -> ResponseFit:
     fit = ResponseFit(*matrices, source.channels[0])
     for index, first, last in spans:
         for u, y in source.pieces(index, first, last):

@@ -95,9 +95,7 @@ def prediction_error_fit(records: Records, orders: Orders) -> tuple[Polynomials,
 
     problem = _Problem(records, orders)
     begin = min((problem.pack(one) for one in _starts(records, orders, start)), key=problem.cost)
-    solved: Any = least_squares(
-        problem.residual, begin, jac=problem.jacobian, method="trf", x_scale="jac", max_nfev=_EVALUATIONS
-    )
+    solved: Any = least_squares(problem.residual, begin, jac=problem.jacobian, method="trf", x_scale="jac", max_nfev=_EVALUATIONS)
     return problem.unpack(solved.x)[0], bool(solved.status > 0)
 
 
@@ -173,9 +171,7 @@ class _Problem:
         )
         return self._cache
 
-    def _record(
-        self, index: int, data: tuple[FloatArray, FloatArray], at: tuple[Polynomials, FloatArray], derivative: bool
-    ) -> tuple[FloatArray, FloatArray]:
+    def _record(self, index: int, data: tuple[FloatArray, FloatArray], at: tuple[Polynomials, FloatArray], derivative: bool) -> tuple[FloatArray, FloatArray]:
         (u, y), (model, initial) = data, at
         n, free, count = self._orders.order, self._orders.initial, len(y)
         one = np.ones(1)
@@ -212,9 +208,7 @@ def _arx(records: Records, orders: Orders, prefilter: FloatArray | None = None) 
     return _from_linear(np.linalg.lstsq(np.vstack(rows), np.concatenate(targets), rcond=None)[0], orders)
 
 
-def _arx_rows(
-    u: FloatArray, y: FloatArray, orders: Orders, prefilter: FloatArray | None
-) -> tuple[FloatArray, FloatArray]:
+def _arx_rows(u: FloatArray, y: FloatArray, orders: Orders, prefilter: FloatArray | None) -> tuple[FloatArray, FloatArray]:
     if prefilter is not None:
         u, y = _filter(np.ones(1), prefilter, u), _filter(np.ones(1), prefilter, y)
     skip = orders.order + orders.delay

@@ -90,8 +90,9 @@ def _trigger(function: Any, arguments: list[FloatArray], results: list[FloatArra
 class Engine:
     """State, configuration and functions of one estimator."""
 
-    def __init__(self, theta0: FloatArray, scale: FloatArray, outputs: int, method: str, settings: Settings,
-                 walk: FloatArray | None, noise: FloatArray | None) -> None:
+    def __init__(
+        self, theta0: FloatArray, scale: FloatArray, outputs: int, method: str, settings: Settings, walk: FloatArray | None, noise: FloatArray | None
+    ) -> None:
         n = theta0.size
         self.freeze, self.walking = settings.freeze, walk is not None or method == "random_walk"
         self._formulas = formulas(n, outputs, method, self.freeze, self.walking)
@@ -101,13 +102,11 @@ class Engine:
         self._fast_next, self._slow_next = np.zeros_like(self.fast), np.zeros_like(self.slow)
         self.y, self.h = np.zeros(outputs), np.zeros((outputs, n))
         self.theta, self._error, self._status = np.zeros(n), np.zeros(outputs), np.zeros(2)
-        flags = self.slow[:n + 2 * outputs]
+        flags = self.slow[: n + 2 * outputs]
         out = [self.theta, self._error, self._status]
         rows = self.h.reshape(-1)
-        self._step = _trigger(self._formulas.step, [self.fast, flags, self.config, self.y, rows],
-                              [self._fast_next, *out])
-        self._check = _trigger(self._formulas.check, [self._fast_next, self.slow, self.config],
-                               [self.fast, self._slow_next])
+        self._step = _trigger(self._formulas.step, [self.fast, flags, self.config, self.y, rows], [self._fast_next, *out])
+        self._check = _trigger(self._formulas.check, [self._fast_next, self.slow, self.config], [self.fast, self._slow_next])
         self._native: Any = None
         self._native_step: Callable[[], None] | None = None
         self._due = int(layout.fast["due"].start)
@@ -184,17 +183,18 @@ class Engine:
             for first in range(0, y.shape[0], chunk):
                 row = first // stride
                 part = slice(first, min(first + chunk, y.shape[0]))
-                self._native(part.stop - first, stride, *(item.ctypes.data for item in (
-                    y[part], h[part], self.fast, self.slow, self.config, theta[row:], error[row:], status[row:])))
+                self._native(
+                    part.stop - first,
+                    stride,
+                    *(item.ctypes.data for item in (y[part], h[part], self.fast, self.slow, self.config, theta[row:], error[row:], status[row:])),
+                )
             self.theta[:] = self.part("fast", "theta") * self.part("config", "scale")
         else:
             self._interpret(y, h, stride, theta, error, status)
         code = status[:, 1].astype(np.int64)
-        return Trajectory(theta, error, status[:, 0].copy(), (code & 1) > 0, (code & 2) > 0, (code & 4) > 0,
-                          outcome, note)
+        return Trajectory(theta, error, status[:, 0].copy(), (code & 1) > 0, (code & 2) > 0, (code & 4) > 0, outcome, note)
 
-    def _interpret(self, y: FloatArray, h: FloatArray, stride: int, theta: FloatArray, error: FloatArray,
-                   status: FloatArray) -> None:
+    def _interpret(self, y: FloatArray, h: FloatArray, stride: int, theta: FloatArray, error: FloatArray, status: FloatArray) -> None:
         native, self._native_step = self._native_step, None
         for k in range(y.shape[0]):
             self.y[:] = y[k]

@@ -111,8 +111,7 @@ class Settings:
             value = getattr(self, field.name)
             if not isinstance(value, (int, float)) or not math.isfinite(value) or value < 0:
                 raise InputError(f"RecursiveLeastSquares: {field.name} must be a finite number >= 0, not {value!r}")
-        for name in ("sample_time", "alarm_samples", "bell_width", "polynomial_width", "covariance_limit",
-                     "window_seconds", "rank_seconds", "noise_seconds"):
+        for name in ("sample_time", "alarm_samples", "bell_width", "polynomial_width", "covariance_limit", "window_seconds", "rank_seconds", "noise_seconds"):
             if getattr(self, name) <= 0:
                 raise InputError(f"RecursiveLeastSquares: {name} must be positive, not {getattr(self, name)!r}")
         for name in ("forgetting", "forgetting_low", "schedule_start", "schedule_rate"):
@@ -193,33 +192,96 @@ class Layout:
     def __init__(self, n: int, m: int) -> None:
         triangle = n * (n - 1) // 2
         self.n, self.m = n, m
-        self.fast = Block([
-            ("theta", n), ("d", n), ("u", triangle), ("noise", m), ("innovation", m), ("power", m),
-            ("error", m), ("sum", m), ("squares", m), ("forgetting", 1), ("samples", 1), ("skipped", 1),
-            ("alarm", 1), ("pause", 1), ("alarms", 1), ("low", 1), ("resets", 1), ("since_check", 1), ("due", 1),
-            ("info", triangle), ("energy", m * n), ("mean", m * n),
-        ])
-        self.slow = Block([
-            ("excited", n), ("live", m), ("inflation", m), ("kept", n),
-            ("whole", m), ("parts", m), ("energy", 2 * m * n), ("energy_before", 2 * m * n),
-            ("energy_best", m * n), ("swing_best", m * n), ("in_block", 1), ("length_before", 1),
-            ("info", triangle + n), ("info_before", triangle + n), ("info_best", n),
-            ("in_rank", 1), ("rank_before", 1),
-        ])
-        self.config = Block([
-            ("scale", n), ("theta0", n), ("schedule_start", 1), ("free", n), ("walk", n), ("walk_alarm", n), ("start", n), ("limit", n),
-            ("enabled", m), ("noise_given", m), ("noise_known", m), ("noise_rate", 1),
-            ("floor", m), ("floor_share", 1),
-            ("alarm_freedom", 1), ("alarm_normal", 1), ("alarm_rate", 1), ("alarm_length", 1), ("pause_length", 1),
-            ("low", 1), ("beta", 1), ("rate", 1), ("forgetting", 1), ("end", 1), ("poly", POLYNOMIAL_DEGREE + 1),
-            ("reset_under", 1), ("reset_length", 1),
-            ("check_length", 1), ("block_length", 1), ("rank_length", 1), ("lost_share", 1), ("rank_share", 1),
-            ("clear_info", 1), ("decay", 1),
-        ])
+        self.fast = Block(
+            [
+                ("theta", n),
+                ("d", n),
+                ("u", triangle),
+                ("noise", m),
+                ("innovation", m),
+                ("power", m),
+                ("error", m),
+                ("sum", m),
+                ("squares", m),
+                ("forgetting", 1),
+                ("samples", 1),
+                ("skipped", 1),
+                ("alarm", 1),
+                ("pause", 1),
+                ("alarms", 1),
+                ("low", 1),
+                ("resets", 1),
+                ("since_check", 1),
+                ("due", 1),
+                ("info", triangle),
+                ("energy", m * n),
+                ("mean", m * n),
+            ]
+        )
+        self.slow = Block(
+            [
+                ("excited", n),
+                ("live", m),
+                ("inflation", m),
+                ("kept", n),
+                ("whole", m),
+                ("parts", m),
+                ("energy", 2 * m * n),
+                ("energy_before", 2 * m * n),
+                ("energy_best", m * n),
+                ("swing_best", m * n),
+                ("in_block", 1),
+                ("length_before", 1),
+                ("info", triangle + n),
+                ("info_before", triangle + n),
+                ("info_best", n),
+                ("in_rank", 1),
+                ("rank_before", 1),
+            ]
+        )
+        self.config = Block(
+            [
+                ("scale", n),
+                ("theta0", n),
+                ("schedule_start", 1),
+                ("free", n),
+                ("walk", n),
+                ("walk_alarm", n),
+                ("start", n),
+                ("limit", n),
+                ("enabled", m),
+                ("noise_given", m),
+                ("noise_known", m),
+                ("noise_rate", 1),
+                ("floor", m),
+                ("floor_share", 1),
+                ("alarm_freedom", 1),
+                ("alarm_normal", 1),
+                ("alarm_rate", 1),
+                ("alarm_length", 1),
+                ("pause_length", 1),
+                ("low", 1),
+                ("beta", 1),
+                ("rate", 1),
+                ("forgetting", 1),
+                ("end", 1),
+                ("poly", POLYNOMIAL_DEGREE + 1),
+                ("reset_under", 1),
+                ("reset_length", 1),
+                ("check_length", 1),
+                ("block_length", 1),
+                ("rank_length", 1),
+                ("lost_share", 1),
+                ("rank_share", 1),
+                ("clear_info", 1),
+                ("decay", 1),
+            ]
+        )
 
 
-def fill_config(layout: Layout, method: str, theta0: FloatArray, scale: FloatArray, settings: Settings, walk: FloatArray | None,
-                noise: FloatArray | None) -> FloatArray:
+def fill_config(
+    layout: Layout, method: str, theta0: FloatArray, scale: FloatArray, settings: Settings, walk: FloatArray | None, noise: FloatArray | None
+) -> FloatArray:
     """The `config` vector: `walk` (R1) and `noise` (R2) are per-sample variances in user units, or None."""
     config, at = np.zeros(layout.config.size), layout.config
     step = settings.sample_time

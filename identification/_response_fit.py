@@ -181,9 +181,7 @@ class ResponseFit:
         return np.ascontiguousarray(states.transpose(1, 2, 0, 3))
 
 
-def simulate(
-    a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, u: FloatArray, x0: FloatArray | None = None
-) -> FloatArray:
+def simulate(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, u: FloatArray, x0: FloatArray | None = None) -> FloatArray:
     """Response of a discrete state-space model, block by block.
 
     Parameters

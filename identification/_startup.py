@@ -69,8 +69,9 @@ class Startup:
         return f"{self.outcome.value}{names}"
 
 
-def solve_window(y: FloatArray, h: FloatArray, theta0: FloatArray, scale: FloatArray, names: tuple[str, ...], *,
-                 limit: float, noise: FloatArray | None) -> Startup:
+def solve_window(
+    y: FloatArray, h: FloatArray, theta0: FloatArray, scale: FloatArray, names: tuple[str, ...], *, limit: float, noise: FloatArray | None
+) -> Startup:
     """Least squares of a window by SVD, (3.47) to (3.49), without the parameters it cannot carry.
 
     Parameters
@@ -116,10 +117,18 @@ def solve_window(y: FloatArray, h: FloatArray, theta0: FloatArray, scale: FloatA
         place = np.flatnonzero(free)
         part = (vt.T / (1.0 + sigma**2)) @ vt
         covariance[np.ix_(place, place)] = part * np.outer(scale[place], scale[place])
-    outcome = (StartupOutcome.FULL_RANK if not removed
-               else StartupOutcome.RANK_DEFICIENT if free.any() else StartupOutcome.NOTHING_DETERMINED)
-    return Startup(theta, covariance, table, tuple(names[i] for i in removed), tuple(removed),
-                   _variance(y - h @ theta, y, int(free.sum())), int(good.sum()), int((~good).sum()), outcome)
+    outcome = StartupOutcome.FULL_RANK if not removed else StartupOutcome.RANK_DEFICIENT if free.any() else StartupOutcome.NOTHING_DETERMINED
+    return Startup(
+        theta,
+        covariance,
+        table,
+        tuple(names[i] for i in removed),
+        tuple(removed),
+        _variance(y - h @ theta, y, int(free.sum())),
+        int(good.sum()),
+        int((~good).sum()),
+        outcome,
+    )
 
 
 def _weakest(matrix: FloatArray, vt: FloatArray) -> FloatArray:

@@ -14,8 +14,7 @@ _SHARE_LOW = 1e-10  # regularisation of the information matrix scaled to unit di
 
 def check_function(layout: Layout, freeze: bool, walking: bool) -> Any:
     """Every few samples: process noise R1, and what the sliding information matrix still carries."""
-    symbols = [ca.SX.sym("fast", layout.fast.size), ca.SX.sym("slow", layout.slow.size),
-               ca.SX.sym("config", layout.config.size)]
+    symbols = [ca.SX.sym("fast", layout.fast.size), ca.SX.sym("slow", layout.slow.size), ca.SX.sym("config", layout.config.size)]
     fast, slow = Parts(symbols[0], layout.fast), Parts(symbols[1], layout.slow)
     config = Parts(symbols[2], layout.config)
     new_fast, new_slow = Parts(symbols[0], layout.fast), Parts(symbols[1], layout.slow)
@@ -25,8 +24,7 @@ def check_function(layout: Layout, freeze: bool, walking: bool) -> Any:
     if walking:
         _walk(layout, fast, config, new_slow["excited"], new_fast)
     new_fast.values.update(since_check=[ca.SX(0)], due=[ca.SX(0)])
-    return ca.Function("rls_check", symbols, [new_fast.joined(), new_slow.joined()],
-                       ["fast", "slow", "config"], ["fast_next", "slow_next"])
+    return ca.Function("rls_check", symbols, [new_fast.joined(), new_slow.joined()], ["fast", "slow", "config"], ["fast_next", "slow_next"])
 
 
 def _walk(layout: Layout, fast: Parts, config: Parts, excited: list[SX], new_fast: Parts) -> None:
@@ -64,10 +62,9 @@ def _excitation(layout: Layout, fast: Parts, slow: Parts, config: Parts, new_fas
     samples = fast["since_check"][0]
     sums, length = _window("energy", [*fast["energy"], *fast["mean"]], samples, slow, config, new_slow)
     given = [select(config["noise_known"][o], 1.0 / ca.fmax(config["noise_given"][o], 1e-30), 1.0) for o in range(m)]
-    energy = sums[:m * n]
+    energy = sums[: m * n]
     # Standstill under load leaves constant regressors: they tell one direction only, known since long.
-    swing = [ca.fmax(0.0, energy[k] - given[k // n] * sums[m * n + k] ** 2 / length - 1e-12 * energy[k])
-             for k in range(m * n)]
+    swing = [ca.fmax(0.0, energy[k] - given[k // n] * sums[m * n + k] ** 2 / length - 1e-12 * energy[k]) for k in range(m * n)]
     decay = select(total(slow["live"]) > 0, config["decay"][0], 1.0)
     energy_best = [ca.fmax(decay * old, now / length) for old, now in zip(slow["energy_best"], energy, strict=True)]
     swing_best = [ca.fmax(decay * old, now / length) for old, now in zip(slow["swing_best"], swing, strict=True)]
@@ -78,45 +75,37 @@ def _excitation(layout: Layout, fast: Parts, slow: Parts, config: Parts, new_fas
         clear = length * config["clear_info"][0] * noise
         places = range(o * n, o * n + n)
         known = [(swing_best[k] > 0) * free[k - o * n] for k in places]
-        swings = [known[k - o * n] * ca.logic_or(swing[k] >= length * share * swing_best[k], swing[k] >= clear)
-                  for k in places]
-        moves = [moves[k - o * n] + (energy_best[k] > 0) * ca.logic_or(
-            energy[k] >= length * share * energy_best[k], energy[k] >= clear) for k in places]
+        swings = [known[k - o * n] * ca.logic_or(swing[k] >= length * share * swing_best[k], swing[k] >= clear) for k in places]
+        moves = [moves[k - o * n] + (energy_best[k] > 0) * ca.logic_or(energy[k] >= length * share * energy_best[k], energy[k] >= clear) for k in places]
         live.append(ca.logic_or(2.0 * total(swings) > total(known), total(known) <= 0))
     diagonal = [total([fast["energy"][o * n + i] for o in range(m)]) for i in range(n)]
     # Standstill tells nothing of the rank: then the matrix waits.
     weight = total(live) > 0
-    info, span = _window("info", [weight * item for item in [*fast["info"], *diagonal]], weight * samples, slow, config,
-                         new_slow)
+    info, span = _window("info", [weight * item for item in [*fast["info"], *diagonal]], weight * samples, slow, config, new_slow)
     kept, info_best = _rank(layout, info, span, slow, config, decay)
     unseen = [total([energy_best[o * n + i] for o in range(m)]) <= 0 for i in range(n)]
     excited = [ca.logic_or(kept[i] * (moves[i] > 0), unseen[i]) for i in range(n)]
-    new_slow.values.update(live=live, excited=excited, kept=kept, energy_best=energy_best, swing_best=swing_best,
-                           info_best=info_best)
+    new_slow.values.update(live=live, excited=excited, kept=kept, energy_best=energy_best, swing_best=swing_best, info_best=info_best)
     zero = [ca.SX(0)]
     new_fast.values.update(info=zero * len(fast["info"]), energy=zero * (m * n), mean=zero * (m * n))
 
 
-def _window(name: str, new: list[SX], samples: SX, slow: Parts, config: Parts,
-            new_slow: Parts) -> tuple[list[SX], SX]:
+def _window(name: str, new: list[SX], samples: SX, slow: Parts, config: Parts, new_slow: Parts) -> tuple[list[SX], SX]:
     """Adds sums to a window of two blocks, moves on where the second is full; the window's sums and its length."""
-    inside, before, full = (("in_block", "length_before", "block_length") if name == "energy"
-                            else ("in_rank", "rank_before", "rank_length"))
+    inside, before, full = ("in_block", "length_before", "block_length") if name == "energy" else ("in_rank", "rank_before", "rank_length")
     block = [a + b for a, b in zip(slow[name], new, strict=True)]
     length = slow[inside][0] + samples
     sums = [a + b for a, b in zip(block, slow[f"{name}_before"], strict=True)]
     moves = length >= config[full][0]
     stays = ca.logic_not(moves)
     new_slow.values[name] = [where(stays, item) for item in block]
-    new_slow.values[f"{name}_before"] = [select(moves, now, old)
-                                         for now, old in zip(block, slow[f"{name}_before"], strict=True)]
+    new_slow.values[f"{name}_before"] = [select(moves, now, old) for now, old in zip(block, slow[f"{name}_before"], strict=True)]
     new_slow.values[inside] = [where(stays, length)]
     new_slow.values[before] = [select(moves, length, slow[before][0])]
     return sums, ca.fmax(1.0, length + slow[before][0])
 
 
-def _rank(layout: Layout, info: list[SX], span: SX, slow: Parts, config: Parts,
-          decay: SX) -> tuple[list[SX], list[SX]]:
+def _rank(layout: Layout, info: list[SX], span: SX, slow: Parts, config: Parts, decay: SX) -> tuple[list[SX], list[SX]]:
     """Which parameters the information matrix can tell apart, and the best information so far.
 
     One parameter leaves per check, the one that has lost most: the others are then judged without it. What is
@@ -124,7 +113,7 @@ def _rank(layout: Layout, info: list[SX], span: SX, slow: Parts, config: Parts,
     """
     n = layout.n
     kept = [slow["kept"][i] * config["free"][i] for i in range(n)]
-    diagonal = info[n * (n - 1) // 2:]
+    diagonal = info[n * (n - 1) // 2 :]
     root = [where(item > 0, 1.0 / ca.sqrt(ca.fmax(item, 1e-300))) for item in diagonal]
     scaled = {(i, j): info[j * (j - 1) // 2 + i] * root[i] * root[j] for j in range(n) for i in range(j)}
     lower: dict[tuple[int, int], SX] = {}
@@ -148,8 +137,10 @@ def _rank(layout: Layout, info: list[SX], span: SX, slow: Parts, config: Parts,
     for i in range(n):
         lowest = ca.fmin(lowest, select(kept[i] * (best[i] > 0), share[i], 2.0))
     limit = config["rank_share"][0]
-    after = [select(kept[i], ca.logic_not((share[i] <= lowest) * (share[i] < limit) * (best[i] > 0)),
-                    config["free"][i] * (share[i] >= 4.0 * limit)) for i in range(n)]
+    after = [
+        select(kept[i], ca.logic_not((share[i] <= lowest) * (share[i] < limit) * (best[i] > 0)), config["free"][i] * (share[i] >= 4.0 * limit))
+        for i in range(n)
+    ]
     # A parameter held by the user counts as kept, so that it moves at once when it is released.
     return [ca.logic_or(after[i], ca.logic_not(config["free"][i])) for i in range(n)], best
 

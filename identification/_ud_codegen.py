@@ -84,10 +84,16 @@ def replay_source(formula: Formulas) -> str:
         generator.add(function)
     layout = formula.layout
     sizes = {
-        "FAST": layout.fast.size, "SLOW": layout.slow.size, "N": layout.n, "M": layout.m, "HM": layout.n * layout.m,
+        "FAST": layout.fast.size,
+        "SLOW": layout.slow.size,
+        "N": layout.n,
+        "M": layout.m,
+        "HM": layout.n * layout.m,
         "DUE": layout.fast["due"].start,
-        "W": 1 + max(f.sz_w() for f in functions), "IW": 1 + max(f.sz_iw() for f in functions),
-        "ARG": 8 + max(f.sz_arg() for f in functions), "RES": 8 + max(f.sz_res() for f in functions),
+        "W": 1 + max(f.sz_w() for f in functions),
+        "IW": 1 + max(f.sz_iw() for f in functions),
+        "ARG": 8 + max(f.sz_arg() for f in functions),
+        "RES": 8 + max(f.sz_res() for f in functions),
     }
     loop = _REPLAY
     for name, value in sizes.items():

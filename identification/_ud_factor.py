@@ -50,8 +50,7 @@ class Parts:
     """Scalars of a flat symbol by name."""
 
     def __init__(self, symbol: SX, block: Block) -> None:
-        self.values = {name: ca.vertsplit(symbol[where]) if where.stop > where.start else []
-                       for name, where in block.parts.items()}
+        self.values = {name: ca.vertsplit(symbol[where]) if where.stop > where.start else [] for name, where in block.parts.items()}
 
     def __getitem__(self, name: str) -> list[SX]:
         found: list[SX] = self.values[name]
@@ -78,8 +77,7 @@ class Factor:
 
     def diagonal(self) -> list[SX]:
         """diag(P)."""
-        return [self.d[i] + total([self.u[i, j] ** 2 * self.d[j] for j in range(i + 1, self.n)])
-                for i in range(self.n)]
+        return [self.d[i] + total([self.u[i, j] ** 2 * self.d[j] for j in range(i + 1, self.n)]) for i in range(self.n)]
 
     def grow(self, growth: SX, which: list[SX], keep: SX) -> None:
         """P := T P T with T = sqrt(growth) where `which` is 1, else 1; without its off-diagonal where keep is 0."""

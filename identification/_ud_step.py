@@ -38,8 +38,7 @@ def _forgetting(method: str, fast: Parts, config: Parts, relative_error: SX) -> 
 class _Sample:
     """What one sample brings: checked values, errors, which rows and parameters take part."""
 
-    def __init__(self, layout: Layout, fast: Parts, flags: list[SX], config: Parts, y: list[SX],
-                 rows: list[SX]) -> None:
+    def __init__(self, layout: Layout, fast: Parts, flags: list[SX], config: Parts, y: list[SX], rows: list[SX]) -> None:
         n, m = layout.n, layout.m
         enabled = config["enabled"]
         scaled = [[rows[o * n + i] * config["scale"][i] for i in range(n)] for o in range(m)]
@@ -54,7 +53,7 @@ class _Sample:
         self.seen = [self.valid * enabled[o] for o in range(m)]
         self.used = [self.seen[o] * flags[n + o] for o in range(m)]
         self.moving = [config["free"][i] * flags[i] for i in range(n)]
-        self.inflation = flags[n + m:]
+        self.inflation = flags[n + m :]
         self.acts = total(self.used) > 0
 
     def relative_error(self, fast: Parts, config: Parts) -> SX:
@@ -87,8 +86,7 @@ def _forget(factor: Factor, method: str, fast: Parts, config: Parts, sample: _Sa
         factor.d = [select(keep, d, start) for d, start in zip(factor.d, config["start"], strict=True)]
 
 
-def _correct(layout: Layout, factor: Factor, fast: Parts, config: Parts, sample: _Sample,
-             new: Parts) -> SX:
+def _correct(layout: Layout, factor: Factor, fast: Parts, config: Parts, sample: _Sample, new: Parts) -> SX:
     """The sequential scalar updates of all outputs; tells whether an innovation is over its limit."""
     theta = list(fast["theta"])
     count = fast["samples"][0] - fast["skipped"][0]
@@ -102,8 +100,7 @@ def _correct(layout: Layout, factor: Factor, fast: Parts, config: Parts, sample:
         error = used * (sample.y[o] - dot(sample.h[o], theta)) if o else used * sample.error[o]
         square = sample.y[o] ** 2
         first = 1e-4 * (square + error**2)
-        noise = select(config["noise_known"][o], config["noise_given"][o],
-                       select(fast["noise"][o] > 0, fast["noise"][o], first + _NOISE_LOW))
+        noise = select(config["noise_known"][o], config["noise_given"][o], select(fast["noise"][o] > 0, fast["noise"][o], first + _NOISE_LOW))
         # Correlated noise (filtered measurements) tells less per sample than its variance says.
         used_noise = noise * select(config["noise_known"][o], 1.0, sample.inflation[o])
         gain, expected = factor.measure(h, used_noise)
@@ -111,8 +108,7 @@ def _correct(layout: Layout, factor: Factor, fast: Parts, config: Parts, sample:
         theta = [theta[i] + sample.moving[i] * (gain[i] * step) for i in range(layout.n)]
         expected = ca.fmax(expected - used_noise, 0.0) + noise
         normalised = error * error / expected
-        power = fast["power"][o] + used * ca.fmax(config["noise_rate"][0], 1.0 / (1.0 + count)) * (
-            square - fast["power"][o])
+        power = fast["power"][o] + used * ca.fmax(config["noise_rate"][0], 1.0 / (1.0 + count)) * (square - fast["power"][o])
         learned = noise * (1.0 + used * calm * quick * (ca.fmin(normalised, _NOISE_CLIP) - 1.0))
         known = ca.logic_or(fast["noise"][o] > 0, first * used > 0)
         noises.append(where(known, ca.fmax(learned, 1e-12 * power + _NOISE_LOW)))
@@ -122,13 +118,11 @@ def _correct(layout: Layout, factor: Factor, fast: Parts, config: Parts, sample:
         limit = _alarm_limit(config, sample.inflation[o])
         # Three samples at least: no single outlier fires the alarm.
         most = limit / (3.0 * config["alarm_rate"][0])
-        average = fast["innovation"][o] + used * config["alarm_rate"][0] * (
-            ca.fmin(normalised, most) - fast["innovation"][o])
+        average = fast["innovation"][o] + used * config["alarm_rate"][0] * (ca.fmin(normalised, most) - fast["innovation"][o])
         innovations.append(average)
         over.append(used * (average > limit))
         powers.append(power)
-    new.values.update(theta=theta, noise=noises, innovation=innovations, power=powers, sum=sums, squares=squares,
-                      d=factor.d, u=factor.packed())
+    new.values.update(theta=theta, noise=noises, innovation=innovations, power=powers, sum=sums, squares=squares, d=factor.d, u=factor.packed())
     return total(over) > 0
 
 
@@ -171,8 +165,13 @@ def _collect(layout: Layout, fast: Parts, config: Parts, sample: _Sample, new: P
 def step_function(layout: Layout, method: str, freeze: bool) -> Any:
     """The step of one sample."""
     n, m = layout.n, layout.m
-    symbols = [ca.SX.sym("fast", layout.fast.size), ca.SX.sym("flags", n + 2 * m),
-               ca.SX.sym("config", layout.config.size), ca.SX.sym("y", m), ca.SX.sym("H", n * m)]
+    symbols = [
+        ca.SX.sym("fast", layout.fast.size),
+        ca.SX.sym("flags", n + 2 * m),
+        ca.SX.sym("config", layout.config.size),
+        ca.SX.sym("y", m),
+        ca.SX.sym("H", n * m),
+    ]
     fast, config = Parts(symbols[0], layout.fast), Parts(symbols[2], layout.config)
     new = Parts(symbols[0], layout.fast)
     flags = ca.vertsplit(symbols[1])
@@ -196,5 +195,10 @@ def step_function(layout: Layout, method: str, freeze: bool) -> Any:
     theta = ca.vertcat(*(t * s for t, s in zip(new["theta"], config["scale"], strict=True)))
     frozen = ca.logic_or(total(flags[:n]) < n, ca.logic_not(sample.acts))
     status = ca.vertcat(new["forgetting"][0], ca.logic_not(sample.valid) + 2.0 * (new["alarm"][0] > 0) + 4.0 * frozen)
-    return ca.Function("rls_step", symbols, [new.joined(), theta, ca.vertcat(*errors), status],
-                       ["fast", "flags", "config", "y", "H"], ["fast_next", "theta", "error", "status"])
+    return ca.Function(
+        "rls_step",
+        symbols,
+        [new.joined(), theta, ca.vertcat(*errors), status],
+        ["fast", "flags", "config", "y", "H"],
+        ["fast_next", "theta", "error", "status"],
+    )

@@ -88,14 +88,11 @@ class Projection:
         Evaluations allowed; :class:`BudgetSpent` is raised beyond.
     """
 
-    def __init__(
-        self, model: SeparableModel, y: FloatArray, signals: FloatArray, weights: FloatArray, budget: int
-    ) -> None:
+    def __init__(self, model: SeparableModel, y: FloatArray, signals: FloatArray, weights: FloatArray, budget: int) -> None:
         good = np.isfinite(y).all(axis=1) & np.isfinite(signals).all(axis=1)
         if int(good.sum()) * model.outputs <= len(model.coefficients) + len(model.shapes):
             raise InputError(
-                f"two-step: {int(good.sum())} usable samples for {len(model.coefficients) + len(model.shapes)} "
-                "parameters; give a longer record without NaN"
+                f"two-step: {int(good.sum())} usable samples for {len(model.coefficients) + len(model.shapes)} parameters; give a longer record without NaN"
             )
         self.model = model
         self.y, self.signals, self.weights = y[good], signals[good], weights

@@ -116,9 +116,7 @@ def fit(
     accepted: _Solution | None = None
     while True:
         budget = settings.max_evaluations if method == "variable_projection" else _UNBOUNDED
-        problem = Projection(
-            model.frozen(frozen) if frozen else model, y, signals, weights, max(budget - evaluations, 60)
-        )
+        problem = Projection(model.frozen(frozen) if frozen else model, y, signals, weights, max(budget - evaluations, 60))
         problem.tick = tick
         solution = _solve(problem, method, settings, start, frozen)
         evaluations += problem.evaluations
@@ -170,9 +168,7 @@ def _square(problem: Projection, z: FloatArray, theta: FloatArray) -> float:
     return 0.5 * float(left @ left)
 
 
-def _project(
-    problem: Projection, settings: TwoStepSettings, start: Mapping[str, float] | None
-) -> tuple[FloatArray, FloatArray, float, tuple[str, ...]]:
+def _project(problem: Projection, settings: TwoStepSettings, start: Mapping[str, float] | None) -> tuple[FloatArray, FloatArray, float, tuple[str, ...]]:
     """Variable projection, repeated with non-negative coefficients where the sign demands it."""
     total = problem.budget
     repeat = settings.non_negative and bool(problem.signed.any())
@@ -184,18 +180,14 @@ def _project(
         clipped = np.array([min(max(v, s.low), s.high) for v, s in zip(given, problem.model.shapes, strict=True)])
         z = warm_search(problem, problem.inner(clipped), settings)
     theta, square = problem.best().solve(None)
-    negative = tuple(
-        c.name for c, v in zip(problem.model.coefficients, theta, strict=True) if c.non_negative and v < 0
-    )
+    negative = tuple(c.name for c, v in zip(problem.model.coefficients, theta, strict=True) if c.non_negative and v < 0)
     if repeat and negative:
         z = repeat_non_negative(problem, settings, total - problem.evaluations)
         theta, square = problem.best().solve(problem.sign)
     return z, theta, square, negative
 
 
-def cramer_rao(
-    problem: Projection, z: FloatArray, theta: FloatArray, square: float
-) -> tuple[FloatArray, bool]:
+def cramer_rao(problem: Projection, z: FloatArray, theta: FloatArray, square: float) -> tuple[FloatArray, bool]:
     """Cramer-Rao deviations of (theta, shapes on the search scale), and True where phi lost rank.
 
     From the full Jacobian [phi, d(phi theta)/dz] and the residual's variance; infinite for a direction that

@@ -70,8 +70,7 @@ class Shape:
         finite = all(math.isfinite(v) for v in (self.low, self.high, self.nominal))
         if not finite or not self.low < self.high or not self.low <= self.nominal <= self.high:
             raise InputError(
-                f"shape parameter {self.name}: box [{self.low}, {self.high}], nominal {self.nominal}; "
-                "give finite low < high with the nominal value inside"
+                f"shape parameter {self.name}: box [{self.low}, {self.high}], nominal {self.nominal}; give finite low < high with the nominal value inside"
             )
 
     @property
@@ -146,10 +145,7 @@ class SeparableModel:
         if found.ndim == 2 and self.outputs == 1:
             found = found[:, None, :]
         if found.shape != (len(signals), self.outputs, len(self.coefficients)):
-            raise InputError(
-                f"separable model: phi has shape {found.shape}; "
-                f"give ({len(signals)}, {self.outputs}, {len(self.coefficients)})"
-            )
+            raise InputError(f"separable model: phi has shape {found.shape}; give ({len(signals)}, {self.outputs}, {len(self.coefficients)})")
         return found
 
     def remainder(self, signals: FloatArray, nonlinear: FloatArray) -> FloatArray:
@@ -180,9 +176,7 @@ class SeparableModel:
         if unknown:
             raise InputError(f"with_boxes: no shape parameter {sorted(unknown)[0]!r}; there are {self.shape_names}")
         changed = tuple(
-            replace(s, low=low, high=high, nominal=min(max(s.nominal, low), high))
-            for s in self.shapes
-            for low, high in [boxes.get(s.name, (s.low, s.high))]
+            replace(s, low=low, high=high, nominal=min(max(s.nominal, low), high)) for s in self.shapes for low, high in [boxes.get(s.name, (s.low, s.high))]
         )
         return replace(self, shapes=changed)
 
@@ -208,9 +202,7 @@ class SeparableModel:
         )
 
 
-def from_casadi(
-    regressor: Any, coefficients: Sequence[Coefficient], shapes: Sequence[Shape], channels: Sequence[str] = ()
-) -> SeparableModel:
+def from_casadi(regressor: Any, coefficients: Sequence[Coefficient], shapes: Sequence[Shape], channels: Sequence[str] = ()) -> SeparableModel:
     """A separable model from a CasADi function of one sample.
 
     Parameters

@@ -63,9 +63,7 @@ class TwoStepSettings:
 
     def __post_init__(self) -> None:
         if self.max_evaluations < 10 or not 0 < self.mcs_share < 1 or self.starts < 0 or self.passes < 1:
-            raise InputError(
-                "two-step settings: give max_evaluations >= 10, 0 < mcs_share < 1, starts >= 0, passes >= 1"
-            )
+            raise InputError("two-step settings: give max_evaluations >= 10, 0 < mcs_share < 1, starts >= 0, passes >= 1")
 
 
 def polish(problem: Projection, z: FloatArray, tolerance: float) -> FloatArray:
@@ -157,9 +155,7 @@ def repeat_non_negative(problem: Projection, settings: TwoStepSettings, budget: 
     return finish(problem, settings, reserve)
 
 
-def alternating_search(
-    problem: Projection, settings: TwoStepSettings, report: Callable[[int, float], object] | None = None
-) -> tuple[FloatArray, FloatArray]:
+def alternating_search(problem: Projection, settings: TwoStepSettings, report: Callable[[int, float], object] | None = None) -> tuple[FloatArray, FloatArray]:
     """The thesis's form (3.7): linear least squares and MCS in turn; gives (z, theta)."""
     z = problem.inner(problem.model.nominal)
     theta = np.zeros(len(problem.model.coefficients))

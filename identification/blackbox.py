@@ -47,9 +47,7 @@ class BlackBoxOutcome(Enum):
 
     CONVERGED = "The prediction error has reached a minimum; the model is stable."
     EVALUATION_LIMIT = "The evaluations ran out before a minimum was reached; the model is stable."
-    UNSTABLE = (
-        "The model predicts one step ahead but is unstable in simulation: take oe or bj, whose poles are kept stable."
-    )
+    UNSTABLE = "The model predicts one step ahead but is unstable in simulation: take oe or bj, whose poles are kept stable."
 
 
 @final
@@ -223,9 +221,7 @@ def linear_ceiling(
         results.append((float(np.mean(chosen_by)), name, reported))
     stable = sorted((result for result in results if np.isfinite(result[0])), key=lambda result: -result[0])
     if not stable:
-        raise InputError(
-            "every linear model tried is unstable: record longer, or remove offsets and integrating channels"
-        )
+        raise InputError("every linear model tried is unstable: record longer, or remove offsets and integrating channels")
     return LinearCeiling(stable[0][2], stable[0][1], tuple((name, vaf) for vaf, name, _ in stable))
 
 
@@ -273,10 +269,7 @@ def _fits(train: Records, test: Records | tuple[tuple[FloatArray, FloatArray], .
     """Polynomials of every output and whether a minimum was reached."""
     shortest = min(len(one) for one, _ in (*train, *test))
     if shortest < rows_needed(orders):
-        raise InputError(
-            f"a record leaves {shortest} samples after holding out, {rows_needed(orders)} are needed: "
-            "record longer or lower the order"
-        )
+        raise InputError(f"a record leaves {shortest} samples after holding out, {rows_needed(orders)} are needed: record longer or lower the order")
     outputs = train[0][1].shape[1]
     return [prediction_error_fit([(one, other[:, k]) for one, other in train], orders) for k in range(outputs)]
 

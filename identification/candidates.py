@@ -25,7 +25,6 @@ WARM_UP: Final = 15.0
 """Shortest run in which a warm-up is looked for without a temperature channel [s]."""
 
 
-
 @final
 @dataclass(frozen=True)
 class NotTestable:

@@ -130,9 +130,7 @@ def left(vaf_percent: float) -> str:
     return f"{max(100.0 - vaf_percent, 0.0):.3g}"
 
 
-def ceiling(
-    data: Dataset, tested: Sequence[WeakRecord], residual: Mapping[str, FloatArray], floor: Mapping[str, float], *, unseen: bool
-) -> Ceiling | None:
+def ceiling(data: Dataset, tested: Sequence[WeakRecord], residual: Mapping[str, FloatArray], floor: Mapping[str, float], *, unseen: bool) -> Ceiling | None:
     """Compare a physical model with linear black boxes fitted to the same records.
 
     Parameters

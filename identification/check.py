@@ -33,9 +33,7 @@ __all__ = ["SEVERITIES", "Finding", "check", "gate", "measured_ratio", "repair",
 SHORTEST_PIECE: Final = 8
 
 
-def check(
-    record: Record, gear_ratio: float | None = None, needs: Sequence[str] = (), torque_per_current: float | None = None
-) -> tuple[Finding, ...]:
+def check(record: Record, gear_ratio: float | None = None, needs: Sequence[str] = (), torque_per_current: float | None = None) -> tuple[Finding, ...]:
     """Check a record before it is used.
 
     Time (finite, increasing, repeated stamps, gaps, jitter, unit), channels (NaN, constant, stuck, saturated,

@@ -329,9 +329,7 @@ def shown(names: Iterable[str], limit: int = 20) -> str:
     return ", ".join(every[:limit]) + more if every else "none"
 
 
-def choose(
-    raw: Mapping[str, Any], names: Sequence[str], units: Mapping[str, str], kind: str, where: str
-) -> tuple[tuple[Column, ...], tuple[str, ...]]:
+def choose(raw: Mapping[str, Any], names: Sequence[str], units: Mapping[str, str], kind: str, where: str) -> tuple[tuple[Column, ...], tuple[str, ...]]:
     """Settle which columns are used: the map first, recognised headers for the other channels.
 
     Parameters
@@ -386,9 +384,7 @@ def choose(
     return tuple(sorted(chosen.values(), key=lambda entry: order[entry.channel])), notes
 
 
-def guess_columns(
-    names: Sequence[str], units: Mapping[str, str] | None = None, kind: str = "rotary"
-) -> tuple[Guess, ...]:
+def guess_columns(names: Sequence[str], units: Mapping[str, str] | None = None, kind: str = "rotary") -> tuple[Guess, ...]:
     """Propose a column map by name and unit; never applied by itself (see `identification._guess`)."""
     from identification._guess import guess_columns as propose
 

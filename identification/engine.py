@@ -234,9 +234,7 @@ def memory_shapes_of(model: JointModel, free: Sequence[str]) -> tuple[str, ...]:
     return tuple(out)
 
 
-def _jacobian(
-    balances: Balances, data: Dataset, values: Mapping[str, float], free: Sequence[str], memory_shapes: Sequence[str]
-) -> Stacked:
+def _jacobian(balances: Balances, data: Dataset, values: Mapping[str, float], free: Sequence[str], memory_shapes: Sequence[str]) -> Stacked:
     """Stacked residual and Jacobian with the columns of `free`."""
     stacked = stack(balances, data.train, values)
     columns = [balances.wrt.index(n) for n in free]

@@ -196,9 +196,7 @@ class Experiment:
         """
         return self.judge(motion, self.run(motion), normalised=normalised, limits=limits)
 
-    def judge(
-        self, motion: Motion, run: Followed, *, normalised: bool = False, limits: Limits | None = None
-    ) -> Excitation:
+    def judge(self, motion: Motion, run: Followed, *, normalised: bool = False, limits: Limits | None = None) -> Excitation:
         """As :meth:`evaluate`, from a run that is there already: one run serves the full and the reduced model.
 
         Parameters
@@ -299,9 +297,7 @@ def _cost(found: Excitation, criterion: str) -> float:
     return -math.log(max(found.smallest, 1e-300))
 
 
-def _refined(
-    experiment: Experiment, motions: Sequence[Motion], criterion: str, limits: Limits | None, evaluations: int
-) -> list[Excitation]:
+def _refined(experiment: Experiment, motions: Sequence[Motion], criterion: str, limits: Limits | None, evaluations: int) -> list[Excitation]:
     """Coordinate search between the grid's ends."""
     pairs = np.array([[m.parameters["speed"], m.parameters["period"]] for m in motions])
     low, high = pairs.min(axis=0), pairs.max(axis=0)

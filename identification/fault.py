@@ -232,9 +232,7 @@ class FaultDetector:
         if described["method"] != self.method or len(numbers) != len(self._rule.numbers()):
             raise InputError("restore: the state is of a detector with another model, method or settings")
         self._rule.load(numbers)
-        self._rule.events = [
-            FaultEvent(s, f, Verdict[v], tuple(sensors), tuple(r)) for s, f, v, sensors, r in described["events"]
-        ]
+        self._rule.events = [FaultEvent(s, f, Verdict[v], tuple(sensors), tuple(r)) for s, f, v, sensors, r in described["events"]]
         self._reported = len(self._rule.events)
 
 

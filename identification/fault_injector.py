@@ -103,9 +103,7 @@ def inject(readings: npt.ArrayLike, dt: float, faults: Sequence[Fault], *, seed:
     return out
 
 
-def _faulty(
-    channel: FloatArray, first: int, last: int, fault: Fault, dt: float, rng: np.random.Generator
-) -> FloatArray | float:
+def _faulty(channel: FloatArray, first: int, last: int, fault: Fault, dt: float, rng: np.random.Generator) -> FloatArray | float:
     part, count = channel[first:last], last - first
     if fault.kind == "noise":
         return rng.normal(0.0, fault.size, count)

@@ -87,9 +87,7 @@ def as_joint(model: JointModel | Joint, joint: Joint | None = None) -> Joint:
     )  # fmt: skip
 
 
-def fit(
-    model: JointModel | Joint, records: Record | Sequence[Record], *, joint: Joint | None = None, held_out: Sequence[Record] = ()
-) -> Fit:
+def fit(model: JointModel | Joint, records: Record | Sequence[Record], *, joint: Joint | None = None, held_out: Sequence[Record] = ()) -> Fit:
     """Fit a joint model to records by weighted least squares on the weak form of its balances.
 
     Parameters

@@ -241,9 +241,7 @@ def _subspace_curve(parts: Sequence[Pair], measured: Response, grid: FloatArray)
     return _curve(SUBSPACE, response, poles, measured, grid[grid < 0.45 / dt])
 
 
-def _curve(
-    name: str, response: Callable[[FloatArray], ComplexArray], poles: npt.NDArray[Any], measured: Response, grid: FloatArray
-) -> Curve:
+def _curve(name: str, response: Callable[[FloatArray], ComplexArray], poles: npt.NDArray[Any], measured: Response, grid: FloatArray) -> Curve:
     trusted = measured.trusted & (measured.frequency <= grid[-1])
     gap_db = gap_degrees = math.nan
     if trusted.any():

@@ -159,9 +159,7 @@ def trial_values(trial: Trial) -> str:
     return ", ".join(f"{text(words(n))} {number(trial.values[n], 3)} {pretty_unit(parameters[n].unit)}".rstrip() for n in shown)
 
 
-def ranking_html(
-    result: Mapping[str, Any], trials: Sequence[Trial] = (), *, first: int = 0, last: int | None = None, caption: str = ""
-) -> str:
+def ranking_html(result: Mapping[str, Any], trials: Sequence[Trial] = (), *, first: int = 0, last: int | None = None, caption: str = "") -> str:
     """The ranked effects: what adding one alone would lower, its estimate, and what it is mistaken for."""
     values = {t.key: trial_values(t) for t in trials}
     claimed = {k: c for c in result["claims"] for k in c["effects"]}
@@ -287,6 +285,5 @@ def improvement_html(improvement: Improvement) -> str:
     result = improvement.as_json()
     parameters = parameters_html(result["steps"][-1]["parameters"]) if result["steps"] else ""
     return spaced(
-        f"<div>{verdict_html(result, 3)}{warnings_html(result['warnings'])}{staircase_html(result)}{ledger_html(result)}"
-        f"{claims_html(result)}{parameters}</div>"
+        f"<div>{verdict_html(result, 3)}{warnings_html(result['warnings'])}{staircase_html(result)}{ledger_html(result)}{claims_html(result)}{parameters}</div>"
     )

@@ -136,7 +136,7 @@ def parse_joint(data: Mapping[str, Any], source: str = "joint") -> Joint:
         raise InputError(f"{source}: model = {name!r} is not known; use one of {', '.join(MODELS)}")
     effects = table.get("effects", [])
     if not isinstance(effects, list) or not all(isinstance(e, str) for e in effects):
-        raise InputError(f"{source}: effects must be a list of names, as effects = [\"viscous\", \"coulomb\"]")
+        raise InputError(f'{source}: effects must be a list of names, as effects = ["viscous", "coulomb"]')
     joint = Joint(
         name=str(table.get("name", Path(source).stem)), kind=kind, gear_ratio=ratio,
         torque_per_current=ratio * constant if constant is not None else per_current,

@@ -67,6 +67,7 @@ class Unexplained:
 
 def axes(records: Sequence[WeakRecord], sensing_has_torque: bool, kind: str = "rotary") -> dict[str, tuple[FloatArray, str]]:
     """Signals against which residuals are binned, averaged like the residuals."""
+
     def joined(name: str) -> FloatArray:
         return np.concatenate([w.averaged[name] for w in records])
 
@@ -135,9 +136,7 @@ def locate(solution: Solution, data: Dataset, error: Error, lines: Sequence[Line
     return out
 
 
-def _axis(
-    balance: str, name: str, values: FloatArray, unit: str, residual: FloatArray, block: IntArray, velocity: FloatArray
-) -> Unexplained:
+def _axis(balance: str, name: str, values: FloatArray, unit: str, residual: FloatArray, block: IntArray, velocity: FloatArray) -> Unexplained:
     edges, index = binned(residual, values)
     size = max(len(edges) - 1, 1)
     plain = table_r2(residual, index, block, size)

@@ -153,9 +153,7 @@ def mcs(
         fun,
         problem,
         target=-math.inf if target is None else real_number("target", target),
-        max_evaluations=(
-            250 + 50 * n * n if max_evaluations is None else whole_number("max_evaluations", max_evaluations, 1)
-        ),
+        max_evaluations=(250 + 50 * n * n if max_evaluations is None else whole_number("max_evaluations", max_evaluations, 1)),
         stall_sweeps=3 * n if stall_sweeps is None else whole_number("stall_sweeps", stall_sweeps, 0),
         callback=callback,
     )

@@ -219,9 +219,7 @@ def _ridged(matrices: FloatArray) -> FloatArray:
     return out
 
 
-def _iterate(
-    shooting: Shooting, state: _State, limits: Mapping[str, tuple[float, float]], sigma: FloatArray, iterations: int
-) -> int:
+def _iterate(shooting: Shooting, state: _State, limits: Mapping[str, tuple[float, float]], sigma: FloatArray, iterations: int) -> int:
     """Damped Gauss-Newton steps; a step that raises the cost is shortened."""
     for used in range(1, iterations + 1):
         cost = state.cost(sigma)
@@ -319,9 +317,7 @@ def _trial(
     return {**state.values, **{n: state.values[n] + float(s) for n, s in zip(shooting.free, step, strict=True)}}, step
 
 
-def _refined(
-    fit: Fit, values: Mapping[str, float], stderr: Mapping[str, float], limits: Mapping[str, tuple[float, float]], used: int
-) -> Fit:
+def _refined(fit: Fit, values: Mapping[str, float], stderr: Mapping[str, float], limits: Mapping[str, tuple[float, float]], used: int) -> Fit:
     """The fit with other values; errors and weights anew."""
     from identification.balances import Balances
 
@@ -333,9 +329,7 @@ def _refined(
         if not n.endswith("_smoothing_velocity")
         and any(math.isfinite(v) and abs(values[n] - v) <= 1e-9 * max(abs(v), 1e-300) for v in limits[n])
     )  # fmt: skip
-    solution = replace(
-        old, model=model, values=dict(values), stderr={**old.stderr, **stderr}, weights=weights, at_bound=bound, iterations=used
-    )
+    solution = replace(old, model=model, values=dict(values), stderr={**old.stderr, **stderr}, weights=weights, at_bound=bound, iterations=used)
     return replace(
         fit, solution=solution, train=assess(model, fit.data, fit.data.train, values),
         held_out=assess(model, fit.data, fit.data.held_out, values) if fit.data.held_out else None,

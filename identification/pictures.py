@@ -67,10 +67,7 @@ def ticks(low: float, high: float, most: int = 5) -> list[float]:
 
 
 def _text(x: float, y: float, text: str, anchor: str = "middle", extra: str = "") -> str:
-    return (
-        f'<text class="s-ink" fill="{INK}" x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" font-size="11"{extra}>'
-        f"{html.escape(text)}</text>"
-    )
+    return f'<text class="s-ink" fill="{INK}" x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" font-size="11"{extra}>{html.escape(text)}</text>'
 
 
 def _axes(frame: Frame, x_label: str, y_label: str, *, x_ticks: bool = True) -> str:

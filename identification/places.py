@@ -315,9 +315,7 @@ def residuals(solution: Solution, data: Dataset, records: Sequence[WeakRecord] |
     return stack(balances, chosen, solution.values).shown
 
 
-def places(
-    solution: Solution, data: Dataset, records: Sequence[WeakRecord] | None = None, *, rows: Rows | None = None
-) -> tuple[Place, ...]:
+def places(solution: Solution, data: Dataset, records: Sequence[WeakRecord] | None = None, *, rows: Rows | None = None) -> tuple[Place, ...]:
     """Residual of every balance against every axis, the most telling first.
 
     Parameters

@@ -29,9 +29,7 @@ _JITTER: Final = 0.01
 _SLOW: Final = ("run", "temperature")
 
 
-def butterworth(
-    values: npt.ArrayLike, dt: float, cutoff: float = THESIS_CUTOFF, order: int = THESIS_ORDER
-) -> FloatArray:
+def butterworth(values: npt.ArrayLike, dt: float, cutoff: float = THESIS_CUTOFF, order: int = THESIS_ORDER) -> FloatArray:
     """Low-pass values without phase: Butterworth, forward and backward.
 
     Parameters
@@ -85,9 +83,7 @@ def _finite(values: npt.ArrayLike) -> FloatArray:
     return array
 
 
-def filter_alike(
-    *signals: npt.ArrayLike, dt: float, cutoff: float = THESIS_CUTOFF, order: int = THESIS_ORDER
-) -> tuple[FloatArray, ...]:
+def filter_alike(*signals: npt.ArrayLike, dt: float, cutoff: float = THESIS_CUTOFF, order: int = THESIS_ORDER) -> tuple[FloatArray, ...]:
     """Filter all terms of a regression by one filter, so that the equation between them still holds.
 
     Parameters
@@ -278,9 +274,7 @@ def decimated(record: Record, factor: int = 10) -> Record:
     _uniform(record)
     parts = record.segments()
     channels = {
-        channel: np.concatenate(
-            [values[part][::factor] if channel == "run" else decimate(values[part], factor) for part in parts]
-        )
+        channel: np.concatenate([values[part][::factor] if channel == "run" else decimate(values[part], factor) for part in parts])
         for channel, values in record.channels.items()
     }
     return replace(
@@ -340,9 +334,7 @@ class AccelerometerCalibration:
         return result
 
 
-def calibrate_accelerometer(
-    up: npt.ArrayLike, down: npt.ArrayLike, horizontal: npt.ArrayLike | None = None
-) -> AccelerometerCalibration:
+def calibrate_accelerometer(up: npt.ArrayLike, down: npt.ArrayLike, horizontal: npt.ArrayLike | None = None) -> AccelerometerCalibration:
     """Calibrate an accelerometer from records at rest, face up, face down and, if there are any, horizontal.
 
     Thesis, equation A.1: ``offset = mean(up) - (mean(up) + |mean(down)|) / 2``; half the difference between up and

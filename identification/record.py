@@ -163,10 +163,7 @@ class Record:
             return self.time
         if channel not in self.channels:
             channel_unit(channel, self.kind)
-            raise InputError(
-                f"record {self.name!r} has no channel {channel} (it has {', '.join(self.channels)}): "
-                f"measure it or name its column in [columns]"
-            )
+            raise InputError(f"record {self.name!r} has no channel {channel} (it has {', '.join(self.channels)}): measure it or name its column in [columns]")
         return self.channels[channel]
 
     def has(self, *channels: str) -> bool:
@@ -331,9 +328,7 @@ class Record:
             time=np.concatenate(times),
             channels=channels,
             segment=np.concatenate(segments),
-            age=None if self.age is None else np.concatenate([
-                np.interp(t, self.time[p], self.age[p]) for t, p in zip(times, self.segments(), strict=True)
-            ]),
+            age=None if self.age is None else np.concatenate([np.interp(t, self.time[p], self.age[p]) for t, p in zip(times, self.segments(), strict=True)]),
             provenance=self.provenance.noted(note),
         )
 
@@ -341,10 +336,7 @@ class Record:
         from identification.formats import pretty_unit
         from identification.html import spaced
 
-        rows = "".join(
-            f"<tr><td>{key}</td><td>{pretty_unit(self.unit(key))}</td><td>{_range(values)}</td></tr>"
-            for key, values in self.channels.items()
-        )
+        rows = "".join(f"<tr><td>{key}</td><td>{pretty_unit(self.unit(key))}</td><td>{_range(values)}</td></tr>" for key, values in self.channels.items())
         size = f"{len(self)} samples, {self.duration:.6g} s, {len(self.segments())} segment(s)"
         head = f"{html.escape(self.name)}: {size}"
         return spaced(f"<table><caption>{head}</caption><tr><th>channel</th><th>unit</th><th>range</th></tr>{rows}</table>")

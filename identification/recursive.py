@@ -16,8 +16,7 @@ from identification._recursive_settings import MAX_PARAMETERS, METHODS, Settings
 from identification._startup import Startup, StartupOutcome, solve_window
 from identification.errors import InputError
 
-__all__ = ["METHODS", "RecursiveLeastSquares", "RunOutcome", "Settings", "Startup", "StartupOutcome", "Trajectory",
-           "forgetting_curve"]
+__all__ = ["METHODS", "RecursiveLeastSquares", "RunOutcome", "Settings", "Startup", "StartupOutcome", "Trajectory", "forgetting_curve"]
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
@@ -84,9 +83,18 @@ class RecursiveLeastSquares:
     [2.0, -3.0]
     """
 
-    def __init__(self, theta0: npt.ArrayLike, scale: npt.ArrayLike, method: str = "random_walk", *,
-                 outputs: int | None = None, names: Sequence[str] | None = None, R1: npt.ArrayLike | None = None,
-                 R2: npt.ArrayLike | None = None, settings: Settings | None = None) -> None:
+    def __init__(
+        self,
+        theta0: npt.ArrayLike,
+        scale: npt.ArrayLike,
+        method: str = "random_walk",
+        *,
+        outputs: int | None = None,
+        names: Sequence[str] | None = None,
+        R1: npt.ArrayLike | None = None,
+        R2: npt.ArrayLike | None = None,
+        settings: Settings | None = None,
+    ) -> None:
         self._theta0 = vector(theta0, "theta0")
         n = self._theta0.size
         if not 1 <= n <= MAX_PARAMETERS:
@@ -119,8 +127,15 @@ class RecursiveLeastSquares:
         With one output a number and a vector (parameters,) do as well.
         """
         engine = self._engine
-        if engine is None or type(y) is not np.ndarray or type(H) is not np.ndarray \
-                or y.shape != engine.y.shape or H.shape != engine.h.shape or y.dtype.kind != "f" or H.dtype.kind != "f":
+        if (
+            engine is None
+            or type(y) is not np.ndarray
+            or type(H) is not np.ndarray
+            or y.shape != engine.y.shape
+            or H.shape != engine.h.shape
+            or y.dtype.kind != "f"
+            or H.dtype.kind != "f"
+        ):
             engine, y, H = self._arranged(y, H)
         engine.y[:] = y
         engine.h[:] = H
@@ -214,8 +229,7 @@ class RecursiveLeastSquares:
         """Everything the estimator will ever use again, as bytes; `restore` brings it back bit by bit."""
         engine = self._ready("state")
         body = engine.fast.tobytes() + engine.slow.tobytes() + engine.config.tobytes()
-        head = _HEADER.pack(_MAGIC, self._theta0.size, engine.y.size, METHODS.index(self._method),
-                            int(engine.freeze), int(engine.walking), zlib.crc32(body))
+        head = _HEADER.pack(_MAGIC, self._theta0.size, engine.y.size, METHODS.index(self._method), int(engine.freeze), int(engine.walking), zlib.crc32(body))
         return head + body
 
     def restore(self, state: bytes) -> None:
@@ -231,16 +245,17 @@ class RecursiveLeastSquares:
         magic, n, m, method, freeze, walking, crc = _HEADER.unpack_from(state)
         if magic != _MAGIC:
             raise InputError("restore: these bytes are no state of a RecursiveLeastSquares; give what state() returned")
-        body = bytes(state[_HEADER.size:])
+        body = bytes(state[_HEADER.size :])
         if zlib.crc32(body) != crc:
             raise InputError("restore: the state is damaged; give the bytes that state() returned")
         if n != self._theta0.size or method >= len(METHODS) or METHODS[method] != self._method:
-            raise InputError(f"restore: the state is of {n} parameters and method {METHODS[method % len(METHODS)]!r}; "
-                             f"this estimator has {self._theta0.size} and {self._method!r}")
+            raise InputError(
+                f"restore: the state is of {n} parameters and method {METHODS[method % len(METHODS)]!r}; "
+                f"this estimator has {self._theta0.size} and {self._method!r}"
+            )
         engine = self._engine or self._build(m)
         if (m, freeze, walking) != (engine.y.size, int(engine.freeze), int(engine.walking)):
-            raise InputError(f"restore: the state is of {m} outputs or other settings; this estimator has "
-                             f"{engine.y.size} outputs")
+            raise InputError(f"restore: the state is of {m} outputs or other settings; this estimator has {engine.y.size} outputs")
         engine.load(np.frombuffer(body, dtype=np.float64))
         self._theta0, self._scale = engine.part("config", "theta0").copy(), engine.part("config", "scale").copy()
 
@@ -299,8 +314,7 @@ class RecursiveLeastSquares:
     def measurement_covariance(self) -> FloatArray:
         """R2 in use, given or estimated, shape (outputs,)."""
         engine = self._ready("measurement_covariance")
-        return np.where(engine.part("config", "noise_known") > 0, engine.part("config", "noise_given"),
-                        engine.part("fast", "noise"))
+        return np.where(engine.part("config", "noise_known") > 0, engine.part("config", "noise_given"), engine.part("fast", "noise"))
 
     @property
     def forgetting(self) -> float:
@@ -392,6 +406,5 @@ class RecursiveLeastSquares:
         fits = y.ndim == 2 and y.shape[1] > 0 and h.shape == (*y.shape, n)
         if not fits or (self._engine is not None and y.shape[1] != self._engine.y.size):
             m = "outputs" if self._engine is None else str(self._engine.y.size)
-            raise InputError(f"{asked}: Y has shape {np.shape(Y)} and H {np.shape(H)}; "
-                             f"give (samples, {m}) and (samples, {m}, {n})")
+            raise InputError(f"{asked}: Y has shape {np.shape(Y)} and H {np.shape(H)}; give (samples, {m}) and (samples, {m}, {n})")
         return self._engine or self._build(y.shape[1]), y, h

@@ -100,7 +100,7 @@ def sense(record: Record, model: JointModel) -> Sensing:
         if drive and not motor:
             found.insert(0, "axis")
         if model.is_elastic and "transmission" not in found:
-            raise InputError(f"{record.name}: model is elastic but {'link' if motor else 'motor'}_position is missing; add it or use model = \"hd1\"")
+            raise InputError(f'{record.name}: model is elastic but {"link" if motor else "motor"}_position is missing; add it or use model = "hd1"')
         return Sensing(tuple(found), moving=moving, **common)
     if model.is_elastic:
         if not (motor and link):

@@ -57,18 +57,9 @@ class SubspaceOutcome(Enum):
     """What became of an identification, in a sentence."""
 
     ORDER_GIVEN = "The order was given; the model is stable."
-    ORDER_CHOSEN = (
-        "The order was chosen from the singular values, the simulation of held-out samples and the spectral radius; "
-        "the model is stable."
-    )
-    NO_CLEAR_ORDER = (
-        "The model is stable, but the singular values show no clear gap: "
-        "its order rests on the simulation of held-out samples."
-    )
-    UNSTABLE = (
-        "The model is unstable (spectral radius 1 or more): "
-        "do not simulate it; take another order, more block rows or more data."
-    )
+    ORDER_CHOSEN = "The order was chosen from the singular values, the simulation of held-out samples and the spectral radius; the model is stable."
+    NO_CLEAR_ORDER = "The model is stable, but the singular values show no clear gap: its order rests on the simulation of held-out samples."
+    UNSTABLE = "The model is unstable (spectral radius 1 or more): do not simulate it; take another order, more block rows or more data."
 
 
 @final
@@ -237,9 +228,7 @@ def moesp_chunks(
     return _identify(ChunkSource(records), block_rows, order, dt, method, options or MoespOptions())
 
 
-def _identify(
-    source: Source, block_rows: int, order: int | None, dt: float, method: Method, options: MoespOptions
-) -> Subspace:
+def _identify(source: Source, block_rows: int, order: int | None, dt: float, method: Method, options: MoespOptions) -> Subspace:
     weights = _check_options(source.channels, dt, options)
     inputs, outputs = source.channels
     accumulator = HankelQR(inputs, outputs, block_rows, method, weights)
@@ -248,10 +237,7 @@ def _identify(
         raise InputError(f"order is {order}: give 1 to {highest} = (block_rows - 1) * outputs")
     for index, length in enumerate(source.lengths):
         if length < accumulator.window:
-            raise InputError(
-                f"record {index} has {length} samples, one Hankel row takes {accumulator.window}: "
-                "leave it out or lower block_rows"
-            )
+            raise InputError(f"record {index} has {length} samples, one Hankel row takes {accumulator.window}: leave it out or lower block_rows")
     split = sum(source.lengths) if order is not None else round((1.0 - options.held_out) * sum(source.lengths))
     compression = options.compression
     try:
@@ -314,9 +300,7 @@ def _finish(
 
 def _outcome(radius: float, chosen: OrderCandidate | None) -> SubspaceOutcome:
     if radius >= 1.0:
-        warnings.warn(
-            f"spectral radius {radius:.6g}: {SubspaceOutcome.UNSTABLE.value}", UnstableModelWarning, stacklevel=5
-        )
+        warnings.warn(f"spectral radius {radius:.6g}: {SubspaceOutcome.UNSTABLE.value}", UnstableModelWarning, stacklevel=5)
         return SubspaceOutcome.UNSTABLE
     if chosen is None:
         return SubspaceOutcome.ORDER_GIVEN

@@ -315,9 +315,7 @@ def _projected_gain(outside: FloatArray, residual: FloatArray, lows: FloatArray)
     return float(2 * right @ delta - delta @ gram @ delta)
 
 
-def _score(
-    candidate: Candidate, base: Base, balances: Balances, shapes: Mapping[str, float], raw: FloatArray, lows: FloatArray, inside: float
-) -> Trial | None:
+def _score(candidate: Candidate, base: Base, balances: Balances, shapes: Mapping[str, float], raw: FloatArray, lows: FloatArray, inside: float) -> Trial | None:
     p, own = base.parts
     count = len(base.balances)
     size = np.linalg.norm(raw * base.weight[:, None], axis=0)
@@ -368,9 +366,7 @@ def _quadratic(grams: FloatArray, vector: FloatArray) -> FloatArray:
     return np.asarray(np.maximum(np.einsum("kbij,i,j->kb", grams, vector, vector), 0.0))
 
 
-def _held_out_drop(
-    candidate: Candidate, base: Base, balances: Balances, shapes: Mapping[str, float], delta: FloatArray, size: FloatArray, where: int
-) -> float:
+def _held_out_drop(candidate: Candidate, base: Base, balances: Balances, shapes: Mapping[str, float], delta: FloatArray, size: FloatArray, where: int) -> float:
     """Fall of the RMS of a balance on records that the fit never saw, in percent."""
     if not len(base.held_residual):
         return math.nan

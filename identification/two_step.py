@@ -82,9 +82,7 @@ class TwoStep:
 
     # --- off line ----------------------------------------------------------------------------------------------------
 
-    def fit(
-        self, y: npt.ArrayLike, signals: npt.ArrayLike, *, start: Mapping[str, float] | None = None
-    ) -> TwoStepFit:
+    def fit(self, y: npt.ArrayLike, signals: npt.ArrayLike, *, start: Mapping[str, float] | None = None) -> TwoStepFit:
         """Fit a whole record.
 
         Parameters
@@ -101,10 +99,7 @@ class TwoStep:
         """
         values, rows = _table(y, "y"), _table(signals, "signals")
         if len(values) != len(rows) or values.shape[1] != self.model.outputs:
-            raise InputError(
-                f"TwoStep.fit: y has shape {values.shape} and signals {rows.shape}; give (n, {self.model.outputs}) "
-                "and (n, channels)"
-            )
+            raise InputError(f"TwoStep.fit: y has shape {values.shape} and signals {rows.shape}; give (n, {self.model.outputs}) and (n, channels)")
         for name, value in (start or {}).items():
             if not np.isfinite(value):
                 raise InputError(f"TwoStep.fit: the start value of {name} is {value!r}; give a finite number")
@@ -255,9 +250,7 @@ class TwoStep:
         def work(tick: Any) -> TwoStepFit:
             if fall_back:
                 return simplex_fit(self.model, y, signals, weights, self.method, first, start or {}, tick)
-            found = search_window(
-                self.model, y, signals, weights, self.method, first, start, self.online.confirm_limit, tick
-            )
+            found = search_window(self.model, y, signals, weights, self.method, first, start, self.online.confirm_limit, tick)
             if reweigh:
                 found = reweighted(self.model, y, signals, found, method=self.method, settings=settings, tick=tick)
             return found

@@ -297,9 +297,7 @@ def prepare(
     )  # fmt: skip
 
 
-def _pointwise(
-    values: FloatArray, segments: tuple[slice, ...], length: float, dt: float, order: int, step: int
-) -> tuple[FloatArray, FloatArray]:
+def _pointwise(values: FloatArray, segments: tuple[slice, ...], length: float, dt: float, order: int, step: int) -> tuple[FloatArray, FloatArray]:
     """Raw (order 0) or smoothed derivative at every `step`-th sample; ends by the nearest full window."""
     weights = kernel(length, dt, order)
     half = len(weights) // 2

@@ -34,7 +34,7 @@ def names(entry: Mapping[str, Any], key: str, where: str) -> tuple[str, ...]:
     found = entry.get(key, [])
     found = [found] if isinstance(found, str) else found
     if not isinstance(found, list) or not all(isinstance(name, str) and name for name in found):
-        raise InputError(f"{where}: {key} must be a list of names, as {key} = [\"...\"]")
+        raise InputError(f'{where}: {key} must be a list of names, as {key} = ["..."]')
     if len(set(found)) < len(found):
         raise InputError(f"{where}: {key} names something twice")
     return tuple(found)

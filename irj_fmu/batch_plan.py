@@ -196,7 +196,7 @@ def _planned(model: _Model, run: tuple[str, Record] | None, study: Study) -> Pla
             if variable.causality == "input":
                 inputs |= _fed(name, study, record, where)
         if record is not None and not model.entry.motion and not any(isinstance(study.inputs.get(n, ""), str) and not n.startswith("valid.") for n in inputs):
-            raise InputError(f"{where}: no input is fed by the records; write [inputs] with input = \"channel\"")
+            raise InputError(f'{where}: no input is fed by the records; write [inputs] with input = "channel"')
         measured = {} if record is None else _measured(names, study, record, fmu, where)
     if study.stop is None and record is None:
         raise InputError(f"{study.source}: [study] has no stop; give the length in s")

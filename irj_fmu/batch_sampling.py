@@ -136,7 +136,7 @@ def _range(entry: Mapping[str, Any], where: str) -> tuple[float, float, bool]:
     if low >= high:
         raise InputError(f"{where}: low = {low:g} is not below high = {high:g}")
     if spacing == "log" and low <= 0:
-        raise InputError(f"{where}: spacing = \"log\" needs low > 0")
+        raise InputError(f'{where}: spacing = "log" needs low > 0')
     return low, high, spacing == "log"
 
 

@@ -152,7 +152,7 @@ def load_study(path: str | Path) -> Study:
 def _models(data: Mapping[str, Any], path: Path) -> tuple[ModelEntry, ...]:
     entries = data.get("model")
     if not isinstance(entries, list) or not entries:
-        raise InputError(f"{path}: no model; write [[model]] and below it fmu = \"...\" or joint = \"...\"")
+        raise InputError(f'{path}: no model; write [[model]] and below it fmu = "..." or joint = "..."')
     found = [_model(entry, i, path) for i, entry in enumerate(entries, 1)]
     twice = {m.name for m in found if sum(m.name == other.name for other in found) > 1}
     if twice:
@@ -199,7 +199,7 @@ def _files(records: Mapping[str, Any], path: Path) -> tuple[Path, ...]:
         else:
             found.append(path.parent / name)
     if records and not found:
-        raise InputError(f"{path}: [records] has no files; write files = [\"run1.csv\"]")
+        raise InputError(f'{path}: [records] has no files; write files = ["run1.csv"]')
     return tuple(found)
 
 

@@ -106,9 +106,7 @@ def run_chunk(chunk: Chunk) -> Done:
 
 def _figures(table: FloatArray, measured: Mapping[int, FloatArray]) -> FloatArray:
     found = np.full((table.shape[1], len(FIGURES)), np.nan)
-    found[:, :5] = np.column_stack(
-        [table[-1], table.min(axis=0), table.max(axis=0), table.mean(axis=0), np.sqrt(np.mean(table**2, axis=0))]
-    )
+    found[:, :5] = np.column_stack([table[-1], table.min(axis=0), table.max(axis=0), table.mean(axis=0), np.sqrt(np.mean(table**2, axis=0))])
     for i, wanted in measured.items():
         residual = table[:, i] - wanted
         spread = float(np.linalg.norm(wanted - wanted.mean()))

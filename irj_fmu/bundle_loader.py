@@ -87,9 +87,7 @@ class Bundle(importlib.abc.MetaPathFinder, importlib.abc.InspectLoader):
         parts = path.relative_to(self.root).with_suffix("").parts
         return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
-    def find_spec(
-        self, fullname: str, path: Sequence[str] | None = None, target: ModuleType | None = None
-    ) -> importlib.machinery.ModuleSpec | None:
+    def find_spec(self, fullname: str, path: Sequence[str] | None = None, target: ModuleType | None = None) -> importlib.machinery.ModuleSpec | None:
         """Answer for the prefix and what lies below it."""
         if fullname != self.prefix and not fullname.startswith(self.prefix + "."):
             return None

@@ -45,10 +45,7 @@ TARGETS = {
     )
 }
 _FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fvisibility=hidden", "-shared", "-w")
-_NO_COMPILER = (
-    "no C compiler found for {target}: estimator FMUs still build, plant FMUs need one; run `pip install ziglang`, or "
-    "install gcc and pass cc='gcc'"
-)
+_NO_COMPILER = "no C compiler found for {target}: estimator FMUs still build, plant FMUs need one; run `pip install ziglang`, or install gcc and pass cc='gcc'"
 
 
 def native_target() -> str:
@@ -126,9 +123,7 @@ def header_folder() -> Path:
     raise InputError("the FMI 2.0 headers are missing: run `pip install fmpy`, which ships them")
 
 
-def compile_library(
-    sources: Mapping[str, bytes], main: str, target: str, *, cc: str | None = None, libraries: Sequence[str] = ()
-) -> bytes:
+def compile_library(sources: Mapping[str, bytes], main: str, target: str, *, cc: str | None = None, libraries: Sequence[str] = ()) -> bytes:
     """Compile one C file (others included from it) to a shared library and return its bytes.
 
     Parameters

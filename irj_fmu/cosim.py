@@ -116,7 +116,13 @@ class Setting:
 
 
 def make_pair(
-    plant: Joint, model: Joint, folder: Path, *, cc: str | None = None, healthy: Sequence[Path] = (), shim: bool = False,
+    plant: Joint,
+    model: Joint,
+    folder: Path,
+    *,
+    cc: str | None = None,
+    healthy: Sequence[Path] = (),
+    shim: bool = False,
     motion: Motion | None = None,
 ) -> tuple[Path, Path]:
     """Build a plant FMU with controller and sensors, and an estimator FMU of a joint file.
@@ -168,9 +174,7 @@ def make_pair(
     return built, made.path
 
 
-def cosimulate(
-    plant: Joint, model: Joint, files: tuple[Path, Path], setting: Setting | None = None, motion: Motion | None = None
-) -> Cosimulation:
+def cosimulate(plant: Joint, model: Joint, files: tuple[Path, Path], setting: Setting | None = None, motion: Motion | None = None) -> Cosimulation:
     """Run plant and estimator together along the plant's built-in motion; `files` are those of :func:`make_pair`.
 
     Raises
@@ -237,7 +241,10 @@ def _limit(name: str) -> float | None:
 
 
 def convergence(
-    joints: Sequence[Joint], setting: Setting | None = None, *, cc: str | None = None,
+    joints: Sequence[Joint],
+    setting: Setting | None = None,
+    *,
+    cc: str | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Row]:
     """The table of convergence: each joint as a plant, its estimator started without values.

@@ -71,9 +71,7 @@ def _inputs(joint: Joint) -> list[Variable]:
     channels = {"q_m": "motor_position", "w_m": "motor_velocity", "q_l": "link_position", "w_l": "link_velocity", "tau_l": "link_torque"}
     found = [drive]
     for name, channel in channels.items():
-        found.append(
-            Variable(name, channel_unit(channel, joint.kind), causality="input", description=f"{channel.replace('_', ' ').capitalize()}.")
-        )
+        found.append(Variable(name, channel_unit(channel, joint.kind), causality="input", description=f"{channel.replace('_', ' ').capitalize()}."))
     found.append(Variable("enable", start=True, causality="input", kind="boolean", description="False holds the estimate."))
     found += [
         Variable(f"valid.{name}", start=True, causality="input", kind="boolean", description=f"False where {name} is missing.")

@@ -90,9 +90,7 @@ def simulate_me(instance: Instance, times: FloatArray, options: Exchange | None 
         raise InputError("model exchange: give at least two increasing output times")
     if instance.fmu.description.numberOfEventIndicators:
         raise InputError(f"{instance.fmu.path.name}: state events are not supported; use its co-simulation")
-    record = tuple(options.record) or tuple(
-        name for name, v in instance.fmu.variables.items() if v.causality == "output" and v.type == "Real"
-    )
+    record = tuple(options.record) or tuple(name for name, v in instance.fmu.variables.items() if v.causality == "output" and v.type == "Real")
     driver = _Driver(instance, options)
     x = driver.start(float(times[0]))
     places = instance.blocks(record)
@@ -198,9 +196,7 @@ class Stepper:
         Called with time and state after each accepted step.
     """
 
-    def __init__(
-        self, name: str, nominal: FloatArray, rtol: float, atol: float, accepted: Callable[[float, FloatArray], None] | None = None
-    ) -> None:
+    def __init__(self, name: str, nominal: FloatArray, rtol: float, atol: float, accepted: Callable[[float, FloatArray], None] | None = None) -> None:
         self.name, self.nominal, self.rtol, self.atol, self.accepted = name, nominal, rtol, atol, accepted
         self.step = 0.0
 

@@ -74,9 +74,7 @@ class Guard:
         self.theta = estimator.theta
         self._kept = [estimator.state()] * 2
 
-    def step(
-        self, estimator: RecursiveLeastSquares, theta: FloatArray, error: FloatArray, level: FloatArray, on: BoolArray
-    ) -> str:
+    def step(self, estimator: RecursiveLeastSquares, theta: FloatArray, error: FloatArray, level: FloatArray, on: BoolArray) -> str:
         """Judge the recursion after a row.
 
         Parameters

@@ -313,9 +313,7 @@ class Wiring:
     record: Sequence[str] = ()
 
 
-def simulate_cs(
-    instances: Mapping[str, Instance] | Instance, wiring: Wiring, *, step: float, stop: float, start: float = 0.0
-) -> Trajectory:
+def simulate_cs(instances: Mapping[str, Instance] | Instance, wiring: Wiring, *, step: float, stop: float, start: float = 0.0) -> Trajectory:
     """Co-simulate FMUs with a fixed communication step.
 
     At each communication point all outputs are read, all inputs set from them and from the functions of time, and

@@ -156,8 +156,4 @@ def _blocks(instances: Mapping[str, Instance], names: Sequence[str]) -> list[_Pl
     for name in names:
         owner, variable = _split(name, instances)
         grouped.setdefault(owner, []).append(variable)
-    return [
-        (f"{owner}.", instances[owner], block)
-        for owner, variables in grouped.items()
-        for block in instances[owner].blocks(variables)
-    ]
+    return [(f"{owner}.", instances[owner], block) for owner, variables in grouped.items() for block in instances[owner].blocks(variables)]

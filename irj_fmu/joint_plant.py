@@ -113,10 +113,7 @@ class _Builder:
         self.functions = model.functions
         kind = options.drive or ("torque" if per_current is None else "current")
         if kind == "current" and per_current is None and not options.controller:
-            raise InputError(
-                f"{model.name}: a plant driven by current needs motor_constant or torque_per_current in [joint]; "
-                "or choose drive = 'torque'"
-            )
+            raise InputError(f"{model.name}: a plant driven by current needs motor_constant or torque_per_current in [joint]; or choose drive = 'torque'")
         self.per_current = per_current
         self.by_current = kind == "current" and per_current is not None
         terms = model.true_equations.memory_terms
@@ -150,10 +147,7 @@ class _Builder:
         return out
 
     def _memory(self) -> list[Variable]:
-        return [
-            Variable(f"state.{identifier(name)}", description=f"Internal state of {name.rpartition('_')[0]}.")
-            for name in self.functions.memory_names
-        ]
+        return [Variable(f"state.{identifier(name)}", description=f"Internal state of {name.rpartition('_')[0]}.") for name in self.functions.memory_names]
 
     def _inputs(self) -> list[Variable]:
         if self.options.controller:

@@ -15,6 +15,7 @@ SHORT_TARGETS: Final = {
 }  # fmt: skip
 """Names of folders below ``binaries/`` to the targets whose libraries lie there."""
 
+
 def native_targets(target: str | Sequence[str] | None) -> tuple[str, ...]:
     """Targets by their names, short ones included.
 

@@ -64,9 +64,7 @@ class OnlineEstimator:
         See :data:`FAULT_TEXT`; how far each reading's residuals are from their limits (1: at the limit).
     """
 
-    def __init__(
-        self, joint: Joint, dt: float, options: OnlineOptions | None = None, detector_state: bytes | None = None
-    ) -> None:
+    def __init__(self, joint: Joint, dt: float, options: OnlineOptions | None = None, detector_state: bytes | None = None) -> None:
         self.joint, self.dt = joint, dt
         self.options = options or OnlineOptions()
         self.model, self.sensing = prepared(joint, self.options)

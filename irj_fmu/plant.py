@@ -67,9 +67,7 @@ class PlantSpec:
     tolerance: float = DEFAULT_TOLERANCE
 
 
-def build_plant(
-    spec: PlantSpec, out: Path, *, cc: str | None = None, target: str | Sequence[str] | None = None
-) -> Path:
+def build_plant(spec: PlantSpec, out: Path, *, cc: str | None = None, target: str | Sequence[str] | None = None) -> Path:
     """Build the FMU.
 
     Parameters
@@ -224,10 +222,7 @@ def _config(spec: PlantSpec, limits: Mapping[str, int], guid: str) -> bytes:
 
 def _describe(spec: PlantSpec, guid: str) -> bytes:
     states = [Entry(replace(v, causality="local", variability="continuous")) for v in spec.states]
-    slopes = [
-        Entry(Variable(f"der({v.name})", unit=_per_second(v.unit)), "calculated", index)
-        for index, v in enumerate(spec.states, 1)
-    ]
+    slopes = [Entry(Variable(f"der({v.name})", unit=_per_second(v.unit)), "calculated", index) for index, v in enumerate(spec.states, 1)]
     inputs = [Entry(replace(v, causality="input", variability="continuous")) for v in spec.inputs]
     parameters = [Entry(replace(v, causality="parameter", variability=_parameter(v))) for v in spec.parameters]
     outputs = [Entry(replace(v, causality="output", variability="continuous"), "calculated") for v in spec.outputs]

@@ -45,9 +45,7 @@ class RowCheck:
         The row times its weights.
     """
 
-    def __init__(
-        self, balances: int, parameters: int, friction: Sequence[Sequence[int]], feels: npt.NDArray[np.bool_], rate: float, limit: float
-    ) -> None:
+    def __init__(self, balances: int, parameters: int, friction: Sequence[Sequence[int]], feels: npt.NDArray[np.bool_], rate: float, limit: float) -> None:
         sizes = {"h": (parameters, balances), "theta": (parameters, 1), "share": (2, 1), "floor_share": (1, 1)}
         v = {name: ca.SX.sym(name, *sizes.get(name, (balances, 1))) for name in _INTO}
         force = [v["share"][i] * sum((ca.fabs(v["theta"][j]) for j in friction[i]), ca.SX(0)) for i in range(2)]

@@ -78,9 +78,7 @@ class RowMaker:
         Which sampled signals enter which balance.
     """
 
-    def __init__(
-        self, model: JointModel, sensing: Sensing, dt: float, held: Container[str] = (), shapes: Sequence[str] = ()
-    ) -> None:
+    def __init__(self, model: JointModel, sensing: Sensing, dt: float, held: Container[str] = (), shapes: Sequence[str] = ()) -> None:
         self.model, self.sensing, self.timing = model, sensing, Timing.of(dt)
         self.shapes = tuple(shapes)
         self.eta = ca.SX.sym("eta", len(self.shapes))

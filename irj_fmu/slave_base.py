@@ -252,9 +252,7 @@ class TableSlave(Fmi2Slave):  # type: ignore[misc, unused-ignore]
             variable = self.table[reference]
             if self._kinds[reference] != kind:
                 raise TypeError(f"variable {variable.name} is {self._kinds[reference]}, not {kind}")
-            if self._phase and (
-                not self._writable[reference] or (self._tunable[reference] and variable.stated_variability == "fixed")
-            ):
+            if self._phase and (not self._writable[reference] or (self._tunable[reference] and variable.stated_variability == "fixed")):
                 self._report(f"variable {variable.name} cannot be set after initialization; it keeps its value")
                 continue
             if self._tunable[reference] and self._values[reference] != value:

@@ -17,9 +17,7 @@ FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 
 
-def guarded(
-    of: OnlineEstimator, guard: Guard, theta: FloatArray, error: FloatArray, least: FloatArray, on: BoolArray
-) -> FloatArray:
+def guarded(of: OnlineEstimator, guard: Guard, theta: FloatArray, error: FloatArray, least: FloatArray, on: BoolArray) -> FloatArray:
     """The estimate to show after a row; a recursion that follows a failed sensor is held."""
     if of.estimator is None:
         return of.theta

@@ -140,9 +140,7 @@ class Reoptimiser:
 
     # --- search ------------------------------------------------------------------------------------------------------
 
-    def launch(
-        self, weight: FloatArray, theta: FloatArray, level: FloatArray, recursion: Recursion, *, first: bool = False
-    ) -> None:
+    def launch(self, weight: FloatArray, theta: FloatArray, level: FloatArray, recursion: Recursion, *, first: bool = False) -> None:
         """Begin a search on the rows kept; `weight` as in :class:`Task`, for the rows of :meth:`window`."""
         self.job = Task(
             self.window(), weight[self.balances.lead :], self.eta.copy(), theta.copy(), level.copy(), first, self._asked,

@@ -142,9 +142,7 @@ def boxes(model: JointModel, names: Sequence[str], task: Task) -> tuple[Shape, .
     return tuple(joint_shape(model, n, signals) for n in names)
 
 
-def _before(
-    task: Task, model: SeparableModel, y: FloatArray, index: FloatArray, group: list[int], settings: OnlineSettings
-) -> tuple[FloatArray, float]:
+def _before(task: Task, model: SeparableModel, y: FloatArray, index: FloatArray, group: list[int], settings: OnlineSettings) -> tuple[FloatArray, float]:
     """1 / size of each balance's residual before, and how much of it the best linear fit leaves now."""
     weights = np.ones(len(group))
     if not task.first:

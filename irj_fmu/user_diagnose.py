@@ -239,6 +239,7 @@ def _extra(model: JointModel, data: Dataset) -> list[Candidate]:
 
 def _only_outside(ranking: Ranking) -> Ranking:
     """The ranking without effects that cannot ride outside as a torque."""
+
     def fits(effect: Any) -> bool:
         return effect.family in _OUTSIDE
 

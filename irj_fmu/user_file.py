@@ -77,14 +77,14 @@ def load_user_joint(path: str | Path) -> UserModel:
             raise InputError(f"{path}: {key} must be a table, as [{key}] on a line of its own")
     table = data.get("model")
     if not isinstance(table, Mapping):
-        raise InputError(f"{path}: no [model] table; write [model] with fmu = \"file.fmu\"")
+        raise InputError(f'{path}: no [model] table; write [model] with fmu = "file.fmu"')
     for key in table:
         if key not in _KEYS:
             raise InputError(f"{path}: [model] has an unknown key {key!r}; known: {', '.join(_KEYS)}")
     if "fmu" not in table:
-        raise InputError(f"{path}: [model] has no fmu; write fmu = \"file.fmu\"")
+        raise InputError(f'{path}: [model] has no fmu; write fmu = "file.fmu"')
     if not isinstance(table["fmu"], str) or not table["fmu"].strip():
-        raise InputError(f"{path}: [model] fmu = {_shown(table['fmu'])} is not the name of an FMU; write fmu = \"file.fmu\"")
+        raise InputError(f'{path}: [model] fmu = {_shown(table["fmu"])} is not the name of an FMU; write fmu = "file.fmu"')
     rest = {k: v for k, v in data.items() if k in ("joint", "columns")}
     joint = parse_joint({**rest, "joint": {**rest.get("joint", {}), "model": "hd1"}}, str(path))
     fmu = path.parent / table["fmu"]
@@ -180,7 +180,7 @@ def _bounds(table: Mapping[str, Any], path: Path) -> dict[str, tuple[float, floa
 def _outside(labels: Any, joint: Joint, fitted: Mapping[str, float], path: Path) -> Correction | None:
     """Effects outside the FMU, with their values."""
     if not isinstance(labels, list) or not all(isinstance(e, str) for e in labels):
-        raise InputError(f"{path}: [model] outside must be a list of effects, as outside = [\"stribeck@motor\"]")
+        raise InputError(f'{path}: [model] outside must be a list of effects, as outside = ["stribeck@motor"]')
     return outside_correction(labels, joint, fitted, str(path)) if labels else None
 
 

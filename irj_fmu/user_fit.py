@@ -99,16 +99,12 @@ class UserFit:
         """Compare with records that the fit may never have seen."""
         return self.model.compare(records)
 
-    def diagnose(
-        self, held_out: Record | Sequence[Record] = (), progress: Callable[[str, float], None] | None = None
-    ) -> UserDiagnosis:
+    def diagnose(self, held_out: Record | Sequence[Record] = (), progress: Callable[[str, float], None] | None = None) -> UserDiagnosis:
         """Name what is missing."""
         return self.model.diagnose(self.records, held_out, progress)
 
 
-def fit(
-    model: UserModel, records: Record | Sequence[Record], *, iterations: int = 25, exact: bool = True, progress: Progress | None = None
-) -> UserFit:
+def fit(model: UserModel, records: Record | Sequence[Record], *, iterations: int = 25, exact: bool = True, progress: Progress | None = None) -> UserFit:
     """Fit the parameters of a user's FMU to records.
 
     Parameters

@@ -191,9 +191,7 @@ class UserInstance:
             self._callbacks = _callbacks(self.messages)
             make = self._function("Instantiate", [text, _I, text, text, _P, _I, _I], _P)
             place = (fmu.folder / "resources").as_uri()
-            found = make(
-                b"user", 0 if self.kind == "me" else 1, str(fmu.description.guid).encode(), place.encode(), ctypes.addressof(self._callbacks), 0, 0
-            )
+            found = make(b"user", 0 if self.kind == "me" else 1, str(fmu.description.guid).encode(), place.encode(), ctypes.addressof(self._callbacks), 0, 0)
         else:
             self._callbacks = _LOG3(_note(self.messages))
             token, place = str(fmu.description.instantiationToken).encode(), f"{fmu.folder / 'resources'}/"

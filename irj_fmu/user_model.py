@@ -127,7 +127,7 @@ class UserModel:
         found: list[Window] = []
         for number, record in enumerate(records):
             if record.kind != self.joint.kind:
-                raise InputError(f"{record.name}: is a {record.kind} record, the joint file says kind = \"{self.joint.kind}\"")
+                raise InputError(f'{record.name}: is a {record.kind} record, the joint file says kind = "{self.joint.kind}"')
             for part in record.segments():
                 count = part.stop - part.start
                 size = count if self.window is None else max(_SHORT, round(self.window / record.dt))
@@ -255,9 +255,7 @@ def load_user_model(
         raise InputError(f"{fmu.path.name}: kind = {kind!r} is not possible; it has {', '.join(ways)}")
     starts, constants = _starts(fmu, start or {}, mapped, notes)
     notes += _idle(fmu, inputs, {*constants, *(m.variable for m in starts)})
-    return UserModel(
-        fmu, joint, inputs, outputs, _parameters(fmu, parameters), starts, constants, window, hold, kind or ways[0], None, tuple(notes)
-    )
+    return UserModel(fmu, joint, inputs, outputs, _parameters(fmu, parameters), starts, constants, window, hold, kind or ways[0], None, tuple(notes))
 
 
 def _mapped(fmu: UserFmu, channel: str, entry: str | tuple[str, float], kind: str, notes: list[str]) -> Mapped:

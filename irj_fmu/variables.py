@@ -68,10 +68,7 @@ class Variable:
             return
         value = float(self.start)
         if self.minimum is not None and value < self.minimum or self.maximum is not None and value > self.maximum:
-            raise InputError(
-                f"FMU variable {self.name!r}: start {value:g} lies outside [{self.minimum}, {self.maximum}]; widen the "
-                "bounds or move the start"
-            )
+            raise InputError(f"FMU variable {self.name!r}: start {value:g} lies outside [{self.minimum}, {self.maximum}]; widen the bounds or move the start")
 
     @property
     def stated_variability(self) -> Variability:

@@ -663,7 +663,7 @@ def test_decimation_loses_no_spike_and_zooms_to_every_sample() -> None:
     assert full
     assert stamps[0] == time_[54_299]
     assert stamps[-1] == time_[54_351]
-    np.testing.assert_array_equal(drawn, values[54_299:54_299 + len(drawn)])
+    np.testing.assert_array_equal(drawn, values[54_299 : 54_299 + len(drawn)])
 
 
 def test_decimation_keeps_the_order_of_a_slope() -> None:

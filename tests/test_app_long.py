@@ -89,9 +89,7 @@ def test_records_of_few_samples_are_taken_whole(pair: tuple[Record, Record]) -> 
     assert len(app_analysis._share([many], 60.0)[0]) < 100_000
 
 
-def test_the_whole_loop_and_the_report_take_the_windows_until_confirmed(
-    pair: tuple[Record, Record], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_whole_loop_and_the_report_take_the_windows_until_confirmed(pair: tuple[Record, Record], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in (("QUICK_TRAIN", 8.0), ("QUICK_HELD_OUT", 5.0), ("USUAL_RATE", 1.0)):
         monkeypatch.setattr(app_analysis, name, value)
     analysis = Analysis(JOINT, [pair[0]], [pair[1]])

@@ -253,6 +253,7 @@ def test_draws_follow_their_law() -> None:
 
 # --- being ended, and going on ---------------------------------------------------------------------------------------
 
+
 def start(path: Path, out: Path, *more: str) -> subprocess.Popen[str]:
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     return subprocess.Popen(

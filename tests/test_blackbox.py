@@ -76,12 +76,7 @@ def test_jacobian_is_the_derivative_of_the_residual(structure: Structure) -> Non
     model, _ = prediction_error_fit(records, orders)
     x = problem.pack(model) + 0.01 * np.random.default_rng(5).standard_normal(len(problem.pack(model)))
     step = 1e-6
-    numeric = np.column_stack(
-        [
-            (problem.residual(x + step * unit) - problem.residual(x - step * unit)) / (2 * step)
-            for unit in np.eye(len(x))
-        ]
-    )
+    numeric = np.column_stack([(problem.residual(x + step * unit) - problem.residual(x - step * unit)) / (2 * step) for unit in np.eye(len(x))])
     assert problem.jacobian(x) == pytest.approx(numeric, abs=1e-7)
 
 

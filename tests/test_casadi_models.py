@@ -119,9 +119,7 @@ def test_energy_of_a_law_without_potential_is_its_integral(monkeypatch: pytest.M
     model = conservative(3, "cubic_stiffness", values=SPRINGS["cubic_stiffness"])
     bare = replace(model, terms=tuple(replace(t, effect=replace(t.effect, potential=None)) for t in model.terms))
     state = np.array([0.4 + 2e-3, 0.3, 0.4, -0.2])
-    assert float(bare.energy(state, bare.value_vector())) == pytest.approx(
-        float(model.energy(state, model.value_vector())), rel=1e-12
-    )
+    assert float(bare.energy(state, bare.value_vector())) == pytest.approx(float(model.energy(state, model.value_vector())), rel=1e-12)
 
 
 # --- linear set ------------------------------------------------------------------------------------------------------
@@ -255,9 +253,7 @@ def test_load_of_a_rigid_joint_solves_with_the_acceleration() -> None:
 
 
 def test_load_from_gravity_needs_no_torque() -> None:
-    model = replace(
-        JointModel.harmonic_drive(3).add("gravity").add("load_dependent_friction@motor"), load_from="gravity"
-    )
+    model = replace(JointModel.harmonic_drive(3).add("gravity").add("load_dependent_friction@motor"), load_from="gravity")
     model = model.with_values({**TABLE_4_3, "gravity_torque": -100.0, "motor_load_friction": 0.1})
     rate = np.array(model.dynamics([0.3, 0.5, 0.3, 0.5], np.zeros(3), model.value_vector())).ravel()
     assert rate[1] == pytest.approx(-0.1 * 100 * math.sin(0.3) / 4.447, rel=1e-6)
@@ -375,9 +371,7 @@ def test_gain_and_offset_are_in_the_reading_and_come_off() -> None:
 
 def test_drive_effects_act_on_the_motion() -> None:
     model = JointModel(gear_ratio=-160.0).add("motor_constant_error").add("current_offset")
-    model = model.with_values(
-        {"motor_inertia": 4.0, "link_inertia": 6.0, "motor_constant_error": 0.18, "current_offset": -2.0}
-    )
+    model = model.with_values({"motor_inertia": 4.0, "link_inertia": 6.0, "motor_constant_error": 0.18, "current_offset": -2.0})
     assert float(model.dynamics([0, 0], [50.0, 0, 0], model.value_vector())[1]) == pytest.approx((1.18 * 50 - 2) / 10)
     assert corrected(model, drive=50.0)["drive"] == pytest.approx(1.18 * 50 - 2)
 

@@ -20,9 +20,7 @@ from identification.record import Record
 Array = npt.NDArray[np.float64]
 
 SHARED = Path(__file__).resolve().parents[1].parent / "shared"
-needs_shared = pytest.mark.skipif(
-    not SHARED.is_dir() and not os.environ.get("CI"), reason="the shared data are not beside the checkout"
-)
+needs_shared = pytest.mark.skipif(not SHARED.is_dir() and not os.environ.get("CI"), reason="the shared data are not beside the checkout")
 
 N = 5000
 DT = 2e-3
@@ -314,9 +312,7 @@ def test_velocity_of_another_axis() -> None:
     def spoil(a: dict[str, Array]) -> None:
         a["link_velocity"] = np.cos(7.7 * a["time"])
 
-    assert "does not follow" in next(
-        f.message for f in check(record(spoil), RATIO) if f.code == "velocity_position" and f.severity == "warn"
-    )
+    assert "does not follow" in next(f.message for f in check(record(spoil), RATIO) if f.code == "velocity_position" and f.severity == "warn")
 
 
 @pytest.mark.parametrize(

@@ -189,7 +189,7 @@ def test_effects_lists_every_effect_and_describes_one(tmp_path: Path, capsys: py
     assert data(tmp_path, "e.json")[0]["key"] == "backlash"
 
 
-OWN = '''
+OWN = """
 import casadi as ca
 from casadi_models import effect, signed
 
@@ -198,7 +198,7 @@ from casadi_models import effect, signed
         absence="a step at zero velocity", excitation="reversals", source="this test", candidate=False)
 def seal(s, p):
     return p.seal_drag * s.direction
-'''
+"""
 
 
 @pytest.fixture
@@ -274,8 +274,6 @@ def test_simulation_is_repeated_by_its_seed(tmp_path: Path) -> None:
 # --- track and plan --------------------------------------------------------------------------------------------------
 
 
-
-
 def test_track_follows_the_parameters_and_finds_no_fault_in_a_healthy_record(demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["track", str(DEMO / "held_out.npz"), "--joint", str(demo / "better.toml"), "--healthy", str(DEMO / "train.npz")]
     assert main([*command, "--json", str(tmp_path / "t.json"), "--fail-on-fault"]) == 0
@@ -310,9 +308,7 @@ def test_fault_codes_in_words() -> None:
     assert "joint changed" in fault_text(8)
 
 
-def test_plan_writes_the_best_motion_of_those_that_keep_the_limits(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_plan_writes_the_best_motion_of_those_that_keep_the_limits(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     from identification import excite
 
     few = excite.sinusoidal_grid([0.3, 0.7], [2.0], duration=6.0)

@@ -204,10 +204,14 @@ def test_unusable_input_is_one_line(said: Said, command: tuple[str, ...], expect
 @pytest.mark.parametrize(
     ("fault", "expected"),
     [
-        ("link_position:bias:nan:1", "start nan s, size 1, end inf s; give finite numbers"), ("link_position:bias:9:nan", "size nan"),
-        ("link_position:bias:9:inf", "size inf"), ("link_position:bias:9:1:nan", "end nan s"),
-        ("link_position:bias:-1:1", "it starts at -1 s; give 0 s or later"), ("link_position:delay:9:-0.1", "delay of size -0.1; give a size above 0"),
-        ("link_position:delay:9:0", "delay of size 0"), ("link_position:noise:9:-1", "noise of size -1"),
+        ("link_position:bias:nan:1", "start nan s, size 1, end inf s; give finite numbers"),
+        ("link_position:bias:9:nan", "size nan"),
+        ("link_position:bias:9:inf", "size inf"),
+        ("link_position:bias:9:1:nan", "end nan s"),
+        ("link_position:bias:-1:1", "it starts at -1 s; give 0 s or later"),
+        ("link_position:delay:9:-0.1", "delay of size -0.1; give a size above 0"),
+        ("link_position:delay:9:0", "delay of size 0"),
+        ("link_position:noise:9:-1", "noise of size -1"),
     ],
 )
 def test_faults_that_are_no_numbers_or_run_backwards(said: Said, fault: str, expected: str) -> None:

@@ -235,9 +235,7 @@ def test_contract_keys_are_there() -> None:
 
 def test_page_is_fresh(tmp_path: Path) -> None:
     written = Path(__file__).resolve().parents[1] / "docs" / "effects.md"
-    assert written.read_text(encoding="utf-8") == page(), (
-        "run python -m casadi_models.effects_doc --write docs/effects.md"
-    )
+    assert written.read_text(encoding="utf-8") == page(), "run python -m casadi_models.effects_doc --write docs/effects.md"
     assert main(["--write", str(tmp_path / "effects.md")]) == 0
     assert (tmp_path / "effects.md").read_text(encoding="utf-8") == page()
     for effect in EFFECTS.values():
@@ -251,9 +249,7 @@ def still(at: Any, ratio: float = -160.0) -> LocalSignals:
     """A joint at rest."""
     names = ("velocity", "acceleration", "direction", "torsion_rate", "torque", "load", "reading", "reading_rate",
              "time", "temperature")  # fmt: skip
-    return LocalSignals(
-        position=at, torsion=at, motor_angle=at * ratio, memory=(), gear_ratio=ratio, **dict.fromkeys(names, 0.0)
-    )
+    return LocalSignals(position=at, torsion=at, motor_angle=at * ratio, memory=(), gear_ratio=ratio, **dict.fromkeys(names, 0.0))
 
 
 @pytest.mark.parametrize("key", [k for k in sorted(EFFECTS) if EFFECTS[k].potential is not None])
@@ -284,9 +280,7 @@ DISSIPATIVE = [(k, p) for k, p in PLACES if EFFECTS[k].dissipative]
 def test_dissipative_law_never_gives_energy(key: str, place: str) -> None:
     model = with_effect(base(True), key, place)
     label = label_of(key, place)
-    alone = replace(
-        model, terms=tuple(t for t in model.terms if t.label == label or t.effect.key == "transmission_compliance")
-    )
+    alone = replace(model, terms=tuple(t for t in model.terms if t.label == label or t.effect.key == "transmission_compliance"))
     alone = alone.with_values({"stiffness": 0.0})
     e = alone.equations
     s = e.signals
@@ -307,16 +301,12 @@ def test_energy_never_rises_above_start(key: str, place: str) -> None:
     model = JointModel.harmonic_drive(3).add("gravity")
     needs_load_path = key == "load_dependent_friction"
     model = with_effect(model, key, place)
-    model = model.with_values(
-        {"gravity_torque": -105.18} | ({} if key == "structural_damping" else {"structural_damping": 0.0})
-    )
+    model = model.with_values({"gravity_torque": -105.18} | ({} if key == "structural_damping" else {"structural_damping": 0.0}))
     start = np.zeros(4 + len(model.functions.memory_names))
     start[:3:2] = [0.5 + 1e-3, 0.5]
     run = simulate(model, np.zeros(800), 1e-3, substeps=8, x0=start)
     energy = np.array(model.energy.map(800)(run.states.T, model.value_vector())).ravel()
-    assert (
-        energy.max() <= energy[0] * (1 + 1e-7) if energy[0] > 0 else energy.max() <= energy[0] + 1e-7 * abs(energy[0])
-    )
+    assert energy.max() <= energy[0] * (1 + 1e-7) if energy[0] > 0 else energy.max() <= energy[0] + 1e-7 * abs(energy[0])
     assert energy[-1] < energy[0] - 1e-6 * abs(energy[0])
     if not EFFECTS[key].states and not needs_load_path:
         assert np.diff(energy).max() <= 1e-7 * abs(energy[0])

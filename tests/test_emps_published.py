@@ -23,9 +23,7 @@ COLUMNS = {
     "motor_torque": {"column": "u_V", "scale": FORCE_PER_VOLT, "unit": "N"},
 }
 
-pytestmark = pytest.mark.skipif(
-    not FOLDER.is_dir() and not os.environ.get("CI"), reason="the measurements are not beside the checkout"
-)
+pytestmark = pytest.mark.skipif(not FOLDER.is_dir() and not os.environ.get("CI"), reason="the measurements are not beside the checkout")
 
 Array = npt.NDArray[np.float64]
 

@@ -147,9 +147,7 @@ def test_bad_input_is_one_line(action: Callable[[], object], words: str) -> None
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_healthy_readings_on_an_unseen_motion_give_no_alarm(
-    detector: FaultDetector, unseen: FloatArray, seed: int
-) -> None:
+def test_healthy_readings_on_an_unseen_motion_give_no_alarm(detector: FaultDetector, unseen: FloatArray, seed: int) -> None:
     track = detector.run(readings(unseen, seed))
     assert alarms(track) == []
     assert [e.verdict for e in track.events] == [Verdict.ARMED]
@@ -170,9 +168,7 @@ CASES = [
 
 
 @pytest.mark.parametrize(("sensor", "kind", "size", "within"), CASES)
-def test_the_failed_sensor_is_named(
-    detector: FaultDetector, unseen: FloatArray, sensor: str, kind: str, size: float, within: float
-) -> None:
+def test_the_failed_sensor_is_named(detector: FaultDetector, unseen: FloatArray, sensor: str, kind: str, size: float, within: float) -> None:
     fault = Fault(sensor, kind, START, size)  # type: ignore[arg-type]
     track = detector.run(inject(readings(unseen, 3), DT, [fault], seed=4)[:6000])
     named = [e for e in alarms(track) if e.is_sensor]
@@ -181,9 +177,7 @@ def test_the_failed_sensor_is_named(
     assert 0 <= named[0].sample * DT - START <= within
 
 
-def test_current_and_motor_friction_are_reported_as_a_pair(
-    detector: FaultDetector, follower: Follower, plant: JointModel, unseen: FloatArray
-) -> None:
+def test_current_and_motor_friction_are_reported_as_a_pair(detector: FaultDetector, follower: Follower, plant: JointModel, unseen: FloatArray) -> None:
     faulty = inject(readings(unseen, 3), DT, [Fault("current", "bias", START, 20.0)])
     first = alarms(detector.run(faulty))
     detector.reset()
@@ -238,9 +232,7 @@ def test_page_of_the_campaign_holds_what_is_wanted() -> None:
     ("factors", "part"),
     [({"stiffness": 0.8, "cubic_stiffness": 0.8}, "stiffness"), ({"link_inertia": 1.2, "gravity_torque": 1.2}, "link")],
 )
-def test_a_plant_change_is_no_sensor_fault(
-    detector: FaultDetector, follower: Follower, plant: JointModel, factors: dict[str, float], part: str
-) -> None:
+def test_a_plant_change_is_no_sensor_fault(detector: FaultDetector, follower: Follower, plant: JointModel, factors: dict[str, float], part: str) -> None:
     motion = sinusoidal(0.6, 2.3, duration=8.0).table
     after = np.arange(len(motion)) * DT >= START
     changes = {n: np.where(after, f, 1.0) * plant.values[n] for n, f in factors.items()}
@@ -251,9 +243,7 @@ def test_a_plant_change_is_no_sensor_fault(
     assert part in events[0].sensors
 
 
-def test_the_replaced_position_follows_the_true_one(
-    detector: FaultDetector, follower: Follower
-) -> None:
+def test_the_replaced_position_follows_the_true_one(detector: FaultDetector, follower: Follower) -> None:
     true = clean(follower, sinusoidal(0.6, 2.3, duration=15.0).table)
     faults = [Fault("link_position", "noise", START, 0.1), Fault("link_velocity", "noise", START + 2.0, 0.1)]
     track = detector.run(inject(readings(true, 6), DT, faults, seed=7))
@@ -278,9 +268,7 @@ def test_a_temporary_fault_ends_and_the_sensor_is_used_again(detector: FaultDete
     assert np.array_equal(track.reconstructed[-1], record[-1])
 
 
-def test_a_stuck_sensor_is_not_taken_back_where_the_motion_crosses_it(
-    detector: FaultDetector, unseen: FloatArray
-) -> None:
+def test_a_stuck_sensor_is_not_taken_back_where_the_motion_crosses_it(detector: FaultDetector, unseen: FloatArray) -> None:
     track = detector.run(inject(readings(unseen, 8), DT, [Fault("link_position", "stuck", START)]))
     assert [e.verdict for e in alarms(track)] == [Verdict.SENSOR]
     assert detector.failed == ("link_position",)
@@ -402,9 +390,7 @@ def test_damaged_or_foreign_states_are_refused(detector: FaultDetector, plant: J
         FaultDetector(plant, DT, "thesis").restore(state)
 
 
-def test_without_a_torque_sensor_positions_and_velocities_are_still_told_apart(
-    plant: JointModel, follower: Follower, unseen: FloatArray
-) -> None:
+def test_without_a_torque_sensor_positions_and_velocities_are_still_told_apart(plant: JointModel, follower: Follower, unseen: FloatArray) -> None:
     detector = FaultDetector(identified(plant), DT, has_torque=False)
     healthy = readings(clean(follower, sinusoidal(0.6, 3.0, duration=10.0).table), 0)
     healthy[:, 5] = np.nan
@@ -436,9 +422,7 @@ def thesis(plant: JointModel, follower: Follower) -> FaultDetector:
 
 
 @pytest.mark.parametrize("sensor", ["link_position", "link_velocity"])
-def test_the_thesis_rule_finds_noise_and_takes_the_sensor_back(
-    thesis: FaultDetector, unseen: FloatArray, sensor: str
-) -> None:
+def test_the_thesis_rule_finds_noise_and_takes_the_sensor_back(thesis: FaultDetector, unseen: FloatArray, sensor: str) -> None:
     thesis.reset()
     track = thesis.run(inject(readings(unseen, 3), DT, [Fault(sensor, "noise", START, 0.5, START + 1.5)], seed=1))
     kinds = [(e.verdict, e.sensors) for e in alarms(track) if e.verdict is not Verdict.PLANT]

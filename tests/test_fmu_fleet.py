@@ -68,9 +68,7 @@ def test_every_executor_gives_the_same(make, batch: Batch, expected: FloatArray)
     assert seen[-1] == (10, 10)
 
 
-def test_goes_on_where_it_stopped(
-    batch: Batch, expected: FloatArray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_goes_on_where_it_stopped(batch: Batch, expected: FloatArray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with ThreadPoolExecutor(1) as executor:
         run_fleet(batch, executor=executor, folder=tmp_path)
         (tmp_path / "chunk-000002.npz").unlink()
@@ -167,9 +165,7 @@ def own(system: tuple[System, Path]) -> dict[str, FloatArray]:
 
 def test_source_is_the_sum_of_sines(own: dict[str, FloatArray]) -> None:
     t = 1e-3 * np.arange(201)
-    np.testing.assert_allclose(
-        own["source.signal"], 8 * np.sin(2 * np.pi * 1.1 * t) + 3 * np.sin(2 * np.pi * 6.3 * t + 0.7), atol=1e-12
-    )
+    np.testing.assert_allclose(own["source.signal"], 8 * np.sin(2 * np.pi * 1.1 * t) + 3 * np.sin(2 * np.pi * 6.3 * t + 0.7), atol=1e-12)
 
 
 def test_ssp_is_the_same_again(system: tuple[System, Path], tmp_path: Path) -> None:

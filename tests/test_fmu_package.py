@@ -123,9 +123,7 @@ def test_estimates_in_fmpy(unzipped: Path) -> None:
     weight = np.sqrt(0.999 ** np.arange(299, -1, -1))
     matrix = np.column_stack([points[:, 0], np.ones(300)])
     prior = np.sqrt(0.999**300 / 1e3) * np.eye(2)
-    expected, *_ = np.linalg.lstsq(
-        np.vstack([matrix * weight[:, None], prior]), np.concatenate([points[:, 1] * weight, np.zeros(2)])
-    )
+    expected, *_ = np.linalg.lstsq(np.vstack([matrix * weight[:, None], prior]), np.concatenate([points[:, 1] * weight, np.zeros(2)]))
     assert found == pytest.approx(expected[0], rel=1e-9)
 
 
@@ -157,9 +155,7 @@ def clean_environment(**more: str) -> dict[str, str]:
 
 def test_c_host_agrees_with_fmpy(c_host: Path, unzipped: Path, tmp_path: Path) -> None:
     """50 cycles without LD_PRELOAD, from another working directory, special characters in the path."""
-    done = subprocess.run(
-        host_command(c_host, unzipped, 50, 40), cwd=tmp_path, env=clean_environment(), capture_output=True, text=True
-    )
+    done = subprocess.run(host_command(c_host, unzipped, 50, 40), cwd=tmp_path, env=clean_environment(), capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     slave = instance(unzipped)
     np.testing.assert_allclose([float(x) for x in done.stdout.split()], run(slave, 0, 40), rtol=1e-12, atol=0)
@@ -432,5 +428,3 @@ def test_shim_compiles_without_warnings(tmp_path: Path) -> None:
     flags = ["-std=gnu99", "-Wall", "-Werror", "-fsyntax-only", f"-I{header_folder()}", f"-I{tmp_path}"]
     subprocess.run([compiler, *flags, "-D_GNU_SOURCE", str(source)], check=True)
     assert compile_library({"a.c": b"int f(void) { return 1; }"}, "a.c", "x86_64-linux-gnu")[:4] == b"\x7fELF"
-
-

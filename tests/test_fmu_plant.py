@@ -48,9 +48,7 @@ def joint(name: str = "two_mass", **options: object) -> PlantSpec:
     spring = p[2] * twist + p[4] * twist**3
     torque = spring + p[3] * rate
     friction = p[5] * x[1] + p[6] * ca.tanh(x[1] / 0.05)
-    dx = ca.vertcat(
-        x[1], (u[0] - torque - friction) / p[0], x[3], (torque + u[1] - p[7] * ca.sin(x[2])) / p[1]
-    )
+    dx = ca.vertcat(x[1], (u[0] - torque - friction) / p[0], x[3], (torque + u[1] - p[7] * ca.sin(x[2])) / p[1])
     stored = p[0] * x[1] ** 2 / 2 + p[1] * x[3] ** 2 / 2 + p[2] * twist**2 / 2 + p[4] * twist**4 / 4
     y = ca.vertcat(x[2] + 1e-3 * u[1], torque, stored - p[7] * ca.cos(x[2]))
     return PlantSpec(

@@ -43,9 +43,7 @@ SPRING = Case("added_spring", "added_spring@link", {"link_added_spring": 25.0}, 
 def joints(case: Case) -> tuple[Joint, Joint]:
     """The plant with the effect, and the joint file that lacks it and has no values."""
     base = reference_joint("hd3")
-    base = replace(
-        base, effects=tuple(e for e in base.effects if e != "stribeck@motor"), fitted={k: v for k, v in base.fitted.items() if "stribeck" not in k}
-    )
+    base = replace(base, effects=tuple(e for e in base.effects if e != "stribeck@motor"), fitted={k: v for k, v in base.fitted.items() if "stribeck" not in k})
     plant = replace(base, name="hidden", effects=(*base.effects, case.label))
     own = dict(zip(plant.model().parameter_names, plant.model().value_vector(), strict=True))
     return replace(plant, fitted={**own, **base.fitted, **case.values}), replace(start_of(base), name="known")

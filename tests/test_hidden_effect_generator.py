@@ -40,9 +40,7 @@ def still(rows: int) -> tuple[FloatArray, FloatArray]:
 
 def free_run(changes: dict[str, float], state: list[float], step: float = STEP) -> FloatArray:
     joint = {"JM": 4.4, "JL": 10.3, "TG": -105.0, "K": 2.15e4, "N": 160.0, "NKM": 8.8, **changes}
-    return simulate(
-        [pack(joint)], [still(1000)], [np.array(state)], [np.zeros((0, 3))], dt=DT, pre_roll=0.0, step=step
-    )[0]
+    return simulate([pack(joint)], [still(1000)], [np.array(state)], [np.zeros((0, 3))], dt=DT, pre_roll=0.0, step=step)[0]
 
 
 def energy(table: FloatArray, k3: float = 0.0) -> FloatArray:
@@ -178,11 +176,7 @@ def balance_ratios(table: FloatArray, ratio: float, truth: dict[str, float]) -> 
     # away from reversals, over the whole window, where the friction does not depend on its smoothing
     away = np.convolve((np.abs(np.convolve(table[:, 5], np.ones(15) / 15, "same")) < 0.08), np.ones(31), "valid") < 0.5
     m = f(ratio * KM * i - t, w) - f(q, jm * dd + bm * d) - truth["motor_coulomb_Nm"] * np.sign(v)
-    li = (
-        f(t + truth["gravity_torque_Nm"] * np.sin(ql), w)
-        - f(ql, jl * dd + bl * d)
-        - truth["link_coulomb_Nm"] * np.sign(vl)
-    )
+    li = f(t + truth["gravity_torque_Nm"] * np.sin(ql), w) - f(ql, jl * dd + bl * d) - truth["link_coulomb_Nm"] * np.sign(vl)
     tr = f(t, w) - f(q - ql, k * w + c * d)
     norm = np.linalg.norm
     expected = {
@@ -349,9 +343,7 @@ def oracle(train: list[Path], held_out: list[Path], joint: Path) -> dict[str, An
     name = truth["hidden_effect"]
     if truth["outside"]:
         return answer(verdict="unexplained", unexplained=[{"balance": truth["balance"][name], "share_percent": 90}])
-    return answer(
-        *([name],) if name else (), first=name or "stribeck", verdict="complete" if name else "nothing_missing"
-    )
+    return answer(*([name],) if name else (), first=name or "stribeck", verdict="complete" if name else "nothing_missing")
 
 
 def test_campaign_counts_and_reports(tmp_path: Path) -> None:

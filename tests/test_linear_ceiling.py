@@ -21,9 +21,7 @@ NOISE = 0.02
 SPRING = ("viscous", "added_spring")
 
 
-def axis(
-    seed: int, *, coulomb: float = 0.0, viscous: float = 1.5, seconds: float = 24.0, second: float = 0.3, runs: int = 1, name: str = "axis"
-) -> Record:
+def axis(seed: int, *, coulomb: float = 0.0, viscous: float = 1.5, seconds: float = 24.0, second: float = 0.3, runs: int = 1, name: str = "axis") -> Record:
     """An axis of inertia 2 seen from one side, moved by two sines."""
     rng = np.random.default_rng(seed)
     time = np.arange(0, seconds, 0.002)

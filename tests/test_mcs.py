@@ -217,10 +217,7 @@ def test_objective_may_overwrite_its_argument() -> None:
 
 def same(a: MCSResult, b: MCSResult) -> bool:
     basket = all(p.fun == q.fun and np.array_equal(p.x, q.x) for p, q in zip(a.basket, b.basket, strict=True))
-    plain = all(
-        getattr(a, name) == getattr(b, name)
-        for name in ("fun", "nfev", "nit", "nfev_local", "local_searches", "not_finite", "outcome")
-    )
+    plain = all(getattr(a, name) == getattr(b, name) for name in ("fun", "nfev", "nit", "nfev_local", "local_searches", "not_finite", "outcome"))
     return basket and plain and np.array_equal(a.x, b.x)
 
 
@@ -509,9 +506,7 @@ def test_no_local_search() -> None:
     assert len(result.basket) > 10
     assert not any(minimum.converged for minimum in result.basket)
     assert CAMEL.minimum < result.fun < -0.9
-    deeper = mcs(
-        CAMEL.fun, CAMEL.box, max_evaluations=3000, stall_sweeps=0, options=MCSOptions(local_steps=0, levels=60)
-    )
+    deeper = mcs(CAMEL.fun, CAMEL.box, max_evaluations=3000, stall_sweeps=0, options=MCSOptions(local_steps=0, levels=60))
     assert CAMEL.minimum < deeper.fun < CAMEL.minimum + 1e-3
 
 
@@ -660,9 +655,7 @@ def test_model_of_a_quadratic_is_exact(seed: int) -> None:
     model.triple_search(full=True)
     inside = [i for i in range(4) if not model.on_bound(i)]
     np.testing.assert_allclose(np.array(model.g)[inside], (matrix @ (np.array(model.x) - centre))[inside], atol=1e-4)
-    np.testing.assert_allclose(
-        np.array(model.hessian)[np.ix_(inside, inside)], matrix[np.ix_(inside, inside)], atol=1e-2
-    )
+    np.testing.assert_allclose(np.array(model.hessian)[np.ix_(inside, inside)], matrix[np.ix_(inside, inside)], atol=1e-2)
 
 
 def test_search_out_of_steps_admits_one_more_from_the_same_valley() -> None:

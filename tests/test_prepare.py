@@ -76,9 +76,7 @@ def test_drop_ends_keeps_the_middle() -> None:
         drop_ends(np.arange(98.0))
 
 
-@pytest.mark.parametrize(
-    ("up", "down", "offset", "factor"), [(2.773, -2.029, 0.372, 2.401), (2.141, -2.933, -0.396, 2.537)]
-)
+@pytest.mark.parametrize(("up", "down", "offset", "factor"), [(2.773, -2.029, 0.372, 2.401), (2.141, -2.933, -0.396, 2.537)])
 def test_accelerometer_calibration_of_the_thesis(up: float, down: float, offset: float, factor: float) -> None:
     """Annex A: offsets 0.372 V and -0.396 V, 1 g = 2.401 V and 2.537 V."""
     noise = 0.05 * np.sin(np.linspace(0.0, 20 * np.pi, 4001))[:-1]

@@ -112,9 +112,7 @@ def test_empty_cells_become_nan_only_there(tmp_path: Path) -> None:
 
 
 def test_run_column_of_text_makes_segments(tmp_path: Path) -> None:
-    body = "run,ok,time_s,motor_current_A\n" + "".join(
-        f"{'slow' if k < 5 else 'fast one'},True,{0.1 * (k % 5)},{k}\n" for k in range(10)
-    )
+    body = "run,ok,time_s,motor_current_A\n" + "".join(f"{'slow' if k < 5 else 'fast one'},True,{0.1 * (k % 5)},{k}\n" for k in range(10))
     record = read(write(tmp_path / "run.csv", body))
     assert record.segments() == [slice(0, 5), slice(5, 10)]
     np.testing.assert_array_equal(record["motor_current"], np.arange(10.0))
@@ -529,9 +527,7 @@ def test_mcap_with_json_messages(tmp_path: Path) -> None:
         ("a.mcap", b"\x89MCAP0\r\n", "mcap.reader", "ros"),
     ],
 )
-def test_missing_package_says_what_to_install(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, magic: bytes, module: str, extra: str
-) -> None:
+def test_missing_package_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, magic: bytes, module: str, extra: str) -> None:
     (tmp_path / name).write_bytes(magic + b"\x00" * 100)
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(InputError, match=rf"pip install irj\[{extra}\]"):

@@ -65,9 +65,7 @@ def quanser() -> Improvement:
         name="quanser",
     )
     half = len(record) // 2
-    return improve(
-        record.take(slice(0, half)), joint(model="hd1", effects=["viscous"], torque_per_current=8.925), [record.take(slice(half, None))]
-    )
+    return improve(record.take(slice(0, half)), joint(model="hd1", effects=["viscous"], torque_per_current=8.925), [record.take(slice(half, None))])
 
 
 def test_quanser_is_elastic_with_coulomb_friction_and_not_explained() -> None:

@@ -42,8 +42,7 @@ def _data(samples: int, n: int = 4, m: int = 2, noise: float = 0.1, seed: int = 
 def test_without_forgetting_it_is_the_posterior_of_all_samples() -> None:
     _, h, y = _data(200)
     scale, noise, theta0 = np.array([2.0, 3.0, 1.0, 5.0]), np.array([0.01, 0.04]), np.full(4, 0.3)
-    estimator = RecursiveLeastSquares(theta0, scale, "constant", R2=noise,
-                                      settings=Settings(freeze=False, forgetting=1.0))
+    estimator = RecursiveLeastSquares(theta0, scale, "constant", R2=noise, settings=Settings(freeze=False, forgetting=1.0))
     estimator.run(y, h)
     weighted = h / noise[:, None]
     information = np.diag(scale**-2) + np.einsum("koi,koj->ij", weighted, h)
@@ -55,8 +54,7 @@ def test_without_forgetting_it_is_the_posterior_of_all_samples() -> None:
 def test_constant_forgetting_is_exponentially_weighted_least_squares() -> None:
     _, h, y = _data(300, m=1)
     factor, scale = 0.97, np.array([2.0, 3.0, 1.0, 5.0])
-    estimator = RecursiveLeastSquares(np.zeros(4), scale, "constant", R2=1e-2,
-                                      settings=Settings(freeze=False, forgetting=factor, covariance_limit=1e6))
+    estimator = RecursiveLeastSquares(np.zeros(4), scale, "constant", R2=1e-2, settings=Settings(freeze=False, forgetting=factor, covariance_limit=1e6))
     estimator.run(y, h)
     weight = factor ** np.arange(299, -1, -1.0)
     information = factor**300 * np.diag(scale**-2) + np.einsum("k,ki,kj->ij", weight / 1e-2, h[:, 0], h[:, 0])
@@ -69,8 +67,7 @@ def test_random_walk_is_the_kalman_filter_with_process_noise() -> None:
     _, h, y = _data(400)
     scale, noise, walk = np.full(4, 2.0), np.array([0.01, 0.02]), np.array([1e-4, 2e-4, 0.0, 1e-5])
     # The shortest window: process noise is then added after every second sample.
-    estimator = RecursiveLeastSquares(np.zeros(4), scale, R1=walk, R2=noise,
-                                      settings=Settings(freeze=False, alarm_drift=0.0, window_seconds=1e-3))
+    estimator = RecursiveLeastSquares(np.zeros(4), scale, R1=walk, R2=noise, settings=Settings(freeze=False, alarm_drift=0.0, window_seconds=1e-3))
     run = estimator.run(y, h)
     theta, p = np.zeros(4), np.diag(scale**2)
     for k in range(400):
@@ -175,8 +172,7 @@ def test_a_million_updates_do_not_diverge(method: str) -> None:
 def test_p_stays_under_its_bound_without_excitation(method: str, freeze: bool) -> None:
     h = np.zeros((3000, 2, 3))
     h[:, :, 0] = 1.0
-    estimator = RecursiveLeastSquares(np.zeros(3), [1.0, 2.0, 3.0], method,
-                                      settings=Settings(freeze=freeze, covariance_limit=0.25, forgetting=0.95))
+    estimator = RecursiveLeastSquares(np.zeros(3), [1.0, 2.0, 3.0], method, settings=Settings(freeze=freeze, covariance_limit=0.25, forgetting=0.95))
     estimator.run(np.ones((3000, 2)), h)
     assert np.all(np.diag(estimator.covariance) <= 0.25 * np.array([1.0, 4.0, 9.0]) * (1.0 + 1e-12))
 
@@ -258,13 +254,13 @@ def test_a_compiler_that_fails_is_named(monkeypatch: pytest.MonkeyPatch, tmp_pat
 
 @needs_compiler
 def test_two_processes_build_into_one_cache_at_once(tmp_path: Path) -> None:
-    code = ("import numpy as np; from identification.recursive import RecursiveLeastSquares as R;"
-            "e = R(np.zeros(2), np.ones(2)); r = e.run(np.ones((9, 1)), np.ones((9, 1, 2)), compiled=True);"
-            "print(r.outcome.name, r.theta[-1].tobytes().hex())")
-    environment = {**os.environ, CACHE_VARIABLE: str(tmp_path / "cache"),
-                   "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
-    started = [subprocess.Popen([sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, text=True)
-               for _ in range(2)]
+    code = (
+        "import numpy as np; from identification.recursive import RecursiveLeastSquares as R;"
+        "e = R(np.zeros(2), np.ones(2)); r = e.run(np.ones((9, 1)), np.ones((9, 1, 2)), compiled=True);"
+        "print(r.outcome.name, r.theta[-1].tobytes().hex())"
+    )
+    environment = {**os.environ, CACHE_VARIABLE: str(tmp_path / "cache"), "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+    started = [subprocess.Popen([sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, text=True) for _ in range(2)]
     printed = [process.communicate(timeout=120)[0] for process in started]
     assert printed[0] == printed[1]
     assert printed[0].startswith("COMPILED")
@@ -281,8 +277,9 @@ def test_a_damaged_library_is_built_again(monkeypatch: pytest.MonkeyPatch, tmp_p
 
     built: list[Path] = []
     compile_source = _compiler._compile
-    monkeypatch.setattr(_compiler, "_compile", lambda s, c, f, target: (built.append(target), target.write_bytes(b"x"))
-                        if not built else compile_source(s, c, f, target))
+    monkeypatch.setattr(
+        _compiler, "_compile", lambda s, c, f, target: (built.append(target), target.write_bytes(b"x")) if not built else compile_source(s, c, f, target)
+    )
     assert RecursiveLeastSquares([0.0, 0.0], 1.0).run(y, h, compiled=True).outcome is RunOutcome.NO_COMPILER
     _library.cache_clear()
     assert RecursiveLeastSquares([0.0, 0.0], 1.0).run(y, h, compiled=True).outcome is RunOutcome.COMPILED
@@ -319,8 +316,11 @@ def test_foreign_or_damaged_states_are_refused() -> None:
     saved = estimator.state()
     damaged = bytearray(saved)
     damaged[100] ^= 1
-    foreign = [RecursiveLeastSquares(np.zeros(4), np.ones(4), outputs=2),
-               RecursiveLeastSquares([0.0] * 3, 1.0, "bell", outputs=2), RecursiveLeastSquares([0.0] * 3, 1.0, outputs=1)]
+    foreign = [
+        RecursiveLeastSquares(np.zeros(4), np.ones(4), outputs=2),
+        RecursiveLeastSquares([0.0] * 3, 1.0, "bell", outputs=2),
+        RecursiveLeastSquares([0.0] * 3, 1.0, outputs=1),
+    ]
     for state in [b"", b"x" * 100, saved[:-8], bytes(damaged), *(other.state() for other in foreign)]:
         with pytest.raises(InputError, match="restore"):
             estimator.restore(state)
@@ -516,32 +516,46 @@ def test_startup_singular_values_are_those_of_the_scaled_regressor() -> None:
 # Bad input
 
 
-@pytest.mark.parametrize(("arguments", "keywords"), [
-    (([], 1.0), {}),
-    (([[1.0]], 1.0), {}),
-    (([np.nan], 1.0), {}),
-    ((["a"], 1.0), {}),
-    (([1.0, 2.0], [1.0, 0.0]), {}),
-    (([1.0, 2.0], [1.0, -1.0]), {}),
-    (([1.0, 2.0], [1.0, 1.0, 1.0]), {}),
-    (([1.0], np.inf), {}),
-    (([1.0], 1.0, "magic"), {}),
-    (([1.0], 1.0), {"outputs": 0}),
-    (([1.0], 1.0), {"names": ("a", "b")}),
-    (([1.0], 1.0), {"R1": [-1.0]}),
-    (([1.0], 1.0), {"R2": [0.0]}),
-    (([1.0, 1.0], 1.0), {"R1": [[1.0, 0.5], [0.5, 1.0]]}),
-    (([1.0], 1.0), {"outputs": 2, "R2": [1.0, 1.0, 1.0]}),
-    ((np.zeros(65), 1.0), {}),
-])
+@pytest.mark.parametrize(
+    ("arguments", "keywords"),
+    [
+        (([], 1.0), {}),
+        (([[1.0]], 1.0), {}),
+        (([np.nan], 1.0), {}),
+        ((["a"], 1.0), {}),
+        (([1.0, 2.0], [1.0, 0.0]), {}),
+        (([1.0, 2.0], [1.0, -1.0]), {}),
+        (([1.0, 2.0], [1.0, 1.0, 1.0]), {}),
+        (([1.0], np.inf), {}),
+        (([1.0], 1.0, "magic"), {}),
+        (([1.0], 1.0), {"outputs": 0}),
+        (([1.0], 1.0), {"names": ("a", "b")}),
+        (([1.0], 1.0), {"R1": [-1.0]}),
+        (([1.0], 1.0), {"R2": [0.0]}),
+        (([1.0, 1.0], 1.0), {"R1": [[1.0, 0.5], [0.5, 1.0]]}),
+        (([1.0], 1.0), {"outputs": 2, "R2": [1.0, 1.0, 1.0]}),
+        ((np.zeros(65), 1.0), {}),
+    ],
+)
 def test_bad_arguments_are_refused_in_one_line(arguments: tuple[object, ...], keywords: dict[str, object]) -> None:
     with pytest.raises(InputError, match=r"^RecursiveLeastSquares: [^\n]+$"):
         RecursiveLeastSquares(*arguments, **keywords)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("values", [{"forgetting": 0.9}, {"forgetting": 1.1}, {"forgetting_low": 0.5}, {"drift": -1.0},
-                                    {"sample_time": 0.0}, {"alarm_probability": 0.7}, {"output_floor": -1.0},
-                                    {"drift": float("nan")}, {"window_seconds": "long"}])
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"forgetting": 0.9},
+        {"forgetting": 1.1},
+        {"forgetting_low": 0.5},
+        {"drift": -1.0},
+        {"sample_time": 0.0},
+        {"alarm_probability": 0.7},
+        {"output_floor": -1.0},
+        {"drift": float("nan")},
+        {"window_seconds": "long"},
+    ],
+)
 def test_bad_settings_are_refused_in_one_line(values: dict[str, float]) -> None:
     with pytest.raises(InputError, match=r"^RecursiveLeastSquares: [^\n]+$"):
         Settings(**values)  # type: ignore[arg-type]
@@ -549,13 +563,18 @@ def test_bad_settings_are_refused_in_one_line(values: dict[str, float]) -> None:
 
 def test_wrong_shapes_are_refused_in_one_line() -> None:
     estimator = RecursiveLeastSquares(np.zeros(3), np.ones(3), outputs=2)
-    for y, h in [(1.0, np.ones(3)), (np.ones(2), np.ones((3, 2))), (np.ones(3), np.ones((2, 3))),
-                 (np.ones((2, 1)), np.ones((2, 3))), (["a", "b"], np.ones((2, 3))), (np.ones(2), 1.0),
-                 (np.ones(2, dtype=complex), np.ones((2, 3)))]:
+    for y, h in [
+        (1.0, np.ones(3)),
+        (np.ones(2), np.ones((3, 2))),
+        (np.ones(3), np.ones((2, 3))),
+        (np.ones((2, 1)), np.ones((2, 3))),
+        (["a", "b"], np.ones((2, 3))),
+        (np.ones(2), 1.0),
+        (np.ones(2, dtype=complex), np.ones((2, 3))),
+    ]:
         with pytest.raises(InputError, match=r"^update: [^\n]+$"):
             estimator.update(y, h)
-    for y, h in [(np.ones((5, 2)), np.ones((4, 2, 3))), (np.ones((5, 1)), np.ones((5, 1, 3))), (1.0, 1.0),
-                 (np.ones((5, 2)), np.ones((5, 6)))]:
+    for y, h in [(np.ones((5, 2)), np.ones((4, 2, 3))), (np.ones((5, 1)), np.ones((5, 1, 3))), (1.0, 1.0), (np.ones((5, 2)), np.ones((5, 6)))]:
         with pytest.raises(InputError, match=r"^run: [^\n]+$"):
             estimator.run(y, h)
     with pytest.raises(InputError, match="stride"):

@@ -55,9 +55,7 @@ def test_against_another_integrator() -> None:
     start = np.array([0.402, 0.5, 0.4, 0.5])
     u = np.array([60.0, 0.0, 0.0])
     run = simulate(model, np.full(201, 60.0), 2e-3, substeps=10, x0=start)
-    other = solve_ivp(
-        lambda t, x: np.array(f.dynamics(x, u, p)).ravel(), (0, 0.4), start, rtol=1e-11, atol=1e-13, method="DOP853"
-    )
+    other = solve_ivp(lambda t, x: np.array(f.dynamics(x, u, p)).ravel(), (0, 0.4), start, rtol=1e-11, atol=1e-13, method="DOP853")
     assert run.states[-1] == pytest.approx(other.y[:, -1], rel=1e-7, abs=1e-8)
 
 

@@ -105,9 +105,7 @@ def test_stiffness_of_model_2a_is_1_23_times_the_catalogue() -> None:
         (thesis.model_1b, "coupled", 9.1791, 111.975, 28.1442),
     ],
 )
-def test_rigid_models(
-    make: Callable[[str], JointModel], variant: str, inertia: float, gravity: float, coulomb: float | None
-) -> None:
+def test_rigid_models(make: Callable[[str], JointModel], variant: str, inertia: float, gravity: float, coulomb: float | None) -> None:
     model = make(variant)
     values = dict(zip(model.parameter_names, model.value_vector(), strict=True))
     assert not model.is_elastic

@@ -165,9 +165,7 @@ def test_data_of_the_replay(failed: Replay) -> None:
     assert len(data["time"]) == len(stiffness["history"]) == len(stiffness["sigma_history"])
 
 
-def test_a_sensor_dead_from_the_start_is_reported_without_parameters(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_sensor_dead_from_the_start_is_reported_without_parameters(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The first window never has every reading, so nothing can be estimated; the fault is still told."""
     assert run_track(namespace(folder, inject=["link_position:stuck:2"], report=str(folder / "tot.html"), fail_on_fault=True)) == 1
     said = capsys.readouterr().out

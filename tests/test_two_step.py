@@ -40,9 +40,7 @@ TRUE = {"b": 9.0, "C1": 29.0, "C2": 480.0, "w1": 0.0595, "wS": 0.0251}
 
 def friction(w: FloatArray, c2: float = 480.0, linear: float = 1.0, shape: float = 1.0) -> FloatArray:
     """Table 4.6, linear and shape parameters multiplied."""
-    return linear * (
-        9 * w + 29 * np.tanh(w / (0.0595 * shape)) + c2 * w * np.exp(-np.abs(w) / (0.0251 * shape))
-    )
+    return linear * (9 * w + 29 * np.tanh(w / (0.0595 * shape)) + c2 * w * np.exp(-np.abs(w) / (0.0251 * shape)))
 
 
 def noisy(seed: int, w: FloatArray = SINE, c2: float = 480.0, noise: float = 0.01) -> FloatArray:
@@ -53,9 +51,7 @@ def noisy(seed: int, w: FloatArray = SINE, c2: float = 480.0, noise: float = 0.0
 def numpy_model() -> SeparableModel:
     """The same friction without CasADi: derivative by differences."""
     return SeparableModel(
-        columns=lambda s, e: np.column_stack(
-            [s[:, 0], np.tanh(s[:, 0] / e[0]), s[:, 0] * np.exp(-np.abs(s[:, 0]) / e[1])]
-        ),
+        columns=lambda s, e: np.column_stack([s[:, 0], np.tanh(s[:, 0] / e[0]), s[:, 0] * np.exp(-np.abs(s[:, 0]) / e[1])]),
         coefficients=(Coefficient("b", "", True), Coefficient("C1", "", True), Coefficient("C2", "", True)),
         shapes=(Shape("w1", 0.005, 0.5, 0.05), Shape("wS", 0.002, 0.2, 0.02)),
     )
@@ -431,9 +427,7 @@ def test_the_window_holds_the_last_samples_in_order() -> None:
 def test_two_outputs_that_share_parameters_are_weighted_by_their_noise() -> None:
     s, eta = ca.SX.sym("s", 1), ca.SX.sym("eta", 1)
     phi = ca.vertcat(ca.horzcat(ca.tanh(s / eta), s), ca.horzcat(ca.tanh(s / eta), 0))
-    model = from_casadi(
-        ca.Function("two", [s, eta], [phi]), [Coefficient("a"), Coefficient("b")], [Shape("w", 0.01, 1.0, 0.1)]
-    )
+    model = from_casadi(ca.Function("two", [s, eta], [phi]), [Coefficient("a"), Coefficient("b")], [Shape("w", 0.01, 1.0, 0.1)])
     rng = np.random.default_rng(0)
     y = model.matrix(SINE[:, None], np.array([0.06])) @ np.array([5.0, 3.0])
     y += rng.normal(size=y.shape) * [0.01, 1.0]

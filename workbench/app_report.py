@@ -68,9 +68,7 @@ def _steps(analysis: Analysis, data: Dataset, entries: Sequence[StepEntry], *, j
     return out
 
 
-def _solved(
-    analysis: Analysis, data: Dataset, effects: Sequence[str], virtual_work: bool, values: Mapping[str, float], iterations: int = 2
-) -> Solution:
+def _solved(analysis: Analysis, data: Dataset, effects: Sequence[str], virtual_work: bool, values: Mapping[str, float], iterations: int = 2) -> Solution:
     model = analysis.model_of([label for label in effects if label != HOLD_DELAY], virtual_work)
     return solve(model, data, start=values, iterations=iterations)
 

@@ -37,8 +37,7 @@ def refuse_size(name: str, size: int, limit: int, folder: Path) -> None:
     """
     if size > limit:
         raise TooLargeError(
-            f"{name}: {megabytes(size)} is over the limit of {megabytes(limit)}; save it as NPZ, cut it, "
-            "or give its path on the command line: irj app FILE"
+            f"{name}: {megabytes(size)} is over the limit of {megabytes(limit)}; save it as NPZ, cut it, or give its path on the command line: irj app FILE"
         )
     if disk_usage(folder).free < size + RESERVE:
         raise TooLargeError(f"{name}: not enough space on the disk of {folder} for {megabytes(size)}; free some")

@@ -225,4 +225,3 @@ def addable(live: Live) -> list[dict[str, Any]]:
 def current_effects(state: State) -> list[str]:
     """Labels of the effects in the model, without the delay of the drive's hold."""
     return [label for label in state.steps[-1].effects if label != HOLD_DELAY] if state.steps else []
-

@@ -164,9 +164,7 @@ def _made(live: Live, name: str) -> Response:
     if not path.is_file():
         raise InputError(f"no {name} yet; make it on its page first")
     stem = _named(live) + (f"_{path.stem}" if path.suffix in (".fmu", ".csv") else "")
-    return FileResponse(
-        path, filename=f"{stem}{path.suffix}", media_type="application/octet-stream", headers={"cache-control": "no-store"}
-    )
+    return FileResponse(path, filename=f"{stem}{path.suffix}", media_type="application/octet-stream", headers={"cache-control": "no-store"})
 
 
 def _report(live: Live, query: Query) -> Response:

@@ -225,8 +225,7 @@ def unexplained_html(improvement: Improvement) -> str:
 def minor_html(improvement: Improvement) -> str:
     """Small but certain effects, worded as such."""
     items = "".join(
-        f"<li>{' or '.join(title_of(k) for k in c.effects)} ({text(c.balance)} balance): {percent(c.held_out_drop_percent, 2)}</li>"
-        for c in improvement.minor
+        f"<li>{' or '.join(title_of(k) for k in c.effects)} ({text(c.balance)} balance): {percent(c.held_out_drop_percent, 2)}</li>" for c in improvement.minor
     )
     return f"<h3>Small but certain</h3><p>Seen in every check, but too small to be added:</p><ul>{items}</ul>" if items else ""
 

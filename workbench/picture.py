@@ -29,7 +29,7 @@ def improvement_picture(improvement: Improvement) -> str:
     before, after = plots.places[0]
     telling = place_picture(before, after)
     legend = _word(WIDTH + 54, BEFORE, "◆ start model") + (_word(WIDTH + 154, AFTER, "■ with the additions") if after is not None else "")
-    title = _word(54, INK, "error on records the fit never saw") 
+    title = _word(54, INK, "error on records the fit never saw")
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {2 * WIDTH} {HEIGHT + _HEAD}" width="{2 * WIDTH}" height="{HEIGHT + _HEAD}" '
         f'font-family="system-ui, sans-serif"><rect width="100%" height="100%" fill="#ffffff"/>{title}{legend}'

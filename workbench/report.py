@@ -39,9 +39,7 @@ RANKED_SHOWN: Final = 8
 PACKAGES: Final = ("irj", "casadi", "numpy", "scipy")
 
 
-def write_report(
-    improvement: Improvement, to: str | Path, *, records: Sequence[Record] = (), command: str | None = None
-) -> Path:
+def write_report(improvement: Improvement, to: str | Path, *, records: Sequence[Record] = (), command: str | None = None) -> Path:
     """Write the report of an improvement as one HTML file.
 
     Parameters
@@ -83,8 +81,7 @@ def render_report(improvement: Improvement, *, records: Sequence[Record] = (), c
     sections.append(("provenance", "Where the figures come from", fragments.provenance_html(improvement, records, versions(), command, made)))
     links = "".join(f'<li><a href="#{key}">{text(title)}</a></li>' for key, title, _ in sections)
     parts = "".join(
-        f'<section id="{key}" aria-labelledby="{key}-title"><h2 id="{key}-title">{text(title)}</h2>{body}</section>'
-        for key, title, body in sections
+        f'<section id="{key}" aria-labelledby="{key}-title"><h2 id="{key}-title">{text(title)}</h2>{body}</section>' for key, title, body in sections
     )
     body = (
         f'<a class="skip" href="#ledger">Skip to the figures</a><header><p class="eyebrow">Joint report</p><h1>{text(name)}</h1></header><main>'
@@ -100,9 +97,7 @@ def _sections(improvement: Improvement, result: dict[str, Any], plots: ReportPlo
     trials = improvement.ranking.trials if improvement.ranking else ()
     where = "held-out records" if plots is not None and plots.on_held_out else "training records"
     effort = "force" if improvement.joint.kind == "linear" else "torque"
-    ledger = (
-        f"<div class='beside'>{staircase_html(result)}<div>{ledger_html(result)}</div></div><p class='note'>{_ledger_note(result, effort)}</p>"
-    )
+    ledger = f"<div class='beside'>{staircase_html(result)}<div>{ledger_html(result)}</div></div><p class='note'>{_ledger_note(result, effort)}</p>"
     ranked = ""
     if result["ranking"]:
         rest = len(result["ranking"]) - RANKED_SHOWN

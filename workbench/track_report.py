@@ -148,9 +148,7 @@ def _parameters_html(replay: Replay, joint: Joint) -> str:
         rows.append([text(words(name)), with_error(float(last), float(sigma)), pretty_unit(p.unit), text(p.side), number(float(first), 5),
                      number(known, 5) if known is not None else "–", change])  # fmt: skip
     head = ["parameter", "last value ± standard deviation", "unit", "side", "first", "joint file", "last against joint file"]
-    ratios = ", ".join(
-        f"{text(b)} {number(v, 3)} ({text(BALANCES.get(b, ''))})" for v, b in _at_end(replay)
-    )
+    ratios = ", ".join(f"{text(b)} {number(v, 3)} ({text(BALANCES.get(b, ''))})" for v, b in _at_end(replay))
     listed = table(head, rows, "At the end of the record", wide=True)
     return (
         f"<p class='legend'><span class='key after'>— estimate, band of {SIGMAS:g} standard deviations</span><span class='key'>┄ joint file</span>"

@@ -1,7 +1,7 @@
 """Re-enact the thesis's tables and figures on simulated data and write the page.
 
-    python -m benchmarks.thesis --out docs/thesis.md     everything: the page and its pictures (some minutes)
-    python -m benchmarks.thesis --quick                  the sections with tables 4.2 to 4.6, on the terminal (some 20 s)
+python -m benchmarks.thesis --out docs/thesis.md     everything: the page and its pictures (some minutes)
+python -m benchmarks.thesis --quick                  the sections with tables 4.2 to 4.6, on the terminal (some 20 s)
 """
 
 from __future__ import annotations

@@ -288,9 +288,7 @@ def variant() -> Variant:
     velocity = np.ascontiguousarray(ts_run().states[LEAD:, 1])
     (linear_at, linear), (shape_at, shape) = thesis.TIME_VARIANT["linear"], thesis.TIME_VARIANT["nonlinear"]
     first, second = round(linear_at / DT), round(shape_at / DT)
-    torque = np.concatenate(
-        [friction(velocity[:first]), friction(velocity[first:second], linear), friction(velocity[second:], linear, shape)]
-    )
+    torque = np.concatenate([friction(velocity[:first]), friction(velocity[first:second], linear), friction(velocity[second:], linear, shape)])
     noisy = torque + np.random.default_rng(0).normal(0.0, NOISE, len(torque))
     two = TwoStep(smooth_friction(velocity), online=OnlineSettings(sample_time=DT))
     path = np.zeros((len(torque), 5))

@@ -25,9 +25,7 @@ def _stored(s: LocalSignals, p: SimpleNamespace) -> Expression:
     acts_on=("transmission",),
     parameters=(
         amplitude("backlash_stiffness_loss", "N.m/rad", "stiffness that is missing inside the gap"),
-        shape(
-            "backlash", "rad", "half the gap", (0.02, 0.05, 0.1, 0.2, 0.4), "torsion", start=1e-4, low=1e-12, high=10.0
-        ),
+        shape("backlash", "rad", "half the gap", (0.02, 0.05, 0.1, 0.2, 0.4), "torsion", start=1e-4, low=1e-12, high=10.0),
     ),
     absence="the transmission carries nothing near zero torque; knocks when it is crossed",
     excitation="torque reversals at low load",

@@ -14,9 +14,7 @@ from ..parameter import amplitude, shape
 from ..signals import Expression, LocalSignals
 
 
-def _oscillator(
-    z: tuple[Expression, ...], step: Expression, s: LocalSignals, p: SimpleNamespace
-) -> tuple[Expression, ...]:
+def _oscillator(z: tuple[Expression, ...], step: Expression, s: LocalSignals, p: SimpleNamespace) -> tuple[Expression, ...]:
     speed, deflection = step / s.clock, z[0]
     sliding = speed - z[1]
     omega = 2 * math.pi * p.flexible_frequency

@@ -11,10 +11,7 @@ from ..signals import Expression, LocalSignals
 
 def _stops(z: tuple[Expression, ...], step: Expression, s: LocalSignals, p: SimpleNamespace) -> tuple[Expression, ...]:
     """Stop operators: each follows the torsion until it slips."""
-    return tuple(
-        ca.fmin(ca.fmax(state + step / (width * p.hysteresis_width), -1), 1)
-        for state, width in zip(z, (1, 3, 9), strict=True)
-    )
+    return tuple(ca.fmin(ca.fmax(state + step / (width * p.hysteresis_width), -1), 1) for state, width in zip(z, (1, 3, 9), strict=True))
 
 
 @effect(
@@ -49,6 +46,4 @@ def _stops(z: tuple[Expression, ...], step: Expression, s: LocalSignals, p: Simp
 )
 def hysteresis(s: LocalSignals, p: SimpleNamespace) -> Expression:
     """Sum of three elements that stick and slip."""
-    return (
-        p.hysteresis_torque_1 * s.memory[0] + p.hysteresis_torque_2 * s.memory[1] + p.hysteresis_torque_3 * s.memory[2]
-    )
+    return p.hysteresis_torque_1 * s.memory[0] + p.hysteresis_torque_2 * s.memory[1] + p.hysteresis_torque_3 * s.memory[2]

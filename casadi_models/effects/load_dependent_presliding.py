@@ -9,9 +9,7 @@ from ..parameter import shape, signed
 from ..signals import Expression, LocalSignals
 
 
-def _bristle(
-    z: tuple[Expression, ...], step: Expression, s: LocalSignals, p: SimpleNamespace
-) -> tuple[Expression, ...]:
+def _bristle(z: tuple[Expression, ...], step: Expression, s: LocalSignals, p: SimpleNamespace) -> tuple[Expression, ...]:
     moved = step / p.load_presliding_distance
     return ((z[0] + moved) / (1 + ca.fabs(moved)),)
 
@@ -52,7 +50,4 @@ def _rate(z: tuple[Expression, ...], s: LocalSignals, p: SimpleNamespace) -> tup
 )
 def load_dependent_presliding(s: LocalSignals, p: SimpleNamespace) -> Expression:
     """Friction in proportion to the load, turned round over a distance."""
-    return (
-        p.load_friction_mean * ca.sqrt(s.load**2 + 1e-6) * s.memory[0]
-        + p.load_friction_difference * s.load * s.memory[0] ** 2
-    )
+    return p.load_friction_mean * ca.sqrt(s.load**2 + 1e-6) * s.memory[0] + p.load_friction_difference * s.load * s.memory[0] ** 2

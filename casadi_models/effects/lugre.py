@@ -9,9 +9,7 @@ from ..parameter import amplitude, shape
 from ..signals import Expression, LocalSignals
 
 
-def _bristle(
-    z: tuple[Expression, ...], step: Expression, s: LocalSignals, p: SimpleNamespace
-) -> tuple[Expression, ...]:
+def _bristle(z: tuple[Expression, ...], step: Expression, s: LocalSignals, p: SimpleNamespace) -> tuple[Expression, ...]:
     moved = step / p.presliding_distance
     return ((z[0] + moved) / (1 + ca.fabs(moved)),)
 

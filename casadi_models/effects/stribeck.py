@@ -38,8 +38,4 @@ from ..signals import Expression, LocalSignals
 )
 def stribeck(s: LocalSignals, p: SimpleNamespace) -> Expression:
     """Extra friction at low speed."""
-    return (
-        p.stribeck_extra
-        * s.direction
-        * ca.exp(-((s.velocity**2 / p.stribeck_velocity**2 + 1e-12) ** (p.stribeck_exponent / 2)))
-    )
+    return p.stribeck_extra * s.direction * ca.exp(-((s.velocity**2 / p.stribeck_velocity**2 + 1e-12) ** (p.stribeck_exponent / 2)))

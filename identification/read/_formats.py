@@ -75,10 +75,7 @@ def _format(path: Path) -> str:
         raise InputError(f"{path}: cannot be read ({error.strerror}): check path and permissions") from None
     expected = _BINARY.get(path.suffix.lower())
     if form == "text" and expected is not None:
-        raise InputError(
-            f"{path}: is not a {expected} file, whatever its name says: "
-            f"rename it to .csv if it is text, or export it again"
-        )
+        raise InputError(f"{path}: is not a {expected} file, whatever its name says: rename it to .csv if it is text, or export it again")
     return form
 
 

@@ -122,11 +122,7 @@ def _is_data(line: str, delimiter: str | None) -> bool:
 
 def _layout(path: Path) -> _Layout:
     encoding, lines, whole = _decode(path)
-    body = [
-        (number, line)
-        for number, line in enumerate(lines[:_HEAD_LINES])
-        if line.strip() and not line.lstrip().startswith(_COMMENT)
-    ]
+    body = [(number, line) for number, line in enumerate(lines[:_HEAD_LINES]) if line.strip() and not line.lstrip().startswith(_COMMENT)]
     first = None
     delimiter: str | None = None
     for place, (_, line) in enumerate(body):
@@ -155,9 +151,7 @@ def _layout(path: Path) -> _Layout:
     return _Layout(path, encoding, delimiter, comma, names, units, number, tuple(notes))
 
 
-def _header(
-    lines: list[str], delimiter: str | None, width: int, path: Path
-) -> tuple[tuple[str, ...], Mapping[str, str], int]:
+def _header(lines: list[str], delimiter: str | None, width: int, path: Path) -> tuple[tuple[str, ...], Mapping[str, str], int]:
     """Find names and units in the lines before the first row of numbers; the count is of lines used."""
     rows = [_cells(line, delimiter) for line in lines]
     if not rows:
@@ -284,10 +278,7 @@ def _slow(layout: _Layout, places: Sequence[int]) -> list[FloatColumn]:
         if len(cells) > width and not any(cells[width:]):
             cells = cells[:width]
         if len(cells) != width and not (len(cells) == width - 1 and not layout.names[-1]):
-            raise InputError(
-                f"{layout.path}, line {number}: {len(cells)} cells where the header has {width}: "
-                f"correct the line or cut the file there"
-            )
+            raise InputError(f"{layout.path}, line {number}: {len(cells)} cells where the header has {width}: correct the line or cut the file there")
         for values, place in zip(columns, places, strict=True):
             values.append(_number(cells[place], layout, number, place))
     return [np.array(values, dtype=np.float64) for values in columns]

@@ -50,9 +50,7 @@ def open_mdf(path: Path) -> Table:
     return Table("MDF", ("time", *places), load, {"time": "s", **units}, (RATES,) if len(groups) > 1 else ())
 
 
-def _signals(
-    asammdf: Any, path: Path, places: Mapping[str, tuple[int, int]]
-) -> dict[str, tuple[npt.NDArray[np.float64], npt.NDArray[Any]]]:
+def _signals(asammdf: Any, path: Path, places: Mapping[str, tuple[int, int]]) -> dict[str, tuple[npt.NDArray[np.float64], npt.NDArray[Any]]]:
     found = {}
     try:
         with asammdf.MDF(path) as file:

@@ -90,9 +90,7 @@ class _Fleet:
         self.j_tip = self.p["JL"] * self.p["FLEX"]
         self.j_link = self.p["JL"] - self.j_tip
 
-    def step(
-        self, t: float, h: float, r: FloatArray, dr: FloatArray, snag: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def step(self, t: float, h: float, r: FloatArray, dr: FloatArray, snag: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Advance by h; returns current and transmission torque at the midpoint."""
         p, m, li = self.p, self.sides["M"], self.sides["L"]
         heat = 1.0 - p["HEAT"] * (1.0 - np.exp(-max(t, 0.0) / p["HEAT_TAU"]))

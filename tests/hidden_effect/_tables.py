@@ -56,9 +56,7 @@ def _scores(outcomes: Iterable[Outcome], group: str) -> list[Score]:
     return [o.score for o in outcomes if o.group == group and o.score is not None]
 
 
-def _single_checks(
-    singles: list[Outcome], size: float, dirt: bool, torque_sensor: bool, one_sided: bool
-) -> list[Check]:
+def _single_checks(singles: list[Outcome], size: float, dirt: bool, torque_sensor: bool, one_sided: bool) -> list[Check]:
     s = [o.score for o in singles if o.score is not None]
     n = len(singles)  # a case that failed counts as not found
     one = sum(x.one_name for x in s)
@@ -83,9 +81,7 @@ def _single_checks(
     return checks
 
 
-def checks(
-    outcomes: Sequence[Outcome], *, size: float, dirt: bool, torque_sensor: bool = True, one_sided: bool = False
-) -> list[Check]:
+def checks(outcomes: Sequence[Outcome], *, size: float, dirt: bool, torque_sensor: bool = True, one_sided: bool = False) -> list[Check]:
     """Figures of a campaign against the acceptance limits (diagnosis, 4.4 and the end of section 6)."""
     singles = [o for o in outcomes if o.group == "single"]
     none, pairs, outside = (_scores(outcomes, g) for g in ("none", "pair", "outside"))

@@ -105,22 +105,15 @@ def plan_jobs(options: argparse.Namespace, cache: Path) -> list[Job]:
     if unknown:
         raise SystemExit(f"--effects: not in the generator: {', '.join(unknown)}; it has {', '.join(LIBRARY)}")
     torque_sensor = not (options.no_torque_sensor or options.one_sided)
-    hidden = (ONE_SIDED_HIDDEN if options.one_sided else frozenset()) | (
-        frozenset() if torque_sensor else NO_GAIN_WITHOUT_SENSOR
-    )
+    hidden = (ONE_SIDED_HIDDEN if options.one_sided else frozenset()) | (frozenset() if torque_sensor else NO_GAIN_WITHOUT_SENSOR)
     seeds = range(options.start, options.start + options.seeds)
-    cases: list[tuple[str, str | tuple[str, ...] | None, int]] = [
-        ("single", e, s) for e in chosen if e not in hidden for s in seeds
-    ]
+    cases: list[tuple[str, str | tuple[str, ...] | None, int]] = [("single", e, s) for e in chosen if e not in hidden for s in seeds]
     cases += [("none", None, options.start + s) for s in range(options.none)]
     cases += [("pair", PAIRS[i % len(PAIRS)], options.start + i // len(PAIRS)) for i in range(options.pairs)
               if not hidden & set(PAIRS[i % len(PAIRS)])]  # fmt: skip
     if not options.one_sided:
         cases += [("outside", e, options.start + s) for e in OUTSIDE for s in range(options.outside)]
-    return [
-        Job(group, effect, seed, options.size, options.dirt, torque_sensor, options.one_sided, cache, options.entry)
-        for group, effect, seed in cases
-    ]
+    return [Job(group, effect, seed, options.size, options.dirt, torque_sensor, options.one_sided, cache, options.entry) for group, effect, seed in cases]
 
 
 def run(jobs: list[Job], workers: int, tell: Callable[[str], object] | None = None) -> list[Outcome]:

@@ -223,8 +223,7 @@ def simulate_case(
         "gear_ratio": ratio,
         "seed": seed,
         "options": {"size": size, "dirt": dirt, "unloaded": unloaded, "side": side},
-        "link_referred": {text: values[key] for key, text in _TRUTH.items()}
-        | {"friction_smoothing_rad_s": values["M_V0"]},
+        "link_referred": {text: values[key] for key, text in _TRUTH.items()} | {"friction_smoothing_rad_s": values["M_V0"]},
         "hidden": hidden | ({"dirt": dict(extra)} if dirt else {}),
         "overrides": dict(overrides or {}),
         "note": "kinematic error: T = k (q_m - q_l + A sin(order |N| q_m + phase)); cyclic: A sin(q_l + phase)",

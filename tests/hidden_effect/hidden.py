@@ -109,16 +109,12 @@ def lugre(s: Setting) -> Draw:
 
 def thermal_friction(s: Setting) -> Draw:
     fall, constant = s.between(0.20, 0.32), s.shape(5.0, 10.0)
-    return Draw(
-        {"HEAT": fall, "HEAT_TAU": constant}, {"friction_fall": fall, "thermal_time_constant_s": constant}, "motor"
-    )
+    return Draw({"HEAT": fall, "HEAT_TAU": constant}, {"friction_fall": fall, "thermal_time_constant_s": constant}, "motor")
 
 
 def cyclic_friction(s: Setting) -> Draw:
     amplitude, phase = s.between(2.5, 5.0), s.shape(0.0, 2.0 * np.pi)
-    return _on_side(
-        s, {"CYC": amplitude, "CYC_P": phase}, {"cyclic_friction_Nm": amplitude, "cyclic_friction_phase_rad": phase}
-    )
+    return _on_side(s, {"CYC": amplitude, "CYC_P": phase}, {"cyclic_friction_Nm": amplitude, "cyclic_friction_phase_rad": phase})
 
 
 def cyclic_torque(s: Setting) -> Draw:

@@ -12,9 +12,7 @@ if TYPE_CHECKING:
     FloatArray = npt.NDArray[np.float64]
 
 
-def triangle(
-    rng: np.random.Generator, rows: int, dt: float, slowest: float, fastest: float
-) -> tuple[FloatArray, FloatArray]:
+def triangle(rng: np.random.Generator, rows: int, dt: float, slowest: float, fastest: float) -> tuple[FloatArray, FloatArray]:
     """Triangle between two angles near +-70 deg, starting upright; speeds in deg/s, changed every second leg.
 
     Returns position [rad] and velocity [rad/s], each of shape (rows,).

@@ -139,9 +139,7 @@ def _order_near(line: Mapping[str, Any], order: float) -> bool:
     return per_motor and abs(float(line["order"]) - order) <= max(ORDER_SLACK, float(line.get("tolerance", 0.0)))
 
 
-def _match(
-    claims: Sequence[frozenset[str]], accepted: Mapping[str, frozenset[str]]
-) -> tuple[dict[str, int], dict[str, int]]:
+def _match(claims: Sequence[frozenset[str]], accepted: Mapping[str, frozenset[str]]) -> tuple[dict[str, int], dict[str, int]]:
     """One claim per hidden name: first those that hold the name itself, then those that hold its class."""
     strict: dict[str, int] = {}
     for name in accepted:
@@ -226,12 +224,7 @@ def _ratios(step: Json) -> dict[str, float]:
 
 def _drop(places: Iterable[str], steps: Sequence[Json]) -> float | None:
     first, last = steps[0]["held_out"]["balances"], steps[-1]["held_out"]["balances"]
-    drops = [
-        100.0 * (1.0 - last[b]["rms"] / first[b]["rms"])
-        for place in places
-        for b in first
-        if b in SEEN_IN[place] and b in last and first[b]["rms"] > 0.0
-    ]
+    drops = [100.0 * (1.0 - last[b]["rms"] / first[b]["rms"]) for place in places for b in first if b in SEEN_IN[place] and b in last and first[b]["rms"] > 0.0]
     return max(drops) if drops else None
 
 

@@ -119,8 +119,12 @@ def _attributes(pairs: dict[str, str | None]) -> str:
 def _two(name: str, guid: str, shape: Shape, make: Make) -> str:
     promise = str(make.derivatives).lower()
     lines = [f'<fmiModelDescription fmiVersion="2.0" modelName="{name}" guid="{guid}" numberOfEventIndicators="{make.events}">']
-    lines += [f'<{k} modelIdentifier="{name}" providesDirectionalDerivative="{promise}" canHandleVariableCommunicationStepSize="true"/>'
-              if k == "CoSimulation" else f'<{k} modelIdentifier="{name}" providesDirectionalDerivative="{promise}"/>' for k in reversed(make.kinds)][::-1]
+    lines += [
+        f'<{k} modelIdentifier="{name}" providesDirectionalDerivative="{promise}" canHandleVariableCommunicationStepSize="true"/>'
+        if k == "CoSimulation"
+        else f'<{k} modelIdentifier="{name}" providesDirectionalDerivative="{promise}"/>'
+        for k in reversed(make.kinds)
+    ][::-1]
     units = dict(make.units)
     if units:
         named = [f'<Unit name="{unit}"/>' for unit in sorted(set(units.values()))]

@@ -136,7 +136,7 @@ def parse_fault(text: str) -> Fault:
     how = f"write SENSOR:KIND:START[:SIZE[:END]], SENSOR one of {', '.join(SENSORS)}, KIND one of {', '.join(KINDS)}, as link_position:stuck:9"
     try:
         sensor, kind, *numbers = parts
-        start, size, end = (*map(float, numbers), *(0.0, math.inf)[max(len(numbers) - 1, 0):])
+        start, size, end = (*map(float, numbers), *(0.0, math.inf)[max(len(numbers) - 1, 0) :])
     except ValueError:
         raise InputError(f"--inject {text!r}: {how}") from None
     if len(numbers) < 2 and kind not in ("stuck", "zero", "dropout"):
@@ -297,7 +297,7 @@ def run_plan(arguments: Namespace) -> int:
     joint = open_joint(arguments.joint)
     model = joint.model()
     if not model.is_elastic:
-        raise InputError(f"{arguments.joint}: plan simulates an elastic joint; set model = \"hd3\" (a rigid model is excited by any motion that reverses)")
+        raise InputError(f'{arguments.joint}: plan simulates an elastic joint; set model = "hd3" (a rigid model is excited by any motion that reverses)')
     for option in ("max_position", "max_speed", "max_torque"):
         if not getattr(arguments, option) > 0:
             raise InputError(f"--{option.replace('_', '-')} {getattr(arguments, option):g}: give a limit above 0")
