@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import time
 import zipfile
 from pathlib import Path
 
@@ -279,26 +278,6 @@ def test_not_finite_input_is_an_error_and_keeps_the_state(unzipped: Path) -> Non
         plant.doStep(1e-3, 1e-3)
     assert plant.getReal(states) == before
     plant.freeInstance()
-
-
-def test_cost_per_step(unzipped: Path) -> None:
-    """Set, step and get from Python within 12 us."""
-    import ctypes
-
-    plant = slave(unzipped)
-    u_vr = (ctypes.c_uint * 2)(plant.vr["tau_m"], plant.vr["tau_e"])
-    y_vr = (ctypes.c_uint * 1)(plant.vr["position"])
-    u, y = (ctypes.c_double * 2)(), (ctypes.c_double * 1)()
-    best = np.inf
-    for _ in range(5):
-        start = time.perf_counter()
-        for i in range(1000):
-            plant.fmi2SetReal(plant.component, u_vr, 2, u)
-            plant.fmi2DoStep(plant.component, i * 1e-3, 1e-3, 1)
-            plant.fmi2GetReal(plant.component, y_vr, 1, y)
-        best = min(best, (time.perf_counter() - start) / 1000)
-    plant.freeInstance()
-    assert best < 12e-6
 
 
 def hysteretic() -> PlantSpec:
