@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+
 import numpy as np
 import numpy.typing as npt
 
@@ -46,3 +48,16 @@ def variances(value: npt.ArrayLike, size: int | None, name: str, what: str, *, z
     if np.any(found < 0) or (not zero and np.any(found <= 0)):
         raise InputError(f"RecursiveLeastSquares: {name} must be {'>= 0' if zero else 'positive'}")
     return found if size is None else spread(found, size, name, what)
+
+
+def positions(names: Sequence[str], wanted: Iterable[int | str], asked: str) -> list[int]:
+    """Positions of parameters given by name or position."""
+    found = []
+    for item in wanted:
+        if isinstance(item, str) and item in names:
+            found.append(names.index(item))
+        elif isinstance(item, (int, np.integer)) and 0 <= item < len(names):
+            found.append(int(item))
+        else:
+            raise InputError(f"{asked}: there is no parameter {item!r}; use {', '.join(names)}")
+    return found

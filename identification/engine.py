@@ -15,13 +15,13 @@ from identification.balances import Balances, balances_of
 from identification.dataset import Dataset, load_dataset, prepared_model, weak_record
 from identification.errors import InputError
 from identification.excitation import attenuation
-from identification.joint_file import Known
 from identification.stacked import Stacked, floor_rows, floors, references, rms, row_weights, stack, taking_part
 from identification.standard_errors import block_errors
+from identification.start_values import bounds_of, starts
 
 __all__ = [
-    "Dataset", "Solution", "Stacked", "bounds_of", "floor_rows", "floors", "gauss_newton", "load_dataset", "memory_shapes_of", "prepared_model", "references",
-    "rms", "row_weights", "solve", "stack", "starts", "taking_part", "weak_record",
+    "Dataset", "Solution", "Stacked", "floor_rows", "floors", "gauss_newton", "load_dataset", "memory_shapes_of", "prepared_model", "references",
+    "rms", "row_weights", "solve", "stack", "taking_part", "weak_record",
 ]  # fmt: skip
 
 FloatArray = npt.NDArray[np.float64]
@@ -63,38 +63,6 @@ LEAST_SWING: Final = 0.05
 """Fall of the RMS by which a link that swings unseen must show itself; else the joint is taken as rigid."""
 HIGHEST_SWING: Final = 4.0
 """Highest frequency of such a link in units of 1/kernel (the kernel's -3 dB point is 0.93): faster ones are rigid to these rows."""
-
-
-def starts(model: JointModel, data: Dataset) -> dict[str, float]:
-    """Start values: those of the model; shapes and smoothing from the ranges of the record."""
-    out = {}
-    for p in model.parameters:
-        if p.name in model.values:
-            out[p.name] = float(model.values[p.name])
-        elif p.is_shape and p.scale != "absolute":
-            out[p.name] = p.grid[len(p.grid) // 2] * data.ranges[p.scale]
-        else:
-            out[p.name] = p.start
-    return out
-
-
-def bounds_of(model: JointModel, known: Mapping[str, Known], data: Dataset) -> dict[str, tuple[float, float]]:
-    """Bounds of every parameter: physical ones, narrowed by what is known and what the record can show."""
-    out = {}
-    for p in model.parameters:
-        low, high = p.low, p.high
-        if p.name.endswith("_smoothing_velocity") or (p.is_shape and p.scale != "absolute"):
-            scale = data.ranges[p.scale]
-            low, high = max(low, p.grid[0] * scale / 3), min(high, p.grid[-1] * scale * 3)
-        if p.name == "drive_delay":
-            hold = data.train[0].grid.dt
-            low, high = -hold, hold
-        k = known.get(p.name)
-        if k is not None:
-            low = max(low, k.low) if k.low is not None else low
-            high = min(high, k.high) if k.high is not None else high
-        out[p.name] = (low, high)
-    return out
 
 
 def solve(

@@ -6,6 +6,9 @@ import math
 import re
 from typing import Final
 
+import numpy as np
+import numpy.typing as npt
+
 _SUPERSCRIPT: Final = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 MINUS: Final = "−"
 SPACE: Final = "\u00a0"
@@ -88,3 +91,9 @@ def interval(low: float, high: float) -> str:
     places = max(1 - math.floor(math.log10(span / 3)), 0)
     ends = (round(v, places) + 0.0 for v in (low, high))
     return " to ".join(f"{v:.{places}f}" for v in ends).replace("-", MINUS)
+
+
+def value_range(values: npt.NDArray[np.float64]) -> str:
+    """Smallest and largest finite value of a channel."""
+    finite = values[np.isfinite(values)]
+    return f"{finite.min():.5g} to {finite.max():.5g}" if finite.size else "no finite value"

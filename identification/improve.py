@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
@@ -37,7 +36,7 @@ from identification.locate import Unexplained, locate, spectral_peak
 from identification.record import Record
 from identification.rival_table import is_absorbed
 from identification.trials import Base, Trial, make_base, try_candidate
-from identification.verdict import verdict_of
+from identification.verdict import hardly_a_model, verdict_of, without_link
 
 __all__ = [
     "HOLD_DELAY", "RATIO_LIMIT", "Improvement", "Step", "excitation_warnings", "held_drop", "improve", "ranked_json",
@@ -50,8 +49,6 @@ RATIO_LIMIT: Final = 1.5
 EXPLAINED_SHARE: Final = 0.5
 LOCATED_SHARE: Final = 50.0
 """Share of what is left that one variable must hold before a table over it is set against the claims [%]."""
-HARDLY: Final = 90.0
-"""Relative error of the start model from which units and signs are doubted [%]."""
 SPOILT_RATIO: Final = 1.3
 """Ratio to the floor above which a balance that has risen by a fifth counts as spoilt by an addition."""
 RISE_LIMIT: Final = 1.02
@@ -296,7 +293,7 @@ class Loop:
         return Improvement(
             self.joint, self.data, tuple(steps), tuple(claims), minor, first, tuple(lines), tuple(where), verdict, reason, ratios,
             tuple(n for n in first.not_testable if n.effect not in {c for x in claims for c in x.effects}),
-            (*_hardly_a_model(steps[0]), *excitation_warnings(self.data), *self._about_temperature(claims), *_without_link(solution)),
+            (*hardly_a_model(steps[0]), *excitation_warnings(self.data), *self._about_temperature(claims), *without_link(solution)),
             tuple(sorted(self.refused)),
         )  # fmt: skip
 
@@ -368,29 +365,6 @@ class Loop:
             if trial.values[name] * found.values[name] <= 0:
                 return False
         return True
-
-
-def _hardly_a_model(start: Step) -> tuple[str, ...]:
-    """A start model that explains next to nothing, or has no stiffness: what is claimed on top of it hangs in the air."""
-    error, out = start.train.relative_error_percent, []
-    if error >= HARDLY:
-        doubt = "check units and signs in [columns], the motor constant and gear_ratio"
-        out.append(f"the start model leaves {error:.3g} % of the measured torque unexplained: {doubt}")
-    if "stiffness" in start.solution.at_bound:
-        doubt = "check gear_ratio, the scale and the zero of both positions"
-        out.append(f"the stiffness went to zero: the difference of the two positions does not follow the torque: {doubt}")
-    return tuple(out)
-
-
-def _without_link(solution: Solution) -> tuple[str, ...]:
-    """What stands in for the link position where it is not recorded."""
-    if not solution.values.get("load_compliance"):
-        return ()
-    swing = 1 / (2 * math.pi * math.sqrt(solution.model.swinging_inertia(solution.values) * solution.values["load_compliance"]))
-    return (
-        "the link position is not recorded: the compliance between motor and link is fitted along; "
-        f"with the motor held the link would swing at {swing:.3g} Hz; its motion leaves a rest over the noise",
-    )
 
 
 def made_worse(before: Error, after: Error) -> bool:

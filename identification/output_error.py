@@ -17,10 +17,11 @@ import numpy.typing as npt
 
 from identification._shooting import MOST_SUBSTEPS, Shooting, Windows, cut_windows, substeps_for, weighted
 from identification.assess import assess
-from identification.engine import bounds_of, row_weights
+from identification.engine import row_weights
 from identification.errors import InputError
 from identification.fit import Fit
 from identification.record import Record
+from identification.start_values import bounds_of
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -333,24 +333,18 @@ class Record:
         )
 
     def _repr_html_(self) -> str:
-        from identification.formats import pretty_unit
+        from identification.formats import pretty_unit, value_range
         from identification.html import spaced
 
-        rows = "".join(f"<tr><td>{key}</td><td>{pretty_unit(self.unit(key))}</td><td>{_range(values)}</td></tr>" for key, values in self.channels.items())
+        rows = "".join(f"<tr><td>{key}</td><td>{pretty_unit(self.unit(key))}</td><td>{value_range(values)}</td></tr>" for key, values in self.channels.items())
         size = f"{len(self)} samples, {self.duration:.6g} s, {len(self.segments())} segment(s)"
-        head = f"{html.escape(self.name)}: {size}"
-        return spaced(f"<table><caption>{head}</caption><tr><th>channel</th><th>unit</th><th>range</th></tr>{rows}</table>")
+        return spaced(f"<table><caption>{html.escape(self.name)}: {size}</caption><tr><th>channel</th><th>unit</th><th>range</th></tr>{rows}</table>")
 
     def __repr__(self) -> str:
         return (
             f"Record({self.name!r}, {self.kind}, {len(self)} samples, {self.duration:.6g} s, "
             f"{len(self.segments())} segment(s), channels: {', '.join(self.channels)})"
         )
-
-
-def _range(values: FloatArray) -> str:
-    finite = values[np.isfinite(values)]
-    return f"{finite.min():.5g} to {finite.max():.5g}" if finite.size else "no finite value"
 
 
 def concat(records: Sequence[Record], name: str | None = None) -> Record:

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from identification._recursive_engine import Engine, RunOutcome, Trajectory
-from identification._recursive_input import doubles, spread, variances, vector
+from identification._recursive_input import doubles, positions, spread, variances, vector
 from identification._recursive_settings import MAX_PARAMETERS, METHODS, Settings, forgetting_curve
 from identification._startup import Startup, StartupOutcome, solve_window
 from identification.errors import InputError
@@ -207,12 +207,12 @@ class RecursiveLeastSquares:
 
     def hold(self, parameters: Iterable[int | str]) -> None:
         """Freeze parameters, by name or position, until `release`."""
-        self._ready("hold").part("config", "free")[self._positions(parameters, "hold")] = 0.0
+        self._ready("hold").part("config", "free")[positions(self._names, parameters, "hold")] = 0.0
 
     def release(self, parameters: Iterable[int | str] | None = None) -> None:
         """Let held parameters move again; None: all of them."""
         where = range(self._theta0.size) if parameters is None else parameters
-        self._ready("release").part("config", "free")[self._positions(where, "release")] = 1.0
+        self._ready("release").part("config", "free")[positions(self._names, where, "release")] = 1.0
 
     def set_measurement_covariance(self, R2: npt.ArrayLike | None) -> None:
         """New R2 from now on (raised when a sensor is suspected); None: estimate it from the innovations."""
@@ -373,17 +373,6 @@ class RecursiveLeastSquares:
         noise = None if self._noise is None else spread(self._noise, outputs, "R2", "outputs")
         self._engine = Engine(self._theta0, self._scale, outputs, self._method, self._settings, self._walk, noise)
         return self._engine
-
-    def _positions(self, parameters: Iterable[int | str], asked: str) -> list[int]:
-        found = []
-        for item in parameters:
-            if isinstance(item, str) and item in self._names:
-                found.append(self._names.index(item))
-            elif isinstance(item, (int, np.integer)) and 0 <= item < self._theta0.size:
-                found.append(int(item))
-            else:
-                raise InputError(f"{asked}: there is no parameter {item!r}; use {', '.join(self._names)}")
-        return found
 
     def _arranged(self, y: npt.ArrayLike, H: npt.ArrayLike) -> tuple[Engine, FloatArray, FloatArray]:
         """One sample in full shape: (outputs,) and (outputs, parameters)."""

@@ -10,9 +10,11 @@ from typing import Final, final
 import numpy as np
 import numpy.typing as npt
 
+from identification._signed_fit import projected_gain, signed_fit
 from identification.balances import Balances, balances_of
 from identification.candidates import Candidate, NotTestable, shape_grid
-from identification.engine import Dataset, Solution, Stacked, bounds_of, row_weights, stack
+from identification.engine import Dataset, Solution, Stacked, row_weights, stack
+from identification.start_values import bounds_of
 from identification.weak import WeakRecord
 
 FloatArray = npt.NDArray[np.float64]
@@ -237,7 +239,7 @@ def try_candidate(candidate: Candidate, base: Base) -> Trial | NotTestable | Non
             return None
         c = np.column_stack([base.inward, c / np.where(size > 0, size, 1.0)])
         outside = c - q @ (q.T @ c)
-        return _projected_gain(outside, base.residual, least), raw, float(np.linalg.norm(outside[:, returning:], axis=0).max())
+        return projected_gain(outside, base.residual, least), raw, float(np.linalg.norm(outside[:, returning:], axis=0).max())
 
     for shapes in shape_grid(candidate, data):
         found = projected(shapes)
@@ -289,32 +291,6 @@ def _collinear_reason(candidate: Candidate) -> str:
     return f"on these records it cannot be told from {names}{separate}"
 
 
-def _signed_fit(gram: FloatArray, right: FloatArray, lows: FloatArray, first: int) -> FloatArray:
-    """Least squares from normal equations; amplitudes with a lower bound of zero that come out negative are left out."""
-    active = np.ones(len(right), dtype=bool)
-    out = np.zeros(len(right))
-    scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-    g = gram / np.outer(scale, scale)
-    b = right / scale
-    for _ in range(len(lows) + 1):
-        index = np.flatnonzero(active)
-        part = np.linalg.lstsq(g[np.ix_(index, index)] + 1e-12 * np.eye(len(index)), b[index], rcond=1e-12)[0]
-        out[:] = 0.0
-        out[index] = part / scale[index]
-        wrong = [first + i for i, low in enumerate(lows) if low == 0.0 and active[first + i] and out[first + i] < 0]
-        if not wrong:
-            break
-        active[wrong] = False
-    return out
-
-
-def _projected_gain(outside: FloatArray, residual: FloatArray, lows: FloatArray) -> float:
-    """Fall of the weighted sum of squares when the projected columns are added (residual = base + J delta)."""
-    gram, right = outside.T @ outside, -(outside.T @ residual)
-    delta = _signed_fit(gram, right, lows, 0)
-    return float(2 * right @ delta - delta @ gram @ delta)
-
-
 def _score(candidate: Candidate, base: Base, balances: Balances, shapes: Mapping[str, float], raw: FloatArray, lows: FloatArray, inside: float) -> Trial | None:
     p, own = base.parts
     count = len(base.balances)
@@ -337,11 +313,11 @@ def _score(candidate: Candidate, base: Base, balances: Balances, shapes: Mapping
     for k in range(folds):
         test = fold == k
         train = total - grams[test].sum(axis=(0, 1)) if folds > 1 else total
-        plain = _signed_fit(train[:own, :own], -train[:own, -1], lows[: own - p], p)
-        more = _signed_fit(train[:-1, :-1], -train[:-1, -1], lows, p)
+        plain = signed_fit(train[:own, :own], -train[:own, -1], lows[: own - p], p)
+        more = signed_fit(train[:-1, :-1], -train[:-1, -1], lows, p)
         sse0[test] = _quadratic(grams[test], np.concatenate([plain, np.zeros(raw.shape[1]), [1.0]]))
         sse1[test] = _quadratic(grams[test], np.concatenate([more, [1.0]]))
-    delta = _signed_fit(total[:-1, :-1], -total[:-1, -1], lows, p)
+    delta = signed_fit(total[:-1, :-1], -total[:-1, -1], lows, p)
     amplitude = delta[own:] / size
     if not np.any(amplitude):
         return None

@@ -1,16 +1,22 @@
-"""The verdict of the loop and the sentence that a reader gets."""
+"""The verdict of the loop, the sentence that a reader gets, and warnings about the model it started from."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
+from typing import Final
 
 from casadi_models import EFFECTS
 from identification.assess import BalanceError
 from identification.claims import Claim
+from identification.engine import Solution
 from identification.formats import number
 from identification.improvement import Step
 from identification.locate import Unexplained
 from identification.trials import Trial
+
+HARDLY: Final = 90.0
+"""Relative error of the start model from which units and signs are doubted [%]."""
 
 
 def _remainder(claim: Claim, unit: str) -> str:
@@ -50,3 +56,26 @@ def verdict_of(
     if claims:
         return "complete", f"Missing: {names}; with it {fall}, and what is left looks like measurement noise."
     return "nothing_missing", "The model explains the records down to their measurement noise: nothing is missing that these records could show."
+
+
+def hardly_a_model(start: Step) -> tuple[str, ...]:
+    """A start model that explains next to nothing, or has no stiffness: what is claimed on top of it hangs in the air."""
+    error, out = start.train.relative_error_percent, []
+    if error >= HARDLY:
+        doubt = "check units and signs in [columns], the motor constant and gear_ratio"
+        out.append(f"the start model leaves {error:.3g} % of the measured torque unexplained: {doubt}")
+    if "stiffness" in start.solution.at_bound:
+        doubt = "check gear_ratio, the scale and the zero of both positions"
+        out.append(f"the stiffness went to zero: the difference of the two positions does not follow the torque: {doubt}")
+    return tuple(out)
+
+
+def without_link(solution: Solution) -> tuple[str, ...]:
+    """What stands in for the link position where it is not recorded."""
+    if not solution.values.get("load_compliance"):
+        return ()
+    swing = 1 / (2 * math.pi * math.sqrt(solution.model.swinging_inertia(solution.values) * solution.values["load_compliance"]))
+    return (
+        "the link position is not recorded: the compliance between motor and link is fitted along; "
+        f"with the motor held the link would swing at {swing:.3g} Hz; its motion leaves a rest over the noise",
+    )

@@ -8,7 +8,8 @@ from typing import Final
 
 from casadi_models import JointModel
 from identification.balances import balances_of
-from identification.engine import Dataset, Solution, bounds_of, gauss_newton, memory_shapes_of, starts
+from identification.engine import Dataset, Solution, gauss_newton, memory_shapes_of
+from identification.start_values import bounds_of, starts
 
 STEPS: Final = 2
 STEPS_MEMORY: Final = 1
