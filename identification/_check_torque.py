@@ -71,7 +71,7 @@ def check_torque(record: Record, gear_ratio: float | None, torque_per_current: f
         advice = "correct the unit or scale of link_torque in [columns], or motor_constant (torque_per_current) and gear_ratio in [joint]"
         return [Finding("refuse", "torque", f"{said} ({guess}): {advice}", "link_torque")]
     if max(size, 1 / size) > _WARN:
-        why = guess or "a scale is wrong, or a strong torque is missing from the model"
+        why = f"{guess or 'a scale is wrong'}, or a strong torque is missing from the model"
         return [Finding("warn", "torque", f"{said} ({why}): check unit and scale of both, and motor_constant", "link_torque")]
     return [Finding("ok", "torque", f"{record.name}: link_torque follows the drive torque (factor {slope:.3g})", "link_torque")]
 

@@ -313,8 +313,8 @@ def _score(candidate: Candidate, base: Base, balances: Balances, shapes: Mapping
     for k in range(folds):
         test = fold == k
         train = total - grams[test].sum(axis=(0, 1)) if folds > 1 else total
-        plain = signed_fit(train[:own, :own], -train[:own, -1], lows[: own - p], p)
-        more = signed_fit(train[:-1, :-1], -train[:-1, -1], lows, p)
+        plain = signed_fit(train[:own, :own], -train[:own, -1], lows[: own - p], p, total[:own, :own])
+        more = signed_fit(train[:-1, :-1], -train[:-1, -1], lows, p, total[:-1, :-1])
         sse0[test] = _quadratic(grams[test], np.concatenate([plain, np.zeros(raw.shape[1]), [1.0]]))
         sse1[test] = _quadratic(grams[test], np.concatenate([more, [1.0]]))
     delta = signed_fit(total[:-1, :-1], -total[:-1, -1], lows, p)

@@ -18,7 +18,7 @@ RECORDED_SECONDS = 96.0
 @final
 @dataclass(frozen=True)
 class Outcome:
-    """One case of a campaign: what it was, how it scored or how it failed, and how long it took [s]."""
+    """One case of a campaign: what it was, how it scored or how it failed, how long it took and how long its records are [s]."""
 
     group: str
     label: str
@@ -27,6 +27,7 @@ class Outcome:
     seconds: float
     score: Score | None
     error: str = ""
+    recorded: float = RECORDED_SECONDS
 
 
 @final
@@ -113,7 +114,7 @@ def checks(outcomes: Sequence[Outcome], *, size: float, dirt: bool, torque_senso
             Check("outside: right axis, order or frequency, %", _share(sum(bool(x.axis_right) for x in outside), n),
                   75.0, True, n)
         )  # fmt: skip
-    times = [o.seconds * 80.0 / RECORDED_SECONDS for o in outcomes if o.score is not None]
+    times = [o.seconds * 80.0 / o.recorded for o in outcomes if o.score is not None]
     if times:
         rows.append(Check("median seconds per 80 s of data", median(times), 5.0, False, len(times)))
     failed = sum(o.score is None for o in outcomes)

@@ -18,7 +18,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast, final
 
-from tests.hidden_effect._tables import Outcome, checks, markdown
+from tests.hidden_effect._tables import RECORDED_SECONDS, Outcome, checks, markdown
 from tests.hidden_effect.generator import generate_case, names_of
 from tests.hidden_effect.hidden import LIBRARY, NEEDS_TORQUE_SENSOR, ONE_SIDED_HIDDEN, OUTSIDE
 from tests.hidden_effect.scoring import score
@@ -34,6 +34,7 @@ PAIRS: tuple[tuple[str, str], ...] = (
     ("motor_constant_error", "kinematic_error"), ("lugre", "piecewise_stiffness"), ("torque_ripple", "stribeck"),
     ("torque_sensor_gain", "asymmetric_viscous"), ("stribeck", "cyclic_torque"), ("torque_sensor_offset", "lugre"),
 )  # fmt: skip
+RECORDS = {"both": ("", "2"), "first": ("",), "second": ("2",)}
 NO_GAIN_WITHOUT_SENSOR = NEEDS_TORQUE_SENSOR | {"motor_constant_error"}
 
 
@@ -51,6 +52,7 @@ class Job:
     one_sided: bool
     cache: Path
     entry: str
+    records: str = "both"
 
     @property
     def label(self) -> str:
@@ -86,13 +88,11 @@ def run_job(job: Job) -> Outcome:
     improve = load_entry(job.entry)
     began = time.perf_counter()
     try:
-        result = improve(
-            [folder / "train.csv", folder / "train2.csv"], [folder / "test.csv", folder / "test2.csv"],
-            folder / "joint.toml",
-        )  # fmt: skip
+        train, held = ([folder / f"{part}{number}.csv" for number in RECORDS[job.records]] for part in ("train", "test"))
+        result = improve(train, held, folder / "joint.toml")
         seconds = time.perf_counter() - began
         (folder / "improve.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-        return Outcome(job.group, job.label, job.seed, stiction, seconds, score(truth, result))
+        return Outcome(job.group, job.label, job.seed, stiction, seconds, score(truth, result), recorded=RECORDED_SECONDS * len(train) / 2)
     except Exception as error:  # whatever the tool raises is this case's result, and must not end the campaign
         text = f"{type(error).__name__}: {error}".splitlines()[0]
         return Outcome(job.group, job.label, job.seed, stiction, time.perf_counter() - began, None, text)
@@ -113,7 +113,10 @@ def plan_jobs(options: argparse.Namespace, cache: Path) -> list[Job]:
               if not hidden & set(PAIRS[i % len(PAIRS)])]  # fmt: skip
     if not options.one_sided:
         cases += [("outside", e, options.start + s) for e in OUTSIDE for s in range(options.outside)]
-    return [Job(group, effect, seed, options.size, options.dirt, torque_sensor, options.one_sided, cache, options.entry) for group, effect, seed in cases]
+    return [
+        Job(group, effect, seed, options.size, options.dirt, torque_sensor, options.one_sided, cache, options.entry, options.records)
+        for group, effect, seed in cases
+    ]
 
 
 def run(jobs: list[Job], workers: int, tell: Callable[[str], object] | None = None) -> list[Outcome]:
@@ -150,6 +153,9 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--outside", type=int, default=3, help="cases of each kind outside the library")
     p.add_argument("--no-torque-sensor", action="store_true")
     p.add_argument("--one-sided", action="store_true", help="current, motor position and motor velocity only")
+    p.add_argument(
+        "--records", choices=list(RECORDS), default="both", help="records the tool is given: both pairs, the first (one speed, few reversals) or the second"
+    )
     p.add_argument("--jobs", type=int, default=1, help="processes")
     p.add_argument("--cache", type=Path, help="folder that keeps the cases (default: temporary)")
     p.add_argument("--entry", default=DEFAULT_ENTRY, help="module:function to run on each case")
