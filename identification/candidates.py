@@ -12,7 +12,7 @@ import numpy as np
 
 from casadi_models import EFFECTS, Effect, JointModel
 from casadi_models.effect import Place
-from identification.dataset import Dataset
+from identification.dataset import HOLD_DELAY, Dataset, with_effect
 from identification.sensing import Sensing
 
 DISPLACEMENT: Final = frozenset({"hysteresis", "backlash", "soft_windup"})
@@ -152,17 +152,17 @@ def _why_not(effect: Effect, model: JointModel, data: Dataset) -> str:
 
 def _placed(effect: Effect, place: Place, model: JointModel) -> list[Candidate]:
     label = f"{effect.key}@{place}" if len(effect.acts_on) > 1 else effect.key
-    if model.has(effect.key, place):
-        hold = effect.key == "channel_delay" and place == "drive" and sum(t.effect.key == effect.key for t in model.terms) == 1
-        if not (effect.periodic or hold):
+    there = sum(t.effect.key == effect.key and t.place == place and t.label != HOLD_DELAY for t in model.terms)
+    if there:
+        if not effect.periodic:
             return []
-        label += f"#{1 + sum(t.effect.key == effect.key and t.place == place for t in model.terms)}"
+        label += f"#{1 + there}"
     variants = [model]
     if place == "torsion" and not any(t.place == "torsion" for t in model.terms):
         variants = [replace(model, virtual_work=True), replace(model, virtual_work=False)]
     out = []
     for variant in variants:
-        bigger = variant.add(label)
+        bigger = with_effect(variant, label)
         term = next(t for t in bigger.terms if t.label == label)
         pairs = list(zip(term.names, effect.parameters, strict=True))
         out.append(Candidate(

@@ -162,11 +162,30 @@ def _ranges(data: Sequence[WeakRecord], clamped: bool) -> dict[str, float]:
     return {"velocity": span(speed), "torsion": span(twist), "position": span(q - np.median(q)), "duration": duration, "absolute": 1.0}
 
 
+HOLD_DELAY: Final = "channel_delay@drive#0"
+"""In every model with a commanded drive: the hold of the logged command is not an effect, but a nuisance of at most a sample."""
+HOLD_NAME: Final = "drive_delay_0"
+
+
+_DRIVE_DELAY: Final = "channel_delay@drive"
+
+
+def with_effect(model: JointModel, label: str) -> JointModel:
+    """The model with one more effect; a delay of the drive, of any length, takes the place of the nuisance."""
+    return (model.drop(HOLD_DELAY) if label == _DRIVE_DELAY and HOLD_DELAY in model.effects else model).add(label)
+
+
+def without(model: JointModel, label: str) -> JointModel:
+    """The model without an effect; where a delay of the drive goes, the hold is a nuisance again."""
+    smaller = model.drop(label)
+    return smaller.add(HOLD_DELAY) if label == _DRIVE_DELAY else smaller
+
+
 def prepared_model(joint: Joint, record: Record) -> JointModel:
     """The joint's model in the form that the record's channels can carry."""
     model = joint.model()
     sensing = sense(record, model)
     adapted = adapt(model, sensing, joint.known)
     if sensing.has_drive and not record.has("motor_torque") and not adapted.has("channel_delay", "drive"):
-        adapted = adapted.add("channel_delay@drive")
+        adapted = adapted.add(HOLD_DELAY)
     return replace(adapted, lagging_load=seen_from_the_motor(sensing, joint) and sensing.has_drive)

@@ -8,6 +8,7 @@ from typing import Any, final
 
 from casadi_models import JointModel
 from identification.assess import Error, assess
+from identification.dataset import HOLD_DELAY
 from identification.engine import Dataset, Solution, load_dataset, prepared_model, solve
 from identification.joint_file import Joint, toml_text
 from identification.parameters import parameter_table
@@ -68,7 +69,7 @@ class Fit:
 
 def joint_text(joint: Joint, solution: Solution, data: Dataset) -> str:
     """A joint file with fitted values, standard errors and provenance."""
-    labels = tuple(label for label in solution.model.effects if label != "channel_delay@drive")
+    labels = tuple(label for label in solution.model.effects if label != HOLD_DELAY)
     fitted = {n: p for n, p in parameter_table(solution, data).items() if n in solution.values}
     whole = replace(joint, effects=labels, virtual_work=solution.model.virtual_work)
     from identification import __version__

@@ -26,10 +26,11 @@ from identification.claims import (
     shortened,
     simplest,
 )
+from identification.dataset import HOLD_DELAY, with_effect, without
 from identification.engine import Dataset, Solution, load_dataset, prepared_model, solve
 from identification.errors import InputError
 from identification.excitation import excitation_warnings, few_reversals, not_identifiable
-from identification.improvement import HOLD_DELAY, Improvement, Step, ranked_json, visible_keys, visible_labels
+from identification.improvement import Improvement, Step, ranked_json, visible_keys, visible_labels
 from identification.joint_file import Joint
 from identification.lines import find_lines
 from identification.locate import Unexplained, locate, spectral_peak
@@ -208,8 +209,8 @@ class Loop:
         for position, claim in enumerate(claims):
             if new.effects[0] not in claim.effects[1:]:
                 continue
-            without = solve(steps[-1].solution.model.drop(claim.label), self.data, start=steps[-1].solution.values)
-            alone = next((t for t in rank(make_base(without, self.data)).everything if t.candidate.label == new.label), None)
+            smaller = solve(without(steps[-1].solution.model, claim.label), self.data, start=steps[-1].solution.values)
+            alone = next((t for t in rank(make_base(smaller, self.data)).everything if t.candidate.label == new.label), None)
             if alone is None:
                 continue
             current = [replace(new, effects=new.effects[:1], separate_by=None) if i == position else c for i, c in enumerate(claims)]
@@ -226,11 +227,10 @@ class Loop:
             needed = {n for c in current if c is not claim for n in EFFECTS[c.effects[0]].needs}
             if claim.effects[0] == LADDER_STEP or claim.effects[0] in needed:
                 continue
-            model = steps[-1].solution.model.drop(claim.label)
+            model = without(steps[-1].solution.model, claim.label)
             if model.terms == steps[-1].solution.model.terms:
                 continue
-            without = solve(model, self.data, start=steps[-1].solution.values)
-            base = make_base(without, self.data)
+            base = make_base(solve(model, self.data, start=steps[-1].solution.values), self.data)
             ranking = rank(base)
             same = next((t for t in ranking.everything if t.candidate.label == claim.label), None)
             best = ranking.best(frozenset(self.refused))
@@ -262,7 +262,7 @@ class Loop:
         for claim in claims:
             before = out[-1]
             try:
-                model = before.solution.model.add(claim.label)
+                model = with_effect(before.solution.model, claim.label)
             except ValueError:
                 continue
             variant = next((s.solution.model.virtual_work for s in reversed(steps) if claim.label in s.solution.model.effects), None)

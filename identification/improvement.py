@@ -5,22 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final, final
+from typing import Any, final
 
 from casadi_models import JointModel
 from identification.assess import BalanceError, Error
 from identification.candidates import NotTestable
 from identification.claims import Claim, Ranking
-from identification.dataset import Dataset
+from identification.dataset import HOLD_DELAY, Dataset
 from identification.engine import Solution
 from identification.joint_file import Joint
 from identification.lines import Line
 from identification.locate import Unexplained
 from identification.parameters import parameter_table
 from identification.trials import Trial
-
-HOLD_DELAY: Final = "channel_delay@drive"
-"""In every model with a commanded drive: the hold of the logged command is not an effect."""
 
 
 @final
@@ -97,6 +94,12 @@ class Improvement:
     def model(self) -> JointModel:
         """The final model with its values."""
         return self.steps[-1].solution.model
+
+    def to_joint_file(self) -> str:
+        """The joint with all that was added, as the text of a joint file."""
+        from identification.fit import joint_text
+
+        return joint_text(self.joint, self.steps[-1].solution, self.data)
 
     def _repr_html_(self) -> str:
         from identification.html import improvement_html

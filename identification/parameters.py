@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from identification.dataset import HOLD_NAME
 from identification.engine import Dataset, Solution
 
 _PAIRS = (
@@ -28,7 +29,7 @@ def parameter_table(solution: Solution, data: Dataset) -> dict[str, dict[str, An
     """
     out: dict[str, dict[str, Any]] = {}
     for p in solution.model.parameters:
-        if p.name == "drive_delay":
+        if p.name == HOLD_NAME:
             continue
         nuisance = p.name.endswith("_smoothing_velocity")
         partner = solution.correlation.get(p.name)

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from identification.candidates import Candidate, offered
 from identification.claims import HELD_OUT_DROP, MAJOR_DROP, Claim
+from identification.dataset import without
 from identification.engine import Dataset, Solution, solve, taking_part
 from identification.locate import BINS, Unexplained, axes, binned
 from identification.trials import Base, Trial, make_base, span_of, try_candidate
@@ -37,7 +38,7 @@ def is_absorbed(claim: Claim, left: Unexplained, solution: Solution, data: Datas
     bool
         False too where the claim cannot be taken out of the model alone.
     """
-    model = solution.model.drop(claim.label)
+    model = without(solution.model, claim.label)
     if left.axis is None or model.terms == solution.model.terms:
         return False
     base = make_base(solve(model, data, start=solution.values), data)

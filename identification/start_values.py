@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from casadi_models import JointModel
-from identification.dataset import Dataset
+from identification.dataset import HOLD_NAME, Dataset
 from identification.joint_file import Known
 
 
@@ -30,7 +30,7 @@ def bounds_of(model: JointModel, known: Mapping[str, Known], data: Dataset) -> d
         if p.name.endswith("_smoothing_velocity") or (p.is_shape and p.scale != "absolute"):
             scale = data.ranges[p.scale]
             low, high = max(low, p.grid[0] * scale / 3), min(high, p.grid[-1] * scale * 3)
-        if p.name == "drive_delay":
+        if p.name == HOLD_NAME:
             hold = data.train[0].grid.dt
             low, high = -hold, hold
         k = known.get(p.name)

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from identification._signed_fit import projected_gain, signed_fit
 from identification.balances import Balances, balances_of
 from identification.candidates import Candidate, NotTestable, shape_grid
+from identification.dataset import HOLD_NAME
 from identification.engine import Dataset, Solution, Stacked, row_weights, stack
 from identification.start_values import bounds_of
 from identification.weak import WeakRecord
@@ -129,7 +130,7 @@ def _inward_signs(solution: Solution, data: Dataset) -> dict[str, float]:
     """Amplitudes at a bound, with the sign of the step back from it; the hold of a logged command is none of them."""
     limits = bounds_of(solution.model, data.joint.known, data)
     shapes = {p.name for p in solution.model.parameters if p.is_shape}
-    held = [n for n in solution.at_bound if n in solution.free and n not in shapes and n != "drive_delay"]
+    held = [n for n in solution.at_bound if n in solution.free and n not in shapes and n != HOLD_NAME]
     return {n: 1.0 if solution.values[n] - limits[n][0] < limits[n][1] - solution.values[n] else -1.0 for n in held}
 
 

@@ -15,6 +15,7 @@ from casadi_models import EFFECTS, JointModel
 from identification.assess import Error, assess
 from identification.balances import Balances
 from identification.claims import confusion_set, make_claim, rank, simplest
+from identification.dataset import with_effect, without
 from identification.engine import Dataset, Solution, load_dataset, prepared_model, references, solve, stack
 from identification.errors import InputError
 from identification.fit import joint_text
@@ -170,7 +171,7 @@ class Analysis:
         began = time.perf_counter()
         now = self._current()
         try:
-            model = now.model.drop(label)
+            model = without(now.model, label)
         except (KeyError, ValueError) as error:
             raise InputError(f"{label}: {error.args[0]}") from None
         return self._looked("remove", label, model, now.values, began)
@@ -181,7 +182,7 @@ class Analysis:
         trial = self.trials.get(label)
         values = {**now.values, **(trial.values if trial else (hint or {}).get("values", {}))}
         try:
-            model = trial.candidate.model if trial else now.model.add(label)
+            model = trial.candidate.model if trial else with_effect(now.model, label)
         except (KeyError, ValueError) as error:
             raise InputError(f"{label}: {error.args[0]}") from None
         if not trial and hint and "virtual_work" in hint:

@@ -11,7 +11,7 @@ from typing import Any
 
 from identification.compare import compare
 from identification.diagnose import diagnose
-from identification.fit import Fit, fit, joint_text
+from identification.fit import Fit, fit
 from identification.improve import Improvement, improve
 from identification.joint_file import Joint, toml_text
 from identification.record import Record
@@ -83,7 +83,7 @@ def _write_improvement(found: Improvement, records: Sequence[Record], report: st
 
         print(f"report: {write_report(found, report, records=records, command=command)}")
     if output:
-        write_text(output, joint_text(found.joint, found.steps[-1].solution, found.data))
+        write_text(output, found.to_joint_file())
         print(f"joint file: {output}")
 
 
