@@ -9,7 +9,7 @@ from types import MappingProxyType
 from typing import Final, final
 
 from casadi_models import EFFECTS, JointModel
-from identification.assess import VERDICT_KERNELS, BalanceError, Error, assess
+from identification.assess import VERDICT_KERNELS, BalanceError, assess
 from identification.candidates import LATE
 from identification.claims import (
     COMMON,
@@ -30,7 +30,7 @@ from identification.dataset import HOLD_DELAY, with_effect, without
 from identification.engine import Dataset, Solution, load_dataset, prepared_model, solve
 from identification.errors import InputError
 from identification.excitation import excitation_warnings, few_reversals, not_identifiable
-from identification.improvement import Improvement, Step, ranked_json, visible_keys, visible_labels
+from identification.improvement import Improvement, Step, held_drop, made_worse, ranked_json, visible_keys, visible_labels
 from identification.joint_file import Joint
 from identification.lines import find_lines
 from identification.locate import Unexplained, locate, spectral_peak
@@ -50,10 +50,8 @@ RATIO_LIMIT: Final = 1.5
 EXPLAINED_SHARE: Final = 0.5
 LOCATED_SHARE: Final = 50.0
 """Share of what is left that one variable must hold before a table over it is set against the claims [%]."""
-SPOILT_RATIO: Final = 1.3
-"""Ratio to the floor above which a balance that has risen by a fifth counts as spoilt by an addition."""
-RISE_LIMIT: Final = 1.02
-"""Rise of the relative held-out error that an addition may cause."""
+SAME_WITH_ONE_LESS: Final = 5.0
+"""Rise of a balance's RMS up to which one effect does as well as two [%]."""
 SWAP_GAIN: Final = 3.0
 
 Progress = Callable[[str, float], None]
@@ -165,8 +163,12 @@ class Loop:
             if drop < 2.0 or made_worse(before.held_out, after.held_out):
                 self.refused.add(best.candidate.label)
                 continue
-            claims.append(replace(claim, held_out_drop_percent=drop))
-            steps.append(after)
+            told = self._instead(claim, after, claims, steps)
+            if told is None:
+                claims.append(replace(claim, held_out_drop_percent=drop))
+                steps.append(after)
+            else:
+                claims, steps = told
             if len(claims) > 1:
                 claims, steps = self._revise(claims, steps)
             base = make_base(steps[-1].solution, self.data)
@@ -209,16 +211,36 @@ class Loop:
         for position, claim in enumerate(claims):
             if new.effects[0] not in claim.effects[1:]:
                 continue
-            smaller = solve(without(steps[-1].solution.model, claim.label), self.data, start=steps[-1].solution.values)
-            alone = next((t for t in rank(make_base(smaller, self.data)).everything if t.candidate.label == new.label), None)
-            if alone is None:
-                continue
-            current = [replace(new, effects=new.effects[:1], separate_by=None) if i == position else c for i, c in enumerate(claims)]
-            kept, out = self._replay(current, steps, alone.values)
-            if len(kept) == len(claims) and held_drop(steps[-1].held_out, out[-1].held_out, claim.balance) >= 2.0:
+            told = self._in_place(position, new.effects[0], claims, steps)
+            if told is not None and held_drop(steps[-1].held_out, told[1][-1].held_out, claim.balance) >= 2.0:
                 self.refused.add(claim.label)
-                return kept, out
+                return told
         return None
+
+    def _instead(self, new: Claim, after: Step, claims: list[Claim], steps: list[Step]) -> tuple[list[Claim], list[Step]] | None:
+        """Another name of an earlier set that alone leaves no more than that set's first name with a relative of it beside it."""
+        for position, claim in enumerate(claims):
+            if new.balance != claim.balance or not set(EFFECTS[new.effects[0]].confused_with) & set(claim.effects):
+                continue
+            for name in claim.effects[1:]:
+                told = self._in_place(position, name, claims, steps)
+                if told is not None and held_drop(after.held_out, told[1][-1].held_out, claim.balance) >= -SAME_WITH_ONE_LESS:
+                    self.refused.add(claim.label)
+                    return told
+        return None
+
+    def _in_place(self, position: int, name: str, claims: list[Claim], steps: list[Step]) -> tuple[list[Claim], list[Step]] | None:
+        """Claims and steps with another effect in the place of a claim; None where it cannot be tried there."""
+        claim, last = claims[position], steps[-1].solution
+        base = make_base(solve(without(last.model, claim.label), self.data, start=last.values), self.data)
+        ranking = rank(base)
+        alone = next((t for t in ranking.everything if t.key == name and t.balance == claim.balance), None)
+        if alone is None:
+            return None
+        current = list(claims)
+        current[position] = make_claim(alone, ranking, base, (name,))
+        kept, out = self._replay(current, steps, alone.values)
+        return (kept, out) if len(kept) == len(claims) else None
 
     def _revise(self, claims: list[Claim], steps: list[Step]) -> tuple[list[Claim], list[Step]]:
         """Judge every earlier claim given all the others: drop it, swap it, or renew its set."""
@@ -365,15 +387,3 @@ class Loop:
             if trial.values[name] * found.values[name] <= 0:
                 return False
         return True
-
-
-def made_worse(before: Error, after: Error) -> bool:
-    """True where the error as a whole rises on held-out records, or a balance that was fine is spoilt."""
-    spoilt = any(e.ratio > max(1.2 * before.balances[b].ratio, SPOILT_RATIO) for b, e in after.balances.items())
-    return spoilt or after.relative_error_percent > RISE_LIMIT * before.relative_error_percent
-
-
-def held_drop(before: Error, after: Error, balance: str) -> float:
-    """Fall of a balance's RMS in percent."""
-    old = before.balances[balance].rms
-    return 100 * (1 - after.balances[balance].rms / old) if old > 0 else 0.0

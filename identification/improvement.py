@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, final
+from typing import Any, Final, final
 
 from casadi_models import JointModel
 from identification.assess import BalanceError, Error
@@ -18,6 +18,11 @@ from identification.lines import Line
 from identification.locate import Unexplained
 from identification.parameters import parameter_table
 from identification.trials import Trial
+
+SPOILT_RATIO: Final = 1.3
+"""Ratio to the floor above which a balance that has risen by a fifth counts as spoilt by an addition."""
+RISE_LIMIT: Final = 1.02
+"""Rise of the relative held-out error that an addition may cause."""
 
 
 @final
@@ -145,3 +150,15 @@ def visible_labels(model: JointModel) -> tuple[str, ...]:
 def visible_keys(model: JointModel) -> tuple[str, ...]:
     """Keys of the effects in the model, each once."""
     return tuple(dict.fromkeys(t.effect.key for t in model.terms if t.label != HOLD_DELAY))
+
+
+def made_worse(before: Error, after: Error) -> bool:
+    """True where the error as a whole rises on held-out records, or a balance that was fine is spoilt."""
+    spoilt = any(e.ratio > max(1.2 * before.balances[b].ratio, SPOILT_RATIO) for b, e in after.balances.items())
+    return spoilt or after.relative_error_percent > RISE_LIMIT * before.relative_error_percent
+
+
+def held_drop(before: Error, after: Error, balance: str) -> float:
+    """Fall of a balance's RMS in percent."""
+    old = before.balances[balance].rms
+    return 100 * (1 - after.balances[balance].rms / old) if old > 0 else 0.0

@@ -37,6 +37,28 @@ def test_hidden_effect_is_in_the_set_and_nothing_else_is_claimed(tmp_path: Path,
     assert result["ranking"][0]["effect"] in {n for c in result["claims"] for n in c["effects"]}
 
 
+@pytest.mark.parametrize(
+    ("effect", "seed"),
+    [("cyclic_torque", 7001), ("stribeck", 7000), ("kinematic_error", 7001), ("asymmetric_coulomb", 7000), ("current_offset", 7003)],
+)
+def test_one_record_with_few_reversals_names_the_effect(tmp_path: Path, effect: str, seed: int) -> None:
+    """Friction shows in one or two blocks only: the folds of the cross-validation without them know nothing about it."""
+    generate_case(effect, seed, folder=tmp_path)
+    result = improve_json([tmp_path / "train.csv"], [tmp_path / "test.csv"], tmp_path / "joint.toml")
+    found = score(json.loads((tmp_path / "truth.json").read_text()), result)
+    assert found.in_set == 1, result["claims"]
+    assert found.extra == 0, result["claims"]
+    assert len(result["claims"]) == 1
+
+
+def test_a_relative_is_not_added_beside_the_wrong_name_of_a_set(tmp_path: Path) -> None:
+    """Three stiffnesses: soft wind-up and backlash together imitate them; the one law alone does as well."""
+    generate_case("piecewise_stiffness", 7004, folder=tmp_path)
+    result = improve_json([tmp_path / "train.csv"], [tmp_path / "test.csv"], tmp_path / "joint.toml")
+    assert [c["effects"] for c in result["claims"]] == [["piecewise_stiffness"]]
+    assert result["verdict"] == "complete"
+
+
 @pytest.mark.parametrize(("seed", "dirt"), [(4002, False), (4003, False), (4004, True)])
 def test_nothing_is_claimed_where_nothing_is_hidden(tmp_path: Path, seed: int, dirt: bool) -> None:
     _, result = judged(tmp_path, None, seed, dirt=dirt)
