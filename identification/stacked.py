@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import final
+from typing import Final, final
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +16,11 @@ from identification.dataset import Dataset
 from identification.weak import POSITION_CHAINS, Grid, WeakRecord, differentiated_kernel
 
 FloatArray = npt.NDArray[np.float64]
+
+TURN_KERNEL: Final = 0.02
+"""Longest kernel of the velocity that still follows a turn with sticking friction [s]."""
+TURN_SHARE: Final = 0.25
+"""Share of what a kernel is longer than that by which the instant of a turn may be wrong, either way."""
 IntArray = npt.NDArray[np.int64]
 
 
@@ -122,7 +127,7 @@ def row_weights(
 
 
 def _standstill(model: JointModel, data: Dataset, values: Mapping[str, float], records: Sequence[WeakRecord]) -> dict[str, FloatArray]:
-    """Friction torque that a standing joint may hold in either direction, averaged like a row [N.m]."""
+    """Friction torque that may act in either direction, at a standstill or a turn, averaged like a row [N.m]."""
     zero = np.zeros(sum(w.rows for w in records))
     out = dict.fromkeys(data.sensing.balances, zero)
     for place, balances in (("motor", ("motor", "sum", "deflection", "axis")), ("link", ("link", "sum", "axis"))):
@@ -135,16 +140,24 @@ def _standstill(model: JointModel, data: Dataset, values: Mapping[str, float], r
         lag = model.swinging_inertia(values) * values["load_compliance"] if model.lagging_load else 0.0
         shares = []
         for w in records:
-            grid = w.grid
-            slow = np.abs(w.points[f"{place}_velocity"]) < 3 * data.noise[source] * grid.velocity_gain(source)
-            shares.append(w.average(slow.astype(float)))
+            either = _either_direction(w.points[f"{place}_velocity"], data.noise[source], w.grid, source).astype(float)
+            shares.append(w.average(either))
             if lag:
-                shares[-1] = shares[-1] + lag * (np.abs(w.curving) @ slow.astype(float))
+                shares[-1] = shares[-1] + lag * (np.abs(w.curving) @ either)
         held = level * np.concatenate(shares)
         for b in balances:
             if b in out:
                 out[b] = np.hypot(out[b], held)
     return out
+
+
+def _either_direction(velocity: FloatArray, noise: float, grid: Grid, source: str) -> npt.NDArray[np.bool_]:
+    """Points at which the direction is not known: slower than the noise, or nearer to a turn than its kernel tells when it was."""
+    slow = np.abs(velocity) < 3 * noise * grid.velocity_gain(source)
+    turns = np.diff(np.sign(velocity), append=velocity[-1]) != 0
+    reach = max(0, round(TURN_SHARE * (grid.pointwise[source] - TURN_KERNEL) / (grid.step * grid.dt)))
+    near = np.convolve(turns, np.ones(2 * reach), "same") > 0 if reach else np.zeros(len(velocity), dtype=bool)
+    return np.asarray(slow | near)
 
 
 def rms(values: FloatArray) -> float:

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from tests.hidden_effect.campaign import thinned
 from tests.hidden_effect.generator import generate_case
 from tests.hidden_effect.scoring import score
 from workbench.cli import improve_json
@@ -49,6 +50,16 @@ def test_one_record_with_few_reversals_names_the_effect(tmp_path: Path, effect: 
     assert found.in_set == 1, result["claims"]
     assert found.extra == 0, result["claims"]
     assert len(result["claims"]) == 1
+
+
+@pytest.mark.parametrize(("effect", "verdict"), [(None, "nothing_missing"), ("stribeck", "complete"), ("piecewise_stiffness", "complete")])
+def test_a_joint_that_sticks_at_its_turns_leaves_nothing_at_125_hz(tmp_path: Path, effect: str | None, verdict: str) -> None:
+    generate_case(effect, 1000, folder=tmp_path)
+    slow = thinned(tmp_path, 4)
+    train, held = ([slow / f"{n}{i}.csv" for i in ("", "2")] for n in ("train", "test"))
+    result = improve_json(train, held, tmp_path / "joint.toml")
+    assert [c["effects"][0] for c in result["claims"]] == ([effect] if effect else [])
+    assert result["verdict"] == verdict
 
 
 def test_a_relative_is_not_added_beside_the_wrong_name_of_a_set(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast, final
 
 from tests.hidden_effect._tables import RECORDED_SECONDS, Outcome, checks, markdown
+from tests.hidden_effect.generator import RECORDS as GENERATED
 from tests.hidden_effect.generator import generate_case, names_of
 from tests.hidden_effect.hidden import LIBRARY, NEEDS_TORQUE_SENSOR, ONE_SIDED_HIDDEN, OUTSIDE
 from tests.hidden_effect.scoring import score
@@ -53,6 +54,7 @@ class Job:
     cache: Path
     entry: str
     records: str = "both"
+    every: int = 1
 
     @property
     def label(self) -> str:
@@ -75,6 +77,16 @@ def load_entry(text: str) -> Callable[[list[Path], list[Path], Path], dict[str, 
     return cast("Callable[[list[Path], list[Path], Path], dict[str, Any]]", function)
 
 
+def thinned(folder: Path, every: int) -> Path:
+    """A folder with every so many rows of a case's records: what a slower logger would have kept."""
+    made = folder / f"every{every}"
+    made.mkdir(exist_ok=True)
+    for name in GENERATED:
+        head, *rows = (folder / f"{name}.csv").read_text(encoding="utf-8").splitlines()
+        (made / f"{name}.csv").write_text("\n".join([head, *rows[::every]]) + "\n", encoding="utf-8")
+    return made
+
+
 def run_job(job: Job) -> Outcome:
     """Make the case if it is not in the cache, run the tool on it, score it; a failure of the tool is an outcome."""
     folder = job.folder
@@ -83,12 +95,13 @@ def run_job(job: Job) -> Outcome:
             job.effect, job.seed, size=job.size, dirt=job.dirt, torque_sensor=job.torque_sensor,
             one_sided=job.one_sided, folder=folder,
         )  # fmt: skip
+    given = folder if job.every == 1 else thinned(folder, job.every)
     truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
     stiction = truth["link_referred"]["friction_smoothing_rad_s"] == 0.0
     improve = load_entry(job.entry)
     began = time.perf_counter()
     try:
-        train, held = ([folder / f"{part}{number}.csv" for number in RECORDS[job.records]] for part in ("train", "test"))
+        train, held = ([given / f"{part}{number}.csv" for number in RECORDS[job.records]] for part in ("train", "test"))
         result = improve(train, held, folder / "joint.toml")
         seconds = time.perf_counter() - began
         (folder / "improve.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
@@ -114,7 +127,7 @@ def plan_jobs(options: argparse.Namespace, cache: Path) -> list[Job]:
     if not options.one_sided:
         cases += [("outside", e, options.start + s) for e in OUTSIDE for s in range(options.outside)]
     return [
-        Job(group, effect, seed, options.size, options.dirt, torque_sensor, options.one_sided, cache, options.entry, options.records)
+        Job(group, effect, seed, options.size, options.dirt, torque_sensor, options.one_sided, cache, options.entry, options.records, options.every)
         for group, effect, seed in cases
     ]
 
@@ -156,6 +169,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--records", choices=list(RECORDS), default="both", help="records the tool is given: both pairs, the first (one speed, few reversals) or the second"
     )
+    p.add_argument("--every", type=int, default=1, help="keep one row of so many: 4 makes 125 Hz of 500 Hz")
     p.add_argument("--jobs", type=int, default=1, help="processes")
     p.add_argument("--cache", type=Path, help="folder that keeps the cases (default: temporary)")
     p.add_argument("--entry", default=DEFAULT_ENTRY, help="module:function to run on each case")
