@@ -27,12 +27,15 @@ def turns(record: Record) -> int:
 def test_too_few_reversals_are_named_in_the_verdict() -> None:
     joint = load_joint(DEMO / "joint.toml")
     whole, held = read(SHARED / "train.csv"), read(SHARED / "test.csv")
-    poor = whole.take(slice(0, 3000))
+    poor = whole.take(slice(0, 4000))
     assert turns(poor) == 1
     found = improve([poor], joint, [held])
     assert found.verdict == "unexplained"
     assert found.reason.endswith("The motor reverses once only, too seldom to name a friction effect: record more reversals.")
     assert "No effect of the library" not in found.reason
+    named = improve([whole.take(slice(0, 3000))], joint, [held])
+    assert [c.effects for c in named.claims] == [("stribeck",)], "where the held-out record confirms it"
+    assert any("reverses once only" in warning for warning in named.warnings)
     rich = improve([whole], joint, [held])
     assert not any("reverses" in warning for warning in (*rich.warnings, rich.reason))
 

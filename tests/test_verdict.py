@@ -15,6 +15,7 @@ from identification.claims import LARGEST_SET, shortened
 from identification.engine import load_dataset, prepared_model
 from identification.errors import InputError
 from identification.joint_file import Joint
+from identification.locate import Unexplained
 from identification.places import gather, places
 from identification.verdict import verdict_of
 from tests.test_other_payload import FAST, JOINT, record
@@ -48,8 +49,9 @@ def test_names_that_are_not_significant_leave_a_set_that_is_too_large() -> None:
 
 def test_a_claim_in_part_is_not_said_to_be_what_is_missing() -> None:
     found = improve(record("loaded", 1, True, *SLOW), JOINT, [record("held out", 2, True, *SLOW)])
-    assert found.unexplained
-    args = (found.unexplained, found.final_ratios, found.steps, None, "")
+    assert found.claims
+    left = (Unexplained("motor", 40.0, axis="motor_velocity"),)
+    args = (left, found.final_ratios, found.steps, None, "")
     whole = verdict_of(found.claims, *args)[1]
     part = verdict_of([replace(c, partial=True) for c in found.claims], *args)[1]
     assert whole.startswith("Missing: ")
