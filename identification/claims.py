@@ -11,6 +11,7 @@ import numpy as np
 
 from casadi_models import EFFECTS
 from identification.candidates import LATE, Candidate, NotTestable, offered
+from identification.dataset import HOLD_NAME
 from identification.trials import Base, Trial, try_candidate
 
 MAJOR_DROP: Final = 10.0
@@ -172,8 +173,8 @@ def _major(trial: Trial, base: Base) -> bool:
         return trial.cv_drop_percent >= LATE_DROP and (math.isnan(held) or held >= LATE_DROP)
     if trial.key == "channel_delay":
         dt = base.data.train[0].grid.dt
-        delay = max(abs(trial.values[n]) for n in trial.candidate.amplitudes)
-        return delay > dt / 2
+        hold = base.solution.values.get(HOLD_NAME, 0.0) if trial.candidate.place == "drive" else 0.0
+        return max(abs(trial.values[n] + hold) for n in trial.candidate.amplitudes) > dt / 2
     return True
 
 
