@@ -235,13 +235,13 @@ def _sample(model: JointModel, free: Sequence[str], rows: Sequence[int], dt: flo
     functions, names = model.functions, model.parameter_names
     n, k = (4 if model.is_elastic else 2), (4 if model.is_elastic else 2) + len(free)
     chosen = [names.index(f) for f in free]
-    delays = [names.index(n) for n in (HOLD_NAME, "drive_delay") if n in names]
+    delays = [names.index(name) for name in (HOLD_NAME, "drive_delay") if name in names]
     x, u, p = ca.SX.sym("x", n), ca.SX.sym("u", 6), ca.SX.sym("p", len(names))
     slopes, share = ca.SX.sym("S", n, k), ca.SX.sym("share")
 
     def applied(c: Any) -> Any:
         """Inputs of the dynamics at the share c of the sample."""
-        late = sum(p[k] for k in delays) * (u[1] + c * (u[3] - u[1]))
+        late = sum(p[i] for i in delays) * (u[1] + c * (u[3] - u[1]))
         return ca.vertcat(u[0] + c * (u[2] - u[0]) + late, u[4], u[5] + c * dt)
 
     def carried(expression: Any) -> Any:

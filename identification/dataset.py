@@ -19,6 +19,10 @@ from identification.weak import POSITION_CHAINS, WeakRecord, kernel, prepare
 
 FloatArray = npt.NDArray[np.float64]
 
+HOLD_DELAY: Final = "channel_delay@drive#0"
+"""In every model with a commanded drive: the hold of the logged command is not an effect, but a nuisance of at most a sample."""
+HOLD_NAME: Final = "drive_delay_0"
+_DRIVE_DELAY: Final = "channel_delay@drive"
 CLAIM_KERNEL: Final = 0.06
 ONE_SIDED_KERNEL: Final = 0.2
 LINK_BALANCES: Final = frozenset({"link", "sum", "axis"})
@@ -160,14 +164,6 @@ def _ranges(data: Sequence[WeakRecord], clamped: bool) -> dict[str, float]:
     twist = q if clamped else np.concatenate([w.smooth["motor_position"] - w.smooth["link_position"] for w in data])
     duration = sum(float(np.ptp(w.time)) for w in data)
     return {"velocity": span(speed), "torsion": span(twist), "position": span(q - np.median(q)), "duration": duration, "absolute": 1.0}
-
-
-HOLD_DELAY: Final = "channel_delay@drive#0"
-"""In every model with a commanded drive: the hold of the logged command is not an effect, but a nuisance of at most a sample."""
-HOLD_NAME: Final = "drive_delay_0"
-
-
-_DRIVE_DELAY: Final = "channel_delay@drive"
 
 
 def with_effect(model: JointModel, label: str) -> JointModel:

@@ -29,7 +29,7 @@ from identification.claims import (
 from identification.dataset import HOLD_DELAY, with_effect, without
 from identification.engine import Dataset, Solution, load_dataset, prepared_model, solve
 from identification.errors import InputError
-from identification.excitation import excitation_warnings, few_reversals, not_identifiable
+from identification.excitation import excitation_warnings, few_reversals, not_identifiable, unlike_units
 from identification.improvement import Improvement, Step, held_drop, made_worse, ranked_json, visible_keys, visible_labels
 from identification.joint_file import Joint
 from identification.lines import find_lines
@@ -50,6 +50,8 @@ RATIO_LIMIT: Final = 1.5
 EXPLAINED_SHARE: Final = 0.5
 LOCATED_SHARE: Final = 50.0
 """Share of what is left that one variable must hold before a table over it is set against the claims [%]."""
+NO_MODEL: Final = 50.0
+"""Held-out error of the start model from which records that move as far apart as degrees and radians are not diagnosed [%]."""
 SAME_WITH_ONE_LESS: Final = 5.0
 """Rise of a balance's RMS up to which one effect does as well as two [%]."""
 SWAP_GAIN: Final = 3.0
@@ -125,6 +127,8 @@ class Loop:
         claims: list[Claim] = []
         self.progress("ranking the library", 0.15)
         why = not_identifiable(self.data)
+        if not why and steps[0].held_out.relative_error_percent >= NO_MODEL:
+            why = unlike_units(self.data)  # no effect is named on top of a wrong unit
         if why:
             return self._without_answer(steps, why)
         base = make_base(steps[-1].solution, self.data)
@@ -211,7 +215,9 @@ class Loop:
         for position, claim in enumerate(claims):
             if new.effects[0] not in claim.effects[1:]:
                 continue
-            told = self._in_place(position, new.effects[0], claims, steps)
+            base, ranking = self._lacking(claim, steps)
+            alone = next((t for t in ranking.everything if t.candidate.label == new.label), None)
+            told = self._in_place(position, alone, make_claim(alone, ranking, base, (alone.key,)), claims, steps) if alone else None
             if told is not None and held_drop(steps[-1].held_out, told[1][-1].held_out, claim.balance) >= 2.0:
                 self.refused.add(claim.label)
                 return told
@@ -220,26 +226,26 @@ class Loop:
     def _instead(self, new: Claim, after: Step, claims: list[Claim], steps: list[Step]) -> tuple[list[Claim], list[Step]] | None:
         """Another name of an earlier set that alone leaves no more than that set's first name with a relative of it beside it."""
         for position, claim in enumerate(claims):
-            if new.balance != claim.balance or not set(EFFECTS[new.effects[0]].confused_with) & set(claim.effects):
+            if len(claim.effects) == 1 or new.balance != claim.balance or not set(EFFECTS[new.effects[0]].confused_with) & set(claim.effects):
                 continue
+            base, ranking = self._lacking(claim, steps)
             for name in claim.effects[1:]:
-                told = self._in_place(position, name, claims, steps)
+                alone = next((t for t in ranking.everything if t.key == name and t.balance == claim.balance), None)
+                told = self._in_place(position, alone, make_claim(alone, ranking, base, (name,)), claims, steps) if alone else None
                 if told is not None and held_drop(after.held_out, told[1][-1].held_out, claim.balance) >= -SAME_WITH_ONE_LESS:
                     self.refused.add(claim.label)
                     return told
         return None
 
-    def _in_place(self, position: int, name: str, claims: list[Claim], steps: list[Step]) -> tuple[list[Claim], list[Step]] | None:
-        """Claims and steps with another effect in the place of a claim; None where it cannot be tried there."""
-        claim, last = claims[position], steps[-1].solution
+    def _lacking(self, claim: Claim, steps: list[Step]) -> tuple[Base, Ranking]:
+        """The last model without a claim, and the library tried on it."""
+        last = steps[-1].solution
         base = make_base(solve(without(last.model, claim.label), self.data, start=last.values), self.data)
-        ranking = rank(base)
-        alone = next((t for t in ranking.everything if t.key == name and t.balance == claim.balance), None)
-        if alone is None:
-            return None
-        current = list(claims)
-        current[position] = make_claim(alone, ranking, base, (name,))
-        kept, out = self._replay(current, steps, alone.values)
+        return base, rank(base)
+
+    def _in_place(self, position: int, alone: Trial, new: Claim, claims: list[Claim], steps: list[Step]) -> tuple[list[Claim], list[Step]] | None:
+        """Claims and steps with another effect in the place of a claim; None where an earlier one does not go with it."""
+        kept, out = self._replay([new if i == position else c for i, c in enumerate(claims)], steps, alone.values)
         return (kept, out) if len(kept) == len(claims) else None
 
     def _revise(self, claims: list[Claim], steps: list[Step]) -> tuple[list[Claim], list[Step]]:
@@ -252,8 +258,7 @@ class Loop:
             model = without(steps[-1].solution.model, claim.label)
             if model.terms == steps[-1].solution.model.terms:
                 continue
-            base = make_base(solve(model, self.data, start=steps[-1].solution.values), self.data)
-            ranking = rank(base)
+            base, ranking = self._lacking(claim, steps)
             same = next((t for t in ranking.everything if t.candidate.label == claim.label), None)
             best = ranking.best(frozenset(self.refused))
             position = current.index(claim)

@@ -100,9 +100,12 @@ def _curve(b: Branch, frame: Frame, kind: str, colour: str) -> str:
     x = [frame.across(float(v)) for v in b.centre]
     known = np.isfinite(b.low) & np.isfinite(b.high)
     out = []
-    if known.sum() > 1:
-        upper = [f"{x[i]:.1f} {frame.up(float(b.high[i])):.1f}" for i in np.flatnonzero(known)]
-        lower = [f"{x[i]:.1f} {frame.up(float(b.low[i])):.1f}" for i in np.flatnonzero(known)[::-1]]
+    for run in np.split(np.arange(len(known)), np.flatnonzero(~known)):
+        run = run[known[run]]  # a band ends where a bin has none
+        if len(run) < 2:
+            continue
+        upper = [f"{x[i]:.1f} {frame.up(float(b.high[i])):.1f}" for i in run]
+        lower = [f"{x[i]:.1f} {frame.up(float(b.low[i])):.1f}" for i in run[::-1]]
         points = "M" + "L".join(upper + lower) + "Z"
         out.append(f'<path class="s-{kind} band" fill="{colour}" fill-opacity="0.22" stroke="none" d="{points}"/>')
     line = "M" + "L".join(f"{p:.1f} {frame.up(float(m)):.1f}" for p, m in zip(x, b.mean, strict=True))

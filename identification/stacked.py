@@ -16,12 +16,12 @@ from identification.dataset import Dataset
 from identification.weak import POSITION_CHAINS, Grid, WeakRecord, differentiated_kernel
 
 FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
 
 TURN_KERNEL: Final = 0.02
 """Longest kernel of the velocity that still follows a turn with sticking friction [s]."""
 TURN_SHARE: Final = 0.25
 """Share of what a kernel is longer than that by which the instant of a turn may be wrong, either way."""
-IntArray = npt.NDArray[np.int64]
 
 
 @final
@@ -120,13 +120,13 @@ def row_weights(
     bare = balances_of(balances.model, data.sensing, wrt=())
     here = stack(bare, records, values).residual
     there = stack(bare, records, doubled).residual if names else here
-    stuck = _standstill(balances.model, data, values, records)
+    either = _either_way(balances.model, data, values, records)
     return {
-        b: 1 / np.sqrt(sigma[b] ** 2 + (here[b] - there[b]) ** 2 / 4 + stuck[b] ** 2) for b in here
+        b: 1 / np.sqrt(sigma[b] ** 2 + (here[b] - there[b]) ** 2 / 4 + either[b] ** 2) for b in here
     }  # fmt: skip
 
 
-def _standstill(model: JointModel, data: Dataset, values: Mapping[str, float], records: Sequence[WeakRecord]) -> dict[str, FloatArray]:
+def _either_way(model: JointModel, data: Dataset, values: Mapping[str, float], records: Sequence[WeakRecord]) -> dict[str, FloatArray]:
     """Friction torque that may act in either direction, at a standstill or a turn, averaged like a row [N.m]."""
     zero = np.zeros(sum(w.rows for w in records))
     out = dict.fromkeys(data.sensing.balances, zero)

@@ -36,7 +36,8 @@ def verdict_of(
 ) -> tuple[str, str]:  # fmt: skip
     """Verdict and its sentence (`few`: the motor reverses too seldom, which no library makes up for; `unnamed`: a set too large to be a name)."""
     names, parts = _names([c for c in claims if not c.partial]), _names([c for c in claims if c.partial])
-    fall = f"the error on held-out data falls from {steps[0].held_out.relative_error_percent:.3g} % to {steps[-1].held_out.relative_error_percent:.3g} %"
+    was, now = (step.held_out.relative_error_percent for step in (steps[0], steps[-1]))
+    fall = f"the error on held-out data {'falls' if now < was else 'goes'} from {was:.3g} % to {now:.3g} %"
     if where:
         left = ", ".join(f"{u.balance} ({number(ratios[u.balance].ratio, 2)} times its noise floor)" for u in where)
         found = f"Missing: {names}; {fall}. " if names else f"{fall[0].upper()}{fall[1:]}. " if parts else ""

@@ -48,6 +48,9 @@ def test_record_in_degrees_beside_one_in_radians_is_pointed_out() -> None:
     for channel in moved:
         degrees = degrees.with_channel(channel, np.rad2deg(train[channel]))
     assert any(w.startswith("train moves ") and "are its positions in degrees?" in w for w in improve([degrees], joint, [held], max_additions=0).warnings)
+    found = improve([degrees], joint, [held])
+    assert (found.verdict, found.claims) == ("not_identifiable", ())
+    assert "are its positions in degrees?" in found.reason
     assert not any("degrees" in w for w in improve([train], joint, [held], max_additions=0).warnings)
 
 
