@@ -51,7 +51,7 @@ EXPLAINED_SHARE: Final = 0.5
 LOCATED_SHARE: Final = 50.0
 """Share of what is left that one variable must hold before a table over it is set against the claims [%]."""
 NO_MODEL: Final = 50.0
-"""Held-out error of the start model from which records that move as far apart as degrees and radians are not diagnosed [%]."""
+"""Held-out error of the start model from which records that move as far apart as degrees and radians are refused [%]."""
 SAME_WITH_ONE_LESS: Final = 5.0
 """Rise of a balance's RMS up to which one effect does as well as two [%]."""
 SWAP_GAIN: Final = 3.0
@@ -127,8 +127,9 @@ class Loop:
         claims: list[Claim] = []
         self.progress("ranking the library", 0.15)
         why = not_identifiable(self.data)
-        if not why and steps[0].held_out.relative_error_percent >= NO_MODEL:
-            why = unlike_units(self.data)  # no effect is named on top of a wrong unit
+        unlike = unlike_units(self.data)
+        if unlike and steps[0].held_out.relative_error_percent >= NO_MODEL:
+            raise InputError(unlike)
         if why:
             return self._without_answer(steps, why)
         base = make_base(steps[-1].solution, self.data)

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from identification import Record, improve, load_joint, read
+from identification import Record, fit, improve, load_joint, read
 from identification.errors import InputError
+from identification.excitation import excitation_warnings
 
 DEMO = Path(str(files("workbench") / "demo"))
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "hidden_effect" / "stribeck"
@@ -40,17 +41,16 @@ def test_too_few_reversals_are_named_in_the_verdict() -> None:
     assert not any("reverses" in warning for warning in (*rich.warnings, rich.reason))
 
 
-def test_record_in_degrees_beside_one_in_radians_is_pointed_out() -> None:
+def test_record_in_degrees_beside_one_in_radians_is_refused() -> None:
     joint = load_joint(DEMO / "joint.toml")
     train, held = read(DEMO / "train.npz"), read(DEMO / "held_out.npz")
     moved = ("motor_position", "motor_velocity", "link_position", "link_velocity")
     degrees = train
     for channel in moved:
         degrees = degrees.with_channel(channel, np.rad2deg(train[channel]))
-    assert any(w.startswith("train moves ") and "are its positions in degrees?" in w for w in improve([degrees], joint, [held], max_additions=0).warnings)
-    found = improve([degrees], joint, [held])
-    assert (found.verdict, found.claims) == ("not_identifiable", ())
-    assert "are its positions in degrees?" in found.reason
+    with pytest.raises(InputError, match=r"^train moves .* are its positions in degrees\? Set their unit in \[columns\]$"):
+        improve([degrees], joint, [held])
+    assert any("degrees" in w for w in excitation_warnings(fit(joint, [degrees], held_out=[held]).data)), "and said by what only fits"
     assert not any("degrees" in w for w in improve([train], joint, [held], max_additions=0).warnings)
 
 
