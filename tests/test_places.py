@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -9,9 +11,12 @@ from scipy.stats import t as student_t
 
 from identification.engine import load_dataset, prepared_model, solve
 from identification.joint_file import Joint
+from identification.pictures import place_picture
 from identification.places import (
     FEWEST_ROWS,
     Axis,
+    Branch,
+    Place,
     Rows,
     bin_edges,
     branch,
@@ -184,3 +189,13 @@ def test_time_runs_on_over_records() -> None:
     time = running_time(data.train)
     assert np.all(np.diff(time) > 0)
     assert time[-1] == pytest.approx(2 * 24, abs=1.0)
+
+
+def test_a_band_is_not_drawn_across_a_bin_without_one() -> None:
+    x = np.arange(6.0)
+    high = np.array([1.0, 1.0, np.nan, 1.0, 1.0, 1.0])
+    gap = Branch("both", x, 0 * x, -high, high, np.full(6, 9))
+    whole = replace(gap, low=0 * x - 1, high=0 * x + 1)
+    place = Place("motor", "motor_velocity", "velocity", "rad/s", "N.m", np.arange(7.0), (gap,), 0.0, 0.0)
+    assert place_picture(place).count('class="s-before band"') == 2
+    assert place_picture(replace(place, branches=(whole,))).count('class="s-before band"') == 1
