@@ -21,6 +21,7 @@ from typing import Any, Final, final
 from .effect import EFFECTS
 from .equations import Equations, Symbols, build_equations, inverse_dynamics, linear_set, time_derivative
 from .parameter import Parameter
+from .sides import side_factor
 from .term import INERTIAS, LOAD_COMPLIANCE, SWINGING_SHARE, Term, smoothing
 
 __all__ = ["MEMORY_STEP", "Equations", "JointModel", "Term", "inverse_dynamics", "time_derivative"]
@@ -170,6 +171,21 @@ class JointModel:
     def parameter_names(self) -> tuple[str, ...]:
         """Names in the order of the parameter vector."""
         return tuple(p.name for p in self.parameters)
+
+    def side_factor(self, name: str) -> float:
+        """What a motor-side value of a parameter is multiplied by to refer it to the link.
+
+        Raises
+        ------
+        KeyError
+            No such parameter in the model.
+        """
+        for term in self.terms:
+            for own, there in zip(term.effect.parameters, term.names, strict=True):
+                if there == name:
+                    return side_factor(term.effect, own, self.gear_ratio)
+        found = next((p for p in self.parameters if p.name == name), None) or INERTIAS[name]
+        return side_factor(None, found, self.gear_ratio)
 
     def value_vector(self) -> list[float]:
         """Parameter values in the order of :attr:`parameter_names`."""

@@ -4,27 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Final, Literal, final
+from typing import Literal, final
+
+from .quantities import linear_unit
 
 Side = Literal["motor", "gear", "link", "sensor", "none"]
 Scale = Literal["absolute", "velocity", "torsion", "position", "duration"]
-
-LINEAR_UNITS: Final = {
-    "N.m": "N",
-    "N.m.s/rad": "N.s/m",
-    "N.m.s2/rad2": "N.s2/m2",
-    "N.m.s3/rad3": "N.s3/m3",
-    "N.m/rad": "N/m",
-    "N.m/rad3": "N/m3",
-    "rad": "m",
-    "rad/s": "m/s",
-    "kg.m2": "kg",
-    "rad/(N.m)": "m/N",
-    "N.m/K": "N/K",
-    "N.m.s/(rad.K)": "N.s/(m.K)",
-}
-"""Unit of the same parameter where the joint is a linear axis (`kind = "linear"`)."""
-
 
 @final
 @dataclass(frozen=True)
@@ -77,7 +62,7 @@ class Parameter:
 
     def for_kind(self, kind: str) -> Parameter:
         """The parameter with the units of a linear axis where `kind` is "linear"."""
-        return self if kind == "rotary" else replace(self, unit=LINEAR_UNITS.get(self.unit, self.unit))
+        return self if kind == "rotary" else replace(self, unit=linear_unit(self.unit))
 
 
 def amplitude(name: str, unit: str, meaning: str, *, low: float = 0.0, high: float = math.inf) -> Parameter:

@@ -25,7 +25,7 @@ INERTIAS: Final = {
 """Inertias by name, all link-referred."""
 
 LOAD_COMPLIANCE: Final = Parameter(
-    "load_compliance", "rad/N.m", 0.0, 0.0, math.inf, "compliance between motor and link where the link position is not recorded", "link"
+    "load_compliance", "rad/(N.m)", 0.0, 0.0, math.inf, "compliance between motor and link where the link position is not recorded", "link"
 )  # fmt: skip
 SWINGING_SHARE: Final = Parameter(
     "swinging_share", "1", 0.5, 0.02, 1.0, "share of the inertia that hangs on that compliance", "link"

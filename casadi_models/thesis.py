@@ -19,18 +19,10 @@ from typing import Final, Literal, final
 
 from .joint import JointModel
 from .parameter import Side
+from .quantities import side_power
 from .transmission import build
 
 Variant = Literal["coupled", "y1", "y2"]
-
-SIDE_POWERS: Final[Mapping[str, int]] = MappingProxyType(
-    {
-        "rad": -1, "rad/s": -1, "rad/s2": -1, "rad/(N.m)": -2, "N.m": 1, "kg.m2": 2, "N.m/rad": 2, "N.m/rad3": 4,
-        "N.m.s/rad": 2, "N.m.s2/rad2": 3, "N.m.s3/rad3": 4, "1": 0, "s": 0, "Hz": 0,
-    }
-)  # fmt: skip
-"""Power of |N| by which a motor-side value is multiplied to refer it to the link, by unit."""
-
 
 @final
 @dataclass(frozen=True)
@@ -164,7 +156,7 @@ TABLE_B_1: Final = MappingProxyType(
 
 
 def to_link(value: float, unit: str, reduction: float = REDUCTION) -> float:
-    """A motor-side value referred to the link: times |N| to the power of :data:`SIDE_POWERS`.
+    """A motor-side value referred to the link: times |N| to the power that its unit says.
 
     Parameters
     ----------
@@ -189,11 +181,9 @@ def to_motor(value: float, unit: str, reduction: float = REDUCTION) -> float:
 
 
 def _factor(unit: str, reduction: float) -> float:
-    if unit not in SIDE_POWERS:
-        raise ValueError(f"unit {unit!r}: no rule to change its side; known: {', '.join(SIDE_POWERS)}")
     if reduction == 0:
         raise ValueError("reduction 0: give N, the motor turns per link turn")
-    return float(abs(reduction) ** SIDE_POWERS[unit])
+    return float(abs(reduction) ** side_power(unit))
 
 
 def numbers(*tables: Mapping[str, Value]) -> dict[str, float]:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Final, final
 
 from casadi_models import JointModel
+from casadi_models.term import INERTIAS
 from casadi_models.transmission import MODELS, build
 from identification.errors import InputError
 from identification.units import base_unit, same_dimension
@@ -146,7 +147,7 @@ def parse_joint(data: Mapping[str, Any], source: str = "joint") -> Joint:
         fitted={k: _fitted(k, v, source) for k, v in data.get("fitted", {}).items()},
     )  # fmt: skip
     model = joint.model()
-    known = {k: _known(k, v, ratio, model, source) for k, v in data.get("known", {}).items()}
+    known = {k: _known(k, v, model, source) for k, v in data.get("known", {}).items()}
     for p in model.parameters:
         if p.name in joint.fitted and not p.low - 1e-9 <= joint.fitted[p.name] <= p.high + 1e-9:
             bounds = f"{p.low:g} to {p.high:g} {p.unit}"
@@ -163,9 +164,9 @@ def _number(table: Mapping[str, Any], key: str, source: str, default: float | No
     return float(value)
 
 
-def _known(name: str, entry: Any, ratio: float, model: JointModel, source: str) -> Known:
+def _known(name: str, entry: Any, model: JointModel, source: str) -> Known:
     parameters = {p.name: p for p in model.parameters}
-    extra = {"inertia": "kg.m2"}
+    extra = {n: p.for_kind(model.kind).unit for n, p in INERTIAS.items()}
     if name not in parameters and name not in extra:
         raise InputError(f"{source}: [known] {name}: the model has no such parameter; it has {', '.join(sorted(parameters))}")
     if isinstance(entry, int | float):
@@ -180,8 +181,7 @@ def _known(name: str, entry: Any, ratio: float, model: JointModel, source: str) 
             raise InputError(f"{source}: [known] {name} has unit {entry['unit']!r}; it must be one like {unit}")
         scale = given.factor / wanted.factor
     if entry.get("side") == "motor":
-        powers = {"kg.m2": 2, "N.m/rad": 2, "N.m.s/rad": 2, "N.m": 1, "N.m/rad3": 4, "rad": -1, "rad/s": -1}
-        scale *= abs(ratio) ** powers.get(unit, 0)
+        scale *= model.side_factor(name)
     for key in entry:
         if key not in _KNOWN_KEYS:
             raise InputError(f"{source}: [known] {name} has an unknown key {key!r}; known: {', '.join(_KNOWN_KEYS)}")
@@ -190,6 +190,8 @@ def _known(name: str, entry: Any, ratio: float, model: JointModel, source: str) 
     values = {k: _entry_number(entry, k, f"{source}: [known] {name}") * scale for k in ("value", "low", "high") if k in entry}
     if not values:
         raise InputError(f"{source}: [known] {name} has neither value nor low nor high")
+    if scale < 0:  # the link is counted against the motor shaft
+        values = {{"low": "high", "high": "low"}.get(k, k): v for k, v in values.items()}
     if values.get("low", -math.inf) > values.get("high", math.inf):
         raise InputError(f"{source}: [known] {name} has low above high; exchange them")
     if "value" in values and not values.get("low", -math.inf) <= values["value"] <= values.get("high", math.inf):

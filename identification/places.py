@@ -13,7 +13,7 @@ from typing import Any, Final, final
 import numpy as np
 import numpy.typing as npt
 
-from casadi_models.parameter import LINEAR_UNITS
+from casadi_models.quantities import linear_unit
 from identification.balances import balances_of
 from identification.engine import Dataset, Solution, stack
 from identification.locate import axes as signals_of_rows
@@ -158,7 +158,7 @@ def gather(data: Dataset, records: Sequence[WeakRecord] | None = None) -> Rows:
     out: dict[str, Axis] = {}
 
     def put(name: str, values: FloatArray, unit: str, use: npt.NDArray[np.bool_] = everywhere) -> None:
-        out[name] = Axis(name, AXIS_TITLES[name], LINEAR_UNITS.get(unit, unit) if linear else unit, values, use)
+        out[name] = Axis(name, AXIS_TITLES[name], linear_unit(unit) if linear else unit, values, use)
 
     for name, (values, unit) in found.items():
         if name == "motor_velocity":

@@ -16,7 +16,8 @@ import casadi as ca
 
 from casadi_models import JointModel
 from casadi_models.functions import JointFunctions
-from casadi_models.parameter import LINEAR_UNITS, Parameter
+from casadi_models.parameter import Parameter
+from casadi_models.quantities import linear_unit
 from identification.channels import channel_unit
 from identification.errors import InputError
 from identification.joint_file import Joint
@@ -127,7 +128,7 @@ class _Builder:
     # --- declarations ------------------------------------------------------------------------------------------------
 
     def _unit(self, rotary: str) -> str:
-        return rotary if self.model.kind == "rotary" else LINEAR_UNITS.get(rotary, rotary)
+        return rotary if self.model.kind == "rotary" else linear_unit(rotary)
 
     def _channel(self, name: str) -> str:
         return channel_unit(name, self.model.kind)

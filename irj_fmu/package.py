@@ -24,6 +24,8 @@ from .compiler import compile_library, find_compiler, header_folder
 
 _HERE = Path(__file__).parent
 _MINIMUM = ("slave_base.py", "variables.py", "unit_definitions.py", "model_description.py")
+_ALONE = ("identification.errors", "casadi_models.quantities")
+"""Modules of other packages that those need; each imports nothing of the project."""
 _SHIM_TARGET = "x86_64-linux-gnu"
 _NO_SHIM = (
     "built with pythonfmu's own library: runs in Python hosts; C hosts need libpython preloaded and a path without "
@@ -169,9 +171,10 @@ def _bundle(spec: SlaveSpec) -> dict[str, bytes]:
         bundle |= _files(Path(root).resolve())
     for name in _MINIMUM:
         bundle.setdefault(f"irj_fmu/{name}", (_HERE / name).read_bytes())
-    errors = importlib.util.find_spec("identification.errors")
-    if errors is not None and errors.origin is not None:
-        bundle.setdefault("identification/errors.py", Path(errors.origin).read_bytes())
+    for module in _ALONE:
+        found = importlib.util.find_spec(module)
+        if found is not None and found.origin is not None:
+            bundle.setdefault(f"{module.replace('.', '/')}.py", Path(found.origin).read_bytes())
     for path in sorted(_pythonfmu_folder().glob("*.py")):
         bundle[f"pythonfmu/{path.name}"] = path.read_bytes()
     module = spec.module.replace(".", "/")

@@ -37,7 +37,7 @@ def test_units(text: str, factor: float, exponents: dict[str, int]) -> None:
     found = base_unit(text)
     assert found is not None
     assert found.factor == pytest.approx(factor, rel=1e-15)
-    assert dict(found.exponents) == exponents
+    assert found.named_exponents == exponents
 
 
 def test_unknown_and_wrong_units() -> None:

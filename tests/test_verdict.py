@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from casadi_models import EFFECTS
-from casadi_models.parameter import LINEAR_UNITS
+from casadi_models.quantities import linear_unit
 from identification import Record, diagnose, fit, improve
 from identification.candidates import offered
 from identification.claims import LARGEST_SET, shortened
@@ -85,7 +85,7 @@ def test_a_linear_axis_has_no_laws_of_an_angle_and_units_of_its_own() -> None:
     assert found.claims[0].effects[0] == "current_offset"
     assert not any(angular & set(c.effects) for c in found.claims)
     units = {p.unit for e in EFFECTS.values() for p in e.parameters}
-    assert not [u for u in units if "rad" in LINEAR_UNITS.get(u, u) or "N.m" in LINEAR_UNITS.get(u, u)]
+    assert not [u for u in units if "rad" in linear_unit(u) or "N.m" in linear_unit(u)]
 
 
 def test_rows_of_another_payload_stand_in_no_picture_of_the_link() -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from casadi_models import EFFECTS
-from casadi_models.parameter import LINEAR_UNITS
+from casadi_models.quantities import linear_unit
 from identification.assess import VERDICT_KERNELS
 from identification.bode_picture import bode_html
 from identification.ceiling import ceiling_html
@@ -197,7 +197,7 @@ def unexplained_sentence(u: Unexplained, linear: bool) -> str:
     """Where structure is left, in a sentence (escaped)."""
     out = f"<strong>{text(u.balance)} balance</strong>: {number(u.rms, 2)} {'N' if linear else 'N·m'} (RMS) are left"
     if u.axis:
-        unit = pretty_unit(LINEAR_UNITS.get(u.unit or "", u.unit or "") if linear else u.unit or "")
+        unit = pretty_unit(linear_unit(u.unit or "") if linear else u.unit or "")
         by = ", differently in the two directions of motion" if u.by_direction else ""
         out += f"; {number(u.share_percent, 2)} % of it depend on the {text(AXIS_TITLES.get(u.axis, words(u.axis)))}{by}"
         if u.low is not None and u.high is not None:
