@@ -10,11 +10,14 @@ import difflib
 import importlib
 import importlib.util
 import pkgutil
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass, fields
+from functools import cached_property
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Final, Literal, final
+
+import casadi as ca
 
 from .parameter import Parameter, Side
 from .signals import Expression, LocalSignals
@@ -46,6 +49,35 @@ PLACE_SIDE: Final[dict[str, Side]] = {
     "motor_position_sensor": "sensor",
     "link_position_sensor": "sensor",
 }
+
+
+Stage = Literal["structure", "plain", "law", "late"]
+TORQUE_SENSOR: Final = "torque sensor"
+SECOND_BALANCE: Final = "second balance"
+ANYTHING_KNOWN: Final = "anything known"
+"""Conditions of a :class:`Requirement` beside names of known parameters."""
+
+
+@final
+@dataclass(frozen=True)
+class Requirement:
+    """What must be there so that an effect can be told from the rest of the model.
+
+    Attributes
+    ----------
+    any_of : tuple of str
+        Names of parameters, one of which must stand in [known]; or one of `TORQUE_SENSOR`,
+        `SECOND_BALANCE` and `ANYTHING_KNOWN`.
+    why : str
+        What is said where nothing of it is there: why it cannot be told, and what to give.
+    """
+
+    any_of: tuple[str, ...]
+    why: str
+
+    def met(self, there: Collection[str]) -> bool:
+        """True where one of the conditions is among those that hold."""
+        return any(c in there for c in self.any_of)
 
 
 @final
@@ -95,6 +127,31 @@ class Effect:
         True where the law uses the load.
     dissipative : bool
         True where the law, with parameters inside their bounds, never gives energy.
+    requires : tuple of Requirement
+        What must be known or recorded so that it can be told from the rest of the model.
+    contains : tuple of str
+        Keys of simpler effects that this law holds as a special case: they explain nothing beside it.
+    parts : tuple of str
+        Keys of effects that this one sums up: proposed on a rigid model without any of them only.
+    stage : {"structure", "plain", "law", "late"}
+        Order in which significant candidates are taken: a change of the joint's structure that the
+        positions themselves show; a plain law, before richer ones that gain less than twice as much;
+        any other law; one with free dynamics of its own, which fits a little of anything, when
+        nothing else is left.
+    common : bool
+        True for an effect that hardly a joint is without: named first in a set, and at a smaller fall.
+    several_valleys : bool
+        True where a fit of its shapes has several minima: it starts from several points.
+    carries_load : bool
+        True for a law from which the load of the gear follows where no torque sensor is there.
+    of_displacement : bool
+        True for a law of the torsion that also makes sense on the position of an axis without gear.
+    shapes_reversal : bool
+        True where the smoothing velocity is part of the law and not a stand-in for a jump.
+    everywhere : bool
+        True where the key alone means all places.
+    pairs : tuple of (str, str, str)
+        Name, sine and cosine parameter of each pair that is also told as amplitude and phase.
     periodic : bool
         True for a line at an order of the motor turn (own claim rule).
     angular : bool
@@ -129,12 +186,47 @@ class Effect:
     angular: bool = False
     separate_by: str = ""
     candidate: bool = True
+    requires: tuple[Requirement, ...] = ()
+    contains: tuple[str, ...] = ()
+    parts: tuple[str, ...] = ()
+    stage: Stage = "law"
+    common: bool = False
+    several_valleys: bool = False
+    carries_load: bool = False
+    of_displacement: bool = False
+    shapes_reversal: bool = False
+    everywhere: bool = False
+    pairs: tuple[tuple[str, str, str], ...] = ()
 
     def __post_init__(self) -> None:
         if (self.memory is None) != (self.states == 0):
             raise ValueError(f"effect {self.key!r}: states need a memory, and a memory needs states")
         if self.rate is not None and self.memory is None:
             raise ValueError(f"effect {self.key!r}: a rate needs its step form, memory")
+
+    @property
+    def related(self) -> tuple[str, ...]:
+        """Keys of all effects that the declaration refers to."""
+        return (*self.confused_with, *self.needs, *self.contains, *self.parts)
+
+    @property
+    def is_delay(self) -> bool:
+        """True for a channel that is late: its amplitude is the time."""
+        return any(p.role == "delay" for p in self.parameters)
+
+    @cached_property
+    def reads(self) -> frozenset[str]:
+        """Names of the signals (of :class:`LocalSignals`) that the law uses."""
+        symbols = {f.name: ca.SX.sym(f.name) for f in fields(LocalSignals) if f.name != "memory"}
+        states = tuple(ca.SX.sym(f"z{i}") for i in range(self.states))
+        values = SimpleNamespace(**{p.name: ca.SX.sym(p.name) for p in self.parameters})
+        found = ca.SX(self.law(LocalSignals(memory=states, **symbols), values))
+        return frozenset(n for n, x in symbols.items() if ca.depends_on(found, x))
+
+    @property
+    def warms(self) -> bool:
+        """True for a law of the temperature."""
+        return "temperature" in self.reads
 
     @property
     def amplitudes(self) -> tuple[Parameter, ...]:
@@ -199,11 +291,23 @@ class Registry(Mapping[str, Effect]):
         before = set(self._effects)
         try:
             spec.loader.exec_module(importlib.util.module_from_spec(spec))
+            self._check_references(set(self._effects) - before, path)
         except BaseException:
             self._effects = kept
             raise
         self._loaded[where] = tuple(sorted(set(self._effects) - before))
         return self._loaded[where]
+
+    def periodic_in(self, place: Place) -> tuple[str, ...]:
+        """Keys of the candidates that make a line at an order of the motor turn in a place."""
+        return tuple(e.key for e in self.values() if e.candidate and e.periodic and place in e.acts_on)
+
+    def _check_references(self, keys: set[str], path: Path) -> None:
+        """Every effect that a new one names must be in the library."""
+        for key in sorted(keys):
+            for other in self._effects[key].related:
+                if other not in self._effects:
+                    raise ValueError(f"{path}: effect {key!r} names {other!r}, which is not in the library")
 
 
 EFFECTS: Final = Registry()
@@ -231,6 +335,17 @@ def effect(
     angular: bool = False,
     separate_by: str = "",
     candidate: bool = True,
+    requires: tuple[Requirement, ...] = (),
+    contains: tuple[str, ...] = (),
+    parts: tuple[str, ...] = (),
+    stage: Stage = "law",
+    common: bool = False,
+    several_valleys: bool = False,
+    carries_load: bool = False,
+    of_displacement: bool = False,
+    shapes_reversal: bool = False,
+    everywhere: bool = False,
+    pairs: tuple[tuple[str, str, str], ...] = (),
 ) -> Callable[[Law], Law]:
     """Declare and register the decorated law as an effect (see :class:`Effect` for the arguments)."""
 
@@ -241,6 +356,9 @@ def effect(
                 excitation=excitation, source=source, memory=memory, rate=rate, states=states, potential=potential,
                 confused_with=confused_with, needs=needs, needs_load=needs_load, dissipative=dissipative,
                 periodic=periodic, angular=angular, separate_by=separate_by, candidate=candidate,
+                requires=requires, contains=contains, parts=parts, stage=stage, common=common,
+                several_valleys=several_valleys, carries_load=carries_load, of_displacement=of_displacement,
+                shapes_reversal=shapes_reversal, everywhere=everywhere, pairs=pairs,
             )
         )  # fmt: skip
         return law

@@ -20,14 +20,16 @@ from typing import Any, Final, final
 
 from .effect import EFFECTS
 from .equations import Equations, Symbols, build_equations, inverse_dynamics, linear_set, time_derivative
-from .parameter import Parameter
+from .parameter import Parameter, Role
 from .sides import side_factor
-from .term import INERTIAS, LOAD_COMPLIANCE, SWINGING_SHARE, Term, smoothing
+from .term import INERTIAS, LOAD_COMPLIANCE, SIDE_INERTIAS, SWINGING_SHARE, TOTAL_INERTIA, Term, smoothing
 
 __all__ = ["MEMORY_STEP", "Equations", "JointModel", "Term", "inverse_dynamics", "time_derivative"]
 
 MEMORY_STEP: Final = 1e-6
 """Time over which a memory without a rate of its own is differentiated to its continuous form [s]."""
+
+_FRICTION_SIDES: Final = ("motor", "link")
 
 
 @final
@@ -62,7 +64,7 @@ class JointModel:
 
     gear_ratio: float = 1.0
     terms: tuple[Term, ...] = ()
-    inertias: tuple[str, ...] = ("motor_inertia", "link_inertia")
+    inertias: tuple[str, ...] = SIDE_INERTIAS
     values: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     kind: str = "rotary"
     virtual_work: bool = True
@@ -87,8 +89,8 @@ class JointModel:
         ----------
         label : str
             Effect key, ``key@place``, or ``key#2`` for a second one with its own parameters. A key
-            alone goes to the effect's first place; viscous and Coulomb friction go to motor and link
-            alike.
+            alone goes to the effect's first place, or to all where its declaration says so (viscous and
+            Coulomb friction).
 
         Raises
         ------
@@ -124,7 +126,7 @@ class JointModel:
             if place not in found.acts_on:
                 raise ValueError(f"effect {key!r} acts on {', '.join(found.acts_on)}, not on {place!r}")
             return [Term(found, p, instance) for p in found.acts_on if p == place]
-        everywhere = key in ("viscous", "coulomb") and self.inertias != ("inertia",)
+        everywhere = found.everywhere and self.inertias != TOTAL_INERTIA
         return [Term(found, p, instance) for p in (found.acts_on if everywhere else found.acts_on[:1])]
 
     def has(self, key: str, place: str | None = None) -> bool:
@@ -145,6 +147,38 @@ class JointModel:
         """What hangs on the compliance of a lagging load [kg.m2], from numbers or symbols."""
         return values["link_inertia"] if "link_inertia" in self.inertias else values["swinging_share"] * values["inertia"]
 
+    def load_compliance(self, values: Mapping[str, Any]) -> Any:
+        """Compliance on which a link that is not recorded hangs [rad/(N.m)], 0 where there is none."""
+        return values[LOAD_COMPLIANCE.name] if self.lagging_load else 0.0
+
+    @property
+    def knows_load(self) -> bool:
+        """True where the load of the gear follows from a law of the model."""
+        return any(t.effect.carries_load for t in self.terms)
+
+    @cached_property
+    def _places(self) -> Mapping[str, str]:
+        """Place of each parameter; that of a smoothing velocity is its side, the joint's own have none."""
+        sides = {smoothing(side).name: side for side in _FRICTION_SIDES}
+        return {**dict.fromkeys(self.parameter_names, ""), **sides, **{n: t.place for t in self.terms for n in t.names}}
+
+    def named(self, role: Role, place: str | None = None) -> tuple[str, ...]:
+        """Names of the parameters with a role, of all places or of one (see :class:`Parameter`)."""
+        return tuple(p.name for p in self.parameters if p.role == role and place in (None, self._places[p.name]))
+
+    @property
+    def stiffness_name(self) -> str | None:
+        """Name of the linear stiffness of the transmission, None for a rigid model."""
+        return next(iter(self.named("stiffness")), None)
+
+    def usual_values(self) -> dict[str, float]:
+        """A value of every parameter: that of the model, else the typical size, else the start."""
+        out = {}
+        for p in self.parameters:
+            usual = p.usual(self._places[p.name])
+            out[p.name] = float(self.values.get(p.name, p.start if usual is None else usual))
+        return out
+
     @property
     def effects(self) -> tuple[str, ...]:
         """Labels of the effects in the model."""
@@ -162,9 +196,9 @@ class JointModel:
                 found[SWINGING_SHARE.name] = SWINGING_SHARE
         for term in self.terms:
             found.update({p.name: p for p in term.parameters})
-        for place in ("motor", "link"):
+        for place in _FRICTION_SIDES:
             if any(t.place == place and t.effect.family == "friction" for t in self.terms):
-                found[f"{place}_smoothing_velocity"] = smoothing(place)
+                found[smoothing(place).name] = smoothing(place)
         return tuple(p.for_kind(self.kind) for p in found.values())
 
     @property

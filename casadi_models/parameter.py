@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Literal, final
 
 from .quantities import linear_unit
 
 Side = Literal["motor", "gear", "link", "sensor", "none"]
 Scale = Literal["absolute", "velocity", "torsion", "position", "duration"]
+Role = Literal["", "inertia", "stiffness", "stiffening", "gravity", "static", "delay", "smoothing", "compliance", "exponent", "order"]
+Typical = float | Mapping[str, float] | None
+"""A usual size, or one for each place, or none."""
 
 @final
 @dataclass(frozen=True)
@@ -35,6 +39,16 @@ class Parameter:
         first); the grid points, in units of `scale`.
     scale : {"absolute", "velocity", "torsion", "position", "duration"}
         What the grid is a fraction of: nothing, or the 99 % range of a signal of the record.
+    role : str
+        What the library may ask the parameter for, whatever its name:
+        ``inertia`` (a joint without it does not move), ``stiffness`` (linear stiffness of the
+        transmission), ``stiffening`` (of its cube), ``gravity`` (torque at 90 degrees, upright positive), ``static`` (friction
+        torque that holds a joint at rest, in either direction), ``delay`` (time by which a channel is
+        late), ``smoothing`` (velocity over which friction changes its sign, a nuisance),
+        ``compliance`` (between motor and a link that is not recorded), ``exponent`` and ``order``
+        (shapes that are taken from their grid as they stand).
+    typical : float, mapping of place to float, or None
+        A usual size, link-referred: what `irj simulate` takes where the joint file gives no value.
     """
 
     name: str
@@ -46,6 +60,8 @@ class Parameter:
     side: Side = "link"
     grid: tuple[float, ...] = ()
     scale: Scale = "absolute"
+    role: Role = ""
+    typical: Typical = field(default=None, hash=False)
 
     def __post_init__(self) -> None:
         if not self.low <= self.start <= self.high:
@@ -56,6 +72,15 @@ class Parameter:
         """True for a parameter that is searched on a grid (shape of a law, not its amplitude)."""
         return bool(self.grid)
 
+    @property
+    def stays_on_grid(self) -> bool:
+        """True for a shape that is not refined between the points of its grid."""
+        return self.role in ("exponent", "order")
+
+    def usual(self, place: str = "") -> float | None:
+        """The typical size in a place, None where none is declared."""
+        return self.typical.get(place) if isinstance(self.typical, Mapping) else self.typical
+
     def renamed(self, name: str, side: Side) -> Parameter:
         """The same parameter under another name and side (used when an effect is put in a place)."""
         return replace(self, name=name, side=side)
@@ -65,16 +90,22 @@ class Parameter:
         return self if kind == "rotary" else replace(self, unit=linear_unit(self.unit))
 
 
-def amplitude(name: str, unit: str, meaning: str, *, low: float = 0.0, high: float = math.inf) -> Parameter:
+def amplitude(
+    name: str, unit: str, meaning: str, *, low: float = 0.0, high: float = math.inf, role: Role = "",
+    typical: Typical = None,
+) -> Parameter:  # fmt: skip
     """An amplitude: enters linearly, 0 means that the effect is absent."""
-    return Parameter(name, unit, 0.0, low, high, meaning)
+    return Parameter(name, unit, 0.0, low, high, meaning, role=role, typical=typical)
 
 
-def signed(name: str, unit: str, meaning: str) -> Parameter:
+def signed(name: str, unit: str, meaning: str, *, role: Role = "", typical: Typical = None) -> Parameter:
     """An amplitude that may have either sign."""
-    return Parameter(name, unit, 0.0, -math.inf, math.inf, meaning)
+    return Parameter(name, unit, 0.0, -math.inf, math.inf, meaning, role=role, typical=typical)
 
 
-def shape(name: str, unit: str, meaning: str, grid: tuple[float, ...], scale: Scale, *, start: float, low: float, high: float) -> Parameter:
+def shape(
+    name: str, unit: str, meaning: str, grid: tuple[float, ...], scale: Scale, *, start: float, low: float, high: float,
+    role: Role = "", typical: Typical = None,
+) -> Parameter:  # fmt: skip
     """A shape parameter: enters nonlinearly, searched on a grid of fractions of a signal's range."""
-    return Parameter(name, unit, start, low, high, meaning, grid=grid, scale=scale)
+    return Parameter(name, unit, start, low, high, meaning, grid=grid, scale=scale, role=role, typical=typical)

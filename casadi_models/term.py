@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Final, final
 
@@ -16,16 +16,25 @@ INERTIAS: Final = {
     "motor_inertia": Parameter(
         "motor_inertia", "kg.m2", 1.0, 1e-12, math.inf,
         "inertia of rotor and wave generator, times the ratio squared", "link",
+        role="inertia", typical=4.447,
     ),
     "link_inertia": Parameter(
-        "link_inertia", "kg.m2", 1.0, 1e-12, math.inf, "inertia of the link with its payload", "link"
+        "link_inertia", "kg.m2", 1.0, 1e-12, math.inf, "inertia of the link with its payload", "link",
+        role="inertia", typical=10.277,
     ),
-    "inertia": Parameter("inertia", "kg.m2", 1.0, 1e-12, math.inf, "inertia of motor and link together", "link"),
+    "inertia": Parameter("inertia", "kg.m2", 1.0, 1e-12, math.inf, "inertia of motor and link together", "link",
+        role="inertia", typical=14.7,
+    ),
 }  # fmt: skip
-"""Inertias by name, all link-referred."""
+"""Inertias by name, all link-referred; typical sizes as in tables 4.1 and 4.2 of the thesis."""
+SIDE_INERTIAS: Final = ("motor_inertia", "link_inertia")
+"""Inertias of a joint measured on both sides."""
+TOTAL_INERTIA: Final = ("inertia",)
+"""Inertia of an axis measured on one side."""
 
 LOAD_COMPLIANCE: Final = Parameter(
-    "load_compliance", "rad/(N.m)", 0.0, 0.0, math.inf, "compliance between motor and link where the link position is not recorded", "link"
+    "load_compliance", "rad/(N.m)", 0.0, 0.0, math.inf, "compliance between motor and link where the link position is not recorded", "link",
+    role="compliance",
 )  # fmt: skip
 SWINGING_SHARE: Final = Parameter(
     "swinging_share", "1", 0.5, 0.02, 1.0, "share of the inertia that hangs on that compliance", "link"
@@ -53,10 +62,16 @@ class Term:
         tail = "" if self.instance == 1 else f"_{self.instance}"
         return tuple(n + tail for n in self.effect.parameter_names(self.place))
 
+    def affixes(self, name: str) -> tuple[str, str]:
+        """A name of the effect's own with the place before it, and the tail of a second term."""
+        prefix = f"{self.place}_" if len(self.effect.acts_on) > 1 else ""
+        return prefix + name, "" if self.instance == 1 else f"_{self.instance}"
+
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """Parameters with the names they have in the model."""
-        return tuple(p.renamed(n, p.side) for p, n in zip(self.effect.placed(self.place), self.names, strict=True))
+        """Parameters with the names they have in the model; the typical size is that of the first term."""
+        named = (p.renamed(n, p.side) for p, n in zip(self.effect.placed(self.place), self.names, strict=True))
+        return tuple(p if self.instance == 1 else replace(p, typical=None) for p in named)
 
     def bound(self, values: Mapping[str, Expression]) -> SimpleNamespace:
         """Values of the model's parameters under the names that the law of this term uses."""
@@ -70,5 +85,5 @@ def smoothing(place: str) -> Parameter:
         f"{place}_smoothing_velocity", "rad/s", 1e-3, 1e-9, math.inf,
         f"velocity over which {place}-side friction changes its sign (nuisance)",
         "link",
-        grid=(0.0003, 0.001, 0.003, 0.01, 0.03), scale="velocity",
+        grid=(0.0003, 0.001, 0.003, 0.01, 0.03), scale="velocity", role="smoothing", typical=0.005,
     )  # fmt: skip

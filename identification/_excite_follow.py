@@ -83,11 +83,11 @@ class Follower:
         seen = ca.Function("seen", [s, u, q], [model.dynamics(s, u, q), model.functions.outputs(s, u, q)])
         self._loop, self._seen, self._size = one.mapaccum("loop", _BLOCK), seen.map(_BLOCK), size
         start = dict(zip(model.parameter_names, model.value_vector(), strict=True))
-        inertia = start["motor_inertia"] + start["link_inertia"]
+        inertia = sum(start[n] for n in model.inertias)
         tuned = controller or Controller()
         self._gains = [
             inertia * tuned.bandwidth**2, 2 * tuned.damping * inertia * tuned.bandwidth, inertia,
-            start.get("gravity_torque", 0.0),
+            sum(start[n] for n in model.named("gravity")),
         ]  # fmt: skip
 
     def run(self, reference: FloatArray, changes: Mapping[str, FloatArray] | None = None) -> Followed:

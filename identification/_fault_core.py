@@ -121,8 +121,8 @@ class ObserverCore:
     @property
     def stiffness(self) -> float:
         """Linear stiffness of the transmission [N.m/rad]."""
-        names = self.model.parameter_names
-        return float(self._values[names.index("stiffness")]) if "stiffness" in names else 1e4
+        name = self.model.stiffness_name
+        return float(self._values[self.model.parameter_names.index(name)]) if name else 1e4
 
     def _link_gain(self) -> float:
         """d link acceleration / d torque on the link [1/(kg m2)]."""

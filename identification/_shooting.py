@@ -13,7 +13,6 @@ import numpy as np
 import numpy.typing as npt
 
 from casadi_models import JointModel
-from identification.dataset import HOLD_NAME
 from identification.errors import InputError
 from identification.joint_file import Joint
 from identification.noise import noise_level
@@ -235,7 +234,7 @@ def _sample(model: JointModel, free: Sequence[str], rows: Sequence[int], dt: flo
     functions, names = model.functions, model.parameter_names
     n, k = (4 if model.is_elastic else 2), (4 if model.is_elastic else 2) + len(free)
     chosen = [names.index(f) for f in free]
-    delays = [names.index(name) for name in (HOLD_NAME, "drive_delay") if name in names]
+    delays = [names.index(name) for name in model.named("delay", "drive")]
     x, u, p = ca.SX.sym("x", n), ca.SX.sym("u", 6), ca.SX.sym("p", len(names))
     slopes, share = ca.SX.sym("S", n, k), ca.SX.sym("share")
 

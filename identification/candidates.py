@@ -11,15 +11,9 @@ from typing import Final, final
 import numpy as np
 
 from casadi_models import EFFECTS, Effect, JointModel
-from casadi_models.effect import Place
+from casadi_models.effect import ANYTHING_KNOWN, SECOND_BALANCE, TORQUE_SENSOR, Place
 from identification.dataset import HOLD_DELAY, Dataset, with_effect
 from identification.sensing import Sensing
-
-DISPLACEMENT: Final = frozenset({"hysteresis", "backlash", "soft_windup"})
-"""Laws of a displacement that also make sense on the position of an axis without gear."""
-
-LATE: Final = frozenset({"flexible_mode"})
-"""Tried only when nothing else is left to claim and the residual stays over its floor (costly memory)."""
 
 WARM_UP: Final = 15.0
 """Shortest run in which a warm-up is looked for without a temperature channel [s]."""
@@ -83,7 +77,7 @@ def offered(model: JointModel, data: Dataset, *, late: bool = False) -> tuple[li
     one_sided = sensing.one_sided
     direct = one_sided and not sensing.both_positions and abs(data.joint.gear_ratio) == 1.0
     for effect in EFFECTS.values():
-        if not effect.candidate or (effect.key in LATE and not late) or (effect.key == "transmission_compliance" and model.lagging_load):
+        if not effect.candidate or (effect.stage == "late" and not late) or (effect.stage == "structure" and model.lagging_load):
             continue
         why = _why_not(effect, model, data)
         if why:
@@ -93,7 +87,7 @@ def offered(model: JointModel, data: Dataset, *, late: bool = False) -> tuple[li
         if one_sided and "motor" in places and "link" in places:
             places.remove("link")
         if one_sided and not sensing.both_positions:
-            kept = ("transmission",) if direct and effect.key in DISPLACEMENT else ()
+            kept = ("transmission",) if direct and effect.of_displacement else ()
             places = [p for p in places if p in kept or p not in ("transmission", "torsion")]
         if effect.angular and data.joint.kind == "linear":
             refused.append(NotTestable(effect.key, "is a law of an angle; this axis is linear"))
@@ -103,7 +97,7 @@ def offered(model: JointModel, data: Dataset, *, late: bool = False) -> tuple[li
         if not places:
             refused.append(NotTestable(effect.key, f"needs a channel that shows the {_shown(effect.acts_on[0])}; these records have none"))
             continue
-        parents = [n for n in effect.needs if n != "transmission_compliance"]
+        parents = [n for n in effect.needs if EFFECTS[n].stage != "structure"]
         for place in places:
             if any(not model.has(n) for n in effect.needs) and not (direct and place == "transmission"):
                 continue
@@ -133,21 +127,24 @@ def _shown(place: str) -> str:
 
 
 def _why_not(effect: Effect, model: JointModel, data: Dataset) -> str:
-    if effect.key == "transmission_losses" and (model.is_elastic or model.has("viscous") or model.has("coulomb")):
-        return "its parts (Coulomb, viscous, cubic viscous, cyclic friction) are tried one by one"
-    if effect.key == "thermal_friction" and not data.sensing.has_temperature and _shortest(data) < WARM_UP:
+    if effect.parts and (model.is_elastic or any(model.has(n) for n in effect.parts)):
+        return f"its parts ({', '.join(EFFECTS[n].title for n in effect.parts)}) are tried one by one"
+    if effect.warms and not data.sensing.has_temperature and _shortest(data) < WARM_UP:
         return f"no temperature channel that changes, and a run shorter than {WARM_UP:g} s; record the temperature over a warm-up"
-    if effect.needs_load and not data.sensing.has_torque and not model.has("gravity"):
+    if effect.needs_load and not data.sensing.has_torque and not model.knows_load:
         return "no torque sensor and no gravity in the model: the load is not known"
-    if effect.key == "extra_inertia" and not any(n in data.joint.known for n in ("motor_inertia", "link_inertia")):
-        return "cannot be told from the inertia itself; give motor_inertia or link_inertia in [known]"
-    if effect.key == "torque_sensor_compliance" and "stiffness" not in data.joint.known:
-        return "cannot be told from the stiffness itself; give the catalogue stiffness in [known]"
-    if effect.key == "motor_constant_error" and data.sensing.balances == ("axis",) and not data.joint.known:
-        return "one balance alone scales with the motor constant; give a known inertia or a torque sensor"
-    if effect.key == "motor_constant_error" and not data.sensing.has_torque and "motor_inertia" not in data.joint.known:
-        return "without a torque sensor the whole balance scales with the motor constant; give a known inertia"
-    return ""
+    there = _conditions(data)
+    return next((r.why for r in effect.requires if not r.met(there)), "")
+
+
+def _conditions(data: Dataset) -> frozenset[str]:
+    """What is known and recorded, in the words of :class:`casadi_models.effect.Requirement`."""
+    recorded = {
+        TORQUE_SENSOR: data.sensing.has_torque,
+        SECOND_BALANCE: data.sensing.balances != ("axis",),
+        ANYTHING_KNOWN: bool(data.joint.known),
+    }
+    return frozenset(data.joint.known) | {name for name, there in recorded.items() if there}
 
 
 def _placed(effect: Effect, place: Place, model: JointModel) -> list[Candidate]:

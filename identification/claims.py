@@ -9,8 +9,8 @@ from typing import Any, Final, final
 
 import numpy as np
 
-from casadi_models import EFFECTS
-from identification.candidates import LATE, Candidate, NotTestable, offered
+from casadi_models import EFFECTS, Effect
+from identification.candidates import Candidate, NotTestable, offered
 from identification.dataset import HOLD_NAME
 from identification.trials import Base, Trial, try_candidate
 
@@ -30,15 +30,9 @@ LATE_DROP: Final = 30.0
 UNSEEN_DROP: Final = 20.0
 """Fall of the RMS where the link is not recorded: its motion leaves structure of 10 times the floor in the balance."""
 COMMON_DROP: Final = 4.0
-"""Fall of the RMS that is enough for viscous and Coulomb friction and gravity: hardly a joint is without them."""
+"""Fall of the RMS that is enough for an effect declared as common: hardly a joint is without it."""
 PLAIN_FIRST: Final = 0.5
-"""Coulomb friction goes before a law that gains less than twice as much."""
-LADDER_STEP: Final = "transmission_compliance"
-"""Both positions show the torsion itself: the step from a rigid to an elastic model comes before laws of friction."""
-COMMON: Final = frozenset({"coulomb", "viscous", "gravity"})
-"""Named first among effects that the data cannot tell apart and that have as many parameters."""
-NESTED: Final = {"coulomb": frozenset({"hysteresis", "lugre"}), "viscous": frozenset({"cubic_viscous"})}
-"""Richer laws that contain a simpler one: they do not stand beside it as another explanation."""
+"""A plain law (Coulomb friction) goes before one that gains less than twice as much."""
 
 
 @final
@@ -66,6 +60,11 @@ class Claim:
     partial: bool = False
     contribution: float = 0.0
 
+    @property
+    def effect(self) -> Effect:
+        """The effect of the first name."""
+        return EFFECTS[self.effects[0]]
+
     def as_json(self) -> dict[str, Any]:
         """The shape of `improve --json`."""
         out: dict[str, Any] = {
@@ -90,10 +89,10 @@ class Ranking:
     def best(self, refused: frozenset[str] = frozenset()) -> Trial | None:
         """Best significant trial whose label was not refused before; a visible torsion comes first."""
         for t in self.everything:
-            if t.key == LADDER_STEP and t.candidate.label in self.significant and t.candidate.label not in refused:
+            if t.effect.stage == "structure" and t.candidate.label in self.significant and t.candidate.label not in refused:
                 return t
         left = [t for t in self.everything if t.candidate.label in self.significant and t.candidate.label not in refused]
-        plain = next((t for t in left if t.key == "coulomb"), None)
+        plain = next((t for t in left if t.effect.stage == "plain"), None)
         if plain is not None and plain.score >= PLAIN_FIRST * left[0].score:
             return plain
         return left[0] if left else None
@@ -162,16 +161,16 @@ def _discoveries(trials: Sequence[Trial]) -> set[str]:
 
 
 def _major(trial: Trial, base: Base) -> bool:
-    common = trial.key in COMMON
-    least = COMMON_DROP if common else UNSEEN_DROP if base.solution.values.get("load_compliance", 0.0) > 0 else MAJOR_DROP
+    common = trial.effect.common
+    least = COMMON_DROP if common else UNSEEN_DROP if base.solution.model.load_compliance(base.solution.values) > 0 else MAJOR_DROP
     if trial.gain <= GAIN or trial.cv_drop_percent < least:
         return False
     held = trial.held_out_drop_percent
     if not math.isnan(held) and held < (COMMON_DROP / 2 if common else HELD_OUT_DROP):
         return False
-    if trial.key in LATE:
+    if trial.effect.stage == "late":
         return trial.cv_drop_percent >= LATE_DROP and (math.isnan(held) or held >= LATE_DROP)
-    if trial.key == "channel_delay":
+    if trial.effect.is_delay:
         dt = base.data.train[0].grid.dt
         hold = base.solution.values.get(HOLD_NAME, 0.0) if trial.candidate.place == "drive" else 0.0
         return max(abs(trial.values[n] + hold) for n in trial.candidate.amplitudes) > dt / 2
@@ -181,11 +180,11 @@ def _major(trial: Trial, base: Base) -> bool:
 def confusion_set(best: Trial, trials: Sequence[Trial], base: Base) -> tuple[str, ...]:
     """Names that these records cannot tell from the best one, the best first."""
     names = [best.key]
-    if best.key == LADDER_STEP and base.data.sensing.both_positions:
+    if best.effect.stage == "structure" and base.data.sensing.both_positions:
         return (best.key,)
     blocks = np.unique(base.block[base.block >= 0])
     for other in trials:
-        if other.key in names or other.score <= 0 or other.key in NESTED.get(best.key, frozenset()):
+        if other.key in names or other.score <= 0 or best.key in other.effect.contains:
             continue
         lost = (best.score - other.score) / best.score
         difference = best.block_score[blocks] - other.block_score[blocks]
@@ -220,7 +219,7 @@ def simplest(best: Trial, names: Sequence[str], ranking: Ranking, refused: froze
     """Of the names that cannot be told apart, the one with the fewest parameters."""
     usable = ranking.significant - refused
     alike = [t for t in ranking.trials if t.key in names and t.candidate.label in usable]
-    return min(alike or [best], key=lambda t: (len(t.values), t.key not in COMMON, -t.score))
+    return min(alike or [best], key=lambda t: (len(t.values), not t.effect.common, -t.score))
 
 
 def make_claim(best: Trial, ranking: Ranking, base: Base, names: tuple[str, ...] | None = None) -> Claim:
@@ -244,7 +243,7 @@ def minor_claims(ranking: Ranking, base: Base) -> list[Trial]:
             continue
         if math.isnan(t.held_out_drop_percent) or t.held_out_drop_percent < MINOR_HELD_OUT or t.p_value > 0.01:
             continue
-        if t.key == "channel_delay" or t.key in LATE:
+        if t.effect.is_delay or t.effect.stage == "late":
             continue
         out.append(t)
     return out[:2]

@@ -9,7 +9,7 @@ from typing import Final, final
 import numpy as np
 import numpy.typing as npt
 
-from casadi_models import JointModel
+from casadi_models import JointModel, hold
 from identification.errors import InputError
 from identification.joint_file import Joint
 from identification.noise import noise_level
@@ -19,10 +19,8 @@ from identification.weak import POSITION_CHAINS, WeakRecord, kernel, prepare
 
 FloatArray = npt.NDArray[np.float64]
 
-HOLD_DELAY: Final = "channel_delay@drive#0"
-"""In every model with a commanded drive: the hold of the logged command is not an effect, but a nuisance of at most a sample."""
-HOLD_NAME: Final = "drive_delay_0"
-_DRIVE_DELAY: Final = "channel_delay@drive"
+HOLD_DELAY: Final = hold.HOLD_DELAY
+HOLD_NAME: Final = hold.HOLD_NAME
 CLAIM_KERNEL: Final = 0.06
 ONE_SIDED_KERNEL: Final = 0.2
 LINK_BALANCES: Final = frozenset({"link", "sum", "axis"})
@@ -168,13 +166,13 @@ def _ranges(data: Sequence[WeakRecord], clamped: bool) -> dict[str, float]:
 
 def with_effect(model: JointModel, label: str) -> JointModel:
     """The model with one more effect; a delay of the drive, of any length, takes the place of the nuisance."""
-    return (model.drop(HOLD_DELAY) if label == _DRIVE_DELAY and HOLD_DELAY in model.effects else model).add(label)
+    return (model.drop(HOLD_DELAY) if label == hold.DRIVE_DELAY and HOLD_DELAY in model.effects else model).add(label)
 
 
 def without(model: JointModel, label: str) -> JointModel:
     """The model without an effect; where a delay of the drive goes, the hold is a nuisance again."""
     smaller = model.drop(label)
-    return smaller.add(HOLD_DELAY) if label == _DRIVE_DELAY else smaller
+    return smaller.add(HOLD_DELAY) if label == hold.DRIVE_DELAY else smaller
 
 
 def prepared_model(joint: Joint, record: Record) -> JointModel:
@@ -182,6 +180,6 @@ def prepared_model(joint: Joint, record: Record) -> JointModel:
     model = joint.model()
     sensing = sense(record, model)
     adapted = adapt(model, sensing, joint.known)
-    if sensing.has_drive and not record.has("motor_torque") and not adapted.has("channel_delay", "drive"):
+    if sensing.has_drive and not record.has("motor_torque") and not adapted.named("delay", "drive"):
         adapted = adapted.add(HOLD_DELAY)
     return replace(adapted, lagging_load=seen_from_the_motor(sensing, joint) and sensing.has_drive)

@@ -168,11 +168,11 @@ def _best_start(
     limits: Mapping[str, tuple[float, float]], memory_shapes: Sequence[str],
 ) -> dict[str, float]:  # fmt: skip
     """Friction laws with a shape near zero velocity have several valleys: the best of a few smoothing velocities and exponents."""
-    shaped = [t for t in balances.model.terms if t.effect.key in ("stribeck", "lugre", "load_dependent_presliding")]
+    shaped = [t for t in balances.model.terms if t.effect.several_valleys]
     if not shaped:
         return values
-    smooth = [f"{t.place}_smoothing_velocity" for t in shaped]
-    exponents = [n for t in shaped for n in t.names if n.endswith("exponent") and n in free]
+    smooth = [n for t in shaped for n in balances.model.named("smoothing", t.place)]
+    exponents = [n for n in balances.model.named("exponent") if any(n in t.names for t in shaped) and n in free]
     trials = [dict(values)]
     for share in (0.003, 0.01):
         for power in (1.0, 2.0) if exponents else (1.0,):
@@ -224,7 +224,8 @@ def _check_moves(balances: Balances, data: Dataset, values: Mapping[str, float],
         n for i, n in enumerate(free)
         if max(float(np.abs(j[:, i]).max(initial=0.0)) for j in stacked.jacobian.values()) == 0.0 and values[n] != 0.0
     ]  # fmt: skip
-    truly = [n for n in dead if n in ("motor_inertia", "link_inertia", "inertia", "stiffness")]
+    model = balances.model
+    truly = [n for n in dead if n in (*model.inertias, model.stiffness_name)]
     if truly:
         raise InputError(f"parameter {', '.join(truly)} moves no output of these records; give it a known value or add the channel that shows it")
 
@@ -340,15 +341,16 @@ def _with_errors(
     r = np.concatenate([stacked.residual[b] * weights[b] for b in balances.balances])
     block = np.tile(stacked.block, len(balances.balances))
     norms = np.linalg.norm(j, axis=0)
+    smoothing = model.named("smoothing")
     at_bound = [
         n for n in free
         if any(math.isfinite(limit) and abs(values[n] - limit) <= 1e-9 * max(abs(limit), 1e-300) for limit in limits[n])
-        and not n.endswith("_smoothing_velocity")
+        and n not in smoothing
     ]  # fmt: skip
     usable = np.array([norm > 1e-12 * norms.max() and n not in at_bound for n, norm in zip(free, norms, strict=True)])
     stderr: dict[str, float | None] = dict.fromkeys(values)
     correlation: dict[str, tuple[str, float]] = {}
-    unidentified = [n for n, norm in zip(free, norms, strict=True) if norm <= 1e-12 * norms.max() and not n.endswith("_smoothing_velocity")]
+    unidentified = [n for n, norm in zip(free, norms, strict=True) if norm <= 1e-12 * norms.max() and n not in smoothing]
     index = np.flatnonzero(usable)
     if len(index):
         scaled = j[:, index] / norms[index]
@@ -365,7 +367,7 @@ def _with_errors(
             other = int(np.argmax(np.abs(corr[k])))
             correlation[free[i]] = (free[int(index[other])], float(corr[k, other]))
             weak = size is not None and values[free[i]] != 0 and size[k] > abs(values[free[i]])
-            if (spread[k] > 1e4 or weak) and not free[i].endswith("_smoothing_velocity"):
+            if (spread[k] > 1e4 or weak) and free[i] not in smoothing:
                 unidentified.append(free[i])
     kept = dict(values)
     return Solution(

@@ -25,8 +25,6 @@ FloatArray = npt.NDArray[np.float64]
 
 SPEEDS: Final = (math.radians(15.0), math.radians(45.0))
 PERIODS: Final = (0.5, 6.0)
-_KNOWN: Final = ("motor_inertia", "link_inertia", "gravity_torque")
-_CUBIC: Final = "cubic_stiffness"
 
 
 @final
@@ -151,8 +149,8 @@ class Experiment:
         if model.functions.memory_names:
             raise InputError("Experiment: the model has effects with internal states; leave them out")
         linear = model.linear_parameters
-        chosen = tuple(parameters) if parameters is not None else tuple(n for n in linear if n not in _KNOWN)
-        chosen = tuple(n for n in chosen if not (reduced and n == _CUBIC))
+        chosen = tuple(parameters) if parameters is not None else tuple(n for n in linear if n not in (*model.inertias, *model.named("gravity")))
+        chosen = tuple(n for n in chosen if not (reduced and n in model.named("stiffening")))
         unknown = [n for n in chosen if n not in linear]
         if unknown or not chosen:
             what = unknown[0] if unknown else "nothing"

@@ -10,11 +10,8 @@ from typing import Final, final
 
 from casadi_models import EFFECTS, JointModel
 from identification.assess import VERDICT_KERNELS, BalanceError, assess
-from identification.candidates import LATE
 from identification.claims import (
-    COMMON,
     HELD_OUT_DROP,
-    LADDER_STEP,
     LARGEST_SET,
     Claim,
     Ranking,
@@ -253,8 +250,8 @@ class Loop:
         """Judge every earlier claim given all the others: drop it, swap it, or renew its set."""
         current = list(claims)
         for claim in claims[:-1]:
-            needed = {n for c in current if c is not claim for n in EFFECTS[c.effects[0]].needs}
-            if claim.effects[0] == LADDER_STEP or claim.effects[0] in needed:
+            needed = {n for c in current if c is not claim for n in c.effect.needs}
+            if claim.effect.stage == "structure" or claim.effects[0] in needed:
                 continue
             model = without(steps[-1].solution.model, claim.label)
             if model.terms == steps[-1].solution.model.terms:
@@ -326,7 +323,7 @@ class Loop:
         )  # fmt: skip
 
     def _about_temperature(self, claims: Sequence[Claim]) -> tuple[str, ...]:
-        if not any("thermal_friction" in c.effects for c in claims):
+        if not any(EFFECTS[n].warms for c in claims for n in c.effects):
             return ()
         if self.data.sensing.has_temperature:
             return (f"the values of thermal friction count from {self.data.sensing.temperature_origin:.4g} K, the first sample of the first record",)
@@ -362,8 +359,8 @@ class Loop:
         before, after = first.held_out.balances[claim.balance], last.held_out.balances[claim.balance]
         over = before.rms**2 - before.floor**2
         share = (before.rms**2 - after.rms**2) / over if over > 0 else 1.0
-        partial = share < EXPLAINED_SHARE or claim.effects[0] in LATE
-        if not partial and left.share_percent >= LOCATED_SHARE and claim.effects[0] not in COMMON:
+        partial = share < EXPLAINED_SHARE or claim.effect.stage == "late"
+        if not partial and left.share_percent >= LOCATED_SHARE and not claim.effect.common:
             partial = is_absorbed(claim, left, last.solution, self.data)
         return replace(claim, partial=partial)
 
@@ -374,7 +371,7 @@ class Loop:
             before = next((a for a, b in itertools.pairwise(steps) if b.label == claim.label), None)
             for k, u in enumerate(out):
                 nowhere = u.axis is None and u.order is None and u.frequency_hz is None
-                if claim.partial and claim.effects[0] in LATE and u.balance == claim.balance and nowhere and before is not None:
+                if claim.partial and claim.effect.stage == "late" and u.balance == claim.balance and nowhere and before is not None:
                     out[k] = replace(u, frequency_hz=spectral_peak(before.solution, self.data, u.balance))
         return out
 

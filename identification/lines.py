@@ -11,6 +11,7 @@ from typing import Any, Final, final
 import numpy as np
 import numpy.typing as npt
 
+from casadi_models import EFFECTS
 from identification.balances import balances_of
 from identification.engine import Dataset, Solution, floors, row_weights, stack
 from identification.weak import WeakRecord
@@ -220,9 +221,9 @@ def _in_balance(balance: str, rows: _Rows, most: int) -> list[Line]:
             break
         tolerance = 2 * np.pi / stroke
         named = any(abs(order - o) <= NAMED_WITHIN * tolerance for o in NAMED_ORDERS)
-        names = ("kinematic_error",) if balance in ("transmission", "deflection") and named else ()
+        names = EFFECTS.periodic_in("torsion") if balance in ("transmission", "deflection") and named else ()
         if balance == "motor":
-            names = ("torque_ripple",)
+            names = EFFECTS.periodic_in("motor")
         size = float(math.hypot(sine, cosine))
         if _evenness(order, angle, left, weight) >= EVEN:
             out.append(Line(float(order), tolerance, size, balance, prominence, names, drop or 0.0))

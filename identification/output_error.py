@@ -139,8 +139,9 @@ def refine(fit: Fit, records: Record | Sequence[Record] | None = None, *, window
     start = {n: float(v) for n, v in fit.solution.values.items()}
     data = cut_windows(given, fit.joint, fit.data.sensing, window)
     start, substeps = _followable(model, start, data)
+    smoothing = model.named("smoothing")
     limits = {
-        n: (max(low, start[n] / SMOOTHING_SHRINK), max(high, start[n])) if n.endswith("_smoothing_velocity") else (low, high)
+        n: (max(low, start[n] / SMOOTHING_SHRINK), max(high, start[n])) if n in smoothing else (low, high)
         for n, (low, high) in limits.items()
     }
     shooting = Shooting(model, free, data, substeps)
@@ -174,7 +175,7 @@ def refine(fit: Fit, records: Record | Sequence[Record] | None = None, *, window
 
 def _followable(model: Any, values: dict[str, float], data: Windows) -> tuple[dict[str, float], int]:
     """Start values with friction smooth enough for the sample time, and the steps per sample."""
-    names = [n for n in values if n.endswith("_smoothing_velocity")]
+    names = list(model.named("smoothing"))
     for _ in range(SOFTEST if names else 0):
         try:
             substeps = substeps_for(model, values, data)
@@ -327,7 +328,7 @@ def _refined(fit: Fit, values: Mapping[str, float], stderr: Mapping[str, float],
     weights = row_weights(Balances(model, fit.data.sensing, wrt=()), fit.data, values, old.sigma, fit.data.train)
     bound = tuple(
         n for n in old.free
-        if not n.endswith("_smoothing_velocity")
+        if n not in model.named("smoothing")
         and any(math.isfinite(v) and abs(values[n] - v) <= 1e-9 * max(abs(v), 1e-300) for v in limits[n])
     )  # fmt: skip
     solution = replace(old, model=model, values=dict(values), stderr={**old.stderr, **stderr}, weights=weights, at_bound=bound, iterations=used)

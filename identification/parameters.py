@@ -8,15 +8,6 @@ from typing import Any
 from identification.dataset import HOLD_NAME
 from identification.engine import Dataset, Solution
 
-_PAIRS = (
-    ("kinematic_error", "kinematic_error_sine", "kinematic_error_cosine"),
-    ("ripple", "ripple_sine", "ripple_cosine"),
-    ("motor_cyclic_torque", "motor_cyclic_torque_sine", "motor_cyclic_torque_cosine"),
-    ("link_cyclic_torque", "link_cyclic_torque_sine", "link_cyclic_torque_cosine"),
-    ("motor_cyclic_friction", "motor_cyclic_friction_sine", "motor_cyclic_friction_cosine"),
-    ("link_cyclic_friction", "link_cyclic_friction_sine", "link_cyclic_friction_cosine"),
-)
-
 
 def parameter_table(solution: Solution, data: Dataset) -> dict[str, dict[str, Any]]:
     """Every parameter of the fitted model by name.
@@ -31,7 +22,7 @@ def parameter_table(solution: Solution, data: Dataset) -> dict[str, dict[str, An
     for p in solution.model.parameters:
         if p.name == HOLD_NAME:
             continue
-        nuisance = p.name.endswith("_smoothing_velocity")
+        nuisance = p.role == "smoothing"
         partner = solution.correlation.get(p.name)
         out[p.name] = {
             "value": float(solution.values[p.name]), "stderr": None if nuisance else _finite(solution.stderr.get(p.name)),
@@ -39,10 +30,10 @@ def parameter_table(solution: Solution, data: Dataset) -> dict[str, dict[str, An
             "identifiable": p.name not in solution.unidentified, "nuisance": nuisance,
             "correlation": {"with": partner[0], "value": partner[1]} if partner else None,
         }  # fmt: skip
-    for name, sine, cosine in _PAIRS:
-        for tail in ("", "_2", "_3"):
-            if sine + tail in out:
-                out.update(_polar(name, tail, out[sine + tail], out[cosine + tail]))
+    for term in solution.model.terms:
+        named = dict(zip((p.name for p in term.effect.parameters), term.names, strict=True))
+        for name, sine, cosine in term.effect.pairs:
+            out.update(_polar(*term.affixes(name), out[named[sine]], out[named[cosine]]))
     del data
     return out
 

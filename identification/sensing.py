@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from casadi_models import JointModel
+from casadi_models.term import SIDE_INERTIAS, TOTAL_INERTIA
 from identification.errors import InputError
 from identification.joint_file import Joint
 from identification.record import Record
@@ -187,8 +188,8 @@ def adapt(model: JointModel, sensing: Sensing, known: Mapping[str, object] | Non
     """The model in the form these channels can carry: one inertia for one balance, load from gravity without a torque sensor."""
     if sensing.clamped_link:
         model = replace(model, inertias=())
-    elif sensing.balances == ("axis",) and "motor_inertia" not in (known or {}) and "link_inertia" not in (known or {}):
-        model = replace(model, inertias=("inertia",))
+    elif sensing.balances == ("axis",) and not set(SIDE_INERTIAS) & set(known or ()):
+        model = replace(model, inertias=TOTAL_INERTIA)
     if sensing.one_sided:
         terms = tuple(t for t in model.terms if not (t.place == "link" and model.has(t.effect.key, "motor")))
         model = replace(model, terms=terms)

@@ -115,7 +115,7 @@ def row_weights(
     records: Sequence[WeakRecord],
 ) -> dict[str, FloatArray]:  # fmt: skip
     """1/sigma of each row: rows that hang on where exactly friction changes its sign count less (`sigma`: of a balance, or of its rows)."""
-    names = [n for n in balances.names if n.endswith("_smoothing_velocity")]
+    names = balances.model.named("smoothing")
     doubled = {**values, **{n: 2 * values[n] for n in names}}
     bare = balances_of(balances.model, data.sensing, wrt=())
     here = stack(bare, records, values).residual
@@ -131,13 +131,11 @@ def _either_way(model: JointModel, data: Dataset, values: Mapping[str, float], r
     zero = np.zeros(sum(w.rows for w in records))
     out = dict.fromkeys(data.sensing.balances, zero)
     for place, balances in (("motor", ("motor", "sum", "deflection", "axis")), ("link", ("link", "sum", "axis"))):
-        level = sum(
-            abs(values[n]) for t in model.terms if t.place == place and t.effect.key in ("coulomb", "stribeck") for n in t.names[:1]
-        )  # fmt: skip
+        level = sum(abs(values[n]) for n in model.named("static", place))
         source = f"{place}_position"
         if not level or source not in data.noise:
             continue
-        lag = model.swinging_inertia(values) * values["load_compliance"] if model.lagging_load else 0.0
+        lag = model.swinging_inertia(values) * model.load_compliance(values) if model.lagging_load else 0.0
         shares = []
         for w in records:
             either = _either_direction(w.points[f"{place}_velocity"], data.noise[source], w.grid, source).astype(float)

@@ -27,7 +27,7 @@ def bounds_of(model: JointModel, known: Mapping[str, Known], data: Dataset) -> d
     out = {}
     for p in model.parameters:
         low, high = p.low, p.high
-        if p.name.endswith("_smoothing_velocity") or (p.is_shape and p.scale != "absolute"):
+        if p.role == "smoothing" or (p.is_shape and p.scale != "absolute"):
             scale = data.ranges[p.scale]
             low, high = max(low, p.grid[0] * scale / 3), min(high, p.grid[-1] * scale * 3)
         if p.name == HOLD_NAME:

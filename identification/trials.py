@@ -10,6 +10,7 @@ from typing import Final, final
 import numpy as np
 import numpy.typing as npt
 
+from casadi_models import Effect
 from identification._signed_fit import projected_gain, signed_fit
 from identification.balances import Balances, balances_of
 from identification.candidates import Candidate, NotTestable, shape_grid
@@ -85,7 +86,8 @@ class Base:
 def make_base(solution: Solution, data: Dataset) -> Base:
     """Evaluate and project the base model on training and held-out rows."""
     model = solution.model
-    free = [n for n in solution.free if n not in solution.at_bound or n.endswith("_smoothing_velocity")]
+    smoothing = model.named("smoothing")
+    free = [n for n in solution.free if n not in solution.at_bound or n in smoothing]
     signs = _inward_signs(solution, data)
     balances = balances_of(model, data.sensing, wrt=[*free, *signs])
     train = stack(balances, data.train, solution.values)
@@ -211,6 +213,11 @@ class Trial:
     score: float
 
     @property
+    def effect(self) -> Effect:
+        """The effect tried."""
+        return self.candidate.effect
+
+    @property
     def key(self) -> str:
         """Key of the effect."""
         return self.candidate.effect.key
@@ -258,7 +265,7 @@ def try_candidate(candidate: Candidate, base: Base) -> Trial | NotTestable | Non
     parameters = {p.name: p for p in candidate.model.parameters}
     limits = {
         n: (parameters[n].grid[0] * data.ranges[parameters[n].scale] / 2, parameters[n].grid[-1] * data.ranges[parameters[n].scale] * 1.25)
-        for n in candidate.shapes if not n.endswith(("_exponent", "_order"))
+        for n in candidate.shapes if not parameters[n].stays_on_grid
     }  # fmt: skip
     if limits and best[0] > REFINE_SHARE * float(base.residual @ base.residual):
         best = _refined(projected, best, limits)

@@ -65,7 +65,7 @@ def hardly_a_model(start: Step) -> tuple[str, ...]:
     if error >= HARDLY:
         doubt = "check units and signs in [columns], the motor constant and gear_ratio"
         out.append(f"the start model leaves {error:.3g} % of the measured torque unexplained: {doubt}")
-    if "stiffness" in start.solution.at_bound:
+    if start.solution.model.stiffness_name in start.solution.at_bound:
         doubt = "check gear_ratio, the scale and the zero of both positions"
         out.append(f"the stiffness went to zero: the difference of the two positions does not follow the torque: {doubt}")
     return tuple(out)
@@ -73,9 +73,9 @@ def hardly_a_model(start: Step) -> tuple[str, ...]:
 
 def without_link(solution: Solution) -> tuple[str, ...]:
     """What stands in for the link position where it is not recorded."""
-    if not solution.values.get("load_compliance"):
+    if not solution.model.load_compliance(solution.values):
         return ()
-    swing = 1 / (2 * math.pi * math.sqrt(solution.model.swinging_inertia(solution.values) * solution.values["load_compliance"]))
+    swing = 1 / (2 * math.pi * math.sqrt(solution.model.swinging_inertia(solution.values) * solution.model.load_compliance(solution.values)))
     return (
         "the link position is not recorded: the compliance between motor and link is fitted along; "
         f"with the motor held the link would swing at {swing:.3g} Hz; its motion leaves a rest over the noise",

@@ -26,7 +26,7 @@ from identification.fault import KINDS, SENSORS, Fault, inject
 from identification.joint_file import Joint
 
 from .command_line import OneLineParser, check_output, fail, run_alone, write_json
-from .cosim import CHANNELS, LOOSE, Row, _rows, make_pair, start_state
+from .cosim import CHANNELS, LOOSE, Row, _rows, limit_of, make_pair, start_state
 from .host import Fmu, Instance, Trajectory
 from .online import estimated_parameters, searched_parameters
 from .reference import NAMES, Motion, published_joint, reference_joint, selected_motion, start_of
@@ -159,7 +159,7 @@ class Bench:
         unit = {p.name: p.unit for p in model.parameters}
         found = []
         for i, name in enumerate(self.shapes, 1):
-            limit = LOOSE if name.endswith("stribeck_velocity") and "smooth" not in name else None
+            limit = limit_of(model, name)
             value, spread = (float(signals[f"estimator.{s}[{i}]"][-1]) for s in ("eta", "sigma_eta"))
             found.append(Row(self.joint.name, name, unit[name], true[name], value, spread, limit))
         return found

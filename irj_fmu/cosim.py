@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, final
 
+from casadi_models import JointModel
+from casadi_models.term import INERTIAS
 from identification.errors import InputError
 from identification.joint_file import Joint, load_joint, toml_text
 
@@ -29,8 +31,15 @@ CHANNELS: Final = {"q_m": "motor_position", "w_m": "motor_velocity", "q_l": "lin
 TIGHT: Final = 2.0
 LOOSE: Final = 10.0
 """Largest errors [%]; the loose one holds for the Stribeck part and the cubic stiffness."""
-_TIGHT_NAMES: Final = ("stiffness", "inertia", "gravity_torque", "coulomb", "viscous", "loss_constant", "loss_viscous")
-_LOOSE_NAMES: Final = ("stribeck", "cubic_stiffness", "loss_cubic", "structural_damping")
+_LIMITS: Final[Mapping[str, float]] = {
+    **dict.fromkeys((*INERTIAS, "stiffness", "gravity_torque", "coulomb", "viscous", "loss_constant", "loss_viscous"), TIGHT),
+    **dict.fromkeys(
+        ("stribeck_extra", "stribeck_velocity", "smooth_stribeck", "cubic_stiffness", "loss_cubic", "structural_damping"), LOOSE,
+    ),
+}  # fmt: skip
+"""Largest error of each parameter of the reference joints, by the name in its declaration."""
+_TWINS: Final = ("gravity_torque", "link_cyclic_torque_sine")
+"""Parameters of which a joint that has both shows the difference only."""
 
 
 @final
@@ -218,14 +227,13 @@ def _rows(plant: Joint, names: Sequence[str], found: Trajectory) -> list[Row]:
     last = {n: float(found[f"estimator.theta[{i}]"][-1]) for i, n in enumerate(names, 1)}
     spread = {n: float(found[f"estimator.sigma[{i}]"][-1]) for i, n in enumerate(names, 1)}
     rows = []
-    twins = ("gravity_torque", "link_cyclic_torque_sine")
-    joined = twins if all(n in last for n in twins) else ()
+    joined = _TWINS if all(n in last for n in _TWINS) else ()
     for n in names:
         if n in joined[1:] or n not in true:
             continue
         group = joined if n in joined else (n,)
         value = _difference(true, group)
-        limit = _limit(n) if value else None
+        limit = limit_of(model, n) if value else None
         rows.append(Row(plant.name, " - ".join(group), units[n], value, _difference(last, group), min(spread[g] for g in group), limit))
     return rows
 
@@ -234,10 +242,10 @@ def _difference(values: Mapping[str, float], group: Sequence[str]) -> float:
     return values[group[0]] - sum(values[g] for g in group[1:])
 
 
-def _limit(name: str) -> float | None:
-    if any(name.endswith(part) or part in name for part in _LOOSE_NAMES):
-        return LOOSE
-    return TIGHT if any(name.endswith(part) for part in _TIGHT_NAMES) and "cubic" not in name else None
+def limit_of(model: JointModel, name: str) -> float | None:
+    """Largest error of a parameter of a reference joint [%], None where none is set."""
+    declared = {n: p.name for t in model.terms for p, n in zip(t.effect.parameters, t.names, strict=True)}
+    return _LIMITS.get(declared.get(name, name))
 
 
 def convergence(

@@ -42,6 +42,8 @@ class Guard:
         Parameters and balances.
     period : float
         Time between rows [s].
+    inertias : sequence of str
+        Those of the parameters that must stay positive.
 
     Attributes
     ----------
@@ -52,8 +54,8 @@ class Guard:
         Rows since the probation began.
     """
 
-    def __init__(self, names: Sequence[str], balances: Sequence[str], period: float) -> None:
-        self._inertias = [i for i, n in enumerate(names) if n.endswith("inertia")]
+    def __init__(self, names: Sequence[str], balances: Sequence[str], period: float, inertias: Sequence[str] = ()) -> None:
+        self._inertias = [i for i, n in enumerate(names) if n in inertias]
         self._count, self._size = len(balances), len(names)
         self._rate = min(1.0, period / _MEMORY)
         self._age, self._wait_back, self._wait_accept = (max(1, round(t / period)) for t in (_AGE, _BACK, _ACCEPT))

@@ -228,7 +228,7 @@ class _Builder:
             start = dict(zip(self.model.parameter_names, self.model.value_vector(), strict=True))
             inertia = sum(start[n] for n in self.model.inertias)
             damping = 2 * _DAMPING * inertia * BANDWIDTH
-            weight = start.get("gravity_torque", 0.0)
+            weight = sum(start[n] for n in self.model.named("gravity"))
             unit = self._unit
             stiff = self._parameter("controller.stiffness", unit("N.m/rad"), inertia * BANDWIDTH**2, "Gain on the position error, link-referred.", 0.0)
             damp = self._parameter("controller.damping", unit("N.m.s/rad"), damping, "Gain on the velocity error, link-referred.", 0.0)

@@ -262,7 +262,8 @@ def _watch_tables(header: _Header, made: OnlineEstimator) -> None:
     header.whole("needs", made._needs, "unsigned char")
     header.define("RECENT_SAMPLES", round(_RECENT / made.dt))
     names = made.names
-    header.define("STIFFNESS_THETA", names.index("stiffness") if "stiffness" in names else -1)
+    stiffness = made.model.stiffness_name
+    header.define("STIFFNESS_THETA", names.index(stiffness) if stiffness in names else -1)
     header.define("LINK_FROM_TORSION", int(made.model.is_elastic and made.options.has_torque))
     found = [(names.index(n), made.joint.fitted[n], code) for n, code in (("link_inertia", SCALED + 1 + TAU), ("motor_inertia", SCALED + 1 + DRIVE))
              if made.is_fitted and n in names and n in made.joint.fitted]  # fmt: skip

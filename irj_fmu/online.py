@@ -70,7 +70,7 @@ class OnlineEstimator:
         self.model, self.sensing = prepared(joint, self.options)
         self.rows = RowMaker(self.model, self.sensing, dt, held_parameters(joint))
         self.names, self.balances = self.rows.names, self.rows.balances
-        self.guard = Guard(self.names, self.balances, self.rows.timing.stride * dt) if self.options.optimise else None
+        self.guard = Guard(self.names, self.balances, self.rows.timing.stride * dt, self.model.inertias) if self.options.optimise else None
         self._plain_rows, self.two_step = self.rows, make_two_step(joint, self.rows, self.options)
         has_link = self.options.has_link
         self.present = (True, True, True, has_link, has_link, self.options.has_torque)
@@ -225,7 +225,8 @@ class OnlineEstimator:
     def _link_from_motor(self) -> tuple[float, float]:
         """Link position and velocity from the motor, torsion taken off."""
         q = self._last_good
-        at = self.names.index("stiffness") if self.model.is_elastic and self.options.has_torque and "stiffness" in self.names else -1
+        name = self.model.stiffness_name
+        at = self.names.index(name) if name in self.names and self.options.has_torque else -1
         stiffness = float(self.theta[at]) if at >= 0 else 0.0
         return (q[Q_M] - q[TAU] / stiffness if stiffness > 0 else q[Q_M]), q[W_M]
 

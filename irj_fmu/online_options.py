@@ -86,8 +86,8 @@ def held_parameters(joint: Joint) -> frozenset[str]:
 
     A kinematic error multiplies the stiffness, so that one of the two must be held; it is the geometry.
     """
-    delays = {"drive_delay", "torque_sensor_delay", "link_position_sensor_delay"}
     model = joint.model()
+    delays = frozenset(model.named("delay"))
     geometry = {n for t in model.terms if t.place == "torsion" for n in t.names}
     return frozenset(k for k, v in joint.known.items() if v.value is not None) | delays | geometry
 

@@ -176,5 +176,6 @@ class Motion:
 def selected_motion(joint: Joint) -> Motion:
     """The built-in motion, fast enough to pass the velocity of a Stribeck law."""
     top = 1.3  # rad/s, at speed 1
-    velocities = [v for k, v in joint.fitted.items() if k.endswith("stribeck_velocity")]
+    shapes = (p for t in joint.model().terms for p in t.parameters if p.is_shape and p.scale == "velocity")
+    velocities = [joint.fitted[p.name] for p in shapes if p.name in joint.fitted]
     return Motion(speed=max(1.0, *(1.2 * v / top for v in velocities)) if velocities else 1.0)

@@ -220,7 +220,7 @@ class RowMaker:
     def _sharpen(self) -> None:
         """Velocities below which a side counts as standing still."""
         smooth = dict(zip(self.model.parameter_names, self.model.value_vector(), strict=True))
-        self._sharp = [2 * min(smooth.get(f"{place}_smoothing_velocity", 0.0), SHARP) for place in ("motor", "link")]
+        self._sharp = [2 * min(sum(smooth[n] for n in self.model.named("smoothing", side)), SHARP) for side in ("motor", "link")]
 
     def _slope_function(self, expressions: Mapping[str, Any], signals: Any, p: Any) -> Any:
         own = ca.vertcat(*expressions.values())

@@ -36,13 +36,12 @@ def shape_parameters(model: JointModel, sensing: Sensing, linear: Container[str]
     stacked = ca.vertcat(*residual_expressions(model, sensing).values())
     columns = set(ca.jacobian(stacked, model.equations.parameters).sparsity().get_triplet()[1])
     values = dict(zip(model.parameter_names, model.value_vector(), strict=True))
-    smooth = {t.place for t in model.terms if t.effect.key == "smooth_stribeck"}
+    shaping = {n for t in model.terms if t.effect.shapes_reversal for n in model.named("smoothing", t.place)}
     found = []
     for i, p in enumerate(model.parameters):
         if i not in columns or p.name in linear or p.name in held or not p.is_shape:
             continue
-        place, _, rest = p.name.partition("_")
-        if rest == "smoothing_velocity" and values[p.name] <= SHARP and place not in smooth:
+        if p.role == "smoothing" and values[p.name] <= SHARP and p.name not in shaping:
             continue
         found.append(p.name)
     return tuple(found)

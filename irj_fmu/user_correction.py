@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, final
 import numpy as np
 
 from casadi_models import JointModel
+from casadi_models.term import TOTAL_INERTIA
 from identification.errors import InputError
 
 from .signals import FloatArray
@@ -137,11 +138,11 @@ def correction_of(model: JointModel, labels: tuple[str, ...], values: Mapping[st
     """A correction from a rigid joint model: the named effects alone, the joint's own inertia and laws left to the FMU."""
     terms = tuple(t for t in model.terms if t.label in labels)
     bare = JointModel(
-        gear_ratio=model.gear_ratio, terms=terms, inertias=("inertia",), kind=model.kind, load_from="gravity",
+        gear_ratio=model.gear_ratio, terms=terms, inertias=TOTAL_INERTIA, kind=model.kind, load_from="gravity",
         clamped_link=False, name="correction",
     )  # fmt: skip
     known = set(bare.parameter_names)
-    made = bare.with_values({**{k: float(v) for k, v in values.items() if k in known}, "inertia": 1.0})
+    made = bare.with_values({**{k: float(v) for k, v in values.items() if k in known}, **dict.fromkeys(TOTAL_INERTIA, 1.0)})
     shapes = {p.name: float(values[p.name]) for p in bare.parameters if p.is_shape and p.name in free and float(values[p.name]) > 0}
     return Correction(made, free, shapes)
 

@@ -227,7 +227,7 @@ def _extra(model: JointModel, data: Dataset) -> list[Candidate]:
         if not plain or not parents or any(EFFECTS[n].family not in _OUTSIDE for n in parents) or "motor" not in effect.acts_on:
             continue
         label = f"{effect.key}@motor" if len(effect.acts_on) > 1 else effect.key
-        if label in there or model.has(effect.key, "motor") or effect.key == "thermal_friction":
+        if label in there or model.has(effect.key, "motor") or effect.warms:
             continue
         bigger = model.add(label)
         term = next(t for t in bigger.terms if t.label == label)

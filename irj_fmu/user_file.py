@@ -30,6 +30,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from casadi_models import JointModel
+from casadi_models.term import TOTAL_INERTIA
 from identification.errors import InputError
 from identification.joint_file import Joint, parse_joint, toml_text
 
@@ -192,7 +193,7 @@ def outside_correction(labels: list[str], joint: Joint, values: Mapping[str, flo
     InputError
         An effect that is not in the library or cannot ride outside.
     """
-    model = JointModel(gear_ratio=joint.gear_ratio, inertias=("inertia",), kind=joint.kind, load_from="gravity")
+    model = JointModel(gear_ratio=joint.gear_ratio, inertias=TOTAL_INERTIA, kind=joint.kind, load_from="gravity")
     try:
         for label in labels:
             model = model.add(label)
@@ -238,7 +239,7 @@ def user_joint_text(model: UserModel, fit: UserFit | None = None, folder: Path |
     shown: dict[str, float] = dict(model.values)
     if model.correction is not None:
         every = zip(model.correction.model.parameter_names, model.correction.model.value_vector(), strict=True)
-        shown |= {PREFIX + n: v for n, v in every if n != "inertia"}
+        shown |= {PREFIX + n: v for n, v in every if n not in TOTAL_INERTIA}
     for key, value in shown.items():
         error = fit.stderr.get(key) if fit is not None else None
         lines.append(f"{_key(key)} = {{ value = {value:.12g}{f', stderr = {error:.6g}' if error is not None else ''} }}")

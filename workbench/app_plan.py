@@ -134,9 +134,9 @@ def _model(live: Live, label: str) -> tuple[JointModel, str]:
     if joint.kind != "rotary" or not model.is_elastic:
         raise InputError("plan: simulates a rotary elastic joint; choose a model such as hd3 (a rigid one is excited by any motion that reverses)")
     notes = [] if solution is not None else ["Nothing is fitted yet: typical values were taken, so read the figures as orders of magnitude."]
-    for name in model.effects:
-        if name.partition("@")[0] == "channel_delay":
-            model = model.drop(name)
+    for term in model.terms:
+        if term.effect.is_delay:
+            model = model.drop(term.label)
     if label and label not in model.effects:
         try:
             model = model.add(label)

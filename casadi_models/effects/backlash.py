@@ -24,9 +24,10 @@ def _stored(s: LocalSignals, p: SimpleNamespace) -> Expression:
     family="transmission",
     acts_on=("transmission",),
     parameters=(
-        amplitude("backlash_stiffness_loss", "N.m/rad", "stiffness that is missing inside the gap"),
-        shape("backlash", "rad", "half the gap", (0.02, 0.05, 0.1, 0.2, 0.4), "torsion", start=1e-4, low=1e-12, high=10.0),
+        amplitude("backlash_stiffness_loss", "N.m/rad", "stiffness that is missing inside the gap", typical=1.5e4),
+        shape("backlash", "rad", "half the gap", (0.02, 0.05, 0.1, 0.2, 0.4), "torsion", start=1e-4, low=1e-12, high=10.0, typical=3e-4),
     ),
+    of_displacement=True,
     absence="the transmission carries nothing near zero torque; knocks when it is crossed",
     excitation="torque reversals at low load",
     source="field knowledge",

@@ -15,9 +15,10 @@ from ..signals import Expression, LocalSignals
     family="friction",
     acts_on=("motor", "link"),
     parameters=(
-        signed("cyclic_friction_sine", "N.m", "sine part of the change of friction per turn of the link"),
-        signed("cyclic_friction_cosine", "N.m", "cosine part of the change of friction per turn of the link"),
+        signed("cyclic_friction_sine", "N.m", "sine part of the change of friction per turn of the link", typical=3.0),
+        signed("cyclic_friction_cosine", "N.m", "cosine part of the change of friction per turn of the link", typical=2.0),
     ),
+    pairs=(("cyclic_friction", "cyclic_friction_sine", "cyclic_friction_cosine"),),
     absence="the friction band breathes with the position",
     excitation="long strokes in both directions",
     source="dissipative form of thesis eq. 2.80",

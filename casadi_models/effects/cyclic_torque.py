@@ -19,9 +19,10 @@ def _stored(s: LocalSignals, p: SimpleNamespace) -> Expression:
     family="torque",
     acts_on=("motor", "link"),
     parameters=(
-        signed("cyclic_torque_sine", "N.m", "sine part per turn of the link"),
-        signed("cyclic_torque_cosine", "N.m", "cosine part per turn of the link"),
+        signed("cyclic_torque_sine", "N.m", "sine part per turn of the link", typical=4.0),
+        signed("cyclic_torque_cosine", "N.m", "cosine part per turn of the link", typical=2.0),
     ),
+    pairs=(("cyclic_torque", "cyclic_torque_sine", "cyclic_torque_cosine"),),
     absence="the residual follows sine and cosine of the position and does not change sign at a reversal",
     excitation="a long stroke, better without gravity",
     source="thesis eq. 2.81",

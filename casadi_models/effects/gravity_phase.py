@@ -18,7 +18,7 @@ def _stored(s: LocalSignals, p: SimpleNamespace) -> Expression:
     title="centre of mass off the zero line",
     family="torque",
     acts_on=("link",),
-    parameters=(signed("gravity_cosine", "N.m", "part of the gravity torque that follows the cosine of the link angle"),),
+    parameters=(signed("gravity_cosine", "N.m", "part of the gravity torque that follows the cosine of the link angle", typical=5.0),),
     absence="the residual of the link follows the cosine of its angle",
     excitation="a long slow swing",
     source="field knowledge (unbalance phase)",

@@ -24,8 +24,8 @@ def _rate(z: tuple[Expression, ...], s: LocalSignals, p: SimpleNamespace) -> tup
     family="friction",
     acts_on=("motor", "link"),
     parameters=(
-        signed("load_friction_mean", "1", "share of the load that resists the motion"),
-        signed("load_friction_difference", "1", "share of the load lost when driving more than when back-driven"),
+        signed("load_friction_mean", "1", "share of the load that resists the motion", typical=0.08),
+        signed("load_friction_difference", "1", "share of the load lost when driving more than when back-driven", typical=0.03),
         shape(
             "load_presliding_distance",
             "rad",
@@ -37,6 +37,7 @@ def _rate(z: tuple[Expression, ...], s: LocalSignals, p: SimpleNamespace) -> tup
             high=10.0,
         ),
     ),
+    several_valleys=True,
     absence="the residual is a loop against distance; its width follows the load and differs when back-driven",
     excitation="small reversals under two or more payloads",
     source="MuJoCo issue 3528 (torque-proportional loss of strain-wave gears), 2026",

@@ -24,7 +24,7 @@ def _rate(z: tuple[Expression, ...], s: LocalSignals, p: SimpleNamespace) -> tup
     family="friction",
     acts_on=("motor", "link"),
     parameters=(
-        amplitude("presliding_torque", "N.m", "part of the Coulomb torque that builds up over the presliding distance"),
+        amplitude("presliding_torque", "N.m", "part of the Coulomb torque that builds up over the presliding distance", typical=18.0),
         shape(
             "presliding_distance",
             "rad",
@@ -34,8 +34,11 @@ def _rate(z: tuple[Expression, ...], s: LocalSignals, p: SimpleNamespace) -> tup
             start=1e-3,
             low=1e-9,
             high=10.0,
+            typical=3e-3,
         ),
     ),
+    contains=("coulomb",),
+    several_valleys=True,
     absence="after a reversal the residual is a loop against distance, not against speed",
     excitation="small slow reversals",
     source="P. Dahl 1968; C. Canudas de Wit et al. 1995",

@@ -24,8 +24,8 @@ def _stored(s: LocalSignals, p: SimpleNamespace) -> Expression:
     family="transmission",
     acts_on=("transmission",),
     parameters=(
-        signed("stiffness_step_1", "N.m/rad", "change of the stiffness beyond the first knot"),
-        signed("stiffness_step_2", "N.m/rad", "change of the stiffness beyond the second knot"),
+        signed("stiffness_step_1", "N.m/rad", "change of the stiffness beyond the first knot", typical=6e3),
+        signed("stiffness_step_2", "N.m/rad", "change of the stiffness beyond the second knot", typical=8e3),
         shape(
             "stiffness_knot_1",
             "rad",
@@ -35,6 +35,7 @@ def _stored(s: LocalSignals, p: SimpleNamespace) -> Expression:
             start=1e-4,
             low=0.0,
             high=10.0,
+            typical=7e-4,
         ),
         shape(
             "stiffness_knot_2",
@@ -45,6 +46,7 @@ def _stored(s: LocalSignals, p: SimpleNamespace) -> Expression:
             start=5e-4,
             low=0.0,
             high=10.0,
+            typical=2e-3,
         ),
     ),
     absence="the residual of the transmission has kinks at two torques",

@@ -21,7 +21,7 @@ def _stored(s: LocalSignals, p: SimpleNamespace) -> Expression:
     family="transmission",
     acts_on=("transmission",),
     parameters=(
-        amplitude("soft_windup_torque", "N.m", "torque lost to the soft zone"),
+        amplitude("soft_windup_torque", "N.m", "torque lost to the soft zone", typical=6.0),
         shape(
             "soft_windup_width",
             "rad",
@@ -31,8 +31,10 @@ def _stored(s: LocalSignals, p: SimpleNamespace) -> Expression:
             start=1e-4,
             low=1e-12,
             high=10.0,
+            typical=4e-4,
         ),
     ),
+    of_displacement=True,
     absence="the transmission is softer near zero torque",
     excitation="many slow crossings of zero torque",
     source="field knowledge (lost motion below one minute of arc)",

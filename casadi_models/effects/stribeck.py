@@ -15,7 +15,7 @@ from ..signals import Expression, LocalSignals
     family="friction",
     acts_on=("motor", "link"),
     parameters=(
-        amplitude("stribeck_extra", "N.m", "static friction above the Coulomb torque"),
+        amplitude("stribeck_extra", "N.m", "static friction above the Coulomb torque", role="static", typical=12.0),
         shape(
             "stribeck_velocity",
             "rad/s",
@@ -25,9 +25,11 @@ from ..signals import Expression, LocalSignals
             start=0.02,
             low=1e-6,
             high=1e3,
+            typical=0.07,
         ),
-        shape("stribeck_exponent", "1", "exponent of the decay", (1.0, 2.0), "absolute", start=1.0, low=0.5, high=2.0),
+        shape("stribeck_exponent", "1", "exponent of the decay", (1.0, 2.0), "absolute", start=1.0, low=0.5, high=2.0, role="exponent"),
     ),
+    several_valleys=True,
     absence="the residual peaks at low speed on both sides of a reversal",
     excitation="slow ramps through zero velocity",
     source="thesis eq. 2.72",

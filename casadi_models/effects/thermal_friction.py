@@ -13,7 +13,7 @@ from ..signals import Expression, LocalSignals
     family="friction",
     acts_on=("motor", "link"),
     parameters=(
-        signed("thermal_coulomb", "N.m/K", "change of the Coulomb torque with temperature"),
+        signed("thermal_coulomb", "N.m/K", "change of the Coulomb torque with temperature", typical=0.3),
         signed("thermal_viscous", "N.m.s/(rad.K)", "change of the viscous coefficient with temperature"),
     ),
     absence="the friction residual changes during the run while its shape stays",

@@ -21,8 +21,8 @@ def _stored(s: LocalSignals, p: SimpleNamespace) -> Expression:
     family="torque",
     acts_on=("motor",),
     parameters=(
-        signed("ripple_sine", "N.m", "sine part"),
-        signed("ripple_cosine", "N.m", "cosine part"),
+        signed("ripple_sine", "N.m", "sine part", typical=1.5),
+        signed("ripple_cosine", "N.m", "cosine part", typical=1.0),
         shape(
             "ripple_order",
             "1",
@@ -32,8 +32,10 @@ def _stored(s: LocalSignals, p: SimpleNamespace) -> Expression:
             start=2.0,
             low=0.05,
             high=400.0,
+            role="order",
         ),
     ),
+    pairs=(("ripple", "ripple_sine", "ripple_cosine"),),
     absence="a line in the motor residual only, at a fixed order of the motor turn",
     excitation="slow constant speed",
     source="field knowledge",

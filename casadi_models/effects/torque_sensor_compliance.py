@@ -2,7 +2,7 @@
 
 from types import SimpleNamespace
 
-from ..effect import effect
+from ..effect import Requirement, effect
 from ..parameter import amplitude
 from ..signals import Expression, LocalSignals
 
@@ -12,7 +12,8 @@ from ..signals import Expression, LocalSignals
     title="compliance of the torque sensor",
     family="transmission",
     acts_on=("torsion",),
-    parameters=(amplitude("sensor_compliance", "rad/(N.m)", "twist of the sensor per torque"),),
+    parameters=(amplitude("sensor_compliance", "rad/(N.m)", "twist of the sensor per torque", typical=1e-5),),
+    requires=(Requirement(("stiffness",), "cannot be told from the stiffness itself; give the catalogue stiffness in [known]"),),
     absence="the transmission seems softer than its catalogue stiffness",
     excitation="torque against torsion, with the catalogue stiffness known",
     source="thesis section 2.5.3",

@@ -12,7 +12,7 @@ from ..signals import Expression, LocalSignals
     title="offset of the torque sensor",
     family="sensor",
     acts_on=("torque_sensor",),
-    parameters=(signed("torque_sensor_offset", "N.m", "reading at zero torque"),),
+    parameters=(signed("torque_sensor_offset", "N.m", "reading at zero torque", typical=3.0),),
     absence="all balances with the torque sensor are shifted by one constant",
     excitation="rest periods",
     source="field knowledge",
