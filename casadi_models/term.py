@@ -27,7 +27,9 @@ INERTIAS: Final = {
     ),
 }  # fmt: skip
 """Inertias by name, all link-referred; typical sizes as in tables 4.1 and 4.2 of the thesis."""
-SIDE_INERTIAS: Final = ("motor_inertia", "link_inertia")
+MOTOR_INERTIA: Final = "motor_inertia"
+LINK_INERTIA: Final = "link_inertia"
+SIDE_INERTIAS: Final = (MOTOR_INERTIA, LINK_INERTIA)
 """Inertias of a joint measured on both sides."""
 TOTAL_INERTIA: Final = ("inertia",)
 """Inertia of an axis measured on one side."""
@@ -39,6 +41,8 @@ LOAD_COMPLIANCE: Final = Parameter(
 SWINGING_SHARE: Final = Parameter(
     "swinging_share", "1", 0.5, 0.02, 1.0, "share of the inertia that hangs on that compliance", "link"
 )  # fmt: skip
+HANGING: Final = (LOAD_COMPLIANCE.name, SWINGING_SHARE.name)
+"""Parameters of a link that is not recorded."""
 
 
 @final

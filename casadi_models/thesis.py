@@ -19,7 +19,7 @@ from typing import Final, Literal, final
 
 from .joint import JointModel
 from .parameter import Side
-from .quantities import side_power
+from .quantities import UnitError, side_power
 from .transmission import build
 
 Variant = Literal["coupled", "y1", "y2"]
@@ -183,7 +183,10 @@ def to_motor(value: float, unit: str, reduction: float = REDUCTION) -> float:
 def _factor(unit: str, reduction: float) -> float:
     if reduction == 0:
         raise ValueError("reduction 0: give N, the motor turns per link turn")
-    return float(abs(reduction) ** side_power(unit))
+    try:
+        return float(abs(reduction) ** side_power(unit))
+    except UnitError as error:
+        raise ValueError(f"unit {unit!r}: no rule to change its side ({error})") from None
 
 
 def numbers(*tables: Mapping[str, Value]) -> dict[str, float]:

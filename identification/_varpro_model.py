@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, final
 import numpy as np
 import numpy.typing as npt
 
+from casadi_models.term import LINK_INERTIA
 from identification.errors import InputError
 
 if TYPE_CHECKING:
@@ -348,7 +349,7 @@ def from_joint(model: JointModel, signals: FloatArray) -> SeparableModel:
     functions = model.functions
     if functions.memory_names:
         raise InputError("from_joint: the model has effects with internal states; drop them for the two-step fit")
-    coefficients = tuple(n for n in model.linear_parameters if not (model.is_elastic and n == "link_inertia"))
+    coefficients = tuple(n for n in model.linear_parameters if not (model.is_elastic and n == LINK_INERTIA))
     at = {p.name: p for p in model.parameters}
     nuisance = [n for n in model.parameter_names if n not in model.linear_parameters]
     shapes = [joint_shape(model, n, signals) for n in nuisance]

@@ -53,7 +53,7 @@ def residual_expressions(model: JointModel, sensing: Sensing) -> dict[str, Expre
         elif balance == "deflection":
             out[balance] = (e.drive - motor - e.transmitted * e.motor_lever) / drive_gain
         else:
-            total: Expression = e.inertia["inertia"] if "inertia" in e.inertia else motor_inertia + link_inertia
+            total: Expression = sum(e.inertia.values(), ca.SX(0))
             resist = e.motor_resistance + e.link_resistance + e.transmitted
             out[balance] = (e.drive - total * e.motor_acceleration - resist) / drive_gain
     return out

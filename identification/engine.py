@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from casadi_models import JointModel
+from casadi_models.term import HANGING, LOAD_COMPLIANCE
 from identification.balances import Balances, balances_of
 from identification.dataset import Dataset, load_dataset, prepared_model, weak_record
 from identification.errors import InputError
@@ -87,10 +88,10 @@ def solve(
     InputError
         A free parameter that moves no output.
     """
-    if not model.lagging_load or "load_compliance" in data.joint.known:
+    if not model.lagging_load or LOAD_COMPLIANCE.name in data.joint.known:
         return _fitted(model, data, iterations, start or {}, progress)
-    tied = {**(start or {}), "load_compliance": 0.0}
-    rigid = _fitted(model, data, iterations, tied, progress, frozenset({"load_compliance", "swinging_share"}))
+    tied = {**(start or {}), LOAD_COMPLIANCE.name: 0.0}
+    rigid = _fitted(model, data, iterations, tied, progress, frozenset(HANGING))
     swinging = _swings(rigid, data)
     if swinging is None:
         return rigid
@@ -108,13 +109,13 @@ def _left(model: JointModel, values: Mapping[str, float], data: Dataset) -> floa
 def _swings(rigid: Solution, data: Dataset) -> dict[str, float] | None:
     """Values with a link that swings unseen, where it shows itself in the rows of a model that was fitted as rigid; else None."""
     model = rigid.model
-    free = [*rigid.free, "load_compliance", "swinging_share"]
+    free = [*rigid.free, *HANGING]
     free = [n for n in model.parameter_names if n in free]
     balances = balances_of(model, data.sensing, wrt=free)
     limits = bounds_of(model, data.joint.known, data)
     values, _ = gauss_newton(balances, data, rigid.values, free, limits, rigid.sigma, rigid.weights, 6, memory_shapes_of(model, free))
     sizes = [_left(model, v, data) for v in (rigid.values, values)]
-    lag = model.swinging_inertia(values) * values["load_compliance"]
+    lag = model.swinging_inertia(values) * values[LOAD_COMPLIANCE.name]
     slow = lag * (2 * math.pi * HIGHEST_SWING / data.kernel) ** 2 > 1
     return values if slow and sizes[1] < (1 - LEAST_SWING) * sizes[0] else None
 

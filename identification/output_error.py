@@ -194,7 +194,7 @@ def _refuse(fit: Fit, records: Sequence[Record]) -> None:
     memory = [t.label for t in fit.model.terms if t.effect.memory is not None]
     if memory:
         raise InputError(f"{name}: output-error refinement does not simulate internal states of {', '.join(memory)}; use the weak-form fit")
-    if fit.model.lagging_load and fit.solution.values["load_compliance"] > 0:
+    if fit.model.load_compliance(fit.solution.values) > 0:
         raise InputError(f"{name}: output-error refinement needs link_position where the link swings on the gear's compliance; use the weak-form fit")
     if not fit.data.sensing.has_drive or fit.data.sensing.clamped_link:
         raise InputError(f"{name}: output-error refinement simulates the joint from its drive torque; add motor_current, motor_torque or motor_voltage")

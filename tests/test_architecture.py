@@ -75,6 +75,77 @@ def test_no_bare_except_star_import_print_or_mutable_default() -> None:
     assert wrong == []
 
 
+def _strings(node: ast.AST) -> Iterator[str]:
+    """String constants of an expression and of the tuples and sets inside it; what a call is asked by is no part of it."""
+    if isinstance(node, ast.Constant) and isinstance(node.value, str):
+        yield node.value
+    elif not isinstance(node, ast.Call):
+        for inner in ast.iter_child_nodes(node):
+            yield from _strings(inner)
+
+
+def _tested(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Strings that decide something: compared, matched, members of a set, or asked of a name's ends."""
+    for node in ast.walk(tree):
+        found: list[ast.AST] = []
+        if isinstance(node, ast.Compare):
+            found = [side for side in (node.left, *node.comparators) if isinstance(side, ast.Constant | ast.Tuple | ast.List | ast.Set)]
+        elif isinstance(node, ast.MatchValue | ast.Set):
+            found = [node]
+        elif isinstance(node, ast.Call):
+            name = node.func.id if isinstance(node.func, ast.Name) else getattr(node.func, "attr", "")
+            found = list(node.args) if name in ("frozenset", "set", "has") else []
+        yield from ((node.lineno, word) for part in found for word in _strings(part))
+
+
+def _cut(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Strings by which the end or the beginning of a name is told."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in ("endswith", "startswith", "removesuffix", "removeprefix"):
+            yield from ((node.lineno, word) for part in node.args for word in _strings(part))
+
+
+def _above_physics() -> Iterator[tuple[Path, ast.Module]]:
+    return ((path, tree) for path, tree in trees().items() if layer_of(path) != "casadi_models")
+
+
+def test_no_effect_key_decides_anything_outside_the_declarations() -> None:
+    from casadi_models import EFFECTS
+
+    labels = {f"{k}@{p}" for k, e in EFFECTS.items() for p in e.acts_on} | set(EFFECTS)
+    wrong = [f"{path.relative_to(ROOT)}:{line} {word!r}" for path, tree in _above_physics() for line, word in _tested(tree) if word in labels]
+    assert wrong == []
+
+
+def test_no_parameter_name_or_ending_decides_anything_outside_the_declarations() -> None:
+    from casadi_models import EFFECTS
+    from casadi_models.term import INERTIAS, LOAD_COMPLIANCE, SWINGING_SHARE, smoothing
+
+    own = {*INERTIAS, LOAD_COMPLIANCE.name, SWINGING_SHARE.name, smoothing("motor").name, smoothing("link").name}
+    names = own | {n for e in EFFECTS.values() for p in e.acts_on for n in e.parameter_names(p)}
+    wrong = [f"{path.relative_to(ROOT)}:{line} {word!r}" for path, tree in _above_physics() for line, word in _tested(tree) if word in names]
+    for path, tree in _above_physics():
+        for line, word in _cut(tree):
+            if any(x.endswith(word) or x.startswith(word) for x in Signals.names()):
+                continue  # the end of a channel's name, which a parameter may share
+            if len(word) > 3 and any(n.endswith(word) or n.startswith(word) for n in names):
+                wrong.append(f"{path.relative_to(ROOT)}:{line} {word!r}")
+    assert wrong == []
+
+
+def test_those_checks_see_what_they_forbid() -> None:
+    bad = """
+LATE = frozenset({"flexible_mode"})
+def f(t, n, model):
+    if t.key == "coulomb" or t.key in ("stribeck", "lugre") or n.endswith("_smoothing_velocity"):
+        return model.has("gravity")
+    return "stiffness" in n
+"""
+    tree = ast.parse(bad)
+    assert {w for _, w in _tested(tree)} == {"flexible_mode", "coulomb", "stribeck", "lugre", "gravity", "stiffness"}
+    assert [w for _, w in _cut(tree)] == ["_smoothing_velocity"]
+
+
 @pytest.mark.parametrize("tool", [("ruff", "check", "--no-cache", "."), ("lint-imports", "--no-cache")], ids=["ruff", "import-linter"])
 def test_lint(tool: tuple[str, ...]) -> None:
     program = Path(sys.executable).with_name(tool[0])

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Final
 
 from casadi_models import JointModel
+from casadi_models.term import HANGING, LOAD_COMPLIANCE
 from identification.balances import balances_of
 from identification.engine import Dataset, Solution, gauss_newton, memory_shapes_of
 from identification.start_values import bounds_of, starts
@@ -38,8 +39,8 @@ def first_look(model: JointModel, data: Dataset, now: Solution, start: Mapping[s
     limits = bounds_of(model, known, data)
     shapes = {p.name for p in model.parameters if p.is_shape} - set(now.free)
     fixed = {n for n, k in known.items() if k.value is not None}
-    if now.values.get("load_compliance") == 0.0:
-        fixed |= {"load_compliance", "swinging_share"}
+    if now.values.get(LOAD_COMPLIANCE.name) == 0.0:
+        fixed |= set(HANGING)
     free = [n for n in model.parameter_names if n not in fixed | shapes]
     for n in free:
         values[n] = min(max(values[n], limits[n][0]), limits[n][1])
