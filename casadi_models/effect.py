@@ -7,14 +7,14 @@ diagnosis candidate, FMU variable, row of the documentation) follows from it.
 from __future__ import annotations
 
 import difflib
+import hashlib
 import importlib
-import importlib.util
 import pkgutil
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import Final, Literal, final
 
 import casadi as ca
@@ -249,12 +249,23 @@ class Effect:
         return tuple(p.renamed(name, PLACE_SIDE[place]) for p, name in zip(self.parameters, names, strict=True))
 
 
+@final
+@dataclass(frozen=True)
+class EffectFile:
+    """A user's file that declares effects: where it lies, its SHA-256, what it declares, and the code that was run."""
+
+    path: Path
+    sha256: str
+    keys: tuple[str, ...]
+    code: bytes = field(repr=False)
+
+
 class Registry(Mapping[str, Effect]):
     """The effect library by key; filled when :mod:`casadi_models.effects` is imported."""
 
     def __init__(self) -> None:
         self._effects: dict[str, Effect] = {}
-        self._loaded: dict[Path, tuple[str, ...]] = {}
+        self._loaded: dict[Path, EffectFile] = {}
 
     def __getitem__(self, key: str) -> Effect:
         try:
@@ -276,26 +287,38 @@ class Registry(Mapping[str, Effect]):
             raise ValueError(f"effect {effect.key!r} is registered already")
         self._effects[effect.key] = effect
 
+    @property
+    def files(self) -> tuple[EffectFile, ...]:
+        """The users' files that were loaded, with those of their effects that are registered still."""
+        kept = (replace(f, keys=tuple(k for k in f.keys if k in self._effects)) for f in self._loaded.values())
+        return tuple(f for f in kept if f.keys)
+
     def load(self, path: Path) -> tuple[str, ...]:
         """Run a user's Python file that declares effects; returns its keys.
 
         A file that is loaded again replaces what it declared before; one that fails leaves nothing behind.
         """
+        return self.load_code(path, path.read_bytes()).keys
+
+    def load_code(self, path: Path, code: bytes) -> EffectFile:
+        """Run the content of a user's Python file, as it was read (see :meth:`load`)."""
         where = path.resolve()
-        spec = importlib.util.spec_from_file_location(f"irj_user_effects_{path.stem}", path)
-        if spec is None or spec.loader is None:
+        if path.suffix != ".py":
             raise ValueError(f"{path}: not a Python file")
         kept = dict(self._effects)
-        for key in self._loaded.get(where, ()):
+        for key in self._loaded[where].keys if where in self._loaded else ():
             self._effects.pop(key, None)
         before = set(self._effects)
+        module = ModuleType(f"irj_user_effects_{path.stem}")
+        module.__file__ = str(path)
         try:
-            spec.loader.exec_module(importlib.util.module_from_spec(spec))
+            exec(compile(code, str(path), "exec"), module.__dict__)
             self._check_references(set(self._effects) - before, path)
         except BaseException:
             self._effects = kept
             raise
-        self._loaded[where] = tuple(sorted(set(self._effects) - before))
+        keys = tuple(sorted(set(self._effects) - before))
+        self._loaded[where] = EffectFile(where, hashlib.sha256(code).hexdigest(), keys, code)
         return self._loaded[where]
 
     def periodic_in(self, place: Place) -> tuple[str, ...]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, final
@@ -13,13 +13,14 @@ from casadi_models import JointModel
 from casadi_models.term import INERTIAS
 from casadi_models.transmission import MODELS, build
 from identification.errors import InputError
+from identification.own_effects import TABLE, load_remembered, remembered
 from identification.units import base_unit, same_dimension
 
 _JOINT_KEYS: Final = frozenset(
     ("name", "kind", "gear_ratio", "motor_constant", "torque_per_current", "torque_per_voltage", "model", "effects", "virtual_work")
 )  # fmt: skip
 _KNOWN_KEYS: Final = ("value", "low", "high", "unit", "side", "source", "note")
-_TABLES: Final = ("joint", "known", "columns", "fitted", "provenance")
+_TABLES: Final = ("joint", "known", "columns", "fitted", "provenance", TABLE)
 
 
 @final
@@ -146,6 +147,7 @@ def parse_joint(data: Mapping[str, Any], source: str = "joint") -> Joint:
         virtual_work=_flag(table, "virtual_work", source), source=source,
         fitted={k: _fitted(k, v, source) for k, v in data.get("fitted", {}).items()},
     )  # fmt: skip
+    load_remembered(data.get(TABLE, {}), source)
     model = joint.model()
     known = {k: _known(k, v, model, source) for k, v in data.get("known", {}).items()}
     for p in model.parameters:
@@ -223,8 +225,13 @@ def _flag(table: Mapping[str, Any], key: str, source: str) -> bool:
     return value
 
 
-def toml_text(joint: Joint, parameters: Mapping[str, Mapping[str, Any]] | None = None, provenance: Mapping[str, str] | None = None) -> str:
-    """The joint as the text of a joint file, with fitted values, standard errors and provenance."""
+def toml_text(
+    joint: Joint, parameters: Mapping[str, Mapping[str, Any]] | None = None, provenance: Mapping[str, str] | None = None, outside: Sequence[str] = ()
+) -> str:
+    """The joint as the text of a joint file, with fitted values, standard errors and provenance.
+
+    Labels of effects `outside` of a user's FMU have their files remembered too.
+    """
     lines = ["[joint]", f'name = "{_escaped(joint.name)}"', f'kind = "{joint.kind}"', f"gear_ratio = {joint.gear_ratio!r}"]
     if joint.torque_per_current is not None:
         lines.append(f"torque_per_current = {joint.torque_per_current!r}")
@@ -233,6 +240,7 @@ def toml_text(joint: Joint, parameters: Mapping[str, Mapping[str, Any]] | None =
     lines += [f'model = "{joint.model_name}"', "effects = [" + ", ".join(f'"{e}"' for e in joint.effects) + "]"]
     if not joint.virtual_work:
         lines.append("virtual_work = false")
+    lines += remembered((*joint.effects, *outside))
     if joint.known:
         lines += ["", "[known]"]
         for name, known in joint.known.items():

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final, final
 
 from identification.errors import InputError
 from identification.joint_file import Joint, load_joint
+from identification.own_effects import files_of
 
 from .command_line import OneLineParser, check_output, checkpoint, fail, keep_inputs, run_alone, write_json
 from .compiler import find_compiler
@@ -222,7 +223,8 @@ def _estimator(request: Request, folder: Path) -> list[tuple[Path, str]]:
     if state is not None:
         (texts / DETECTOR_FILE).write_bytes(state)
         files[DETECTOR_FILE] = texts / DETECTOR_FILE
-    spec = SlaveSpec(name, "irj_fmu.estimator", "Estimator", tuple(_package(p) for p in ("casadi_models", "identification", "irj_fmu")), files)
+    spec = SlaveSpec(name, "irj_fmu.estimator", "Estimator", tuple(_package(p) for p in ("casadi_models", "identification", "irj_fmu")), files,
+                     effects=files_of(request.joint.effects))  # fmt: skip
     packaged = package_slave(spec, folder / f"{name}.fmu", cc=request.cc)
     return [(packaged.path, f"FMI 2.0 co-simulation; {packaged.message}")]
 

@@ -14,6 +14,7 @@ from casadi_models import JointModel
 from casadi_models.term import INERTIAS
 from identification.errors import InputError
 from identification.joint_file import Joint, load_joint, toml_text
+from identification.own_effects import files_of
 
 from .command_line import OneLineParser, check_output, counted, fail, progress_bar, write_json
 from .compiler import find_compiler
@@ -177,7 +178,7 @@ def make_pair(
         files[DETECTOR_FILE] = texts / DETECTOR_FILE
     packages = tuple(_package(p) for p in ("casadi_models", "identification", "irj_fmu"))
     made = package_slave(
-        SlaveSpec(f"{name}_estimator", "irj_fmu.estimator", "Estimator", packages, files),
+        SlaveSpec(f"{name}_estimator", "irj_fmu.estimator", "Estimator", packages, files, effects=files_of(model.effects)),
         folder / f"{name}_estimator.fmu", cc=cc, shim=shim,
     )  # fmt: skip
     return built, made.path

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import final
 
+from casadi_models.effect import EffectFile
 from identification.errors import InputError
 
 from .archive import content_guid, write_archive
@@ -51,6 +52,8 @@ class SlaveSpec:
     files : mapping of str to Path
         Name in the FMU's resources folder to file, e.g. the joint file. The slave finds them below
         ``self.resources``.
+    effects : tuple of EffectFile
+        Users' own effects that the model uses: they join the library of the bundled packages.
     record_paths : bool
         Note this machine's libpython and site-packages in the FMU, so that a host without Python runs it here.
         Elsewhere the environment variables IRJ_LIBPYTHON and IRJ_SITE_PACKAGES say where they are.
@@ -62,6 +65,7 @@ class SlaveSpec:
     packages: tuple[Path, ...]
     files: Mapping[str, Path] = field(default_factory=dict)
     record_paths: bool = True
+    effects: tuple[EffectFile, ...] = ()
 
 
 @final
@@ -169,6 +173,8 @@ def _bundle(spec: SlaveSpec) -> dict[str, bytes]:
     bundle: dict[str, bytes] = {}
     for root in spec.packages:
         bundle |= _files(Path(root).resolve())
+    for number, own in enumerate(spec.effects, 1):
+        bundle[f"casadi_models/effects/own_{number}.py"] = own.code
     for name in _MINIMUM:
         bundle.setdefault(f"irj_fmu/{name}", (_HERE / name).read_bytes())
     for module in _ALONE:

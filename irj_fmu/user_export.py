@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from identification.errors import InputError
+from identification.own_effects import files_of
 
 from .joint_plant import identifier
 from .package import SlaveSpec, package_slave
@@ -91,7 +92,8 @@ def _package(model: UserModel, out: Path, what: str, *, cc: str | None, shim: bo
         (folder / PAIR_FILE).write_text(text, encoding="utf-8")
         files[PAIR_FILE] = folder / PAIR_FILE
         packages = tuple(_folder(p) for p in ("casadi_models", "identification", "irj_fmu"))
-        return package_slave(SlaveSpec(name, "irj_fmu.user_slave", what, packages, files), out, cc=cc, shim=shim).path
+        own = files_of(model.correction.labels if model.correction is not None else ())
+        return package_slave(SlaveSpec(name, "irj_fmu.user_slave", what, packages, files, effects=own), out, cc=cc, shim=shim).path
 
 
 def _archive(fmu: UserFmu, out: Path) -> Path:

@@ -219,7 +219,7 @@ def user_joint_text(model: UserModel, fit: UserFit | None = None, folder: Path |
     folder : Path, optional
         Where the file goes: an FMU beside it is named without its path.
     """
-    head = toml_text(replace(model.joint, model_name="hd1", known={}, fitted={}))
+    head = toml_text(replace(model.joint, model_name="hd1", known={}, fitted={}), outside=model.correction.labels if model.correction else ())
     body = "\n".join(line for line in head.splitlines() if not line.startswith("model = "))
     path = model.fmu.path
     name = path.name if folder is not None and path.parent == folder.resolve() else str(path)

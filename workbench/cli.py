@@ -140,6 +140,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = _parser()
     arguments, rest = parser.parse_known_args(given)
     arguments.rest = rest
+    if arguments.module == "fmi":
+        arguments.rest, arguments.own_effects = _taken(rest)
     if rest and arguments.module != "fmi":
         parser.error(f"unrecognized arguments: {' '.join(rest)}")
     arguments.command = shlex.join(["irj", *given])
@@ -230,16 +232,18 @@ def _watched_interrupt() -> Iterator[None]:
 
 
 def _register(files: Sequence[str]) -> None:
-    from casadi_models import EFFECTS
+    from identification.own_effects import register
 
     for name in files:
-        path = Path(name)
-        if not path.is_file():
-            raise InputError(f"{path}: no such file; --effects takes a Python file that declares effects")
-        try:
-            EFFECTS.load(path)
-        except Exception as error:  # a user's file may fail in any way
-            raise InputError(f"{path}: cannot be used as effects ({type(error).__name__}: {error})") from None
+        register(name)
+
+
+def _taken(rest: list[str]) -> tuple[list[str], list[str]]:
+    """Words that go through to another parser without ``--effects``, and the files that it names."""
+    parser = OneLineParser(prog="irj", add_help=False, allow_abbrev=False)
+    parser.add_argument("--effects", action="append", default=[])
+    found, others = parser.parse_known_args(rest)
+    return others, found.effects
 
 
 def improve_json(train: Sequence[str | Path], held_out: Sequence[str | Path], joint: str | Path) -> dict[str, Any]:
