@@ -298,13 +298,13 @@ class Registry(Mapping[str, Effect]):
 
         A file that is loaded again replaces what it declared before; one that fails leaves nothing behind.
         """
+        _only_python(path)
         return self.load_code(path, path.read_bytes()).keys
 
     def load_code(self, path: Path, code: bytes) -> EffectFile:
         """Run the content of a user's Python file, as it was read (see :meth:`load`)."""
         where = path.resolve()
-        if path.suffix != ".py":
-            raise ValueError(f"{path}: not a Python file")
+        _only_python(path)
         kept = dict(self._effects)
         for key in self._loaded[where].keys if where in self._loaded else ():
             self._effects.pop(key, None)
@@ -331,6 +331,11 @@ class Registry(Mapping[str, Effect]):
             for other in self._effects[key].related:
                 if other not in self._effects:
                     raise ValueError(f"{path}: effect {key!r} names {other!r}, which is not in the library")
+
+
+def _only_python(path: Path) -> None:
+    if path.suffix != ".py":
+        raise ValueError(f"{path}: not a Python file")
 
 
 EFFECTS: Final = Registry()

@@ -26,7 +26,7 @@ SIZES = {
     "N.m": 3.0, "N.m.s/rad": 5.0, "N.m.s2/rad2": 4.0, "N.m.s3/rad3": 3.0, "N.m/rad": 60.0, "N.m/rad3": 2e8,
     "rad/(N.m)": 1e-5, "rad": 1e-4, "1": 0.07, "kg.m2": 1.5, "s": 2e-3, "N.m/K": 0.2, "N.m.s/(rad.K)": 0.3,
 }  # fmt: skip
-"""Realistic size of an amplitude by its unit."""
+"""Realistic size of an amplitude by its unit; of another unit the typical size that its declaration gives."""
 NAMED = {
     "motor_inertia": 4.447, "link_inertia": 10.277, "inertia": 14.7, "stiffness": 2.1513e4, "gravity_torque": -105.18,
     "structural_damping": 25.0, "stiffness_step_1": 9e3, "stiffness_step_2": 7e3, "stiffness_knot_1": 3e-4,
@@ -63,7 +63,7 @@ def size_of(parameter: Parameter) -> float:
     for name in (parameter.name, bare):
         if name in NAMED:
             return NAMED[name]
-    return parameter.start if parameter.is_shape else SIZES[parameter.unit]
+    return parameter.start if parameter.is_shape else SIZES.get(parameter.unit) or parameter.usual() or 1.0
 
 
 def random_state(model: JointModel, rng: np.random.Generator) -> FloatArray:
