@@ -146,20 +146,23 @@ class Minimum:
 
 
 @final
-@dataclass(frozen=True)
 class _Rows:
     """A problem without blocks, seen as one with a single block that has no unknowns of its own."""
 
-    problem: Problem
+    def __init__(self, problem: Problem) -> None:
+        self._problem = problem
+        self._kept: tuple[FloatArray, FloatArray] | None = None
 
     def costs(self, x: FloatArray, local: FloatArray) -> FloatArray:
-        r = self.problem.residual(x)
+        r = self._problem.residual(x)
+        self._kept = x, r
         return np.array([float(r @ r) if np.isfinite(r).all() else math.inf])
 
     def triangles(self, x: FloatArray, local: FloatArray) -> FloatArray:
-        return triangle_of(np.column_stack([self.problem.jacobian(x), self.problem.residual(x)]))[
-            None
-        ]
+        jacobian = self._problem.jacobian(x)
+        kept = self._kept is not None and self._kept[0] is x
+        r = self._kept[1] if self._kept is not None and kept else self._problem.residual(x)
+        return triangle_of(np.column_stack([jacobian, r]))[None]
 
 
 def least_squares(
