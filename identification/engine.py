@@ -12,11 +12,11 @@ import numpy.typing as npt
 
 from casadi_models import JointModel
 from identification.balances import Balances, balances_of
+from identification.covariance import block_errors
 from identification.dataset import Dataset, load_dataset, prepared_model, weak_record
 from identification.errors import InputError
 from identification.excitation import attenuation
 from identification.stacked import Stacked, floor_rows, floors, references, rms, row_weights, stack, taking_part
-from identification.standard_errors import block_errors
 from identification.start_values import bounds_of, starts
 from identification.weak_form import WeakForm
 

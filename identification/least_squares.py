@@ -225,6 +225,8 @@ def least_squares(
             promised = linear.fall(step)
             trial = _Point.of(rows, box.moved(at.x, step), at.local + linear.own_step(step))
             evaluations += 1
+            if not step.any():
+                trial = at.each_better(trial)
             gained = at.cost - trial.cost
             if gained >= LEAST_SHARE * promised - ROUNDING * at.cost:
                 at, damping = trial, _eased(damping, gained, promised)
@@ -330,16 +332,20 @@ def eliminated(triangles: FloatArray, unknowns: int) -> Linear:
     unknowns : int
         How many of them are the block's own.
     """
-    inner = triangles[:, :unknowns, :unknowns]
-    across = triangles[:, :unknowns, unknowns:]
+    inner, across = triangles[:, :unknowns, :unknowns], triangles[:, :unknowns, unknowns:]
     back = np.zeros(across.shape)
     if unknowns:
         size = np.linalg.norm(inner, axis=1)
         size = np.where(size > 0, size, 1.0)
         back = np.linalg.pinv(inner / size[:, None, :], rcond=RANK) @ across / size[:, :, None]
-    rest = triangles[:, unknowns:, unknowns:].reshape(-1, triangles.shape[2] - unknowns)
-    small = triangle_of(rest) if len(triangles) > 1 else rest
+    rest = common_rows(triangles, unknowns)
+    small = triangle_of(rest.reshape(-1, rest.shape[2])) if len(rest) > 1 else rest[0]
     return Linear(small[:-1, :-1], small[:-1, -1], back, float(np.sum(across[:, :, -1] ** 2)))
+
+
+def common_rows(triangles: FloatArray, unknowns: int) -> FloatArray:
+    """Triangle of each block for the common parameters and the residual alone, (blocks, p + 1, p + 1)."""
+    return triangles[:, unknowns:, unknowns:]
 
 
 def bounded_step(
