@@ -8,10 +8,10 @@ import pytest
 
 from identification import Record, fit
 from identification.assess import assess
+from identification.covariance import FEWEST_BLOCKS, block_errors
 from identification.engine import load_dataset, prepared_model
 from identification.excitation import attenuation, excitation_warnings
 from identification.noise import noise_level
-from identification.covariance import FEWEST_BLOCKS, block_errors
 from tests.test_other_payload import FAST, JOINT, record
 
 FloatArray = npt.NDArray[np.float64]
