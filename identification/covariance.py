@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -21,6 +22,8 @@ LEAST: Final = 1e-3
 at the one reversal of a record).  Its scatter can say nothing there, and the other parameters do not hang on it."""
 HALF: Final = 0.5
 """Share of a parameter's variance in such a direction from which on the parameter is the one that a single block tells of."""
+MOST_TIED: Final = 0.999
+"""Largest correlation of neighbouring samples that a short record can tell from 1."""
 NORMAL: Final = 1.959964
 """The normal distribution's bound of 95 %."""
 
@@ -104,6 +107,50 @@ def errors_of_blocks(
     return np.asarray(
         np.sqrt(np.maximum(np.diag(covariance), 0.0)) * wider / size, dtype=np.float64
     )
+
+
+def process_errors(jacobian: FloatArray, residual: FloatArray, series: Sequence[FloatArray]) -> FloatArray:
+    """Standard errors where a record is too short for blocks: the residual counts as a process of first order.
+
+    Parameters
+    ----------
+    jacobian, residual : (n, p) and (n,) arrays
+        Weighted.
+    series : sequence of (samples, outputs) arrays
+        The residual in the order of time, each without a gap: their correlation from one sample to the next says how many
+        rows count as one (sum of the geometric series).
+    """
+    top = sum(float(np.sum(r[1:] * r[:-1])) for r in series)
+    bottom = sum(float(np.sum(r**2)) for r in series)
+    rho = min(max(top / bottom if bottom > 0 else 0.0, 0.0), MOST_TIED)
+    gram = jacobian.T @ jacobian
+    size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    inverse = np.linalg.pinv(gram / np.outer(size, size), rcond=RANK)
+    variance = float(residual @ residual) / max(len(residual) - len(gram), 1) * (1 + rho) / (1 - rho)
+    return np.asarray(np.sqrt(np.maximum(np.diag(inverse), 0.0) * variance) / size, dtype=np.float64)
+
+
+def correlations(gram: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """How far each parameter is tied to the others.
+
+    Parameters
+    ----------
+    gram : (p, p) array
+        Normal matrix.
+
+    Returns
+    -------
+    spread : (p,) array
+        Standard deviation in units of the one that the column alone would have: 1 where it is orthogonal to all others.
+    together : (p, p) array
+        Correlations, zero on the diagonal.
+    """
+    size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    inverse = np.linalg.pinv(gram / np.outer(size, size), rcond=RANK)
+    spread = np.sqrt(np.maximum(np.diag(inverse), 1e-300))
+    together = np.asarray(inverse / np.outer(spread, spread), dtype=np.float64)
+    np.fill_diagonal(together, 0.0)
+    return np.asarray(spread, dtype=np.float64), together
 
 
 def block_numbers(time: FloatArray, length: float) -> IntArray:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from casadi_models import JointModel
 from identification.balances import Balances, balances_of
-from identification.covariance import block_errors
+from identification.covariance import block_errors, correlations
 from identification.dataset import Dataset, load_dataset, prepared_model, weak_record
 from identification.errors import InputError
 from identification.excitation import attenuation
@@ -226,14 +226,11 @@ def _with_errors(problem: WeakForm, limits: Mapping[str, tuple[float, float]], s
     index = np.flatnonzero(usable)
     if len(index):
         scaled = j[:, index] / norms[index]
-        inverse = np.linalg.pinv(scaled.T @ scaled, rcond=1e-12)
         errors = block_errors(scaled, r, block)
         pulled = {name.replace(" ", "_"): share for name, share in attenuation(data).items()}
         biases = np.array([pulled.get(free[i], 0.0) * values[free[i]] for i in index.tolist()])
         size = None if errors is None else np.hypot(errors / norms[index], biases)
-        spread = np.sqrt(np.maximum(np.diag(inverse), 1e-300))
-        corr = inverse / np.outer(spread, spread)
-        np.fill_diagonal(corr, 0.0)
+        spread, corr = correlations(scaled.T @ scaled)
         for k, i in enumerate(index.tolist()):
             stderr[free[i]] = None if size is None else float(size[k])
             other = int(np.argmax(np.abs(corr[k])))
