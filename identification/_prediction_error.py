@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, final
+from typing import final
 
 import numpy as np
 import numpy.typing as npt
 
+from identification.least_squares import Outcome, least_squares
+
 FloatArray = npt.NDArray[np.float64]
 Records = list[tuple[FloatArray, FloatArray]]
 
-_EVALUATIONS = 60
+_STEPS = 60
+# relative fall of the prediction error that ends a search
+_ENOUGH = 1e-8
 # modulus to which unstable start values are drawn back
 _MARGIN = 0.995
 
@@ -84,19 +88,17 @@ def prediction_error_fit(records: Records, orders: Orders) -> tuple[Polynomials,
 
     ARX is one least-squares problem. The others start from ARX, instrumental
     variables and Steiglitz-McBride iterations, and minimise the prediction error by
-    a trust-region method with exact derivatives; steps to unstable predictors are
+    Levenberg-Marquardt steps with exact derivatives; steps to unstable predictors are
     refused. Unknown initial conditions enter as an impulse at the first sample
     of every record. Returns the polynomials and whether a minimum was reached.
     """
     start = _arx(records, orders)
     if orders.structure == "arx":
         return start, True
-    from scipy.optimize import least_squares
-
     problem = _Problem(records, orders)
     begin = min((problem.pack(one) for one in _starts(records, orders, start)), key=problem.cost)
-    solved: Any = least_squares(problem.residual, begin, jac=problem.jacobian, method="trf", x_scale="jac", max_nfev=_EVALUATIONS)
-    return problem.unpack(solved.x)[0], bool(solved.status > 0)
+    solved = least_squares(problem, begin, iterations=_STEPS, tolerance=_ENOUGH)
+    return problem.unpack(solved.x)[0], solved.outcome in (Outcome.SETTLED, Outcome.EXACT)
 
 
 def held_out_error(u: FloatArray, y: FloatArray, model: Polynomials) -> FloatArray:

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from casadi_models import JointModel
+from identification._window_run import WindowRun
 from identification.errors import InputError
 from identification.joint_file import Joint
 from identification.noise import noise_level
@@ -176,64 +177,58 @@ class Shooting:
     def __init__(self, model: JointModel, free: Sequence[str], data: Windows, substeps: int) -> None:
         self.free = tuple(free)
         parameters = {p.name: p for p in model.parameters}
-        self.positive = [parameters[n].is_shape and parameters[n].scale != "absolute" for n in free]
+        self.logarithmic = np.array([parameters[n].is_shape and parameters[n].scale != "absolute" for n in free], dtype=bool)
         self.states = 4 if model.is_elastic else 2
         self._names = model.parameter_names
         self._data = data
-        self._columns = self.states + len(self.free)
         rows = [OUTPUT_ROWS[c] for c in data.channels]
-        self._window = _sample(model, self.free, rows, data.dt, substeps).mapaccum("window", data.length)
-        self._run = self._window.map(data.count)
+        samples = data.count * data.length
+        self._plain = WindowRun(_sample(model, None, rows, data.dt, substeps), data.length, samples)
+        self._full = WindowRun(_sample(model, self.free, rows, data.dt, substeps), data.length, samples)
 
     @property
-    def noise(self) -> FloatArray:
-        """Noise level of each channel."""
-        return self._data.noise
+    def data(self) -> Windows:
+        """The windows."""
+        return self._data
 
     def every(self, stride: int) -> Shooting:
         """The same simulation over one window in `stride`."""
         out = copy(self)
         out._data = self._data.every(stride)
-        out._run = self._window.map(out._data.count)
         return out
 
-    def evaluate(self, values: Mapping[str, float], x0: FloatArray) -> FloatArray:
-        """Products of the columns (initial states, parameters, error) by channel and window, (channels, windows, k, k).
+    def errors(self, values: Mapping[str, float], x0: FloatArray) -> FloatArray:
+        """Simulated less measured outputs, (windows, channels, length); not finite where the simulation diverges."""
+        found = self._plain(x0, self._data.inputs.T, self._vector(values))
+        out: FloatArray = found.transpose(0, 2, 1) - self._data.measured
+        return out
 
-        Infinite where the simulation diverges.
-        """
-        data, channels = self._data, len(self._data.channels)
-        start = np.zeros((data.count, self.states * (1 + self._columns)))
+    def columns(self, values: Mapping[str, float], x0: FloatArray) -> FloatArray:
+        """Slopes along initial states and free parameters, and the errors, (windows, columns + 1, channels, length)."""
+        data, channels, wide = self._data, len(self._data.channels), self.states + len(self.free)
+        start = np.zeros((data.count, self.states * (1 + wide)))
         start[:, : self.states] = x0
         for i in range(self.states):
             start[:, self.states * (1 + i) + i] = 1.0
-        p = np.array([values[n] for n in self._names])
-        full = self._run(start.T, data.inputs, p)[1].full()
-        rows = np.empty((channels, data.count, self._columns + 1, data.length))
-        rows[:, :, :-1] = full[channels:].reshape(self._columns, channels, data.count, data.length).transpose(1, 2, 0, 3)
-        rows[:, :, -1] = data.measured.transpose(1, 0, 2) - full[:channels].reshape(channels, data.count, data.length)
-        if not np.isfinite(rows).all():
-            return np.full((channels, data.count, self._columns + 1, self._columns + 1), np.inf)
-        product: FloatArray = rows @ rows.transpose(0, 1, 3, 2)
-        return product
-
-    def rms(self, products: FloatArray) -> FloatArray:
-        """RMS error of each channel."""
-        out: FloatArray = np.sqrt(products[:, :, -1, -1].sum(axis=1) / (self._data.count * self._data.length))
+        found = self._full(start, data.inputs.T, self._vector(values)).transpose(0, 2, 1)
+        found = found.reshape(data.count, 1 + wide, channels, data.length)
+        out = np.empty_like(found)
+        out[:, :-1], out[:, -1] = found[:, 1:], found[:, 0] - data.measured
         return out
 
-
-def weighted(products: FloatArray, sigma: FloatArray) -> FloatArray:
-    """Products of all channels, each divided by its sigma, (windows, k, k)."""
-    out: FloatArray = np.einsum("cwij,c->wij", products, 1 / sigma**2)
-    return out
+    def _vector(self, values: Mapping[str, float]) -> FloatArray:
+        return np.array([values[n] for n in self._names])
 
 
-def _sample(model: JointModel, free: Sequence[str], rows: Sequence[int], dt: float, substeps: int) -> Any:
-    """CasADi function (state and sensitivities, inputs, p) -> (the same one sample later, outputs and their slopes)."""
+def _sample(model: JointModel, free: Sequence[str] | None, rows: Sequence[int], dt: float, substeps: int) -> Any:
+    """CasADi function (state and sensitivities, inputs, p) -> (the same one sample later, outputs and their slopes).
+
+    Without `free` the state alone.
+    """
     functions, names = model.functions, model.parameter_names
-    n, k = (4 if model.is_elastic else 2), (4 if model.is_elastic else 2) + len(free)
-    chosen = [names.index(f) for f in free]
+    n = 4 if model.is_elastic else 2
+    k = 0 if free is None else n + len(free)
+    chosen = [names.index(f) for f in free or ()]
     delays = [names.index(name) for name in model.named("delay", "drive")]
     x, u, p = ca.SX.sym("x", n), ca.SX.sym("u", 6), ca.SX.sym("p", len(names))
     slopes, share = ca.SX.sym("S", n, k), ca.SX.sym("share")
@@ -243,10 +238,12 @@ def _sample(model: JointModel, free: Sequence[str], rows: Sequence[int], dt: flo
         late = sum(p[i] for i in delays) * (u[1] + c * (u[3] - u[1]))
         return ca.vertcat(u[0] + c * (u[2] - u[0]) + late, u[4], u[5] + c * dt)
 
-    def carried(expression: Any) -> Any:
-        """Slope of an expression of (x, p) along the columns."""
-        own = ca.jacobian(expression, p)[:, chosen]
-        return ca.jacobian(expression, x) @ slopes + ca.horzcat(ca.SX.zeros(expression.size1(), n), own)
+    def with_slopes(expression: Any) -> Any:
+        """An expression of (x, p) with its slopes along the columns."""
+        if not k:
+            return expression
+        own = ca.horzcat(ca.SX.zeros(expression.size1(), n), ca.jacobian(expression, p)[:, chosen])
+        return ca.vertcat(expression, ca.vec(ca.jacobian(expression, x) @ slopes + own))
 
     h = dt / substeps
     rate = functions.dynamics
@@ -256,14 +253,13 @@ def _sample(model: JointModel, free: Sequence[str], rows: Sequence[int], dt: flo
     k3 = rate(x + h / 2 * k2, middle, p)
     k4 = rate(x + h * k3, applied(share + 1 / substeps), p)
     new = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-    whole = ca.vertcat(x, ca.vec(slopes))
-    moved = ca.cse([ca.vertcat(new, ca.vec(carried(new)))])
-    step = ca.Function("step", [whole, u, p, share], moved)
+    whole = ca.vertcat(x, ca.vec(slopes)) if k else x
+    step = ca.Function("step", [whole, u, p, share], ca.cse([with_slopes(new)]))
     y = functions.outputs(x, applied(ca.SX(0)), p)[list(rows)]
-    read = ca.Function("read", [whole, u, p], ca.cse([ca.vertcat(y, ca.vec(carried(y)))]))
+    read = ca.Function("read", [whole, u, p], ca.cse([ca.densify(with_slopes(y))]))
     kind = ca.SX if substeps <= INLINED else ca.MX
     a, b, c = kind.sym("a", n * (1 + k)), kind.sym("b", 6), kind.sym("c", len(names))
     now = a
     for i in range(substeps):
         now = step(now, b, c, i / substeps)
-    return ca.Function("sample", [a, b, c], [now, read(a, b, c)])
+    return ca.Function("sample", [a, b, c], [ca.densify(now), read(a, b, c)])

@@ -12,9 +12,13 @@ import numpy.typing as npt
 
 from identification._varpro import BudgetSpent, Projection
 from identification.errors import InputError
+from identification.least_squares import least_squares
 from identification.mcs import mcs
 
 FloatArray = npt.NDArray[np.float64]
+
+STEPS = 40
+"""Steps of one polish at most: a start that needs more lies far from the minimum that a neighbouring start ends in."""
 
 Method = Literal["variable_projection", "alternating"]
 
@@ -68,16 +72,8 @@ class TwoStepSettings:
 
 def polish(problem: Projection, z: FloatArray, tolerance: float) -> FloatArray:
     """Least squares from z inside the box; the end point, also where the budget ends on the way."""
-    from scipy.optimize import least_squares
-
-    inside = np.clip(z, problem.low, problem.high)
-    margin = 1e-9 * (problem.high - problem.low)
-    inside = np.clip(inside, problem.low + margin, problem.high - margin)
-    found = least_squares(
-        problem.residual, inside, jac=problem.jacobian, bounds=(problem.low, problem.high),
-        ftol=tolerance, xtol=tolerance, gtol=1e-15, x_scale=problem.high - problem.low, max_nfev=40,
-    )  # fmt: skip
-    return np.asarray(found.x, dtype=np.float64)
+    found = least_squares(problem, z, (problem.low, problem.high), iterations=STEPS, tolerance=tolerance)
+    return found.x
 
 
 def hypercube(count: int, low: FloatArray, high: FloatArray, seed: int) -> FloatArray:

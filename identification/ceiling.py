@@ -11,15 +11,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Final, final
+from typing import TYPE_CHECKING, Any, Final, final
 
 import numpy as np
 import numpy.typing as npt
 
-from identification.blackbox import Tried, linear_ceiling
 from identification.engine import Dataset
 from identification.errors import InputError
 from identification.weak import WeakRecord
+
+if TYPE_CHECKING:
+    from identification.blackbox import Tried
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -223,6 +225,9 @@ def reference_of(balance: str) -> str:
 
 def _best(fit: Sequence[tuple[FloatArray, FloatArray]], test: Sequence[tuple[FloatArray, FloatArray]]) -> tuple[str, float] | None:
     """Name and VAF of the linear model that simulates the test rows best."""
+    # black boxes are loaded where one is fitted: no verb but the comparison needs them
+    from identification.blackbox import linear_ceiling
+
     u, y = np.concatenate([one for one, _ in fit]), np.concatenate([other for _, other in fit])
     size = u.std(axis=0)
     moving = size > 1e-9 * max(float(size.max()), 1e-300)

@@ -13,15 +13,16 @@ import numpy.typing as npt
 from casadi_models import JointModel
 from casadi_models.term import HANGING, LOAD_COMPLIANCE
 from identification.balances import Balances, balances_of
+from identification.covariance import block_errors, correlations
 from identification.dataset import Dataset, load_dataset, prepared_model, weak_record
 from identification.errors import InputError
 from identification.excitation import attenuation
 from identification.stacked import Stacked, floor_rows, floors, references, rms, row_weights, stack, taking_part
-from identification.standard_errors import block_errors
 from identification.start_values import bounds_of, starts
+from identification.weak_form import WeakForm
 
 __all__ = [
-    "Dataset", "Solution", "Stacked", "floor_rows", "floors", "gauss_newton", "load_dataset", "memory_shapes_of", "prepared_model", "references",
+    "Dataset", "Solution", "Stacked", "floor_rows", "floors", "load_dataset", "prepared_model", "references",
     "rms", "row_weights", "solve", "stack", "taking_part", "weak_record",
 ]  # fmt: skip
 
@@ -113,7 +114,7 @@ def _swings(rigid: Solution, data: Dataset) -> dict[str, float] | None:
     free = [n for n in model.parameter_names if n in free]
     balances = balances_of(model, data.sensing, wrt=free)
     limits = bounds_of(model, data.joint.known, data)
-    values, _ = gauss_newton(balances, data, rigid.values, free, limits, rigid.sigma, rigid.weights, 6, memory_shapes_of(model, free))
+    values, _ = WeakForm(balances, data, rigid.values, tuple(free), rigid.weights).fitted(limits, 6)
     sizes = [_left(model, v, data) for v in (rigid.values, values)]
     lag = model.swinging_inertia(values) * values[LOAD_COMPLIANCE.name]
     slow = lag * (2 * math.pi * HIGHEST_SWING / data.kernel) ** 2 > 1
@@ -134,27 +135,26 @@ def _fitted(
     shapes = {p.name for p in model.parameters if p.is_shape}
     free = [n for n in model.parameter_names if n not in fixed and n not in held]
     balances = balances_of(model, data.sensing, wrt=free)
-    memory_shapes = memory_shapes_of(model, free)
     for n in free:
         low, high = limits[n]
         values[n] = min(max(values[n], low), high)
     tell = progress or (lambda text, share: None)
     tell("start values", 0.0)
     # first pass without shapes: linear amplitudes from any start
-    sigma = dict.fromkeys(balances.balances, 1.0)
     linear_only = [n for n in free if n not in shapes]
-    _check_moves(balances, data, values, linear_only)
-    values, _ = gauss_newton(balances, data, values, linear_only, limits, sigma, {}, 3, memory_shapes)
-    values = _best_start(balances, data, values, free, limits, memory_shapes)
+    linear = WeakForm(balances, data, values, tuple(linear_only), dict.fromkeys(balances.balances, 1.0))
+    _check_moves(linear)
+    values, _ = linear.fitted(limits, 3)
+    values = _best_start(balances, data, values, free, limits)
     for number in range(2):
         tell(("first pass", "second pass")[number], 0.2 + 0.35 * number)
         sigma = _sigmas(model, data, values)
         weights = row_weights(balances, data, values, sigma, data.train)
-        values, used = gauss_newton(balances, data, values, free, limits, sigma, weights, iterations, memory_shapes)
+        values, used = WeakForm(balances, data, values, tuple(free), weights).fitted(limits, iterations)
     sigma = _sigmas(model, data, values)
     weights = row_weights(balances, data, values, sigma, data.train)
     tell("standard errors", 0.9)
-    return _with_errors(model, balances, data, values, free, limits, weights, sigma, memory_shapes, used)
+    return _with_errors(WeakForm(balances, data, values, tuple(free), weights), limits, sigma, used)
 
 
 def _sigmas(model: JointModel, data: Dataset, values: Mapping[str, float]) -> dict[str, float]:
@@ -166,7 +166,7 @@ def _sigmas(model: JointModel, data: Dataset, values: Mapping[str, float]) -> di
 
 def _best_start(
     balances: Balances, data: Dataset, values: dict[str, float], free: Sequence[str],
-    limits: Mapping[str, tuple[float, float]], memory_shapes: Sequence[str],
+    limits: Mapping[str, tuple[float, float]],
 ) -> dict[str, float]:  # fmt: skip
     """Friction laws with a shape near zero velocity have several valleys: the best of a few smoothing velocities and exponents."""
     shaped = [t for t in balances.model.terms if t.effect.several_valleys]
@@ -186,7 +186,7 @@ def _best_start(
     bare = balances_of(balances.model, data.sensing, wrt=())
     best: tuple[float, dict[str, float]] | None = None
     for trial in trials:
-        fitted, _ = gauss_newton(balances, data, trial, free, limits, sigma, weights, 6, memory_shapes)
+        fitted, _ = WeakForm(balances, data, trial, tuple(free), weights).fitted(limits, 6)
         residual = stack(bare, data.train, fitted).residual
         cost = sum(float(np.sum((residual[b] * weights[b]) ** 2)) for b in residual)
         if best is None or cost < best[0]:
@@ -194,36 +194,12 @@ def _best_start(
     return best[1] if best is not None else values
 
 
-def memory_shapes_of(model: JointModel, free: Sequence[str]) -> tuple[str, ...]:
-    """Shape parameters that act through internal states only: differentiated numerically."""
-    out = []
-    for t in model.terms:
-        if t.effect.memory is not None:
-            out += [n for n, p in zip(t.names, t.effect.parameters, strict=True) if p.is_shape and n in free]
-    return tuple(out)
-
-
-def _jacobian(balances: Balances, data: Dataset, values: Mapping[str, float], free: Sequence[str], memory_shapes: Sequence[str]) -> Stacked:
-    """Stacked residual and Jacobian with the columns of `free`."""
-    stacked = stack(balances, data.train, values)
-    columns = [balances.wrt.index(n) for n in free]
-    jacobian = {b: np.array(j[:, columns]) for b, j in stacked.jacobian.items()}
-    numeric = [n for n in memory_shapes if n in free]
-    if numeric:
-        bare = balances_of(balances.model, data.sensing, wrt=())
-        for n in numeric:
-            step = 1e-2 * values[n]
-            moved = stack(bare, data.train, {**values, n: values[n] + step}).residual
-            for b in jacobian:
-                jacobian[b][:, list(free).index(n)] = (moved[b] - stacked.residual[b]) / step
-    return Stacked(stacked.residual, jacobian, stacked.block, stacked.taking)
-
-
-def _check_moves(balances: Balances, data: Dataset, values: Mapping[str, float], free: Sequence[str]) -> None:
-    stacked = _jacobian(balances, data, values, free, ())
+def _check_moves(problem: WeakForm) -> None:
+    values = problem.values
+    jacobian = problem.stacked(np.array([values[n] for n in problem.free])).jacobian
     dead = [
-        n for i, n in enumerate(free)
-        if max(float(np.abs(j[:, i]).max(initial=0.0)) for j in stacked.jacobian.values()) == 0.0 and values[n] != 0.0
+        n for i, n in enumerate(problem.free)
+        if max(float(np.abs(j[:, i]).max(initial=0.0)) for j in jacobian.values()) == 0.0 and values[n] != 0.0
     ]  # fmt: skip
     model = balances.model
     truly = [n for n in dead if n in (*model.inertias, model.stiffness_name)]
@@ -231,113 +207,11 @@ def _check_moves(balances: Balances, data: Dataset, values: Mapping[str, float],
         raise InputError(f"parameter {', '.join(truly)} moves no output of these records; give it a known value or add the channel that shows it")
 
 
-def gauss_newton(
-    balances: Balances, data: Dataset, values: Mapping[str, float], free: Sequence[str],
-    limits: Mapping[str, tuple[float, float]], sigma: Mapping[str, float], weights: Mapping[str, FloatArray],
-    iterations: int, memory_shapes: Sequence[str],
-) -> tuple[dict[str, float], int]:  # fmt: skip
-    """Damped Gauss-Newton with bounds; shape parameters move on a log scale.
-
-    Parameters
-    ----------
-    balances : Balances
-        With a Jacobian column for every one of `free`.
-    data : Dataset
-        Its training records are fitted.
-    values, free, limits
-        Start values of every parameter, the names that move, their bounds.
-    sigma, weights
-        Scale of each balance, and 1/sigma of each row where it is known.
-    iterations : int
-        At most so many.
-    memory_shapes : sequence of str
-        Those of `memory_shapes_of`: differentiated numerically.
-
-    Returns
-    -------
-    values, iterations used
-    """
-    now = dict(values)
-    parameters = {p.name: p for p in balances.model.parameters}
-    logs = np.array([parameters[n].is_shape and parameters[n].scale != "absolute" for n in free])
-    bare = balances_of(balances.model, data.sensing, wrt=())
-
-    def scaled(residual: Mapping[str, FloatArray]) -> FloatArray:
-        return np.concatenate([residual[b] * (weights[b] if b in weights else 1 / sigma[b]) for b in balances.balances])
-
-    damping = 1e-9
-    cost = math.inf
-    for used in range(1, iterations + 1):
-        stacked = _jacobian(balances, data, now, free, memory_shapes)
-        r = scaled(stacked.residual)
-        j = np.concatenate([stacked.jacobian[b] * (weights[b][:, None] if b in weights else 1 / sigma[b]) for b in balances.balances])
-        j = j * np.where(logs, [now[n] for n in free], 1.0)
-        cost = float(r @ r)
-        norms = np.linalg.norm(j, axis=0)
-        alive = norms > 1e-12 * max(float(norms.max(initial=0.0)), 1e-300)
-        better = False
-        for _ in range(6):
-            step = _bounded_step(j / np.where(alive, norms, 1.0), -r, alive, norms, damping, now, free, limits, logs)
-            trial = dict(now)
-            for n, s, log in zip(free, step, logs, strict=True):
-                low, high = limits[n]
-                trial[n] = min(max(now[n] * math.exp(min(max(s, -1.0), 1.0)) if log else now[n] + s, low), high)
-            after = scaled(stack(bare, data.train, trial).residual)
-            if float(after @ after) <= cost * (1 + 1e-12):
-                better = True
-                break
-            damping = max(damping * 30, 1e-4)
-        if not better:
-            return now, used
-        gained = cost - float(after @ after)
-        now = trial
-        damping = max(damping / 10, 1e-12)
-        if gained <= 1e-6 * cost:
-            return now, used
-    return now, iterations
-
-
-def _bounded_step(
-    j: FloatArray, r: FloatArray, alive: npt.NDArray[np.bool_], norms: FloatArray, damping: float,
-    now: Mapping[str, float], free: Sequence[str], limits: Mapping[str, tuple[float, float]], logs: npt.NDArray[np.bool_],
-) -> FloatArray:  # fmt: skip
-    """Least-squares step; a parameter that would leave its bound goes to the bound and the others are solved again."""
-    active = alive.copy()
-    fixed = np.zeros(len(free))
-    step = np.zeros(len(free))
-    gram, right = j.T @ j, j.T @ r
-    for _ in range(len(free) + 1):
-        index = np.flatnonzero(active)
-        if not len(index):
-            break
-        a = gram[np.ix_(index, index)] + damping * np.eye(len(index))
-        b = right[index] - gram[np.ix_(index, np.flatnonzero(~active))] @ fixed[~active]
-        part = np.linalg.lstsq(a, b, rcond=1e-13)[0]
-        step[:] = fixed
-        step[index] = part
-        outside = []
-        for i in index.tolist():
-            if logs[i]:
-                continue
-            low, high = limits[free[i]]
-            target = now[free[i]] + step[i] / norms[i]
-            if target < low - 1e-12 * abs(low) or target > high + 1e-12 * abs(high):
-                fixed[i] = (min(max(target, low), high) - now[free[i]]) * norms[i]
-                outside.append(i)
-        if not outside:
-            break
-        active[outside] = False
-    step[~active] = fixed[~active]
-    return np.where(alive, step / np.where(alive, norms, 1.0), 0.0)
-
-
-def _with_errors(
-    model: JointModel, balances: Balances, data: Dataset, values: Mapping[str, float], free: Sequence[str],
-    limits: Mapping[str, tuple[float, float]], weights: Mapping[str, FloatArray], sigma: Mapping[str, float],
-    memory_shapes: Sequence[str], used: int,
-) -> Solution:  # fmt: skip
+def _with_errors(problem: WeakForm, limits: Mapping[str, tuple[float, float]], sigma: Mapping[str, float], used: int) -> Solution:
     """Standard errors from blocks of time and from what noise of the positions takes off; what cannot be identified is said."""
-    stacked = _jacobian(balances, data, values, free, memory_shapes)
+    balances, data, values, free = problem.balances, problem.data, problem.values, problem.free
+    weights = {b: np.asarray(w, dtype=np.float64) for b, w in problem.weights.items()}
+    stacked = problem.stacked(np.array([values[n] for n in free]))
     j = np.concatenate([stacked.jacobian[b] * weights[b][:, None] for b in balances.balances])
     r = np.concatenate([stacked.residual[b] * weights[b] for b in balances.balances])
     block = np.tile(stacked.block, len(balances.balances))
@@ -355,14 +229,11 @@ def _with_errors(
     index = np.flatnonzero(usable)
     if len(index):
         scaled = j[:, index] / norms[index]
-        inverse = np.linalg.pinv(scaled.T @ scaled, rcond=1e-12)
         errors = block_errors(scaled, r, block)
         pulled = {name.replace(" ", "_"): share for name, share in attenuation(data).items()}
         biases = np.array([pulled.get(free[i], 0.0) * values[free[i]] for i in index.tolist()])
         size = None if errors is None else np.hypot(errors / norms[index], biases)
-        spread = np.sqrt(np.maximum(np.diag(inverse), 1e-300))
-        corr = inverse / np.outer(spread, spread)
-        np.fill_diagonal(corr, 0.0)
+        spread, corr = correlations(scaled.T @ scaled)
         for k, i in enumerate(index.tolist()):
             stderr[free[i]] = None if size is None else float(size[k])
             other = int(np.argmax(np.abs(corr[k])))
@@ -372,6 +243,6 @@ def _with_errors(
                 unidentified.append(free[i])
     kept = dict(values)
     return Solution(
-        replace(model, values=kept), kept, stderr, tuple(free), weights, sigma, tuple(at_bound), tuple(unidentified),
+        replace(balances.model, values=kept), kept, stderr, free, weights, sigma, tuple(at_bound), tuple(unidentified),
         correlation, used,
     )  # fmt: skip

@@ -6,8 +6,6 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from identification._mcs_problem import make_problem, real_number, whole_number
-from identification._mcs_search import Search
 from identification._mcs_types import FloatArray, MCSMinimum, MCSOptions, MCSOutcome, MCSProgress, MCSResult
 
 __all__ = ["MCSMinimum", "MCSOptions", "MCSOutcome", "MCSProgress", "MCSResult", "mcs"]
@@ -147,6 +145,10 @@ def mcs(
     >>> [round(minimum.fun, 4) for minimum in result.basket]
     [-1.0316, -1.0316]
     """
+    # the search itself is loaded where it is called: no verb of the package needs it
+    from identification._mcs_problem import make_problem, real_number, whole_number
+    from identification._mcs_search import Search
+
     problem = make_problem(bounds, options if options is not None else MCSOptions())
     n = len(problem.low)
     search = Search(

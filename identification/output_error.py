@@ -1,8 +1,8 @@
 """Output-error refinement: the simulated outputs of a fitted model against the measured ones, window by window.
 
 Multiple shooting: the record is cut into short windows with free initial states; Runge-Kutta steps of
-4th order carry the sensitivities along, and Gauss-Newton steps eliminate the initial states of each
-window (Schur complement; Bock's direct multiple shooting without continuity conditions).
+4th order carry the sensitivities along, and the least-squares solver eliminates the initial states of each
+window (Bock's direct multiple shooting without continuity conditions).
 """
 
 from __future__ import annotations
@@ -15,11 +15,13 @@ from typing import Any, Final, final
 import numpy as np
 import numpy.typing as npt
 
-from identification._shooting import MOST_SUBSTEPS, Shooting, Windows, cut_windows, substeps_for, weighted
+from identification._shooting import MOST_SUBSTEPS, Shooting, Windows, cut_windows, substeps_for
 from identification.assess import assess
+from identification.covariance import BLOCK, block_numbers, errors_of_blocks
 from identification.engine import row_weights
 from identification.errors import InputError
 from identification.fit import Fit
+from identification.least_squares import common_rows, least_squares, triangles_of_products
 from identification.record import Record
 from identification.start_values import bounds_of
 
@@ -33,8 +35,6 @@ EASY_SUBSTEPS: Final = 4
 """Steps per sample up to which friction counts as smooth enough: sharper, and Gauss-Newton steps stick at reversals."""
 FEW_WINDOWS: Final = 40
 """Windows of the first steps; all of them take the last ones."""
-SETTLED: Final = 1e-3
-"""Relative fall of the cost by initial states alone that is worth another step of the parameters."""
 ENOUGH: Final = 1e-5
 """Relative fall of the cost below which the iteration ends."""
 
@@ -85,26 +85,60 @@ class Refinement:
         return self.fit.parameters
 
 
-@dataclass
-class _State:
-    """Where the iteration stands."""
+@final
+@dataclass(frozen=True)
+class OutputError:
+    """Errors of the simulated outputs, window by window; a :class:`identification.least_squares.LocalProblem`.
 
-    values: dict[str, float]
-    x0: FloatArray
-    products: FloatArray
-    damping: float = 1e-8
+    Attributes
+    ----------
+    shooting : Shooting
+    values : mapping of str to float
+        Of every parameter; those not free stay.
+    sigma : (channels,) array
+        What the errors of each channel are divided by.
+    free : bool
+        False: the initial states alone move.
+    """
 
-    def cost(self, sigma: FloatArray) -> float:
-        """Sum of squares of the weighted errors."""
-        return float(np.sum(self.products[:, :, -1, -1] / sigma[:, None] ** 2))
+    shooting: Shooting
+    values: Mapping[str, float]
+    sigma: FloatArray
+    free: bool = True
 
-    def projected(self, sigma: FloatArray, states: int) -> float:
-        """The cost that the best initial states would leave, to first order."""
-        gram = weighted(self.products, sigma)
-        if not np.isfinite(gram).all():
-            return math.inf
-        part = gram[:, :states, -1:]
-        return float(np.sum(gram[:, -1, -1] - (part * np.linalg.solve(_ridged(gram[:, :states, :states]), part)).sum(axis=(1, 2))))
+    def at(self, x: FloatArray) -> dict[str, float]:
+        """Values of every parameter."""
+        return {**self.values, **dict(zip(self.shooting.free, map(float, x), strict=False))}
+
+    def costs(self, x: FloatArray, local: FloatArray) -> FloatArray:
+        """Sum of squares of each window."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            squares = np.sum(self.shooting.errors(self.at(x), local) ** 2, axis=2) / self.sigma**2
+            return np.asarray(squares.sum(axis=1), dtype=np.float64)
+
+    def triangles(self, x: FloatArray, local: FloatArray) -> FloatArray:
+        """Triangle of each window: initial states, free parameters, error."""
+        columns = self.shooting.columns(self.at(x), local) / self.sigma[:, None]
+        if not self.free:
+            columns = np.concatenate([columns[:, : self.shooting.states], columns[:, -1:]], axis=1)
+        flat = columns.reshape(*columns.shape[:2], -1)
+        return triangles_of_products(flat @ flat.transpose(0, 2, 1))
+
+    def settled(self, local: FloatArray) -> FloatArray:
+        """Initial states after one step of their own, in the windows where that lowers the error."""
+        alone = replace(self, free=False)
+        return least_squares(alone, [], local=local, iterations=1).local
+
+    def errors(self, x: FloatArray, local: FloatArray) -> list[float]:
+        """Standard errors of the free parameters from blocks of windows; infinite with too few blocks."""
+        data, unknowns = self.shooting.data, self.shooting.states
+        rest = common_rows(self.triangles(x, local), unknowns)
+        products = rest.transpose(0, 2, 1) @ rest
+        block = block_numbers(data.inputs[5, :: data.length], BLOCK)
+        summed = np.zeros((int(block[-1]) + 1, *products.shape[1:]))
+        np.add.at(summed, block, products)
+        found = errors_of_blocks(summed[:, :-1, :-1], summed[:, :-1, -1])
+        return [math.inf] * len(self.shooting.free) if found is None else found.tolist()
 
 
 def refine(fit: Fit, records: Record | Sequence[Record] | None = None, *, window: float = 0.25, iterations: int = 8) -> Refinement:
@@ -145,32 +179,48 @@ def refine(fit: Fit, records: Record | Sequence[Record] | None = None, *, window
         for n, (low, high) in limits.items()
     }
     shooting = Shooting(model, free, data, substeps)
-    state = _settled(shooting, start, data.start_states(model.is_elastic))
-    first = replace(state)
-    before = shooting.rms(state.products)
-    sigma, used = np.maximum(data.noise, before), 0
+    begin = OutputError(shooting, start, data.noise)
+    local = begin.settled(data.start_states(model.is_elastic))
+    before = _rms(begin.shooting, start, local)
+    if not np.isfinite(before).all():
+        raise InputError("output-error refinement: the simulation with the start values diverges; fit the model first or shorten the window")
+    x = np.array([start[n] for n in free])
+    box = [limits[n][0] for n in free], [limits[n][1] for n in free]
+    problem, used = replace(begin, sigma=np.maximum(data.noise, before)), 0
+    first = x, local
     stride = max(1, data.count // FEW_WINDOWS)
     if stride > 1:
-        few = shooting.every(stride)
-        part = _State(start, state.x0[::stride], state.products[:, ::stride])
-        used = _iterate(few, part, limits, sigma, iterations)
-        near = _settled(shooting, part.values, _settled(shooting, part.values, state.x0).x0)
-        if near.cost(sigma) < state.cost(sigma):
-            state = near
+        few = replace(problem, shooting=shooting.every(stride))
+        part = least_squares(few, x, box, logarithmic=shooting.logarithmic, local=local[::stride], iterations=iterations, tolerance=ENOUGH)
+        used = part.iterations
+        near = replace(problem, values=problem.at(part.x))
+        own = near.settled(near.settled(local))
+        if float(near.costs(part.x, own).sum()) < float(problem.costs(x, local).sum()):
+            x, local = part.x, own
     for _ in range(2):
         # a channel is divided by the error of the model where that is above the noise
-        sigma = np.maximum(data.noise, shooting.rms(state.products))
-        used += _iterate(shooting, state, limits, sigma, max(iterations - used, 1))
-    if state.cost(sigma) > first.cost(sigma):
-        state = first
-    after, total = shooting.rms(state.products), before.size * data.count * data.length
+        problem = replace(problem, sigma=np.maximum(data.noise, _rms(shooting, problem.at(x), local)))
+        left = max(iterations - used, 1)
+        found = least_squares(problem, x, box, logarithmic=shooting.logarithmic, local=local, iterations=left, tolerance=ENOUGH)
+        x, local, used = found.x, found.local, used + found.iterations
+    costs = [float(problem.costs(*point).sum()) for point in (first, (x, local))]
+    if costs[1] > costs[0]:
+        (x, local), costs = first, [costs[0], costs[0]]
+    values, sigma = problem.at(x), problem.sigma
+    after, total = _rms(shooting, values, local), before.size * data.count * data.length
     names = data.channels
     return Refinement(
-        _refined(fit, state.values, dict(zip(free, _stderr(state, shooting.states, sigma), strict=True)), limits, used),
+        _refined(fit, values, dict(zip(free, problem.errors(x, local), strict=True)), limits, used),
         dict(zip(names, before.tolist(), strict=True)), dict(zip(names, after.tolist(), strict=True)),
-        dict(zip(names, sigma.tolist(), strict=True)), math.sqrt(first.cost(sigma) / total), math.sqrt(state.cost(sigma) / total),
+        dict(zip(names, sigma.tolist(), strict=True)), math.sqrt(costs[0] / total), math.sqrt(costs[1] / total),
         used, data.count, data.count * data.length,
     )  # fmt: skip
+
+
+def _rms(shooting: Shooting, values: Mapping[str, float], local: FloatArray) -> FloatArray:
+    """RMS error of each channel."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.asarray(np.sqrt(np.mean(shooting.errors(values, local) ** 2, axis=(0, 2))), dtype=np.float64)
 
 
 def _followable(model: Any, values: dict[str, float], data: Windows) -> tuple[dict[str, float], int]:
@@ -198,125 +248,6 @@ def _refuse(fit: Fit, records: Sequence[Record]) -> None:
         raise InputError(f"{name}: output-error refinement needs link_position where the link swings on the gear's compliance; use the weak-form fit")
     if not fit.data.sensing.has_drive or fit.data.sensing.clamped_link:
         raise InputError(f"{name}: output-error refinement simulates the joint from its drive torque; add motor_current, motor_torque or motor_voltage")
-
-
-def _settled(shooting: Shooting, values: dict[str, float], x0: FloatArray) -> _State:
-    """The state of the iteration with initial states fitted and the parameters left alone."""
-    n = shooting.states
-    products = shooting.evaluate(values, x0)
-    if not np.isfinite(products).all():
-        raise InputError("output-error refinement: the simulation with the start values diverges; fit the model first or shorten the window")
-    gram = weighted(products, shooting.noise)
-    trial = x0 + np.linalg.solve(_ridged(gram[:, :n, :n]), gram[:, :n, -1:])[:, :, 0]
-    moved = shooting.evaluate(values, trial)
-    better = weighted(moved, shooting.noise)[:, -1, -1] < gram[:, -1, -1]
-    x0 = np.where(better[:, None], trial, x0)
-    products = np.where(better[:, None, None], moved, products)
-    return _State(values, x0, products)
-
-
-def _ridged(matrices: FloatArray) -> FloatArray:
-    largest = np.einsum("wii->wi", matrices).max(axis=1)
-    out: FloatArray = matrices + np.eye(matrices.shape[1]) * (1e-12 * largest + 1e-300)[:, None, None]
-    return out
-
-
-def _iterate(shooting: Shooting, state: _State, limits: Mapping[str, tuple[float, float]], sigma: FloatArray, iterations: int) -> int:
-    """Damped Gauss-Newton steps; a step that raises the cost is shortened."""
-    for used in range(1, iterations + 1):
-        cost = state.cost(sigma)
-        reduced, right, back, _ = schur(weighted(state.products, sigma), shooting.states)
-        scale = np.sqrt(np.maximum(np.diag(reduced), 1e-300))
-        promised = right / scale @ np.linalg.lstsq(reduced / np.outer(scale, scale), right / scale, rcond=1e-13)[0]
-        unsettled = cost - state.projected(sigma, shooting.states)
-        if used > 1 and promised + unsettled <= ENOUGH * cost:
-            return used - 1
-        for _ in range(5):
-            values, step = _trial(shooting, state, limits, reduced, right)
-            x0 = state.x0 + back[:, :, -1] - back[:, :, :-1] @ step
-            trial = _State(values, x0, shooting.evaluate(values, x0))
-            if trial.cost(sigma) <= cost:
-                break
-            state.damping = max(30 * state.damping, 1e-4)
-        else:
-            # windows whose own start state is off hold up the common step: their states first, one by one
-            near = _settled(shooting, state.values, state.x0)
-            if near.cost(sigma) >= (1 - SETTLED) * cost:
-                return used
-            state.x0, state.products, state.damping = near.x0, near.products, 1e-8
-            continue
-        gained = cost - trial.cost(sigma)
-        state.values, state.x0, state.products = trial.values, trial.x0, trial.products
-        state.damping = max(state.damping / 10, 1e-10)
-        if gained <= ENOUGH * cost:
-            return used
-    return iterations
-
-
-def schur(gram: FloatArray, states: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Normal equations of the parameters with the initial states eliminated.
-
-    Parameters
-    ----------
-    gram : (windows, k, k) array
-        Products of the columns (initial states, parameters, error).
-    states : int
-
-    Returns
-    -------
-    reduced : (parameters, parameters) array
-    right : (parameters,) array
-    back : (windows, states, parameters + 1) array
-        Step of the initial states: last column less the others times the parameter step.
-    scores : (windows, parameters) array
-        What each window adds to `right`.
-    """
-    back: FloatArray = np.asarray(np.linalg.solve(_ridged(gram[:, :states, :states]), gram[:, :states, states:]), dtype=np.float64)
-    rest: FloatArray = gram[:, states:, states:] - gram[:, states:, :states] @ back
-    whole: FloatArray = rest.sum(axis=0)
-    return whole[:-1, :-1], whole[:-1, -1], back, rest[:, :-1, -1]
-
-
-def _stderr(state: _State, states: int, sigma: FloatArray) -> list[float]:
-    """Standard errors of the free parameters from the scatter of the windows' scores."""
-    reduced, _, _, scores = schur(weighted(state.products, sigma), states)
-    scale = np.sqrt(np.maximum(np.diag(reduced), 1e-300))
-    inverse = np.linalg.pinv(reduced / np.outer(scale, scale), rcond=1e-12)
-    scaled = scores / scale
-    covariance = inverse @ (scaled.T @ scaled) @ inverse
-    out: list[float] = (np.sqrt(np.maximum(np.diag(covariance), 0.0)) / scale).tolist()
-    return out
-
-
-def _trial(
-    shooting: Shooting, state: _State, limits: Mapping[str, tuple[float, float]], reduced: FloatArray, right: FloatArray
-) -> tuple[dict[str, float], FloatArray]:
-    """Parameters after one step inside their bounds, and the step that was taken."""
-    scale = np.sqrt(np.maximum(np.diag(reduced), 0.0))
-    alive = scale > 1e-12 * scale.max(initial=0.0)
-    step = np.zeros(len(scale))
-    active = alive.copy()
-    for _ in range(len(scale) + 1):
-        index = np.flatnonzero(active)
-        if not len(index):
-            break
-        a = reduced[np.ix_(index, index)] / np.outer(scale[index], scale[index]) + state.damping * np.eye(len(index))
-        b = (right[index] - reduced[np.ix_(index, np.flatnonzero(~active))] @ step[~active]) / scale[index]
-        step[index] = np.linalg.lstsq(a, b, rcond=1e-13)[0] / scale[index]
-        outside = []
-        for i in index.tolist():
-            name = shooting.free[i]
-            low, high = limits[name]
-            if shooting.positive[i]:
-                low, high = max(low, state.values[name] / 3), min(high, state.values[name] * 3)
-            target = state.values[name] + step[i]
-            if target < low or target > high:
-                step[i] = min(max(target, low), high) - state.values[name]
-                outside.append(i)
-        if not outside:
-            break
-        active[outside] = False
-    return {**state.values, **{n: state.values[n] + float(s) for n, s in zip(shooting.free, step, strict=True)}}, step
 
 
 def _refined(fit: Fit, values: Mapping[str, float], stderr: Mapping[str, float], limits: Mapping[str, tuple[float, float]], used: int) -> Fit:

@@ -1,7 +1,6 @@
 """Fit the parameters of a user's FMU by the error of its outputs.
 
-Damped Gauss-Newton steps; the start values of each window are eliminated by a QR decomposition of their own columns,
-and bounds are kept by a bounded least-squares problem for the step (Stark & Parker 1995, as in scipy's lsq_linear).
+The outputs of the windows are a problem of the one least-squares solver; the start values of each window are its own unknowns.
 """
 
 from __future__ import annotations
@@ -13,7 +12,9 @@ from typing import TYPE_CHECKING, Any, Final, final
 
 import numpy as np
 
+from identification.covariance import BLOCK, block_errors, correlations, process_errors
 from identification.errors import InputError
+from identification.least_squares import least_squares, triangle_of
 from identification.noise import noise_level
 from identification.record import Record
 
@@ -23,7 +24,7 @@ from .user_compare import UserComparison, comparison_of
 from .user_exact import Exact, NotExact
 from .user_model import UserModel, listed, start_values
 from .user_run import Window
-from .user_sensitivity import BlackBox, Simulator, scale_of, start_scale
+from .user_sensitivity import BlackBox, Simulator, scale_of
 
 if TYPE_CHECKING:
     from .user_diagnose import UserDiagnosis
@@ -32,10 +33,9 @@ Progress = Callable[[str, float], None]
 _MOVED: Final = 1e-9
 """A column smaller than this share of the output's own size moves nothing."""
 _ENOUGH: Final = 1e-5
-_BLOCK: Final = 1.5
-"""Length of the blocks whose scores give the standard errors [s]."""
-_FEW_BLOCKS: Final = 10
-"""With fewer blocks the residual counts as a process of first order instead."""
+"""Relative fall of the sum of squares that ends a pass: every step costs a run of the FMU for each parameter."""
+_SPREAD: Final = 1e5
+"""Standard deviation, in units of what a column alone would have, beyond which a parameter cannot be told from others."""
 
 
 @final
@@ -165,8 +165,61 @@ def noise_of(model: UserModel, records: Sequence[Record]) -> FloatArray:
 
 
 @final
+class Outputs:
+    """Errors of the outputs of an FMU, window by window; a :class:`identification.least_squares.LocalProblem`.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Of every parameter; those not in `names` stay.
+    names : sequence of str
+        The parameters that move.
+    sigma : (outputs,) array
+        What the errors of each output are divided by.
+    say : callable, optional
+        Called with the number of the step before its derivatives are made.
+    """
+
+    def __init__(
+        self, windows: Sequence[Window], simulator: Simulator, values: Mapping[str, float], names: Sequence[str], sigma: FloatArray,
+        say: Callable[[int], None] | None = None,
+    ) -> None:  # fmt: skip
+        self.windows, self.simulator, self.values, self.names, self.sigma = windows, simulator, dict(values), tuple(names), sigma
+        self.steps = 0
+        self._say = say
+
+    def at(self, x: FloatArray) -> dict[str, float]:
+        """Values of every parameter."""
+        return {**self.values, **dict(zip(self.names, map(float, x), strict=True))}
+
+    def costs(self, x: FloatArray, local: FloatArray) -> FloatArray:
+        """Sum of squares of each window; infinite where the FMU fails."""
+        try:
+            predicted = self.simulator.simulate(self.at(x), local)
+        except (FmuError, InputError):
+            return np.full(len(self.windows), np.inf)
+        return np.array([float(np.sum(((y - w.outputs) / self.sigma) ** 2)) for w, y in zip(self.windows, predicted, strict=True)])
+
+    def rows(self, x: FloatArray, local: FloatArray) -> list[FloatArray]:
+        """Columns of each window (samples x outputs, k): start values, parameters, error."""
+        predicted, jacobian = self.simulator.sensitivities(self.at(x), local, self.names)
+        count, out = len(self.names), []
+        for w, y, j in zip(self.windows, predicted, jacobian, strict=True):
+            whole = np.concatenate([j[:, :, count:], j[:, :, :count], (y - w.outputs)[:, :, None]], axis=2) / self.sigma[:, None]
+            out.append(whole.reshape(-1, whole.shape[2]))
+        return out
+
+    def triangles(self, x: FloatArray, local: FloatArray) -> FloatArray:
+        """Triangle of each window."""
+        self.steps += 1
+        if self._say is not None:
+            self._say(self.steps)
+        return np.array([triangle_of(rows) for rows in self.rows(x, local)])
+
+
+@final
 class Solver:
-    """Where the iteration stands.
+    """The fit of an FMU: which parameters move, their values, the start values of the windows.
 
     Attributes
     ----------
@@ -175,48 +228,36 @@ class Solver:
     names : list of str
         Parameters that move an output.
     starts : (windows, starts) array
+    predicted : list of (n, outputs) array
     """
 
     def __init__(self, model: UserModel, windows: Sequence[Window], simulator: Simulator, noise: FloatArray, frozen: bool = False) -> None:
         self.model, self.windows, self.simulator = model, tuple(windows), simulator
         self.values = dict(model.values)
-        self.names: list[str] = []
         self._frozen = frozen
         self.bounds = model.bounds()
         self.starts = start_values(self.windows)
-        self.spread = start_scale(model, windows)
         measured = np.concatenate([w.outputs for w in self.windows])
         self.size = np.maximum(np.std(measured, axis=0), 1e-300)
         self.noise = np.maximum(noise, 1e-9 * self.size)
         self.sigma = self.size.copy()
-        self.damping = 1e-4
-        self._kept: tuple[list[FloatArray], list[FloatArray]] = ([], [])
         self.predicted = simulator.simulate(self.values, self.starts)
-        self._drop_unmoved()
+        self.names = self._moving()
 
-    def _drop_unmoved(self) -> None:
-        """Leave out parameters that move no output here; a shape does so while its amplitude is 0."""
+    def _moving(self) -> list[str]:
+        """Parameters that move an output here; a shape does not while its amplitude is 0."""
         if self._frozen:
-            return
-        self.names = list(self.values)
-        self._kept = ([], [])
-        _, jacobian = self._sensitivities()
-        for i, name in reversed(list(enumerate(self.names))):
-            moved = max(float(np.max(np.abs(j[:, :, i]) / self.size)) for j in jacobian)
-            if moved * scale_of(self.values[name], self.bounds[name]) <= _MOVED:
-                del self.names[i]
-                self._kept = (self._kept[0], [np.delete(j, i, axis=2) for j in self._kept[1]])
+            return []
+        names = list(self.values)
+        _, jacobian = self.simulator.sensitivities(self.values, self.starts, names)
+        moved = {n: max(float(np.max(np.abs(j[:, :, i]) / self.size)) for j in jacobian) for i, n in enumerate(names)}
+        return [n for n in names if moved[n] * scale_of(self.values[n], self.bounds[n]) > _MOVED]
 
-    def _sensitivities(self) -> tuple[list[FloatArray], list[FloatArray]]:
-        """Outputs and derivatives where the iteration stands, made once."""
-        if not self._kept[0]:
-            self._kept = self.simulator.sensitivities(self.values, self.starts, self.names)
-        return self._kept
+    def _problem(self, say: Callable[[int], None] | None = None) -> Outputs:
+        return Outputs(self.windows, self.simulator, self.values, self.names, self.sigma, say)
 
-    def cost(self, predicted: Sequence[FloatArray] | None = None) -> float:
-        """Sum of squares of the weighted errors."""
-        pairs = zip(self.windows, self.predicted if predicted is None else predicted, strict=True)
-        return sum(float(np.sum(((w.outputs - y) / self.sigma) ** 2)) for w, y in pairs)
+    def _x(self) -> FloatArray:
+        return np.array([self.values[n] for n in self.names])
 
     def solve(self, iterations: int, say: Progress = lambda _text, _share: None) -> int:
         """Iterate to the end; the number of steps."""
@@ -224,124 +265,52 @@ class Solver:
         for last in (False, True):
             residual = np.concatenate([w.outputs - y for w, y in zip(self.windows, self.predicted, strict=True)])
             self.sigma = np.maximum(self.noise, np.sqrt(np.mean(residual**2, axis=0)))
-            self.damping = 1e-4
             if last and len(self.names) < len(self.values):
-                self._drop_unmoved()
-            for _ in range(max(1, iterations - used) if last else iterations):
-                used += 1
-                say(f"fitting, step {used}", 0.95 - 0.9 * 0.85**used)
-                if self._step() < _ENOUGH:
-                    break
+                self.names = self._moving()
+            before = used
+
+            def tell(step: int, before: int = before) -> None:
+                say(f"fitting, step {before + step}", 0.95 - 0.9 * 0.85 ** (before + step))
+
+            problem = self._problem(tell)
+            box = [self.bounds[n][0] for n in self.names], [self.bounds[n][1] for n in self.names]
+            left = max(1, iterations - used) if last else iterations
+            found = least_squares(problem, self._x(), box, local=self.starts, iterations=left, tolerance=_ENOUGH)
+            used += found.iterations
+            self.values, self.starts = problem.at(found.x), found.local
+            self.predicted = self.simulator.simulate(self.values, self.starts)
         return used
 
-    def _step(self) -> float:
-        """One accepted step; the relative fall of the cost."""
-        before = self.cost()
-        reduced, right, blocks = self._reduced()
-        for _ in range(10):
-            delta = self._bounded(reduced, right)
-            values = {**self.values, **{n: self._inside(n, self.values[n] + d) for n, d in zip(self.names, delta, strict=True)}}
-            applied = np.array([values[n] - self.values[n] for n in self.names])
-            starts = self.starts + np.array([self._start_step(*b, applied) for b in blocks]).reshape(self.starts.shape)
-            try:
-                predicted = self.simulator.simulate(values, starts)
-                after = self.cost(predicted)
-            except (FmuError, InputError):
-                after = math.inf
-            if after < before:
-                self.values, self.starts, self.predicted = values, starts, predicted
-                self._kept = ([], [])
-                self.damping = max(self.damping / 10, 1e-12)
-                return (before - after) / before
-            self.damping *= 10
-        return 0.0
-
-    def _inside(self, name: str, value: float) -> float:
-        low, high = self.bounds[name]
-        return float(min(max(value, low), high))
-
-    def _reduced(self) -> tuple[FloatArray, FloatArray, list[tuple[FloatArray, FloatArray, FloatArray]]]:
-        """Rows without the start values, stacked and compressed; and what gives the start values back."""
-        predicted, jacobian = self._sensitivities()
-        n = len(self.names)
-        rows, blocks = [], []
-        for w, y, j in zip(self.windows, predicted, jacobian, strict=True):
-            r = ((w.outputs - y) / self.sigma).ravel()
-            full = (j / self.sigma[:, None]).reshape(len(r), -1)
-            theta, x = full[:, :n], full[:, n:] * self.spread
-            q, upper = np.linalg.qr(x) if x.shape[1] else (np.empty((len(r), 0)), np.empty((0, 0)))
-            outside = np.column_stack([theta, r]) - q @ (q.T @ np.column_stack([theta, r]))
-            rows.append(np.asarray(np.linalg.qr(outside, mode="r")))
-            blocks.append((upper, q.T @ theta, q.T @ r))
-        small: FloatArray = np.asarray(np.linalg.qr(np.concatenate(rows), mode="r"))
-        return small[:, :n], small[:, n], blocks
-
-    def _bounded(self, reduced: FloatArray, right: FloatArray) -> FloatArray:
-        from scipy.optimize import lsq_linear
-
-        if not self.names:
-            return np.empty(0)
-        scale = np.maximum(np.linalg.norm(reduced, axis=0), 1e-300)
-        low = np.array([(self.bounds[n][0] - self.values[n]) * s for n, s in zip(self.names, scale, strict=True)])
-        high = np.array([(self.bounds[n][1] - self.values[n]) * s for n, s in zip(self.names, scale, strict=True)])
-        room = np.where(high - low > 0, 0.0, 1e-300)
-        a = np.vstack([reduced / scale, math.sqrt(self.damping) * np.eye(len(scale))])
-        b = np.concatenate([right, np.zeros(len(scale))])
-        found = lsq_linear(a, b, (low - 1e-300, high + room + 1e-300), method="bvls", max_iter=200)
-        return np.asarray(found.x / scale, dtype=np.float64)
-
-    def _start_step(self, upper: FloatArray, theta: FloatArray, right: FloatArray, delta: FloatArray) -> FloatArray:
-        if not len(right):
-            return np.empty(0)
-        n = upper.shape[1]
-        a = np.vstack([upper, math.sqrt(self.damping) * np.eye(n)])
-        step = np.linalg.lstsq(a, np.concatenate([right - theta @ delta, np.zeros(n)]), rcond=1e-12)[0]
-        return np.asarray(step * self.spread, dtype=np.float64)
-
-    def _inflation(self) -> float:
-        """Rows per independent row, from the autocorrelation of the residual one sample later (first-order process)."""
-        top = bottom = 0.0
-        for w, y in zip(self.windows, self.predicted, strict=True):
-            r = (w.outputs - y) / self.sigma
-            top += float(np.sum(r[1:] * r[:-1]))
-            bottom += float(np.sum(r**2))
-        rho = min(max(top / bottom if bottom > 0 else 0.0, 0.0), 0.999)
-        return (1 + rho) / (1 - rho)
-
     def errors(self) -> tuple[dict[str, float | None], dict[str, tuple[str, float]]]:
-        """Standard errors by the block sandwich, and correlations."""
+        """Standard errors from blocks of time, and correlations."""
         n = len(self.names)
         stderr: dict[str, float | None] = dict.fromkeys(self.values)
         if not n:
             return stderr, {}
-        predicted, jacobian = self._sensitivities()
-        gram, scores = np.zeros((n, n)), []
-        for w, y, j in zip(self.windows, predicted, jacobian, strict=True):
-            r = ((w.outputs - y) / self.sigma).ravel()
-            full = (j / self.sigma[:, None]).reshape(len(r), -1)
-            q = np.linalg.qr(full[:, n:] * self.spread)[0] if full.shape[1] > n else np.empty((len(r), 0))
-            theta = full[:, :n] - q @ (q.T @ full[:, :n])
-            gram += theta.T @ theta
-            block = np.repeat(np.floor((w.time - w.time[0]) / _BLOCK + 1e-9), w.outputs.shape[1])
-            scores += [theta[block == k].T @ r[block == k] for k in np.unique(block)]
-        scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-        inverse = np.linalg.pinv(gram / np.outer(scale, scale), rcond=1e-12)
-        s = np.array(scores) / scale
-        total = inverse @ (s.T @ s) @ inverse * len(s) / max(len(s) - 1, 1)
-        if len(s) < max(_FEW_BLOCKS, 3 * n):
-            rows = sum(w.outputs.size for w in self.windows)
-            total = inverse * self.cost() / max(rows - n, 1) * self._inflation()
-        spread = np.sqrt(np.maximum(np.diag(inverse), 1e-300))
-        together = inverse / np.outer(spread, spread)
-        np.fill_diagonal(together, 0.0)
+        parts, blocks, first = [], [], 0
+        for w, rows in zip(self.windows, self._problem().rows(self._x(), self.starts), strict=True):
+            starts = rows.shape[1] - n - 1
+            norms = np.linalg.norm(rows[:, :starts], axis=0)
+            q = np.linalg.qr(rows[:, :starts] / np.where(norms > 0, norms, 1.0))[0]
+            parts.append(rows[:, starts:] - q @ (q.T @ rows[:, starts:]))
+            block = first + np.floor((w.time - w.time[0]) / BLOCK + 1e-9).astype(np.int64)
+            blocks.append(np.repeat(block, w.outputs.shape[1]))
+            first = int(block[-1]) + 1
+        rows = np.concatenate(parts)
+        theta, r = rows[:, :n], rows[:, n]
+        spread, together = correlations(theta.T @ theta)
+        found = block_errors(theta, r, np.concatenate(blocks))
+        if found is None:
+            left = [(w.outputs - y) / self.sigma for w, y in zip(self.windows, self.predicted, strict=True)]
+            found = process_errors(theta, r, left)
         correlation = {}
         for i, name in enumerate(self.names):
-            error = math.sqrt(max(float(total[i, i]), 0.0)) / float(scale[i])
-            stderr[name] = error if spread[i] < 1e5 and math.isfinite(error) else None
+            error = float(found[i])
+            stderr[name] = error if spread[i] < _SPREAD and math.isfinite(error) else None
             if n > 1:
                 other = int(np.argmax(np.abs(together[i])))
                 correlation[name] = (self.names[other], float(together[i, other]))
         return stderr, correlation
 
 
-__all__ = ["Solver", "UserFit", "fit", "noise_of", "simulator_of"]
+__all__ = ["Outputs", "Solver", "UserFit", "fit", "noise_of", "simulator_of"]

@@ -213,6 +213,16 @@ def test_importing_does_not_pull_heavy_packages(module: str) -> None:
     assert json.loads(done.stdout) == []
 
 
+def test_importing_loads_no_optimiser_that_the_verbs_do_not_call() -> None:
+    rare = ("_mcs_search", "blackbox", "_prediction_error", "subspace", "recursive", "two_step", "fault", "output_error", "_compiler")
+    code = "import sys, json, identification; print(json.dumps([m for m in sys.modules if m.startswith(('identification.', 'scipy'))]))"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+    loaded = json.loads(done.stdout)
+    assert [m for m in loaded if m.removeprefix("identification.") in rare or m == "scipy.optimize"] == []
+    assert "identification.fit" in loaded
+
+
 def _hidden(file: Path) -> bool:
     return any(part.startswith(".") or part == "__pycache__" for part in file.relative_to(ROOT).parts)
 

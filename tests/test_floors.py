@@ -8,10 +8,10 @@ import pytest
 
 from identification import Record, fit
 from identification.assess import assess
+from identification.covariance import FEWEST_BLOCKS, block_errors
 from identification.engine import load_dataset, prepared_model
 from identification.excitation import attenuation, excitation_warnings
 from identification.noise import noise_level
-from identification.standard_errors import FEWEST_BLOCKS, block_errors
 from tests.test_other_payload import FAST, JOINT, record
 
 FloatArray = npt.NDArray[np.float64]
@@ -91,3 +91,18 @@ def test_what_noise_takes_off_an_inertia_is_said() -> None:
         assert error is not None
         assert abs(found - 3.0) < 3 * error
         assert any("link inertia by about" in w for w in excitation_warnings(data))
+
+
+def test_a_direction_that_one_block_alone_tells_of_does_not_spoil_the_errors_of_the_others() -> None:
+    rng = np.random.default_rng(5)
+    block = np.repeat(np.arange(20), 30)
+    jacobian = rng.standard_normal((len(block), 3))
+    jacobian[:, 2] = np.where(block == 7, jacobian[:, 2] + jacobian[:, 0], 0.0)
+    noise = rng.standard_normal(len(block))
+    found = np.linalg.lstsq(jacobian, noise, rcond=None)[0]
+    together = block_errors(jacobian, noise - jacobian @ found, block)
+    without = jacobian[:, :2]
+    alone = block_errors(without, noise - without @ np.linalg.lstsq(without, noise, rcond=None)[0], block)
+    assert together is not None
+    assert alone is not None
+    assert together[:2] == pytest.approx(alone, rel=0.3)

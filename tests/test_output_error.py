@@ -16,7 +16,7 @@ from casadi_models import JointModel
 from casadi_models.simulate import simulate
 from identification import InputError, Joint, Record, load_joint, read
 from identification.fit import Fit, fit
-from identification.output_error import Refinement, refine, schur
+from identification.output_error import Refinement, refine
 
 FloatArray = npt.NDArray[np.float64]
 SHARED = Path(__file__).resolve().parents[1].parent / "shared" / "hidden_effect"
@@ -103,21 +103,6 @@ def test_start_values_off_by_a_tenth_are_pulled_back() -> None:
     assert refined.cost_before > 2 * refined.cost_after
     for name in ("motor_inertia", "stiffness", "motor_coulomb"):
         assert refined.values[name] == pytest.approx(truth[name], rel=5e-3), name
-
-
-def test_schur_complement_solves_the_whole_least_squares_problem() -> None:
-    rng = np.random.default_rng(0)
-    windows, states, parameters, rows = 3, 2, 4, 12
-    blocks = rng.normal(size=(windows, rows, states + parameters + 1))
-    reduced, right, back, _ = schur(blocks.transpose(0, 2, 1) @ blocks, states)
-    step = np.linalg.solve(reduced, right)
-    whole = np.zeros((windows * rows, windows * states + parameters))
-    for w, b in enumerate(blocks):
-        whole[w * rows : (w + 1) * rows, w * states : (w + 1) * states] = b[:, :states]
-        whole[w * rows : (w + 1) * rows, windows * states :] = b[:, states:-1]
-    exact = np.linalg.lstsq(whole, blocks[:, :, -1].ravel())[0]
-    assert step == pytest.approx(exact[-parameters:], rel=1e-8)
-    assert (back[:, :, -1] - back[:, :, :-1] @ step).ravel() == pytest.approx(exact[:-parameters], rel=1e-8)
 
 
 def test_internal_states_are_refused() -> None:

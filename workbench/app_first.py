@@ -9,8 +9,9 @@ from typing import Final
 from casadi_models import JointModel
 from casadi_models.term import HANGING, LOAD_COMPLIANCE
 from identification.balances import balances_of
-from identification.engine import Dataset, Solution, gauss_newton, memory_shapes_of
+from identification.engine import Dataset, Solution
 from identification.start_values import bounds_of, starts
+from identification.weak_form import WeakForm
 
 STEPS: Final = 2
 STEPS_MEMORY: Final = 1
@@ -46,7 +47,7 @@ def first_look(model: JointModel, data: Dataset, now: Solution, start: Mapping[s
         values[n] = min(max(values[n], limits[n][0]), limits[n][1])
     balances = balances_of(model, data.sensing, wrt=free)
     steps = STEPS_MEMORY if model.equations.memory_terms else STEPS
-    values, used = gauss_newton(balances, data, values, free, limits, now.sigma, now.weights, steps, memory_shapes_of(model, free))
+    values, used = WeakForm(balances, data, values, tuple(free), now.weights).fitted(limits, steps)
     kept = {k: float(v) for k, v in values.items()}
     return Solution(replace(model, values=kept), kept, dict.fromkeys(kept), tuple(free), now.weights, now.sigma, iterations=used)
 

@@ -1,0 +1,172 @@
+"""The one covariance behind every "+-": from blocks of time, honest with few blocks too."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+FEWEST_BLOCKS: Final = 4
+"""Blocks below which their scatter says nothing."""
+BLOCK: Final = 1.5
+"""Length of a block [s]: some periods of the slowest modes of a joint, after which errors of a model count as independent."""
+RANK: Final = 1e-12
+"""Share of the largest information, columns scaled alike, below which a direction is rounding."""
+LEAST: Final = 1e-3
+"""Share of the information on a direction that must be left without a block: less, and that block alone tells of it (friction
+at the one reversal of a record).  Its scatter can say nothing there, and the other parameters do not hang on it."""
+HALF: Final = 0.5
+"""Share of a parameter's variance in such a direction from which on the parameter is the one that a single block tells of."""
+MOST_TIED: Final = 0.999
+"""Largest correlation of neighbouring samples that a short record can tell from 1."""
+NORMAL: Final = 1.959964
+"""The normal distribution's bound of 95 %."""
+
+
+def block_errors(jacobian: FloatArray, residual: FloatArray, block: IntArray) -> FloatArray | None:
+    """Standard error of each parameter of a least-squares fit whose rows depend on each other within blocks.
+
+    The leave-one-block-out form of the sandwich (Bell and McCaffrey 2002, Survey Methodology 28:169), widened by the
+    ratio of Student's t over blocks - 1 degrees of freedom to the normal at 95 %: twice the error is a 95 % band.
+
+    Parameters
+    ----------
+    jacobian : (n, p) array
+        Weighted, in any scale of its columns.
+    residual : (n,) array
+        Weighted, at the fit.
+    block : (n,) int array
+        Block of each row, -1 for none: such rows take part in the fit only.
+
+    Returns
+    -------
+    (p,) array, or None with fewer than `FEWEST_BLOCKS` blocks.
+    """
+    numbers = np.unique(block[block >= 0])
+    if len(numbers) < FEWEST_BLOCKS:
+        return None
+    order = np.argsort(block, kind="stable")
+    parts = np.split(order, np.searchsorted(block[order], numbers))[1:]
+    grams = np.array([jacobian[rows].T @ jacobian[rows] for rows in parts])
+    scores = np.array([jacobian[rows].T @ residual[rows] for rows in parts])
+    return errors_of_blocks(grams, scores, jacobian.T @ jacobian)
+
+
+def errors_of_blocks(
+    grams: FloatArray, scores: FloatArray, whole: FloatArray | None = None
+) -> FloatArray | None:
+    """The same from what each block adds to the normal equations.
+
+    Parameters
+    ----------
+    grams : (blocks, p, p) array
+        Products of the columns within each block; unknowns of the block alone eliminated.
+    scores : (blocks, p) array
+        Products of the columns with the residual.
+    whole : (p, p) array, optional
+        Normal matrix of all rows, where some belong to no block; the sum of `grams` otherwise.
+
+    Returns
+    -------
+    (p,) array, or None with fewer than `FEWEST_BLOCKS` blocks.
+    """
+    from scipy.special import stdtrit
+
+    count = len(grams)
+    if count < FEWEST_BLOCKS:
+        return None
+    total = grams.sum(axis=0) if whole is None else whole
+    size = np.sqrt(np.maximum(np.diag(total), 0.0))
+    size = np.where(size > 0, size, 1.0)
+    scaled, pushed = total / np.outer(size, size), scores / size
+    left = np.linalg.pinv(scaled - grams / np.outer(size, size), rcond=RANK, hermitian=True)
+    shifts = np.einsum("bij,bj->bi", left, pushed)
+    value, vector = np.linalg.eigh(scaled)
+    white = vector[:, value > RANK * value[-1]] / np.sqrt(value[value > RANK * value[-1]])
+    spread = np.maximum(np.sum(white**2, axis=1), 1e-300)
+    for b in np.flatnonzero(
+        np.einsum("bii->b", grams / np.outer(size, size) @ (white @ white.T)) > 1 - LEAST
+    ):
+        kept, direction = np.linalg.eigh(
+            np.eye(white.shape[1]) - white.T @ (grams[b] / np.outer(size, size)) @ white
+        )
+        alone = kept < LEAST
+        if not alone.any():
+            continue
+        rest = direction[:, ~alone]
+        shift = white @ (rest @ ((rest.T @ (white.T @ pushed[b])) / kept[~alone]))
+        own = np.sum((white @ direction[:, alone]) ** 2, axis=1) / spread
+        shifts[b] = np.where(own > HALF, shifts[b], shift)
+    covariance = shifts.T @ shifts * (count - 1) / count
+    wider = float(stdtrit(count - 1, 0.975)) / NORMAL
+    return np.asarray(
+        np.sqrt(np.maximum(np.diag(covariance), 0.0)) * wider / size, dtype=np.float64
+    )
+
+
+def process_errors(jacobian: FloatArray, residual: FloatArray, series: Sequence[FloatArray]) -> FloatArray:
+    """Standard errors where a record is too short for blocks: the residual counts as a process of first order.
+
+    Parameters
+    ----------
+    jacobian, residual : (n, p) and (n,) arrays
+        Weighted.
+    series : sequence of (samples, outputs) arrays
+        The residual in the order of time, each without a gap: their correlation from one sample to the next says how many
+        rows count as one (sum of the geometric series).
+    """
+    top = sum(float(np.sum(r[1:] * r[:-1])) for r in series)
+    bottom = sum(float(np.sum(r**2)) for r in series)
+    rho = min(max(top / bottom if bottom > 0 else 0.0, 0.0), MOST_TIED)
+    gram = jacobian.T @ jacobian
+    size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    inverse = np.linalg.pinv(gram / np.outer(size, size), rcond=RANK)
+    variance = float(residual @ residual) / max(len(residual) - len(gram), 1) * (1 + rho) / (1 - rho)
+    return np.asarray(np.sqrt(np.maximum(np.diag(inverse), 0.0) * variance) / size, dtype=np.float64)
+
+
+def correlations(gram: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """How far each parameter is tied to the others.
+
+    Parameters
+    ----------
+    gram : (p, p) array
+        Normal matrix.
+
+    Returns
+    -------
+    spread : (p,) array
+        Standard deviation in units of the one that the column alone would have: 1 where it is orthogonal to all others.
+    together : (p, p) array
+        Correlations, zero on the diagonal.
+    """
+    size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    inverse = np.linalg.pinv(gram / np.outer(size, size), rcond=RANK)
+    spread = np.sqrt(np.maximum(np.diag(inverse), 1e-300))
+    together = np.asarray(inverse / np.outer(spread, spread), dtype=np.float64)
+    np.fill_diagonal(together, 0.0)
+    return np.asarray(spread, dtype=np.float64), together
+
+
+def block_numbers(time: FloatArray, length: float) -> IntArray:
+    """Number of the block of each instant: a new one after `length`, and where the time jumps back (another record).
+
+    Parameters
+    ----------
+    time : (n,) array
+        Start of each window, record after record [s].
+    length : float
+        Length of a block [s].
+    """
+    numbers = np.zeros(len(time), dtype=np.int64)
+    begun = time[0] if len(time) else 0.0
+    for k in range(1, len(time)):
+        new = time[k] < time[k - 1] or time[k] - begun >= length * (1 - 1e-9)
+        numbers[k] = numbers[k - 1] + new
+        begun = time[k] if new else begun
+    return numbers
