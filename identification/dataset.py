@@ -27,6 +27,8 @@ CLAIM_KERNEL: Final = 0.06
 ONE_SIDED_KERNEL: Final = 0.2
 LINK_BALANCES: Final = frozenset({"link", "sum", "axis"})
 POINTWISE_KERNELS: Final = (0.01, 0.014, 0.02, 0.03)
+STILL: Final = 3.0
+"""Pointwise speed of a side at rest, in standard deviations of its noise: 0.3 % of samples at rest lie above."""
 VELOCITY_NOISE: Final = 2e-3
 """Noise of a pointwise velocity, as a share of the record's speed, that is small enough."""
 
@@ -60,6 +62,12 @@ class Dataset:
     def kernel(self) -> float:
         """Kernel length of the balances [s]."""
         return self.train[0].grid.length
+
+    def at_rest(self, records: Sequence[WeakRecord] | None = None) -> float:
+        """Share of the rows (of all records by default) that are at rest in some balance and left out of it."""
+        chosen = (*self.train, *self.held_out) if records is None else tuple(records)
+        left = sum(int(np.any([w.resting(b) for b in self.sensing.balances if b not in w.masked], axis=0).sum()) for w in chosen)
+        return left / max(sum(w.rows for w in chosen), 1)
 
     @property
     def blocks(self) -> int:
@@ -98,6 +106,9 @@ def load_dataset(
                 f"{held_out[0].name}: every held-out record has another payload than {train[0].name}, so none shows the {balance} balance; "
                 "give a held-out record with the same payload"
             )
+        at_rest = [not made.taking(balance).any() for made in prepared[count:] if balance not in made.masked]
+        if at_rest and all(at_rest):
+            raise InputError(f"{held_out[0].name}: the joint stands still in every held-out record; give one in which it moves")
     signals = [signals_of(r, joint, sensing) for r in train]
     names = {c for s in signals for c in s if c in POSITION_CHAINS}
     noise = {c: float(np.median([noise_level(s[c], tuple(r.segments()), r.time) for s, r in zip(signals, train, strict=True)])) for c in names}
@@ -136,9 +147,38 @@ def weak_record(record: Record, joint: Joint, sensing: Sensing, length: float, f
         pointwise={c: pointwise_kernel(signals[c], segments, record.dt, longest, level) for c, level in noise.items()},
         curved=curved,
     )  # fmt: skip
+    made = _with_rests(made, noise)
     if made.rows < 8:
         raise InputError(f"{record.name}: {len(record)} samples in {record.duration:.3g} s are too few for a kernel of {length:.3g} s; give a longer record")
     return made
+
+
+def _with_rests(made: WeakRecord, noise: Mapping[str, float]) -> WeakRecord:
+    """The record with the kernel average, for each row, of the flag "this side stands still".
+
+    A side stands still where its pointwise speed stays within its noise for at least one kernel of that speed: a reversal is
+    shorter, and is kept, because it shows friction at low speed. Laws with memory follow a straight line through a rest: the
+    noise of a position that stands still would wear their state down, since they count every step, whatever its sign.
+    """
+    out: dict[str, FloatArray] = {}
+    smooth = dict(made.smooth)
+    for side in ("motor", "link"):
+        source = f"{side}_position"
+        if source not in noise:
+            continue
+        slow = np.abs(made.points[f"{side}_velocity"]) <= STILL * noise[source] * made.grid.velocity_gain(source)
+        shortest = max(1, round(made.grid.pointwise[source] / (made.grid.step * made.grid.dt)))
+        still, held = np.zeros(len(slow)), made.smooth[source].copy()
+        for first, last in zip(made.starts[:-1], made.starts[1:], strict=True):
+            edges = np.flatnonzero(np.diff(np.concatenate([[False], slow[first:last], [False]])))
+            for begin, end in edges.reshape(-1, 2):
+                if end - begin >= shortest:
+                    rows = slice(first + begin, first + end)
+                    still[rows] = 1.0
+                    held[rows] = np.linspace(held[rows.start], held[rows.stop - 1], end - begin)
+        smooth[source] = held
+        out[side] = made.average(still) if still.any() else np.zeros(made.rows)
+    return replace(made, rest=out, smooth=smooth)
 
 
 def pointwise_kernel(position: FloatArray, segments: tuple[slice, ...], dt: float, longest: float, noise: float) -> float:

@@ -6,9 +6,10 @@ import math
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 
 from identification.dataset import Dataset
-from identification.weak import differentiated_kernel
+from identification.weak import REST_SHARE, WeakRecord, differentiated_kernel
 
 ATTENUATION: Final = 0.02
 """Pull of a parameter towards zero that is worth a word."""
@@ -18,6 +19,15 @@ FEWEST_REVERSALS: Final = 4
 
 DEGREES_LIKE: Final = 2.0
 """Factor around 180/pi within which two records' motions look like one in degrees and one in radians."""
+
+
+REST_WORTH: Final = 0.01
+"""Share of rows at rest that is worth a word."""
+
+
+def rest_note(share: float) -> str:
+    """What is said about rows at rest; empty where they are too few."""
+    return f"{100 * share:.0f} % of the rows are at rest and left out" if share >= REST_WORTH else ""
 
 
 def not_identifiable(data: Dataset) -> str:
@@ -42,6 +52,9 @@ def excitation_warnings(data: Dataset) -> tuple[str, ...]:
     unlike = unlike_units(data)
     if unlike:
         out.append(unlike)
+    still = rest_note(data.at_rest())
+    if still:
+        out.append(still)
     few = few_reversals(data)
     if few:
         out.append(f"{few}: friction cannot be told from offsets; record more reversals")
@@ -94,6 +107,13 @@ def attenuation(data: Dataset) -> dict[str, float]:
     for side in ("motor", "link"):
         if f"{side}_position" in data.noise:
             noise = float(np.sum(differentiated_kernel(grid.length, grid.dt, 2) ** 2)) * data.noise[f"{side}_position"] ** 2
-            power = float(np.var(np.concatenate([w.averaged[f"{side}_acceleration"] for w in data.train])))
+            power = float(np.var(np.concatenate([_moving(w, side) for w in data.train])))
             out[f"{side} inertia"] = noise / max(power, 1e-300)
     return out
+
+
+def _moving(record: WeakRecord, side: str) -> npt.NDArray[np.float64]:
+    """Averaged acceleration of a side in the rows in which it does not stand still; one zero where it never moves."""
+    values = record.averaged[f"{side}_acceleration"]
+    moving = values[record.rest[side] <= REST_SHARE] if side in record.rest else values
+    return moving if len(moving) else np.zeros(1)
