@@ -15,7 +15,8 @@ from identification.joint_file import Joint
 from identification.noise import noise_level
 from identification.record import Record
 from identification.sensing import Sensing, adapt, check_alike, sense, signals_of
-from identification.weak import POSITION_CHAINS, WeakRecord, kernel, prepare
+from identification.stamps import evened
+from identification.weak import CLAIM_KERNEL, KERNEL_SAMPLES, POSITION_CHAINS, WeakRecord, differentiated_kernel, kernel, prepare
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -23,7 +24,6 @@ HOLD_DELAY: Final = "channel_delay@drive#0"
 """In every model with a commanded drive: the hold of the logged command is not an effect, but a nuisance of at most a sample."""
 HOLD_NAME: Final = "drive_delay_0"
 _DRIVE_DELAY: Final = "channel_delay@drive"
-CLAIM_KERNEL: Final = 0.06
 ONE_SIDED_KERNEL: Final = 0.2
 LINK_BALANCES: Final = frozenset({"link", "sum", "axis"})
 POINTWISE_KERNELS: Final = (0.01, 0.014, 0.02, 0.03)
@@ -109,9 +109,8 @@ def load_dataset(
         at_rest = [not made.taking(balance).any() for made in prepared[count:] if balance not in made.masked]
         if at_rest and all(at_rest):
             raise InputError(f"{held_out[0].name}: the joint stands still in every held-out record; give one in which it moves")
-    signals = [signals_of(r, joint, sensing) for r in train]
-    names = {c for s in signals for c in s if c in POSITION_CHAINS}
-    noise = {c: float(np.median([noise_level(s[c], tuple(r.segments()), r.time) for s, r in zip(signals, train, strict=True)])) for c in names}
+    levels = [measured_noise(r, joint, sensing) for r in train]
+    noise = {c: float(np.median([level[c] for level in levels])) for c in levels[0]}
     return Dataset(
         joint, sensing, tuple(prepared[:count]), tuple(prepared[count:]), _ranges(prepared[:count], model.clamped_link), noise,
         tuple(r.name for r in train), tuple(r.name for r in held_out),
@@ -133,14 +132,10 @@ def seen_from_the_motor(sensing: Sensing, joint: Joint) -> bool:
 
 def weak_record(record: Record, joint: Joint, sensing: Sensing, length: float, first_block: int = 0, *, curved: bool = False) -> WeakRecord:
     """One record, resampled to uniform time where needed, averaged with the kernel."""
-    steps = np.diff(record.time)
-    inside = np.diff(record.segment) == 0
+    noise = measured_noise(record, joint, sensing)
+    record = evened(record)
     signals, segments = signals_of(record, joint, sensing), tuple(record.segments())
-    noise = {c: noise_level(x, segments, record.time) for c, x in signals.items() if c in POSITION_CHAINS}
-    if inside.any() and np.ptp(steps[inside]) > 0.02 * float(np.median(steps[inside])):
-        record = record.resampled()
-        signals, segments = signals_of(record, joint, sensing), tuple(record.segments())
-    length = max(length, 8 * record.dt)
+    length = max(length, KERNEL_SAMPLES * record.dt)
     longest = length / 2 if length <= CLAIM_KERNEL else 0.06
     made = prepare(
         record.time, signals, segments, length=length, first_block=first_block,
@@ -148,6 +143,8 @@ def weak_record(record: Record, joint: Joint, sensing: Sensing, length: float, f
         curved=curved,
     )  # fmt: skip
     made = _with_rests(made, noise)
+    if record.measured is not None and not record.measured.all():
+        made = replace(made, support=made.grid.correlate(record.measured.astype(float), differentiated_kernel(made.grid.length, made.grid.dt, 0)))
     if made.rows < 8:
         raise InputError(f"{record.name}: {len(record)} samples in {record.duration:.3g} s are too few for a kernel of {length:.3g} s; give a longer record")
     return made
@@ -179,6 +176,17 @@ def _with_rests(made: WeakRecord, noise: Mapping[str, float]) -> WeakRecord:
         smooth[source] = held
         out[side] = made.average(still) if still.any() else np.zeros(made.rows)
     return replace(made, rest=out, smooth=smooth)
+
+
+def measured_noise(record: Record, joint: Joint, sensing: Sensing) -> dict[str, float]:
+    """White-noise level of each measured signal, from samples that were measured: bridges are smoother than a reading."""
+    segments = tuple(record.segments())
+    time, signals = record.time, signals_of(record, joint, sensing)
+    if record.measured is not None and not record.measured.all():
+        edges = np.concatenate([[0], np.cumsum([int(record.measured[s].sum()) for s in segments])]).tolist()
+        segments = tuple(slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True))
+        time, signals = time[record.measured], {c: x[record.measured] for c, x in signals.items()}
+    return {c: noise_level(x, segments, time) for c, x in signals.items() if c in POSITION_CHAINS}
 
 
 def pointwise_kernel(position: FloatArray, segments: tuple[slice, ...], dt: float, longest: float, noise: float) -> float:

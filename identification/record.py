@@ -86,6 +86,8 @@ class Record:
         transmission's parameters, not the link's.
     age : (n,) ndarray, optional
         Time since the run of each sample began [s], for a record that was cut off a longer one (see `run_age`).
+    measured : (n,) ndarray of bool, optional
+        False for a sample that was lost and bridged from its neighbours.
 
     Raises
     ------
@@ -101,6 +103,7 @@ class Record:
     provenance: Provenance = field(default_factory=Provenance)
     payload: str = ""
     age: FloatArray | None = None
+    measured: npt.NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
         time = np.ascontiguousarray(self.time, dtype=np.float64)
@@ -117,13 +120,15 @@ class Record:
         channel_unit("time", self.kind)
         if self.age is not None and self.age.shape != time.shape:
             raise InputError(f"record {self.name!r}: age has shape {self.age.shape}, time has {time.shape}")
+        if self.measured is not None and self.measured.shape != time.shape:
+            raise InputError(f"record {self.name!r}: measured has shape {self.measured.shape}, time has {time.shape}")
         object.__setattr__(self, "time", _readonly(time))
         object.__setattr__(self, "segment", segment)
         object.__setattr__(self, "channels", MappingProxyType(channels))
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle by value: records travel to worker processes."""
-        return Record, (self.name, self.kind, self.time, dict(self.channels), self.segment, self.provenance, self.payload, self.age)
+        return Record, (self.name, self.kind, self.time, dict(self.channels), self.segment, self.provenance, self.payload, self.age, self.measured)
 
     @classmethod
     def from_channels(
@@ -224,6 +229,7 @@ class Record:
             channels={key: values[selector] for key, values in self.channels.items()},
             segment=segment,
             age=None if self.age is None else self.age[selector],
+            measured=None if self.measured is None else self.measured[selector],
             provenance=self.provenance.noted(*notes),
         )
 
@@ -329,8 +335,16 @@ class Record:
             channels=channels,
             segment=np.concatenate(segments),
             age=None if self.age is None else np.concatenate([np.interp(t, self.time[p], self.age[p]) for t, p in zip(times, self.segments(), strict=True)]),
+            measured=self._resampled_flags(times),
             provenance=self.provenance.noted(note),
         )
+
+    def _resampled_flags(self, times: Sequence[FloatArray]) -> npt.NDArray[np.bool_] | None:
+        """Which of the new samples lie between samples that were measured."""
+        if self.measured is None:
+            return None
+        flags = self.measured.astype(np.float64)
+        return np.concatenate([np.interp(t, self.time[p], flags[p]) for t, p in zip(times, self.segments(), strict=True)]) > 0.5
 
     def _repr_html_(self) -> str:
         from identification.formats import pretty_unit, value_range
@@ -397,4 +411,7 @@ def concat(records: Sequence[Record], name: str | None = None) -> Record:
             tuple(notes),
         ),
         age=None if all(record.age is None for record in records) else np.concatenate([record.run_age() for record in records]),
+        measured=None if all(record.measured is None for record in records) else np.concatenate([
+            np.ones(len(record), dtype=np.bool_) if record.measured is None else record.measured for record in records
+        ]),
     )

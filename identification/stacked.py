@@ -121,8 +121,10 @@ def row_weights(
     here = stack(bare, records, values).residual
     there = stack(bare, records, doubled).residual if names else here
     either = _either_way(balances.model, data, values, records)
+    # a row of which samples were lost averages fewer of them: its variance grows with one over what is left
+    support = np.sqrt(np.concatenate([np.ones(w.rows) if w.support is None else w.support for w in records]))
     return {
-        b: 1 / np.sqrt(sigma[b] ** 2 + (here[b] - there[b]) ** 2 / 4 + either[b] ** 2) for b in here
+        b: support / np.sqrt(sigma[b] ** 2 + (here[b] - there[b]) ** 2 / 4 + either[b] ** 2) for b in here
     }  # fmt: skip
 
 

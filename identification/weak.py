@@ -28,6 +28,10 @@ POSITION_CHAINS: Final = {
 """Measured signals and the signals that follow from them by derivatives."""
 
 HIGHEST_DERIVATIVE: Final = 4
+CLAIM_KERNEL: Final = 0.06
+"""Length of the balances' kernel [s]."""
+KERNEL_SAMPLES: Final = 8
+"""Samples that a kernel has at least, however slow the logger."""
 
 RESTING_SIDES: Final[Mapping[str, tuple[str, ...]]] = {
     "motor": ("motor",), "deflection": ("motor",), "link": ("link",), "sum": ("motor", "link"), "axis": ("motor", "link"),
@@ -35,6 +39,8 @@ RESTING_SIDES: Final[Mapping[str, tuple[str, ...]]] = {
 """Sides whose dry friction acts in a balance. At rest it is any torque up to its limit: such a row is an inequality, no equation.
 The transmission has no friction against the ground."""
 
+LEAST_SUPPORT: Final = 0.5
+"""Share of a row's kernel that must have been measured: with less, the row is more cubic than record."""
 REST_SHARE: Final = 0.01
 """Share of a row's kernel that may be at rest: a choice. At 1 % the unknown friction of the rest weighs a hundredth of its limit in
 the row, which is what noise leaves of it elsewhere; the kernels taper, so that only rows whose edge touches a rest are near it."""
@@ -176,6 +182,8 @@ class WeakRecord:
         Second derivative of the average of every signal where it was asked for.
     rest : mapping of str to (rows,) array
         Kernel average of "this side stands still" (0 to 1), by side: motor, link.
+    support : (rows,) array, optional
+        Share of each row's kernel that was measured and not bridged; 1 everywhere where it is None.
     """
 
     grid: Grid
@@ -188,12 +196,14 @@ class WeakRecord:
     masked: frozenset[str] = frozenset()
     curved: Mapping[str, FloatArray] = field(default_factory=dict)
     rest: Mapping[str, FloatArray] = field(default_factory=dict)
+    support: FloatArray | None = None
 
     def taking(self, balance: str) -> npt.NDArray[np.bool_]:
         """Rows that take part in a balance, shape (rows,): the one mask of every fit, error, line and picture."""
         if balance in self.masked:
             return np.zeros(self.rows, dtype=np.bool_)
-        return ~self.resting(balance)
+        lost = self.support < LEAST_SUPPORT if self.support is not None else False
+        return ~(self.resting(balance) | lost)
 
     def resting(self, balance: str) -> npt.NDArray[np.bool_]:
         """Rows in which a side whose dry friction acts in the balance stands still, shape (rows,)."""

@@ -130,8 +130,18 @@ def plan_jobs(options: argparse.Namespace, cache: Path) -> list[Job]:
         cases += [("outside", e, options.start + s) for e in OUTSIDE for s in range(options.outside)]
     return [
         Job(
-            group, effect, seed, options.size, options.dirt, torque_sensor, options.one_sided, cache, options.entry, options.records,
-            options.every, options.rests,
+            group,
+            effect,
+            seed,
+            options.size,
+            options.dirt,
+            torque_sensor,
+            options.one_sided,
+            cache,
+            options.entry,
+            options.records,
+            options.every,
+            options.rests,
         )
         for group, effect, seed in cases
     ]

@@ -62,9 +62,7 @@ def multisine(rng: np.random.Generator, rows: int, dt: float) -> tuple[FloatArra
     return scale * (position - middle), scale * velocity
 
 
-def with_rests(
-    rng: np.random.Generator, reference: tuple[FloatArray, FloatArray], dt: float, share: float
-) -> tuple[FloatArray, FloatArray]:
+def with_rests(rng: np.random.Generator, reference: tuple[FloatArray, FloatArray], dt: float, share: float) -> tuple[FloatArray, FloatArray]:
     """The same path with stops: slowed down to a standstill in 0.15 s, held for 0.6 to 3 s, started again.
 
     Stops fill about `share` of the time, the last one ends the record; the path is cut where the time is up.
