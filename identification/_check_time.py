@@ -63,8 +63,7 @@ def check_stamps(record: Record) -> list[Finding]:
         message = f"{record.name}: {100 * share:.0f} % of the stamps repeat the one before, first at {at(record, row)}: write time with more digits"
         return [Finding("refuse", "time_repeated", message, "time", row)]
     message = (
-        f"{record.name}: {repeated.size} repeated stamp(s), first at {at(record, row)}: frames written twice are dropped, "
-        f"others get the time of their slot"
+        f"{record.name}: {repeated.size} repeated stamp(s), first at {at(record, row)}: frames written twice are dropped, others get the time of their slot"
     )
     return [Finding("repair", "time_repeated", message, "time", row)]
 
@@ -117,11 +116,11 @@ def _lost(record: Record, slots: Slots) -> list[Finding]:
     most = longest_hole(slots.period)
     cut = missing > most
     row, count = int(rows[0]), int(missing.sum())
-    share = 100.0 * count / (len(record) + count)
+    share = 100.0 * float(missing[~cut].sum()) / (len(record) + count)
     message = f"{record.name}: {rows.size} gap(s), the first before {at(record, row)}, about {count} samples missing in all: "
     if cut.all():
         message += "the record is split there"
     else:
-        message += f"{share:.2g} % lost, bridged by cubics; bridged samples do not count"
+        message += f"{share:.2g} % of the record is bridged by cubics, which does not count as measured"
         message += f"; the record is split at {int(cut.sum())} gap(s) of over {most} samples" if cut.any() else ""
     return [Finding("repair", "gap", message, "time", row)]

@@ -98,7 +98,9 @@ def compare(fitted: Fit, records: Record | Sequence[Record], *, linear: bool = T
     time = np.concatenate([w.time for w in data.train])
     sigma = {b: max(error.balances[b].floor, 1e-12) for b in residual}
     power = sum((residual[b] / sigma[b]) ** 2 for b in residual)
-    worst = _worst(time, np.asarray(power))
+    counts = np.cumsum([0, *(int(w.stretch.max(initial=0)) + 1 for w in data.train)])
+    stretch = np.concatenate([w.stretch + first for w, first in zip(data.train, counts[:-1], strict=True)])
+    worst = _worst(time, np.asarray(power), stretch)
     unseen = not any(_same(r, seen) for r in given for seen in fitted.records)
     floor = {b: e.floor for b, e in error.balances.items()}
     above = ceiling(fitted.data, data.train, residual, floor, unseen=unseen) if linear else None
@@ -117,12 +119,15 @@ def _same(one: Record, other: Record) -> bool:
     return len(one) == len(other) and bool(np.array_equal(one.time[[0, -1]], other.time[[0, -1]]))
 
 
-def _worst(time: FloatArray, power: FloatArray) -> tuple[float, float]:
+def _worst(time: FloatArray, power: FloatArray, stretch: npt.NDArray[np.int64]) -> tuple[float, float]:
+    """Start and end of the second with the largest residual; it does not reach over a hole or from one run into the next."""
     if len(time) < 2:
         return float(time[0]), float(time[0])
     step = float(np.median(np.diff(time)))
     width = max(1, min(len(power), round(1.0 / max(step, 1e-9))))
-    k = int(np.argmax(np.convolve(power, np.ones(width), "valid")))
+    whole = stretch[: len(power) - width + 1] == stretch[width - 1 :]
+    summed = np.convolve(power, np.ones(width), "valid")
+    k = int(np.argmax(np.where(whole, summed, -1.0) if whole.any() else summed))
     return float(time[k]), float(time[min(k + width, len(time) - 1)])
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, Any, Final, final
 
 import numpy as np
 import numpy.typing as npt
@@ -54,6 +54,28 @@ def _readonly(values: FloatArray) -> FloatArray:
     view = values.view()
     view.flags.writeable = False
     return view
+
+
+NEAR_START: Final = 10
+"""Median steps within which a run must begin where the one before began, for a stamp that goes back to mean a new run."""
+
+
+def _restarts(time: FloatArray) -> IntArray:
+    """Number of the run of each sample: a run begins where time goes back to where the run before began."""
+    out = np.zeros(time.shape, dtype=np.int64)
+    if time.ndim != 1 or time.size < 2:
+        return out
+    steps = np.diff(time)
+    back = np.flatnonzero(steps < 0.0) + 1
+    if not back.size:
+        return out
+    near = NEAR_START * float(np.nanmedian(np.abs(steps)))
+    start = 0
+    for row in back.tolist():
+        if abs(time[row] - time[start]) <= near and row - start > NEAR_START:
+            out[row:] += 1
+            start = row
+    return out
 
 
 def _renumbered(segment: IntArray) -> IntArray:
@@ -140,7 +162,7 @@ class Record:
         kind: str = "rotary",
         provenance: Provenance | None = None,
     ) -> Record:
-        """Make a record from arrays in SI; a ``run`` channel cuts it into segments.
+        """Make a record from arrays in SI; a ``run`` channel, and time that starts again, cut it into segments.
 
         Parameters
         ----------
@@ -157,6 +179,7 @@ class Record:
         run = arrays.get("run")
         if run is not None and run.size > 1 and run.shape == stamps.shape:
             segment[1:] = np.cumsum(np.diff(run) != 0.0)
+        segment = segment + _restarts(stamps)
         return cls(name, kind, stamps, arrays, segment, provenance or Provenance())
 
     def __len__(self) -> int:
@@ -411,7 +434,7 @@ def concat(records: Sequence[Record], name: str | None = None) -> Record:
             tuple(notes),
         ),
         age=None if all(record.age is None for record in records) else np.concatenate([record.run_age() for record in records]),
-        measured=None if all(record.measured is None for record in records) else np.concatenate([
-            np.ones(len(record), dtype=np.bool_) if record.measured is None else record.measured for record in records
-        ]),
+        measured=None
+        if all(record.measured is None for record in records)
+        else np.concatenate([np.ones(len(record), dtype=np.bool_) if record.measured is None else record.measured for record in records]),
     )
