@@ -38,6 +38,10 @@ AROUND: Final = 25
 """Samples on either side whose median tells a repeated stamp from a surplus row: a fifth of repeated stamps leaves it alone."""
 ALONE: Final = 1.5
 """Steps, in medians, up to which no sample is missing."""
+REGULAR: Final = 0.2
+"""Deviation of nine steps in ten from the median, in medians, below which a step of one and a half is a hole."""
+MADE_GOOD: Final = -0.2
+"""Correlation of neighbouring steps: -0.5 for a clock whose stamps are late by chance, 0 for steps drawn one by one."""
 PAUSE: Final = 5.0
 """Periods from which a step is a hole where the slots cannot be told: six deviations of a jitter of 0.7 periods."""
 SAMPLES: Final = 6
@@ -111,7 +115,7 @@ def slots_of(record: Record) -> Slots | None:
     guesses = (usual, float(np.mean(positive[positive <= ALONE * usual])))
     period = max((_period(longest, guess) for guess in guesses), key=lambda guess: _coherence(longest, guess))
     again = _same_as_before(record)
-    found = [_in_stretches(record.time[part], period, again[part]) for part in parts]
+    found = [None if _wanders(longest, period) else _in_stretches(record.time[part], period, again[part]) for part in parts]
     told = all(f is not None for f in found)
     if not told:
         period = usual
@@ -144,6 +148,16 @@ def _local_phasor(time: FloatArray, period: float) -> npt.NDArray[np.complex128]
     window = np.ones(min(LOCAL, len(time)))
     around = np.convolve(np.ones(len(time)), window, "same")
     return np.asarray(np.convolve(np.exp(2j * np.pi * (time - time[0]) / period), window, "same") / around)
+
+
+def _wanders(time: FloatArray, period: float) -> bool:
+    """True where the steps are drawn one by one, as by a loop that waits: a late step is not made good by an early one."""
+    off = np.diff(time) / period - 1.0
+    both = (np.abs(off[1:]) < 0.5) & (np.abs(off[:-1]) < 0.5)
+    first, second = off[:-1][both], off[1:][both]
+    if first.size < LOCAL or float(np.std(first)) <= EVEN / 2:
+        return False
+    return float(np.corrcoef(first, second)[0, 1]) > MADE_GOOD
 
 
 def _coherence(time: FloatArray, period: float) -> float:
@@ -210,9 +224,12 @@ def _surplus(time: FloatArray, ahead: FloatArray) -> BoolArray:
 def _from_stamps(time: FloatArray, period: float) -> tuple[IntArray, FloatArray]:
     """Slot numbers where stamps scatter, a sample each with holes only at steps that no jitter makes; and how far steps are off."""
     steps = np.diff(time) / period
-    missing = np.where(steps > PAUSE, np.round(steps) - 1.0, 0.0)
+    positive = steps[steps > 0.0]
+    spread = float(np.quantile(np.abs(positive - 1.0), 0.9)) if positive.size else 1.0
+    limit = ALONE if spread < REGULAR else PAUSE
+    missing = np.where(steps > limit, np.round(steps) - 1.0, 0.0)
     number = np.concatenate([[0.0], np.cumsum((steps > 0.0) + missing)]).astype(np.int64)
-    return number, np.concatenate([[0.0], np.where(steps > PAUSE, 0.0, np.abs(steps - 1.0))])
+    return number, np.concatenate([[0.0], np.where(steps > limit, 0.0, np.abs(steps - 1.0))])
 
 
 def _smoother(record: Record, slots: Slots, even: FloatArray) -> bool:

@@ -203,7 +203,7 @@ class WeakRecord:
         if balance in self.masked:
             return np.zeros(self.rows, dtype=np.bool_)
         lost = self.support < LEAST_SUPPORT if self.support is not None else False
-        return ~(self.resting(balance) | lost)
+        return np.asarray(~(self.resting(balance) | lost))
 
     def resting(self, balance: str) -> npt.NDArray[np.bool_]:
         """Rows in which a side whose dry friction acts in the balance stands still, shape (rows,)."""
@@ -223,7 +223,7 @@ class WeakRecord:
     @property
     def begins(self) -> npt.NDArray[np.bool_]:
         """Rows that begin a stretch after another one, shape (rows,): no curve is drawn up to them."""
-        return np.diff(self.stretch, prepend=0) != 0
+        return np.asarray(np.diff(self.stretch, prepend=0) != 0)
 
     def average(self, values: FloatArray) -> FloatArray:
         """Kernel average of values at the points, one row per row.
