@@ -7,15 +7,18 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from identification._finding import Finding, at
+from identification.stamps import EVEN, Slots, longest_hole, slots_of
 
 if TYPE_CHECKING:
     import numpy.typing as npt
 
-    from identification.record import IntArray, Record
+    from identification.record import Record
 
 MINIMUM_SAMPLES: Final = 10
-_REPEATED_LIMIT: Final = 0.1
-_JITTER_WARN: Final = 0.05
+_WITHOUT_TIME: Final = 0.1
+"""Share of rows without a time above which the export is at fault, not a row."""
+_REPEATED_LIMIT: Final = 1 / 3
+"""Share of repeated stamps above which the median step may be no period of the clock any more."""
 _REGULAR: Final = 0.2
 
 
@@ -37,7 +40,7 @@ def check_stamps(record: Record) -> list[Finding]:
     bad = np.flatnonzero(~np.isfinite(record.time))
     if bad.size:
         message = f"{record.name}: time is not a number in {bad.size} rows, first in row {bad[0] + 1}: rows are dropped"
-        if bad.size > _REPEATED_LIMIT * len(record):
+        if bad.size > _WITHOUT_TIME * len(record):
             message = f"{record.name}: time is not a number in {bad.size} of {len(record)} rows: export time again"
             return [Finding("refuse", "time_nan", message, "time", int(bad[0]))]
         return [Finding("repair", "time_nan", message, "time", int(bad[0]))]
@@ -59,7 +62,9 @@ def check_stamps(record: Record) -> list[Finding]:
     if share > _REPEATED_LIMIT:
         message = f"{record.name}: {100 * share:.0f} % of the stamps repeat the one before, first at {at(record, row)}: write time with more digits"
         return [Finding("refuse", "time_repeated", message, "time", row)]
-    message = f"{record.name}: {repeated.size} repeated stamp(s), first at {at(record, row)}: the later row is dropped"
+    message = (
+        f"{record.name}: {repeated.size} repeated stamp(s), first at {at(record, row)}: frames written twice are dropped, others get the time of their slot"
+    )
     return [Finding("repair", "time_repeated", message, "time", row)]
 
 
@@ -79,41 +84,43 @@ def gap_limit(record: Record) -> float:
     return (1.5 if spread < _REGULAR else 5.0) * median
 
 
-def gaps(record: Record) -> IntArray:
-    """Rows that come after a gap within a segment."""
-    inside = np.diff(record.segment) == 0
-    steps = np.diff(record.time)
-    return np.flatnonzero(inside & (steps > gap_limit(record))) + 1
-
-
 def check_sampling(record: Record) -> list[Finding]:
-    """Find gaps, jitter and an implausible sampling step."""
-    findings = []
-    rows = gaps(record)
-    if rows.size:
-        row = int(rows[0])
-        lost = float(np.sum(record.time[rows] - record.time[rows - 1] - record.dt))
-        message = (
-            f"{record.name}: {rows.size} gap(s), the first before {at(record, row)}, about "
-            f"{lost / record.dt:.0f} samples missing in all: the record is split there"
-        )
-        findings.append(Finding("repair", "gap", message, "time", row))
+    """Find lost samples, jitter and an implausible sampling step."""
     steps = _positive_steps(record)
     if not steps.size:
-        return findings
-    dt = float(np.median(steps))
-    regular = steps[steps <= gap_limit(record)]
-    jitter = float(np.percentile(np.abs(regular - dt), 95.0)) / dt
-    if jitter > _JITTER_WARN:
-        message = (
-            f"{record.name}: the sampling is irregular, steps of {regular.min():.4g} to {regular.max():.4g} s around "
-            f"{dt:.4g} s: resample before filters and differences"
-        )
-        findings.append(Finding("warn", "jitter", message, "time"))
-    else:
+        return []
+    slots = slots_of(record)
+    dt = slots.period if slots is not None else float(np.median(steps))
+    findings = _lost(record, slots) if slots is not None else []
+    if slots is None or slots.latest <= EVEN:
+        jitter = 0.0 if slots is None else slots.jitter
         findings.append(Finding("ok", "jitter", f"{record.name}: step {dt:.6g} s, jitter {100 * jitter:.2g} %", "time"))
+    else:
+        how = "the samples are even, the stamps are not: each sample gets the time of its slot"
+        how = how if slots.in_slots else "the samples are uneven: the record is resampled by cubics between its stamps"
+        off = f"up to {100 * slots.latest:.2g} % of a step off (95 % of them at most {100 * slots.jitter:.2g} %)"
+        message = f"{record.name}: the stamps of a clock of {dt:.4g} s are {off}; {how}"
+        findings.append(Finding("repair", "jitter", message, "time"))
     if dt >= 0.5 or dt < 2e-6:
         unit = "ms" if dt >= 0.5 else "s"
         message = f"{record.name}: the sampling step is {dt:.4g} s: is time in {unit}? correct the unit of time"
         findings.append(Finding("refuse" if dt >= 0.5 else "warn", "time_unit", message, "time"))
     return findings
+
+
+def _lost(record: Record, slots: Slots) -> list[Finding]:
+    """What is said about lost samples: holes that are bridged and those at which the record is cut."""
+    rows, missing = slots.holes(record.segment)
+    if not rows.size:
+        return []
+    most = longest_hole(slots.period)
+    cut = missing > most
+    row, count = int(rows[0]), int(missing.sum())
+    share = 100.0 * float(missing[~cut].sum()) / (len(record) + count)
+    message = f"{record.name}: {rows.size} gap(s), the first before {at(record, row)}, about {count} samples missing in all: "
+    if cut.all():
+        message += "the record is split there"
+    else:
+        message += f"{share:.2g} % of the record is bridged by cubics, which does not count as measured"
+        message += f"; the record is split at {int(cut.sum())} gap(s) of over {most} samples" if cut.any() else ""
+    return [Finding("repair", "gap", message, "time", row)]

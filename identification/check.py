@@ -18,10 +18,11 @@ from identification._check_channels import (
 )
 from identification._check_jumps import check_jumps
 from identification._check_relations import check_delay, check_motion, check_ratio, check_velocity, check_wrapped, measured_ratio
-from identification._check_time import check_sampling, check_size, check_stamps, gap_limit, gaps
+from identification._check_time import check_sampling, check_size, check_stamps
 from identification._check_torque import check_torque, check_work
 from identification._finding import SEVERITIES, Finding, rank
 from identification.errors import InputError
+from identification.stamps import cut_at_holes, evened
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -76,7 +77,7 @@ def check(record: Record, gear_ratio: float | None = None, needs: Sequence[str] 
         return rank(findings)
     findings += check_sampling(record)
     findings += check_constant(record, gear_ratio)
-    pieces = _split_at_gaps(record)
+    pieces = cut_at_holes(record)
     for gate_check in (check_wrapped, check_motion):
         found = gate_check(pieces)
         findings += found
@@ -87,7 +88,7 @@ def check(record: Record, gear_ratio: float | None = None, needs: Sequence[str] 
         findings += check_stuck(record)
         findings += check_saturation(record)
         findings += check_quantisation(record)
-        jumps = check_jumps(pieces)
+        jumps = check_jumps(cut_at_holes(record, most=0))
         findings += jumps
         findings += check_velocity(usable, gear_ratio)
         findings += [f for f in check_ratio(usable, gear_ratio) if f.severity != "warn" or not jumps]
@@ -141,10 +142,11 @@ def gate(
 def repair(record: Record) -> Record:
     """Repair a record by named rules, each noted in the provenance with its count and first row.
 
-    ``drop_rows_without_time``, ``drop_repeated_stamps`` (the later row), ``interpolate_temperature``,
-    ``bridge_nan_rows`` (holes of one or two rows, by interpolation), ``drop_nan_rows``
-    (and split there), ``split_at_gaps``, ``drop_short_pieces`` (under 8 samples).  Time that runs
-    backwards is not repaired.
+    ``drop_rows_without_time``, ``interpolate_temperature``, ``bridge_nan_rows`` (holes of one or two rows, by
+    interpolation), ``drop_nan_rows`` (and split there); then what `identification.stamps.evened` does:
+    ``drop_repeated_stamps`` (a frame written twice), ``bridge_lost_samples`` (holes shorter than half a kernel),
+    ``split_at_gaps`` (longer ones), ``resample_jitter``; at last ``drop_short_pieces`` (under 8 samples).  Time that
+    runs backwards is not repaired.
 
     Parameters
     ----------
@@ -164,24 +166,12 @@ def repair(record: Record) -> Record:
     if len(record) == 0:
         return record
     record = _drop(record, np.isfinite(record.time), "drop_rows_without_time")
-    record = _drop_repeated(record)
     record = _bridge(_fill_temperature(record))
     finite = np.ones(len(record), dtype=np.bool_)
     for values in record.channels.values():
         finite &= np.isfinite(values)
     record = _drop(record, finite, "drop_nan_rows", "split there")
-    return _drop_short(_split_at_gaps(record))
-
-
-def _split_at_gaps(record: Record) -> Record:
-    rows = gaps(record)
-    if not rows.size:
-        return record
-    limit = gap_limit(record)
-    cut = np.zeros(len(record), dtype=np.int64)
-    cut[rows] = 1
-    note = f"split_at_gaps: {rows.size} step(s) over {limit:.4g} s, first before row {rows[0] + 1}"
-    return replace(record, segment=record.segment + np.cumsum(cut), provenance=record.provenance.noted(note))
+    return _drop_short(_drop_repeated(evened(record)))
 
 
 def _drop(record: Record, keep: np.typing.NDArray[np.bool_], rule: str, also: str = "") -> Record:

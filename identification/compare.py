@@ -13,6 +13,7 @@ from identification.assess import Error, assess
 from identification.balances import Balances
 from identification.ceiling import Ceiling, ceiling
 from identification.engine import load_dataset, stack
+from identification.excitation import rest_note
 from identification.fit import Fit
 from identification.places import Place, gather, places_of
 from identification.record import Record
@@ -36,6 +37,8 @@ class Comparison:
         Autocorrelation of each residual one kernel length later.
     linear : Ceiling or None
         What linear models without physics explain; None where not asked for, or where the records are too short.
+    at_rest : float
+        Share of the rows in which the joint stands still: left out of errors and places.
     """
 
     name: str
@@ -44,6 +47,7 @@ class Comparison:
     worst_window: tuple[float, float]
     whiteness: dict[str, float]
     linear: Ceiling | None = None
+    at_rest: float = 0.0
 
     def as_json(self) -> dict[str, Any]:
         """Errors and places as data."""
@@ -52,13 +56,15 @@ class Comparison:
             "worst_window_s": list(self.worst_window), "whiteness": self.whiteness,
             "places": [p.as_json() for p in self.places],
             "linear_ceiling": self.linear.as_json() if self.linear else None,
+            "at_rest_percent": 100 * self.at_rest,
         }  # fmt: skip
 
     def __str__(self) -> str:
         ratios = ", ".join(f"{b} {e.ratio:.3g} times its floor" for b, e in self.error.balances.items())
         top = f"; fails most against {self.places[0].axis.replace('_', ' ')} ({self.places[0].balance} balance)" if self.places else ""
         linear = f"\n{self.linear}" if self.linear else ""
-        return f"{self.name}: fit {self.error.fit_percent:.3g} %, relative error {self.error.relative_error_percent:.3g} % ({ratios}){top}{linear}"
+        still = f"\n{rest_note(self.at_rest)}" if rest_note(self.at_rest) else ""
+        return f"{self.name}: fit {self.error.fit_percent:.3g} %, relative error {self.error.relative_error_percent:.3g} % ({ratios}){top}{still}{linear}"
 
     def _repr_html_(self) -> str:
         from identification.ceiling import ceiling_html
@@ -92,13 +98,15 @@ def compare(fitted: Fit, records: Record | Sequence[Record], *, linear: bool = T
     time = np.concatenate([w.time for w in data.train])
     sigma = {b: max(error.balances[b].floor, 1e-12) for b in residual}
     power = sum((residual[b] / sigma[b]) ** 2 for b in residual)
-    worst = _worst(time, np.asarray(power))
+    counts = np.cumsum([0, *(int(w.stretch.max(initial=0)) + 1 for w in data.train)])
+    stretch = np.concatenate([w.stretch + first for w, first in zip(data.train, counts[:-1], strict=True)])
+    worst = _worst(time, np.asarray(power), stretch)
     unseen = not any(_same(r, seen) for r in given for seen in fitted.records)
     floor = {b: e.floor for b, e in error.balances.items()}
     above = ceiling(fitted.data, data.train, residual, floor, unseen=unseen) if linear else None
     return Comparison(
         ", ".join(r.name for r in given), error, places, worst,
-        {b: _lagged(r) for b, r in residual.items()}, above,
+        {b: _lagged(r[stacked.taking[b]]) for b, r in residual.items()}, above, data.at_rest(),
     )  # fmt: skip
 
 
@@ -111,12 +119,15 @@ def _same(one: Record, other: Record) -> bool:
     return len(one) == len(other) and bool(np.array_equal(one.time[[0, -1]], other.time[[0, -1]]))
 
 
-def _worst(time: FloatArray, power: FloatArray) -> tuple[float, float]:
+def _worst(time: FloatArray, power: FloatArray, stretch: npt.NDArray[np.int64]) -> tuple[float, float]:
+    """Start and end of the second with the largest residual; it does not reach over a hole or from one run into the next."""
     if len(time) < 2:
         return float(time[0]), float(time[0])
     step = float(np.median(np.diff(time)))
     width = max(1, min(len(power), round(1.0 / max(step, 1e-9))))
-    k = int(np.argmax(np.convolve(power, np.ones(width), "valid")))
+    whole = stretch[: len(power) - width + 1] == stretch[width - 1 :]
+    summed = np.convolve(power, np.ones(width), "valid")
+    k = int(np.argmax(np.where(whole, summed, -1.0) if whole.any() else summed))
     return float(time[k]), float(time[min(k + width, len(time) - 1)])
 
 

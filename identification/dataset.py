@@ -15,16 +15,18 @@ from identification.joint_file import Joint
 from identification.noise import noise_level
 from identification.record import Record
 from identification.sensing import Sensing, adapt, check_alike, sense, signals_of
-from identification.weak import POSITION_CHAINS, WeakRecord, kernel, prepare
+from identification.stamps import evened
+from identification.weak import CLAIM_KERNEL, KERNEL_SAMPLES, POSITION_CHAINS, WeakRecord, differentiated_kernel, kernel, prepare
 
 FloatArray = npt.NDArray[np.float64]
 
 HOLD_DELAY: Final = hold.HOLD_DELAY
 HOLD_NAME: Final = hold.HOLD_NAME
-CLAIM_KERNEL: Final = 0.06
 ONE_SIDED_KERNEL: Final = 0.2
 LINK_BALANCES: Final = frozenset({"link", "sum", "axis"})
 POINTWISE_KERNELS: Final = (0.01, 0.014, 0.02, 0.03)
+STILL: Final = 3.0
+"""Pointwise speed of a side at rest, in standard deviations of its noise: 0.3 % of samples at rest lie above."""
 VELOCITY_NOISE: Final = 2e-3
 """Noise of a pointwise velocity, as a share of the record's speed, that is small enough."""
 
@@ -58,6 +60,12 @@ class Dataset:
     def kernel(self) -> float:
         """Kernel length of the balances [s]."""
         return self.train[0].grid.length
+
+    def at_rest(self, records: Sequence[WeakRecord] | None = None) -> float:
+        """Share of the rows (of all records by default) that are at rest in some balance and left out of it."""
+        chosen = (*self.train, *self.held_out) if records is None else tuple(records)
+        left = sum(int(np.any([w.resting(b) for b in self.sensing.balances if b not in w.masked], axis=0).sum()) for w in chosen)
+        return left / max(sum(w.rows for w in chosen), 1)
 
     @property
     def blocks(self) -> int:
@@ -96,9 +104,11 @@ def load_dataset(
                 f"{held_out[0].name}: every held-out record has another payload than {train[0].name}, so none shows the {balance} balance; "
                 "give a held-out record with the same payload"
             )
-    signals = [signals_of(r, joint, sensing) for r in train]
-    names = {c for s in signals for c in s if c in POSITION_CHAINS}
-    noise = {c: float(np.median([noise_level(s[c], tuple(r.segments()), r.time) for s, r in zip(signals, train, strict=True)])) for c in names}
+        at_rest = [not made.taking(balance).any() for made in prepared[count:] if balance not in made.masked]
+        if at_rest and all(at_rest):
+            raise InputError(f"{held_out[0].name}: the joint stands still in every held-out record; give one in which it moves")
+    levels = [measured_noise(r, joint, sensing) for r in train]
+    noise = {c: float(np.median([level[c] for level in levels])) for c in levels[0]}
     return Dataset(
         joint, sensing, tuple(prepared[:count]), tuple(prepared[count:]), _ranges(prepared[:count], model.clamped_link), noise,
         tuple(r.name for r in train), tuple(r.name for r in held_out),
@@ -120,23 +130,61 @@ def seen_from_the_motor(sensing: Sensing, joint: Joint) -> bool:
 
 def weak_record(record: Record, joint: Joint, sensing: Sensing, length: float, first_block: int = 0, *, curved: bool = False) -> WeakRecord:
     """One record, resampled to uniform time where needed, averaged with the kernel."""
-    steps = np.diff(record.time)
-    inside = np.diff(record.segment) == 0
+    noise = measured_noise(record, joint, sensing)
+    record = evened(record)
     signals, segments = signals_of(record, joint, sensing), tuple(record.segments())
-    noise = {c: noise_level(x, segments, record.time) for c, x in signals.items() if c in POSITION_CHAINS}
-    if inside.any() and np.ptp(steps[inside]) > 0.02 * float(np.median(steps[inside])):
-        record = record.resampled()
-        signals, segments = signals_of(record, joint, sensing), tuple(record.segments())
-    length = max(length, 8 * record.dt)
+    length = max(length, KERNEL_SAMPLES * record.dt)
     longest = length / 2 if length <= CLAIM_KERNEL else 0.06
     made = prepare(
         record.time, signals, segments, length=length, first_block=first_block,
         pointwise={c: pointwise_kernel(signals[c], segments, record.dt, longest, level) for c, level in noise.items()},
         curved=curved,
     )  # fmt: skip
+    made = _with_rests(made, noise)
+    if record.measured is not None and not record.measured.all():
+        made = replace(made, support=made.grid.correlate(record.measured.astype(float), differentiated_kernel(made.grid.length, made.grid.dt, 0)))
     if made.rows < 8:
         raise InputError(f"{record.name}: {len(record)} samples in {record.duration:.3g} s are too few for a kernel of {length:.3g} s; give a longer record")
     return made
+
+
+def _with_rests(made: WeakRecord, noise: Mapping[str, float]) -> WeakRecord:
+    """The record with the kernel average, for each row, of the flag "this side stands still".
+
+    A side stands still where its pointwise speed stays within its noise for at least one kernel of that speed: a reversal is
+    shorter, and is kept, because it shows friction at low speed. Laws with memory follow a straight line through a rest: the
+    noise of a position that stands still would wear their state down, since they count every step, whatever its sign.
+    """
+    out: dict[str, FloatArray] = {}
+    smooth = dict(made.smooth)
+    for side in ("motor", "link"):
+        source = f"{side}_position"
+        if source not in noise:
+            continue
+        slow = np.abs(made.points[f"{side}_velocity"]) <= STILL * noise[source] * made.grid.velocity_gain(source)
+        shortest = max(1, round(made.grid.pointwise[source] / (made.grid.step * made.grid.dt)))
+        still, held = np.zeros(len(slow)), made.smooth[source].copy()
+        for first, last in zip(made.starts[:-1], made.starts[1:], strict=True):
+            edges = np.flatnonzero(np.diff(np.concatenate([[False], slow[first:last], [False]])))
+            for begin, end in edges.reshape(-1, 2):
+                if end - begin >= shortest:
+                    rows = slice(first + begin, first + end)
+                    still[rows] = 1.0
+                    held[rows] = np.linspace(held[rows.start], held[rows.stop - 1], end - begin)
+        smooth[source] = held
+        out[side] = made.average(still) if still.any() else np.zeros(made.rows)
+    return replace(made, rest=out, smooth=smooth)
+
+
+def measured_noise(record: Record, joint: Joint, sensing: Sensing) -> dict[str, float]:
+    """White-noise level of each measured signal, from samples that were measured: bridges are smoother than a reading."""
+    segments = tuple(record.segments())
+    time, signals = record.time, signals_of(record, joint, sensing)
+    if record.measured is not None and not record.measured.all():
+        edges = np.concatenate([[0], np.cumsum([int(record.measured[s].sum()) for s in segments])]).tolist()
+        segments = tuple(slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True))
+        time, signals = time[record.measured], {c: x[record.measured] for c, x in signals.items()}
+    return {c: noise_level(x, segments, time) for c, x in signals.items() if c in POSITION_CHAINS}
 
 
 def pointwise_kernel(position: FloatArray, segments: tuple[slice, ...], dt: float, longest: float, noise: float) -> float:

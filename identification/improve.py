@@ -26,7 +26,7 @@ from identification.claims import (
 from identification.dataset import HOLD_DELAY, with_effect, without
 from identification.engine import Dataset, Solution, load_dataset, prepared_model, solve
 from identification.errors import InputError
-from identification.excitation import excitation_warnings, few_reversals, not_identifiable, unlike_units
+from identification.excitation import claim_limit, excitation_warnings, few_reversals, not_identifiable, unlike_units
 from identification.improvement import Improvement, Step, held_drop, made_worse, ranked_json, visible_keys, visible_labels
 from identification.joint_file import Joint
 from identification.lines import find_lines
@@ -118,7 +118,8 @@ class Loop:
         return lambda text, share: self.progress(text, low + span * share)
 
     def run(self, model: JointModel, max_additions: int) -> Improvement:
-        """Fit `model`, then add what is missing, at most `max_additions` effects."""
+        """Fit `model`, then add what is missing, at most `max_additions` effects, and no more than the motion can carry."""
+        max_additions = min(max_additions, claim_limit(self.data))
         self.progress("fitting the start model", 0.05)
         steps = [self._step(None, None, solve(model, self.data))]
         claims: list[Claim] = []

@@ -187,10 +187,17 @@ def _motor_angle(put: Any, data: Dataset, records: Sequence[WeakRecord], velocit
 
 
 def running_time(records: Sequence[WeakRecord]) -> FloatArray:
-    """Time of each row with the records laid end to end [s]."""
+    """Time of each row [s], zero where a record begins; records, and runs whose stamps start anew, laid end to end.
+
+    A record that is alone keeps its own stamps where they do not go back.
+    """
     parts, offset = [], 0.0
     for w in records:
-        t = w.time - w.time[0]
+        steps = np.diff(w.time)
+        # stamps that go back begin a new run: it goes on one kernel later
+        steps = np.where(steps > 0, steps, w.grid.length)
+        origin = float(w.time[0]) if len(records) == 1 else 0.0
+        t = origin + np.concatenate([[0.0], np.cumsum(steps)])
         parts.append(t + offset)
         offset += float(t[-1]) + w.grid.length
     return np.concatenate(parts)

@@ -283,6 +283,7 @@ def decimated(record: Record, factor: int = 10) -> Record:
         channels=channels,
         segment=np.concatenate([record.segment[part][::factor] for part in parts]),
         age=None if record.age is None else np.concatenate([record.age[part][::factor] for part in parts]),
+        measured=None if record.measured is None else np.concatenate([record.measured[part][::factor] for part in parts]),
         provenance=record.provenance.noted(f"decimated by {factor}: Chebyshev I order 8, 0.05 dB, both ways"),
     )
 

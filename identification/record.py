@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, Any, Final, final
 
 import numpy as np
 import numpy.typing as npt
@@ -56,6 +56,28 @@ def _readonly(values: FloatArray) -> FloatArray:
     return view
 
 
+NEAR_START: Final = 10
+"""Median steps within which a run must begin where the one before began, for a stamp that goes back to mean a new run."""
+
+
+def _restarts(time: FloatArray) -> IntArray:
+    """Number of the run of each sample: a run begins where time goes back to where the run before began."""
+    out = np.zeros(time.shape, dtype=np.int64)
+    if time.ndim != 1 or time.size < 2:
+        return out
+    steps = np.diff(time)
+    back = np.flatnonzero(steps < 0.0) + 1
+    if not back.size:
+        return out
+    near = NEAR_START * float(np.nanmedian(np.abs(steps)))
+    start = 0
+    for row in back.tolist():
+        if abs(time[row] - time[start]) <= near and row - start > NEAR_START:
+            out[row:] += 1
+            start = row
+    return out
+
+
 def _renumbered(segment: IntArray) -> IntArray:
     if segment.size == 0:
         return segment
@@ -86,6 +108,8 @@ class Record:
         transmission's parameters, not the link's.
     age : (n,) ndarray, optional
         Time since the run of each sample began [s], for a record that was cut off a longer one (see `run_age`).
+    measured : (n,) ndarray of bool, optional
+        False for a sample that was lost and bridged from its neighbours.
 
     Raises
     ------
@@ -101,6 +125,7 @@ class Record:
     provenance: Provenance = field(default_factory=Provenance)
     payload: str = ""
     age: FloatArray | None = None
+    measured: npt.NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
         time = np.ascontiguousarray(self.time, dtype=np.float64)
@@ -117,13 +142,15 @@ class Record:
         channel_unit("time", self.kind)
         if self.age is not None and self.age.shape != time.shape:
             raise InputError(f"record {self.name!r}: age has shape {self.age.shape}, time has {time.shape}")
+        if self.measured is not None and self.measured.shape != time.shape:
+            raise InputError(f"record {self.name!r}: measured has shape {self.measured.shape}, time has {time.shape}")
         object.__setattr__(self, "time", _readonly(time))
         object.__setattr__(self, "segment", segment)
         object.__setattr__(self, "channels", MappingProxyType(channels))
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle by value: records travel to worker processes."""
-        return Record, (self.name, self.kind, self.time, dict(self.channels), self.segment, self.provenance, self.payload, self.age)
+        return Record, (self.name, self.kind, self.time, dict(self.channels), self.segment, self.provenance, self.payload, self.age, self.measured)
 
     @classmethod
     def from_channels(
@@ -135,7 +162,7 @@ class Record:
         kind: str = "rotary",
         provenance: Provenance | None = None,
     ) -> Record:
-        """Make a record from arrays in SI; a ``run`` channel cuts it into segments.
+        """Make a record from arrays in SI; a ``run`` channel, and time that starts again, cut it into segments.
 
         Parameters
         ----------
@@ -152,6 +179,7 @@ class Record:
         run = arrays.get("run")
         if run is not None and run.size > 1 and run.shape == stamps.shape:
             segment[1:] = np.cumsum(np.diff(run) != 0.0)
+        segment = segment + _restarts(stamps)
         return cls(name, kind, stamps, arrays, segment, provenance or Provenance())
 
     def __len__(self) -> int:
@@ -224,6 +252,7 @@ class Record:
             channels={key: values[selector] for key, values in self.channels.items()},
             segment=segment,
             age=None if self.age is None else self.age[selector],
+            measured=None if self.measured is None else self.measured[selector],
             provenance=self.provenance.noted(*notes),
         )
 
@@ -329,8 +358,16 @@ class Record:
             channels=channels,
             segment=np.concatenate(segments),
             age=None if self.age is None else np.concatenate([np.interp(t, self.time[p], self.age[p]) for t, p in zip(times, self.segments(), strict=True)]),
+            measured=self._resampled_flags(times),
             provenance=self.provenance.noted(note),
         )
+
+    def _resampled_flags(self, times: Sequence[FloatArray]) -> npt.NDArray[np.bool_] | None:
+        """Which of the new samples lie between samples that were measured."""
+        if self.measured is None:
+            return None
+        flags = self.measured.astype(np.float64)
+        return np.concatenate([np.interp(t, self.time[p], flags[p]) for t, p in zip(times, self.segments(), strict=True)]) > 0.5
 
     def _repr_html_(self) -> str:
         from identification.formats import pretty_unit, value_range
@@ -397,4 +434,7 @@ def concat(records: Sequence[Record], name: str | None = None) -> Record:
             tuple(notes),
         ),
         age=None if all(record.age is None for record in records) else np.concatenate([record.run_age() for record in records]),
+        measured=None
+        if all(record.measured is None for record in records)
+        else np.concatenate([np.ones(len(record), dtype=np.bool_) if record.measured is None else record.measured for record in records]),
     )

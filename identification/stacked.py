@@ -43,18 +43,18 @@ class Stacked:
 def stack(balances: Balances, records: Sequence[WeakRecord], values: Mapping[str, float]) -> Stacked:
     """Evaluate the balances on records one after the other; rows that take no part are zero."""
     parts = [balances.evaluate(w, values) for w in records]
-    share = [{b: 0.0 if b in w.masked else 1.0 for b in balances.balances} for w in records]
+    share = [{b: w.taking(b) for b in balances.balances} for w in records]
     return Stacked(
         {b: np.concatenate([p[b][0] * s[b] for p, s in zip(parts, share, strict=True)]) for b in balances.balances},
-        {b: np.concatenate([p[b][1] * s[b] for p, s in zip(parts, share, strict=True)]) for b in balances.balances},
+        {b: np.concatenate([p[b][1] * s[b][:, None] for p, s in zip(parts, share, strict=True)]) for b in balances.balances},
         np.concatenate([w.block for w in records]),
         {b: taking_part(b, records) for b in balances.balances},
     )
 
 
 def taking_part(balance: str, records: Sequence[WeakRecord]) -> npt.NDArray[np.bool_]:
-    """Which of the stacked rows of a balance are not masked."""
-    return np.concatenate([np.full(w.rows, balance not in w.masked) for w in records])
+    """Which of the stacked rows of a balance take part: neither masked nor at rest."""
+    return np.concatenate([w.taking(balance) for w in records])
 
 
 def floors(model: JointModel, data: Dataset, values: Mapping[str, float]) -> dict[str, float]:
@@ -121,8 +121,10 @@ def row_weights(
     here = stack(bare, records, values).residual
     there = stack(bare, records, doubled).residual if names else here
     either = _either_way(balances.model, data, values, records)
+    # a row of which samples were lost averages fewer of them: its variance grows with one over what is left
+    support = np.sqrt(np.concatenate([np.ones(w.rows) if w.support is None else w.support for w in records]))
     return {
-        b: 1 / np.sqrt(sigma[b] ** 2 + (here[b] - there[b]) ** 2 / 4 + either[b] ** 2) for b in here
+        b: support / np.sqrt(sigma[b] ** 2 + (here[b] - there[b]) ** 2 / 4 + either[b] ** 2) for b in here
     }  # fmt: skip
 
 

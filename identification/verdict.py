@@ -48,7 +48,8 @@ def verdict_of(
         if unnamed is not None:
             return "unexplained", f"{found}{_remainder(unnamed, ratios[unnamed.balance].unit)} Left over: {left}."
         if few:
-            return "unexplained", f"{found}Left over: {left}. {few[0].upper()}{few[1:]}, too seldom to name a friction effect: record more reversals."
+            seldom = "too seldom to name friction or a law with memory: record more reversals."
+            return "unexplained", f"{found}Left over: {left}. {few[0].upper()}{few[1:]}, {seldom}"
         if claims:
             return "unexplained", f"{found}Structure that is not in the library is left in: {left}."
         return "unexplained", f"No effect of the library explains what is left in: {left}."

@@ -28,6 +28,22 @@ POSITION_CHAINS: Final = {
 """Measured signals and the signals that follow from them by derivatives."""
 
 HIGHEST_DERIVATIVE: Final = 4
+CLAIM_KERNEL: Final = 0.06
+"""Length of the balances' kernel [s]."""
+KERNEL_SAMPLES: Final = 8
+"""Samples that a kernel has at least, however slow the logger."""
+
+RESTING_SIDES: Final[Mapping[str, tuple[str, ...]]] = {
+    "motor": ("motor",), "deflection": ("motor",), "link": ("link",), "sum": ("motor", "link"), "axis": ("motor", "link"),
+}  # fmt: skip
+"""Sides whose dry friction acts in a balance. At rest it is any torque up to its limit: such a row is an inequality, no equation.
+The transmission has no friction against the ground."""
+
+LEAST_SUPPORT: Final = 0.5
+"""Share of a row's kernel that must have been measured: with less, the row is more cubic than record."""
+REST_SHARE: Final = 0.01
+"""Share of a row's kernel that may be at rest: a choice. At 1 % the unknown friction of the rest weighs a hundredth of its limit in
+the row, which is what noise leaves of it elsewhere; the kernels taper, so that only rows whose edge touches a rest are near it."""
 
 
 def kernel(length: float, dt: float, order: int = 0) -> FloatArray:
@@ -164,6 +180,10 @@ class WeakRecord:
         Balances that these rows do not take part in: those of a link with another payload.
     curved : mapping of str to (rows,) array
         Second derivative of the average of every signal where it was asked for.
+    rest : mapping of str to (rows,) array
+        Kernel average of "this side stands still" (0 to 1), by side: motor, link.
+    support : (rows,) array, optional
+        Share of each row's kernel that was measured and not bridged; 1 everywhere where it is None.
     """
 
     grid: Grid
@@ -175,6 +195,35 @@ class WeakRecord:
     starts: IntArray
     masked: frozenset[str] = frozenset()
     curved: Mapping[str, FloatArray] = field(default_factory=dict)
+    rest: Mapping[str, FloatArray] = field(default_factory=dict)
+    support: FloatArray | None = None
+
+    def taking(self, balance: str) -> npt.NDArray[np.bool_]:
+        """Rows that take part in a balance, shape (rows,): the one mask of every fit, error, line and picture."""
+        if balance in self.masked:
+            return np.zeros(self.rows, dtype=np.bool_)
+        lost = self.support < LEAST_SUPPORT if self.support is not None else False
+        return np.asarray(~(self.resting(balance) | lost))
+
+    def resting(self, balance: str) -> npt.NDArray[np.bool_]:
+        """Rows in which a side whose dry friction acts in the balance stands still, shape (rows,)."""
+        still = np.zeros(self.rows, dtype=np.bool_)
+        for side in RESTING_SIDES.get(balance, ()):
+            if side in self.rest:
+                still |= self.rest[side] > REST_SHARE
+        return still
+
+    @cached_property
+    def stretch(self) -> IntArray:
+        """Number of the contiguous stretch of each row, shape (rows,)."""
+        grid = self.grid
+        counts = [len(range(grid.half, s.stop - s.start - grid.half, grid.stride)) for s in grid.segments]
+        return np.repeat(np.arange(len(counts)), counts)
+
+    @property
+    def begins(self) -> npt.NDArray[np.bool_]:
+        """Rows that begin a stretch after another one, shape (rows,): no curve is drawn up to them."""
+        return np.asarray(np.diff(self.stretch, prepend=0) != 0)
 
     def average(self, values: FloatArray) -> FloatArray:
         """Kernel average of values at the points, one row per row.

@@ -166,10 +166,11 @@ def test_gap_splits_the_record_and_is_said(tmp_path: Path, capsys: pytest.Captur
     assert "1 gap(s), the first before row 1001 (t = 3.5 s), about 400 samples missing in all: the record is split there" in err
 
 
-def test_repeated_stamp_is_dropped_and_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_repeated_stamp_gets_its_slot_and_that_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     stamps = good()["time_s"].copy()
     stamps[500] = stamps[499]
-    assert "1 repeated stamp(s), first at row 501 (t = 1.2475 s): the later row is dropped" in warned(tmp_path, capsys, changed("time_s", stamps))
+    err = warned(tmp_path, capsys, changed("time_s", stamps))
+    assert "1 repeated stamp(s), first at row 501 (t = 1.2475 s): frames written twice are dropped, others get the time of their slot" in err
 
 
 def one_way() -> Table:

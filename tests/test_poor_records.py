@@ -32,7 +32,7 @@ def test_too_few_reversals_are_named_in_the_verdict() -> None:
     assert turns(poor) == 1
     found = improve([poor], joint, [held])
     assert found.verdict == "unexplained"
-    assert found.reason.endswith("The motor reverses once only, too seldom to name a friction effect: record more reversals.")
+    assert found.reason.endswith("The motor reverses once only, too seldom to name friction or a law with memory: record more reversals.")
     assert "No effect of the library" not in found.reason
     named = improve([whole.take(slice(0, 3000))], joint, [held])
     assert [c.effects for c in named.claims] == [("stribeck",)], "where the held-out record confirms it"

@@ -74,8 +74,8 @@ def test_quanser_is_elastic_with_coulomb_friction_and_not_explained() -> None:
     assert named[0] == "transmission_compliance"
     assert "coulomb" in named
     errors = [s.held_out.relative_error_percent for s in found.steps]
-    assert 43.0 < errors[0] < 46.0
-    assert errors[-1] <= 25.0
+    assert 37.0 < errors[0] < 41.0
+    assert errors[-1] <= 12.0, "half of the rows are at rest: scored, they read 18 %"
     assert found.verdict == "unexplained"
 
 

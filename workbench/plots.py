@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ from identification.engine import Dataset, Solution, references
 from identification.errors import InputError
 from identification.frequency import Bode, bode_of
 from identification.improve import Improvement
-from identification.places import Place, Rows, gather, place, places_of, residuals
+from identification.places import Place, Rows, gather, place, places_of, residuals, running_time
 from identification.record import Record
 from identification.weak import WeakRecord
 
@@ -54,7 +55,7 @@ def min_max(count: int, curves: Sequence[FloatArray], points: int = POINTS) -> n
     for i, y in enumerate(curves):
         for k in range(buckets):
             part = y[edges[k] : edges[k + 1]]
-            a, b = int(np.argmin(part)), int(np.argmax(part))
+            a, b = int(np.argmin(np.where(np.isnan(part), np.inf, part))), int(np.argmax(np.where(np.isnan(part), -np.inf, part)))
             out[i, 2 * k], out[i, 2 * k + 1] = edges[k] + min(a, b), edges[k] + max(a, b)
     return out
 
@@ -87,7 +88,8 @@ class Overlay:
     ----------
     balance, record, unit : str
     time, measured, start, final : (rows,) array
-        Seconds; torque; what the start model and the final model give.
+        Seconds, runs laid end to end; torque; what the start model and the final model give. NaN in rows at rest and
+        where a new stretch begins: curves break there.
     window : tuple of float
         Where the start model is worst [s].
     """
@@ -120,20 +122,19 @@ def _short(value: float) -> float:
     return float(f"{value:.6g}")
 
 
-def _rounded(values: FloatArray) -> list[float]:
-    """Rounded to a part of the range that no screen shows: short in the file."""
-    size = float(np.max(np.abs(values), initial=0.0))
-    if size == 0:
-        return [0.0] * len(values)
-    places = DIGITS - 1 - int(np.floor(np.log10(size)))
-    return [float(v) for v in np.round(values, max(places, 0))] if places < 12 else [float(f"{v:.5g}") for v in values]
+def _rounded(values: FloatArray) -> list[float | None]:
+    """Rounded to a part of the range that no screen shows: short in the file; None where there is no value."""
+    size = float(np.max(np.abs(values[np.isfinite(values)]), initial=0.0))
+    places = DIGITS - 1 - int(np.floor(np.log10(size))) if size else 0
+    short = np.round(values, max(places, 0)).tolist() if places < 12 else [float(f"{v:.5g}") for v in values]
+    return [v if math.isfinite(v) else None for v in short]
 
 
 def worst_window(time: FloatArray, residual: FloatArray, length: float) -> tuple[float, float]:
     """Window of a length [s] in which the residual is largest."""
     step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
     width = max(1, min(len(time), round(length / max(step, 1e-9))))
-    power = np.concatenate([[0.0], np.cumsum(residual**2)])
+    power = np.concatenate([[0.0], np.cumsum(np.nan_to_num(residual) ** 2)])
     k = int(np.argmax(power[width:] - power[:-width]))
     return float(time[k]), float(time[k + width - 1])
 
@@ -160,12 +161,14 @@ def overlays(
         rows = slice(first, first + w.rows)
         first += w.rows
         for balance, residual in start.items():
-            if balance in w.masked:
+            if not w.taking(balance).any():
                 continue
-            m, before, after = measured[balance][rows], residual[rows], final[balance][rows]
-            window = worst_window(w.time, before, WINDOW_KERNELS * data.kernel)
-            size = float(np.sqrt(np.mean(before**2)))
-            out.append((size, Overlay(balance, name, unit, w.time, m, m - before, m - after, window)))
+            drawn = np.where(w.taking(balance) & ~w.begins, 0.0, np.nan)
+            m, before, after = measured[balance][rows] + drawn, residual[rows], final[balance][rows]
+            time = running_time([w])
+            window = worst_window(time, before, WINDOW_KERNELS * data.kernel)
+            size = float(np.sqrt(np.nanmean(before**2)))
+            out.append((size, Overlay(balance, name, unit, time, m, m - before, m - after, window)))
     return [o for _, o in sorted(out, key=lambda p: -p[0])]
 
 

@@ -55,6 +55,7 @@ class Job:
     entry: str
     records: str = "both"
     every: int = 1
+    rests: float = 0.0
 
     @property
     def label(self) -> str:
@@ -66,6 +67,7 @@ class Job:
         """Where the case is kept."""
         words = [f"size{self.size:g}"]
         words += ["dirt"] if self.dirt else []
+        words += [f"rests{self.rests:g}"] if self.rests else []
         words += ["one_sided"] if self.one_sided else [] if self.torque_sensor else ["no_torque"]
         return self.cache / "-".join(words) / f"{self.label}_{self.seed}"
 
@@ -93,7 +95,7 @@ def run_job(job: Job) -> Outcome:
     if not (folder / "truth.json").exists():
         generate_case(
             job.effect, job.seed, size=job.size, dirt=job.dirt, torque_sensor=job.torque_sensor,
-            one_sided=job.one_sided, folder=folder,
+            one_sided=job.one_sided, folder=folder, rests=job.rests,
         )  # fmt: skip
     given = folder if job.every == 1 else thinned(folder, job.every)
     truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
@@ -127,7 +129,20 @@ def plan_jobs(options: argparse.Namespace, cache: Path) -> list[Job]:
     if not options.one_sided:
         cases += [("outside", e, options.start + s) for e in OUTSIDE for s in range(options.outside)]
     return [
-        Job(group, effect, seed, options.size, options.dirt, torque_sensor, options.one_sided, cache, options.entry, options.records, options.every)
+        Job(
+            group,
+            effect,
+            seed,
+            options.size,
+            options.dirt,
+            torque_sensor,
+            options.one_sided,
+            cache,
+            options.entry,
+            options.records,
+            options.every,
+            options.rests,
+        )
         for group, effect, seed in cases
     ]
 
@@ -158,6 +173,7 @@ def parser() -> argparse.ArgumentParser:
     p = argparse.ArgumentParser(prog="python -m tests.hidden_effect.campaign", description=__doc__)
     p.add_argument("--size", type=float, default=1.0, help="factor on the strength of the hidden effects")
     p.add_argument("--dirt", action="store_true", help="small unmodelled disturbances in every record")
+    p.add_argument("--rests", type=float, default=0.0, help="share of the time in which the joint stands still (0.3: three tenths)")
     p.add_argument("--seeds", type=int, default=4, help="cases per effect")
     p.add_argument("--start", type=int, default=START, help="first seed")
     p.add_argument("--effects", help="comma-separated keys (default: all)")

@@ -21,7 +21,7 @@ import numpy as np
 
 from tests.hidden_effect._engine import pack, simulate, write_csv
 from tests.hidden_effect.hidden import LIBRARY, NEEDS_TORQUE_SENSOR, OUTSIDE, SIDED, Draw, Setting
-from tests.hidden_effect.motion import plan
+from tests.hidden_effect.motion import plan, with_rests
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -165,6 +165,7 @@ def simulate_case(
     overrides: Mapping[str, float] | None = None,
     records: Iterable[str] = RECORDS,
     span: float = SPAN,
+    rests: float = 0.0,
 ) -> Case:
     """Draw a joint, hide the effect in it, record it.
 
@@ -188,6 +189,8 @@ def simulate_case(
         Parameters of the integrator to set by hand after all draws (for example ``{"KM": 0.82}``).
     records, span
         Which records, and how long [s].
+    rests
+        Share of the time in which the reference stands still; the joint and its path are the same.
     """
     names = names_of(effect)
     if not torque_sensor and NEEDS_TORQUE_SENSOR & set(names):
@@ -207,7 +210,7 @@ def simulate_case(
     if unloaded:
         values["TG"], values["JL"] = 0.0, 0.5 * values["JL"]
     values |= overrides or {}
-    exact = _run(_stream(seed, label, "motion", unloaded), values, draws, dirt, tuple(records), span)
+    exact = _run(_stream(seed, label, "motion", unloaded), values, draws, dirt, tuple(records), span, rests)
     ratio = float(np.sign(values["NKM"])) * TURNS
     for table in exact.values():
         table[:, 2:4] *= ratio
@@ -222,7 +225,7 @@ def simulate_case(
         "balance": {n: d.balance for n, d in draws.items()},
         "gear_ratio": ratio,
         "seed": seed,
-        "options": {"size": size, "dirt": dirt, "unloaded": unloaded, "side": side},
+        "options": {"size": size, "dirt": dirt, "unloaded": unloaded, "side": side} | ({"rests": rests} if rests else {}),
         "link_referred": {text: values[key] for key, text in _TRUTH.items()} | {"friction_smoothing_rad_s": values["M_V0"]},
         "hidden": hidden | ({"dirt": dict(extra)} if dirt else {}),
         "overrides": dict(overrides or {}),
@@ -238,9 +241,12 @@ def _run(
     dirt: bool,
     records: tuple[str, ...],
     span: float,
+    rests: float,
 ) -> dict[str, FloatArray]:
     rows = round(span / DT)
     references = plan(rng, rows, DT)
+    if rests > 0.0:
+        references = {name: with_rests(rng, reference, DT, rests) for name, reference in references.items()}
     vector = pack(values)
     states: list[FloatArray] = []
     snags: list[FloatArray] = []
@@ -279,6 +285,7 @@ def generate_case(
     unloaded: bool = False,
     side: str = "motor",
     overrides: Mapping[str, float] | None = None,
+    rests: float = 0.0,
 ) -> Path:
     """Write a case: train, train2, test, test2 (csv), joint.toml, truth.json; see `simulate_case`.
 
@@ -286,7 +293,7 @@ def generate_case(
     """
     case = simulate_case(
         effect, seed, size=size, dirt=dirt, torque_sensor=torque_sensor, unloaded=unloaded, side=side,
-        overrides=overrides,
+        overrides=overrides, rests=rests,
     )  # fmt: skip
     folder.mkdir(parents=True, exist_ok=True)
     keep = kept_columns(torque_sensor, one_sided)

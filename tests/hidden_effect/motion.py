@@ -62,6 +62,35 @@ def multisine(rng: np.random.Generator, rows: int, dt: float) -> tuple[FloatArra
     return scale * (position - middle), scale * velocity
 
 
+def with_rests(rng: np.random.Generator, reference: tuple[FloatArray, FloatArray], dt: float, share: float) -> tuple[FloatArray, FloatArray]:
+    """The same path with stops: slowed down to a standstill in 0.15 s, held for 0.6 to 3 s, started again.
+
+    Stops fill about `share` of the time, the last one ends the record; the path is cut where the time is up.
+    """
+    position, velocity = reference
+    rows = len(position)
+    pace = np.ones(rows)
+    ramp = round(0.15 / dt)
+    down = 0.5 + 0.5 * np.cos(np.linspace(0.0, np.pi, ramp))
+    held = round(rows * share)
+    stops = []
+    while held > 0:
+        length = min(round(rng.uniform(0.6, 3.0) / dt), held)
+        stops.append(length)
+        held -= length
+    moving = rows - sum(stops) - 2 * ramp * len(stops)
+    legs = np.diff(np.concatenate([[0], np.sort(rng.integers(0, moving, len(stops) - 1)), [moving]]))
+    at = 0
+    for leg, length in zip(legs.tolist(), stops, strict=True):
+        at += int(leg)
+        stop = np.concatenate([down, np.zeros(length), down[::-1]])
+        pace[at : at + len(stop)] = stop[: rows - at]
+        at += len(stop)
+    place = np.concatenate([[0.0], np.cumsum(0.5 * (pace[1:] + pace[:-1]))])
+    index = np.arange(rows)
+    return np.interp(place, index, position), pace * np.interp(place, index, velocity)
+
+
 def plan(rng: np.random.Generator, rows: int, dt: float) -> dict[str, tuple[FloatArray, FloatArray]]:
     """The four references of a case: training triangle and multisine, test multisine and triangle at other speeds."""
     return {

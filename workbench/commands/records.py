@@ -1,20 +1,61 @@
-"""check: is a record fit for use?"""
+"""check: is a record fit for use? resample: the record on an even grid."""
 
 from __future__ import annotations
 
 from argparse import Namespace
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
-from identification.check import Finding, check
+import numpy as np
+
+from identification.check import Finding, check, repair
+from identification.errors import InputError
 from identification.joint_file import Joint
 from identification.read import read
 from identification.record import Record
 from workbench.commands.files import open_joint, write_json
+from workbench.commands.virtual import write_table
 
 
 def run_check(arguments: Namespace) -> int:
     """`irj check`: 1 where a record would be refused."""
     return checked(arguments, open_joint(arguments.joint) if arguments.joint else None)
+
+
+def run_resample(arguments: Namespace) -> int:
+    """`irj resample`: the record with its stamps put right, short holes bridged, cut at the longer ones.
+
+    Raises
+    ------
+    InputError
+        Stamps that no rule repairs.
+    """
+    joint = open_joint(arguments.joint) if arguments.joint else None
+    path = arguments.records[0]
+    if Path(arguments.output).suffix not in (".csv", ".npz"):
+        raise InputError(f"{arguments.output}: give a name that ends in .csv or .npz")
+    record = read(path, columns=joint.columns if joint else None, kind=joint.kind if joint else None)
+    stamps = [f for f in check(record) if f.channel == "time"]
+    refused = next((f for f in stamps if f.severity == "refuse"), None)
+    if refused is not None:
+        raise InputError(refused.message)
+    for finding in stamps:
+        print(f"{finding.severity}: {finding.message}")
+    even = repair(record)
+    table = {"time_s": np.asarray(even.time)} | {f"{c}{_suffix(even.unit(c))}": np.asarray(v) for c, v in even.channels.items() if c != "run"}
+    if len(even.segments()) > 1:
+        table["run"] = even.segment.astype(np.float64)
+    write_table(Path(arguments.output), table)
+    lost = 0 if even.measured is None else int(np.sum(~even.measured))
+    print(f"{arguments.output}: {len(even)} samples in {len(even.segments())} run(s), step {even.dt:.6g} s, {lost} of them bridged")
+    out = {"samples": len(even), "runs": len(even.segments()), "step_s": even.dt, "bridged": lost, "notes": list(even.provenance.notes)}
+    write_json(arguments.json, out)
+    return 0
+
+
+def _suffix(unit: str) -> str:
+    """Unit at the end of a column's name, as the readers take it."""
+    return f"_{unit.replace('.', '').replace('/', '_')}" if unit else ""
 
 
 def checked(arguments: Namespace, joint: Joint | None, more: Callable[[Record], Sequence[Finding]] = lambda record: ()) -> int:

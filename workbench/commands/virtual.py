@@ -40,7 +40,7 @@ def run_simulate(arguments: Namespace) -> int:
         raise InputError(f"--set: {error.args[0]}") from None
     _check_hidden(model, arguments.hide)
     table = recording(model, joint, arguments.seconds, arguments.rate, arguments.seed, arguments.motion)
-    _write_table(Path(arguments.output), table)
+    write_table(Path(arguments.output), table)
     truth = {"hidden": arguments.hide, "parameters": dict(zip(model.parameter_names, model.value_vector(), strict=True))}
     write_json(arguments.truth, truth)
     write_json(arguments.json, {"file": arguments.output, "samples": len(table["time_s"])})
@@ -155,7 +155,7 @@ def _read_off(
     return table
 
 
-def _write_table(path: Path, table: dict[str, FloatArray]) -> None:
+def write_table(path: Path, table: dict[str, FloatArray]) -> None:
     if path.suffix == ".npz":
         _write_npz(path, table)
         return
