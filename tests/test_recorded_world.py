@@ -63,6 +63,14 @@ def test_dry_friction_holds_and_lets_go_at_its_level() -> None:
     assert moved[-1, 1] > 1e-4
 
 
+def test_torque_and_twist_belong_to_one_moment() -> None:
+    run = free({"C": 30.0})
+    twist, rate = run[:, 1] - run[:, 3], run[:, 2] - run[:, 4]
+    found = np.linalg.lstsq(np.column_stack([twist, rate]), run[:, 5], rcond=None)[0]
+    assert found[0] == pytest.approx(BODY["K"], rel=1e-4)
+    assert found[1] == pytest.approx(30.0, rel=1e-2)  # half a step of lateness would make it 31.1
+
+
 def test_balances_of_both_bodies_hold_on_the_exact_motion() -> None:
     case = world.make_case(8, without=world.TROUBLES, names=(), seconds=8.0)
     e, p = case.exact["train"], case.values

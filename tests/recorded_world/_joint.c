@@ -81,7 +81,7 @@ int simulate(const double *p, const double *state, const double *ref, const long
     const double *fm = p + P_M, *fl = p + P_L, h = p[P_STEP];
     long rows = count[0], stride = count[1], before = count[2], pushes = count[3], i, n, k;
     double q = state[0], v = state[1], th = state[2], w = state[3], zm = 0.0, zl = 0.0, z[3] = {0, 0, 0};
-    double old = 0.0, sum = 0.0;
+    double old = 0.0, sum = 0.0, u_before = 0.0, torque_before = 0.0;
     int j, started = 0;
     for (n = 0; n < before + (rows - 1) * stride + 1; n++) {
         double t = (n - before + 0.5) * h, r, dr, qm, tm, err = 0.0, slope = 0.0, touching, stat, hys = 0.0;
@@ -146,11 +146,14 @@ int simulate(const double *p, const double *state, const double *ref, const long
             wm = 0.5 * (w + wn);
         }
         if (o) {
-            o[0] = u;
-            o[5] = torque;
+            /* torques belong to the midpoint of a step, the row to its beginning */
+            o[0] = n ? 0.5 * (u + u_before) : u;
+            o[5] = n ? 0.5 * (torque + torque_before) : torque;
             o[6] = 0.5 * p[P_JM] * vm * vm + 0.5 * p[P_JL] * wm * wm + 0.5 * p[P_K] * x * x
                  + 0.25 * p[P_K3] * x * x * x * x + p[P_TG] * cos(tm + p[P_TG_P]);
         }
+        u_before = u;
+        torque_before = torque;
         sum += h * (r - qm);
         v = vn; w = wn; zm = znm; zl = znl;
         q = qm + 0.5 * h * v;

@@ -89,7 +89,7 @@ IDEAL: Final[Mapping[str, Mapping[str, float | int | str]]] = {
     "filter": {"filter": 0.0},
     "jitter": {"jitter": 0.0},
     "lost": {"lost": 0.0},
-    "noise": {"noise": "white"},
+    "noise": {"noise": "white", "level": 0.002},
     "slow": {"rate": 500.0},
 }
 """What switching off one trouble of the sensors sets."""
@@ -204,11 +204,11 @@ def observe(
     link_step = turn / 2**sensors.link_bits
     late = t - sensors.link_skew / rate
     q = (
-        np.floor(_between(exact, "q", t, "v") / motor_step + 0.2 * rng.standard_normal(rows))
+        np.round(_between(exact, "q", t, "v") / motor_step + 0.2 * rng.standard_normal(rows))
         * motor_step
     )
     link = _between(exact, "theta", late, "omega") + sensors.zero
-    theta = np.floor(link / link_step + 0.2 * rng.standard_normal(rows)) * link_step
+    theta = np.round(link / link_step + 0.2 * rng.standard_normal(rows)) * link_step
     torque = _between(exact, "torque", t - sensors.torque_skew / rate)
     torque = faults.get("torque_gain", 1.0) * torque + faults.get("torque_offset", 0.0)
     torque = torque + sensors.level * joint.friction * coloured(rng, sensors.noise, rows, rate)
