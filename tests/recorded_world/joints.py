@@ -117,8 +117,12 @@ class Plain:
         return self.make.speed / 0.2
 
 
-def draw(rng: Generator, make: Make, *, any_zero: bool = True) -> Plain:
-    """Draw one joint of a make; ``any_zero`` False puts the zero upright."""
+def draw(rng: Generator, make: Make, *, any_zero: bool = True, sticks: bool = True) -> Plain:
+    """Draw one joint of a make.
+
+    ``any_zero`` False puts the zero upright; ``sticks`` False smooths dry friction, which two joints in five have
+    set-valued.
+    """
 
     def pick(pair: tuple[float, float]) -> float:
         return float(rng.uniform(*pair))
@@ -127,7 +131,7 @@ def draw(rng: Generator, make: Make, *, any_zero: bool = True) -> Plain:
     k, b, tc = pick(make.stiffness), pick(make.viscous), pick(make.coulomb)
     bl, tl, gap = pick(make.link_viscous), pick(make.link_coulomb), pick(make.half_gap)
     damping, smooth = pick((0.02, 0.05)), pick((0.002, 0.006)) * make.speed
-    set_valued = rng.random() < 0.4
+    set_valued = rng.random() < 0.4 and sticks
     sign = -1.0 if rng.random() < 0.5 and not make.linear else 1.0
     zero = pick((-np.pi, np.pi))
     # the loop of a position drive stays below the swing of its load, and under 10 Hz

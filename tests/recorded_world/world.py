@@ -46,7 +46,7 @@ HELD_BACK: Final = 100_000
 """Seeds from here on are never looked at while something is tuned."""
 KINDS: Final = ("none", "single", "pair", "triple", "outside")
 KIND_SHARE: Final = (0.25, 0.4, 0.1, 0.05, 0.2)
-TROUBLES: Final = ("joint_zero", "rest", "dirt", *sensors.IDEAL)
+TROUBLES: Final = ("joint_zero", "rest", "stick", "dirt", *sensors.IDEAL)
 """What can be switched off, to find the cause of a failure."""
 DIRT: Final = 0.02
 """Torque of the small unmodelled disturbances, as a share of the friction torque."""
@@ -181,7 +181,10 @@ def make_case(
     drawn_kind = str(rng.choice(KINDS, p=KIND_SHARE))
     drawn_size = float(rng.choice(SIZES))
     joint = joints.draw(
-        stream(seed, "joint", made.name), made, any_zero="joint_zero" not in without
+        stream(seed, "joint", made.name),
+        made,
+        any_zero="joint_zero" not in without,
+        sticks="stick" not in without,
     )
     kind = kind or drawn_kind
     if names is None:
