@@ -121,12 +121,12 @@ RIGS: Final[Mapping[str, Rig]] = {
     r.name: r
     for r in (
         Rig("emps", _emps, "u_V", 35.15065188, "q_m", 1.0, 1e-3, 20.4, 95.1, 0.12, 0.01),
-        # a plain fit: 1900 N.m of friction at rest, 5000 kg m2; second order of the motor turn
+        # friction and inertia of a plain fit; the ripple is the second order of the motor turn
         Rig(
             "kuka_axis1", _kuka, "axis1_motor_torque_Nm", 256.857142857, "axis1_motor_position_link_referred_deg",
             np.pi / 180.0, 4e-3, 300.0, 1000.0, 1.0, np.pi / 256.857142857,
         ),
-        Rig("quanser", _quanser, "i1_A", 8.925, "q1_deg", np.pi / 180.0, 2e-3, 0.8, 0.09, 1.0, np.pi / 100.0),
+        Rig("quanser", _quanser, "i1_A", 8.925, "q1_deg", np.pi / 180.0, 2e-3, 1.3, 0.35, 1.0, np.pi / 100.0),
         # the drive counts volts: sizes are volts per unit
         Rig("bam_xl330", _bam, "volts", 1.0, "q_rad", 1.0, 1.0 / 240.0, 0.5, 0.05, 5.0, 2.0 * np.pi / 12.0),
     )
@@ -442,7 +442,7 @@ def main(argv: list[str] | None = None) -> int:
     )
     p.add_argument("--effects", nargs="*", choices=[*NEW, *CHANGED], default=[*NEW, *CHANGED])
     p.add_argument("--sizes", nargs="+", type=float, default=[1.0])
-    p.add_argument("--limit", type=int, default=180, help="seconds for one answer")
+    p.add_argument("--limit", type=int, default=180, help="processor seconds for one answer")
     p.add_argument("--keep", type=Path, help="folder that keeps the planted records")
     options = p.parse_args(argv)
     if not SHARED.exists():
