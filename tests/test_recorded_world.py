@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+import os
 import time
 import tomllib
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 
-from tests.recorded_world import hidden, joints, motions, sensors, world
+from tests.recorded_world import campaign, hidden, joints, motions, planted, sensors, world
 from tests.recorded_world._engine import ROWS_PER_SECOND, STEP, FloatArray, library, simulate
+from tests.recorded_world.scoring import score
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -234,3 +237,181 @@ def test_files_say_what_each_sensor_set_records(tmp_path: Path) -> None:
         joint = tomllib.loads((folder / "joint.toml").read_text(encoding="utf-8"))["joint"]
         assert joint["model"] == ("hd3" if "link_position" in channels else "hd1")
         assert "stribeck" not in joint["effects"]
+
+
+def _truth(**changes: object) -> dict[str, Any]:
+    plain: dict[str, Any] = {
+        "seed": 1, "make": "cobot100", "motion": "multisine", "kind": "single", "size": 1.0, "hidden": ["stribeck"],
+        "neutral": ["gravity_phase"], "laws": {"stribeck": {}}, "orders": {}, "motor_turns": 100.0,
+        "values": {"KE2_O": 3.3}, "sensor_set": "all", "sensors": {"rate": 500.0, "noise": "white", "lost": 0.0},
+    }  # fmt: skip
+    return {**plain, **changes}
+
+
+def _result(*claims: object, verdict: str = "complete", **more: object) -> dict[str, Any]:
+    listed = [
+        c if isinstance(c, dict) else {"effects": [c] if isinstance(c, str) else c} for c in claims
+    ]
+    held = {"relative_error_percent": 2.0, "balances": {"motor": {"ratio": 1.1}}}
+    return {"claims": listed, "verdict": verdict, "steps": [{"held_out": held}], **more}
+
+
+def test_right_names_sets_and_neutral_names_are_told_apart() -> None:
+    right = score(_truth(), _result("stribeck@motor", "gravity_phase"))
+    assert (right.found, right.single, right.right, right.wrong) == (
+        ("stribeck",),
+        ("stribeck",),
+        ("stribeck",),
+        (),
+    )
+    assert right.all_right
+    in_set = score(_truth(), _result(["lugre", "stribeck"]))
+    assert in_set.found == ("stribeck",)
+    assert in_set.single == ()
+    beside = score(_truth(), _result("stribeck", "cubic_viscous"))
+    assert beside.wrong == ("cubic_viscous",)
+    assert not beside.all_right
+    partial = score(
+        _truth(), _result({"effects": ["lugre"], "partial": True}, verdict="unexplained")
+    )
+    assert (partial.wrong, partial.marked, partial.found) == ((), ("lugre",), ())
+    assert not partial.all_right
+
+
+def test_nothing_hidden_and_laws_outside_the_library() -> None:
+    nothing = {"hidden": [], "kind": "none", "laws": {}}
+    assert score(_truth(**nothing), _result(verdict="nothing_missing")).all_right
+    assert not score(_truth(**nothing), _result("lugre")).all_right
+    assert not score(_truth(**nothing), _result(verdict="unexplained")).all_right
+    outside = {"hidden": ["odd_curve"], "kind": "outside", "laws": {"odd_curve": {}}}
+    assert score(_truth(**outside), _result(verdict="unexplained")).all_right
+    assert score(_truth(**outside), _result("learned")).all_right
+    assert not score(_truth(**outside), _result("stribeck", "quadratic_drag")).all_right
+
+
+def test_lines_count_by_their_order_in_any_unit() -> None:
+    ripple = {
+        "hidden": ["torque_ripple"],
+        "laws": {"torque_ripple": {}},
+        "orders": {"torque_ripple": 2.0},
+    }
+    for order, per in ((2.0, "motor turn"), (200.0, "link turn")):
+        line = {"order": order, "per": per, "tolerance": 0.02, "effects": ["torque_ripple"]}
+        assert score(_truth(**ripple), _result(lines=[line])).found == ("torque_ripple",)
+    off = {"order": 2.6, "per": "motor turn", "tolerance": 0.02, "effects": ["torque_ripple"]}
+    missed = score(_truth(**ripple), _result("torque_ripple", lines=[off]))
+    assert missed.found == ()
+    assert missed.wrong
+    dirt = {**off, "order": 3.3}
+    assert score(_truth(**ripple), _result(lines=[dirt])).wrong == ()
+    pitch = {"order": 100.0, "per": "metre", "tolerance": 0.1, "effects": ["torque_ripple"]}
+    screw = {**ripple, "orders": {"torque_ripple": 1.0}, "motor_turns": 2.0 * np.pi / 0.01}
+    assert score(_truth(**screw), _result(lines=[pitch])).found == ("torque_ripple",)
+
+
+def test_a_delay_may_be_told_as_skew() -> None:
+    late = {"hidden": ["channel_delay"], "laws": {"channel_delay": {"current_delay_s": 8e-3}}}
+    skew = {"what": "skew", "sensor": "motor_current", "run": 0, "value": -7.6e-3}
+    assert score(_truth(**late), _result(calibration=[skew])).all_right
+    assert not score(_truth(**late), _result(calibration=[{**skew, "value": 1e-3}])).all_right
+
+
+def test_campaign_names_what_is_hidden_and_goes_on_where_it_stopped(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "answers.jsonl"
+    words = [
+        "--seeds",
+        "20",
+        "--sensors",
+        "all",
+        "motor",
+        "--without",
+        "everything",
+        "--names",
+        "cubic_stiffness",
+    ]
+    words += ["--size", "1", "--seconds", "12", "--json", str(out)]
+    assert campaign.main(words) == 0
+    first = capsys.readouterr()
+    # the motor side alone is not asked to show a law of the transmission
+    assert [json.loads(x)["sensors"] for x in out.read_text(encoding="utf-8").splitlines()] == [
+        "all",
+        "motor",
+    ]
+    assert [a.found for a in campaign.load(out)] == [("cubic_stiffness",)]
+    assert campaign.main(words) == 0
+    again = capsys.readouterr()
+    assert again.err == ""
+    assert again.out == first.out
+    assert "Seeds to tune on" in again.out
+    assert "Held-back" not in again.out
+
+
+def test_a_command_line_makes_the_same_case_again() -> None:
+    job = campaign.Job(
+        7,
+        "all",
+        without=("zero", "skew"),
+        size=0.3,
+        names=("stribeck",),
+        kind="single",
+        seconds=2.0,
+    )
+    words = job.command.partition("campaign ")[2].split()
+    assert campaign.plan(campaign.parser().parse_args(words)) == [replace(job, limit=180.0)]
+    lone = replace(job, without=tuple(t for t in world.TROUBLES if t != "zero"))
+    assert "--only zero" in lone.command
+    words = lone.command.partition("campaign ")[2].split()
+    assert campaign.plan(campaign.parser().parse_args(words)) == [replace(lone, limit=180.0)]
+
+
+needs_recordings = pytest.mark.skipif(
+    not planted.SHARED.exists() and not os.environ.get("CI"),
+    reason="../shared/measurements is not there",
+)
+
+
+def _emps_fit(table: planted.Table) -> FloatArray:
+    m = planted.motion(planted.RIGS["emps"], table)
+    columns = [m.a, m.v, np.tanh(m.v / 1e-3), np.ones_like(m.v), m.q - m.q.mean()]
+    return np.linalg.lstsq(np.column_stack(columns), m.torque, rcond=None)[0]
+
+
+@needs_recordings
+def test_what_is_planted_moves_the_parameter_by_its_size() -> None:
+    rig = planted.RIGS["emps"]
+    table = rig.load()[0][0]
+    plain = _emps_fit(table)
+    assert plain[0] == pytest.approx(95.1, rel=0.03)
+    assert plain[2] == pytest.approx(20.4, rel=0.05)
+    for name, row, change in (("mass", 0, 9.51), ("coulomb", 2, 5.1), ("offset", 3, -5.1)):
+        law = {**planted.NEW, **planted.CHANGED}[name][0]
+        moved = _emps_fit(planted.plant(rig, table, law, 1.0)) - plain
+        assert moved[row] == pytest.approx(change, rel=0.03)
+    gained = _emps_fit(planted.plant(rig, table, planted.CHANGED["gain"][0], 1.0))
+    assert gained[:3] == pytest.approx(plain[:3] / 0.85, rel=1e-6)
+
+
+@needs_recordings
+@pytest.mark.parametrize("name", planted.RIGS)
+def test_every_rig_has_a_joint_file_of_its_columns_and_each_law_acts(name: str) -> None:
+    rig = planted.RIGS[name]
+    train, held = rig.load()
+    joint = tomllib.loads((planted.FILES / f"{name}.toml").read_text(encoding="utf-8"))
+    assert {c["column"] for c in joint["columns"].values()} <= set(train[0]) & set(held[0])
+    for law, _ in (*planted.NEW.values(), *planted.CHANGED.values()):
+        added = law(rig, planted.motion(rig, train[0]), 1.0)
+        assert np.all(np.isfinite(added))
+        assert np.std(added) > 0.0 or np.all(added != 0.0)
+
+
+def test_a_planted_name_is_judged_against_what_the_plain_records_give() -> None:
+    usual, right = frozenset({"coulomb"}), frozenset({"stribeck"})
+    assert planted.judged(_result("coulomb", "stribeck"), right, usual) == (True, True, ())
+    assert planted.judged(_result("coulomb", ["lugre", "stribeck"]), right, usual) == (
+        True,
+        False,
+        (),
+    )
+    assert planted.judged(_result("lugre"), right, usual) == (False, False, ("lugre",))

@@ -51,7 +51,7 @@ class Job:
     seed: int
     sensors: str
     entry: str = ENTRY
-    limit: int = 0
+    limit: float = 0.0
     seconds: float = SECONDS
     without: tuple[str, ...] = ()
     kind: str | None = None
@@ -80,7 +80,14 @@ class Job:
             value = getattr(self, option)
             words += [f"--{option} {value}"] if value is not None else []
         words += [f"--names {' '.join(self.names)}"] if self.names is not None else []
-        words += [f"--without {' '.join(self.without)}"] if self.without else []
+        if self.without == TROUBLES:
+            words.append("--without everything")
+        elif self.without:
+            left = [t for t in TROUBLES if t not in self.without]
+            few = len(left) < len(self.without)
+            words.append(
+                f"--only {' '.join(left)}" if few else f"--without {' '.join(self.without)}"
+            )
         words += [f"--seconds {self.seconds:g}"] if self.seconds != SECONDS else []
         return " ".join(words)
 
@@ -223,6 +230,7 @@ def parser() -> argparse.ArgumentParser:
         default=[],
         help="troubles to switch off",
     )
+    p.add_argument("--only", nargs="+", choices=TROUBLES, help="switch off all troubles but these")
     p.add_argument("--kind", choices=KINDS, help="instead of a drawn one")
     p.add_argument(
         "--names",
@@ -235,7 +243,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--motion", choices=list(motions.MOTIONS))
     p.add_argument("--jobs", type=int, default=1, help="processes")
     p.add_argument(
-        "--limit", type=int, default=180, help="processor seconds for one answer (0: no limit)"
+        "--limit", type=float, default=180.0, help="processor seconds for one answer (0: no limit)"
     )
     p.add_argument(
         "--budget",
@@ -256,6 +264,8 @@ def plan(options: argparse.Namespace) -> list[Job]:
     names = options.names
     kind = options.kind
     without = TROUBLES if "everything" in options.without else tuple(options.without)
+    if options.only:
+        without = tuple(t for t in TROUBLES if t not in options.only)
     if names is not None and kind is None:
         outside = any(n in hidden.OUTSIDE for n in names)
         kind = "outside" if outside else KINDS[min(len(names), 3)]

@@ -36,9 +36,9 @@ Table = dict[str, FloatArray]
 
 SHARED: Final = Path(__file__).resolve().parents[2].parent / "shared" / "measurements"
 FILES: Final = Path(__file__).resolve().parent / "rigs"
-SMOOTHING: Final = 0.06
-"""Window of the cubic that gives velocity and acceleration of a recorded motion [s]: beyond the swing of the drive's
-loop, below that of the motion."""
+SMOOTHING: Final = 0.02
+"""Window of the cubic that gives velocity and acceleration of a recorded motion [s]: the mass of emps then comes out
+within 2 % of the published one; 0.06 s blunts its ramps by 8 %."""
 
 
 @final
@@ -442,7 +442,7 @@ def main(argv: list[str] | None = None) -> int:
     )
     p.add_argument("--effects", nargs="*", choices=[*NEW, *CHANGED], default=[*NEW, *CHANGED])
     p.add_argument("--sizes", nargs="+", type=float, default=[1.0])
-    p.add_argument("--limit", type=int, default=180, help="processor seconds for one answer")
+    p.add_argument("--limit", type=float, default=180.0, help="processor seconds for one answer")
     p.add_argument("--keep", type=Path, help="folder that keeps the planted records")
     options = p.parse_args(argv)
     if not SHARED.exists():
