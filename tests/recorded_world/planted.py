@@ -18,6 +18,7 @@ import json
 import sys
 import tempfile
 import time
+import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, final
@@ -57,7 +58,7 @@ class Rig:
     step
         Sampling interval [s].
     friction, inertia, speed
-        Of the axis, to size what is planted (README of the recordings, or a plain fit).
+        Scales of what is planted: two fifths of the drive's rms, the inertia of a plain fit, a usual speed.
     pitch
         Travel of one period of the planted ripple [rad, m].
     """
@@ -126,9 +127,9 @@ RIGS: Final[Mapping[str, Rig]] = {
             "kuka_axis1", _kuka, "axis1_motor_torque_Nm", 256.857142857, "axis1_motor_position_link_referred_deg",
             np.pi / 180.0, 4e-3, 300.0, 1000.0, 1.0, np.pi / 256.857142857,
         ),
-        Rig("quanser", _quanser, "i1_A", 8.925, "q1_deg", np.pi / 180.0, 2e-3, 1.3, 0.35, 1.0, np.pi / 100.0),
+        Rig("quanser", _quanser, "i1_A", 8.925, "q1_deg", np.pi / 180.0, 2e-3, 0.9, 0.35, 1.0, np.pi / 100.0),
         # the drive counts volts: sizes are volts per unit
-        Rig("bam_xl330", _bam, "volts", 1.0, "q_rad", 1.0, 1.0 / 240.0, 0.5, 0.05, 5.0, 2.0 * np.pi / 12.0),
+        Rig("bam_xl330", _bam, "volts", 1.0, "q_rad", 1.0, 1.0 / 240.0, 1.8, 0.05, 5.0, 2.0 * np.pi / 12.0),
     )
 }  # fmt: skip
 
@@ -205,6 +206,10 @@ NEW: Final[Mapping[str, Planted]] = {
 CHANGED: Final[Mapping[str, Planted]] = {
     "coulomb": (_coulomb, frozenset({"coulomb", "motor_coulomb"})),
     "mass": (_mass, frozenset({"inertia", "motor_inertia", "extra_inertia"})),
+    "offset": (
+        _offset,
+        frozenset({"current_offset", "asymmetric_coulomb", "motor_asymmetric_coulomb"}),
+    ),
     "gain": (
         _gain,
         frozenset({"motor_constant_error", "torque_per_current", "motor_constant", "gain"}),
@@ -296,6 +301,9 @@ def _new(
 ) -> list[Outcome]:
     improve, joint = load_entry(ENTRY), FILES / f"{rig.name}.toml"
     train, held = rig.load()
+    listed = set(tomllib.loads(joint.read_text(encoding="utf-8"))["joint"]["effects"])
+    # what the joint file has already cannot be found missing in it: then it is a change
+    effects = [e for e in effects if not NEW[e][1] & listed]
     outcomes: list[Outcome] = []
     usual: frozenset[str] = frozenset()
     for effect, size in [("", 0.0), *((e, s) for e in effects for s in sizes)]:
@@ -369,6 +377,7 @@ def _changed(rig: Rig, effects: list[str], sizes: list[float], folder: Path) -> 
     outcomes = []
     for effect, size in [("", 0.0), *((e, s) for e in effects for s in sizes)]:
         law, right = CHANGED[effect] if effect else (None, frozenset[str]())
+        told = effect or "nothing"
         # the records that were not fitted: a change is found on new motion
         given = [plant(rig, t, law, size) for t in held] if law else held
         files = write(given, folder / f"{rig.name}-changed-{effect}-{size:g}", "now")
@@ -376,18 +385,8 @@ def _changed(rig: Rig, effects: list[str], sizes: list[float], folder: Path) -> 
         code, text = _verb("changed", str(reference), *map(str, files), "--json", str(out))
         if code == 2:
             last = next((x for x in reversed(text.splitlines()) if x.strip()), "refused")
-            outcomes.append(
-                Outcome(
-                    rig.name,
-                    effect or "nothing",
-                    size,
-                    "changed",
-                    False,
-                    False,
-                    (),
-                    f"REFUSED {last[:90]}",
-                )
-            )
+            said = f"REFUSED {last.partition(' (choose')[0]}"
+            outcomes.append(Outcome(rig.name, told, size, "changed", False, False, (), said))
             continue
         names = [
             str(c["parameter"]) for c in json.loads(out.read_text(encoding="utf-8"))["changed"]
@@ -452,8 +451,9 @@ def main(argv: list[str] | None = None) -> int:
     with contextlib.ExitStack() as stack:
         folder = options.keep or Path(stack.enter_context(tempfile.TemporaryDirectory()))
         for name in options.rigs:
-            new = [e for e in options.effects if e in NEW]
-            moved = [e for e in options.effects if e in CHANGED]
+            chosen = list(dict.fromkeys(options.effects))
+            new = [e for e in chosen if e in NEW]
+            moved = [e for e in chosen if e in CHANGED]
             outcomes += _new(RIGS[name], new, options.sizes, options.limit, folder) if new else []
             outcomes += _changed(RIGS[name], moved, options.sizes, folder) if moved else []
             sys.stderr.write(f"{name} done\n")
