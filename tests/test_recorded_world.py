@@ -42,11 +42,18 @@ def test_energy_is_kept_without_friction_and_drive(law: dict[str, float]) -> Non
 @pytest.mark.parametrize(
     "law",
     [
-        {"M_TC": 3.0}, {"M_TC": 3.0, "M_V0": 0.005}, {"M_TC": 3.0, "M_ZS": 2e-3}, {"M_B": 5.0}, {"C": 30.0},
-        {"M_TC": 3.0, "M_MU": 0.05}, {"L_TC": 2.0}, {"HK1": 4e3, "HS1": 1e-3}, {"M_BUMP": 4.0, "M_BUMP_W": 0.2},
+        {"M_TC": 3.0},
+        {"M_TC": 3.0, "M_V0": 0.005},
+        {"M_TC": 3.0, "M_ZS": 2e-3},
+        {"M_B": 5.0},
+        {"C": 30.0},
+        {"M_TC": 3.0, "M_MU": 0.05},
+        {"L_TC": 2.0},
+        {"HK1": 4e3, "HS1": 1e-3},
+        {"M_BUMP": 4.0, "M_BUMP_W": 0.2},
         {"M_O1": 3.0, "M_V1": 0.1},
     ],
-)  # fmt: skip
+)
 def test_friction_takes_energy(law: dict[str, float]) -> None:
     energy = free(law)[:, 6]
     # a slip element gives back what it stored, at most its own spring's energy
@@ -150,10 +157,20 @@ def test_noise_has_unit_deviation_and_its_colour(kind: str) -> None:
 
 def _sensors(**changes: float | int | str | bool) -> sensors.Sensors:
     plain: dict[str, float | int | str | bool] = {
-        "rate": 500.0, "zero": 0.0, "link_skew": 0.0, "torque_skew": 0.0, "motor_bits": 19, "link_bits": 19,
-        "current_bits": 16, "filter": 0.0, "jitter": 0.0, "lost": 0.0, "noise": "white", "level": 1e-9,
+        "rate": 500.0,
+        "zero": 0.0,
+        "link_skew": 0.0,
+        "torque_skew": 0.0,
+        "motor_bits": 19,
+        "link_bits": 19,
+        "current_bits": 16,
+        "filter": 0.0,
+        "jitter": 0.0,
+        "lost": 0.0,
+        "noise": "white",
+        "level": 1e-9,
         "velocities": True,
-    }  # fmt: skip
+    }
     return sensors.Sensors(**{**plain, **changes})  # type: ignore[arg-type]
 
 
@@ -241,10 +258,20 @@ def test_files_say_what_each_sensor_set_records(tmp_path: Path) -> None:
 
 def _truth(**changes: object) -> dict[str, Any]:
     plain: dict[str, Any] = {
-        "seed": 1, "make": "cobot100", "motion": "multisine", "kind": "single", "size": 1.0, "hidden": ["stribeck"],
-        "neutral": ["gravity_phase"], "laws": {"stribeck": {}}, "orders": {}, "motor_turns": 100.0,
-        "values": {"KE2_O": 3.3}, "sensor_set": "all", "sensors": {"rate": 500.0, "noise": "white", "lost": 0.0},
-    }  # fmt: skip
+        "seed": 1,
+        "make": "cobot100",
+        "motion": "multisine",
+        "kind": "single",
+        "size": 1.0,
+        "hidden": ["stribeck"],
+        "neutral": ["gravity_phase"],
+        "laws": {"stribeck": {}},
+        "orders": {},
+        "motor_turns": 100.0,
+        "values": {"KE2_O": 3.3},
+        "sensor_set": "all",
+        "sensors": {"rate": 500.0, "noise": "white", "lost": 0.0},
+    }
     return {**plain, **changes}
 
 

@@ -64,9 +64,15 @@ class Job:
     def case(self) -> Case:
         """The joint and its recordings."""
         return make_case(
-            self.seed, without=self.without, seconds=self.seconds, kind=self.kind, names=self.names, size=self.size,
-            make=self.make, motion=self.motion,
-        )  # fmt: skip
+            self.seed,
+            without=self.without,
+            seconds=self.seconds,
+            kind=self.kind,
+            names=self.names,
+            size=self.size,
+            make=self.make,
+            motion=self.motion,
+        )
 
     @property
     def command(self) -> str:
@@ -271,13 +277,22 @@ def plan(options: argparse.Namespace) -> list[Job]:
         kind = "outside" if outside else KINDS[min(len(names), 3)]
     return [
         Job(
-            seed, given, options.entry, options.limit, options.seconds, without, kind=kind,
-            names=None if names is None else tuple(names), size=options.size, make=options.make,
-            motion=options.motion, keep=options.keep,
+            seed,
+            given,
+            options.entry,
+            options.limit,
+            options.seconds,
+            without,
+            kind=kind,
+            names=None if names is None else tuple(names),
+            size=options.size,
+            make=options.make,
+            motion=options.motion,
+            keep=options.keep,
         )
         for seed in options.seeds or range(options.start, options.start + options.joints)
         for given in options.sensors
-    ]  # fmt: skip
+    ]
 
 
 def main(argv: list[str] | None = None) -> int:

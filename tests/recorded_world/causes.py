@@ -116,9 +116,12 @@ def main(argv: list[str] | None = None) -> int:
         job = Job(failed.seed, failed.sensors, limit=options.limit, seconds=options.seconds)
         for cause, shows, answer in causes(job):
             row: dict[str, object] = {
-                "case": name, "hidden": "+".join(failed.hidden) or "nothing", "cause": cause,
-                "command": shows.command, "said": said(answer),
-            }  # fmt: skip
+                "case": name,
+                "hidden": "+".join(failed.hidden) or "nothing",
+                "cause": cause,
+                "command": shows.command,
+                "said": said(answer),
+            }
             rows.append(row)
             if options.json:
                 with options.json.open("a", encoding="utf-8") as file:

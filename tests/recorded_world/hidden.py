@@ -166,9 +166,11 @@ def cubic_stiffness(s: Setting) -> Law:
 def piecewise_stiffness(s: Setting) -> Law:
     k, d = s.joint.values["K"], s.twist
     values = {
-        "X1": s.shape(0.12, 0.18, d), "X2": s.shape(0.36, 0.46, d),
-        "D1": s.some(0.4, 0.65, k), "D2": s.some(0.2, 0.4, k),
-    }  # fmt: skip
+        "X1": s.shape(0.12, 0.18, d),
+        "X2": s.shape(0.36, 0.46, d),
+        "D1": s.some(0.4, 0.65, k),
+        "D2": s.some(0.2, 0.4, k),
+    }
     return Law(values, values, "transmission")
 
 
@@ -263,22 +265,60 @@ def touch(s: Setting) -> Law:
 LIBRARY: Final[Mapping[str, Callable[[Setting], Law]]] = {
     f.__name__: f
     for f in (
-        cubic_viscous, quadratic_drag, asymmetric_coulomb, asymmetric_viscous, stribeck, load_dependent_friction,
-        lugre, thermal_friction, cyclic_friction, cyclic_torque, added_spring, coulomb, gravity,
-        motor_constant_error, current_offset, torque_ripple, cubic_stiffness, piecewise_stiffness, hysteresis,
-        backlash, soft_windup, kinematic_error, torque_sensor_gain, torque_sensor_offset, channel_delay,
+        cubic_viscous,
+        quadratic_drag,
+        asymmetric_coulomb,
+        asymmetric_viscous,
+        stribeck,
+        load_dependent_friction,
+        lugre,
+        thermal_friction,
+        cyclic_friction,
+        cyclic_torque,
+        added_spring,
+        coulomb,
+        gravity,
+        motor_constant_error,
+        current_offset,
+        torque_ripple,
+        cubic_stiffness,
+        piecewise_stiffness,
+        hysteresis,
+        backlash,
+        soft_windup,
+        kinematic_error,
+        torque_sensor_gain,
+        torque_sensor_offset,
+        channel_delay,
     )
-}  # fmt: skip
+}
 OUTSIDE: Final[Mapping[str, Callable[[Setting], Law]]] = {
     f.__name__: f for f in (odd_curve, position_bump, one_sided_snag, warm_up, saturation, touch)
 }
-SIDED: Final = frozenset({
-    "cubic_viscous", "quadratic_drag", "asymmetric_coulomb", "asymmetric_viscous", "stribeck", "lugre",
-    "load_dependent_friction", "cyclic_friction", "cyclic_torque", "added_spring",
-})  # fmt: skip
-TRANSMISSION: Final = frozenset({
-    "cubic_stiffness", "piecewise_stiffness", "hysteresis", "backlash", "soft_windup", "kinematic_error",
-})  # fmt: skip
+SIDED: Final = frozenset(
+    {
+        "cubic_viscous",
+        "quadratic_drag",
+        "asymmetric_coulomb",
+        "asymmetric_viscous",
+        "stribeck",
+        "lugre",
+        "load_dependent_friction",
+        "cyclic_friction",
+        "cyclic_torque",
+        "added_spring",
+    }
+)
+TRANSMISSION: Final = frozenset(
+    {
+        "cubic_stiffness",
+        "piecewise_stiffness",
+        "hysteresis",
+        "backlash",
+        "soft_windup",
+        "kinematic_error",
+    }
+)
 OF_TORQUE_SENSOR: Final = frozenset({"torque_sensor_gain", "torque_sensor_offset"})
 OF_MOTOR: Final = tuple(
     n for n in LIBRARY if n not in TRANSMISSION | OF_TORQUE_SENSOR | {"gravity"}

@@ -107,9 +107,12 @@ def _bam() -> tuple[list[Table], list[Table]]:
     gain = (4096 / 2 / np.pi) / (128 * 885)  # duty per count of error, as the firmware has it
     duty = np.clip(gain * rows["kp"] * (rows["q_ref_rad"] - rows["q_rad"]), -1, 1)
     table = {
-        "t_s": rows["t_s"], "q_rad": rows["q_rad"], "volts": duty * rows["vin_V"], "kp": rows["kp"],
+        "t_s": rows["t_s"],
+        "q_rad": rows["q_rad"],
+        "volts": duty * rows["vin_V"],
+        "kp": rows["kp"],
         "run": np.unique(rows["run"], return_inverse=True)[1],
-    }  # fmt: skip
+    }
 
     def part(*gains: int) -> Table:
         keep = np.isin(rows["kp"], gains)
@@ -124,14 +127,47 @@ RIGS: Final[Mapping[str, Rig]] = {
         Rig("emps", _emps, "u_V", 35.15065188, "q_m", 1.0, 1e-3, 20.4, 95.1, 0.12, 0.01),
         # friction and inertia of a plain fit; the ripple is the second order of the motor turn
         Rig(
-            "kuka_axis1", _kuka, "axis1_motor_torque_Nm", 256.857142857, "axis1_motor_position_link_referred_deg",
-            np.pi / 180.0, 4e-3, 300.0, 1000.0, 1.0, np.pi / 256.857142857,
+            "kuka_axis1",
+            _kuka,
+            "axis1_motor_torque_Nm",
+            256.857142857,
+            "axis1_motor_position_link_referred_deg",
+            np.pi / 180.0,
+            4e-3,
+            390.0,
+            1560.0,
+            0.4,
+            np.pi / 256.857142857,
         ),
-        Rig("quanser", _quanser, "i1_A", 8.925, "q1_deg", np.pi / 180.0, 2e-3, 0.9, 0.35, 1.0, np.pi / 100.0),
+        Rig(
+            "quanser",
+            _quanser,
+            "i1_A",
+            8.925,
+            "q1_deg",
+            np.pi / 180.0,
+            2e-3,
+            0.9,
+            0.35,
+            1.0,
+            np.pi / 100.0,
+        ),
         # the drive counts volts: sizes are volts per unit
-        Rig("bam_xl330", _bam, "volts", 1.0, "q_rad", 1.0, 1.0 / 240.0, 1.8, 0.05, 5.0, 2.0 * np.pi / 12.0),
+        Rig(
+            "bam_xl330",
+            _bam,
+            "volts",
+            1.0,
+            "q_rad",
+            1.0,
+            1.0 / 240.0,
+            1.8,
+            0.05,
+            5.0,
+            2.0 * np.pi / 12.0,
+        ),
     )
-}  # fmt: skip
+}
 
 
 @final

@@ -121,8 +121,12 @@ def score(truth: Mapping[str, Any], result: Json) -> Answer:
     true_orders = [*orders.values(), float(truth["values"].get("KE2_O", 0.0))]
     stray = [x for x in lines if not any(o and _is_order(x, o, truth) for o in true_orders)]
     # a periodic effect that only lines of another order name is not found
-    missed = {n for n in orders if any(n in x["effects"] for x in stray)
-              and not any(_is_order(x, orders[n], truth) for x in lines)}  # fmt: skip
+    missed = {
+        n
+        for n in orders
+        if any(n in x["effects"] for x in stray)
+        and not any(_is_order(x, orders[n], truth) for x in lines)
+    }
     claims = [(_names(c) - missed, c) for c in result["claims"]]
     found = _calibrated(truth, result)
     found |= {n for n, order in orders.items() if any(_is_order(x, order, truth) for x in lines)}
@@ -158,25 +162,44 @@ def score(truth: Mapping[str, Any], result: Json) -> Answer:
     last = result["steps"][-1]["held_out"]
     sensors = truth["sensors"]
     return Answer(
-        seed=int(truth["seed"]), sensors=str(truth["sensor_set"]), make=str(truth["make"]),
-        motion=str(truth["motion"]), kind=str(truth["kind"]), size=float(truth["size"]),
-        rate=float(sensors["rate"]), noise=str(sensors["noise"]), lost=float(sensors["lost"]), hidden=hidden,
-        found=tuple(sorted(found)), single=tuple(counted), right=tuple(n for n in counted if n in hidden_names),
-        wrong=tuple(wrong), marked=tuple("|".join(sorted(names)) for names, c in empty if _marked(c)),
-        verdict=verdict, verdict_right=good, held_out=float(last["relative_error_percent"]),
+        seed=int(truth["seed"]),
+        sensors=str(truth["sensor_set"]),
+        make=str(truth["make"]),
+        motion=str(truth["motion"]),
+        kind=str(truth["kind"]),
+        size=float(truth["size"]),
+        rate=float(sensors["rate"]),
+        noise=str(sensors["noise"]),
+        lost=float(sensors["lost"]),
+        hidden=hidden,
+        found=tuple(sorted(found)),
+        single=tuple(counted),
+        right=tuple(n for n in counted if n in hidden_names),
+        wrong=tuple(wrong),
+        marked=tuple("|".join(sorted(names)) for names, c in empty if _marked(c)),
+        verdict=verdict,
+        verdict_right=good,
+        held_out=float(last["relative_error_percent"]),
         ratio=max((float(b["ratio"]) for b in last["balances"].values()), default=float("nan")),
-    )  # fmt: skip
+    )
 
 
 def refused(truth: Mapping[str, Any], error: str) -> Answer:
     """The answer of a case that ended in an error."""
     sensors = truth["sensors"]
     return Answer(
-        seed=int(truth["seed"]), sensors=str(truth["sensor_set"]), make=str(truth["make"]),
-        motion=str(truth["motion"]), kind=str(truth["kind"]), size=float(truth["size"]),
-        rate=float(sensors["rate"]), noise=str(sensors["noise"]), lost=float(sensors["lost"]),
-        hidden=tuple(truth["hidden"]), error=error,
-    )  # fmt: skip
+        seed=int(truth["seed"]),
+        sensors=str(truth["sensor_set"]),
+        make=str(truth["make"]),
+        motion=str(truth["motion"]),
+        kind=str(truth["kind"]),
+        size=float(truth["size"]),
+        rate=float(sensors["rate"]),
+        noise=str(sensors["noise"]),
+        lost=float(sensors["lost"]),
+        hidden=tuple(truth["hidden"]),
+        error=error,
+    )
 
 
 def _share(part: int, whole: int) -> str:
@@ -199,14 +222,18 @@ def row(label: str, answers: Iterable[Answer]) -> str:
     nothing = [a for a in told if a.kind == "none"]
     held = [a.held_out for a in told]
     cells = [
-        label, str(len(every)), _share(sum(len(a.found) for a in library), names),
+        label,
+        str(len(every)),
+        _share(sum(len(a.found) for a in library), names),
         _share(sum(len(a.right) for a in every), sum(len(a.single) for a in every)),
         _share(sum(bool(a.wrong) for a in told), len(told)),
         _share(sum(bool(a.wrong) for a in nothing), len(nothing)),
-        _share(sum(a.verdict_right for a in every), len(every)), _share(sum(a.all_right for a in every), len(every)),
-        str(len(every) - len(told)), f"{np.median(held):.1f}" if held else "-",
+        _share(sum(a.verdict_right for a in every), len(every)),
+        _share(sum(a.all_right for a in every), len(every)),
+        str(len(every) - len(told)),
+        f"{np.median(held):.1f}" if held else "-",
         f"{np.median([a.seconds for a in every]):.1f}",
-    ]  # fmt: skip
+    ]
     return "| " + " | ".join(cells) + " |"
 
 
@@ -219,11 +246,16 @@ def tables(answers: list[Answer]) -> str:
     if not answers:
         return "no cases\n"
     conditions = {
-        "sensors": lambda a: a.sensors, "sensors and size": lambda a: f"{a.sensors}: {_sized(a)}",
-        "hidden": _sized, "make": lambda a: a.make, "motion": lambda a: a.motion, "rate": lambda a: f"{a.rate:g} Hz",
-        "noise": lambda a: a.noise, "lost": lambda a: f"{100 * a.lost:g} %",
+        "sensors": lambda a: a.sensors,
+        "sensors and size": lambda a: f"{a.sensors}: {_sized(a)}",
+        "hidden": _sized,
+        "make": lambda a: a.make,
+        "motion": lambda a: a.motion,
+        "rate": lambda a: f"{a.rate:g} Hz",
+        "noise": lambda a: a.noise,
+        "lost": lambda a: f"{100 * a.lost:g} %",
         "name": lambda a: "+".join(a.hidden) or "nothing",
-    }  # fmt: skip
+    }
     text = [HEADER.format("all"), row("all", answers), ""]
     for title, key in conditions.items():
         text.append(HEADER.format(title))

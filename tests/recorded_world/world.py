@@ -51,9 +51,13 @@ TROUBLES: Final = ("joint_zero", "rest", "stick", "dirt", *sensors.IDEAL)
 DIRT: Final = 0.02
 """Torque of the small unmodelled disturbances, as a share of the friction torque."""
 UNITS: Final[Mapping[str, tuple[str, str]]] = {
-    "motor_current": ("A", "A"), "motor_position": ("rad", "m"), "motor_velocity": ("rad_s", "m_s"),
-    "link_position": ("rad", "m"), "link_velocity": ("rad_s", "m_s"), "link_torque": ("Nm", "N"),
-}  # fmt: skip
+    "motor_current": ("A", "A"),
+    "motor_position": ("rad", "m"),
+    "motor_velocity": ("rad_s", "m_s"),
+    "link_position": ("rad", "m"),
+    "link_velocity": ("rad_s", "m_s"),
+    "link_torque": ("Nm", "N"),
+}
 
 
 @final
@@ -138,10 +142,13 @@ def _dirt(seed: int, joint: Plain) -> dict[str, float]:
     rng = stream(seed, "dirt")
     stroke = joint.make.stroke
     return {
-        "L_BUMP": DIRT * joint.friction, "L_BUMP_X": rng.uniform(-0.5, 0.5) * stroke,
-        "L_BUMP_W": 0.08 * stroke, "KE2": 0.002 * joint.load / joint.values["K"],
-        "KE2_O": float(np.round(rng.uniform(2.3, 5.7), 2)), "KE2_P": float(rng.uniform(0.0, 6.28)),
-    }  # fmt: skip
+        "L_BUMP": DIRT * joint.friction,
+        "L_BUMP_X": rng.uniform(-0.5, 0.5) * stroke,
+        "L_BUMP_W": 0.08 * stroke,
+        "KE2": 0.002 * joint.load / joint.values["K"],
+        "KE2_O": float(np.round(rng.uniform(2.3, 5.7), 2)),
+        "KE2_P": float(rng.uniform(0.0, 6.28)),
+    }
 
 
 def make_case(
@@ -230,10 +237,14 @@ def joint_text(case: Case, given: str) -> str:
     listed = ", ".join(f'"{e}"' for e in effects)
     constant = case.joint.make.per_current * (1.0 if make.linear else case.joint.sign)
     lines = [
-        "[joint]", f'name = "{make.name} {case.seed}"', f'kind = "{"linear" if make.linear else "rotary"}"',
-        f"gear_ratio = {case.joint.gear_ratio!r}", f"torque_per_current = {constant!r}",
-        f'model = "{"hd3" if both else "hd1"}"', f"effects = [{listed}]",
-    ]  # fmt: skip
+        "[joint]",
+        f'name = "{make.name} {case.seed}"',
+        f'kind = "{"linear" if make.linear else "rotary"}"',
+        f"gear_ratio = {case.joint.gear_ratio!r}",
+        f"torque_per_current = {constant!r}",
+        f'model = "{"hd3" if both else "hd1"}"',
+        f"effects = [{listed}]",
+    ]
     if gap and both:  # a catalogue value, wrong by a factor of three
         lines += ["", "[fitted]", f"backlash = {{ value = {3.0 * gap!r} }}"]
     return "\n".join(lines) + "\n"
@@ -257,15 +268,23 @@ def neutral(case: Case, given: str) -> tuple[str, ...]:
 def truth(case: Case, given: str) -> dict[str, object]:
     """What the truth file says."""
     return {
-        "seed": case.seed, "held_back": held_back(case.seed), "make": case.joint.make.name,
-        "linear": case.joint.make.linear, "motion": case.motion, "kind": case.kind,
-        "size": case.size if case.names else 0.0, "hidden": list(case.names), "neutral": neutral(case, given),
+        "seed": case.seed,
+        "held_back": held_back(case.seed),
+        "make": case.joint.make.name,
+        "linear": case.joint.make.linear,
+        "motion": case.motion,
+        "kind": case.kind,
+        "size": case.size if case.names else 0.0,
+        "hidden": list(case.names),
+        "neutral": neutral(case, given),
         "laws": {n: dict(law.truth) for n, law in case.laws.items()},
         "places": {n: law.place for n, law in case.laws.items()},
         "orders": {n: law.order for n, law in case.laws.items() if law.order is not None},
-        "motor_turns": case.joint.make.ratio, "sensor_set": given,
-        "sensors": sensors.described(case.sensors), "values": dict(case.values),
-    }  # fmt: skip
+        "motor_turns": case.joint.make.ratio,
+        "sensor_set": given,
+        "sensors": sensors.described(case.sensors),
+        "values": dict(case.values),
+    }
 
 
 def write_case(case: Case, folder: Path, given: str) -> Path:
