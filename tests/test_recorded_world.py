@@ -129,6 +129,17 @@ def test_nothing_is_hidden_where_nothing_is_asked_for() -> None:
     assert not case.laws
 
 
+def test_strength_is_what_the_law_makes_of_the_signals() -> None:
+    assert world.make_case(3, names=(), seconds=2.0).strength == 0.0
+    full, third = (
+        world.make_case(20, names=("current_offset",), size=s, seconds=6.0) for s in (1.0, 0.3)
+    )
+    offset = full.laws["current_offset"].truth["current_offset_A"]
+    share = 100.0 * abs(offset) / np.std(full.measured["train"][:, 0])
+    assert full.strength == pytest.approx(share, rel=1e-3)
+    assert third.strength == pytest.approx(0.3 * share, rel=1e-3)
+
+
 def test_size_scales_a_law_in_proportion() -> None:
     full, third = (
         world.make_case(0, names=("quadratic_drag",), size=s, seconds=2.0) for s in (1.0, 0.3)

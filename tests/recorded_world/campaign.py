@@ -162,11 +162,14 @@ def load(path: Path) -> list[Answer]:
     if not path.exists():
         return []
     rows = [json.loads(x) for x in path.read_text(encoding="utf-8").splitlines() if x.strip()]
+    known = [r for r in rows if r.get("make")]
     return [
-        Answer(**{k: tuple(v) if isinstance(v, list) else v for k, v in r.items()})
-        for r in rows
-        if r.get("make")
+        _answer({k: tuple(v) if isinstance(v, list) else v for k, v in r.items()}) for r in known
     ]
+
+
+def _answer(fields: dict[str, Any]) -> Answer:
+    return Answer(**fields)
 
 
 def _done(path: Path | None) -> set[tuple[int, str]]:

@@ -39,6 +39,8 @@ class Law:
         Rows of length [s], torque [N.m], side; the moments are drawn per record.
     order
         Order of a line, per motor turn (or None).
+    absent
+        Parameters of the joint without the law, where the plain joint has it (None: the plain joint).
     """
 
     values: Mapping[str, float]
@@ -47,6 +49,7 @@ class Law:
     sensor: Mapping[str, float] = field(default_factory=dict)
     pushes: tuple[tuple[float, float, float], ...] = ()
     order: float | None = None
+    absent: Mapping[str, float] | None = None
 
 
 @final
@@ -132,13 +135,13 @@ def added_spring(s: Setting) -> Law:
 def coulomb(s: Setting) -> Law:
     """The plain joint's own Coulomb friction, which the joint file then lacks."""
     value = s.joint.values["M_TC"] * s.size
-    return Law({"M_TC": value}, {"motor_coulomb_Nm": value}, "motor")
+    return Law({"M_TC": value}, {"motor_coulomb_Nm": value}, "motor", absent={"M_TC": 0.0})
 
 
 def gravity(s: Setting) -> Law:
     """The plain joint's own gravity, which the joint file then lacks."""
     value = s.joint.values["TG"] * s.size
-    return Law({"TG": value}, {"gravity_Nm": value}, "link")
+    return Law({"TG": value}, {"gravity_Nm": value}, "link", absent={"TG": 0.0})
 
 
 def motor_constant_error(s: Setting) -> Law:

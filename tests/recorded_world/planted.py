@@ -78,7 +78,7 @@ class Rig:
 
 def _csv(path: Path) -> Table:
     data = np.genfromtxt(path, delimiter=",", names=True)
-    return {str(n): np.asarray(data[n], dtype=np.float64) for n in data.dtype.names}
+    return {str(n): np.asarray(data[n], dtype=np.float64) for n in data.dtype.names or ()}
 
 
 def _emps() -> tuple[list[Table], list[Table]]:
@@ -124,47 +124,59 @@ def _bam() -> tuple[list[Table], list[Table]]:
 RIGS: Final[Mapping[str, Rig]] = {
     r.name: r
     for r in (
-        Rig("emps", _emps, "u_V", 35.15065188, "q_m", 1.0, 1e-3, 20.4, 95.1, 0.12, 0.01),
+        Rig(
+            name="emps",
+            load=_emps,
+            drive="u_V",
+            per_unit=35.15065188,
+            position="q_m",
+            to_si=1.0,
+            step=1e-3,
+            friction=20.4,
+            inertia=95.1,
+            speed=0.12,
+            pitch=0.01,
+        ),
         # friction and inertia of a plain fit; the ripple is the second order of the motor turn
         Rig(
-            "kuka_axis1",
-            _kuka,
-            "axis1_motor_torque_Nm",
-            256.857142857,
-            "axis1_motor_position_link_referred_deg",
-            np.pi / 180.0,
-            4e-3,
-            390.0,
-            1560.0,
-            0.4,
-            np.pi / 256.857142857,
+            name="kuka_axis1",
+            load=_kuka,
+            drive="axis1_motor_torque_Nm",
+            per_unit=256.857142857,
+            position="axis1_motor_position_link_referred_deg",
+            to_si=np.pi / 180.0,
+            step=4e-3,
+            friction=390.0,
+            inertia=1560.0,
+            speed=0.4,
+            pitch=np.pi / 256.857142857,
         ),
         Rig(
-            "quanser",
-            _quanser,
-            "i1_A",
-            8.925,
-            "q1_deg",
-            np.pi / 180.0,
-            2e-3,
-            0.9,
-            0.35,
-            1.0,
-            np.pi / 100.0,
+            name="quanser",
+            load=_quanser,
+            drive="i1_A",
+            per_unit=8.925,
+            position="q1_deg",
+            to_si=np.pi / 180.0,
+            step=2e-3,
+            friction=0.9,
+            inertia=0.35,
+            speed=1.0,
+            pitch=np.pi / 100.0,
         ),
         # the drive counts volts: sizes are volts per unit
         Rig(
-            "bam_xl330",
-            _bam,
-            "volts",
-            1.0,
-            "q_rad",
-            1.0,
-            1.0 / 240.0,
-            1.8,
-            0.05,
-            5.0,
-            2.0 * np.pi / 12.0,
+            name="bam_xl330",
+            load=_bam,
+            drive="volts",
+            per_unit=1.0,
+            position="q_rad",
+            to_si=1.0,
+            step=1.0 / 240.0,
+            friction=1.8,
+            inertia=0.05,
+            speed=5.0,
+            pitch=2.0 * np.pi / 12.0,
         ),
     )
 }
@@ -191,7 +203,7 @@ def _ripple(rig: Rig, m: Motion, size: float) -> FloatArray:
 
 def _spring(rig: Rig, m: Motion, size: float) -> FloatArray:
     middle = 0.5 * (m.q.max() + m.q.min())
-    return size * rig.friction / np.ptp(m.q) * (m.q - middle)
+    return np.asarray(size * rig.friction / np.ptp(m.q) * (m.q - middle))
 
 
 def _offset(rig: Rig, m: Motion, size: float) -> FloatArray:
@@ -354,23 +366,28 @@ def _new(
             with time_limit(limit):
                 result = improve(files[0], files[1], joint)
         except Exception as error:  # the refusal of one case is its result
-            outcomes.append(
-                Outcome(
-                    rig.name, effect or "nothing", size, "new", False, False, (), f"REFUSED {error}"
-                )
-            )
+            outcomes.append(_refused(rig, effect, size, "new", str(error)))
             continue
         if not effect:
             usual = frozenset().union(*(names for names, _ in _sets(result)))
         found, alone, wrong = judged(result, right, usual)
-        error = result["steps"][-1]["held_out"]["relative_error_percent"]
+        left = result["steps"][-1]["held_out"]["relative_error_percent"]
         sets = (
             "; ".join(("in part " if m else "") + "|".join(sorted(n)) for n, m in _sets(result))
             or "no claim"
         )
-        said = f"{sets}. {result['verdict']}, {error:.1f} %, {time.process_time() - began:.0f} s"
+        said = f"{sets}. {result['verdict']}, {left:.1f} %, {time.process_time() - began:.0f} s"
         outcomes.append(
-            Outcome(rig.name, effect or "nothing", size, "new", found, alone, wrong, said)
+            Outcome(
+                rig=rig.name,
+                effect=effect or "nothing",
+                size=size,
+                task="new",
+                right=found,
+                alone=alone,
+                wrong=wrong,
+                said=said,
+            )
         )
     return outcomes
 
@@ -398,31 +415,20 @@ def _changed(rig: Rig, effects: list[str], sizes: list[float], folder: Path) -> 
         "fit", *map(str, healthy), "--joint", str(FILES / f"{rig.name}.toml"), "-o", str(reference)
     )
     if code:
-        return [
-            Outcome(
-                rig.name,
-                "nothing",
-                0.0,
-                "changed",
-                False,
-                False,
-                (),
-                f"no reference: {text.splitlines()[-1]}",
-            )
-        ]
+        why = f"no reference: {text.splitlines()[-1]}"
+        return [_refused(rig, "", 0.0, "changed", why)]
     outcomes = []
     for effect, size in [("", 0.0), *((e, s) for e in effects for s in sizes)]:
         law, right = CHANGED[effect] if effect else (None, frozenset[str]())
-        told = effect or "nothing"
         # the records that were not fitted: a change is found on new motion
         given = [plant(rig, t, law, size) for t in held] if law else held
         files = write(given, folder / f"{rig.name}-changed-{effect}-{size:g}", "now")
         out = folder / "changed.json"
         code, text = _verb("changed", str(reference), *map(str, files), "--json", str(out))
         if code == 2:
-            last = next((x for x in reversed(text.splitlines()) if x.strip()), "refused")
-            said = f"REFUSED {last.partition(' (choose')[0]}"
-            outcomes.append(Outcome(rig.name, told, size, "changed", False, False, (), said))
+            last = next((x for x in reversed(text.splitlines()) if x.strip()), "no answer")
+            why = last.partition(" (choose")[0]
+            outcomes.append(_refused(rig, effect, size, "changed", why))
             continue
         names = [
             str(c["parameter"]) for c in json.loads(out.read_text(encoding="utf-8"))["changed"]
@@ -432,14 +438,14 @@ def _changed(rig: Rig, effects: list[str], sizes: list[float], folder: Path) -> 
         said = ", ".join(names) or "nothing changed"
         outcomes.append(
             Outcome(
-                rig.name,
-                effect or "nothing",
-                size,
-                "changed",
-                good,
-                good and not wrong,
-                wrong,
-                said,
+                rig=rig.name,
+                effect=effect or "nothing",
+                size=size,
+                task="changed",
+                right=good,
+                alone=good and not wrong,
+                wrong=wrong,
+                said=said,
             )
         )
     return outcomes
@@ -462,9 +468,10 @@ def table(outcomes: list[Outcome]) -> str:
     for task in ("new", "changed"):
         asked = [o for o in outcomes if o.task == task and o.effect != "nothing"]
         if asked:
-            right, wrong = sum(o.right for o in asked), sum(bool(o.wrong) for o in asked)
+            good, bad = sum(o.right for o in asked), sum(bool(o.wrong) for o in asked)
             text.append(
-                f"{task}: named alone or in its set {right} of {len(asked)}; with a wrong unmarked name {wrong} of {len(asked)}"
+                f"{task}: named alone or in its set {good} of {len(asked)}; "
+                f"with a wrong unmarked name {bad} of {len(asked)}"
             )
     return "\n".join(text) + "\n"
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final, final
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Callable, Iterable, Mapping
 
 Json = dict[str, Any]
 
@@ -31,8 +31,8 @@ class Answer:
 
     Attributes
     ----------
-    seed, sensors, make, motion, kind, size, rate, noise, lost, hidden
-        The case.
+    seed, sensors, make, motion, kind, size, rate, noise, lost, hidden, strength
+        The case; strength is the share of the signals' rms that the hidden laws make [%].
     found
         Hidden names that stand in a claim's set, in a line of their order, or in the calibration.
     single, right
@@ -57,6 +57,7 @@ class Answer:
     noise: str
     lost: float
     hidden: tuple[str, ...]
+    strength: float = float("nan")
     found: tuple[str, ...] = ()
     single: tuple[str, ...] = ()
     right: tuple[str, ...] = ()
@@ -115,7 +116,8 @@ def score(truth: Mapping[str, Any], result: Json) -> Answer:
     """Score one result (``improve.schema.json``) against a truth file."""
     hidden = tuple(str(n) for n in truth["hidden"])
     accepted = {n: frozenset({n}) | SAME.get(n, frozenset()) for n in hidden}
-    true_names = frozenset().union(*accepted.values()) | frozenset(truth["neutral"])
+    hidden_names: frozenset[str] = frozenset().union(*accepted.values())
+    true_names = hidden_names | frozenset(truth["neutral"])
     orders = dict(truth["orders"])
     lines: list[Json] = list(result.get("lines", []))
     true_orders = [*orders.values(), float(truth["values"].get("KE2_O", 0.0))]
@@ -137,7 +139,6 @@ def score(truth: Mapping[str, Any], result: Json) -> Answer:
         for names, c in claims
         if len(c["effects"]) == 1 and not _marked(c) and LEARNED not in names
     ]
-    hidden_names = frozenset().union(*accepted.values())
     counted = [
         next(iter(names), "")
         for names in single
@@ -172,6 +173,7 @@ def score(truth: Mapping[str, Any], result: Json) -> Answer:
         noise=str(sensors["noise"]),
         lost=float(sensors["lost"]),
         hidden=hidden,
+        strength=float(truth.get("strength_percent", "nan")),
         found=tuple(sorted(found)),
         single=tuple(counted),
         right=tuple(n for n in counted if n in hidden_names),
@@ -198,6 +200,7 @@ def refused(truth: Mapping[str, Any], error: str) -> Answer:
         noise=str(sensors["noise"]),
         lost=float(sensors["lost"]),
         hidden=tuple(truth["hidden"]),
+        strength=float(truth.get("strength_percent", "nan")),
         error=error,
     )
 
@@ -241,13 +244,22 @@ def _sized(a: Answer) -> str:
     return "nothing hidden" if a.kind == "none" else f"{a.kind}, size {a.size:g}"
 
 
+def _banded(a: Answer) -> str:
+    """How much of the signals the hidden laws make: below a percent hardly any record shows it."""
+    if not a.hidden or a.strength != a.strength:
+        return "-"
+    low = next(x for x in (30, 10, 3, 1, 0) if a.strength >= x)
+    return f"{low:02d} % and more"
+
+
 def tables(answers: list[Answer]) -> str:
     """Markdown: all, then one table per condition."""
     if not answers:
         return "no cases\n"
-    conditions = {
+    conditions: dict[str, Callable[[Answer], str]] = {
         "sensors": lambda a: a.sensors,
         "sensors and size": lambda a: f"{a.sensors}: {_sized(a)}",
+        "strength": _banded,
         "hidden": _sized,
         "make": lambda a: a.make,
         "motion": lambda a: a.motion,

@@ -134,7 +134,7 @@ def coloured(rng: Generator, kind: str, rows: int, rate: float) -> FloatArray:
         t, phase = np.arange(rows) / rate, rng.uniform(0.0, 2.0 * np.pi, 2)
         slow = 2.0 * np.pi * rng.uniform(9.0, 14.0)
         lines = np.sin(2.0 * np.pi * 50.0 * t + phase[0]) + np.sin(slow * t + phase[1])
-        return np.sqrt(0.5) * (white + lines)
+        return np.asarray(np.sqrt(0.5) * (white + lines))
     if kind == "heavy":
         return np.asarray(rng.standard_t(3.0, rows) / np.sqrt(3.0))
     if kind == "drift":

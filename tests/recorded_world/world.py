@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Final, final
 import numpy as np
 
 from tests.recorded_world import joints, motions, sensors
-from tests.recorded_world._engine import simulate, write_csv
+from tests.recorded_world._engine import INDEX, pack, simulate, write_csv
 from tests.recorded_world.hidden import (
     LIBRARY,
     OF_MOTOR,
@@ -77,6 +77,9 @@ class Case:
         Per record the fine rows of `_engine.COLUMNS`.
     time, measured
         Per record the time [s] and the channels (`sensors.CHANNELS`).
+    strength
+        Largest share of the rms of current, torque or twist that the hidden laws make on the first record, same motion
+        and same noise [%].
     """
 
     seed: int
@@ -91,6 +94,7 @@ class Case:
     exact: Mapping[str, FloatArray]
     time: Mapping[str, FloatArray]
     measured: Mapping[str, FloatArray]
+    strength: float
 
 
 def stream(seed: int, *labels: object) -> np.random.Generator:
@@ -151,6 +155,24 @@ def _dirt(seed: int, joint: Plain) -> dict[str, float]:
     }
 
 
+def neutral_value(joint: Plain, key: str) -> float:
+    """What a parameter is where nothing is hidden."""
+    return float(joint.values.get(key, pack({})[INDEX[key]]))
+
+
+def _strength(joint: Plain, seen: FloatArray, plain: FloatArray) -> float:
+    """Largest share [%] of the rms of current, torque or twist that the hidden laws make."""
+    at = {n: i for i, n in enumerate(sensors.CHANNELS)}
+
+    def channels(table: FloatArray) -> FloatArray:
+        twist = table[:, at["motor_position"]] / joint.gear_ratio - table[:, at["link_position"]]
+        return np.column_stack([table[:, at["motor_current"]], table[:, at["link_torque"]], twist])
+
+    one, other = channels(seen), channels(plain)
+    share = np.sqrt(np.mean((one - other) ** 2, axis=0) / np.var(one, axis=0))
+    return float(100.0 * share.max())
+
+
 def make_case(
     seed: int,
     *,
@@ -209,11 +231,14 @@ def make_case(
         values |= law.values
         faults |= law.sensor
         pushes += law.pushes
+    plain = {**values, **{k: neutral_value(joint, k) for law in laws.values() for k in law.values}}
+    for law in laws.values():
+        plain |= law.absent or {}
     exact, time, measured = {}, {}, {}
+    strength = 0.0
     for name in RECORDS:
-        path = motions.record(
-            stream(seed, "motion", name), joint, motion, seconds, rests="rest" not in without
-        )
+        fading = "rest" not in without
+        path = motions.record(stream(seed, "motion", name), joint, motion, seconds, rests=fading)
         begin = path[0, 0]
         hang = values["TG"] * np.sin(begin + values["TG_P"])
         start = np.array([begin, 0.0, begin + hang / values["K"], 0.0])
@@ -222,7 +247,27 @@ def make_case(
         exact[name] = simulate(values, path, start, outside.reshape(-1, 4))
         noise = stream(seed, "noise", name)
         time[name], measured[name] = sensors.observe(noise, exact[name], joint, logger, faults)
-    return Case(seed, kind, size, motion, names, laws, joint, logger, values, exact, time, measured)
+        if names and name == RECORDS[0]:
+            without_it = simulate(plain, path, start)
+            again = stream(seed, "noise", name)
+            strength = _strength(
+                joint, measured[name], sensors.observe(again, without_it, joint, logger, {})[1]
+            )
+    return Case(
+        seed=seed,
+        kind=kind,
+        size=size,
+        motion=motion,
+        names=names,
+        laws=laws,
+        joint=joint,
+        sensors=logger,
+        values=values,
+        exact=exact,
+        time=time,
+        measured=measured,
+        strength=strength,
+    )
 
 
 def joint_text(case: Case, given: str) -> str:
@@ -282,6 +327,7 @@ def truth(case: Case, given: str) -> dict[str, object]:
         "orders": {n: law.order for n, law in case.laws.items() if law.order is not None},
         "motor_turns": case.joint.make.ratio,
         "sensor_set": given,
+        "strength_percent": case.strength,
         "sensors": sensors.described(case.sensors),
         "values": dict(case.values),
     }
