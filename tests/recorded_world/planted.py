@@ -344,6 +344,19 @@ def judged(
     return found, alone, wrong
 
 
+def _refused(rig: Rig, effect: str, size: float, task: str, why: str) -> Outcome:
+    return Outcome(
+        rig=rig.name,
+        effect=effect or "nothing",
+        size=size,
+        task=task,
+        right=False,
+        alone=False,
+        wrong=(),
+        said=f"REFUSED {why}",
+    )
+
+
 def _new(
     rig: Rig, effects: list[str], sizes: list[float], limit: int, folder: Path
 ) -> list[Outcome]:
