@@ -232,6 +232,7 @@ def test_every_run_of_thirty_seeds_has_all_makes_and_motions() -> None:
     cases = [world.make_case(s, seconds=2.0) for s in range(30)]
     assert len({(c.joint.make.name, c.motion) for c in cases}) == 30
     assert {c.kind for c in cases} == set(world.KINDS)
+    assert 0 < sum(c.dirty for c in cases) < 20
 
 
 def test_one_seed_is_one_joint_whatever_is_switched_off() -> None:
@@ -281,6 +282,7 @@ def _truth(**changes: object) -> dict[str, Any]:
         "motor_turns": 100.0,
         "values": {"KE2_O": 3.3},
         "sensor_set": "all",
+        "dirty": False,
         "sensors": {"rate": 500.0, "noise": "white", "lost": 0.0},
     }
     return {**plain, **changes}
@@ -321,6 +323,7 @@ def test_nothing_hidden_and_laws_outside_the_library() -> None:
     assert score(_truth(**nothing), _result(verdict="nothing_missing")).all_right
     assert not score(_truth(**nothing), _result("lugre")).all_right
     assert not score(_truth(**nothing), _result(verdict="unexplained")).all_right
+    assert score(_truth(**nothing, dirty=True), _result(verdict="unexplained")).all_right
     outside = {"hidden": ["odd_curve"], "kind": "outside", "laws": {"odd_curve": {}}}
     assert score(_truth(**outside), _result(verdict="unexplained")).all_right
     assert score(_truth(**outside), _result("learned")).all_right

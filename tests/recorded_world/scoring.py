@@ -154,12 +154,13 @@ def score(truth: Mapping[str, Any], result: Json) -> Answer:
     ]
     learned = any(LEARNED in names for names, _ in claims)
     verdict = str(result["verdict"])
+    left = {"unexplained"} if truth["dirty"] else set()
     if not hidden:
-        good = verdict in CLEAN
+        good = verdict in CLEAN | left
     elif outside:
         good = verdict == "unexplained" or learned or bool(found)
     else:
-        good = verdict == "complete" and set(hidden) <= found
+        good = verdict in {"complete"} | left and set(hidden) <= found
     last = result["steps"][-1]["held_out"]
     sensors = truth["sensors"]
     return Answer(
