@@ -141,6 +141,13 @@ class OnlineEstimator:
         return all(n in self.joint.fitted for n in self.names)
 
     @property
+    def least(self) -> FloatArray:
+        """What counts as noise of each balance at least [N.m], (balances,)."""
+        share = self.options.floor_share * np.sqrt(self._torque)
+        found: FloatArray = np.maximum(np.maximum(self.floor, share), LEAST)
+        return found
+
+    @property
     def made(self) -> int:
         """Rows so far."""
         return self._rows
@@ -244,6 +251,7 @@ class OnlineEstimator:
         if self.estimator is None:
             if enable and on.all():
                 self._collected.append((y, h, shares))
+                self._torque += self.rows.signals[self._reference] ** 2
                 if len(self._collected) >= self._collect:
                     with single_thread():
                         self._begin()
@@ -290,18 +298,20 @@ class OnlineEstimator:
     def _begin(self) -> None:
         """Start the recursion from the collected rows."""
         y, h, shares = (np.array([row[i] for row in self._collected]) for i in range(3))
-        first, weight = first_estimate(y, h, partial(self._weight_of, shares))
+        self._torque /= len(y)
+        least = np.maximum(self.options.floor_share * np.sqrt(self._torque), LEAST)
+        first, weight = first_estimate(y, h, least, partial(self._weight_of, shares))
+        least = np.maximum(least, self.rows.floor(first.tolist(), self.watch.noise[list(SAMPLED)]))
         y, h = y * weight, h * weight[:, :, None]
         self._scale = np.maximum(np.maximum(np.abs(first), np.abs(self.theta)), least_range(h, y))
         self.estimator = self._recursion(self.theta)
-        started = self.estimator.startup(y, h, limit=1e-6)
-        self.estimator.release()
-        if started.removed:
-            self.events.append(f"not determined by the first window: {', '.join(started.removed)}")
+        started = self.estimator.begin(y, h, least, overlap=self.rows.timing.overlap)
+        if started.undetermined:
+            names = ", ".join(self.names[i] for i in started.undetermined)
+            self.events.append(f"not determined by the first window: {names}")
         self.theta = self.estimator.theta
         self.sigma = self.estimator.deviation
         self._square = np.mean((y - h @ self.theta) ** 2, axis=0)
-        self._torque = self.rows.signals[self._reference] ** 2
         self._collected = []
         self._floors()
         self.level = np.sqrt(self._square)
@@ -345,8 +355,7 @@ class OnlineEstimator:
         self._ratios()
 
     def _ratios(self) -> None:
-        share = self.options.floor_share * np.sqrt(self._torque)
-        self.ratio = np.sqrt(self._square) / np.maximum(np.maximum(self.floor, share), LEAST)
+        self.ratio = np.sqrt(self._square) / self.least
 
     def _judge(self, good: list[bool]) -> None:
         """The most severe fault now, and the scores."""

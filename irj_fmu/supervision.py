@@ -35,7 +35,7 @@ def launch(of: OnlineEstimator, two: Reoptimiser, *, first: bool = False) -> Non
     """Begin a search for the shapes on the rows kept."""
     window = two.window()
     weight = of._weight_of(window.shares, of.theta, of._size()) * window.on
-    two.launch(weight, of.theta, of.level, of._factory(), first=first)
+    two.launch(weight, of.theta, of.level, of.least, of._factory(), first=first)
     of.events.append(str(two.mode))
 
 

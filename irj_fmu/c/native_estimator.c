@@ -70,7 +70,7 @@ static void publish(State *s) {
 }
 
 static double least(const State *s, int b) { /* what counts as noise at least */
-    return fmax(fmax(s->floor[b], s->floor_share * sqrt(s->torque[b])), 1e-12);
+    return fmax(fmax(s->floor[b], s->floor_share * sqrt(s->torque[b])), LEAST);
 }
 
 static void ratios(State *s) {
@@ -124,7 +124,7 @@ static int configure(Twin *m) { /* take the parameters over; 0 where they ask fo
 
 static void floors(Twin *m) {
     if (!m->s.rls.running) return;
-    noise_floor(m, m->s.floor);
+    noise_floor(m, m->s.theta, m->s.floor);
     deviations(&m->s);
     ratios(&m->s);
 }
@@ -141,6 +141,7 @@ static void collect_row(Twin *m) {
     memcpy(f->y[f->count], m->y, sizeof m->y);
     memcpy(f->h[f->count], m->h, sizeof m->h);
     shares(s, f->shares[f->count]);
+    for (b = 0; b < N_BALANCES; b++) s->torque[b] += s->rows.signals[reference_signal[b]] * s->rows.signals[reference_signal[b]];
     if (++f->count < s->collect) return;
     if (begin_recursion(m)) tell(m, TELL_WINDOW, "the first window does not determine every parameter");
     floors(m);
@@ -201,7 +202,7 @@ static int take_row(Twin *m, double time, int enable) {
     }
     for (b = 0; b < N_BALANCES; b++) {
         s->residual[b] = error[b] = error_of(m->y[b], m->h + b * N_THETA, s->theta);
-        size[b] = fmax(fmax(s->floor[b], sqrt(s->square[b])), 1e-12);
+        size[b] = fmax(fmax(s->floor[b], sqrt(s->square[b])), LEAST);
     }
     shares(s, share);
     weight_of(share, s->theta, size, weight);

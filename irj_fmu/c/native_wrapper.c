@@ -5,6 +5,7 @@
  *   sample_observer       identification._fault_core
  * Value references are the positions in the variable table of irj_fmu.estimator, so that a host can exchange the two.
  */
+#include <float.h>
 #include <math.h>
 #include <stdarg.h>
 #include <stdio.h>
