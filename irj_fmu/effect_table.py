@@ -24,7 +24,7 @@ from identification.typical import true_values
 
 from .command_line import OneLineParser, check_output, fail, run_alone, write_json
 from .convergence import NOISE, STEP, STOP
-from .cosim import CHANNELS, start_state
+from .cosim import CHANNELS, link_referred, start_state
 from .host import Fmu, Instance
 from .identifiable import identifiable
 from .joint_plant import PlantOptions, plant_spec
@@ -130,13 +130,7 @@ def readings_of(joint: Joint, motion: Motion | None = None) -> FloatArray:
             for k in range(count):
                 table[k] = instance.call("getReal", references)
                 instance.call("doStep", k * STEP, STEP)
-    return table * gains(joint)
-
-
-def gains(joint: Joint) -> FloatArray:
-    """From readings at the sensors to link-referred ones, (6,)."""
-    ratio = joint.gear_ratio
-    return np.array([joint.torque_per_current or ratio, 1 / ratio, 1 / ratio, 1.0, 1.0, 1.0])
+    return table * link_referred(joint)
 
 
 def by_python(joint: Joint, readings: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -151,7 +145,7 @@ def by_python(joint: Joint, readings: FloatArray) -> tuple[FloatArray, FloatArra
 def by_native(joint: Joint, readings: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The same by the native FMU."""
     count = len(estimated_parameters(joint))
-    table = readings / gains(joint)
+    table = readings / link_referred(joint)
     with tempfile.TemporaryDirectory(prefix="irj-effects-") as folder:
         path = build_native(NativeSpec(joint, "native", _PLAIN), Path(folder) / "native.fmu")
         with Fmu(path) as fmu, Instance(fmu, name="native") as instance:
@@ -181,7 +175,7 @@ def run(label: str, seeds: Sequence[int | None], sides: Sequence[Side]) -> Itera
     units = {p.name: p.unit for p in model.parameters}
     plant = np.array([true[n] for n in names])
     for seed in seeds:
-        noise = np.abs(np.array(NOISE) * gains(joint)) * (seed is not None)
+        noise = np.abs(np.array(NOISE) * link_referred(joint)) * (seed is not None)
         readings = clean if seed is None else clean + np.random.default_rng(seed).normal(size=clean.shape) * noise
         shown = identifiable(joint, clean, noise, STEP)
         for side in sides:
