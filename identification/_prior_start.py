@@ -33,12 +33,15 @@ class PriorStart:
         Posterior over prior variance, 0 to 1.
     noise : (outputs,) array
         Variance of each output's residual, never under its floor.
+    rows : int
+        Rows without NaN and infinity.
     """
 
     theta: FloatArray
     covariance: FloatArray
     share: FloatArray
     noise: FloatArray
+    rows: int
 
     @property
     def undetermined(self) -> tuple[int, ...]:
@@ -86,4 +89,4 @@ def solve_with_prior(
     inverse = np.linalg.inv(triangle[:n, :n])
     posterior = inverse @ inverse.T
     covariance = posterior * np.outer(scale, scale)
-    return PriorStart(theta0 + scale * step, covariance, np.diag(posterior).copy(), noise)
+    return PriorStart(theta0 + scale * step, covariance, np.diag(posterior).copy(), noise, len(y))

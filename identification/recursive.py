@@ -191,6 +191,7 @@ class RecursiveLeastSquares:
         engine.part("config", "free")[list(found.removed_index)] = 0.0
         if noise is None:
             engine.part("fast", "noise")[:] = found.residual_variance
+            engine.part("fast", "learned")[:] = float(found.samples)
         return found
 
     def begin(self, Y: npt.ArrayLike, H: npt.ArrayLike, least: npt.ArrayLike, *, overlap: float = 1.0) -> PriorStart:
@@ -213,6 +214,7 @@ class RecursiveLeastSquares:
         engine.start(found.theta, found.covariance)
         engine.part("config", "free")[:] = 1.0
         engine.part("fast", "noise")[:] = found.noise
+        engine.part("fast", "learned")[:] = float(found.rows)
         return found
 
     def reset(self) -> None:

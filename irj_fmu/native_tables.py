@@ -289,7 +289,7 @@ def _recursion_tables(header: _Header, made: OnlineEstimator) -> None:
     header.define("OVERLAP", float(made.rows.timing.overlap))
     header.define("RESIDUAL_RATE", period / _RESIDUAL_SECONDS)
     for name, block, parts in (
-        ("FAST", layout.fast, ("d", "u", "theta", "noise", "alarm", "due")),
+        ("FAST", layout.fast, ("d", "u", "theta", "noise", "learned", "alarm", "due")),
         ("SLOW", layout.slow, ()),
         ("CONFIG", layout.config, ("scale", "theta0", "walk", "walk_alarm", "enabled", "start")),
     ):

@@ -325,7 +325,7 @@ class OnlineEstimator:
         period = self.rows.timing.stride * self.dt
         settings = Settings(
             sample_time=period, drift=self.options.drift, alarm_drift=self.options.alarm_drift, window_seconds=2.0,
-            rank_seconds=8.0,
+            rank_seconds=8.0, inflation=self.rows.timing.overlap,
         )  # fmt: skip
         return partial(fast_recursion, len(self.balances), self.names, settings)
 

@@ -187,6 +187,7 @@ static int start_values(Twin *m, const double theta0[N_THETA], const double scal
     for (i = 0; i < N_THETA; i++) r->fast[FAST_THETA + i] = theta[i] / scale[i];
     factorise(p, r->fast + FAST_D, r->fast + FAST_U);
     memcpy(r->fast + FAST_NOISE, noise, sizeof noise);
+    r->fast[FAST_LEARNED] = count;
     return undetermined;
 }
 
