@@ -29,7 +29,7 @@ from .online import _RESIDUAL_SECONDS, _STRAIN, OnlineEstimator
 from .row_check import LEAST
 from .rows import _NAMES, SOURCES, RowMaker
 from .variables import Variable
-from .verdict import _RECENT, FAULT_TEXT, SCALED
+from .verdict import _RECENT, FAULT_TEXT, HELD, SCALED
 from .watch import DRIVE, READINGS, TAU
 
 FloatArray = npt.NDArray[np.float64]
@@ -289,7 +289,7 @@ def _recursion_tables(header: _Header, made: OnlineEstimator) -> None:
     header.define("OVERLAP", float(made.rows.timing.overlap))
     header.define("RESIDUAL_RATE", period / _RESIDUAL_SECONDS)
     for name, block, parts in (
-        ("FAST", layout.fast, ("d", "u", "theta", "noise", "learned", "alarm", "due")),
+        ("FAST", layout.fast, ("d", "u", "theta", "noise", "error", "learned", "alarm", "due")),
         ("SLOW", layout.slow, ()),
         ("CONFIG", layout.config, ("scale", "theta0", "walk", "walk_alarm", "enabled", "start")),
     ):
@@ -306,6 +306,14 @@ def _recursion_tables(header: _Header, made: OnlineEstimator) -> None:
     header.raw(f"static const unsigned char is_friction[2][N_THETA] = {{{marks}}};")
     header.raw(f"static const unsigned char feels[N_BALANCES][2] = {{{feels}}};")
     header.whole("reference_signal", (11 if from_link else 1 for from_link in made._from_link))
+    for key, value in made.guard.figures().items():
+        header.define(f"GUARD_{key}", value)
+    header.whole("is_inertia", (int(i in made.guard.inertias) for i in range(n)), "unsigned char")
+    header.doubles("lowest", made.low)
+    header.doubles("highest", made.high)
+    for key, number in made.pulse.figures().items():
+        header.define(f"PULSE_{key}", number)
+    header.define("HELD_CODE", HELD)
     header.define("ERROR_LIMIT", float(_STRAIN.error_limit))
     header.define("CONFIRM_ROWS", made._confirm)
 

@@ -242,10 +242,12 @@ static int begin_recursion(Twin *m) {
     for (i = 0; i < N_THETA; i++) s->scale[i] = fmax(fmax(fabs(first[i]), fabs(s->theta[i])), range[i]);
     clear_recursion(s);
     undetermined = start_values(m, s->rls.config + CONFIG_THETA0, s->scale, least, s->theta);
-    for (i = 0; i < N_THETA; i++) s->theta[i] = s->rls.fast[FAST_THETA + i] * s->scale[i];
+    estimate_of(s, &s->rls, first);
+    show(s, first);
     deviations(s);
     for (b = 0; b < N_BALANCES; b++) s->square[b] = residual_square(m, b, s->theta) / s->window.count;
     memset(&s->window, 0, sizeof s->window);
     s->rls.running = 1;
+    guard_start(s);
     return undetermined;
 }

@@ -21,6 +21,7 @@
 #include "native_rows.c"
 #include "native_watch.c"
 #include "native_algebra.c"
+#include "native_guard.c"
 #include "native_window.c"
 #include "native_residuals.c"
 #include "native_fault.c"
