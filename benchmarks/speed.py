@@ -39,7 +39,8 @@ def now() -> tuple[float, float]:
 def make(folder: Path) -> None:
     """Write a record of 40 s at 1 kHz with hidden Stribeck friction, and one of a million samples (its copies in a row)."""
     from identification import Joint
-    from workbench.commands.virtual import recording, true_values
+    from identification.typical import true_values
+    from workbench.commands.virtual import recording
 
     joint = Joint(name="virtual", gear_ratio=160.0, torque_per_current=8.848, model_name="hd3", effects=EFFECTS)
     model = joint.model().add("stribeck@motor")

@@ -214,6 +214,12 @@ class JointFunctions:
         ]
         return ca.Function("outputs", [ca.vertcat(x, z), u, p], [ca.vertcat(*rows)], ["x", "u", "p"], ["y"])
 
+    @cached_property
+    def drive_lag(self) -> Any:
+        """(p) -> time by which the reading of the drive is late [s]; to first order it is the true drive less this times its rate."""
+        e, p = self._model.equations, self._symbols[3]
+        return ca.Function("drive_lag", [p], [ca.densify(ca.jacobian(e.drive, e.signals.drive_rate))], ["p"], ["lag"])
+
     def _reading(self, place: str, true: Expression, rate: Expression, *, offset: bool = True) -> Expression:
         """Reading from the true value: the affine law of the sensor turned round."""
         e = self._model.equations

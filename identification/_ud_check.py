@@ -42,18 +42,26 @@ def _walk(layout: Layout, fast: Parts, config: Parts, excited: list[SX], new_fas
 
 
 def _inflation(layout: Layout, fast: Parts, slow: Parts, config: Parts, new_fast: Parts, new_slow: Parts) -> None:
-    """Variance of a sum of innovations over the sum of their variances: 1 for white noise, more for filtered one."""
-    whole, parts, inflation = [], [], []
+    """Variance of a sum of innovations over the sum of their variances: 1 for white noise, more for filtered one.
+
+    From differences of neighbouring sums: what the estimate lags behind a slow drift is in both of them and is no
+    noise. For the same reason the product of the two comes off the estimate of R2.
+    """
+    whole, parts, inflation, noises = [], [], [], []
+    given = config["inflation"][0]
     for o in range(layout.m):
         enough = fast["squares"][o] > 0
         count = fast["samples"][0] - fast["skipped"][0]
         rate = enough * ca.fmin(0.5, fast["since_check"][0] * ca.fmax(config["noise_rate"][0], 1.0 / (200.0 + count)))
-        whole.append(slow["whole"][o] + rate * (fast["sum"][o] ** 2 - slow["whole"][o]))
+        apart = fast["sum"][o] - slow["sum_before"][o]
+        whole.append(slow["whole"][o] + rate * (0.5 * apart**2 - slow["whole"][o]))
         parts.append(slow["parts"][o] + rate * (fast["squares"][o] - slow["parts"][o]))
-        inflation.append(ca.fmax(1.0, whole[o] / ca.fmax(parts[o], 1e-6)))
-    new_slow.values.update(whole=whole, parts=parts, inflation=inflation)
+        inflation.append(select(given > 0, given, ca.fmax(1.0, whole[o] / ca.fmax(parts[o], 1e-6))))
+        lag = fast["sum"][o] * slow["sum_before"][o] / ca.fmax(1.0, fast["since_check"][0]) ** 2
+        noises.append(fast["noise"][o] * (1.0 - ca.fmax(-0.5, ca.fmin(rate * lag, 0.5))))
+    new_slow.values.update(whole=whole, parts=parts, inflation=inflation, sum_before=fast["sum"])
     zero = [ca.SX(0)] * layout.m
-    new_fast.values.update(sum=zero, squares=zero)
+    new_fast.values.update(sum=zero, squares=zero, noise=noises)
 
 
 def _excitation(layout: Layout, fast: Parts, slow: Parts, config: Parts, new_fast: Parts, new_slow: Parts) -> None:

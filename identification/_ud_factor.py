@@ -79,6 +79,11 @@ class Factor:
         """diag(P)."""
         return [self.d[i] + total([self.u[i, j] ** 2 * self.d[j] for j in range(i + 1, self.n)]) for i in range(self.n)]
 
+    def uncorrelated(self) -> list[SX]:
+        """1 for each parameter whose row of P is zero beside the diagonal."""
+        zero = {pair: value == 0 for pair, value in self.u.items()}
+        return [every([ca.SX(1), *(item for pair, item in zero.items() if i in pair)]) for i in range(self.n)]
+
     def grow(self, growth: SX, which: list[SX], keep: SX) -> None:
         """P := T P T with T = sqrt(growth) where `which` is 1, else 1; without its off-diagonal where keep is 0."""
         root = ca.sqrt(growth)

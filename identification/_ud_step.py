@@ -12,6 +12,7 @@ from identification._ud_factor import SX, Factor, Parts, dot, every, select, tot
 _INPUT_LIMIT = 1e30  # larger inputs would overflow in squares: treated as invalid samples
 _ERROR_LIMIT = 1e60
 _NOISE_LOW = 1e-30
+_NOISE_HASTE = 5.0  # share of the samples so far in which the first guess of R2 is forgotten: to one part in 1000 in 80 samples
 _NOISE_CLIP = 10.0  # of the squared normalised innovation, in the estimate of R2
 _SUM_CLIP = 3.0  # of the normalised innovation, in the estimate of its correlation
 
@@ -80,7 +81,12 @@ def _forget(factor: Factor, method: str, fast: Parts, config: Parts, sample: _Sa
     new.values["forgetting"] = [select(sample.acts, following, fast["forgetting"][0])]
     growth = 1.0 / factor_now
     variances = factor.diagonal()
-    which = [sample.acts * sample.moving[i] * (variances[i] * growth <= config["limit"][i]) for i in range(factor.n)]
+    # All of P or nothing: where single rows grew, the directions that the samples have told would turn away. A
+    # parameter without any correlation stands for itself.
+    inside = [ca.logic_or(ca.logic_not(sample.moving[i]), variances[i] * growth <= config["limit"][i]) for i in range(factor.n)]
+    alone = factor.uncorrelated()
+    together = every([ca.logic_or(inside[i], alone[i]) for i in range(factor.n)])
+    which = [sample.acts * sample.moving[i] * inside[i] * ca.logic_or(together, alone[i]) for i in range(factor.n)]
     factor.grow(growth, which, keep)
     if method in ("bell", "polynomial"):
         factor.d = [select(keep, d, start) for d, start in zip(factor.d, config["start"], strict=True)]
@@ -90,7 +96,7 @@ def _correct(layout: Layout, factor: Factor, fast: Parts, config: Parts, sample:
     """The sequential scalar updates of all outputs; tells whether an innovation is over its limit."""
     theta = list(fast["theta"])
     count = fast["samples"][0] - fast["skipped"][0]
-    quick = ca.fmax(config["noise_rate"][0], 1.0 / (20.0 + count))
+    quick = ca.fmax(config["noise_rate"][0], _NOISE_HASTE / (20.0 + fast["learned"][0]))
     calm = ca.logic_not(fast["alarm"][0])
     noises, innovations, powers, sums, squares, over = [], [], [], [], [], []
     for o in range(layout.m):
@@ -99,12 +105,17 @@ def _correct(layout: Layout, factor: Factor, fast: Parts, config: Parts, sample:
         # The scalars see the estimate that the outputs before them have corrected.
         error = used * (sample.y[o] - dot(sample.h[o], theta)) if o else used * sample.error[o]
         square = sample.y[o] ** 2
-        first = 1e-4 * (square + error**2)
+        # Too large a first R2 costs a few samples, too small a one gives the first samples weight for ever.
+        first = 1e-2 * (square + error**2 + total([d * item**2 for d, item in zip(factor.d, h, strict=True)]))
         noise = select(config["noise_known"][o], config["noise_given"][o], select(fast["noise"][o] > 0, fast["noise"][o], first + _NOISE_LOW))
         # Correlated noise (filtered measurements) tells less per sample than its variance says.
         used_noise = noise * select(config["noise_known"][o], 1.0, sample.inflation[o])
         gain, expected = factor.measure(h, used_noise)
-        step = error / expected
+        limit = _alarm_limit(config, sample.inflation[o])
+        # One sample far off among quiet ones is an outlier; where its neighbours are as far off, the parameters have moved.
+        bound = config["huber"][0] * ca.sqrt(ca.fmax(expected - used_noise, 0.0) + noise)
+        cut = select(fast["innovation"][o] <= limit, ca.fmax(-bound, ca.fmin(error, bound)), error)
+        step = cut / expected
         theta = [theta[i] + sample.moving[i] * (gain[i] * step) for i in range(layout.n)]
         expected = ca.fmax(expected - used_noise, 0.0) + noise
         normalised = error * error / expected
@@ -115,13 +126,13 @@ def _correct(layout: Layout, factor: Factor, fast: Parts, config: Parts, sample:
         standard = used * calm * ca.fmax(-_SUM_CLIP, ca.fmin(error / ca.sqrt(expected), _SUM_CLIP))
         sums.append(fast["sum"][o] + standard)
         squares.append(fast["squares"][o] + standard * standard)
-        limit = _alarm_limit(config, sample.inflation[o])
         # Three samples at least: no single outlier fires the alarm.
         most = limit / (3.0 * config["alarm_rate"][0])
         average = fast["innovation"][o] + used * config["alarm_rate"][0] * (ca.fmin(normalised, most) - fast["innovation"][o])
         innovations.append(average)
         over.append(used * (average > limit))
         powers.append(power)
+    new.values["learned"] = [fast["learned"][0] + sample.acts * calm]
     new.values.update(theta=theta, noise=noises, innovation=innovations, power=powers, sum=sums, squares=squares, d=factor.d, u=factor.packed())
     return total(over) > 0
 

@@ -10,6 +10,7 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
+from identification._prior_start import PriorStart, solve_with_prior
 from identification._recursive_engine import Engine, RunOutcome, Trajectory
 from identification._recursive_input import doubles, positions, spread, variances, vector
 from identification._recursive_settings import MAX_PARAMETERS, METHODS, Settings, forgetting_curve
@@ -190,6 +191,30 @@ class RecursiveLeastSquares:
         engine.part("config", "free")[list(found.removed_index)] = 0.0
         if noise is None:
             engine.part("fast", "noise")[:] = found.residual_variance
+            engine.part("fast", "learned")[:] = float(found.samples)
+        return found
+
+    def begin(self, Y: npt.ArrayLike, H: npt.ArrayLike, least: npt.ArrayLike, *, overlap: float = 1.0) -> PriorStart:
+        """Start from a window and the prior theta0 +- scale; no parameter is removed.
+
+        Parameters
+        ----------
+        Y, H
+            As in `run`.
+        least
+            Standard deviation of each output's noise at least, shape (outputs,), units of y.
+        overlap
+            Variance of a mean of rows over that of as many independent ones, >= 1.
+        """
+        if not overlap >= 1:
+            raise InputError(f"begin: overlap must be a number >= 1, not {overlap!r}")
+        engine, y, h = self._record(Y, H, "begin")
+        floor = spread(vector(least, "least"), engine.y.size, "least", "outputs")
+        found = solve_with_prior(y, h, self._theta0, self._scale, floor, overlap)
+        engine.start(found.theta, found.covariance)
+        engine.part("config", "free")[:] = 1.0
+        engine.part("fast", "noise")[:] = found.noise
+        engine.part("fast", "learned")[:] = float(found.rows)
         return found
 
     def reset(self) -> None:

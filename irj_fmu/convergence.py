@@ -26,9 +26,10 @@ from identification.fault import KINDS, SENSORS, Fault, inject
 from identification.joint_file import Joint
 
 from .command_line import OneLineParser, check_output, fail, run_alone, write_json
-from .cosim import CHANNELS, LOOSE, Row, _rows, limit_of, make_pair, start_state
+from .cosim import CHANNELS, LOOSE, Row, _rows, limit_of, link_referred, make_pair, start_state
 from .host import Fmu, Instance, Trajectory
-from .online import estimated_parameters, searched_parameters
+from .identifiable import identifiable
+from .online import searched_parameters
 from .reference import NAMES, Motion, published_joint, reference_joint, selected_motion, start_of
 
 FloatArray = npt.NDArray[np.float64]
@@ -106,7 +107,8 @@ class Bench:
         plant, self.file = make_pair(joint, model, folder, cc=cc, motion=motion)
         self.drive = "motor_current" if joint.torque_per_current is not None else "motor_torque"
         self.table = self._record(plant, motion)
-        self.names, self.shapes = estimated_parameters(model), searched_parameters(model)
+        self.shapes = searched_parameters(model)
+        self.shown = identifiable(joint, self.table * link_referred(joint), NOISE * np.abs(link_referred(joint)), STEP)
         self.scale = float(np.quantile(np.abs(self.table[:, 5]), 0.99)) / 170.0
 
     def _record(self, plant: Path, motion: Motion) -> FloatArray:
@@ -128,8 +130,7 @@ class Bench:
     def run(self, fault: Fault | None) -> Run:
         """Feed the estimator; see :class:`Run`."""
         joint = self.joint
-        ratio = joint.gear_ratio
-        gains = np.array([joint.torque_per_current or ratio, 1 / ratio, 1 / ratio, 1.0, 1.0, 1.0])
+        gains = link_referred(joint)
         table = self.table if fault is None else inject(self.table * gains, STEP, [fault]) / gains
         signals: dict[str, FloatArray] = {}
         codes: set[int] = set()
@@ -149,7 +150,7 @@ class Bench:
                 if name.startswith(("theta[", "sigma[", "eta[", "sigma_eta[")):
                     signals[f"estimator.{name}"] = np.array(instance.call("getReal", [at[name]]))
             searches = int(instance.call("getInteger", [at["n_searches"]])[0])
-        rows = [*_rows(joint, self.names, Trajectory(np.array([STOP]), signals)), *self._shape_rows(signals)]
+        rows = [*_rows(joint, self.shown, Trajectory(np.array([STOP]), signals)), *self._shape_rows(signals)]
         sensor, kind = (fault.sensor, fault.kind) if fault is not None else ("", "")
         return Run(joint.name, self.start, sensor, kind, tuple(rows), tuple(sorted(codes - {0})), searches)
 

@@ -10,6 +10,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, final
 
+import numpy as np
+import numpy.typing as npt
+
 from casadi_models import JointModel
 from casadi_models.term import INERTIAS
 from identification.errors import InputError
@@ -21,11 +24,14 @@ from .compiler import find_compiler
 from .estimator import DETECTOR_FILE, JOINT_FILE, OPTIONS_FILE, Estimator, options_text
 from .healthy import detector_state, read_healthy
 from .host import Fmu, FmuError, Instance, Trajectory, Wiring, simulate_cs
+from .identifiable import Identifiable, identifiable
 from .joint_plant import PlantOptions, identifier, plant_spec
 from .online import OnlineOptions, estimated_parameters, prepared
 from .plant import build_plant
 from .reference import NAMES, Motion, published_joint, reference_joint, start_of
 from .signals import Fault
+
+FloatArray = npt.NDArray[np.float64]
 
 CHANNELS: Final = {"q_m": "motor_position", "w_m": "motor_velocity", "q_l": "link_position", "w_l": "link_velocity", "tau_l": "link_torque"}
 """Inputs of the estimator and the outputs of the plant that feed them."""
@@ -51,7 +57,7 @@ class Row:
     Attributes
     ----------
     plant, estimate, sigma : float
-        In `unit`; a name with ``-`` is a difference of parameters that no motion of this joint tells apart.
+        In `unit`; where the motion shows a parameter in combinations only, the estimate is without what it does not show.
     limit : float or None
         Largest error asked for [%].
     """
@@ -201,17 +207,20 @@ def cosimulate(plant: Joint, model: Joint, files: tuple[Path, Path], setting: Se
     connections = {f"estimator.{k}": f"plant.{v}" for k, v in {**CHANNELS, drive[0]: drive[1]}.items()}
     outputs = [f"theta[{i}]" for i in range(1, len(names) + 1)] + [f"sigma[{i}]" for i in range(1, len(names) + 1)]
     outputs += ["health", "fault", *(f"ratio.{b}" for b in sensing.balances)]
+    channels = [f"plant.{v}" for v in (drive[1], *CHANNELS.values())]
     wiring = Wiring(
         connections=connections,
         faults={f"estimator.{k}": f for k, f in setting.faults.items()},
         parameters={**start_state(plant, motion), **setting.parameters},
-        record=[*(f"estimator.{n}" for n in outputs), *setting.record],
+        record=[*(f"estimator.{n}" for n in outputs), *(c for c in channels if c not in setting.record), *setting.record],
     )  # fmt: skip
     with Fmu(files[0]) as first, Fmu(files[1]) as second, Instance(first, name="plant") as a, Instance(second, name="estimator") as b:
         found = simulate_cs({"plant": a, "estimator": b}, wiring, step=setting.step, stop=setting.stop)
         messages = tuple(b.messages)
     ratios = {key: float(found[f"estimator.ratio.{key}"][-1]) for key in sensing.balances}
-    return Cosimulation(found, names, tuple(_rows(plant, names, found)), ratios, messages)
+    readings = np.column_stack([found[c] for c in channels]) * link_referred(plant)
+    shown = identifiable(plant, readings, np.zeros(6), setting.step)
+    return Cosimulation(found, names, tuple(_rows(plant, shown, found)), ratios, messages)
 
 
 def start_state(plant: Joint, motion: Motion) -> dict[str, float]:
@@ -221,26 +230,26 @@ def start_state(plant: Joint, motion: Motion) -> dict[str, float]:
     return {f"plant.state.{side}{n}": x for side in sides for n, x in (("position", q), ("velocity", v))}
 
 
-def _rows(plant: Joint, names: Sequence[str], found: Trajectory) -> list[Row]:
-    model = plant.model()
+def link_referred(joint: Joint) -> FloatArray:
+    """From readings at the sensors, in the order drive and :data:`CHANNELS`, to link-referred ones, (6,)."""
+    ratio = joint.gear_ratio
+    return np.array([joint.torque_per_current or ratio, 1 / ratio, 1 / ratio, 1.0, 1.0, 1.0])
+
+
+def _rows(plant: Joint, shown: Identifiable, found: Trajectory) -> list[Row]:
+    """The estimates at the end, without the part of their errors that the motion does not show."""
+    model, names = plant.model(), shown.names
     units = {p.name: p.unit for p in model.parameters}
     true = dict(zip(model.parameter_names, model.value_vector(), strict=True))
-    last = {n: float(found[f"estimator.theta[{i}]"][-1]) for i, n in enumerate(names, 1)}
-    spread = {n: float(found[f"estimator.sigma[{i}]"][-1]) for i, n in enumerate(names, 1)}
+    at = np.array([true[n] for n in names])
+    last, spread = (np.array([float(found[f"estimator.{s}[{i}]"][-1]) for i in range(1, len(names) + 1)]) for s in ("theta", "sigma"))
+    seen = at + shown.seen(last - at)
     rows = []
-    joined = _TWINS if all(n in last for n in _TWINS) else ()
-    for n in names:
-        if n in joined[1:] or n not in true:
-            continue
-        group = joined if n in joined else (n,)
-        value = _difference(true, group)
-        limit = limit_of(model, n) if value else None
-        rows.append(Row(plant.name, " - ".join(group), units[n], value, _difference(last, group), min(spread[g] for g in group), limit))
+    for i, n in enumerate(names):
+        limit = limit_of(model, n) if true[n] else None
+        name = n if shown.alone(i) else f"{n} (in combination)"
+        rows.append(Row(plant.name, name, units[n], true[n], float(seen[i]), float(spread[i]), limit))
     return rows
-
-
-def _difference(values: Mapping[str, float], group: Sequence[str]) -> float:
-    return values[group[0]] - sum(values[g] for g in group[1:])
 
 
 def limit_of(model: JointModel, name: str) -> float | None:

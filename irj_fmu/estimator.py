@@ -250,7 +250,7 @@ class Estimator(TableSlave):
             names = ", ".join(self.table[self._first + i].name for i in estimator.unusable)
             self._report(f"input not finite or beyond {ABSURD:g} in SI units: {names}; it counts as missing")
             return Health.NUMERIC_TROUBLE
-        if fault > 8:
+        if fault > 8 or estimator.held:
             return Health.NUMERIC_TROUBLE
         return Health.WARMING_UP if estimator.warming_up else Health.OK
 

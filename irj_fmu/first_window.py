@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -12,8 +13,13 @@ from identification.recursive import RecursiveLeastSquares, Settings
 FloatArray = npt.NDArray[np.float64]
 
 
-ABSENT = 1e-30
+ABSENT: Final = 1e-30
 """Size under which a column holds nothing but rounding (a sensor that stands still from the first sample on)."""
+
+
+RIDGE: Final = 1e-5
+"""Weight of the rows theta = 0 beside columns of unit length: a direction that is 1000 times weaker than its columns
+loses one part in ten thousand, one that rounding alone shows stays at zero."""
 
 
 def least_range(h: FloatArray, y: FloatArray) -> FloatArray:
@@ -30,28 +36,40 @@ def least_range(h: FloatArray, y: FloatArray) -> FloatArray:
     return found
 
 
-def least_squares(y: FloatArray, h: FloatArray) -> FloatArray:
-    """Least squares with columns of equal size and balances of equal residual; smallest solution without full rank."""
-    count = h.shape[2]
-    weight = np.ones(y.shape[1])
-    theta = np.zeros(count)
-    for _ in range(2):
-        rows = (h * weight[:, None]).reshape(-1, count)
-        size = np.linalg.norm(rows, axis=0)
-        shrink = np.where(size > ABSENT, 1 / np.maximum(size, ABSENT), 0.0)
-        theta = np.asarray(np.linalg.lstsq(rows * shrink, (y * weight).ravel(), rcond=1e-9)[0] * shrink, dtype=np.float64)
-        left = np.sqrt(np.mean((y - h @ theta) ** 2, axis=0))
-        weight = 1.0 / np.maximum(left, 1e-12 + 1e-9 * float(np.max(np.abs(y))))
-    return theta
-
-
-def first_estimate(y: FloatArray, h: FloatArray, weight_of: Callable[[FloatArray, FloatArray], FloatArray]) -> tuple[FloatArray, FloatArray]:
-    """Least squares of the first window with weights that follow from it.
+def least_squares(y: FloatArray, h: FloatArray, least: FloatArray) -> FloatArray:
+    """Least squares with columns of equal size and balances of equal residual; what no row shows stays at zero.
 
     Parameters
     ----------
     y, h
         As in :func:`least_range`.
+    least : (balances,) array
+        Residual of each balance at least [N.m].
+    """
+    count = h.shape[2]
+    weight = 1.0 / np.maximum(np.sqrt(np.mean(y**2, axis=0)), least)
+    theta = np.zeros(count)
+    for _ in range(2):
+        rows = (h * weight[:, None]).reshape(-1, count)
+        size = np.linalg.norm(rows, axis=0)
+        shrink = np.where(size > ABSENT, 1 / np.maximum(size, ABSENT), 0.0)
+        target = (y * weight).ravel()
+        ridge = np.vstack([rows * shrink, RIDGE * np.eye(count)])
+        triangle = np.linalg.qr(np.column_stack([ridge, np.concatenate([target, np.zeros(count)])]), mode="r")
+        theta = np.asarray(np.linalg.solve(triangle[:count, :count], triangle[:count, count]) * shrink, dtype=np.float64)
+        weight = 1.0 / np.maximum(np.sqrt(np.mean((y - h @ theta) ** 2, axis=0)), least)
+    return theta
+
+
+def first_estimate(
+    y: FloatArray, h: FloatArray, least: FloatArray, weight_of: Callable[[FloatArray, FloatArray], FloatArray]
+) -> tuple[FloatArray, FloatArray]:
+    """Least squares of the first window with weights that follow from it.
+
+    Parameters
+    ----------
+    y, h, least
+        As in :func:`least_squares`.
     weight_of : callable
         (parameters, size of the residuals (balances,)) -> weights (rows, balances).
 
@@ -61,9 +79,9 @@ def first_estimate(y: FloatArray, h: FloatArray, weight_of: Callable[[FloatArray
     """
     weight = np.ones_like(y)
     for _ in range(3):
-        first = least_squares(y * weight, h * weight[:, :, None])
+        first = least_squares(y * weight, h * weight[:, :, None], least)
         size = 1.5 * np.median(np.abs(y - h @ first), axis=0)
-        weight = weight_of(first, np.maximum(size, 1e-9 * float(np.max(np.abs(y)))))
+        weight = weight_of(first, np.maximum(size, least))
     return first, weight
 
 

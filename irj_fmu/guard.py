@@ -55,7 +55,7 @@ class Guard:
     """
 
     def __init__(self, names: Sequence[str], balances: Sequence[str], period: float, inertias: Sequence[str] = ()) -> None:
-        self._inertias = [i for i, n in enumerate(names) if n in inertias]
+        self.inertias = [i for i, n in enumerate(names) if n in inertias]
         self._count, self._size = len(balances), len(names)
         self._rate = min(1.0, period / _MEMORY)
         self._age, self._wait_back, self._wait_accept = (max(1, round(t / period)) for t in (_AGE, _BACK, _ACCEPT))
@@ -175,8 +175,14 @@ class Guard:
         """True where the joint itself may have changed from the estimate shown to `theta`."""
         if self.several:
             return False
-        at = self._inertias
+        at = self.inertias
         return bool(np.all(np.abs(theta[at] - self.theta[at]) <= _INERTIA * np.abs(self.theta[at])))
+
+    def figures(self) -> dict[str, float]:
+        """Limits and times [rows], for the native twin."""
+        return {
+            "LIMIT": _LIMIT, "CAP": _CAP, "RATE": self._rate, "AGE": self._age, "BACK": self._wait_back, "ACCEPT": self._wait_accept, "INERTIA": _INERTIA,
+        }  # fmt: skip
 
     # --- state -------------------------------------------------------------------------------------------------------
 

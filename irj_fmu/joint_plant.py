@@ -90,7 +90,8 @@ def plant_spec(joint: Joint | JointModel, options: PlantOptions | None = None) -
     PlantSpec
         Parameters are those of the model with unit, bounds and meaning, link-referred and tunable. Effects with
         internal states add states; where an effect knows its states only as steps of a displacement (hysteresis),
-        they are memory and the plant runs in co-simulation only.
+        they are memory and the plant runs in co-simulation only. Where the model's drive is late, so is its reading in a
+        plant with a controller; an input of the host is read as it comes.
 
     Raises
     ------
@@ -186,7 +187,7 @@ class _Builder:
         model_input = ca.vertcat(drive, u[-1] if self.heated else 0, clock)
         rates = f.dynamics(full, model_input, p)
         rates = ca.vertcat(rates[: size if self.stepped else size + held], *([1] if self.clocked else []))
-        channels = self._readings(f.outputs(full, model_input, p), drive)
+        channels = self._readings(f.outputs(full, model_input, p), drive - f.drive_lag(p) * ca.jtimes(drive, x, rates))
         if options.sensors:
             readings = Readings(self._parameter, clock, options.sample_time)
             channels = [readings.read(*pair) for pair in channels]
@@ -246,7 +247,7 @@ class _Builder:
         return u[0] * self.model.gear_ratio
 
     def _readings(self, outputs: Any, drive: Any) -> list[tuple[Variable, Any]]:
-        """Record channels as readings: motor side on the motor shaft."""
+        """Record channels as readings: motor side on the motor shaft; `drive` as it is read, late where the model says so."""
         ratio = self.model.gear_ratio
         found: list[tuple[Variable, Any]] = []
         for i, name in enumerate(CHANNELS[:5]):

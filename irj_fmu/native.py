@@ -28,7 +28,7 @@ from .variables import Variable
 _C: Final = Path(__file__).with_name("c")
 _MAIN: Final = "native_wrapper.c"
 _SOURCES: Final = (
-    _MAIN, "fmi2_common.c", "native_state.h", "native_rows.c", "native_watch.c", "native_algebra.c", "native_window.c", "native_residuals.c",
+    _MAIN, "fmi2_common.c", "native_state.h", "native_rows.c", "native_watch.c", "native_algebra.c", "native_guard.c", "native_window.c", "native_residuals.c",
     "native_fault.c", "native_estimator.c",
 )  # fmt: skip
 _TELLS: Final = "Online estimation of the parameters of a geared joint, with residuals of its balances and fault detection; in C."

@@ -17,24 +17,25 @@ from typing import Any, Final, final
 import numpy as np
 import numpy.typing as npt
 
+from identification._prior_start import PRIOR_PASSES, UNDETERMINED
 from identification.errors import InputError
 from identification.fault import MOVED, PARITY_SENSORS, DetectorTables
 from identification.joint_file import Joint
 
 from . import watch as watch_settings
+from .first_window import ABSENT, RIDGE
 from .native_expressions import cheaper
 from .online import _RESIDUAL_SECONDS, _STRAIN, OnlineEstimator
+from .row_check import LEAST
 from .rows import _NAMES, SOURCES, RowMaker
 from .variables import Variable
-from .verdict import _RECENT, FAULT_TEXT, SCALED
+from .verdict import _RECENT, FAULT_TEXT, HELD, SCALED
 from .watch import DRIVE, READINGS, TAU
 
 FloatArray = npt.NDArray[np.float64]
 
 MAX_WARM_UP: Final = 20.0
 """Longest first window that a native estimator has room for, where the built-in one is not longer [s]."""
-_WINDOW_LIMIT: Final = 1e-6
-"""Singular-value limit of the first window, as in :meth:`OnlineEstimator._begin`."""
 _KINDS: Final = {"real": 0, "integer": 1, "boolean": 2, "string": 3}
 
 
@@ -281,10 +282,15 @@ def _recursion_tables(header: _Header, made: OnlineEstimator) -> None:
     layout, n = engine._layout, len(made.names)
     fast, slow = start_state(layout, np.zeros(n), engine.config)
     header.define("COLLECT", max(made._collect, round(MAX_WARM_UP / period)))
-    header.define("WINDOW_LIMIT", _WINDOW_LIMIT)
+    header.define("LEAST", LEAST)
+    header.define("ABSENT", ABSENT)
+    header.define("RIDGE", RIDGE)
+    header.define("UNDETERMINED", UNDETERMINED)
+    header.define("PRIOR_PASSES", PRIOR_PASSES)
+    header.define("OVERLAP", float(made.rows.timing.overlap))
     header.define("RESIDUAL_RATE", period / _RESIDUAL_SECONDS)
     for name, block, parts in (
-        ("FAST", layout.fast, ("d", "u", "theta", "noise", "alarm", "due")),
+        ("FAST", layout.fast, ("d", "u", "theta", "noise", "error", "learned", "alarm", "due")),
         ("SLOW", layout.slow, ()),
         ("CONFIG", layout.config, ("scale", "theta0", "walk", "walk_alarm", "enabled", "start")),
     ):
@@ -301,6 +307,14 @@ def _recursion_tables(header: _Header, made: OnlineEstimator) -> None:
     header.raw(f"static const unsigned char is_friction[2][N_THETA] = {{{marks}}};")
     header.raw(f"static const unsigned char feels[N_BALANCES][2] = {{{feels}}};")
     header.whole("reference_signal", (11 if from_link else 1 for from_link in made._from_link))
+    for key, value in made.guard.figures().items():
+        header.define(f"GUARD_{key}", value)
+    header.whole("is_inertia", (int(i in made.guard.inertias) for i in range(n)), "unsigned char")
+    header.doubles("lowest", made.low)
+    header.doubles("highest", made.high)
+    for key, number in made.pulse.figures().items():
+        header.define(f"PULSE_{key}", number)
+    header.define("HELD_CODE", HELD)
     header.define("ERROR_LIMIT", float(_STRAIN.error_limit))
     header.define("CONFIRM_ROWS", made._confirm)
 

@@ -20,12 +20,13 @@ from identification.two_step import OnlineSettings
 from .first_window import fast_recursion, first_estimate, least_range, reversal_weights
 from .guard import Guard
 from .online_options import OnlineOptions, estimated_parameters, held_parameters, prepared, searched_parameters
+from .pulse import Pulse
 from .row_check import LEAST, RowCheck
 from .rows import RowMaker
 from .samples import Samples
 from .supervision import advance, guarded, launch
 from .two_step_online import make_two_step
-from .verdict import FAULT_TEXT, NONE, implausible, make_detector, plant_alarm, worst
+from .verdict import FAULT_TEXT, HELD, NONE, implausible, make_detector, plant_alarm, worst
 from .watch import DRIVE, Q_L, Q_M, SAMPLED, TAU, W_L, W_M, Watch
 
 FloatArray = npt.NDArray[np.float64]
@@ -70,7 +71,7 @@ class OnlineEstimator:
         self.model, self.sensing = prepared(joint, self.options)
         self.rows = RowMaker(self.model, self.sensing, dt, held_parameters(joint))
         self.names, self.balances = self.rows.names, self.rows.balances
-        self.guard = Guard(self.names, self.balances, self.rows.timing.stride * dt, self.model.inertias) if self.options.optimise else None
+        self.guard = Guard(self.names, self.balances, self.rows.timing.stride * dt, self.model.inertias)
         self._plain_rows, self.two_step = self.rows, make_two_step(joint, self.rows, self.options)
         has_link = self.options.has_link
         self.present = (True, True, True, has_link, has_link, self.options.has_torque)
@@ -81,6 +82,11 @@ class OnlineEstimator:
             self._needs[reading] = used[k] and self.present[reading]
         self.samples = Samples(self.rows.timing, self._needs)
         self.watch = Watch(dt, self.present)
+        self.pulse = Pulse(dt, self.rows.timing.length, self.present)
+        own = {p.name: (p.low, p.high) for p in self.model.parameters}
+        start = dict(zip(self.model.parameter_names, self.model.value_vector(), strict=True))
+        self.low = np.array([min(own[n][0], start[n]) for n in self.names])
+        self.high = np.array([max(own[n][1], start[n]) for n in self.names])
         self._margin = 1.0
         self.detector = make_detector(self.model, dt, self.options, detector_state) if self.options.detect and self.is_fitted else None
         self._confirm = replace(_STRAIN, sample_time=self.rows.timing.stride * dt).samples(_STRAIN.confirm_seconds)
@@ -109,9 +115,10 @@ class OnlineEstimator:
         self.rows = self._plain_rows
         self.rows.reset()
         self.watch.reset()
-        for part in (self.two_step, self.guard):
-            if part is not None:
-                part.reset()
+        self.pulse.reset()
+        self.guard.reset()
+        if self.two_step is not None:
+            self.two_step.reset()
         if self.detector is not None:
             self.detector.reset()
         self.samples.reset()
@@ -139,6 +146,18 @@ class OnlineEstimator:
     def is_fitted(self) -> bool:
         """True where the joint file has a value for every estimated parameter."""
         return all(n in self.joint.fitted for n in self.names)
+
+    @property
+    def held(self) -> bool:
+        """True while the estimate shown is one from before: the readings stand still, or what they say is not believed."""
+        return self.estimator is not None and (self.pulse.failed or self.guard.on_probation)
+
+    @property
+    def least(self) -> FloatArray:
+        """What counts as noise of each balance at least [N.m], (balances,)."""
+        share = self.options.floor_share * np.sqrt(self._torque)
+        found: FloatArray = np.maximum(np.maximum(self.floor, share), LEAST)
+        return found
 
     @property
     def made(self) -> int:
@@ -191,11 +210,14 @@ class OnlineEstimator:
             values = [0.0 if i in self.unusable else v for i, v in enumerate(values)]
             valid = [flag and i not in self.unusable for i, flag in enumerate(valid)]
         good = self._all if valid == _ALL else [bool(valid[i]) and self.present[i] for i in range(6)]
+        given = good
+        if not self.pulse.add(time, values):
+            good = [False] * 6
         looked = self.watch.add(values, good)
         used = values if good is self._all and self._whole else [v if g else held for v, g, held in zip(values, good, self._last_good, strict=True)]
         self._last_good = used
         failed = self._detect(values, good)
-        q = self.readings if self.guard is None else used
+        q = used
         self.samples.add((q[Q_M], q[Q_L] if self.present[Q_L] else q[Q_M], q[TAU], q[DRIVE]))
         self.samples.mark(good, failed, self.watch, whole=good is self._all)
         made = False
@@ -203,7 +225,7 @@ class OnlineEstimator:
         if self._since >= self.rows.timing.stride:
             self._since = 0
             made = self._row(time, enable)
-            self._judge(good)
+            self._judge(given if not self.pulse.jumped else good)
         if looked:
             self._floors()
         if self.two_step is not None and self.two_step.searching and enable:
@@ -245,6 +267,7 @@ class OnlineEstimator:
         if self.estimator is None:
             if enable and on.all():
                 self._collected.append((y, h, shares))
+                self._torque += self.rows.signals[self._reference] ** 2
                 if len(self._collected) >= self._collect:
                     with single_thread():
                         self._begin()
@@ -259,8 +282,7 @@ class OnlineEstimator:
         if not enable:
             return True
         if not on.any():
-            if self.guard is not None:
-                self.theta = self.guard.blind(self.estimator)
+            self.theta = self._within(self.guard.blind(self.estimator))
             return True
         for b, use in enumerate(on.tolist()):
             self.estimator.enable(b, use)
@@ -268,10 +290,15 @@ class OnlineEstimator:
         noise = self.estimator._ready("noise").part("fast", "noise")
         np.maximum(noise, check.least**2, out=noise)
         self._strained = self._strained + 1 if check.over.any() else 0
-        self.theta = theta if self.guard is None else guarded(self, self.guard, theta, check.weighted_error, check.least, on)
-        if self.two_step is not None and self.two_step.due(self._strained) and not (self.guard and self.guard.several):
+        self.theta = self._within(guarded(self, self.guard, theta, check.weighted_error, check.least, on))
+        if self.two_step is not None and self.two_step.due(self._strained) and not self.guard.several:
             launch(self, self.two_step)
         return True
+
+    def _within(self, theta: FloatArray) -> FloatArray:
+        """The estimate to show: never outside what the parameters can be."""
+        found: FloatArray = np.clip(theta, self.low, self.high)
+        return found
 
     def _shares(self) -> FloatArray:
         """Share of the kernel in which motor and link stand still or turn round."""
@@ -291,23 +318,24 @@ class OnlineEstimator:
     def _begin(self) -> None:
         """Start the recursion from the collected rows."""
         y, h, shares = (np.array([row[i] for row in self._collected]) for i in range(3))
-        first, weight = first_estimate(y, h, partial(self._weight_of, shares))
+        self._torque /= len(y)
+        least = np.maximum(self.options.floor_share * np.sqrt(self._torque), LEAST)
+        first, weight = first_estimate(y, h, least, partial(self._weight_of, shares))
+        least = np.maximum(least, self.rows.floor(first.tolist(), self.watch.noise[list(SAMPLED)]))
         y, h = y * weight, h * weight[:, :, None]
         self._scale = np.maximum(np.maximum(np.abs(first), np.abs(self.theta)), least_range(h, y))
         self.estimator = self._recursion(self.theta)
-        started = self.estimator.startup(y, h, limit=1e-6)
-        self.estimator.release()
-        if started.removed:
-            self.events.append(f"not determined by the first window: {', '.join(started.removed)}")
-        self.theta = self.estimator.theta
+        started = self.estimator.begin(y, h, least, overlap=self.rows.timing.overlap)
+        if started.undetermined:
+            names = ", ".join(self.names[i] for i in started.undetermined)
+            self.events.append(f"not determined by the first window: {names}")
+        self.theta = self._within(self.estimator.theta)
         self.sigma = self.estimator.deviation
         self._square = np.mean((y - h @ self.theta) ** 2, axis=0)
-        self._torque = self.rows.signals[self._reference] ** 2
         self._collected = []
         self._floors()
         self.level = np.sqrt(self._square)
-        if self.guard is not None:
-            self.guard.start(self.estimator)
+        self.guard.start(self.estimator)
         if self.two_step is not None and not self.two_step.known:
             launch(self, self.two_step, first=True)
 
@@ -316,7 +344,7 @@ class OnlineEstimator:
         period = self.rows.timing.stride * self.dt
         settings = Settings(
             sample_time=period, drift=self.options.drift, alarm_drift=self.options.alarm_drift, window_seconds=2.0,
-            rank_seconds=8.0,
+            rank_seconds=8.0, inflation=self.rows.timing.overlap,
         )  # fmt: skip
         return partial(fast_recursion, len(self.balances), self.names, settings)
 
@@ -332,8 +360,7 @@ class OnlineEstimator:
             new.fast[:], new.slow[:] = old.fast, old.slow
             new.theta[:] = old.theta
             self.estimator = fresh
-            if self.guard is not None:
-                self.guard.start(fresh)
+            self.guard.start(fresh)
 
     # --- judgement ---------------------------------------------------------------------------------------------------
 
@@ -346,8 +373,7 @@ class OnlineEstimator:
         self._ratios()
 
     def _ratios(self) -> None:
-        share = self.options.floor_share * np.sqrt(self._torque)
-        self.ratio = np.sqrt(self._square) / np.maximum(np.maximum(self.floor, share), LEAST)
+        self.ratio = np.sqrt(self._square) / self.least
 
     def _judge(self, good: list[bool]) -> None:
         """The most severe fault now, and the scores."""
@@ -355,10 +381,10 @@ class OnlineEstimator:
         if detector is not None:
             self.plant_alarm, self.score = plant_alarm(detector, self.dt), detector.scores()
         missing = [not g and (self._needs[i] or (detector is not None and self.present[i])) for i, g in enumerate(good)]
-        found = worst(missing, detector, self.watch)
+        found = HELD if self.pulse.failed and self.estimator is not None else worst(missing, detector, self.watch)
         if not found and self.estimator is not None and self.is_fitted:
             found = implausible(self.names, self.theta, self.sigma, self.joint.fitted)
-        found = found or self.plant_alarm
+        found = found or self.plant_alarm or (HELD if self.guard.on_probation else NONE)
         if found != self.fault and found:
             self.events.append(f"fault {found}")
         self.fault = found

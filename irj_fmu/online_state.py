@@ -35,10 +35,9 @@ def state(of: OnlineEstimator) -> bytes:
         plain["two_step"], more = of.two_step.state()
         arrays |= {_PREFIX + name: values for name, values in more.items()}
     parts = {} if of.estimator is None else {"rls": of.estimator.state()}
-    if of.guard is not None:
-        plain["guard"], more, kept = of.guard.state()
-        arrays |= {_GUARD + name: values for name, values in more.items()}
-        parts |= kept
+    plain["guard"], more, kept = of.guard.state()
+    arrays |= {_GUARD + name: values for name, values in more.items()} | {"pulse": np.array(of.pulse.numbers())}
+    parts |= kept
     if of.detector is not None:
         parts["detector"] = of.detector.state()
     return pack(plain, arrays, parts)
@@ -54,7 +53,7 @@ def restore(of: OnlineEstimator, saved: bytes) -> None:
     """
     plain, arrays, parts = unpack(saved)
     fits = arrays["theta"].shape == of.theta.shape and arrays["samples"].shape == of.samples.state()[1].shape
-    if not fits or ("two_step" in plain) != (of.two_step is not None) or ("guard" in plain) != (of.guard is not None):
+    if not fits or ("two_step" in plain) != (of.two_step is not None):
         raise InputError("restore: the state is of another joint, sample time or options; give one of this estimator")
     for name in (*_PLAIN, *_ARRAYS):
         setattr(of, name, plain[name] if name in plain else arrays[name])
@@ -70,8 +69,8 @@ def restore(of: OnlineEstimator, saved: bytes) -> None:
     of.estimator = of._recursion(of.theta) if "rls" in parts else None
     if of.estimator is not None:
         of.estimator.restore(parts["rls"])
-    if of.guard is not None:
-        of.guard.restore(plain["guard"], _own(arrays, _GUARD), parts)
+    of.guard.restore(plain["guard"], _own(arrays, _GUARD), parts)
+    of.pulse.load(arrays["pulse"].tolist())
     if of.detector is not None and "detector" in parts:
         of.detector.restore(parts["detector"])
 

@@ -35,7 +35,7 @@ def launch(of: OnlineEstimator, two: Reoptimiser, *, first: bool = False) -> Non
     """Begin a search for the shapes on the rows kept."""
     window = two.window()
     weight = of._weight_of(window.shares, of.theta, of._size()) * window.on
-    two.launch(weight, of.theta, of.level, of._factory(), first=first)
+    two.launch(weight, of.theta, of.level, of.least, of._factory(), first=first)
     of.events.append(str(two.mode))
 
 
@@ -48,14 +48,14 @@ def advance(of: OnlineEstimator, two: Reoptimiser) -> None:
     of._strained = 0
     if found.eta is None:
         return
-    trusted = found.good and found.estimator is not None and guard is not None and guard.plausible(found.estimator.theta)
-    if guard is not None and guard.on_probation and not trusted:
+    trusted = found.good and found.estimator is not None and guard.plausible(found.estimator.theta)
+    if guard.on_probation and not trusted:
         return
     of.rows = two.reshaped(found.eta, found.deviation, of.rows)
     if found.estimator is not None:
         of.estimator, of._scale = found.estimator, found.scale
         of.theta, of.sigma = found.estimator.theta, found.estimator.deviation
         of._square, of.level = found.level**2, found.level
-    if guard is not None and of.estimator is not None:
+    if of.estimator is not None:
         guard.start(of.estimator)
     of._floors()

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final, final
 
+import numpy as np
+
 from identification.weak import differentiated_kernel, kernel
 
 _LENGTH: Final = 0.06
@@ -54,6 +56,14 @@ class Timing:
         reach = max(half, point_half * step + own)
         window = reach + max(half, point_half * step + own) + 1
         return Timing(dt, length, pointwise, step, stride, half, reach, point_half, window)
+
+    @property
+    def overlap(self) -> float:
+        """Variance of a mean of rows over that of as many independent ones: neighbours share samples."""
+        weights = differentiated_kernel(self.length, self.dt, 0)
+        shared = np.correlate(weights, weights, "full")
+        middle = len(weights) - 1
+        return float(np.sum(shared[middle % self.stride :: self.stride]) / shared[middle])
 
     @property
     def delay(self) -> float:

@@ -28,7 +28,7 @@ _WINDOW: Final = 32.0
 _TUNING: Final = TwoStepSettings(max_evaluations=400)
 _PLAIN: Final = ("_rows", "_quiet_until", "_failures", "searches", "_asked", "_since", "_refine_at")
 _ARRAYS: Final = ("_signals", "_shares", "_on", "_points", "eta", "deviation")
-_TASK: Final = ("weight", "eta", "theta", "level")
+_TASK: Final = ("weight", "eta", "theta", "level", "least")
 
 
 @final
@@ -140,10 +140,12 @@ class Reoptimiser:
 
     # --- search ------------------------------------------------------------------------------------------------------
 
-    def launch(self, weight: FloatArray, theta: FloatArray, level: FloatArray, recursion: Recursion, *, first: bool = False) -> None:
+    def launch(
+        self, weight: FloatArray, theta: FloatArray, level: FloatArray, least: FloatArray, recursion: Recursion, *, first: bool = False
+    ) -> None:
         """Begin a search on the rows kept; `weight` as in :class:`Task`, for the rows of :meth:`window`."""
         self.job = Task(
-            self.window(), weight[self.balances.lead :], self.eta.copy(), theta.copy(), level.copy(), first, self._asked,
+            self.window(), weight[self.balances.lead :], self.eta.copy(), theta.copy(), level.copy(), least.copy(), first, self._asked,
             self._failures >= self.settings.passes,
         )  # fmt: skip
         self._asked = False
@@ -220,8 +222,8 @@ class Reoptimiser:
             return
         first, forced, local, granted = plain["job"]
         window = RowWindow(arrays["job_signals"], arrays["job_shares"], arrays["job_on"] > 0, arrays["job_points"])
-        weight, eta, theta, level = (arrays[f"job_{n}"] for n in _TASK)
-        self.job = Task(window, weight, eta, theta, level, bool(first), bool(forced), bool(local))
+        weight, eta, theta, level, least = (arrays[f"job_{n}"] for n in _TASK)
+        self.job = Task(window, weight, eta, theta, level, least, bool(first), bool(forced), bool(local))
         self._begin(recursion)
         if self._task is not None and granted:
             with single_thread():

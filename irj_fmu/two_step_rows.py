@@ -91,6 +91,8 @@ class ShapedBalances:
         The balances that the shapes enter, with those that share a parameter with them, and their parameters.
     lead : int
         Rows at the beginning of a window that only fill the kernel.
+    overlap : float
+        See :attr:`irj_fmu.timing.Timing.overlap`.
     """
 
     def __init__(self, rows: RowMaker) -> None:
@@ -100,7 +102,7 @@ class ShapedBalances:
         self._width, self._count = rows.width, len(rows.balances)
         self._weights = rows._weights.copy()
         self._new = rows.timing.stride // rows.timing.step
-        self.lead = rows.rows_before_ready
+        self.lead, self.overlap = rows.rows_before_ready, rows.timing.overlap
         signals = rows.model.equations.signals.vector()
         columns = ca.jacobian_sparsity(rows.laws, signals).get_triplet()[1] if rows.needed else []
         self.used = tuple(sorted(set(columns)))

@@ -21,7 +21,6 @@ from .two_step_rows import SIGNALS, RowWindow, ShapedBalances
 FloatArray = npt.NDArray[np.float64]
 Recursion = Callable[[FloatArray, FloatArray], RecursiveLeastSquares]
 
-RANK_LIMIT = 1e-6
 _FEWEST = 60
 """Rows that a search needs at least."""
 _GAIN = 0.8
@@ -41,8 +40,8 @@ class Task:
         Weights of the rows; 0 leaves a row out.
     eta, theta : arrays
         Shapes and linear parameters now.
-    level : (balances,) array
-        Size of the residuals before.
+    level, least : (balances,) array
+        Size of the residuals before, and what counts as noise at least [N.m].
     first, forced, local : bool
         First search; asked for by the host; only a local simplex, after several searches that did not help.
     """
@@ -52,6 +51,7 @@ class Task:
     eta: FloatArray
     theta: FloatArray
     level: FloatArray
+    least: FloatArray
     first: bool
     forced: bool
     local: bool
@@ -146,11 +146,11 @@ def _before(task: Task, model: SeparableModel, y: FloatArray, index: FloatArray,
     """1 / size of each balance's residual before, and how much of it the best linear fit leaves now."""
     weights = np.ones(len(group))
     if not task.first:
-        weights = 1.0 / np.maximum(task.level[group], 1e-12)
+        weights = 1.0 / np.maximum(task.level, task.least)[group]
     for _ in range(2 if task.first else 0):
         theta = linear_fit(model, y, index, task.eta, weights, limit=settings.rank_limit).theta
         left = y - model.remainder(index, task.eta) - model.matrix(index, task.eta) @ theta
-        weights = 1.0 / np.maximum(np.sqrt(np.mean(left**2, axis=0)), 1e-12)
+        weights = 1.0 / np.maximum(np.sqrt(np.mean(left**2, axis=0)), task.least[group])
     return weights, linear_fit(model, y, index, task.eta, weights, limit=settings.rank_limit).ratio
 
 
@@ -177,12 +177,11 @@ def _restarted(
         return np.zeros(y.shape[1]), None, np.ones(len(task.theta))
     weight = task.weight[whole]
     y, h = y[whole] * weight, h[whole] * weight[:, :, None]
-    first = least_squares(y, h)
+    first = least_squares(y, h, task.least)
     tick()
     scale = np.maximum(np.maximum(np.abs(first), np.abs(task.theta)), least_range(h, y))
     made = recursion(task.theta, scale)
-    made.startup(y, h, limit=RANK_LIMIT)
-    made.release()
+    made.begin(y, h, task.least, overlap=balances.overlap)
     return np.sqrt(np.mean((y - h @ made.theta) ** 2, axis=0)), made, scale
 
 

@@ -19,10 +19,11 @@ if TYPE_CHECKING:
 FloatArray = npt.NDArray[np.float64]
 
 NONE, MISSING, CONSTANT, SCALED = 0, 10, 20, 30
-CURRENT_OR_FRICTION, PLANT = 7, 8
+CURRENT_OR_FRICTION, PLANT, HELD = 7, 8, 9
 FAULT_TEXT: Final = (
     "0 none; 1 to 6 sensor failed: motor current, motor position, motor velocity, link position, link velocity, "
-    "torque; 7 current sensor or motor friction; 8 the joint changed; 11 to 16 reading missing, 21 to 26 reading "
+    "torque; 7 current sensor or motor friction; 8 the joint changed; 9 the readings cannot be those of the joint, or stand still "
+    "while it moves, and the estimate is held; 11 to 16 reading missing, 21 to 26 reading "
     "constant while the joint moves, 31 to 36 reading of wrong scale, in the same order"
 )
 _RECENT: Final = 5.0

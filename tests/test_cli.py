@@ -17,11 +17,11 @@ import pytest
 
 from casadi_models import EFFECTS, JointModel
 from identification import load_joint, read
+from identification.typical import true_values
 from workbench.cli import main
 from workbench.commands import files as outputs
 from workbench.commands import loop
 from workbench.commands.online import fault_text
-from workbench.commands.virtual import true_values
 
 ROOT = Path(__file__).resolve().parents[1]
 DEMO = Path(str(files("workbench"))) / "demo"

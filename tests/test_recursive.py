@@ -42,7 +42,7 @@ def _data(samples: int, n: int = 4, m: int = 2, noise: float = 0.1, seed: int = 
 def test_without_forgetting_it_is_the_posterior_of_all_samples() -> None:
     _, h, y = _data(200)
     scale, noise, theta0 = np.array([2.0, 3.0, 1.0, 5.0]), np.array([0.01, 0.04]), np.full(4, 0.3)
-    estimator = RecursiveLeastSquares(theta0, scale, "constant", R2=noise, settings=Settings(freeze=False, forgetting=1.0))
+    estimator = RecursiveLeastSquares(theta0, scale, "constant", R2=noise, settings=Settings(freeze=False, forgetting=1.0, huber=0.0))
     estimator.run(y, h)
     weighted = h / noise[:, None]
     information = np.diag(scale**-2) + np.einsum("koi,koj->ij", weighted, h)
@@ -54,7 +54,7 @@ def test_without_forgetting_it_is_the_posterior_of_all_samples() -> None:
 def test_constant_forgetting_is_exponentially_weighted_least_squares() -> None:
     _, h, y = _data(300, m=1)
     factor, scale = 0.97, np.array([2.0, 3.0, 1.0, 5.0])
-    estimator = RecursiveLeastSquares(np.zeros(4), scale, "constant", R2=1e-2, settings=Settings(freeze=False, forgetting=factor, covariance_limit=1e6))
+    estimator = RecursiveLeastSquares(np.zeros(4), scale, "constant", R2=1e-2, settings=Settings(freeze=False, forgetting=factor, covariance_limit=1e6, huber=0.0))
     estimator.run(y, h)
     weight = factor ** np.arange(299, -1, -1.0)
     information = factor**300 * np.diag(scale**-2) + np.einsum("k,ki,kj->ij", weight / 1e-2, h[:, 0], h[:, 0])
@@ -67,7 +67,7 @@ def test_random_walk_is_the_kalman_filter_with_process_noise() -> None:
     _, h, y = _data(400)
     scale, noise, walk = np.full(4, 2.0), np.array([0.01, 0.02]), np.array([1e-4, 2e-4, 0.0, 1e-5])
     # The shortest window: process noise is then added after every second sample.
-    estimator = RecursiveLeastSquares(np.zeros(4), scale, R1=walk, R2=noise, settings=Settings(freeze=False, alarm_drift=0.0, window_seconds=1e-3))
+    estimator = RecursiveLeastSquares(np.zeros(4), scale, R1=walk, R2=noise, settings=Settings(freeze=False, alarm_drift=0.0, window_seconds=1e-3, huber=0.0))
     run = estimator.run(y, h)
     theta, p = np.zeros(4), np.diag(scale**2)
     for k in range(400):

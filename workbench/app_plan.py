@@ -126,7 +126,7 @@ def plan(live: Live, asked: Request, folder: Path, progress: Progress) -> Path:
 
 def _model(live: Live, label: str) -> tuple[JointModel, str]:
     """The joint to simulate, and what was left out of it or assumed."""
-    from workbench.commands.virtual import true_values
+    from identification.typical import true_values
 
     joint = live.joint()
     solution = live.analysis().solution if live.state.steps else None

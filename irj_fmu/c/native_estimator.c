@@ -35,6 +35,8 @@ static void clear_estimator(Twin *m) {
     int i;
     clear_rows(m);
     memset(&s->watch, 0, sizeof s->watch);
+    memset(&s->pulse, 0, sizeof s->pulse);
+    clear_guard(&s->guard);
     memset(&s->window, 0, sizeof s->window);
     memset(s->last_good, 0, sizeof s->last_good);
     memset(s->readings, 0, sizeof s->readings);
@@ -70,7 +72,7 @@ static void publish(State *s) {
 }
 
 static double least(const State *s, int b) { /* what counts as noise at least */
-    return fmax(fmax(s->floor[b], s->floor_share * sqrt(s->torque[b])), 1e-12);
+    return fmax(fmax(s->floor[b], s->floor_share * sqrt(s->torque[b])), LEAST);
 }
 
 static void ratios(State *s) {
@@ -107,11 +109,12 @@ static int configure(Twin *m) { /* take the parameters over; 0 where they ask fo
         clear_estimator(m);
         s->configured = 1;
     }
-    s->floor_share = s->real[V_FLOOR_SHARE];
-    if (s->drift != s->real[V_DRIFT] || s->alarm_drift != s->real[V_ALARM_DRIFT]) {
+    if (s->drift != s->real[V_DRIFT] || s->alarm_drift != s->real[V_ALARM_DRIFT] || s->floor_share != s->real[V_FLOOR_SHARE]) {
+        s->floor_share = s->real[V_FLOOR_SHARE];
         s->drift = s->real[V_DRIFT];
         s->alarm_drift = s->real[V_ALARM_DRIFT];
         tune_recursion(s);
+        if (s->rls.running) guard_start(s);
     }
     set_margin(&s->detector, s->real[V_FAULT_MARGIN]);
     if (s->whole[V_RESET] && !s->reset_before) clear_estimator(m);
@@ -124,7 +127,7 @@ static int configure(Twin *m) { /* take the parameters over; 0 where they ask fo
 
 static void floors(Twin *m) {
     if (!m->s.rls.running) return;
-    noise_floor(m, m->s.floor);
+    noise_floor(m, m->s.theta, m->s.floor);
     deviations(&m->s);
     ratios(&m->s);
 }
@@ -141,13 +144,14 @@ static void collect_row(Twin *m) {
     memcpy(f->y[f->count], m->y, sizeof m->y);
     memcpy(f->h[f->count], m->h, sizeof m->h);
     shares(s, f->shares[f->count]);
+    for (b = 0; b < N_BALANCES; b++) s->torque[b] += s->rows.signals[reference_signal[b]] * s->rows.signals[reference_signal[b]];
     if (++f->count < s->collect) return;
     if (begin_recursion(m)) tell(m, TELL_WINDOW, "the first window does not determine every parameter");
     floors(m);
     for (b = 0; b < N_BALANCES; b++) s->first_level[b] = sqrt(s->square[b]);
 }
 
-static void recursive_step(Twin *m, const double weight[N_BALANCES], const int on[N_BALANCES]) {
+static void recursive_step(Twin *m, const double weight[N_BALANCES], const int on[N_BALANCES], double theta[N_THETA]) {
     State *s = &m->s;
     Recursion *r = &s->rls;
     double row[N_BALANCES * N_THETA], y[N_BALANCES];
@@ -168,7 +172,7 @@ static void recursive_step(Twin *m, const double weight[N_BALANCES], const int o
     } else {
         memcpy(r->fast, m->fast_next, sizeof r->fast);
     }
-    memcpy(s->theta, m->theta_next, sizeof s->theta);
+    memcpy(theta, m->theta_next, sizeof s->theta);
     for (b = 0; b < N_BALANCES; b++) r->fast[FAST_NOISE + b] = fmax(r->fast[FAST_NOISE + b], least(s, b) * least(s, b));
 }
 
@@ -184,7 +188,7 @@ static void watch_strain(State *s, const int on[N_BALANCES]) {
 /* Take a row; 0 until there is one. */
 static int take_row(Twin *m, double time, int enable) {
     State *s = &m->s;
-    double error[N_BALANCES], weight[N_BALANCES], size[N_BALANCES], share[2];
+    double error[N_BALANCES], weight[N_BALANCES], size[N_BALANCES], share[2], theta[N_THETA];
     int on[N_BALANCES], any = 0, all = 1, b, k;
     if (!make_row(m, time)) return 0;
     s->n_rows++;
@@ -201,7 +205,7 @@ static int take_row(Twin *m, double time, int enable) {
     }
     for (b = 0; b < N_BALANCES; b++) {
         s->residual[b] = error[b] = error_of(m->y[b], m->h + b * N_THETA, s->theta);
-        size[b] = fmax(fmax(s->floor[b], sqrt(s->square[b])), 1e-12);
+        size[b] = fmax(fmax(s->floor[b], sqrt(s->square[b])), LEAST);
     }
     shares(s, share);
     weight_of(share, s->theta, size, weight);
@@ -212,9 +216,23 @@ static int take_row(Twin *m, double time, int enable) {
         s->torque[b] += RESIDUAL_RATE / 5 * (reference * reference - s->torque[b]);
     }
     ratios(s);
-    if (!enable || !any) return 1;
-    recursive_step(m, weight, on);
+    if (!enable) return 1;
+    if (!any) {
+        guard_blind(s);
+        show(s, s->guard.theta);
+        return 1;
+    }
+    recursive_step(m, weight, on, theta);
     watch_strain(s, on);
+    for (b = 0; b < N_BALANCES; b++) {
+        error[b] *= weight[b];
+        size[b] = fmax(least(s, b), s->first_level[b]);
+    }
+    if (guard_step(s, theta, error, size, on) == BACK) {
+        for (b = 0; b < N_BALANCES; b++) s->square[b] = s->first_level[b] * s->first_level[b];
+        s->strained = 0;
+    }
+    show(s, s->guard.theta);
     return 1;
 }
 
@@ -235,7 +253,7 @@ static int implausible(const State *s) { /* an inertia far from that of the fitt
 }
 
 static void judge(State *s, const int good[SENSORS]) {
-    int found = 0, i;
+    int found = s->pulse.failed && s->rls.running ? HELD_CODE : 0, i;
     for (i = 0; i < SENSORS && !found; i++)
         if (!good[i] && (needs[i] || (s->detect && present[i]))) found = 11 + i;
     if (s->detect) {
@@ -249,7 +267,9 @@ static void judge(State *s, const int good[SENSORS]) {
     for (i = 0; i < SENSORS && !found; i++)
         if (s->watch.scaled[i]) found = 31 + i;
     if (!found && s->rls.running) found = implausible(s);
-    s->fault = found ? found : s->plant_alarm;
+    if (!found) found = s->plant_alarm;
+    if (!found && s->guard.on_probation) found = HELD_CODE;
+    s->fault = found;
 }
 
 /* ---- a sample ----------------------------------------------------------------------------------------------------- */
@@ -264,7 +284,7 @@ static void link_from_motor(State *s) {
 
 static void push(State *s, const int good[SENSORS]) {
     static const int reading[SOURCES] = {Q_M, Q_L, TAU, DRIVE};
-    const double *q = s->readings;
+    const double *q = s->last_good;
     const double sample[SOURCES] = {q[Q_M], present[Q_L] ? q[Q_L] : q[Q_M], q[TAU], q[DRIVE]};
     int k;
     append_sample(&s->rows, sample);
@@ -276,10 +296,12 @@ static void push(State *s, const int good[SENSORS]) {
 }
 
 /* Take a sample; 1 where a row was made. */
-static int update(Twin *m, double time, const double readings[SENSORS], const int good[SENSORS], int enable) {
+static int update(Twin *m, double time, const double readings[SENSORS], const int given[SENSORS], int enable) {
     State *s = &m->s;
-    const int looked = watch_sample(m, readings, good);
-    int made = 0, i;
+    const int counts = pulse_sample(s, time, readings);
+    int good[SENSORS], made = 0, looked, i;
+    for (i = 0; i < SENSORS; i++) good[i] = given[i] && counts;
+    looked = watch_sample(m, readings, good);
     for (i = 0; i < SENSORS; i++)
         if (good[i]) s->last_good[i] = readings[i];
     if (s->detect) {
@@ -292,7 +314,7 @@ static int update(Twin *m, double time, const double readings[SENSORS], const in
     if (++s->rows.since >= STRIDE) {
         s->rows.since = 0;
         made = take_row(m, time, enable);
-        judge(s, good);
+        judge(s, s->pulse.jumped ? good : given);
     }
     if (looked) floors(m);
     return made;
@@ -318,7 +340,7 @@ static int process(Twin *m, double time) { /* gives the health */
         s->whole[V_FAULT] = s->fault;
         if (s->fault) tell(m, TELL_FAULT + s->fault, "fault %d at t = %g s (%s)", s->fault, time, FAULT_TEXT);
     }
-    if (lost || s->fault > 8) return NUMERIC_TROUBLE;
+    if (lost || s->fault > 8 || is_held(s)) return NUMERIC_TROUBLE;
     return s->rls.running ? HEALTH_OK : WARMING_UP;
 }
 

@@ -92,17 +92,17 @@ static double standstill(const Rows *r, int side, double noise) {
 }
 
 /* RMS that sensor noise alone leaves in each balance. */
-static void noise_floor(Twin *m, double out[N_BALANCES]) {
+static void noise_floor(Twin *m, const double theta[N_THETA], double out[N_BALANCES]) {
     State *s = &m->s;
     static const int reading[SOURCES] = {Q_M, Q_L, TAU, DRIVE};
     double entering[N_BALANCES][N_SIGNALS] = {{0}}, values[N_VALUES], slope[3 * N_BALANCES];
     int i, j, b, source;
     for (i = 0; i < N_LINEAR; i++) {
         const int column = linear_row[i] % (1 + N_THETA);
-        entering[linear_row[i] / (1 + N_THETA)][linear_column[i]] += linear_value[i] * (column ? s->theta[column - 1] : 1.0);
+        entering[linear_row[i] / (1 + N_THETA)][linear_column[i]] += linear_value[i] * (column ? theta[column - 1] : 1.0);
     }
     memcpy(values, fixed_value, sizeof values);
-    for (i = 0; i < N_THETA; i++) values[theta_value[i]] = s->theta[i];
+    for (i = 0; i < N_THETA; i++) values[theta_value[i]] = theta[i];
     m->arg[0] = s->rows.signals; m->arg[1] = s->rows.held; m->arg[2] = values;
     m->res[0] = slope;
     slopes(m->arg, m->res, m->iw, m->w, 0);

@@ -40,6 +40,19 @@ typedef struct { /* RecursiveLeastSquares */
     int running;
 } Recursion;
 
+typedef struct { /* Pulse */
+    int still, failed, jumped, any;
+    Count same;
+    double speed, share, time, before[SENSORS];
+} Pulse;
+
+typedef struct { /* Guard */
+    int on_probation, on[N_BALANCES];
+    Count back, explained, next, held_for, over[N_BALANCES];
+    double quick[N_BALANCES], fresh[N_BALANCES], theta[N_THETA];
+    Recursion kept[2];
+} Guard;
+
 typedef struct { /* StructuredRule and Residuals */
     double observer[DIM(N_OBSERVER)], used[SENSORS], gain[5 * DIM(N_OBSERVER)], gate[5], gates[5];
     double limits[RESIDUALS], values[RESIDUALS], scale[5], energy[3], sums[5], last[5];
@@ -73,6 +86,8 @@ typedef struct {
     Watch watch;
     FirstWindow window;
     Recursion rls;
+    Pulse pulse;
+    Guard guard;
     Fault detector;
 } State;
 

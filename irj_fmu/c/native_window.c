@@ -1,6 +1,4 @@
-/* Start of the recursion from the first window: irj_fmu.first_window, identification._startup, OnlineEstimator._begin. */
-
-#define ABSENT 1e-30 /* size under which a column holds nothing but rounding */
+/* Start of the recursion from the first window: irj_fmu.first_window, identification._prior_start, OnlineEstimator._begin. */
 
 /* Weights of the balances' rows at a reversal, where friction may take any value between its limits. */
 static void weight_of(const double shares[2], const double theta[N_THETA], const double size[N_BALANCES], double out[N_BALANCES]) {
@@ -24,22 +22,19 @@ static double error_of(const double y, const double h[N_THETA], const double the
     return y - sum;
 }
 
-/* The rows of the window with their weights, each balance reduced to a triangle of [h | y]. Gives the largest |y|. */
-static double reduce_window(Twin *m) {
+/* The rows of the window with their weights, each balance reduced to a triangle of [h | y]. */
+static void reduce_window(Twin *m) {
     const FirstWindow *f = &m->s.window;
-    double largest = 0;
     int k, b, i;
     for (b = 0; b < N_BALANCES; b++) {
         for (k = 0; k < f->count; k++) {
             const double weight = m->weight[k][b];
             for (i = 0; i < N_THETA; i++) m->matrix[k][i] = f->h[k][b][i] * weight;
             m->matrix[k][N_THETA] = f->y[k][b] * weight;
-            largest = fmax(largest, fabs(m->matrix[k][N_THETA]));
         }
         triangularise(m->matrix, f->count);
         memcpy(m->triangle[b], m->matrix, sizeof m->triangle[b]);
     }
-    return largest;
 }
 
 /* Sum of squares of a column of a balance: of a regressor, or of y. */
@@ -62,8 +57,8 @@ static double residual_square(const Twin *m, int b, const double theta[N_THETA])
     return sum;
 }
 
-/* Triangle of all balances, columns times `scale`, rows times `weight`, y less what theta explains. */
-static void stack_balances(Twin *m, const double scale[N_THETA], const double weight[N_BALANCES], const double theta[N_THETA]) {
+/* Triangle of all balances, columns times `scale`, rows times `weight`, y less what theta explains, and of rows `prior` x = 0. */
+static void stack_balances(Twin *m, const double scale[N_THETA], const double weight[N_BALANCES], const double theta[N_THETA], double prior) {
     int b, i, j;
     for (b = 0; b < N_BALANCES; b++)
         for (i = 0; i < COLUMNS; i++) {
@@ -75,26 +70,31 @@ static void stack_balances(Twin *m, const double scale[N_THETA], const double we
             }
             row[N_THETA] = left * weight[b];
         }
-    triangularise(m->matrix, N_BALANCES * COLUMNS);
+    for (i = 0; i < N_THETA; i++) {
+        double *row = m->matrix[N_BALANCES * COLUMNS + i];
+        for (j = 0; j < COLUMNS; j++) row[j] = i == j ? prior : 0;
+    }
+    triangularise(m->matrix, N_BALANCES * COLUMNS + N_THETA);
 }
 
 /* Least squares of the weighted window with columns of equal size and balances of equal residual. */
-static void least_squares(Twin *m, double theta[N_THETA]) {
-    const double largest = reduce_window(m), none[N_THETA] = {0};
+static void least_squares(Twin *m, const double least[N_BALANCES], double theta[N_THETA]) {
+    const double none[N_THETA] = {0};
+    const int count = m->s.window.count;
     double weight[N_BALANCES], size[N_THETA];
     int pass, b, i;
-    for (b = 0; b < N_BALANCES; b++) weight[b] = 1;
+    reduce_window(m);
+    for (b = 0; b < N_BALANCES; b++) weight[b] = 1 / fmax(sqrt(column_square(m, b, N_THETA) / count), least[b]);
     for (pass = 0; pass < 2; pass++) {
         for (i = 0; i < N_THETA; i++) {
             size[i] = 0;
             for (b = 0; b < N_BALANCES; b++) size[i] += weight[b] * weight[b] * column_square(m, b, i);
             size[i] = sqrt(size[i]) > ABSENT ? 1 / sqrt(size[i]) : 0;
         }
-        stack_balances(m, size, weight, none);
-        solve_all(m->matrix, 1e-9, theta);
+        stack_balances(m, size, weight, none, RIDGE);
+        back_substitute(m->matrix, theta);
         for (i = 0; i < N_THETA; i++) theta[i] *= size[i];
-        for (b = 0; b < N_BALANCES; b++)
-            weight[b] = 1 / fmax(sqrt(residual_square(m, b, theta) / m->s.window.count), 1e-12 + 1e-9 * largest);
+        for (b = 0; b < N_BALANCES; b++) weight[b] = 1 / fmax(sqrt(residual_square(m, b, theta) / count), least[b]);
     }
 }
 
@@ -108,20 +108,17 @@ static double median(double v[], int n) {
 }
 
 /* First parameters, with rows at reversals weighted down; leaves the triangles of the weighted window. */
-static void robust_fit(Twin *m, double first[N_THETA]) {
+static void robust_fit(Twin *m, const double least[N_BALANCES], double first[N_THETA]) {
     const FirstWindow *f = &m->s.window;
-    double size[N_BALANCES], largest = 0;
+    double size[N_BALANCES];
     int pass, k, b;
     for (k = 0; k < f->count; k++)
-        for (b = 0; b < N_BALANCES; b++) {
-            m->weight[k][b] = 1;
-            largest = fmax(largest, fabs(f->y[k][b]));
-        }
+        for (b = 0; b < N_BALANCES; b++) m->weight[k][b] = 1;
     for (pass = 0; pass < 3; pass++) {
-        least_squares(m, first);
+        least_squares(m, least, first);
         for (b = 0; b < N_BALANCES; b++) {
             for (k = 0; k < f->count; k++) m->sorted[k] = fabs(error_of(f->y[k][b], f->h[k][b], first));
-            size[b] = fmax(1.5 * median(m->sorted, f->count), 1e-9 * largest);
+            size[b] = fmax(1.5 * median(m->sorted, f->count), least[b]);
         }
         for (k = 0; k < f->count; k++) weight_of(f->shares[k], first, size, m->weight[k]);
     }
@@ -144,15 +141,6 @@ static void least_range(const Twin *m, double out[N_THETA]) {
     }
 }
 
-/* Variance of each balance's residual, kept above the rounding of the balance. */
-static void residual_variance(const Twin *m, const double theta[N_THETA], int parameters, double out[N_BALANCES]) {
-    const int count = m->s.window.count;
-    const double degrees = fmax(1, count - (double)parameters / N_BALANCES);
-    int b;
-    for (b = 0; b < N_BALANCES; b++)
-        out[b] = fmax(residual_square(m, b, theta) / degrees, 1e-24 * (column_square(m, b, N_THETA) / count) + 1e-30);
-}
-
 /* P in scaled parameters as U diag(d) U'. */
 static void factorise(double p[N_THETA][N_THETA], double d[N_THETA], double u[]) {
     int i, j, k;
@@ -166,49 +154,41 @@ static void factorise(double p[N_THETA][N_THETA], double d[N_THETA], double u[])
     }
 }
 
-/* Start values and covariance by SVD, without the parameters that the window cannot carry. */
-static int start_values(Twin *m, const double theta0[N_THETA], const double scale[N_THETA], double theta[N_THETA]) {
-    static const Svd empty;
+/* Start values and covariance from the window and the prior theta0 +- scale. Gives the number of parameters that they do not
+ * determine. */
+static int start_values(Twin *m, const double theta0[N_THETA], const double scale[N_THETA], const double least[N_BALANCES], double theta[N_THETA]) {
     State *s = &m->s;
     Recursion *r = &s->rls;
-    double ones[N_BALANCES], weight[N_BALANCES], step[N_THETA], p[N_THETA][N_THETA] = {{0}};
-    Svd d = empty;
-    int place[N_THETA], n = N_THETA, i, j, k, b;
-    for (b = 0; b < N_BALANCES; b++) ones[b] = 1;
-    stack_balances(m, scale, ones, theta0);
-    solve_all(m->matrix, WINDOW_LIMIT, step);
-    for (i = 0; i < N_THETA; i++) { theta[i] = theta0[i] + scale[i] * step[i]; place[i] = i; }
-    residual_variance(m, theta, N_THETA, weight);
-    for (b = 0; b < N_BALANCES; b++) weight[b] = 1 / sqrt(weight[b]);
-    stack_balances(m, scale, weight, theta0);
-    while (n) {
-        int worst = 0;
-        decompose(&d, m->matrix, place, n);
-        if (d.s[0] > 0 && d.s[n - 1] > WINDOW_LIMIT * d.s[0]) break;
-        for (i = 1; i < n; i++)
-            if (fabs(d.v[n - 1][i]) > fabs(d.v[n - 1][worst])) worst = i;
-        n--;
-        memmove(place + worst, place + worst + 1, (n - worst) * sizeof *place);
+    const int count = s->window.count;
+    const double degrees = fmax(1, count - (double)N_THETA / N_BALANCES);
+    double noise[N_BALANCES], weight[N_BALANCES], step[N_THETA], inverse[N_THETA][N_THETA] = {{0}}, p[N_THETA][N_THETA];
+    int pass, i, j, k, b, undetermined = 0;
+    for (b = 0; b < N_BALANCES; b++) noise[b] = fmax(residual_square(m, b, theta0) / count, fmax(least[b] * least[b], DBL_MIN));
+    for (pass = 0; pass <= PRIOR_PASSES; pass++) {
+        for (b = 0; b < N_BALANCES; b++) weight[b] = 1 / sqrt(OVERLAP * noise[b]);
+        stack_balances(m, scale, weight, theta0, 1);
+        back_substitute(m->matrix, step);
+        for (i = 0; i < N_THETA; i++) theta[i] = theta0[i] + scale[i] * step[i];
+        for (b = 0; b < N_BALANCES; b++) noise[b] = fmax(residual_square(m, b, theta) / degrees, fmax(least[b] * least[b], DBL_MIN));
     }
-    memcpy(theta, theta0, N_THETA * sizeof *theta);
-    for (i = 0; i < N_THETA; i++) p[i][i] = 1;
-    if (n) {
-        solve(&d, m->matrix, 0, step);
-        for (i = 0; i < n; i++) {
-            theta[place[i]] += scale[place[i]] * step[i];
-            for (j = 0; j < n; j++) {
-                double sum = 0;
-                for (k = 0; k < n; k++) sum += d.v[k][i] * d.v[k][j] / (1 + d.s[k] * d.s[k]);
-                p[place[i]][place[j]] = sum;
-            }
+    for (j = 0; j < N_THETA; j++) /* inverse of the triangle, column by column */
+        for (i = j; i >= 0; i--) {
+            double sum = i == j;
+            for (k = i + 1; k <= j; k++) sum -= m->matrix[i][k] * inverse[k][j];
+            inverse[i][j] = sum / m->matrix[i][i];
         }
-    }
     for (i = 0; i < N_THETA; i++)
-        for (j = 0; j < N_THETA; j++) p[i][j] *= start_config[CONFIG_START];
+        for (j = 0; j < N_THETA; j++) {
+            double sum = 0;
+            for (k = i > j ? i : j; k < N_THETA; k++) sum += inverse[i][k] * inverse[j][k];
+            undetermined += i == j && sum > UNDETERMINED;
+            p[i][j] = sum * start_config[CONFIG_START];
+        }
     for (i = 0; i < N_THETA; i++) r->fast[FAST_THETA + i] = theta[i] / scale[i];
     factorise(p, r->fast + FAST_D, r->fast + FAST_U);
-    residual_variance(m, theta, n, r->fast + FAST_NOISE);
-    return N_THETA - n;
+    memcpy(r->fast + FAST_NOISE, noise, sizeof noise);
+    r->fast[FAST_LEARNED] = count;
+    return undetermined;
 }
 
 /* Forgetting as the options say. */
@@ -249,20 +229,25 @@ static void deviations(State *s) {
 /* Start the recursion from the collected rows; gives the number of parameters that they do not determine. */
 static int begin_recursion(Twin *m) {
     State *s = &m->s;
-    double first[N_THETA], range[N_THETA];
-    int i, b, removed;
-    robust_fit(m, first);
+    double first[N_THETA], range[N_THETA], least[N_BALANCES], floor[N_BALANCES];
+    int i, b, undetermined;
+    for (b = 0; b < N_BALANCES; b++) {
+        s->torque[b] /= s->window.count;
+        least[b] = fmax(s->floor_share * sqrt(s->torque[b]), LEAST);
+    }
+    robust_fit(m, least, first);
+    noise_floor(m, first, floor);
+    for (b = 0; b < N_BALANCES; b++) least[b] = fmax(least[b], floor[b]);
     least_range(m, range);
     for (i = 0; i < N_THETA; i++) s->scale[i] = fmax(fmax(fabs(first[i]), fabs(s->theta[i])), range[i]);
     clear_recursion(s);
-    removed = start_values(m, s->rls.config + CONFIG_THETA0, s->scale, s->theta);
-    for (i = 0; i < N_THETA; i++) s->theta[i] = s->rls.fast[FAST_THETA + i] * s->scale[i];
+    undetermined = start_values(m, s->rls.config + CONFIG_THETA0, s->scale, least, s->theta);
+    estimate_of(s, &s->rls, first);
+    show(s, first);
     deviations(s);
-    for (b = 0; b < N_BALANCES; b++) {
-        s->square[b] = residual_square(m, b, s->theta) / s->window.count;
-        s->torque[b] = s->rows.signals[reference_signal[b]] * s->rows.signals[reference_signal[b]];
-    }
+    for (b = 0; b < N_BALANCES; b++) s->square[b] = residual_square(m, b, s->theta) / s->window.count;
     memset(&s->window, 0, sizeof s->window);
     s->rls.running = 1;
-    return removed;
+    guard_start(s);
+    return undetermined;
 }

@@ -5,6 +5,7 @@
  *   sample_observer       identification._fault_core
  * Value references are the positions in the variable table of irj_fmu.estimator, so that a host can exchange the two.
  */
+#include <float.h>
 #include <math.h>
 #include <stdarg.h>
 #include <stdio.h>
@@ -20,6 +21,7 @@
 #include "native_rows.c"
 #include "native_watch.c"
 #include "native_algebra.c"
+#include "native_guard.c"
 #include "native_window.c"
 #include "native_residuals.c"
 #include "native_fault.c"

@@ -292,7 +292,7 @@ def _print_track(result: dict[str, Any]) -> None:
 def run_plan(arguments: Namespace) -> int:
     """`irj plan`."""
     from identification.excite import Experiment, Limits, select, sinusoidal_grid, triangular_grid
-    from workbench.commands.virtual import true_values
+    from identification.typical import true_values
 
     joint = open_joint(arguments.joint)
     model = joint.model()

@@ -14,6 +14,7 @@ from casadi_models import JointModel
 from casadi_models.simulate import sampled_step
 from identification.errors import InputError
 from identification.joint_file import Joint
+from identification.typical import true_values
 from irj_fmu.command_line import is_special
 from workbench.commands.files import open_joint, progress_bar, write_bytes, write_json, write_text
 
@@ -72,12 +73,6 @@ def _check_hidden(model: JointModel, keys: Sequence[str]) -> None:
         sizes = [p.name for t in model.terms if t.effect.key == bare for p in t.parameters if not p.is_shape]
         if not any(values[n] for n in sizes):
             raise InputError(f"--hide {key}: no typical size is known, so it would do nothing; give one with --set {sizes[0]}=VALUE")
-
-
-def true_values(model: JointModel, joint: Joint) -> dict[str, float]:
-    """Parameter values: those of the joint file, else the typical ones of the declarations."""
-    known = {n: k.value for n, k in joint.known.items() if k.value is not None}
-    return {n: float(known[n]) if n in known and n not in model.values else v for n, v in model.usual_values().items()}
 
 
 def reference(time: FloatArray, motion: str, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:

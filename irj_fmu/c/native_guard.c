@@ -1,0 +1,146 @@
+/* What holds the estimate: irj_fmu.pulse.Pulse for failures of all readings at once, irj_fmu.guard.Guard for those that
+ * nothing else has told. */
+
+#define LONG_AGO (-1000000)
+enum { NOTHING, HELD_NOW, BACK, ACCEPTED };
+
+/* Take a sample; 0 where it does not count. */
+static int pulse_sample(State *s, double time, const double readings[SENSORS]) {
+    Pulse *p = &s->pulse;
+    const int stopped = p->any && !(time > p->time);
+    int equal = p->any, dead, i;
+    double pace = 0;
+    p->jumped = p->any && time - p->time > PULSE_GAP;
+    for (i = 0; i < SENSORS; i++)
+        if (present[i] && readings[i] != p->before[i]) equal = 0;
+    if (p->any && !p->still) {
+        if (present[Q_M]) pace = fmax(pace, fabs(readings[Q_M] - p->before[Q_M]));
+        if (present[Q_L]) pace = fmax(pace, fabs(readings[Q_L] - p->before[Q_L]));
+        p->speed += (pace - p->speed) / PULSE_PACE;
+        p->share += (equal - p->share) / PULSE_MEMORY;
+    }
+    p->same = equal || stopped ? p->same + 1 : 0;
+    dead = p->same >= PULSE_REPEATS && p->same * log(fmax(p->share, PULSE_CHANCE)) < log(PULSE_CHANCE);
+    p->still = dead || stopped;
+    p->failed = p->still && (stopped || p->speed > PULSE_STEP);
+    p->any = 1;
+    p->time = time;
+    memcpy(p->before, readings, sizeof p->before);
+    return !(p->still || p->jumped);
+}
+
+static void clear_guard(Guard *g) {
+    int b;
+    memset(g, 0, sizeof *g);
+    for (b = 0; b < N_BALANCES; b++) { g->over[b] = LONG_AGO; g->on[b] = 1; }
+}
+
+static void estimate_of(const State *s, const Recursion *r, double theta[N_THETA]) {
+    int i;
+    for (i = 0; i < N_THETA; i++) theta[i] = r->fast[FAST_THETA + i] * s->scale[i];
+}
+
+static void guard_start(State *s) { /* a new recursion, trusted */
+    clear_guard(&s->guard);
+    estimate_of(s, &s->rls, s->guard.theta);
+    s->guard.kept[0] = s->guard.kept[1] = s->rls;
+}
+
+static void guard_restore(State *s) {
+    Guard *g = &s->guard;
+    s->rls = g->kept[0];
+    estimate_of(s, &s->rls, g->theta);
+    g->kept[1] = g->kept[0];
+    g->next = 0;
+}
+
+/* Mean squares of errors, in place; what is far over the limit is cut, not to be remembered for long. Tells where they are over. */
+static int guard_follow(Guard *g, double squares[N_BALANCES], const double errors[N_BALANCES], const double limits[N_BALANCES], double share, int over[N_BALANCES]) {
+    int b, any = 0;
+    for (b = 0; b < N_BALANCES; b++) {
+        const double most = GUARD_CAP * limits[b];
+        const double cut = g->on[b] ? fmin(fmax(errors[b], -most), most) : 0;
+        squares[b] += GUARD_RATE * (cut * cut - squares[b]);
+        over[b] = squares[b] > (share * limits[b]) * (share * limits[b]);
+        any |= over[b];
+    }
+    return any;
+}
+
+/* True where the joint itself may have changed from the estimate shown to theta. */
+static int guard_plausible(const Guard *g, const double theta[N_THETA]) {
+    int b, i, several = 0;
+    for (b = 0; b < N_BALANCES; b++) several += g->held_for - g->over[b] < GUARD_ACCEPT;
+    if (g->on_probation && several > 1) return 0;
+    for (i = 0; i < N_THETA; i++)
+        if (is_inertia[i] && fabs(theta[i] - g->theta[i]) > GUARD_INERTIA * fabs(g->theta[i])) return 0;
+    return 1;
+}
+
+/* Judge the recursion after a row; it may be put back. */
+static int guard_step(State *s, const double theta[N_THETA], const double error[N_BALANCES], const double level[N_BALANCES], const int on[N_BALANCES]) {
+    Guard *g = &s->guard;
+    double limits[N_BALANCES];
+    int over[N_BALANCES], unexplained[N_BALANCES], lost = 0, any, b;
+    for (b = 0; b < N_BALANCES; b++) {
+        limits[b] = GUARD_LIMIT * level[b];
+        lost |= g->on[b] && !on[b];
+    }
+    memcpy(g->on, on, sizeof g->on);
+    any = guard_follow(g, g->quick, error, limits, 1.0, over);
+    if (!g->on_probation) {
+        if (any) {
+            g->on_probation = 1;
+            for (b = 0; b < N_BALANCES; b++) g->over[b] = over[b] ? 0 : LONG_AGO;
+            memcpy(g->fresh, g->quick, sizeof g->fresh);
+            g->back = g->explained = g->held_for = 0;
+            estimate_of(s, &g->kept[0], g->theta);
+            return HELD_NOW;
+        }
+        if (lost) { /* rows before a failure was noticed may hold it */
+            guard_restore(s);
+            return NOTHING;
+        }
+        memcpy(g->theta, theta, sizeof g->theta);
+        if (++g->next >= GUARD_AGE) {
+            g->next = 0;
+            g->kept[0] = g->kept[1];
+            g->kept[1] = s->rls;
+        }
+        return NOTHING;
+    }
+    g->held_for++;
+    for (b = 0; b < N_BALANCES; b++)
+        if (over[b]) g->over[b] = g->held_for;
+    g->back = any ? 0 : g->back + 1;
+    any = guard_follow(g, g->fresh, s->rls.fast + FAST_ERROR, limits, 0.5, unexplained);
+    g->explained = any ? 0 : g->explained + 1;
+    if (g->back >= GUARD_BACK) {
+        guard_restore(s);
+        g->on_probation = 0;
+        return BACK;
+    }
+    if (g->explained >= GUARD_ACCEPT && guard_plausible(g, theta)) {
+        guard_start(s);
+        return ACCEPTED;
+    }
+    return NOTHING;
+}
+
+/* No balance has its readings. */
+static void guard_blind(State *s) {
+    Guard *g = &s->guard;
+    int b, any = 0;
+    for (b = 0; b < N_BALANCES; b++) any |= g->on[b];
+    if (any && !g->on_probation) guard_restore(s);
+    memset(g->on, 0, sizeof g->on);
+}
+
+static void show(State *s, const double theta[N_THETA]) { /* never outside what the parameters can be */
+    int i;
+    for (i = 0; i < N_THETA; i++) s->theta[i] = fmin(fmax(theta[i], lowest[i]), highest[i]);
+}
+
+static int is_held(const State *s) {
+    return s->rls.running && (s->pulse.failed || s->guard.on_probation);
+}
