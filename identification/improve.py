@@ -311,7 +311,7 @@ class Loop:
         self.progress("looking at what is left", 0.85)
         solution = steps[-1].solution
         ratios = self._ratios(solution)
-        lines = find_lines(solution, [self._at_kernel(k) for k in self._line_kernels()] + [self.data])
+        lines = find_lines(solution, self.data, self._train, self._held)
         minor = tuple(self._minor(t, solution) for t in minor_claims(last, base) if self._same_sign(t, solution))
         error = replace(steps[-1].held_out, balances=ratios)
         where = locate(solution, self.data, error, lines, RATIO_LIMIT)
@@ -334,11 +334,6 @@ class Loop:
             "no temperature was recorded: thermal friction is judged by the time since each run started, taken as a cold start; "
             "its values are the change over one run, not per kelvin",
         )
-
-    def _line_kernels(self) -> list[float]:
-        """The shortest kernel and one between it and that of the claims."""
-        shortest = max(8 * self.data.train[0].grid.dt, 0.012)
-        return [k for k in (shortest, 0.03) if k < 0.7 * self.data.kernel]
 
     def _at_kernel(self, length: float) -> Dataset:
         """The same records with another kernel."""

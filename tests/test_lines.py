@@ -11,7 +11,8 @@ import pytest
 from identification import Record, load_joint, read
 from identification.engine import load_dataset, prepared_model, solve
 from identification.joint_file import Joint
-from identification.lines import Line, find_lines, scan
+from identification.lines import Line, find_lines
+from identification.order_tracking import Samples, spectrum
 
 SHARED = Path(__file__).resolve().parents[1].parent / "shared" / "hidden_effect" / "none"
 
@@ -20,7 +21,7 @@ def test_scan_peaks_at_the_order() -> None:
     rng = np.random.default_rng(3)
     angle = np.cumsum(rng.uniform(0, 0.2, 5000))
     residual = 0.3 * np.sin(3.37 * angle + 1) + rng.standard_normal(5000)
-    orders, power = scan(angle, residual, np.ones(5000))
+    orders, power = spectrum(Samples(angle, residual, np.ones(5000), np.zeros(5000, dtype=np.int64)), 14.0)
     assert orders[np.argmax(power)] == pytest.approx(3.37, abs=2 * np.pi / np.ptp(angle))
 
 
@@ -28,8 +29,7 @@ def found(joint: Joint, train: list[Record], held: list[Record]) -> list[Line]:
     model = prepared_model(joint, train[0])
     data = load_dataset(train, held, joint, model)
     solution = solve(model, data)
-    kernels = [load_dataset(train, held, joint, model, kernel=k) for k in (0.016, 0.03)]
-    return find_lines(solution, [*kernels, data])
+    return find_lines(solution, data, train, held)
 
 
 @pytest.mark.parametrize(("order", "twist"), [(0.85, 2.6e-6), (3.05, 3.4e-6), (7.2, 3.4e-6), (None, 0.0)])
