@@ -33,7 +33,7 @@ from identification.order_tracking import (
     confirmed,
     detrended,
     peaks,
-    phase_fit,
+    refined,
     spectrum,
     trend,
     velocity_knots,
@@ -50,10 +50,13 @@ MOTOR_ORDERS: Final = (1.0, 2.0, 4.0)
 """Orders per motor turn that have a name: shaft, wave generator and its second harmonic (T. Tuttle, W. Seering 1996)."""
 LOWEST_ORDER: Final = 0.25
 """Periods per motor turn (or pitch) from which on an order is looked for that nobody named: what is slower belongs to the link."""
-SPANS: Final = (7, 11, 15, 31)
-"""Samples over which velocity and acceleration are smoothed; the span that leaves the least is taken."""
+SPANS: Final = ((7, 6), (7, 4), (11, 4), (15, 4), (31, 4))
+"""Samples, and degree of the polynomial through them, from which velocity and acceleration are taken; the pair that leaves the least
+of a balance is used: short ones keep the band, long ones the noise of a coarse encoder down (A. Savitzky, M. Golay 1964)."""
 NAME_GAIN: Final = 0.85
 """Share of the best name's power over the balances that a name of the same set explains: a name that loses more is another one."""
+AROUND: Final = tuple(np.linspace(-0.4, 0.4, 5))
+"""Orders about a peak, in units of 2 pi / stroke, at which the law of an effect is tried."""
 MEMORY_KERNEL: Final = 0.03
 """Kernel of the positions that drive internal states [s]: quantisation wipes out a memory."""
 NORMAL_95: Final = 1.96
@@ -138,21 +141,24 @@ class _Run:
     masked: frozenset[str]
 
 
-def at_every_sample(record: Record, joint: Joint, sensing: Sensing, span: int) -> WeakRecord:
-    """Signals of a record at every sample: torque, drive and positions as recorded, derivatives over `span` samples.
+Span = tuple[int, int]
+
+
+def at_every_sample(record: Record, joint: Joint, sensing: Sensing, span: Span) -> WeakRecord:
+    """Signals of a record at every sample: torque, drive and positions as recorded, derivatives from polynomials.
 
     Parameters
     ----------
     record : Record
     joint, sensing : Joint, Sensing
-    span : int
-        Samples of the derivatives' kernel.
+    span : (samples, degree)
+        Of the polynomials.
     """
     steps, inside = np.diff(record.time), np.diff(record.segment) == 0
     if inside.any() and np.ptp(steps[inside]) > 0.02 * float(np.median(steps[inside])):
         record = record.resampled()
     signals, dt = signals_of(record, joint, sensing), record.dt
-    long = max(span, 2 * round(MEMORY_KERNEL / dt / 2) + 1)
+    long = max(span[0], 2 * round(MEMORY_KERNEL / dt / 2) + 1)
     segments = tuple(s for s in record.segments() if s.stop - s.start > 2 * long)
     points: dict[str, FloatArray] = {}
     smooth: dict[str, FloatArray] = {}
@@ -160,22 +166,29 @@ def at_every_sample(record: Record, joint: Joint, sensing: Sensing, span: int) -
         if source not in signals:
             continue
         for order, name in enumerate(chain):
-            points[name] = smooth[name] = _derivative(signals[source], segments, span * dt, dt, order)
             if order == 0:
-                smooth[name] = _derivative(signals[source], segments, long * dt, dt, 0)
+                smooth[name] = _filtered(signals[source], segments, kernel(long * dt, dt))
                 points[name] = np.concatenate([signals[source][s] for s in segments] or [np.empty(0)])
+            else:
+                points[name] = smooth[name] = _filtered(signals[source], segments, _polynomial(span, order) / dt**order)
     for name, values in (("temperature", signals.get("temperature")), ("time", record.time)):
         if values is not None:
             points[name] = smooth[name] = np.concatenate([values[s] for s in segments] or [np.empty(0)])
-    grid = Grid(span * dt, dt, 1, 1, segments, 0, dict.fromkeys(POSITION_CHAINS, span * dt))
+    grid = Grid(span[0] * dt, dt, 1, 1, segments, 0, dict.fromkeys(POSITION_CHAINS, span[0] * dt))
     starts = np.concatenate([[0], np.cumsum([s.stop - s.start for s in segments])]).astype(np.int64)
     block = _seconds(points["time"], starts)
     return WeakRecord(grid, {}, points, smooth, points["time"], block, starts)
 
 
-def _derivative(values: FloatArray, segments: Sequence[slice], length: float, dt: float, order: int) -> FloatArray:
-    """Derivative at every sample; the ends of a segment by the nearest full window."""
-    weights = kernel(length, dt, order)
+def _polynomial(span: Span, order: int) -> FloatArray:
+    """Weights of the samples for a derivative per sample, from the polynomial of least squares."""
+    half = span[0] // 2
+    basis = np.vander(np.arange(-half, half + 1), span[1] + 1, increasing=True).astype(np.float64)
+    return np.asarray(np.linalg.pinv(basis)[order] * math.factorial(order), dtype=np.float64)
+
+
+def _filtered(values: FloatArray, segments: Sequence[slice], weights: FloatArray) -> FloatArray:
+    """Correlation with weights at every sample; the ends of a segment by the nearest full window."""
     half = len(weights) // 2
     parts = []
     for segment in segments:
@@ -244,16 +257,16 @@ class _Tracked:
     balance: str
     train: Samples
     held: Samples | None
-    span: int
+    span: Span
     dt: float
 
 
 def _tracked(
     solution: Solution, data: Dataset, train: Sequence[Record], held_out: Sequence[Record],
-) -> tuple[list[_Tracked], dict[int, tuple[list[WeakRecord], list[WeakRecord]]]]:  # fmt: skip
+) -> tuple[list[_Tracked], dict[Span, tuple[list[WeakRecord], list[WeakRecord]]]]:  # fmt: skip
     """Every balance at the span that leaves the least of it."""
     law = _Pointwise(solution.model, data.sensing)
-    runs: dict[int, tuple[list[WeakRecord], list[WeakRecord]]] = {}
+    runs: dict[Span, tuple[list[WeakRecord], list[WeakRecord]]] = {}
     best: dict[str, tuple[float, _Tracked]] = {}
     for span in SPANS:
         first = [at_every_sample(r, data.joint, data.sensing, span) for r in train]
@@ -271,7 +284,7 @@ def _tracked(
 
 
 def _without_trend(
-    balance: str, data: Dataset, span: int, runs: tuple[list[WeakRecord], list[WeakRecord]], residuals: Sequence[FloatArray],
+    balance: str, data: Dataset, span: Span, runs: tuple[list[WeakRecord], list[WeakRecord]], residuals: Sequence[FloatArray],
 ) -> _Tracked | None:  # fmt: skip
     """Samples of a balance without what depends on velocity, acceleration and slowly on the position."""
     factor = _angle_factor(data.joint)
@@ -331,10 +344,10 @@ def find_lines(solution: Solution, data: Dataset, train: Sequence[Record], held_
     if data.sensing.clamped_link:
         return []
     tracked, runs = _tracked(solution, data, train, held_out)
-    named, turn = named_orders(data.joint), turns_per_unit(data.joint)
+    named = named_orders(data.joint)
     seen: list[tuple[_Tracked, Peak]] = []
     for one in tracked:
-        found = peaks(one.train, highest_order([one.train], one.dt), named, 2 * most, LOWEST_ORDER * turn)
+        found = peaks(one.train, highest_order([one.train], one.dt), named, 2 * most, LOWEST_ORDER * turns_per_unit(data.joint))
         seen += [(one, p) for p in found if one.held is None or confirmed(p, one.held, len(found))]
     seen.sort(key=lambda x: -x[1].prominence)
     out: list[Line] = []
@@ -342,17 +355,17 @@ def find_lines(solution: Solution, data: Dataset, train: Sequence[Record], held_
         apart = 2 * math.pi / one.train.stroke
         if len(out) == most or any(abs(line.order - peak.order) < 2 * apart for line in out):
             continue
-        near = min((h for h in named if peak.at(h)), key=lambda h: abs(h - peak.order), default=None)
-        names = _names(peak, one, tracked, runs, solution, data) if near is not None else ()
-        out.append(_line(peak, one, names, data.joint))
+        near = min(named, key=lambda h: abs(h - peak.order), default=math.inf)
+        names, order = _names(peak, near, _Scan(solution, data, tracked, runs)) if abs(near - peak.order) <= apart / 2 else ((), peak.order)
+        out.append(_line(peak, order, one, names, data.joint))
     return out
 
 
-def _line(peak: Peak, one: _Tracked, names: tuple[str, ...], joint: Joint) -> Line:
+def _line(peak: Peak, order: float, one: _Tracked, names: tuple[str, ...], joint: Joint) -> Line:
     linear = joint.kind == "linear"
     band = NORMAL_95 * peak.amplitude_error
     return Line(
-        peak.order, 2 * math.pi / one.train.stroke, peak.amplitude, one.balance, peak.prominence, names, _held_out_drop(peak, one.held),
+        order, 2 * math.pi / one.train.stroke, peak.amplitude, one.balance, peak.prominence, names, _held_out_drop(peak, one.held),
         "metre" if linear else "motor turn", "N" if linear else "N.m", peak.error, max(peak.amplitude - band, 0.0), peak.amplitude + band,
     )  # fmt: skip
 
@@ -378,56 +391,68 @@ def line_labels(model: JointModel, sensing: Sensing) -> dict[str, str]:
     return out
 
 
-def _names(
-    peak: Peak, one: _Tracked, tracked: Sequence[_Tracked], runs: dict[int, tuple[list[WeakRecord], list[WeakRecord]]],
-    solution: Solution, data: Dataset,
-) -> tuple[str, ...]:  # fmt: skip
-    """Effects that put such a line into the balances that show it, and none into those that do not."""
-    gains: dict[str, float] = {}
-    for key, label in line_labels(solution.model, data.sensing).items():
-        model = solution.model.add(label)
-        term = next(t for t in model.terms if t.label == label)
-        pairs = list(zip(term.names, term.effect.parameters, strict=True))
-        amplitudes = [n for n, p in pairs if not p.is_shape]
-        shape = next(n for n, p in pairs if p.is_shape)
-        values = {p.name: p.start for p in model.parameters} | dict(solution.values)
-        turn = turns_per_unit(data.joint)
-        scale = 2 * math.pi / abs(data.joint.gear_ratio) if data.joint.kind == "linear" else 1.0
-        values |= dict.fromkeys(amplitudes, 0.0) | {shape: peak.order * scale}
-        law = _Pointwise(model, data.sensing, amplitudes)
-        gains[key] = _gain(peak, tracked, runs, law, values, data) if turn or data.joint.orders else 0.0
-    best = max(gains.values(), default=0.0)
+@final
+@dataclass(frozen=True)
+class _Scan:
+    """What the naming of a line needs."""
+
+    solution: Solution
+    data: Dataset
+    tracked: Sequence[_Tracked]
+    runs: dict[Span, tuple[list[WeakRecord], list[WeakRecord]]]
+
+
+def _names(peak: Peak, near: float, scan: _Scan) -> tuple[tuple[str, ...], float]:
+    """Effects that put such a line into the balances that show it, and none into those that do not; the order of the first one.
+
+    Each effect is fitted with its own law, at orders about the peak: the virtual work of a kinematic error under gravity shifts
+    the peak of a plain sine by more than noise. Its own order has to lie at the named one.
+    """
+    noise = [_noise(peak, one) for one in scan.tracked]
+    tried: dict[str, tuple[float, float]] = {}
+    for key, label in line_labels(scan.solution.model, scan.data.sensing).items():
+        orders = np.array([peak.order + peak.apart * x for x in AROUND])
+        gains = _gains(label, orders, noise, scan)
+        k = int(np.argmax(gains))
+        tried[key] = (float(gains[k]), refined(orders, gains, k))
+    best = max((g for g, _ in tried.values()), default=0.0)
     if best <= 0:
-        return ()
-    ordered = sorted((k for k in gains if gains[k] >= NAME_GAIN * best), key=lambda k: -gains[k])
-    if not data.sensing.has_torque:
+        return (), peak.order
+    # without a torque sensor an acceleration that is too smooth looks like a torque of the motor: the order tells, the balances do not
+    least = NAME_GAIN * best if scan.data.sensing.has_torque else 0.0
+    kept = [k for k, (g, h) in tried.items() if g >= least and replace(peak, order=h).at(near)]
+    kept.sort(key=lambda k: -tried[k][0])
+    if not kept:
+        return (), peak.order
+    if not scan.data.sensing.has_torque:
         # nothing tells the sides apart: what is declared as confused belongs to the set
-        ordered += [c for k in tuple(ordered) for c in EFFECTS[k].confused_with if EFFECTS[c].periodic and c not in ordered]
-    return tuple(ordered)
+        kept += [c for k in tuple(kept) for c in EFFECTS[k].confused_with if EFFECTS[c].periodic and c not in kept]
+    return tuple(kept), tried[kept[0]][1]
 
 
-def _gain(
-    peak: Peak, tracked: Sequence[_Tracked], runs: dict[int, tuple[list[WeakRecord], list[WeakRecord]]], law: _Pointwise,
-    values: dict[str, float], data: Dataset,
-) -> float:  # fmt: skip
-    """Power of the line over the noise that one pair of amplitudes explains in all balances together."""
-    rows: list[FloatArray] = []
-    target: list[float] = []
-    for one in tracked:
-        which = [w for w, d in zip(runs[one.span][0], data.train, strict=True) if one.balance not in d.masked and len(w.time)]
-        columns = np.concatenate([law.at(w, values)[one.balance] for w in which])
-        measured = _amplitude(peak.order, one.train)
-        noise = _noise(peak, one)
-        modelled = [_amplitude(peak.order, replace(one.train, residual=-column)) for column in columns.T]
-        rows += [np.array([m[part] for m in modelled]) / noise for part in (0, 1)]
-        target += [measured[part] / noise for part in (0, 1)]
-    a, y = np.array(rows), np.array(target)
-    found = np.linalg.lstsq(a, y, rcond=None)[0]
-    return float(y @ y - np.sum((y - a @ found) ** 2))
-
-
-def _amplitude(order: float, samples: Samples) -> tuple[float, float]:
-    return phase_fit(order, samples)
+def _gains(label: str, orders: FloatArray, noise: Sequence[float], scan: _Scan) -> FloatArray:
+    """Squared standard deviations that an effect explains in all balances together, at several orders."""
+    model, data = scan.solution.model.add(label), scan.data
+    term = next(t for t in model.terms if t.label == label)
+    pairs = list(zip(term.names, term.effect.parameters, strict=True))
+    amplitudes = [n for n, p in pairs if not p.is_shape]
+    shape = next(n for n, p in pairs if p.is_shape)
+    values = {p.name: p.start for p in model.parameters} | dict(scan.solution.values) | dict.fromkeys(amplitudes, 0.0)
+    law = _Pointwise(model, data.sensing, amplitudes)
+    turn = _angle_factor(data.joint) / abs(data.joint.gear_ratio)
+    out = []
+    for order in orders:
+        normal, right = np.zeros((len(amplitudes), len(amplitudes))), np.zeros(len(amplitudes))
+        at = {s: [law.at(w, {**values, shape: float(order) * turn}) for w in scan.runs[s][0]] for s in {one.span for one in scan.tracked}}
+        for one, level in zip(scan.tracked, noise, strict=True):
+            columns = np.concatenate([c[one.balance] for c, d in zip(at[one.span], data.train, strict=True) if one.balance not in d.masked])
+            # a sine of amplitude A takes A^2 / 2 of the weight off the squares
+            scale = 2 / (float(one.train.weight.sum()) * level**2)
+            weighted = columns * (scale * one.train.weight)[:, None]
+            normal += weighted.T @ columns
+            right += weighted.T @ one.train.residual
+        out.append(float(right @ np.linalg.lstsq(normal, right, rcond=None)[0]))
+    return np.array(out)
 
 
 def _noise(peak: Peak, one: _Tracked) -> float:
@@ -436,6 +461,5 @@ def _noise(peak: Peak, one: _Tracked) -> float:
     top = max(highest_order([one.train], one.dt), 1.2 * peak.order + 64 * math.pi / stroke)
     orders, power = spectrum(one.train, top)
     level = float(np.interp(peak.order, orders, background(orders, power, stroke, 4 * math.pi / stroke)))
-    weight = float(one.train.weight.sum())
     # a line of amplitude A has the power (A weight / 2)^2; one of its two parts holds half the noise
-    return math.sqrt(2 * max(level, 1e-300)) / weight
+    return math.sqrt(2 * max(level, 1e-300)) / float(one.train.weight.sum())

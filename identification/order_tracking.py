@@ -84,11 +84,13 @@ class Peak:
     ----------
     order : float
     error : float
-        Standard error of the order.
+        Standard error of the order: that of a sine in noise, or from block to block where that is larger.
     sine, cosine : float
         Of order times angle, in the unit of the residual.
     prominence : float
         Power over the mean power of the background (z).
+    apart : float
+        2 pi / stroke: distance of orders that can be told apart.
     """
 
     order: float
@@ -96,6 +98,7 @@ class Peak:
     sine: float
     cosine: float
     prominence: float
+    apart: float
 
     @property
     def amplitude(self) -> float:
@@ -112,8 +115,8 @@ class Peak:
         return np.asarray(self.sine * np.sin(self.order * angle) + self.cosine * np.cos(self.order * angle), dtype=np.float64)
 
     def at(self, order: float) -> bool:
-        """True where the line lies at an order within its error."""
-        return abs(self.order - order) <= NAMED_WITHIN * self.error
+        """True where the line lies at an order within its error, and nearer to it than to the next one that can be told apart."""
+        return abs(self.order - order) <= min(NAMED_WITHIN * self.error, self.apart / 2)
 
 
 def trend(angle: FloatArray, velocity: FloatArray, acceleration: FloatArray, knots: FloatArray, span: tuple[float, float]) -> FloatArray:
@@ -297,7 +300,18 @@ def peaks(samples: Samples, highest: float, named: Sequence[float] = (), most: i
 def _peak(order: float, samples: Samples, prominence: float, apart: float) -> Peak:
     at = _polished(order, samples, apart / 2)
     sine, cosine = phase_fit(at, samples)
-    return Peak(at, ORDER_ERROR * apart / math.sqrt(prominence), sine, cosine, prominence)
+    found = Peak(at, ORDER_ERROR * apart / math.sqrt(prominence), sine, cosine, prominence, apart)
+    return replace(found, error=max(found.error, _block_error(found, samples)))
+
+
+def _block_error(peak: Peak, samples: Samples) -> float:
+    """Standard error of the order from the scores of the blocks: a phase that hangs on the speed moves the order more than noise."""
+    far = samples.angle - np.average(samples.angle, weights=samples.weight)
+    turn = peak.order * samples.angle
+    slope = far * (peak.sine * np.cos(turn) - peak.cosine * np.sin(turn))
+    _, inverse = np.unique(samples.block, return_inverse=True)
+    scores = np.bincount(inverse, weights=samples.weight * slope * (samples.residual - peak.wave(samples.angle)))
+    return float(np.linalg.norm(scores) / max(float(np.sum(samples.weight * slope**2)), 1e-300))
 
 
 def confirmed(peak: Peak, samples: Samples, candidates: int) -> bool:
