@@ -33,6 +33,7 @@ from identification.order_tracking import (
     confirmed,
     detrended,
     peaks,
+    phase_fit,
     refined,
     spectrum,
     trend,
@@ -54,7 +55,9 @@ SPANS: Final = ((7, 6), (7, 4), (11, 4), (15, 4), (31, 4))
 """Samples, and degree of the polynomial through them, from which velocity and acceleration are taken; the pair that leaves the least
 of a balance is used: short ones keep the band, long ones the noise of a coarse encoder down (A. Savitzky, M. Golay 1964)."""
 NAME_GAIN: Final = 0.85
-"""Share of the best name's power over the balances that a name of the same set explains: a name that loses more is another one."""
+"""Share of the best name's power that a name of the same set explains: one that loses more belongs to another side."""
+NAME_SHARE: Final = 0.5
+"""Share of the line's power over all balances that a name explains: with less, most of the line has another cause."""
 AROUND: Final = tuple(np.linspace(-0.4, 0.4, 5))
 """Orders about a peak, in units of 2 pi / stroke, at which the law of an effect is tried."""
 MEMORY_KERNEL: Final = 0.03
@@ -416,7 +419,7 @@ def _names(peak: Peak, near: float, scan: _Scan) -> tuple[tuple[str, ...], float
         k = int(np.argmax(gains))
         tried[key] = (float(gains[k]), refined(orders, gains, k))
     best = max((g for g, _ in tried.values()), default=0.0)
-    if best <= 0:
+    if best < NAME_SHARE * _shown(peak, noise, scan):
         return (), peak.order
     # without a torque sensor an acceleration that is too smooth looks like a torque of the motor: the order tells, the balances do not
     least = NAME_GAIN * best if scan.data.sensing.has_torque else 0.0
@@ -428,6 +431,12 @@ def _names(peak: Peak, near: float, scan: _Scan) -> tuple[tuple[str, ...], float
         # nothing tells the sides apart: what is declared as confused belongs to the set
         kept += [c for k in tuple(kept) for c in EFFECTS[k].confused_with if EFFECTS[c].periodic and c not in kept]
     return tuple(kept), tried[kept[0]][1]
+
+
+def _shown(peak: Peak, noise: Sequence[float], scan: _Scan) -> float:
+    """Squared standard deviations of the line over all balances, each with a phase of its own."""
+    sizes = [math.hypot(*phase_fit(peak.order, one.train)) / level for one, level in zip(scan.tracked, noise, strict=True)]
+    return sum(size**2 for size in sizes)
 
 
 def _gains(label: str, orders: FloatArray, noise: Sequence[float], scan: _Scan) -> FloatArray:
