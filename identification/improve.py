@@ -32,7 +32,7 @@ from identification.errors import InputError
 from identification.excitation import excitation_warnings, few_reversals, not_identifiable, unlike_units
 from identification.improvement import Improvement, Step, held_drop, made_worse, ranked_json, visible_keys, visible_labels
 from identification.joint_file import Joint
-from identification.lines import find_lines
+from identification.lines import find_lines, orders_of
 from identification.locate import Unexplained, locate, spectral_peak
 from identification.record import Record
 from identification.rival_table import is_absorbed
@@ -123,7 +123,9 @@ class Loop:
     def run(self, model: JointModel, max_additions: int) -> Improvement:
         """Fit `model`, then add what is missing, at most `max_additions` effects."""
         self.progress("fitting the start model", 0.05)
-        steps = [self._step(None, None, solve(model, self.data))]
+        started = solve(model, self.data)
+        self.data = replace(self.data, orders=orders_of(find_lines(started, self.data, self._train, self._held), self.joint))
+        steps = [self._step(None, None, started)]
         claims: list[Claim] = []
         self.progress("ranking the library", 0.15)
         why = not_identifiable(self.data)

@@ -43,7 +43,7 @@ from identification.record import Record
 from identification.sensing import Sensing, signals_of
 from identification.weak import POSITION_CHAINS, Grid, WeakRecord, kernel
 
-__all__ = ["Line", "find_lines", "highest_order", "named_orders"]
+__all__ = ["Line", "find_lines", "highest_order", "named_orders", "orders_of"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -134,14 +134,11 @@ def _angle_factor(joint: Joint) -> float:
     return 2 * math.pi if joint.kind == "linear" else abs(joint.gear_ratio)
 
 
-@final
-@dataclass(frozen=True)
-class _Run:
-    """One record at every sample: what the laws see, and the second that each sample belongs to."""
-
-    rows: WeakRecord
-    block: npt.NDArray[np.int64]
-    masked: frozenset[str]
+def orders_of(lines: Sequence[Line], joint: Joint) -> dict[str, tuple[float, ...]]:
+    """By effect, the orders of the lines that carry its name, as the shape of its law counts them (periods per radian of the motor)."""
+    turn = _angle_factor(joint) / abs(joint.gear_ratio)
+    keys = dict.fromkeys(k for line in lines for k in line.effects)
+    return {k: tuple(line.order * turn for line in lines if k in line.effects) for k in keys}
 
 
 Span = tuple[int, int]

@@ -31,7 +31,7 @@ def _stored(s: LocalSignals, p: SimpleNamespace) -> Expression:
             "absolute",
             start=2.0,
             low=0.05,
-            high=400.0,
+            high=1e5,
         ),
     ),
     absence="a line in the motor residual only, at a fixed order of the motor turn",
