@@ -7,6 +7,7 @@ lines above 15 Hz, has no part in it.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,7 +16,6 @@ from typing import Any, Final, final
 import casadi as ca
 import numpy as np
 import numpy.typing as npt
-from numpy.lib.stride_tricks import sliding_window_view
 
 from casadi_models import EFFECTS, JointModel, Signals
 from casadi_models.vectorised import Vectorised
@@ -25,6 +25,7 @@ from identification.dataset import Dataset
 from identification.engine import Solution
 from identification.joint_file import Joint
 from identification.order_tracking import (
+    ALPHA,
     BLOCK,
     Peak,
     Samples,
@@ -46,22 +47,26 @@ from identification.weak import POSITION_CHAINS, Grid, WeakRecord, kernel
 __all__ = ["Line", "find_lines", "highest_order", "named_orders", "orders_of"]
 
 FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
 
 MOTOR_ORDERS: Final = (1.0, 2.0, 4.0)
 """Orders per motor turn that have a name: shaft, wave generator and its second harmonic (T. Tuttle, W. Seering 1996)."""
 LOWEST_ORDER: Final = 0.25
 """Periods per motor turn (or pitch) from which on an order is looked for that nobody named: what is slower belongs to the link."""
-SPANS: Final = ((7, 6), (7, 4), (11, 4), (15, 4), (31, 4))
-"""Samples, and degree of the polynomial through them, from which velocity and acceleration are taken; the pair that leaves the least
-of a balance is used: short ones keep the band, long ones the noise of a coarse encoder down (A. Savitzky, M. Golay 1964)."""
+SMOOTHED: Final = (1, 9, 15, 31)
+"""Samples over which the residual is smoothed, one after the other: what hangs on an acceleration is noise above a frequency that
+the encoder sets, and samples whose line lies above it only disturb. Smoothing the whole residual keeps its terms in balance; smoothing
+the acceleration alone would leave a line that is none."""
+DERIVATIVE: Final = {1: (7, 4), 2: (7, 6), 3: (7, 6)}
+"""Samples and degree of the polynomial from which a derivative is taken (A. Savitzky, M. Golay 1964): flat to half of the band."""
 NAME_GAIN: Final = 0.85
 """Share of the best name's power that a name of the same set explains: one that loses more belongs to another side."""
 NAME_SHARE: Final = 0.5
 """Share of the line's power over all balances that a name explains: with less, most of the line has another cause."""
 AROUND: Final = tuple(np.linspace(-0.4, 0.4, 5))
 """Orders about a peak, in units of 2 pi / stroke, at which the law of an effect is tried."""
-MEMORY_KERNEL: Final = 0.03
-"""Kernel of the positions that drive internal states [s]: quantisation wipes out a memory."""
+SLOW_KERNEL: Final = 0.03
+"""Kernel of the positions that drive internal states, and of the velocity over which the trend is drawn [s]: quantisation wipes out both."""
 NORMAL_95: Final = 1.96
 
 
@@ -141,64 +146,51 @@ def orders_of(lines: Sequence[Line], joint: Joint) -> dict[str, tuple[float, ...
     return {k: tuple(line.order * turn for line in lines if k in line.effects) for k in keys}
 
 
-Span = tuple[int, int]
-
-
-def at_every_sample(record: Record, joint: Joint, sensing: Sensing, span: Span) -> WeakRecord:
-    """Signals of a record at every sample: torque, drive and positions as recorded, derivatives from polynomials.
-
-    Parameters
-    ----------
-    record : Record
-    joint, sensing : Joint, Sensing
-    span : (samples, degree)
-        Of the polynomials.
-    """
+def at_every_sample(record: Record, joint: Joint, sensing: Sensing) -> WeakRecord:
+    """Signals of a record at every sample: torque, drive and positions as recorded, derivatives over seven samples."""
     steps, inside = np.diff(record.time), np.diff(record.segment) == 0
     if inside.any() and np.ptp(steps[inside]) > 0.02 * float(np.median(steps[inside])):
         record = record.resampled()
     signals, dt = signals_of(record, joint, sensing), record.dt
-    long = max(span[0], 2 * round(MEMORY_KERNEL / dt / 2) + 1)
-    segments = tuple(s for s in record.segments() if s.stop - s.start > 2 * long)
+    long = max(7, 2 * round(SLOW_KERNEL / dt / 2) + 1)
+    segments = tuple(s for s in record.segments() if s.stop - s.start > 2 * max(long, SMOOTHED[-1]))
+    starts = np.concatenate([[0], np.cumsum([s.stop - s.start for s in segments])]).astype(np.int64)
     points: dict[str, FloatArray] = {}
     smooth: dict[str, FloatArray] = {}
     for source, chain in POSITION_CHAINS.items():
         if source not in signals:
             continue
+        raw = np.concatenate([signals[source][s] for s in segments] or [np.empty(0)])
         for order, name in enumerate(chain):
-            if order == 0:
-                smooth[name] = _filtered(signals[source], segments, kernel(long * dt, dt))
-                points[name] = np.concatenate([signals[source][s] for s in segments] or [np.empty(0)])
-            else:
-                points[name] = smooth[name] = _filtered(signals[source], segments, _polynomial(span, order) / dt**order)
+            smooth[name] = _filtered(raw, starts, kernel(long * dt, dt, order))
+            points[name] = _filtered(raw, starts, _polynomial(order) / dt**order) if order else raw
     for name, values in (("temperature", signals.get("temperature")), ("time", record.time)):
         if values is not None:
             points[name] = smooth[name] = np.concatenate([values[s] for s in segments] or [np.empty(0)])
-    grid = Grid(span[0] * dt, dt, 1, 1, segments, 0, dict.fromkeys(POSITION_CHAINS, span[0] * dt))
-    starts = np.concatenate([[0], np.cumsum([s.stop - s.start for s in segments])]).astype(np.int64)
-    block = _seconds(points["time"], starts)
-    return WeakRecord(grid, {}, points, smooth, points["time"], block, starts)
+    grid = Grid(7 * dt, dt, 1, 1, segments, 0, dict.fromkeys(POSITION_CHAINS, 7 * dt))
+    return WeakRecord(grid, {}, points, smooth, points["time"], _seconds(points["time"], starts), starts)
 
 
-def _polynomial(span: Span, order: int) -> FloatArray:
+def _polynomial(order: int) -> FloatArray:
     """Weights of the samples for a derivative per sample, from the polynomial of least squares."""
-    half = span[0] // 2
-    basis = np.vander(np.arange(-half, half + 1), span[1] + 1, increasing=True).astype(np.float64)
+    count, degree = DERIVATIVE[order]
+    basis = np.vander(np.arange(count) - count // 2, degree + 1, increasing=True).astype(np.float64)
     return np.asarray(np.linalg.pinv(basis)[order] * math.factorial(order), dtype=np.float64)
 
 
-def _filtered(values: FloatArray, segments: Sequence[slice], weights: FloatArray) -> FloatArray:
+def _filtered(values: FloatArray, starts: IntArray, weights: FloatArray) -> FloatArray:
     """Correlation with weights at every sample; the ends of a segment by the nearest full window."""
+    if len(weights) == 1:
+        return np.asarray(values * weights[0], dtype=np.float64)
     half = len(weights) // 2
-    parts = []
-    for segment in segments:
-        x = values[segment]
-        inner = sliding_window_view(x, len(weights)) @ weights
-        parts.append(inner[np.clip(np.arange(len(x)) - half, 0, len(inner) - 1)])
-    return np.concatenate(parts or [np.empty(0)])
+    out = np.empty(len(values))
+    for first, last in itertools.pairwise(starts.tolist()):
+        inner = np.correlate(values[first:last], weights, "valid")
+        out[first:last] = np.pad(inner, half, "edge")
+    return out
 
 
-def _seconds(time: FloatArray, starts: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+def _seconds(time: FloatArray, starts: IntArray) -> IntArray:
     """Number of the second of each sample; segments share none."""
     out = np.zeros(len(time), dtype=np.int64)
     first = 0
@@ -242,85 +234,113 @@ class _Pointwise:
         return {b: full[i] if not self.wrt else full[i * width : (i + 1) * width].T for i, b in enumerate(self.balances)}
 
 
-def highest_order(samples: Sequence[Samples], dt: float) -> float:
+def highest_order(samples: Samples, dt: float) -> float:
     """Order that is at half the sampling rate at the median speed."""
-    speed = np.concatenate([s.weight for s in samples])
-    moving = speed[speed > 0.05 * float(speed.max(initial=0.0))]
+    moving = samples.weight[samples.weight > 0.05 * float(samples.weight.max(initial=0.0))]
     return math.pi / (dt * float(np.median(moving))) if len(moving) else 0.0
 
 
 @final
 @dataclass(frozen=True)
 class _Tracked:
-    """A balance ready for the scan: samples of training and held-out records with the trend taken out."""
+    """A balance at one smoothing, ready for the scan: samples of training and held-out records with the trend taken out."""
 
     balance: str
+    smoothed: int
     train: Samples
     held: Samples | None
-    span: Span
     dt: float
 
 
-def _tracked(
-    solution: Solution, data: Dataset, train: Sequence[Record], held_out: Sequence[Record],
-) -> tuple[list[_Tracked], dict[Span, tuple[list[WeakRecord], list[WeakRecord]]]]:  # fmt: skip
-    """Every balance at the span that leaves the least of it."""
-    law = _Pointwise(solution.model, data.sensing)
-    runs: dict[Span, tuple[list[WeakRecord], list[WeakRecord]]] = {}
-    best: dict[str, tuple[float, _Tracked]] = {}
-    for span in SPANS:
-        first = [at_every_sample(r, data.joint, data.sensing, span) for r in train]
-        second = [at_every_sample(r, data.joint, data.sensing, span) for r in held_out]
-        runs[span] = (first, second)
-        residuals = [law.at(w, dict(solution.values)) for w in (*first, *second)]
-        for balance in law.balances:
-            made = _without_trend(balance, data, span, (first, second), [r[balance] for r in residuals])
-            if made is None:
-                continue
-            size = float(np.sqrt(np.average(made.train.residual**2, weights=made.train.weight)))
-            if balance not in best or size < best[balance][0]:
-                best[balance] = (size, made)
-    return [made for _, made in best.values()], runs
+@final
+@dataclass(frozen=True)
+class _Joined:
+    """Runs one after the other, with the residual of every balance."""
 
+    runs: tuple[WeakRecord, ...]
+    residual: FloatArray
+    factor: float
 
-def _without_trend(
-    balance: str, data: Dataset, span: Span, runs: tuple[list[WeakRecord], list[WeakRecord]], residuals: Sequence[FloatArray],
-) -> _Tracked | None:  # fmt: skip
-    """Samples of a balance without what depends on velocity, acceleration and slowly on the position."""
-    factor = _angle_factor(data.joint)
-    count = len(runs[0])
-    train = [i for i, w in enumerate(data.train) if balance not in w.masked and len(runs[0][i].time)]
-    held = [i for i, w in enumerate(data.held_out) if balance not in w.masked and len(runs[1][i].time)]
-    if not train:
-        return None
+    @property
+    def starts(self) -> IntArray:
+        """First sample of each stretch."""
+        parts, first = [np.zeros(1, dtype=np.int64)], 0
+        for w in self.runs:
+            parts.append(w.starts[1:] + first)
+            first += int(w.starts[-1])
+        return np.concatenate(parts)
 
-    def joined(side: int, which: Sequence[int]) -> tuple[Samples, FloatArray, FloatArray]:
-        chosen = [runs[side][i] for i in which]
-        velocity = np.concatenate([w.points["motor_velocity"] for w in chosen])
-        acceleration = np.concatenate([w.points["motor_acceleration"] for w in chosen])
+    def signal(self, name: str, *, smooth: bool = False) -> FloatArray:
+        """A signal over all runs."""
+        return np.concatenate([(w.smooth if smooth else w.points)[name] for w in self.runs])
+
+    def samples(self, smoothed: int) -> Samples:
+        """Samples with the residual smoothed."""
         block, first = [], 0
-        for w in chosen:
+        for w in self.runs:
             block.append(w.block + first)
-            first = int(block[-1].max()) + 1
-        samples = Samples(
-            factor * np.concatenate([w.points["motor_position"] for w in chosen]),
-            np.concatenate([residuals[i + side * count] for i in which]), factor * np.abs(velocity), np.concatenate(block),
-        )  # fmt: skip
-        return samples, velocity, acceleration
+            first = int(block[-1].max(initial=first)) + 1
+        starts = self.starts
+        weights = kernel(smoothed * self.runs[0].grid.dt, self.runs[0].grid.dt) if smoothed > 1 else np.ones(1)
 
-    samples, velocity, acceleration = joined(0, train)
-    if samples.stroke <= 0 or float(samples.weight.sum()) <= 0:
-        return None
-    knots, span_of = velocity_knots(velocity), (float(samples.angle.min()), float(samples.angle.max()))
-    columns = trend(samples.angle, velocity, acceleration, knots, span_of)
-    coefficients = detrended(columns, samples)
-    left = clipped(replace(samples, residual=samples.residual - columns @ coefficients))
-    beyond = None
-    if held:
-        unseen, velocity, acceleration = joined(1, held)
-        columns = trend(unseen.angle, velocity, acceleration, knots, span_of)
-        beyond = clipped(replace(unseen, residual=unseen.residual - columns @ coefficients))
-    return _Tracked(balance, left, beyond, span, float(runs[0][train[0]].grid.dt))
+        def seen(values: FloatArray) -> FloatArray:
+            return _filtered(values, starts, weights)
+
+        return Samples(
+            self.factor * self.signal("motor_position"), seen(self.residual), self.factor * np.abs(self.signal("motor_velocity", smooth=True)),
+            np.concatenate(block), seen,
+        )  # fmt: skip
+
+
+def _tracked(solution: Solution, data: Dataset, train: Sequence[Record], held_out: Sequence[Record]) -> tuple[list[_Tracked], tuple[WeakRecord, ...]]:
+    """Every balance at every smoothing; the training runs."""
+    law = _Pointwise(solution.model, data.sensing)
+    runs = tuple(at_every_sample(r, data.joint, data.sensing) for r in train)
+    unseen = tuple(at_every_sample(r, data.joint, data.sensing) for r in held_out)
+    values = dict(solution.values)
+    residuals = [[law.at(w, values) for w in part] for part in (runs, unseen)]
+    out: list[_Tracked] = []
+    for balance in law.balances:
+        joined = [
+            _Joined(tuple(itertools.compress(part, kept)), np.concatenate([r[balance] for r in itertools.compress(found, kept)] or [np.empty(0)]), factor)
+            for part, found, kept, factor in zip(
+                (runs, unseen), residuals, (_taking(balance, runs, data.train), _taking(balance, unseen, data.held_out)), (_angle_factor(data.joint),) * 2,
+                strict=True,
+            )
+        ]  # fmt: skip
+        if joined[0].runs:
+            out += _without_trend(balance, joined[0], joined[1] if joined[1].runs else None)
+    return out, runs
+
+
+def _taking(balance: str, runs: Sequence[WeakRecord], prepared: Sequence[WeakRecord]) -> list[bool]:
+    """Which runs take part in a balance."""
+    return [balance not in w.masked and len(r.time) > 0 for r, w in zip(runs, prepared, strict=True)]
+
+
+def _without_trend(balance: str, train: _Joined, held: _Joined | None) -> list[_Tracked]:
+    """Samples of a balance without what depends on velocity, acceleration and slowly on the position."""
+    angle, velocity = train.factor * train.signal("motor_position"), train.signal("motor_velocity", smooth=True)
+    if not float(np.ptp(angle)) or not np.any(velocity):
+        return []
+    knots, ends = velocity_knots(velocity), (float(angle.min()), float(angle.max()))
+
+    def columns(of: _Joined) -> FloatArray:
+        slow = [of.signal(n, smooth=True) for n in ("motor_velocity", "motor_acceleration")]
+        return trend(of.factor * of.signal("motor_position"), slow[0], slow[1], knots, ends)
+
+    own, beyond = columns(train), None if held is None else columns(held)
+    out = []
+    for smoothed in SMOOTHED:
+        samples = train.samples(smoothed)
+        coefficients = detrended(own, samples)
+        left = clipped(replace(samples, residual=samples.residual - own @ coefficients))
+        apart = None
+        if held is not None and beyond is not None:
+            apart = held.samples(smoothed)
+            apart = clipped(replace(apart, residual=apart.residual - beyond @ coefficients))
+        out.append(_Tracked(balance, smoothed, left, apart, train.runs[0].grid.dt))
+    return out
 
 
 def find_lines(solution: Solution, data: Dataset, train: Sequence[Record], held_out: Sequence[Record], most: int = 4) -> list[Line]:
@@ -347,7 +367,8 @@ def find_lines(solution: Solution, data: Dataset, train: Sequence[Record], held_
     named = named_orders(data.joint)
     seen: list[tuple[_Tracked, Peak]] = []
     for one in tracked:
-        found = peaks(one.train, highest_order([one.train], one.dt), named, 2 * most, LOWEST_ORDER * turns_per_unit(data.joint))
+        lowest = LOWEST_ORDER * turns_per_unit(data.joint)
+        found = peaks(one.train, highest_order(one.train, one.dt), named, 2 * most, lowest, ALPHA / len(SMOOTHED))
         seen += [(one, p) for p in found if one.held is None or confirmed(p, one.held, len(found))]
     seen.sort(key=lambda x: -x[1].prominence)
     out: list[Line] = []
@@ -375,19 +396,24 @@ def _held_out_drop(peak: Peak, held: Samples | None) -> float:
     if held is None:
         return 0.0
     before = float(np.sum(held.weight * held.residual**2))
-    after = float(np.sum(held.weight * (held.residual - peak.wave(held.angle)) ** 2))
+    after = float(np.sum(held.weight * (held.residual - peak.wave(held)) ** 2))
     return 100 * (1 - math.sqrt(after / max(before, 1e-300)))
 
 
-def line_labels(model: JointModel, sensing: Sensing) -> dict[str, str]:
-    """Key and label of the effects that are lines and that these channels can show; a further one of its kind where there is one."""
-    out = {}
+def line_models(model: JointModel, sensing: Sensing) -> list[tuple[str, str, JointModel]]:
+    """Key, label and model of every effect that is a line and that these channels can show; a further one of its kind where there is one.
+
+    The first kinematic error of a model comes with and without its virtual work, which not every joint shows.
+    """
+    out = []
     for effect in EFFECTS.values():
         missing = any(not model.has(n) for n in effect.needs)
         if not effect.periodic or missing or not observable(effect.acts_on[0], sensing):
             continue
         there = sum(t.effect.key == effect.key for t in model.terms)
-        out[effect.key] = effect.key if there == 0 else f"{effect.key}#{1 + there}"
+        label = effect.key if there == 0 else f"{effect.key}#{1 + there}"
+        first = effect.acts_on[0] == "torsion" and not any(t.place == "torsion" for t in model.terms)
+        out += [(effect.key, label, replace(model, virtual_work=w).add(label)) for w in ((True, False) if first else (model.virtual_work,))]
     return out
 
 
@@ -399,7 +425,16 @@ class _Scan:
     solution: Solution
     data: Dataset
     tracked: Sequence[_Tracked]
-    runs: dict[Span, tuple[list[WeakRecord], list[WeakRecord]]]
+    runs: Sequence[WeakRecord]
+
+    def clearest(self, peak: Peak) -> list[tuple[_Tracked, float]]:
+        """Every balance at the smoothing that tells most at an order, with the standard error of a sine there."""
+        out: dict[str, tuple[_Tracked, float]] = {}
+        for one in self.tracked:
+            noise = _noise(peak, one)
+            if one.balance not in out or noise < out[one.balance][1]:
+                out[one.balance] = one, noise
+        return list(out.values())
 
 
 def _names(peak: Peak, near: float, scan: _Scan) -> tuple[tuple[str, ...], float]:
@@ -408,15 +443,16 @@ def _names(peak: Peak, near: float, scan: _Scan) -> tuple[tuple[str, ...], float
     Each effect is fitted with its own law, at orders about the peak: the virtual work of a kinematic error under gravity shifts
     the peak of a plain sine by more than noise. Its own order has to lie at the named one.
     """
-    noise = [_noise(peak, one) for one in scan.tracked]
+    chosen = scan.clearest(peak)
     tried: dict[str, tuple[float, float]] = {}
-    for key, label in line_labels(scan.solution.model, scan.data.sensing).items():
-        orders = np.array([peak.order + peak.apart * x for x in AROUND])
-        gains = _gains(label, orders, noise, scan)
+    orders = np.array([peak.order + peak.apart * x for x in AROUND])
+    for key, label, model in line_models(scan.solution.model, scan.data.sensing):
+        gains = _gains(label, model, orders, chosen, scan)
         k = int(np.argmax(gains))
-        tried[key] = (float(gains[k]), refined(orders, gains, k))
+        if gains[k] > tried.get(key, (0.0, 0.0))[0]:
+            tried[key] = (float(gains[k]), refined(orders, gains, k))
     best = max((g for g, _ in tried.values()), default=0.0)
-    if best < NAME_SHARE * _shown(peak, noise, scan):
+    if best < NAME_SHARE * _shown(peak, chosen):
         return (), peak.order
     # without a torque sensor an acceleration that is too smooth looks like a torque of the motor: the order tells, the balances do not
     least = NAME_GAIN * best if scan.data.sensing.has_torque else 0.0
@@ -430,15 +466,14 @@ def _names(peak: Peak, near: float, scan: _Scan) -> tuple[tuple[str, ...], float
     return tuple(kept), tried[kept[0]][1]
 
 
-def _shown(peak: Peak, noise: Sequence[float], scan: _Scan) -> float:
+def _shown(peak: Peak, chosen: Sequence[tuple[_Tracked, float]]) -> float:
     """Squared standard deviations of the line over all balances, each with a phase of its own."""
-    sizes = [math.hypot(*phase_fit(peak.order, one.train)) / level for one, level in zip(scan.tracked, noise, strict=True)]
-    return sum(size**2 for size in sizes)
+    return sum((math.hypot(*phase_fit(peak.order, one.train)) / noise) ** 2 for one, noise in chosen)
 
 
-def _gains(label: str, orders: FloatArray, noise: Sequence[float], scan: _Scan) -> FloatArray:
+def _gains(label: str, model: JointModel, orders: FloatArray, chosen: Sequence[tuple[_Tracked, float]], scan: _Scan) -> FloatArray:
     """Squared standard deviations that an effect explains in all balances together, at several orders."""
-    model, data = scan.solution.model.add(label), scan.data
+    data = scan.data
     term = next(t for t in model.terms if t.label == label)
     pairs = list(zip(term.names, term.effect.parameters, strict=True))
     amplitudes = [n for n, p in pairs if not p.is_shape]
@@ -449,23 +484,28 @@ def _gains(label: str, orders: FloatArray, noise: Sequence[float], scan: _Scan) 
     out = []
     for order in orders:
         normal, right = np.zeros((len(amplitudes), len(amplitudes))), np.zeros(len(amplitudes))
-        at = {s: [law.at(w, {**values, shape: float(order) * turn}) for w in scan.runs[s][0]] for s in {one.span for one in scan.tracked}}
-        for one, level in zip(scan.tracked, noise, strict=True):
-            columns = np.concatenate([c[one.balance] for c, d in zip(at[one.span], data.train, strict=True) if one.balance not in d.masked])
-            # a sine of amplitude A takes A^2 / 2 of the weight off the squares
-            scale = 2 / (float(one.train.weight.sum()) * level**2)
-            weighted = columns * (scale * one.train.weight)[:, None]
+        at = [law.at(w, {**values, shape: float(order) * turn}) for w in scan.runs]
+        for one, noise in chosen:
+            raw = np.concatenate([c[one.balance] for c in itertools.compress(at, _taking(one.balance, scan.runs, data.train))])
+            columns = np.column_stack([one.train.seen(c) for c in raw.T])
+            # a part of unit size takes its information off the squares, and stands 1/noise deviations over nothing
+            weighted = columns * (one.train.weight / (_information(float(order), one) * noise**2))[:, None]
             normal += weighted.T @ columns
             right += weighted.T @ one.train.residual
         out.append(float(right @ np.linalg.lstsq(normal, right, rcond=None)[0]))
     return np.array(out)
 
 
+def _information(order: float, one: _Tracked) -> float:
+    """Weighted squares of a sine of unit amplitude as the smoothing leaves it."""
+    return float(np.sum(one.train.weight * one.train.seen(np.sin(order * one.train.angle)) ** 2))
+
+
 def _noise(peak: Peak, one: _Tracked) -> float:
     """Standard error of the sine or cosine of a line at that order in a balance."""
     stroke = one.train.stroke
-    top = max(highest_order([one.train], one.dt), 1.2 * peak.order + 64 * math.pi / stroke)
+    top = max(highest_order(one.train, one.dt), 1.2 * peak.order + 64 * math.pi / stroke)
     orders, power = spectrum(one.train, top)
     level = float(np.interp(peak.order, orders, background(orders, power, stroke, 4 * math.pi / stroke)))
-    # a line of amplitude A has the power (A weight / 2)^2; one of its two parts holds half the noise
-    return math.sqrt(2 * max(level, 1e-300)) / float(one.train.weight.sum())
+    # the power is that of the sum of weight times residual times exp: one of its two parts holds half the noise
+    return math.sqrt(max(level, 1e-300) / 2) / max(_information(peak.order, one), 1e-300)

@@ -11,7 +11,7 @@ exponentially distributed, with the mean median / ln 2 (N. Wiener, B. Fisher: pe
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, final
 
@@ -62,12 +62,15 @@ class Samples:
         What each sample counts: the angle that it covers.
     block : (n,) int array
         Number of the second that the sample belongs to.
+    seen : callable
+        What the smoothing of the residual leaves of a signal at the samples.
     """
 
     angle: FloatArray
     residual: FloatArray
     weight: FloatArray
     block: IntArray
+    seen: Callable[[FloatArray], FloatArray] = np.asarray
 
     @property
     def stroke(self) -> float:
@@ -110,9 +113,9 @@ class Peak:
         """Standard error of the size: one part of the complex amplitude holds half the power of the background."""
         return self.amplitude / math.sqrt(2 * max(self.prominence, 1e-300))
 
-    def wave(self, angle: FloatArray) -> FloatArray:
-        """The line at given angles."""
-        return np.asarray(self.sine * np.sin(self.order * angle) + self.cosine * np.cos(self.order * angle), dtype=np.float64)
+    def wave(self, samples: Samples) -> FloatArray:
+        """The line as the samples show it."""
+        return samples.seen(self.sine * np.sin(self.order * samples.angle) + self.cosine * np.cos(self.order * samples.angle))
 
     def at(self, order: float) -> bool:
         """True where the line lies at an order within its error, and nearer to it than to the next one that can be told apart."""
@@ -215,7 +218,8 @@ def independent_orders(lowest: float, highest: float, stroke: float) -> float:
 def phase_fit(order: float, samples: Samples) -> tuple[float, float]:
     """Sine and cosine of a line at an order, by weighted least squares."""
     root = np.sqrt(samples.weight)
-    columns = np.column_stack([np.sin(order * samples.angle), np.cos(order * samples.angle), np.ones_like(samples.angle)])
+    waves = [samples.seen(f(order * samples.angle)) for f in (np.sin, np.cos)]
+    columns = np.column_stack([*waves, np.ones_like(samples.angle)])
     found = np.linalg.lstsq(columns * root[:, None], samples.residual * root, rcond=None)[0]
     return float(found[0]), float(found[1])
 
@@ -243,7 +247,9 @@ def _polished(order: float, samples: Samples, width: float) -> float:
     return float(done.x)
 
 
-def peaks(samples: Samples, highest: float, named: Sequence[float] = (), most: int = 4, lowest: float = 0.0) -> list[Peak]:
+def peaks(
+    samples: Samples, highest: float, named: Sequence[float] = (), most: int = 4, lowest: float = 0.0, alpha: float = ALPHA,
+) -> list[Peak]:  # fmt: skip
     """Lines that stand over their surroundings, the strongest first; each is taken out before the next is looked for.
 
     Parameters
@@ -258,6 +264,8 @@ def peaks(samples: Samples, highest: float, named: Sequence[float] = (), most: i
         At most so many.
     lowest : float
         Lowest order without a name; at least :data:`FREE_CYCLES` periods over the stroke.
+    alpha : float
+        Chance of a line in noise.
 
     Returns
     -------
@@ -272,8 +280,8 @@ def peaks(samples: Samples, highest: float, named: Sequence[float] = (), most: i
     top = max([highest, *(1.1 * h + 2 * SURROUNDINGS * apart for h in known)])
     if top <= low:
         return []
-    anywhere = -math.log(ALPHA / independent_orders(low, highest, stroke)) if highest > low else math.inf
-    by_name = -math.log(ALPHA / max(len(known), 1))
+    anywhere = -math.log(alpha / independent_orders(low, highest, stroke)) if highest > low else math.inf
+    by_name = -math.log(alpha / max(len(known), 1))
     left = samples
     out: list[Peak] = []
     for _ in range(most):
@@ -293,7 +301,7 @@ def peaks(samples: Samples, highest: float, named: Sequence[float] = (), most: i
         if found is None:
             break
         out.append(found)
-        left = replace(left, residual=left.residual - found.wave(left.angle))
+        left = replace(left, residual=left.residual - found.wave(left))
     return out
 
 
@@ -308,9 +316,9 @@ def _block_error(peak: Peak, samples: Samples) -> float:
     """Standard error of the order from the scores of the blocks: a phase that hangs on the speed moves the order more than noise."""
     far = samples.angle - np.average(samples.angle, weights=samples.weight)
     turn = peak.order * samples.angle
-    slope = far * (peak.sine * np.cos(turn) - peak.cosine * np.sin(turn))
+    slope = far * samples.seen(peak.sine * np.cos(turn) - peak.cosine * np.sin(turn))
     _, inverse = np.unique(samples.block, return_inverse=True)
-    scores = np.bincount(inverse, weights=samples.weight * slope * (samples.residual - peak.wave(samples.angle)))
+    scores = np.bincount(inverse, weights=samples.weight * slope * (samples.residual - peak.wave(samples)))
     return float(np.linalg.norm(scores) / max(float(np.sum(samples.weight * slope**2)), 1e-300))
 
 
@@ -326,9 +334,9 @@ def confirmed(peak: Peak, samples: Samples, candidates: int) -> bool:
     candidates : int
         Lines that are put to this test.
     """
-    from scipy.stats import t as student
+    from scipy.special import stdtrit
 
-    wave = peak.wave(samples.angle)
+    wave = peak.wave(samples)
     names, inverse = np.unique(samples.block, return_inverse=True)
     top = np.bincount(inverse, weights=samples.weight * wave * samples.residual, minlength=len(names))
     under = np.bincount(inverse, weights=samples.weight * wave**2, minlength=len(names))
@@ -339,4 +347,4 @@ def confirmed(peak: Peak, samples: Samples, candidates: int) -> bool:
     spread = math.sqrt(float(np.sum((top - slope * under) ** 2)) * len(names) / (len(names) - 1)) / total
     if spread == 0:
         return slope > 0
-    return slope / spread > float(student.ppf(1 - ALPHA / max(candidates, 1), len(names) - 1))
+    return slope / spread > float(stdtrit(len(names) - 1, 1 - ALPHA / max(candidates, 1)))
