@@ -61,6 +61,18 @@ class Result:
     case: Case
     lines: tuple[Line, ...]
     truth: float
+    amplitude: float
+
+    @property
+    def covered(self) -> bool:
+        """True where the band of the amplitude holds the true one."""
+        x = self.right
+        return x is not None and x.amplitude_low is not None and x.amplitude_high is not None and x.amplitude_low <= self.amplitude <= x.amplitude_high
+
+    @property
+    def size_error(self) -> float:
+        """Relative error of the amplitude."""
+        return math.nan if self.right is None else self.right.amplitude / self.amplitude - 1
 
     @property
     def right(self) -> Line | None:
@@ -165,8 +177,8 @@ def _draw(rng: np.random.Generator, case: Case) -> dict[str, float]:
     }  # fmt: skip
 
 
-def simulate(drawn: Sequence[Case], seed: int) -> list[tuple[Joint, list[Record]]]:
-    """Records of all cases: two to fit, one held out."""
+def simulate(drawn: Sequence[Case], seed: int) -> list[tuple[Joint, list[Record], float]]:
+    """Records of all cases: two to fit, one held out; amplitude of the line."""
     rng = np.random.default_rng((seed, 2))
     steps = round(SPAN / STEP)
     joints = [_draw(rng, c) for c in drawn]
@@ -184,7 +196,7 @@ def simulate(drawn: Sequence[Case], seed: int) -> list[tuple[Joint, list[Record]
         run = plant.run((d[0], d[1], d[2]))
         for i, c in enumerate(drawn):
             out[i][1].append(_record(rng, c, {n: x[:: round(1 / c.rate / STEP), i] for n, x in run.items()}, (wave[i], plant.phase[i])))
-    return out
+    return [(joint, records, float(a)) for (joint, records), a in zip(out, size, strict=True)]
 
 
 def _joint(case: Case) -> Joint:
@@ -215,18 +227,18 @@ def _record(rng: np.random.Generator, case: Case, run: dict[str, FloatArray], se
     return Record.from_channels(time, channels, name="joint")
 
 
-def judge(case: Case, joint: Joint, records: Sequence[Record]) -> Result:
+def judge(case: Case, joint: Joint, records: Sequence[Record], amplitude: float) -> Result:
     """Lines of one joint: fit of the start model, then the scan."""
     train, held = list(records[:2]), list(records[2:])
     model = prepared_model(joint, train[0])
     data = load_dataset(train, held, joint, model)
-    return Result(case, tuple(find_lines(solve(model, data), data, train, held)), case.order)
+    return Result(case, tuple(find_lines(solve(model, data), data, train, held)), case.order, amplitude)
 
 
 def results(seed: int, chosen: Sequence[Case] | None = None) -> list[Result]:
     """All cases of a seed."""
     drawn = list(chosen) if chosen is not None else cases(seed)
-    return [judge(c, joint, records) for c, (joint, records) in zip(drawn, simulate(drawn, seed), strict=True)]
+    return [judge(c, *made) for c, made in zip(drawn, simulate(drawn, seed), strict=True)]
 
 
 def table(found: Sequence[Result]) -> str:
@@ -237,10 +249,22 @@ def table(found: Sequence[Result]) -> str:
         kind = "linear axis, pitch " + ("given" if c.pitch_known else "not given") if c.linear else f"100:1, {c.sensors}"
         order = "" if c.effect is None else "pitch" if c.linear else f"{c.order:g}"
         groups.setdefault((kind, c.effect or "none", order), []).append(r)
-    lines = ["| joint | hidden | order | joints | right order | name in set | name alone | lines elsewhere |", "|---|---|---|---|---|---|---|---|"]
+    lines = [
+        "| joint | hidden | order | joints | right order | name in set | name alone | lines elsewhere | amplitude in its band | median error, % |",
+        "|---|---|---|---|---|---|---|---|---|---|",
+    ]
     for key, rs in sorted(groups.items()):
         alone = sum(r.named and r.right is not None and len(r.right.effects) == 1 for r in rs)
-        cells = [*key, str(len(rs)), str(sum(r.right is not None for r in rs)), str(sum(r.named for r in rs)), str(alone), str(sum(r.others for r in rs))]
+        cells = [
+            *key,
+            str(len(rs)),
+            str(sum(r.right is not None for r in rs)),
+            str(sum(r.named for r in rs)),
+            str(alone),
+            str(sum(r.others for r in rs)),
+            str(sum(r.covered for r in rs)),
+            f"{100 * np.median([r.size_error for r in rs]):.1f}",
+        ]
         lines.append("| " + " | ".join(cells) + " |")
     with_line = [r for r in found if r.case.effect]
     without = [r for r in found if not r.case.effect]

@@ -209,6 +209,8 @@ class _Pointwise:
         e = model.equations
         expressions = residual_expressions(model, sensing)
         self.balances = tuple(expressions)
+        moved = ca.vertcat(e.signals.motor_acceleration, e.signals.link_acceleration)
+        self.at_rest_too = frozenset(b for b, r in expressions.items() if not ca.depends_on(r, moved))
         self.names = model.parameter_names
         self.wrt = tuple(wrt)
         columns = [self.names.index(n) for n in wrt]
@@ -243,13 +245,17 @@ def highest_order(samples: Samples, dt: float) -> float:
 @final
 @dataclass(frozen=True)
 class _Tracked:
-    """A balance at one smoothing, ready for the scan: samples of training and held-out records with the trend taken out."""
+    """A balance at one smoothing, ready for the scan: samples of training and held-out records with the trend taken out.
+
+    `direct` where no acceleration enters.
+    """
 
     balance: str
     smoothed: int
     train: Samples
     held: Samples | None
     dt: float
+    direct: bool
 
 
 @final
@@ -309,7 +315,7 @@ def _tracked(solution: Solution, data: Dataset, train: Sequence[Record], held_ou
             )
         ]  # fmt: skip
         if joined[0].runs:
-            out += _without_trend(balance, joined[0], joined[1] if joined[1].runs else None)
+            out += _without_trend(balance, joined[0], joined[1] if joined[1].runs else None, direct=balance in law.at_rest_too)
     return out, runs
 
 
@@ -318,7 +324,7 @@ def _taking(balance: str, runs: Sequence[WeakRecord], prepared: Sequence[WeakRec
     return [balance not in w.masked and len(r.time) > 0 for r, w in zip(runs, prepared, strict=True)]
 
 
-def _without_trend(balance: str, train: _Joined, held: _Joined | None) -> list[_Tracked]:
+def _without_trend(balance: str, train: _Joined, held: _Joined | None, *, direct: bool) -> list[_Tracked]:
     """Samples of a balance without what depends on velocity, acceleration and slowly on the position."""
     angle, velocity = train.factor * train.signal("motor_position"), train.signal("motor_velocity", smooth=True)
     if not float(np.ptp(angle)) or not np.any(velocity):
@@ -339,7 +345,7 @@ def _without_trend(balance: str, train: _Joined, held: _Joined | None) -> list[_
         if held is not None and beyond is not None:
             apart = held.samples(smoothed)
             apart = clipped(replace(apart, residual=apart.residual - beyond @ coefficients))
-        out.append(_Tracked(balance, smoothed, left, apart, train.runs[0].grid.dt))
+        out.append(_Tracked(balance, smoothed, left, apart, train.runs[0].grid.dt, direct))
     return out
 
 
@@ -370,16 +376,17 @@ def find_lines(solution: Solution, data: Dataset, train: Sequence[Record], held_
         lowest = LOWEST_ORDER * turns_per_unit(data.joint)
         found = peaks(one.train, highest_order(one.train, one.dt), named, 2 * most, lowest, ALPHA / len(SMOOTHED))
         seen += [(one, p) for p in found if one.held is None or confirmed(p, one.held, len(found))]
-    seen.sort(key=lambda x: -x[1].prominence)
+    # what a position reads wrong stands in every balance of its acceleration, larger: where a balance without shows it, it is there
+    seen.sort(key=lambda x: (not x[0].direct, -x[1].prominence))
     out: list[Line] = []
     for one, peak in seen:
         apart = 2 * math.pi / one.train.stroke
-        if len(out) == most or any(abs(line.order - peak.order) < 2 * apart for line in out):
+        if any(abs(line.order - peak.order) < 2 * apart for line in out):
             continue
         near = min(named, key=lambda h: abs(h - peak.order), default=math.inf)
         names, order = _names(peak, near, _Scan(solution, data, tracked, runs)) if abs(near - peak.order) <= apart / 2 else ((), peak.order)
         out.append(_line(peak, order, one, names, data.joint))
-    return out
+    return sorted(out, key=lambda line: -line.prominence)[:most]
 
 
 def _line(peak: Peak, order: float, one: _Tracked, names: tuple[str, ...], joint: Joint) -> Line:

@@ -23,8 +23,12 @@ IntArray = npt.NDArray[np.int64]
 
 ALPHA: Final = 0.01
 """Share of joints without a line on which noise may pass for one, in the scan and again on held-out records."""
-SURROUNDINGS: Final = 16
-"""Independent orders on either side of a peak from which its background is taken: their median is known to a third."""
+SURROUNDINGS: Final = 32
+"""Independent orders on either side of a peak from which its background is taken: their median is known to a fifth."""
+MEDIAN_EFFICIENCY: Final = 0.48
+"""Of the median against the mean, for the level of exponentially distributed powers: (ln 2)^2."""
+FEWEST_SURROUNDINGS: Final = 4
+"""Independent orders below a peak from which on they count as its left side."""
 NEAREST: Final = 2
 """Independent orders next to a peak that its own main lobe covers: no background."""
 FEWEST_CYCLES: Final = 2.0
@@ -74,8 +78,12 @@ class Samples:
 
     @property
     def stroke(self) -> float:
-        """Angle from the first to the last one."""
-        return float(np.ptp(self.angle)) if len(self.angle) else 0.0
+        """Angle over which the samples spread: that of samples spread evenly with the same deviation, so that orders
+        2 pi / stroke apart are independent however long the motion dwelt in the middle."""
+        if not len(self.angle) or float(self.weight.sum()) <= 0:
+            return 0.0
+        middle = float(np.average(self.angle, weights=self.weight))
+        return math.sqrt(12 * float(np.average((self.angle - middle) ** 2, weights=self.weight)))
 
 
 @final
@@ -94,6 +102,8 @@ class Peak:
         Power over the mean power of the background (z).
     apart : float
         2 pi / stroke: distance of orders that can be told apart.
+    amplitude_error : float
+        Standard error of the size: one part of it holds half the power of the background; from block to block where that is larger.
     """
 
     order: float
@@ -102,16 +112,12 @@ class Peak:
     cosine: float
     prominence: float
     apart: float
+    amplitude_error: float
 
     @property
     def amplitude(self) -> float:
         """Size of the line."""
         return math.hypot(self.sine, self.cosine)
-
-    @property
-    def amplitude_error(self) -> float:
-        """Standard error of the size: one part of the complex amplitude holds half the power of the background."""
-        return self.amplitude / math.sqrt(2 * max(self.prominence, 1e-300))
 
     def wave(self, samples: Samples) -> FloatArray:
         """The line as the samples show it."""
@@ -203,11 +209,23 @@ def background(orders: FloatArray, power: FloatArray, stroke: float, lowest: flo
     at = np.arange(count)
     reach = (near + far) // 2
     left = np.where(at - far >= 0, medians[np.clip(at - reach, 0, count - 1)], 0.0)
+    for k in range(near + round(FEWEST_SURROUNDINGS * one), far):
+        left[k] = np.median(inside[: k - near])
     right = np.where(at + far < count, medians[np.clip(at + reach, 0, count - 1)], 0.0)
     out = np.zeros(len(power))
     out[first:] = np.maximum(left, right) / math.log(2)
     out[:first] = out[first] if count else 0.0
     return out
+
+
+def threshold(alpha: float, orders: float) -> float:
+    """Power over the background that noise passes with a chance of alpha in so many independent orders.
+
+    -ln(alpha / orders) over a known background; the background is itself known from few orders only (beta-prime
+    distribution of the ratio of two exponential levels).
+    """
+    known = 2 * (SURROUNDINGS - NEAREST) * MEDIAN_EFFICIENCY
+    return known * ((max(orders, 1.0) / alpha) ** (1 / known) - 1)
 
 
 def independent_orders(lowest: float, highest: float, stroke: float) -> float:
@@ -280,8 +298,8 @@ def peaks(
     top = max([highest, *(1.1 * h + 2 * SURROUNDINGS * apart for h in known)])
     if top <= low:
         return []
-    anywhere = -math.log(alpha / independent_orders(low, highest, stroke)) if highest > low else math.inf
-    by_name = -math.log(alpha / max(len(known), 1))
+    anywhere = threshold(alpha, independent_orders(low, highest, stroke)) if highest > low else math.inf
+    by_name = threshold(alpha, len(known))
     left = samples
     out: list[Peak] = []
     for _ in range(most):
@@ -308,15 +326,25 @@ def peaks(
 def _peak(order: float, samples: Samples, prominence: float, apart: float) -> Peak:
     at = _polished(order, samples, apart / 2)
     sine, cosine = phase_fit(at, samples)
-    found = Peak(at, ORDER_ERROR * apart / math.sqrt(prominence), sine, cosine, prominence, apart)
-    return replace(found, error=max(found.error, _block_error(found, samples)))
-
-
-def _block_error(peak: Peak, samples: Samples) -> float:
-    """Standard error of the order from the scores of the blocks: a phase that hangs on the speed moves the order more than noise."""
+    size = math.hypot(sine, cosine) / math.sqrt(2 * prominence)
+    found = Peak(at, ORDER_ERROR * apart / math.sqrt(prominence), sine, cosine, prominence, apart, size)
     far = samples.angle - np.average(samples.angle, weights=samples.weight)
-    turn = peak.order * samples.angle
-    slope = far * samples.seen(peak.sine * np.cos(turn) - peak.cosine * np.sin(turn))
+    turned = replace(found, sine=-cosine, cosine=sine).wave(samples)
+    unit = found.wave(samples) / max(found.amplitude, 1e-300)
+    return replace(
+        found, error=max(found.error, _block_error(far * turned, found, samples)),
+        amplitude_error=max(size, _block_error(unit, found, samples)),
+    )  # fmt: skip
+
+
+def _block_error(slope: FloatArray, peak: Peak, samples: Samples) -> float:
+    """Standard error of a parameter of the line from the scores of the blocks: what hangs on the speed moves it more than noise.
+
+    Parameters
+    ----------
+    slope : (n,) array
+        Derivative of the line with respect to the parameter.
+    """
     _, inverse = np.unique(samples.block, return_inverse=True)
     scores = np.bincount(inverse, weights=samples.weight * slope * (samples.residual - peak.wave(samples)))
     return float(np.linalg.norm(scores) / max(float(np.sum(samples.weight * slope**2)), 1e-300))
