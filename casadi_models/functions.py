@@ -212,6 +212,7 @@ class JointFunctions:
             self._reading("link_position_sensor", link[1], accelerations[1], offset=False),
             self._reading("torque_sensor", true_torque, torque_rate),
         ]
+        rows = self._substituted(*rows)  # a sensor may read the angle too
         return ca.Function("outputs", [ca.vertcat(x, z), u, p], [ca.vertcat(*rows)], ["x", "u", "p"], ["y"])
 
     @cached_property

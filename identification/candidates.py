@@ -92,7 +92,7 @@ def offered(model: JointModel, data: Dataset, *, late: bool = False) -> tuple[li
         if effect.angular and data.joint.kind == "linear":
             refused.append(NotTestable(effect.key, "is a law of an angle; this axis is linear"))
             continue
-        if effect.periodic and (data.joint.kind == "linear" or _turns(data) < 2):
+        if effect.periodic and effect.key not in data.orders and (data.joint.kind == "linear" or _turns(data) < 2):
             places = []
         if not places:
             refused.append(NotTestable(effect.key, f"needs a channel that shows the {_shown(effect.acts_on[0])}; these records have none"))
@@ -169,7 +169,8 @@ def _placed(effect: Effect, place: Place, model: JointModel) -> list[Candidate]:
 
 
 def shape_grid(candidate: Candidate, data: Dataset) -> list[dict[str, float]]:
-    """All combinations of the candidate's shape grids, in SI units."""
+    """All combinations of the candidate's shape grids, in SI units; for a line, the orders at which one was found too."""
     parameters = {p.name: p for p in candidate.model.parameters}
-    axes = [[(n, g * data.ranges[parameters[n].scale]) for g in parameters[n].grid] for n in candidate.shapes]
+    found = data.orders.get(candidate.effect.key, ()) if candidate.effect.periodic else ()
+    axes = [[(n, g * data.ranges[parameters[n].scale]) for g in parameters[n].grid] + [(n, h) for h in found] for n in candidate.shapes]
     return [dict(point) for point in itertools.product(*axes)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Final, final
 
 import numpy as np
@@ -44,6 +44,8 @@ class Dataset:
         99 % range of velocity [rad/s], torsion [rad], position [rad] and the duration [s]: scales of shape grids.
     noise : mapping of str to float
         White-noise level of each measured signal.
+    orders : mapping of str to tuple of float
+        By effect, orders per motor turn at which a line carries its name: start values of its shape.
     """
 
     joint: Joint
@@ -55,6 +57,7 @@ class Dataset:
     train_names: tuple[str, ...] = ()
     held_out_names: tuple[str, ...] = ()
     note: str = ""
+    orders: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
 
     @property
     def kernel(self) -> float:

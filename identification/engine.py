@@ -201,7 +201,7 @@ def _check_moves(problem: WeakForm) -> None:
         n for i, n in enumerate(problem.free)
         if max(float(np.abs(j[:, i]).max(initial=0.0)) for j in jacobian.values()) == 0.0 and values[n] != 0.0
     ]  # fmt: skip
-    model = balances.model
+    model = problem.balances.model
     truly = [n for n in dead if n in (*model.inertias, model.stiffness_name)]
     if truly:
         raise InputError(f"parameter {', '.join(truly)} moves no output of these records; give it a known value or add the channel that shows it")
@@ -216,7 +216,7 @@ def _with_errors(problem: WeakForm, limits: Mapping[str, tuple[float, float]], s
     r = np.concatenate([stacked.residual[b] * weights[b] for b in balances.balances])
     block = np.tile(stacked.block, len(balances.balances))
     norms = np.linalg.norm(j, axis=0)
-    smoothing = model.named("smoothing")
+    smoothing = balances.model.named("smoothing")
     at_bound = [
         n for n in free
         if any(math.isfinite(limit) and abs(values[n] - limit) <= 1e-9 * max(abs(limit), 1e-300) for limit in limits[n])

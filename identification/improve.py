@@ -29,7 +29,7 @@ from identification.errors import InputError
 from identification.excitation import claim_limit, excitation_warnings, few_reversals, not_identifiable, unlike_units
 from identification.improvement import Improvement, Step, held_drop, made_worse, ranked_json, visible_keys, visible_labels
 from identification.joint_file import Joint
-from identification.lines import find_lines
+from identification.lines import find_lines, orders_of
 from identification.locate import Unexplained, locate, spectral_peak
 from identification.record import Record
 from identification.rival_table import is_absorbed
@@ -121,7 +121,9 @@ class Loop:
         """Fit `model`, then add what is missing, at most `max_additions` effects, and no more than the motion can carry."""
         max_additions = min(max_additions, claim_limit(self.data))
         self.progress("fitting the start model", 0.05)
-        steps = [self._step(None, None, solve(model, self.data))]
+        started = solve(model, self.data)
+        self.data = replace(self.data, orders=orders_of(find_lines(started, self.data, self._train, self._held), self.joint))
+        steps = [self._step(None, None, started)]
         claims: list[Claim] = []
         self.progress("ranking the library", 0.15)
         why = not_identifiable(self.data)
@@ -309,7 +311,7 @@ class Loop:
         self.progress("looking at what is left", 0.85)
         solution = steps[-1].solution
         ratios = self._ratios(solution)
-        lines = find_lines(solution, [self._at_kernel(k) for k in self._line_kernels()] + [self.data])
+        lines = find_lines(solution, self.data, self._train, self._held)
         minor = tuple(self._minor(t, solution) for t in minor_claims(last, base) if self._same_sign(t, solution))
         error = replace(steps[-1].held_out, balances=ratios)
         where = locate(solution, self.data, error, lines, RATIO_LIMIT)
@@ -332,11 +334,6 @@ class Loop:
             "no temperature was recorded: thermal friction is judged by the time since each run started, taken as a cold start; "
             "its values are the change over one run, not per kelvin",
         )
-
-    def _line_kernels(self) -> list[float]:
-        """The shortest kernel and one between it and that of the claims."""
-        shortest = max(8 * self.data.train[0].grid.dt, 0.012)
-        return [k for k in (shortest, 0.03) if k < 0.7 * self.data.kernel]
 
     def _at_kernel(self, length: float) -> Dataset:
         """The same records with another kernel."""

@@ -52,6 +52,10 @@ class Joint:
         By parameter name; fitted values come from a fit written back.
     columns : mapping or None
         Column map of the record files.
+    orders : tuple of float
+        Orders at which a line has a name beside those of the motor turn, such as meshing orders: per motor turn, or per metre.
+    pitch : float or None
+        Travel of a linear axis per turn of its motor [m].
     """
 
     name: str = "joint"
@@ -66,6 +70,8 @@ class Joint:
     columns: Mapping[str, Any] | None = None
     virtual_work: bool = True
     source: str = ""
+    orders: tuple[float, ...] = ()
+    pitch: float | None = None
 
     def model(self) -> JointModel:
         """The joint model with its effects (values of a fit written back included).
@@ -149,12 +155,40 @@ def parse_joint(data: Mapping[str, Any], source: str = "joint") -> Joint:
     )  # fmt: skip
     load_remembered(data.get(TABLE, {}), source)
     model = joint.model()
-    known = {k: _known(k, v, model, source) for k, v in data.get("known", {}).items()}
+    table = dict(data.get("known", {}))
+    orders, pitch = _orders(table.pop("orders", []), source), _pitch(table.pop("pitch", None), kind, source)
+    known = {k: _known(k, v, model, source) for k, v in table.items()}
     for p in model.parameters:
         if p.name in joint.fitted and not p.low - 1e-9 <= joint.fitted[p.name] <= p.high + 1e-9:
             bounds = f"{p.low:g} to {p.high:g} {p.unit}"
             raise InputError(f"{source}: [fitted] {p.name} = {joint.fitted[p.name]:g} lies outside its physical bounds {bounds}; correct it or fit again")
-    return replace(joint, known=known)
+    return replace(joint, known=known, orders=orders, pitch=pitch)
+
+
+def _orders(entry: Any, source: str) -> tuple[float, ...]:
+    """Orders of lines that are known beforehand."""
+    if not isinstance(entry, list) or any(isinstance(h, bool) or not isinstance(h, int | float) or not 0 < h < math.inf for h in entry):
+        raise InputError(f"{source}: [known] orders must be a list of positive numbers, as orders = [12.0, 36.0]")
+    return tuple(float(h) for h in entry)
+
+
+def _pitch(entry: Any, kind: str, source: str) -> float | None:
+    """Travel per turn of the motor [m], from a number or a table with value and unit."""
+    if entry is None:
+        return None
+    if kind != "linear":
+        raise InputError(f'{source}: [known] pitch belongs to kind = "linear"; a rotary joint has its orders per motor turn')
+    table = entry if isinstance(entry, Mapping) else {"value": entry}
+    where = f"{source}: [known] pitch"
+    if "value" not in table or not set(table) <= {"value", "unit"}:
+        raise InputError(f'{where} must be a number of metres, or a table, as pitch = {{ value = 10.0, unit = "mm" }}')
+    given = base_unit(str(table.get("unit", "m")))
+    if not same_dimension(given, base_unit("m")):
+        raise InputError(f"{where} has unit {table['unit']!r}; it must be one like m")
+    found = _entry_number(table, "value", where) * given.factor
+    if found <= 0:
+        raise InputError(f"{where} = {found:g} m must be positive")
+    return found
 
 
 def _number(table: Mapping[str, Any], key: str, source: str, default: float | None) -> float | None:
@@ -241,8 +275,12 @@ def toml_text(
     if not joint.virtual_work:
         lines.append("virtual_work = false")
     lines += remembered((*joint.effects, *outside))
-    if joint.known:
+    if joint.known or joint.orders or joint.pitch is not None:
         lines += ["", "[known]"]
+        if joint.orders:
+            lines.append(f"orders = [{', '.join(repr(h) for h in joint.orders)}]")
+        if joint.pitch is not None:
+            lines.append(f"pitch = {joint.pitch!r}")
         for name, known in joint.known.items():
             parts = [f"{k} = {getattr(known, k)!r}" for k in ("value", "low", "high") if getattr(known, k) is not None]
             lines.append(f"{name} = {{ {', '.join(parts)} }}")

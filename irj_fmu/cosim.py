@@ -45,9 +45,6 @@ _LIMITS: Final[Mapping[str, float]] = {
     ),
 }  # fmt: skip
 """Largest error of each parameter of the reference joints, by the name in its declaration."""
-_TWINS: Final = ("gravity_torque", "link_cyclic_torque_sine")
-"""Parameters of which a joint that has both shows the difference only."""
-
 
 @final
 @dataclass(frozen=True)

@@ -182,12 +182,12 @@ def additions_html(improvement: Improvement, plots: ReportPlots) -> str:
 
 
 def lines_html(lines: Sequence[Line]) -> str:
-    """Lines: residual periodic in the motor angle."""
+    """Lines: residual periodic in the motor angle or the position."""
     if not lines:
-        return "<p>None: nothing that is left repeats with the motor angle.</p>"
+        return "<p>None: nothing that is left repeats with the motor angle or the position.</p>"
     rows = [
         [f"{number(x.order)} ± {number(x.tolerance, 2)} per {text(x.per)}", f"{text(x.balance)} balance", f"{number(x.amplitude, 3)} {pretty_unit(x.unit)}",
-         f"{number(x.prominence, 2)} ×", " or ".join(title_of(k) for k in x.effects) or "position-periodic, no name in the library"]
+         f"{number(x.prominence, 2)} ×", " or ".join(title_of(k) for k in x.effects) or "function of position, no name in the library"]
         for x in lines
     ]  # fmt: skip
     return table(["order", "seen in", "amplitude", "over its surroundings", "name"], rows, "Residual that repeats with the motor angle")

@@ -31,7 +31,7 @@ def _stored(s: LocalSignals, p: SimpleNamespace) -> Expression:
             "absolute",
             start=2.0,
             low=0.05,
-            high=400.0,
+            high=1e5,
             role="order",
         ),
     ),

@@ -56,7 +56,7 @@ def lines_of(joint: Joint, train: Sequence[Record], held: Sequence[Record]) -> t
     data = kernels(joint, train, held)
     solution = solve(prepared_model(joint, train[0]), data[-1])
     error = assess(solution.model, data[0], data[0].train, solution.values)
-    return find_lines(solution, data), {b: e.rms for b, e in error.balances.items()}
+    return find_lines(solution, data[-1], train, held), {b: e.rms for b, e in error.balances.items()}
 
 
 def case(seed: int, folder: Path) -> Case:

@@ -112,8 +112,8 @@ def _print_improvement(found: Improvement) -> None:
     for claim in found.minor:
         print(f"minor, small but certain: {', '.join(claim.effects)} ({claim.balance} balance, {claim.held_out_drop_percent:.1f} %)")
     for line in found.lines:
-        named = f", {' or '.join(line.effects)}" if line.effects else ", position-periodic"
-        print(f"line: order {line.order:.3f} +- {line.tolerance:.3f} per motor turn, {line.amplitude:.3g} {line.unit} ({line.balance}{named})")
+        named = f", {' or '.join(line.effects)}" if line.effects else ", function of position"
+        print(f"line: order {line.order:.3f} +- {line.tolerance:.3f} per {line.per}, {line.amplitude:.3g} {line.unit} ({line.balance}{named})")
     for place in found.unexplained:
         where = "no measured variable"
         if place.axis and place.low is not None and place.high is not None:
