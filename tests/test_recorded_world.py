@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from tests.recorded_world import campaign, hidden, joints, motions, planted, sensors, world
+from tests.recorded_world import campaign, causes, hidden, joints, motions, planted, sensors, world
 from tests.recorded_world._engine import ROWS_PER_SECOND, STEP, FloatArray, library, simulate
 from tests.recorded_world.scoring import score
 
@@ -456,3 +456,33 @@ def test_a_planted_name_is_judged_against_what_the_plain_records_give() -> None:
         (),
     )
     assert planted.judged(_result("lugre"), right, usual) == (False, False, ("lugre",))
+
+
+def test_only_troubles_that_change_the_records_are_tried_as_causes() -> None:
+    job = campaign.Job(20, "all", seconds=2.0, without=world.TROUBLES)
+    case = world.make_case(20, seconds=2.0)
+    for trouble, there in (
+        ("zero", True),
+        ("lost", case.sensors.lost > 0.0),
+        ("jitter", case.sensors.jitter > 0.0),
+        ("filter", case.sensors.filter > 0.0),
+        ("dirt", case.dirty),
+    ):
+        alone = replace(job, without=tuple(t for t in world.TROUBLES if t != trouble))
+        assert causes.acts(alone, job) == there
+
+
+def test_causes_are_counted_with_a_command_for_each() -> None:
+    rows: list[dict[str, object]] = [
+        {
+            "case": f"{i} all",
+            "hidden": "nothing",
+            "cause": cause,
+            "command": f"run {i}",
+            "said": "x",
+        }
+        for i, cause in enumerate(("zero", "noise", "zero"))
+    ]
+    text = causes.markdown(rows)
+    assert "| zero | 2 | `run 0` |" in text
+    assert text.index("| zero | 2") < text.index("| noise | 1")
