@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import os
 import time
 import tomllib
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,9 +17,6 @@ import pytest
 from tests.recorded_world import campaign, causes, hidden, joints, motions, planted, sensors, world
 from tests.recorded_world._engine import ROWS_PER_SECOND, STEP, FloatArray, library, simulate
 from tests.recorded_world.scoring import score
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 pytestmark = pytest.mark.skipif(library() is None, reason="no C compiler")
 BODY = {"JM": 4.4, "JL": 10.3, "TG": -105.0, "K": 2.15e4, "N": 160.0}
@@ -486,3 +485,14 @@ def test_causes_are_counted_with_a_command_for_each() -> None:
     text = causes.markdown(rows)
     assert "| zero | 2 | `run 0` |" in text
     assert text.index("| zero | 2") < text.index("| noise | 1")
+
+
+def test_generator_and_scoring_import_nothing_of_the_project() -> None:
+    own = {"casadi_models", "identification", "irj_fmu", "workbench"}
+    folder = Path(world.__file__).parent
+    for name in ("_engine", "joints", "motions", "hidden", "sensors", "world", "scoring"):
+        tree = ast.parse((folder / f"{name}.py").read_text(encoding="utf-8"))
+        nodes = list(ast.walk(tree))
+        taken = {a.name for n in nodes if isinstance(n, ast.Import) for a in n.names}
+        taken |= {str(n.module) for n in nodes if isinstance(n, ast.ImportFrom)}
+        assert not own & {t.partition(".")[0] for t in taken}
