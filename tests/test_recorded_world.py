@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import os
 import time
 import tomllib
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from tests.recorded_world import campaign, hidden, joints, motions, planted, sensors, world
+from tests.recorded_world import campaign, causes, hidden, joints, motions, planted, sensors, world
 from tests.recorded_world._engine import ROWS_PER_SECOND, STEP, FloatArray, library, simulate
 from tests.recorded_world.scoring import score
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 pytestmark = pytest.mark.skipif(library() is None, reason="no C compiler")
 BODY = {"JM": 4.4, "JL": 10.3, "TG": -105.0, "K": 2.15e4, "N": 160.0}
@@ -456,3 +455,44 @@ def test_a_planted_name_is_judged_against_what_the_plain_records_give() -> None:
         (),
     )
     assert planted.judged(_result("lugre"), right, usual) == (False, False, ("lugre",))
+
+
+def test_only_troubles_that_change_the_records_are_tried_as_causes() -> None:
+    job = campaign.Job(20, "all", seconds=2.0, without=world.TROUBLES)
+    case = world.make_case(20, seconds=2.0)
+    for trouble, there in (
+        ("zero", True),
+        ("lost", case.sensors.lost > 0.0),
+        ("jitter", case.sensors.jitter > 0.0),
+        ("filter", case.sensors.filter > 0.0),
+        ("dirt", case.dirty),
+    ):
+        alone = replace(job, without=tuple(t for t in world.TROUBLES if t != trouble))
+        assert causes.acts(alone, job) == there
+
+
+def test_causes_are_counted_with_a_command_for_each() -> None:
+    rows: list[dict[str, object]] = [
+        {
+            "case": f"{i} all",
+            "hidden": "nothing",
+            "cause": cause,
+            "command": f"run {i}",
+            "said": "x",
+        }
+        for i, cause in enumerate(("zero", "noise", "zero"))
+    ]
+    text = causes.markdown(rows)
+    assert "| zero | 2 | `run 0` |" in text
+    assert text.index("| zero | 2") < text.index("| noise | 1")
+
+
+def test_generator_and_scoring_import_nothing_of_the_project() -> None:
+    own = {"casadi_models", "identification", "irj_fmu", "workbench"}
+    folder = Path(world.__file__).parent
+    for name in ("_engine", "joints", "motions", "hidden", "sensors", "world", "scoring"):
+        tree = ast.parse((folder / f"{name}.py").read_text(encoding="utf-8"))
+        nodes = list(ast.walk(tree))
+        taken = {a.name for n in nodes if isinstance(n, ast.Import) for a in n.names}
+        taken |= {str(n.module) for n in nodes if isinstance(n, ast.ImportFrom)}
+        assert not own & {t.partition(".")[0] for t in taken}

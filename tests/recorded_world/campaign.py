@@ -232,14 +232,17 @@ def parser() -> argparse.ArgumentParser:
     )
     p.add_argument("--sensors", nargs="+", choices=list(sensors.SETS), default=list(sensors.SETS))
     p.add_argument("--seconds", type=float, default=SECONDS, help="length of each record")
-    p.add_argument(
+    which = p.add_mutually_exclusive_group()
+    which.add_argument(
         "--without",
         nargs="+",
         choices=(*TROUBLES, "everything"),
         default=[],
         help="troubles to switch off",
     )
-    p.add_argument("--only", nargs="+", choices=TROUBLES, help="switch off all troubles but these")
+    which.add_argument(
+        "--only", nargs="+", choices=TROUBLES, help="switch off all troubles but these"
+    )
     p.add_argument("--kind", choices=KINDS, help="instead of a drawn one")
     p.add_argument(
         "--names",

@@ -25,7 +25,7 @@ ENGINE = "no trouble needed"
 TOGETHER = "several together"
 
 
-def _acts(job: Job, clean: Job) -> bool:
+def acts(job: Job, clean: Job) -> bool:
     """Whether the troubles that are left in a job change what is recorded."""
     one, other = job.case(), clean.case()
     return any(
@@ -46,7 +46,7 @@ def causes(job: Job) -> list[tuple[str, Job, Answer]]:
     found = []
     for trouble in TROUBLES:
         alone = replace(job, without=tuple(t for t in TROUBLES if t != trouble))
-        if not _acts(alone, clean):
+        if not acts(alone, clean):
             continue
         answer = run_job(alone)
         if answer is not None and not answer.all_right:
