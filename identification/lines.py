@@ -451,26 +451,25 @@ def _names(peak: Peak, near: float, scan: _Scan) -> tuple[tuple[str, ...], float
     the peak of a plain sine by more than noise. Its own order has to lie at the named one.
     """
     chosen = scan.clearest(peak)
-    tried: dict[str, tuple[float, float]] = {}
+    tried: list[tuple[str, float, float]] = []
     orders = np.array([peak.order + peak.apart * x for x in AROUND])
     for key, label, model in line_models(scan.solution.model, scan.data.sensing):
         gains = _gains(label, model, orders, chosen, scan)
         k = int(np.argmax(gains))
-        if gains[k] > tried.get(key, (0.0, 0.0))[0]:
-            tried[key] = (float(gains[k]), refined(orders, gains, k))
-    best = max((g for g, _ in tried.values()), default=0.0)
+        tried.append((key, float(gains[k]), refined(orders, gains, k)))
+    best = max((gain for _, gain, _ in tried), default=0.0)
     if best < NAME_SHARE * _shown(peak, chosen):
         return (), peak.order
     # without a torque sensor an acceleration that is too smooth looks like a torque of the motor: the order tells, the balances do not
     least = NAME_GAIN * best if scan.data.sensing.has_torque else 0.0
-    kept = [k for k, (g, h) in tried.items() if g >= least and replace(peak, order=h).at(near)]
-    kept.sort(key=lambda k: -tried[k][0])
-    if not kept:
+    held = sorted((-gain, key, order) for key, gain, order in tried if gain >= least and replace(peak, order=order).at(near))
+    if not held:
         return (), peak.order
+    kept = list(dict.fromkeys(key for _, key, _ in held))
     if not scan.data.sensing.has_torque:
         # nothing tells the sides apart: what is declared as confused belongs to the set
         kept += [c for k in tuple(kept) for c in EFFECTS[k].confused_with if EFFECTS[c].periodic and c not in kept]
-    return tuple(kept), tried[kept[0]][1]
+    return tuple(kept), held[0][2]
 
 
 def _shown(peak: Peak, chosen: Sequence[tuple[_Tracked, float]]) -> float:

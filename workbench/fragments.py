@@ -203,7 +203,7 @@ def unexplained_sentence(u: Unexplained, linear: bool) -> str:
         if u.low is not None and u.high is not None:
             out += f", mostly at {interval(u.low, u.high)} {unit}"
     if u.order is not None:
-        out += f"; it repeats {number(u.order)} times per turn of the motor"
+        out += f"; it repeats {number(u.order)} times per {'metre' if linear else 'turn of the motor'}"
     if u.frequency_hz is not None:
         out += f"; its spectrum peaks at {number(u.frequency_hz, 3)} Hz"
     if u.axis is None and u.order is None and u.frequency_hz is None:
