@@ -54,7 +54,7 @@ class Guard:
         Rows since the probation began.
     """
 
-    def __init__(self, names: Sequence[str], balances: Sequence[str], period: float, inertias: Sequence[str] = ()) -> None:
+    def __init__(self, names: Sequence[str], balances: Sequence[str], period: float, inertias: Sequence[str]) -> None:
         self.inertias = [i for i, n in enumerate(names) if n in inertias]
         self._count, self._size = len(balances), len(names)
         self._rate = min(1.0, period / _MEMORY)

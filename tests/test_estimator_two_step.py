@@ -241,7 +241,7 @@ def guard_run(changes: dict[int, tuple[FloatArray, float]], stop: int) -> tuple[
     theta, offset = np.array([4.0, 20.0, 10.0, 9.0]), 0.0
     settings = Settings(sample_time=0.016, drift=3e-3, alarm_drift=1.0)
     est = RecursiveLeastSquares(theta, np.abs(theta), outputs=2, names=names, settings=settings)
-    guard = Guard(names, ("motor", "link"), 0.016)
+    guard = Guard(names, ("motor", "link"), 0.016, names[::2])
     est.update(np.zeros(2), np.zeros((2, 4)))
     guard.start(est)
     told, level, before = [], np.full(2, 0.05), theta

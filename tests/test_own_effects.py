@@ -152,7 +152,7 @@ def test_it_is_hidden_named_and_exported_like_any_other(own: Path, tmp_path: Pat
     for seed in (1, 2):
         records.append(str(tmp_path / f"{seed}.npz"))
         command = ["--effects", str(own), "simulate", "--joint", str(DEMO / "joint.toml"), "--hide", f"{KEY}@motor"]
-        assert main([*command, "--seconds", "12", "--rate", "400", "--seed", str(seed), "-o", records[-1]]) == 0
+        assert main([*command, "--seconds", "10", "--rate", "250", "--seed", str(seed), "-o", records[-1]]) == 0
     better = tmp_path / "better.toml"
     command = ["improve", records[0], "--held-out", records[1], "--joint", str(DEMO / "joint.toml"), "--max-steps", "1"]
     assert main([*command, "--effects", str(own), "--json", str(tmp_path / "out.json"), "-o", str(better)]) == 0
