@@ -133,9 +133,7 @@ def _either_way(model: JointModel, data: Dataset, values: Mapping[str, float], r
     zero = np.zeros(sum(w.rows for w in records))
     out = dict.fromkeys(data.sensing.balances, zero)
     for place, balances in (("motor", ("motor", "sum", "deflection", "axis")), ("link", ("link", "sum", "axis"))):
-        level = sum(
-            abs(values[n]) for t in model.terms if t.place == place and t.effect.key in ("coulomb", "stribeck") for n in t.names[:1]
-        )  # fmt: skip
+        level = sticking_torque(model, values, place)
         source = f"{place}_position"
         if not level or source not in data.noise:
             continue
@@ -151,6 +149,13 @@ def _either_way(model: JointModel, data: Dataset, values: Mapping[str, float], r
             if b in out:
                 out[b] = np.hypot(out[b], held)
     return out
+
+
+def sticking_torque(model: JointModel, values: Mapping[str, float], place: str) -> float:
+    """Torque that dry friction of a side may hold at a standstill, in either direction [N.m]."""
+    return float(sum(
+        abs(values[n]) for t in model.terms if t.place == place and t.effect.key in ("coulomb", "stribeck") for n in t.names[:1]
+    ))  # fmt: skip
 
 
 def _either_direction(velocity: FloatArray, noise: float, grid: Grid, source: str) -> npt.NDArray[np.bool_]:
