@@ -17,6 +17,7 @@ from identification.excitation import rest_note
 from identification.fit import Fit
 from identification.places import Place, gather, places_of
 from identification.record import Record
+from identification.rest import rest_check, rest_warnings
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -39,6 +40,8 @@ class Comparison:
         What linear models without physics explain; None where not asked for, or where the records are too short.
     at_rest : float
         Share of the rows in which the joint stands still: left out of errors and places.
+    at_rest_beyond : tuple of str
+        What these rows leave beyond sticking friction, a sentence for each balance in which they do.
     """
 
     name: str
@@ -48,6 +51,7 @@ class Comparison:
     whiteness: dict[str, float]
     linear: Ceiling | None = None
     at_rest: float = 0.0
+    at_rest_beyond: tuple[str, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
         """Errors and places as data."""
@@ -56,14 +60,14 @@ class Comparison:
             "worst_window_s": list(self.worst_window), "whiteness": self.whiteness,
             "places": [p.as_json() for p in self.places],
             "linear_ceiling": self.linear.as_json() if self.linear else None,
-            "at_rest_percent": 100 * self.at_rest,
+            "at_rest_percent": 100 * self.at_rest, "at_rest_beyond": list(self.at_rest_beyond),
         }  # fmt: skip
 
     def __str__(self) -> str:
         ratios = ", ".join(f"{b} {e.ratio:.3g} times its floor" for b, e in self.error.balances.items())
         top = f"; fails most against {self.places[0].axis.replace('_', ' ')} ({self.places[0].balance} balance)" if self.places else ""
         linear = f"\n{self.linear}" if self.linear else ""
-        still = f"\n{rest_note(self.at_rest)}" if rest_note(self.at_rest) else ""
+        still = "".join(f"\n{line}" for line in (rest_note(self.at_rest), *self.at_rest_beyond) if line)
         return f"{self.name}: fit {self.error.fit_percent:.3g} %, relative error {self.error.relative_error_percent:.3g} % ({ratios}){top}{still}{linear}"
 
     def _repr_html_(self) -> str:
@@ -107,6 +111,7 @@ def compare(fitted: Fit, records: Record | Sequence[Record], *, linear: bool = T
     return Comparison(
         ", ".join(r.name for r in given), error, places, worst,
         {b: _lagged(r[stacked.taking[b]]) for b, r in residual.items()}, above, data.at_rest(),
+        rest_warnings(rest_check(fitted.model, data, data.train, fitted.solution.values), "N.m" if data.joint.kind == "rotary" else "N"),
     )  # fmt: skip
 
 

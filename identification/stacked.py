@@ -133,7 +133,7 @@ def _either_way(model: JointModel, data: Dataset, values: Mapping[str, float], r
     zero = np.zeros(sum(w.rows for w in records))
     out = dict.fromkeys(data.sensing.balances, zero)
     for place, balances in (("motor", ("motor", "sum", "deflection", "axis")), ("link", ("link", "sum", "axis"))):
-        level = sum(abs(values[n]) for n in model.named("static", place))
+        level = sticking_torque(model, values, place)
         source = f"{place}_position"
         if not level or source not in data.noise:
             continue
@@ -149,6 +149,11 @@ def _either_way(model: JointModel, data: Dataset, values: Mapping[str, float], r
             if b in out:
                 out[b] = np.hypot(out[b], held)
     return out
+
+
+def sticking_torque(model: JointModel, values: Mapping[str, float], place: str) -> float:
+    """Torque that dry friction of a side may hold at a standstill, in either direction [N.m]."""
+    return float(sum(abs(values[n]) for n in model.named("static", place)))
 
 
 def _either_direction(velocity: FloatArray, noise: float, grid: Grid, source: str) -> npt.NDArray[np.bool_]:

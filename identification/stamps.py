@@ -34,8 +34,9 @@ CLEARLY: Final = 0.05
 """Logarithm of how much smoother a motion must be over the stamps: noise levels scatter by half a per cent."""
 STANDS_FOR: Final = 0.75
 """Distance to a sample, in periods, up to which it stands for a grid point: beside a lost sample the nearest is one away."""
-AROUND: Final = 25
-"""Samples on either side whose median tells a repeated stamp from a surplus row: a fifth of repeated stamps leaves it alone."""
+AROUND: Final = 60
+"""Samples on either side whose median tells a repeated stamp from a surplus row: with a fifth of the stamps repeated it errs once in
+some million rows."""
 ALONE: Final = 1.5
 """Steps, in medians, up to which no sample is missing."""
 REGULAR: Final = 0.2

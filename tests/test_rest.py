@@ -13,6 +13,7 @@ from identification import Record, compare, fit, load_joint, read
 from identification.dataset import weak_record
 from identification.excitation import excitation_warnings
 from identification.joint_file import Joint
+from identification.rest import rest_check, rest_warnings
 from identification.sensing import sense
 from identification.weak import REST_SHARE, prepare
 from tests.hidden_effect.generator import QUANTUM, generate_case
@@ -92,3 +93,19 @@ def test_a_mask_is_the_union_of_its_sides() -> None:
     assert not w.taking("sum").any()
     assert w.taking("transmission").all()
     assert not replace(w, masked=frozenset({"transmission"})).taking("transmission").any()
+
+
+def test_rest_rows_check_the_model_as_an_inequality(tmp_path: Path) -> None:
+    """Nothing hidden: sticking friction holds what is left at rest. A torque that a rest must carry and the model has not: it does not."""
+    if shutil.which("gcc") is None:
+        pytest.skip("the generator's C integrator needs gcc")
+    held = {}
+    for effect in (None, "added_spring"):
+        folder = generate_case(effect, 9100, folder=tmp_path / str(effect), rests=0.4)
+        fitted = fit(load_joint(folder / "joint.toml"), [read(folder / "train.csv"), read(folder / "train2.csv")])
+        held[effect] = rest_check(fitted.model, fitted.data, fitted.data.train, fitted.solution.values)
+    assert all(c.rows > 500 and c.holds for c in held[None].values())
+    assert "transmission" not in held[None]
+    assert not held["added_spring"]["motor"].holds
+    assert len(rest_warnings(held["added_spring"], "N.m")) == 1
+    assert rest_warnings(held[None], "N.m") == ()

@@ -10,6 +10,7 @@ import pytest
 
 from identification import Joint, Record, fit, load_joint, read
 from identification.check import check, gate, repair
+from identification.places import running_time
 from identification.stamps import evened, longest_hole, slots_of
 from tests.hidden_effect.generator import generate_case
 from tests.stamps_bench import DAMAGES, lost, queued
@@ -140,3 +141,19 @@ def test_resample_writes_an_even_record(tmp_path: Path, capsys: pytest.CaptureFi
     assert slots_of(again) is None
     np.testing.assert_allclose(again["motor_position"], whole["motor_position"], atol=1e-3)
     assert main(["resample", str(source), "-o", str(tmp_path / "even.txt")]) == 2
+
+
+def test_runs_are_laid_end_to_end_and_no_curve_joins_them(joint_and_records: tuple[Joint, list[Record]]) -> None:
+    """Two runs in one file, each from zero: no row, block or curve reaches from one into the other."""
+    joint, records = joint_and_records
+    parts = [r.take(slice(0, 5000)) for r in records]
+    both = Record.from_channels(np.concatenate([p.time for p in parts]), {c: np.concatenate([p[c] for p in parts]) for c in parts[0].channels}, name="both")
+    assert len(both.segments()) == 2
+    joined, apart = fit(joint, [both]), fit(joint, parts)
+    for name, value in apart.solution.values.items():
+        assert joined.solution.values[name] == pytest.approx(value, rel=0.01, abs=1e-6), "the noise level of a file is one"
+    w = joined.data.train[0]
+    assert sorted(w.block[w.stretch == 0].tolist())[-1] < min(b for b in w.block[w.stretch == 1].tolist() if b >= 0)
+    time = running_time([w])
+    assert (np.diff(time) > 0).all()
+    assert np.flatnonzero(w.begins).tolist() == [int(np.argmax(w.stretch == 1))]

@@ -264,7 +264,9 @@ class Analysis:
         residual = self._residuals()
         if balance not in residual:
             raise InputError(f"no {balance} balance in these records; they have {', '.join(residual)}")
-        measured = references(self.data, self.data.held_out)[balance]
+        # a curve breaks where a new stretch begins
+        breaks = np.concatenate([np.where(w.begins, np.nan, 0.0) for w in self.data.held_out])
+        measured = references(self.data, self.data.held_out)[balance] + breaks
         return self._gathered().axes["time"].values, measured, measured - residual[balance]
 
     def parameters(self) -> dict[str, Any]:

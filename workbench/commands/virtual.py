@@ -151,6 +151,7 @@ def _read_off(
 
 
 def write_table(path: Path, table: dict[str, FloatArray]) -> None:
+    """Write columns as a record file, .csv or .npz by the name."""
     if path.suffix == ".npz":
         _write_npz(path, table)
         return
