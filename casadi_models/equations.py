@@ -138,14 +138,18 @@ class _Builder:
     model: JointModel
     symbols: Symbols
 
-    def local(self, term: Term, view: _View) -> LocalSignals:
-        """What the law of a term sees."""
+    def torsion_rate(self, view: _View) -> Expression:
+        """Rate of what twists the gear's damping; made once for all laws of a view."""
+        # the approximation (2.58) lets the kinematic error wind up the stiffness only, not the damping
+        twist = view.torsion if self.model.virtual_work else bare_twist(self.model, view.signals)
+        return time_derivative(twist, self.symbols.signals)
+
+    def local(self, term: Term, view: _View, rate: Expression | None = None) -> LocalSignals:
+        """What the law of a term sees; `rate` from :meth:`torsion_rate` where it is at hand."""
         s = view.signals
         link = term.place in ("link", "link_position_sensor")
         gear = term.place == "transmission"
-        # the approximation (2.58) lets the kinematic error wind up the stiffness only, not the damping
-        twist = view.torsion if self.model.virtual_work else bare_twist(self.model, s)
-        rate = time_derivative(twist, self.symbols.signals)
+        rate = self.torsion_rate(view) if rate is None else rate
         velocity = s.link_velocity if link else s.motor_velocity
         smooth = self.symbols.parameters.get(f"{'link' if link else 'motor'}_smoothing_velocity")
         return LocalSignals(
@@ -163,9 +167,10 @@ class _Builder:
     def total(self, place: str, view: _View) -> Expression:
         """Sum of the laws of one place."""
         found = _zero()
-        for t in self.model.terms:
-            if t.place == place:
-                found = found + t.effect.law(self.local(t, view), t.bound(self.symbols.parameters))
+        terms = [t for t in self.model.terms if t.place == place]
+        rate = self.torsion_rate(view) if terms else None
+        for t in terms:
+            found = found + t.effect.law(self.local(t, view, rate), t.bound(self.symbols.parameters))
         return found
 
     def corrected(self, place: str, *channels: str) -> dict[str, Expression]:
@@ -210,9 +215,12 @@ def bare_twist(model: JointModel, s: Signals) -> Expression:
 
 def time_derivative(expression: Expression, signals: Signals) -> Expression:
     """Rate of an expression of the signals by the chain rule."""
+    names = list(_RATES)
+    slopes = ca.jacobian(expression, ca.vertcat(*(getattr(signals, n) for n in names)))
     total = _zero()
-    for name, rate in _RATES.items():
-        total = total + ca.jacobian(expression, getattr(signals, name)) * getattr(signals, rate)
+    # what does not appear adds nothing, not even a node of the graph
+    for i in sorted(set(slopes.sparsity().get_triplet()[1])):
+        total = total + slopes[0, i] * getattr(signals, _RATES[names[i]])
     return total
 
 

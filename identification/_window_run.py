@@ -1,4 +1,5 @@
-"""A function of one sample run along windows of samples: by CasADi's virtual machine, or by compiled C for long records."""
+"""A function of one sample run along windows of samples: by CasADi's virtual machine, or by
+compiled C for long records."""
 
 from __future__ import annotations
 
@@ -13,7 +14,8 @@ from identification._compiler import NoCompilerError, build
 FloatArray = npt.NDArray[np.float64]
 
 LONG: Final = 10_000
-"""Samples from which compiling pays: the compiler takes as long as the virtual machine with a few passes over so many."""
+"""Samples from which compiling pays: the compiler takes as long as the virtual machine with a few
+passes over so many."""
 
 _LOOP: Final = """
 #if defined(_WIN32)
@@ -22,7 +24,9 @@ _LOOP: Final = """
 #define EXPORT __attribute__((visibility("default")))
 #endif
 #include <string.h>
-EXPORT void irj_windows(long long windows, long long length, const double *start, const double *inputs, const double *p, double *out) {{
+EXPORT void irj_windows(
+    long long windows, long long length,
+    const double *start, const double *inputs, const double *p, double *out) {{
   const double *arg[{arg}];
   double *res[{res}];
   casadi_int iw[{iw}];
@@ -54,7 +58,8 @@ class WindowRun:
     length : int
         Samples of a window.
     samples : int
-        Samples of all windows that will be run: long records are worth a compiler, where there is one.
+        Samples of all windows that will be run: long records are worth a compiler, where there is
+        one.
     """
 
     def __init__(self, sample: Any, length: int, samples: int) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from typing import Any, Final, final
 
 import casadi as ca
@@ -121,11 +122,7 @@ class _Part:
         full: FloatArray = matrix @ np.array(self._linear(p)).T
         if self.needed:
             count = len(data.points["motor_position"])
-            points = np.zeros((len(_NAMES), count))
-            for i, name in enumerate(_NAMES):
-                if name in data.points:
-                    points[i] = data.points[name]
-            full[:, self.needed] += average(self._rest(count, points, memory, p).T)
+            full[:, self.needed] += average(self._rest(count, data.table(_NAMES), memory, p).T)
         return full
 
     def slopes(self, balances: Sequence[str], p: Sequence[float]) -> dict[str, dict[str, float]]:
@@ -156,19 +153,22 @@ class Balances:
         self.sensing = sensing
         self.names: tuple[str, ...] = model.parameter_names
         self.wrt: tuple[str, ...] = tuple(wrt) if wrt is not None else self.names
-        e = model.equations
-        signals: Any = e.signals.vector()
-        parameters = e.parameters
         expressions = residual_expressions(model, sensing)
         columns = [self.names.index(n) for n in self.wrt]
         self.balances = tuple(expressions)
         curved = curved_expressions(model, sensing)
         self._plain = _Part(model, expressions, columns, columns_only=columns_only)
         self._curved = _Part(model, curved, columns, columns_only=columns_only) if curved else None
-        own = [expressions[b] for b in self.balances]
-        sources = ca.vertcat(*(signals[_NAMES.index(n)] for n in _DIRECT))
-        self._slopes = ca.Function("slopes", [signals, e.memory, parameters], [ca.densify(ca.jacobian(ca.vertcat(*own), sources))])
         self._memory = Memory(model) if self._plain.remembers else None
+
+    @cached_property
+    def _slopes(self) -> Any:
+        """Slopes of the residuals along the signals whose noise enters nonlinear laws directly."""
+        e = self.model.equations
+        signals: Any = e.signals.vector()
+        own = ca.vertcat(*residual_expressions(self.model, self.sensing).values())
+        sources = ca.vertcat(*(signals[_NAMES.index(n)] for n in _DIRECT))
+        return ca.Function("slopes", [signals, e.memory, e.parameters], [ca.densify(ca.jacobian(own, sources))])
 
     def curved_coefficients(self, values: Mapping[str, float]) -> dict[str, dict[str, float]]:
         """How strongly the second derivative of each averaged signal enters each residual."""

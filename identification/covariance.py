@@ -14,14 +14,17 @@ IntArray = npt.NDArray[np.int64]
 FEWEST_BLOCKS: Final = 4
 """Blocks below which their scatter says nothing."""
 BLOCK: Final = 1.5
-"""Length of a block [s]: some periods of the slowest modes of a joint, after which errors of a model count as independent."""
+"""Length of a block [s]: some periods of the slowest modes of a joint, after which errors of a
+model count as independent."""
 RANK: Final = 1e-12
 """Share of the largest information, columns scaled alike, below which a direction is rounding."""
 LEAST: Final = 1e-3
-"""Share of the information on a direction that must be left without a block: less, and that block alone tells of it (friction
-at the one reversal of a record).  Its scatter can say nothing there, and the other parameters do not hang on it."""
+"""Share of the information on a direction that must be left without a block: less, and that block
+alone tells of it (friction at the one reversal of a record).  Its scatter can say nothing there,
+and the other parameters do not hang on it."""
 HALF: Final = 0.5
-"""Share of a parameter's variance in such a direction from which on the parameter is the one that a single block tells of."""
+"""Share of a parameter's variance in such a direction from which on the parameter is the one that
+a single block tells of."""
 MOST_TIED: Final = 0.999
 """Largest correlation of neighbouring samples that a short record can tell from 1."""
 NORMAL: Final = 1.959964
@@ -29,10 +32,12 @@ NORMAL: Final = 1.959964
 
 
 def block_errors(jacobian: FloatArray, residual: FloatArray, block: IntArray) -> FloatArray | None:
-    """Standard error of each parameter of a least-squares fit whose rows depend on each other within blocks.
+    """Standard error of each parameter of a least-squares fit whose rows depend on each other
+    within blocks.
 
-    The leave-one-block-out form of the sandwich (Bell and McCaffrey 2002, Survey Methodology 28:169), widened by the
-    ratio of Student's t over blocks - 1 degrees of freedom to the normal at 95 %: twice the error is a 95 % band.
+    The leave-one-block-out form of the sandwich (Bell and McCaffrey 2002, Survey Methodology
+    28:169), widened by the ratio of Student's t over blocks - 1 degrees of freedom to the normal
+    at 95 %: twice the error is a 95 % band.
 
     Parameters
     ----------
@@ -109,16 +114,19 @@ def errors_of_blocks(
     )
 
 
-def process_errors(jacobian: FloatArray, residual: FloatArray, series: Sequence[FloatArray]) -> FloatArray:
-    """Standard errors where a record is too short for blocks: the residual counts as a process of first order.
+def process_errors(
+    jacobian: FloatArray, residual: FloatArray, series: Sequence[FloatArray]
+) -> FloatArray:
+    """Standard errors where a record is too short for blocks: the residual counts as a process of
+    first order.
 
     Parameters
     ----------
     jacobian, residual : (n, p) and (n,) arrays
         Weighted.
     series : sequence of (samples, outputs) arrays
-        The residual in the order of time, each without a gap: their correlation from one sample to the next says how many
-        rows count as one (sum of the geometric series).
+        The residual in the order of time, each without a gap: their correlation from one sample to
+        the next says how many rows count as one (sum of the geometric series).
     """
     top = sum(float(np.sum(r[1:] * r[:-1])) for r in series)
     bottom = sum(float(np.sum(r**2)) for r in series)
@@ -126,8 +134,12 @@ def process_errors(jacobian: FloatArray, residual: FloatArray, series: Sequence[
     gram = jacobian.T @ jacobian
     size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
     inverse = np.linalg.pinv(gram / np.outer(size, size), rcond=RANK)
-    variance = float(residual @ residual) / max(len(residual) - len(gram), 1) * (1 + rho) / (1 - rho)
-    return np.asarray(np.sqrt(np.maximum(np.diag(inverse), 0.0) * variance) / size, dtype=np.float64)
+    variance = (
+        float(residual @ residual) / max(len(residual) - len(gram), 1) * (1 + rho) / (1 - rho)
+    )
+    return np.asarray(
+        np.sqrt(np.maximum(np.diag(inverse), 0.0) * variance) / size, dtype=np.float64
+    )
 
 
 def correlations(gram: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -141,7 +153,8 @@ def correlations(gram: FloatArray) -> tuple[FloatArray, FloatArray]:
     Returns
     -------
     spread : (p,) array
-        Standard deviation in units of the one that the column alone would have: 1 where it is orthogonal to all others.
+        Standard deviation in units of the one that the column alone would have: 1 where it is
+        orthogonal to all others.
     together : (p, p) array
         Correlations, zero on the diagonal.
     """
@@ -154,7 +167,8 @@ def correlations(gram: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def block_numbers(time: FloatArray, length: float) -> IntArray:
-    """Number of the block of each instant: a new one after `length`, and where the time jumps back (another record).
+    """Number of the block of each instant: a new one after `length`, and where the time jumps back
+    (another record).
 
     Parameters
     ----------

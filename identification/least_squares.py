@@ -1,8 +1,9 @@
 """The bounded least-squares solver: one for every fit of the package.
 
-Levenberg-Marquardt steps inside a box.  Each step solves a small triangle (QR of the Jacobian, columns scaled alike) with an
-active set on the box; parameters of the size of a scale move on a log scale; unknowns that belong to one block of rows alone
-(the start state of a window) are eliminated block by block (Schur complement, on triangles).
+Levenberg-Marquardt steps inside a box.  Each step solves a small triangle (QR of the Jacobian,
+columns scaled alike) with an active set on the box; parameters of the size of a scale move on a
+log scale; unknowns that belong to one block of rows alone (the start state of a window) are
+eliminated block by block (Schur complement, on triangles).
 
 References: Nocedal and Wright, Numerical Optimization (2006), chapters 10 and 16; Marquardt (1963).
 """
@@ -21,36 +22,47 @@ FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 
 FIRST_DAMPING: Final = 1e-9
-"""Damping of the first step, relative to columns of unit length: next to a plain Gauss-Newton step."""
+"""Damping of the first step, relative to columns of unit length: next to a plain Gauss-Newton
+step."""
 LEAST_DAMPING: Final = 1e-12
 """Damping is not lowered further: rounding of the triangle is of this size."""
 RAISED_DAMPING: Final = 1e-6
-"""Damping after a refused step, at least: smaller ones do not change the step of well-conditioned columns. A larger floor
-makes long narrow valleys slow (NIST's Lanczos3 and MGH09 take twice the evaluations with 1e-4)."""
+"""Damping after a refused step, at least: smaller ones do not change the step of well-conditioned
+columns. A larger floor makes long narrow valleys slow (NIST's Lanczos3 and MGH09 take twice the
+evaluations with 1e-4)."""
 RAISE, LOWER = 30.0, 10.0
-"""Factors of the damping after a refused and after an accepted step (Marquardt's rule with uneven factors, so that the
-damping does not swing between two values)."""
+"""Factors of the damping after a refused and after an accepted step (Marquardt's rule with uneven
+factors, so that the damping does not swing between two values)."""
 MOST_REFUSALS: Final = 12
-"""Refused steps in a row: with `RAISE` the damping has passed 1e12 by then, a step of nothing but rounding."""
+"""Refused steps in a row: with `RAISE` the damping has passed 1e10 by then, a step of nothing but
+rounding."""
 LONGEST_LOG_STEP: Final = 1.0
-"""Longest step of a parameter on a log scale: a factor e, within which a curve in its logarithm is still near its tangent."""
+"""Longest step of a parameter on a log scale: a factor e, within which a curve in its logarithm is
+still near its tangent."""
 LEAST_SHARE: Final = 0.1
-"""Share of the promised fall that a step must bring: less, and the rows are too curved for it. With steps of any fall a
-search runs out into plains where nothing moves (a rate so fast that its exponential is over at the first sample)."""
+"""Share of the promised fall that a step must bring: less, and the rows are too curved for it.
+With steps of any fall a search runs out into plains where nothing moves (a rate so fast that its
+exponential is over at the first sample)."""
 KEPT: Final = 0.9
-"""Share of the promised fall that makes the next step bolder: between this and `LEAST_SHARE` the damping is right as it is."""
+"""Share of the promised fall that makes the next step bolder: between this and `LEAST_SHARE` the
+damping is right as it is."""
 DEAD: Final = 1e-12
-"""A column smaller than this share of the largest moves nothing that rounding would not move too."""
+"""A column smaller than this share of the largest moves nothing that rounding would not move
+too."""
 RANK: Final = 1e-13
-"""Singular values below this share of the largest are rounding; the step of least length is taken there."""
+"""Singular values below this share of the largest are rounding; the step of least length is taken
+there."""
 ROUNDING: Final = 1e-12
 """Relative rise of a sum of squares that is rounding of its many terms."""
 NOTHING_LEFT: Final = 1e-28
-"""Share of the sum of squares at the start below which what is left is rounding: residuals 1e-14 of their start."""
+"""Share of the sum of squares at the start below which what is left is rounding: residuals 1e-14
+of their start."""
 WORTH: Final = 1e-3
-"""Relative fall of the sum of squares by the blocks' own unknowns alone that is worth another step of the parameters."""
+"""Relative fall of the sum of squares by the blocks' own unknowns alone that is worth another step
+of the parameters."""
 RIDGE: Final = 1e-14
-"""Added to the diagonal of products of columns scaled to unit length before their square root: the rounding of a product."""
+"""Added to the diagonal of products of columns scaled to unit length before their square root: the
+rounding of a product."""
 
 
 class Outcome(Enum):
@@ -71,7 +83,8 @@ class Problem(Protocol):
     """Rows that ought to be zero."""
 
     def residual(self, x: FloatArray) -> FloatArray:
-        """Weighted residual at `x` (parameters,), shape (rows,); not finite where it cannot be had."""
+        """Weighted residual at `x` (parameters,), shape (rows,); not finite where it cannot be
+        had."""
 
     def jacobian(self, x: FloatArray) -> FloatArray:
         """Its derivative with respect to `x`, shape (rows, parameters)."""
@@ -82,10 +95,12 @@ class LocalProblem(Protocol):
     """Rows in blocks, each with a few unknowns of its own beside the common parameters."""
 
     def costs(self, x: FloatArray, local: FloatArray) -> FloatArray:
-        """Sum of squares of each block at `x` (parameters,) and `local` (blocks, unknowns), shape (blocks,); not finite where it cannot be had."""
+        """Sum of squares of each block at `x` (parameters,) and `local` (blocks, unknowns), shape
+        (blocks,); not finite where it cannot be had."""
 
     def triangles(self, x: FloatArray, local: FloatArray) -> FloatArray:
-        """Triangle of each block's columns: own unknowns, parameters, residual; shape (blocks, k, k)."""
+        """Triangle of each block's columns: own unknowns, parameters, residual; shape (blocks, k,
+        k)."""
 
 
 @final
@@ -191,8 +206,9 @@ def least_squares(
     iterations : int
         Steps at most.
     tolerance : float
-        The search ends with the step that promises, or brings, a smaller relative fall of the sum of squares.  What a step
-        promises is free of the rounding of the sum, so that the number of steps does not depend on the processor.
+        The search ends with the step that promises, or brings, a smaller relative fall of the sum
+        of squares.  What a step promises is free of the rounding of the sum, so that the number of
+        steps does not depend on the processor.
 
     Returns
     -------
@@ -237,7 +253,8 @@ def least_squares(
                 break
             damping = max(damping * RAISE, RAISED_DAMPING)
         else:
-            # blocks whose own unknowns are off hold up the common step: these first, each block for itself
+            # blocks whose own unknowns are off hold up the common step: these first, each block
+            # for itself
             settled = at.each_better(_Point.of(rows, at.x, at.local + linear.own_step(0.0 * step)))
             evaluations += 1
             outcome = Outcome.STUCK if at.cost - settled.cost <= WORTH * at.cost else outcome
@@ -249,7 +266,8 @@ def least_squares(
 @final
 @dataclass(frozen=True)
 class _Point:
-    """Where the search stands: parameters, the blocks' own unknowns, each block's sum of squares."""
+    """Where the search stands: parameters, the blocks' own unknowns, each block's sum of
+    squares."""
 
     x: FloatArray
     local: FloatArray
@@ -267,7 +285,8 @@ class _Point:
         return total if math.isfinite(total) else math.inf
 
     def each_better(self, other: _Point) -> _Point:
-        """Each block's own unknowns from the point that leaves less of it; the parameters must be the same."""
+        """Each block's own unknowns from the point that leaves less of it; the parameters must be
+        the same."""
         better = other.costs < self.costs
         local = np.where(better[:, None], other.local, self.local)
         return _Point(self.x, local, np.where(better, other.costs, self.costs))
@@ -298,7 +317,8 @@ class _Box:
 
 
 def _linear(rows: LocalProblem, at: _Point, logs: BoolArray) -> Linear:
-    """The rows to first order around a point; slopes of logarithmic parameters per unit of the logarithm."""
+    """The rows to first order around a point; slopes of logarithmic parameters per unit of the
+    logarithm."""
     linear = eliminated(rows.triangles(at.x, at.local), at.local.shape[1])
     factor = np.where(logs, at.x, 1.0)
     back = linear.back * np.append(factor, 1.0)
@@ -313,7 +333,8 @@ def triangle_of(rows: FloatArray) -> FloatArray:
 
 
 def triangles_of_products(products: FloatArray) -> FloatArray:
-    """The same from products of the columns, (blocks, k, k): half the digits, for rows that were never kept."""
+    """The same from products of the columns, (blocks, k, k): half the digits, for rows that were
+    never kept."""
     size = np.sqrt(np.einsum("bii->bi", products))
     size = np.where(size > 0, size, 1.0)
     k = products.shape[1]
@@ -344,7 +365,8 @@ def eliminated(triangles: FloatArray, unknowns: int) -> Linear:
 
 
 def common_rows(triangles: FloatArray, unknowns: int) -> FloatArray:
-    """Triangle of each block for the common parameters and the residual alone, (blocks, p + 1, p + 1)."""
+    """Triangle of each block for the common parameters and the residual alone, (blocks, p + 1, p +
+    1)."""
     return triangles[:, unknowns:, unknowns:]
 
 
@@ -356,8 +378,9 @@ def bounded_step(
 ) -> FloatArray:
     """Step that minimises ``|triangle @ step + target|^2 + damping |scaled step|^2`` inside a box.
 
-    Parameters that would leave the box stay on its wall and the others are solved again; then those that the slope drives
-    back inside are let go, until none is left (Portugal, Judice and Vicente 1994: block pivoting).
+    Parameters that would leave the box stay on its wall and the others are solved again; then
+    those that the slope drives back inside are let go, until none is left (Portugal, Judice and
+    Vicente 1994: block pivoting).
 
     Parameters
     ----------
@@ -406,5 +429,6 @@ def _flat(target: FloatArray) -> float:
 
 
 def _eased(damping: float, gained: float, promised: float) -> float:
-    """Damping after an accepted step: lower where the step kept its promise, as it is where it fell short."""
+    """Damping after an accepted step: lower where the step kept its promise, as it is where it
+    fell short."""
     return max(damping / LOWER, LEAST_DAMPING) if gained >= KEPT * promised else damping

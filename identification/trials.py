@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final, final
 
 import numpy as np
@@ -81,6 +82,72 @@ class Base:
     def balances(self) -> tuple[str, ...]:
         """Balances in the order of their numbers."""
         return self.data.sensing.balances
+
+    @cached_property
+    def blocks(self) -> int:
+        """Number of blocks."""
+        return int(self.block.max()) + 1
+
+    @cached_property
+    def order(self) -> IntArray:
+        """Rows that belong to a block, block after block and balance after balance."""
+        used = np.flatnonzero(self.block >= 0)
+        return np.asarray(used[np.lexsort((self.balance[used], self.block[used]))], dtype=np.int64)
+
+    @cached_property
+    def firsts(self) -> IntArray:
+        """Where each group of one block and balance begins in `order`."""
+        group = self.block[self.order] * len(self.balances) + self.balance[self.order]
+        return np.concatenate([[0], np.flatnonzero(np.diff(group)) + 1]).astype(np.int64)
+
+    @cached_property
+    def numbers(self) -> IntArray:
+        """Rows of each block and balance."""
+        count = len(self.balances)
+        where = self.block[self.order] * count + self.balance[self.order]
+        return np.bincount(where, minlength=self.blocks * count).reshape(self.blocks, count)
+
+    def grouped(self, left: FloatArray, right: FloatArray) -> FloatArray:
+        """Products of columns of `order` within each block and balance, (blocks, balances, left, right)."""
+        out = np.zeros((self.blocks, len(self.balances), left.shape[1], right.shape[1]))
+        ends = np.append(self.firsts[1:], len(self.order))
+        at = self.order[self.firsts]
+        for first, end, b, k in zip(self.firsts.tolist(), ends.tolist(), self.block[at].tolist(), self.balance[at].tolist(), strict=True):
+            np.matmul(left[first:end].T, right[first:end], out=out[b, k])
+        return out
+
+    @cached_property
+    def plain(self) -> FloatArray:
+        """Columns of the base and its residual, in `order`."""
+        return np.column_stack([self.jacobian, self.inward, self.residual])[self.order]
+
+    @cached_property
+    def products(self) -> FloatArray:
+        """Products of these within each block and balance."""
+        return self.grouped(self.plain, self.plain)
+
+    @cached_property
+    def folds(self) -> int:
+        """Parts of the cross-validation."""
+        return FOLDS if self.blocks >= FEW_BLOCKS else max(1, min(self.blocks, 10))
+
+    @cached_property
+    def crossed(self) -> FloatArray:
+        """Sum of squares that the base leaves of each block and balance, fitted without that fold; (blocks, balances)."""
+        p, own = self.parts
+        grams = self.products
+        total = grams.sum(axis=(0, 1))
+        out = np.zeros(grams.shape[:2])
+        for test in self.held_out_folds():
+            train = total - grams[test].sum(axis=(0, 1)) if self.folds > 1 else total
+            found = signed_fit(train[:own, :own], -train[:own, -1], np.zeros(own - p), p, total[:own, :own])
+            out[test] = _quadratic(grams[test], np.append(found, 1.0))
+        return out
+
+    def held_out_folds(self) -> list[npt.NDArray[np.bool_]]:
+        """Which blocks each fold holds out."""
+        fold = np.arange(self.blocks) % self.folds
+        return [fold == k for k in range(self.folds)]
 
 
 def make_base(solution: Solution, data: Dataset) -> Base:
@@ -301,29 +368,16 @@ def _collinear_reason(candidate: Candidate) -> str:
 
 def _score(candidate: Candidate, base: Base, balances: Balances, shapes: Mapping[str, float], raw: FloatArray, lows: FloatArray, inside: float) -> Trial | None:
     p, own = base.parts
-    count = len(base.balances)
     size = np.linalg.norm(raw * base.weight[:, None], axis=0)
     size = np.where(size > 0, size, 1.0)
-    full = np.column_stack([base.jacobian, base.inward, raw * base.weight[:, None] / size, base.residual])
-    used = np.flatnonzero(base.block >= 0)
-    blocks = int(base.block.max()) + 1
-    grams = np.zeros((blocks, count, full.shape[1], full.shape[1]))
-    order = used[np.lexsort((base.balance[used], base.block[used]))]
-    cuts = np.flatnonzero(np.diff(base.block[order] * count + base.balance[order])) + 1
-    for rows in np.split(order, cuts):
-        x = full[rows]
-        grams[base.block[rows[0]], base.balance[rows[0]]] += x.T @ x
-    numbers = np.bincount(base.block[used] * count + base.balance[used], minlength=blocks * count).reshape(blocks, count)
+    added = raw * base.weight[:, None] / size
+    grams = _bordered(base, added[base.order])
+    numbers = base.numbers
     total = grams.sum(axis=(0, 1))
-    sse0, sse1 = np.zeros((blocks, count)), np.zeros((blocks, count))
-    folds = FOLDS if blocks >= FEW_BLOCKS else max(1, min(blocks, 10))
-    fold = np.arange(blocks) % folds
-    for k in range(folds):
-        test = fold == k
-        train = total - grams[test].sum(axis=(0, 1)) if folds > 1 else total
-        plain = signed_fit(train[:own, :own], -train[:own, -1], lows[: own - p], p, total[:own, :own])
+    sse0, sse1 = base.crossed, np.zeros(base.crossed.shape)
+    for test in base.held_out_folds():
+        train = total - grams[test].sum(axis=(0, 1)) if base.folds > 1 else total
         more = signed_fit(train[:-1, :-1], -train[:-1, -1], lows, p, total[:-1, :-1])
-        sse0[test] = _quadratic(grams[test], np.concatenate([plain, np.zeros(raw.shape[1]), [1.0]]))
         sse1[test] = _quadratic(grams[test], np.concatenate([more, [1.0]]))
     delta = signed_fit(total[:-1, :-1], -total[:-1, -1], lows, p)
     amplitude = delta[own:] / size
@@ -340,10 +394,24 @@ def _score(candidate: Candidate, base: Base, balances: Balances, shapes: Mapping
     drop = 100 * (1 - math.sqrt(per_balance1[where] / max(per_balance0[where], 1e-300)))
     return Trial(
         candidate, {**shapes, **dict(zip(candidate.amplitudes, map(float, amplitude), strict=True))}, base.balances[where],
-        float(gains.sum()), drop, held, _wald(full, base, delta), block_score, np.sqrt(per_balance1 / rows_in), inside,
+        float(gains.sum()), drop, held, _wald(added, base, delta), block_score, np.sqrt(per_balance1 / rows_in), inside,
         float(np.sqrt(np.mean((raw[base.balance == where] @ amplitude) ** 2))),
         float(np.sum(KERNEL_SHARE * rows_in / 2 * np.log(np.maximum(per_balance0, 1e-300) / np.maximum(per_balance1, 1e-300)))),
     )  # fmt: skip
+
+
+def _bordered(base: Base, added: FloatArray) -> FloatArray:
+    """Products within each block and balance with a candidate's columns between those of the base and the residual."""
+    own, more = base.parts[1], added.shape[1]
+    plain = base.products
+    across = base.grouped(added, np.column_stack([base.plain, added]))
+    out = np.empty((*plain.shape[:2], own + more + 1, own + more + 1))
+    kept = [*range(own), own + more]
+    out[:, :, np.array(kept)[:, None], kept] = plain
+    out[:, :, own:-1, kept] = across[:, :, :, : own + 1]
+    out[:, :, kept, own:-1] = across[:, :, :, : own + 1].transpose(0, 1, 3, 2)
+    out[:, :, own:-1, own:-1] = across[:, :, :, own + 1 :]
+    return out
 
 
 def _quadratic(grams: FloatArray, vector: FloatArray) -> FloatArray:
@@ -362,7 +430,7 @@ def _held_out_drop(candidate: Candidate, base: Base, balances: Balances, shapes:
     return 100 * (1 - math.sqrt(float(after @ after) / max(float(before @ before), 1e-300)))
 
 
-def _wald(full: FloatArray, base: Base, delta: FloatArray) -> float:
+def _wald(added: FloatArray, base: Base, delta: FloatArray) -> float:
     """p-value of the amplitudes, scores clustered by block."""
     from scipy.special import fdtrc
 
@@ -371,17 +439,17 @@ def _wald(full: FloatArray, base: Base, delta: FloatArray) -> float:
     moving = base.inward[:, delta[p:own] > 0]
     if moving.shape[1]:
         q = np.column_stack([q, np.linalg.qr(moving - q @ (q.T @ moving))[0]])
-    c = full[:, own:-1]
-    c = c - q @ (q.T @ c)
-    residual = full[:, -1] + full[:, :-1] @ delta
-    blocks = np.unique(base.block[base.block >= 0])
     active = np.flatnonzero(delta[own:])
-    if not len(active) or len(blocks) <= len(active) + 1:
+    blocks = int(np.count_nonzero(base.numbers.sum(axis=1)))
+    if not len(active) or blocks <= len(active) + 1:
         return 1.0
+    c = added - q @ (q.T @ added)
     c = c[:, active]
-    scores = np.array([c[base.block == b].T @ residual[base.block == b] for b in blocks])
+    residual = base.residual + base.jacobian @ delta[:p] + base.inward @ delta[p:own] + added @ delta[own:]
+    begins = base.firsts[np.flatnonzero(np.diff(base.block[base.order[base.firsts]], prepend=-1))]
+    scores = np.add.reduceat((c * residual[:, None])[base.order], begins, axis=0)
     inverse = np.linalg.pinv(c.T @ c, rcond=1e-10)
-    covariance = inverse @ (scores.T @ scores) @ inverse * len(blocks) / (len(blocks) - 1)
+    covariance = inverse @ (scores.T @ scores) @ inverse * blocks / (blocks - 1)
     d = delta[own:][active]
     statistic = float(d @ np.linalg.pinv(covariance, rcond=1e-12) @ d) / len(active)
-    return float(fdtrc(len(active), len(blocks) - len(active), statistic))
+    return float(fdtrc(len(active), blocks - len(active), statistic))

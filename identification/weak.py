@@ -252,6 +252,20 @@ class WeakRecord:
         """Sparse matrix (rows, points) of the second derivative of the kernel average."""
         return self._sparse(2)
 
+    def table(self, names: tuple[str, ...]) -> FloatArray:
+        """Signals at the points as rows in the order of `names`, zeros where one is not there; made once, not to be written to."""
+        if names not in self._tables:
+            out = np.zeros((len(names), int(self.starts[-1])))
+            for i, name in enumerate(names):
+                if name in self.points:
+                    out[i] = self.points[name]
+            self._tables[names] = out
+        return self._tables[names]
+
+    @cached_property
+    def _tables(self) -> dict[tuple[str, ...], FloatArray]:
+        return {}
+
     def _sparse(self, order: int) -> Any:
         from scipy.sparse import csr_array
 

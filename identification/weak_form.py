@@ -1,4 +1,5 @@
-"""The weak form as a least-squares problem: rows of the balances against the parameters that move."""
+"""The weak form as a least-squares problem: rows of the balances against the parameters that
+move."""
 
 from __future__ import annotations
 
@@ -19,9 +20,11 @@ from identification.stacked import Stacked, stack
 FloatArray = npt.NDArray[np.float64]
 
 NUMERIC_STEP: Final = 1e-2
-"""Relative step of the shapes that act through internal states: their law has kinks, which smaller steps would resolve."""
+"""Relative step of the shapes that act through internal states: their law has kinks, which smaller
+steps would resolve."""
 ENOUGH: Final = 1e-6
-"""Relative fall of the sum of squares that ends a fit: a thousandth of a standard error over a few hundred rows."""
+"""Relative fall of the sum of squares that ends a fit: a thousandth of a standard error over a few
+hundred rows."""
 
 
 def memory_shapes_of(model: JointModel, free: Sequence[str]) -> tuple[str, ...]:
@@ -29,14 +32,19 @@ def memory_shapes_of(model: JointModel, free: Sequence[str]) -> tuple[str, ...]:
     out = []
     for t in model.terms:
         if t.effect.memory is not None:
-            out += [n for n, p in zip(t.names, t.effect.parameters, strict=True) if p.is_shape and n in free]
+            out += [
+                n
+                for n, p in zip(t.names, t.effect.parameters, strict=True)
+                if p.is_shape and n in free
+            ]
     return tuple(out)
 
 
 @final
 @dataclass(frozen=True)
 class WeakForm:
-    """Rows of the balances on the training records, weighted; a :class:`identification.least_squares.Problem`.
+    """Rows of the balances on the training records, weighted; a
+    :class:`identification.least_squares.Problem`.
 
     Attributes
     ----------
@@ -65,7 +73,13 @@ class WeakForm:
     def logarithmic(self) -> npt.NDArray[np.bool_]:
         """Which of the free parameters are scales: positive, of unknown size."""
         known = {p.name: p for p in self.balances.model.parameters}
-        return np.array([known[n].is_shape and known[n].scale != "absolute" and self.values[n] > 0 for n in self.free], dtype=bool)
+        return np.array(
+            [
+                known[n].is_shape and known[n].scale != "absolute" and self.values[n] > 0
+                for n in self.free
+            ],
+            dtype=bool,
+        )
 
     def at(self, x: FloatArray) -> dict[str, float]:
         """Values of every parameter."""
@@ -92,9 +106,13 @@ class WeakForm:
     def jacobian(self, x: FloatArray) -> FloatArray:
         """Their derivative, (rows, free)."""
         found = self.stacked(x).jacobian
-        return np.concatenate([found[b] * np.atleast_1d(self.weights[b])[:, None] for b in self.balances.balances])
+        return np.concatenate(
+            [found[b] * np.atleast_1d(self.weights[b])[:, None] for b in self.balances.balances]
+        )
 
-    def fitted(self, limits: Mapping[str, tuple[float, float]], iterations: int) -> tuple[dict[str, float], int]:
+    def fitted(
+        self, limits: Mapping[str, tuple[float, float]], iterations: int
+    ) -> tuple[dict[str, float], int]:
         """Values at the minimum inside the limits, and the steps it took.
 
         Parameters
@@ -105,5 +123,12 @@ class WeakForm:
         """
         start = [self.values[n] for n in self.free]
         low, high = [limits[n][0] for n in self.free], [limits[n][1] for n in self.free]
-        found = least_squares(self, start, (low, high), logarithmic=self.logarithmic, iterations=iterations, tolerance=ENOUGH)
+        found = least_squares(
+            self,
+            start,
+            (low, high),
+            logarithmic=self.logarithmic,
+            iterations=iterations,
+            tolerance=ENOUGH,
+        )
         return self.at(found.x), found.iterations

@@ -155,6 +155,18 @@ def test_lint(tool: tuple[str, ...]) -> None:
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
 
 
+def test_there_is_one_least_squares_solver_and_one_covariance() -> None:
+    """No other bounded solver and no own covariance beside `least_squares` and `covariance` (searches without slopes may be scipy's)."""
+    wrong = []
+    for path, tree in trees().items():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and node.module == "scipy.optimize":
+                wrong += [f"{path.relative_to(ROOT)}: {a.name}" for a in node.names if a.name in ("least_squares", "lsq_linear", "leastsq", "curve_fit")]
+        if path.name != "covariance.py" and "stdtrit" in path.read_text(encoding="utf-8"):
+            wrong.append(f"{path.relative_to(ROOT)}: stdtrit")
+    assert wrong == []
+
+
 # --- documentation ---------------------------------------------------------------------------------------------------
 
 

@@ -1,4 +1,5 @@
-"""The one solver, crossed with problems of known minimum and with NIST's certified nonlinear regressions."""
+"""The one solver, crossed with problems of known minimum and with NIST's certified nonlinear
+regressions."""
 
 from __future__ import annotations
 
@@ -21,7 +22,8 @@ from identification.least_squares import (
 )
 
 NIST = Path(__file__).parent / "data" / "nist"
-"""Statistical Reference Datasets of the National Institute of Standards and Technology: work of the United States, public domain."""
+"""Statistical Reference Datasets of the National Institute of Standards and Technology: work of
+the United States, public domain."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +96,8 @@ FREE = (-INF, INF)
         (helical, [-1, 0, 0], FREE, [1, 0, 0], 0),
         (freudenstein, [0.5, -2], FREE, [11.41277900, -0.89680525], 48.98425368),
         (freudenstein, [4.0, 4.5], FREE, [5, 4], 0),
-        # the minimum on a wall: x1 = 1.5 with the valley x2 = x1^2; x2 = 0.25 with the best x1 beside it
+        # the minimum on a wall: x1 = 1.5 with the valley x2 = x1^2; x2 = 0.25 with the best x1
+        # beside it
         (rosenbrock, [2, 2], ([1.5, -INF], INF), [1.5, 2.25], 0.25),
         (rosenbrock, [-1.2, -1], ([-INF, -INF], [INF, 0.25]), None, None),
         (box, [0.5, 5, 20], ([0, 0, 0], [0.8, 20, 20]), None, None),
@@ -107,7 +110,8 @@ def test_a_known_minimum_is_found(rows, start, bounds, minimum, cost) -> None:
     assert found.outcome in (Outcome.SETTLED, Outcome.EXACT)
     if minimum is not None:
         assert found.cost == pytest.approx(cost, rel=1e-8, abs=1e-20)
-        # Powell's Jacobian has rank 2 there, Freudenstein and Roth's residual is large: slow to the last digit
+        # Powell's Jacobian has rank 2 there, Freudenstein and Roth's residual is large: slow to
+        # the last digit
         assert found.x == pytest.approx(
             minimum, abs=2e-6 if cost == 0 and rows is not powell_singular else 1e-4
         )
@@ -164,7 +168,8 @@ def test_a_bounded_step_is_the_minimum_in_the_box() -> None:
             np.testing.assert_allclose(step * size, known, atol=1e-8)
 
 
-# --- unknowns of blocks ------------------------------------------------------------------------------------------------
+# --- unknowns of blocks
+# ------------------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -228,7 +233,8 @@ def test_eliminating_the_unknowns_of_blocks_changes_nothing() -> None:
     assert abs(rough.triangle) == pytest.approx(abs(exact.triangle), rel=1e-5)
 
 
-# --- NIST --------------------------------------------------------------------------------------------------------------
+# --- NIST ----------------------------------------------------------------------------------------
+# ----------------------
 
 E = ca.exp
 
@@ -267,7 +273,8 @@ MODELS: dict[str, Callable[[ca.SX, np.ndarray], ca.SX]] = {
 
 @dataclass(frozen=True)
 class Certified:
-    """A file of NIST's: two starts, certified values with their standard deviations, sum of squares, data."""
+    """A file of NIST's: two starts, certified values with their standard deviations, sum of
+    squares, data."""
 
     starts: np.ndarray
     values: np.ndarray
@@ -304,7 +311,8 @@ PLAINS = {
 }
 """Sets whose far start leads downhill to another stationary point, and to which."""
 POSITIVE = {"MGH10": True}
-"""Sets searched on a log scale: from the far start the plain one runs along a valley of 1e9 for thousands of steps."""
+"""Sets searched on a log scale: from the far start the plain one runs along a valley of 1e9 for
+thousands of steps."""
 
 
 @pytest.mark.parametrize(
