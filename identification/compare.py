@@ -14,6 +14,7 @@ from identification.balances import Balances
 from identification.ceiling import Ceiling, ceiling
 from identification.engine import load_dataset, stack
 from identification.fit import Fit
+from identification.gate import gated
 from identification.places import Place, gather, places_of
 from identification.record import Record
 
@@ -83,7 +84,7 @@ def compare(fitted: Fit, records: Record | Sequence[Record], *, linear: bool = T
     InputError
         Records with other channels than those of the fit.
     """
-    given = [records] if isinstance(records, Record) else list(records)
+    given = gated([records] if isinstance(records, Record) else list(records), fitted.joint)
     data = load_dataset(given, [], fitted.joint, fitted.model, kernel=fitted.data.kernel, like=fitted.data.sensing)
     error = assess(fitted.model, data, data.train, fitted.solution.values)
     stacked = stack(Balances(fitted.model, data.sensing, wrt=()), data.train, fitted.solution.values)

@@ -177,6 +177,11 @@ def without(model: JointModel, label: str) -> JointModel:
     return smaller.add(HOLD_DELAY) if label == _DRIVE_DELAY else smaller
 
 
+def visible_labels(model: JointModel) -> tuple[str, ...]:
+    """Labels of the effects, without the nuisance delay of the drive."""
+    return tuple(label for label in model.effects if label != HOLD_DELAY)
+
+
 def prepared_model(joint: Joint, record: Record) -> JointModel:
     """The joint's model in the form that the record's channels can carry."""
     model = joint.model()

@@ -5,7 +5,8 @@ from __future__ import annotations
 from argparse import Namespace
 from collections.abc import Callable, Sequence
 
-from identification.check import Finding, check
+from identification.check import Finding
+from identification.gate import inspected
 from identification.joint_file import Joint
 from identification.read import read
 from identification.record import Record
@@ -23,8 +24,7 @@ def checked(arguments: Namespace, joint: Joint | None, more: Callable[[Record], 
     out = {}
     for path in arguments.records:
         record = read(path, columns=joint.columns if joint else None, kind=joint.kind if joint else None)
-        gate = check(record, joint.gear_ratio, torque_per_current=joint.torque_per_current) if joint else check(record)
-        findings = [*gate, *more(record)]
+        findings = [*inspected(record, joint), *more(record)]
         print(f"{path}: {len(record)} samples, {record.duration:.3g} s, channels {', '.join(record.channels)}")
         for finding in findings:
             print(f"  {finding.severity}: {finding.message}")
