@@ -61,6 +61,9 @@ class Comparison:
         linear = f"\n{self.linear}" if self.linear else ""
         return f"{self.name}: fit {self.error.fit_percent:.3g} %, relative error {self.error.relative_error_percent:.3g} % ({ratios}){top}{linear}"
 
+    def __repr__(self) -> str:
+        return f"Comparison({self.name!r}, {self.error.relative_error_percent:.3g} % relative error, {len(self.places)} places)"
+
     def _repr_html_(self) -> str:
         from identification.ceiling import ceiling_html
         from identification.html import comparison_html, spaced

@@ -56,6 +56,9 @@ class Dataset:
     held_out_names: tuple[str, ...] = ()
     note: str = ""
 
+    def __repr__(self) -> str:
+        return f"Dataset({self.joint.name!r}, train: {list(self.train_names)}, held out: {list(self.held_out_names)}, balances: {self.sensing.balances})"
+
     @property
     def kernel(self) -> float:
         """Kernel length of the balances [s]."""

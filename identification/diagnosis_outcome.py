@@ -60,9 +60,7 @@ def weak(trial: Trial) -> str:
     return f"{found} (p = {trial.p_value:.2g}): too little, or not to be told from chance"
 
 
-def refusals(
-    ranking: Ranking | None, recorded: Mapping[str, str], claims: Sequence[Claim]
-) -> tuple[Refusal, ...]:
+def refusals(ranking: Ranking | None, recorded: Mapping[str, str], claims: Sequence[Claim]) -> tuple[Refusal, ...]:
     """Every candidate that was tried and not named, with the reason, each key once.
 
     Parameters
@@ -87,8 +85,11 @@ def refusals(
 
 
 def why_not(
-    key: str, claims: Sequence[Claim], refused: Sequence[Refusal],
-    not_testable: Sequence[NotTestable], inside: Sequence[str],
+    key: str,
+    claims: Sequence[Claim],
+    refused: Sequence[Refusal],
+    not_testable: Sequence[NotTestable],
+    inside: Sequence[str],
 ) -> str:
     """One sentence: why an effect is named, or why it is not.
 
@@ -119,9 +120,7 @@ def why_not(
             return f"{title} is in a set: these records cannot tell it from {claim.effects[0]}{how}."
     for refusal in refused:
         if refusal.effect == wanted:
-            return f"{title} is not named: it {refusal.why}." if not refusal.why.startswith("with ") else (
-                f"{title} is not named: {refusal.why}."
-            )
+            return f"{title} is not named: it {refusal.why}." if not refusal.why.startswith("with ") else (f"{title} is not named: {refusal.why}.")
     for item in not_testable:
         if item.effect == wanted:
             return f"{title} is not testable with these records: {item.why}."
