@@ -12,7 +12,7 @@ import numpy.typing as npt
 from casadi_models import JointModel
 from identification.errors import InputError
 from identification.joint_file import Joint
-from identification.noise import noise_level
+from identification.noise import level_of
 from identification.record import Record
 from identification.sensing import Sensing, adapt, check_alike, sense, signals_of
 from identification.weak import POSITION_CHAINS, WeakRecord, kernel, prepare
@@ -103,7 +103,8 @@ def load_dataset(
             )
     signals = [signals_of(r, joint, sensing) for r in train]
     names = {c for s in signals for c in s if c in POSITION_CHAINS}
-    noise = {c: float(np.median([noise_level(s[c], tuple(r.segments()), r.time) for s, r in zip(signals, train, strict=True)])) for c in names}
+    ratio = joint.gear_ratio
+    noise = {c: float(np.median([level_of(r, c, s[c], ratio) for s, r in zip(signals, train, strict=True)])) for c in names}
     return Dataset(
         joint, sensing, tuple(prepared[:count]), tuple(prepared[count:]), _ranges(prepared[:count], model.clamped_link), noise,
         tuple(r.name for r in train), tuple(r.name for r in held_out),
@@ -128,7 +129,7 @@ def weak_record(record: Record, joint: Joint, sensing: Sensing, length: float, f
     steps = np.diff(record.time)
     inside = np.diff(record.segment) == 0
     signals, segments = signals_of(record, joint, sensing), tuple(record.segments())
-    noise = {c: noise_level(x, segments, record.time) for c, x in signals.items() if c in POSITION_CHAINS}
+    noise = {c: level_of(record, c, x, joint.gear_ratio) for c, x in signals.items() if c in POSITION_CHAINS}
     if inside.any() and np.ptp(steps[inside]) > 0.02 * float(np.median(steps[inside])):
         record = record.resampled()
         signals, segments = signals_of(record, joint, sensing), tuple(record.segments())
