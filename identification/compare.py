@@ -12,6 +12,7 @@ import numpy.typing as npt
 from identification.assess import Error, assess
 from identification.balances import Balances
 from identification.ceiling import Ceiling, ceiling
+from identification.diagnosis_bench import JointBench
 from identification.engine import load_dataset, stack
 from identification.fit import Fit
 from identification.gate import gated
@@ -89,7 +90,8 @@ def compare(fitted: Fit, records: Record | Sequence[Record], *, linear: bool = T
     """
     given = gated([records] if isinstance(records, Record) else list(records), fitted.joint)
     data = load_dataset(given, [], fitted.joint, fitted.model, kernel=fitted.data.kernel, like=fitted.data.sensing)
-    error = assess(fitted.model, data, data.train, fitted.solution.values)
+    bench = JointBench(fitted.joint, data, given, [], like=fitted.data.sensing)
+    error = bench.judged(fitted.solution, assess(fitted.model, data, data.train, fitted.solution.values), held_out=False)
     stacked = stack(Balances(fitted.model, data.sensing, wrt=()), data.train, fitted.solution.values)
     residual = stacked.residual
     places = places_of(stacked.shown, gather(data))

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Final, Protocol, final
 
 from casadi_models import JointModel
-from identification.assess import VERDICT_KERNELS, BalanceError, Error, assess
+from identification.assess import RATIO_LIMIT, VERDICT_KERNELS, BalanceError, Error, assess
+from identification.candidates import offered
 from identification.claims import Ranking, rank
 from identification.engine import Dataset, Solution, load_dataset, prepared_model, solve
 from identification.improvement import Step, visible_keys
@@ -14,6 +16,7 @@ from identification.joint_file import Joint
 from identification.lines import Line, find_lines
 from identification.locate import Unexplained, locate
 from identification.record import Record
+from identification.sensing import Sensing
 from identification.trials import Base, Trial, make_base, try_candidate
 
 Progress = Callable[[str, float], None]
@@ -50,8 +53,14 @@ class Bench(Protocol):
     def ranking(self, base: Base, *, late: bool = False, progress: Progress | None = None) -> Ranking:
         """The library tried on a base."""
 
+    def tried(self, solution: Solution) -> list[str]:
+        """Keys of the effects that a ranking of a fitted model tries."""
+
     def ratios(self, step: Step) -> dict[str, BalanceError]:
         """Residual over floor of every balance on held-out records, as the verdict counts it."""
+
+    def shown(self, step: Step) -> Step:
+        """The step with ratios that agree with the verdict, as every door shows them."""
 
     def lines(self, step: Step) -> list[Line]:
         """Lines in what is left."""
@@ -73,12 +82,15 @@ class JointBench:
     data : Dataset
         Made from `train` and `held`.
     train, held : sequence of Record
+    like : Sensing, optional
+        Of the fit that is judged on these records: temperature counts as there.
     """
 
-    def __init__(self, joint: Joint, data: Dataset, train: Sequence[Record], held: Sequence[Record]) -> None:
-        self.joint, self.data = joint, data
+    def __init__(self, joint: Joint, data: Dataset, train: Sequence[Record], held: Sequence[Record], *, like: Sensing | None = None) -> None:
+        self.joint, self.data, self._like = joint, data, like
         self._train, self._held = list(train), list(held)
         self._solved: dict[tuple[object, ...], Solution] = {}
+        self._ratios: dict[tuple[int, bool], tuple[Solution, dict[str, BalanceError]]] = {}
         self._kernels: dict[float, Dataset] = {round(data.kernel, 9): data}
 
     def start(self) -> Solution:
@@ -112,15 +124,40 @@ class JointBench:
         """See :func:`identification.claims.rank`."""
         return rank(base, late=late, progress=progress)
 
+    def tried(self, solution: Solution) -> list[str]:
+        """Keys of the effects that the records can show beside the model."""
+        return [c.effect.key for c in offered(solution.model, self.data)[0]]
+
     def ratios(self, step: Step) -> dict[str, BalanceError]:
         """Residual over floor, each balance at its own kernel, on held-out records."""
-        out: dict[str, BalanceError] = {}
-        solution = step.solution
-        for length in sorted({VERDICT_KERNELS[b] for b in self.data.sensing.balances}):
-            data = self._at_kernel(length)
-            error = assess(solution.model, data, data.held_out, solution.values)
-            out.update({b: e for b, e in error.balances.items() if VERDICT_KERNELS[b] == length})
-        return {b: out[b] for b in self.data.sensing.balances}
+        return self._judged(step.solution, held_out=True)
+
+    def shown(self, step: Step) -> Step:
+        """The step with its ratios as `judged` gives them; RMS and floor stay those of the claims' kernel."""
+        return replace(step, train=self.judged(step.solution, step.train, held_out=False), held_out=self.judged(step.solution, step.held_out))
+
+    def judged(self, solution: Solution, error: Error, *, held_out: bool = True) -> Error:
+        """An error of a fitted model on these records, its ratios in agreement with the verdict.
+
+        A balance that the verdict counts as clean reads as the verdict reads it: dirt of the sensors that only a slow kernel
+        sees must not stand in a table beside "nothing is missing". One with structure left reads at the kernel that
+        shows it best.
+        """
+        ratios = {b: e.ratio for b, e in self._judged(solution, held_out=held_out).items()}
+        shown = {b: r if r <= RATIO_LIMIT else max(r, error.balances[b].ratio) for b, r in ratios.items()}
+        return replace(error, balances={b: replace(e, ratio=shown[b]) for b, e in error.balances.items()})
+
+    def _judged(self, solution: Solution, *, held_out: bool) -> dict[str, BalanceError]:
+        mark = (id(solution), held_out)
+        if mark not in self._ratios:
+            out: dict[str, BalanceError] = {}
+            for length in sorted({VERDICT_KERNELS[b] for b in self.data.sensing.balances}):
+                data = self._at_kernel(length)
+                error = assess(solution.model, data, data.held_out if held_out else data.train, solution.values)
+                out.update({b: e for b, e in error.balances.items() if VERDICT_KERNELS[b] == length})
+            # the solution is kept with its ratios: an identity is not given to another while it lives
+            self._ratios[mark] = solution, {b: out[b] for b in self.data.sensing.balances}
+        return dict(self._ratios[mark][1])
 
     def lines(self, step: Step) -> list[Line]:
         """Lines at two shorter kernels and that of the claims."""
@@ -150,5 +187,5 @@ class JointBench:
         mark = round(length, 9)
         if mark not in self._kernels:
             model = prepared_model(self.joint, self._train[0])
-            self._kernels[mark] = load_dataset(self._train, self._held, self.joint, model, kernel=length)
+            self._kernels[mark] = load_dataset(self._train, self._held, self.joint, model, kernel=length, like=self._like)
         return self._kernels[mark]

@@ -60,7 +60,7 @@ def weak(trial: Trial) -> str:
     return f"{found} (p = {trial.p_value:.2g}): too little, or not to be told from chance"
 
 
-def refusals(ranking: Ranking | None, recorded: Mapping[str, str], claims: Sequence[Claim]) -> tuple[Refusal, ...]:
+def refusals(ranking: Ranking | None, recorded: Mapping[str, str], claims: Sequence[Claim], offered: Sequence[str] = ()) -> tuple[Refusal, ...]:
     """Every candidate that was tried and not named, with the reason, each key once.
 
     Parameters
@@ -70,6 +70,8 @@ def refusals(ranking: Ranking | None, recorded: Mapping[str, str], claims: Seque
     recorded : mapping of label to str
         Reasons that a decision gave.
     claims : sequence of Claim
+    offered : sequence of str
+        Keys that were tried; those without a trial helped in no physical direction.
     """
     named = {key for claim in claims for key in claim.effects}
     out = {key_of(label): why for label, why in recorded.items()}
@@ -81,6 +83,10 @@ def refusals(ranking: Ranking | None, recorded: Mapping[str, str], claims: Seque
             out[trial.key] = f"with {added} in the model it is not needed" if added else "no whole fit of it was made"
         else:
             out[trial.key] = weak(trial)
+    untestable = {n.effect for n in ranking.not_testable} if ranking else set()
+    for key in offered:
+        if key not in untestable:
+            out.setdefault(key, "lowers no error with any physical value")
     return tuple(Refusal(key, why) for key, why in out.items() if key not in named)
 
 

@@ -12,6 +12,7 @@ from types import MappingProxyType
 from typing import Final, final
 
 from casadi_models import EFFECTS
+from identification.assess import RATIO_LIMIT
 from identification.candidates import LATE
 from identification.claims import (
     COMMON,
@@ -50,8 +51,6 @@ from identification.verdict import hardly_a_model, verdict_of, without_link
 MAX_ADDITIONS: Final = 6
 ATTEMPTS: Final = 2 * MAX_ADDITIONS
 """Candidates that are taken up at most, named or refused; the same however few additions are asked for."""
-RATIO_LIMIT: Final = 1.5
-"""Residual over noise floor above which structure is left; joints without a hidden effect read 0.9 to 1.2."""
 LEAST_ADDED_DROP: Final = 2.0
 """Fall of a balance's held-out RMS that an addition must bring after its whole fit [%]."""
 EXPLAINED_SHARE: Final = 0.5
@@ -262,11 +261,12 @@ class Session:
             following = f"Stopped at the limit of additions ({len(claims)}): {title} would be the next."
         verdict, reason = verdict_of(judged, where, ratios, steps, following, few=few_reversals(self.data), unnamed=unnamed)
         named = {c for x in judged for c in x.effects}
+        shown = tuple(self.bench.shown(s) for s in steps)
         return Improvement(
-            self.joint, self.data, tuple(steps), tuple(judged), minor, first, tuple(lines), tuple(where), verdict, reason, ratios,
+            self.joint, self.data, shown, tuple(judged), minor, first, tuple(lines), tuple(where), verdict, reason, ratios,
             tuple(n for n in first.not_testable if n.effect not in named),
             (*hardly_a_model(steps[0]), *excitation_warnings(self.data), *self._about_temperature(judged), *without_link(solution), *self._warnings),
-            refusals(first, {**self._doubted, **self._refused}, judged),
+            refusals(first, {**self._doubted, **self._refused}, judged, self.bench.tried(steps[0].solution)),
         )  # fmt: skip
 
     # --- inside -----------------------------------------------------------------------------------------------------
@@ -295,9 +295,9 @@ class Session:
 
     def _without_answer(self, steps: Sequence[Step], why: str) -> Improvement:
         """The records cannot carry the question: the steps that were made, and the reason."""
-        ratios = dict(steps[-1].held_out.balances)
+        shown = tuple(self.bench.shown(s) for s in steps)
         return Improvement(
-            self.joint, self.data, tuple(steps), (), (), None, (), (), "not_identifiable", why, ratios, (),
+            self.joint, self.data, shown, (), (), None, (), (), "not_identifiable", why, self.bench.ratios(steps[-1]), (),
             (*excitation_warnings(self.data), *self._warnings), (),
         )  # fmt: skip
 

@@ -69,11 +69,10 @@ class Fit:
     def __str__(self) -> str:
         effects = ", ".join(visible_labels(self.model)) or "no effect beyond the model's own"
         held = f", {self.held_out.relative_error_percent:.3g} % on held-out records" if self.held_out else ""
-        ratios = ", ".join(f"{b} {e.ratio:.3g}" for b, e in (self.held_out or self.train).balances.items())
         lines = [
             f"{self.joint.name}: fitted to {', '.join(self.data.train_names)}",
             f"model: {effects}",
-            f"relative error {self.train.relative_error_percent:.3g} %{held}; residual over noise floor: {ratios}",
+            f"relative error {self.train.relative_error_percent:.3g} %{held}",
         ]
         shown = [(n, p) for n, p in self.parameters.items() if not p["nuisance"]]
         for name, p in shown[:SHOWN]:

@@ -223,9 +223,18 @@ class FmuBench:
         """The effects that can ride outside as a torque."""
         return _only_outside(rank(base, _extra(self._outside, self.data), late=late, progress=progress))
 
+    def tried(self, solution: Solution) -> list[str]:
+        """Keys of the effects that can ride outside as a torque."""
+        every = [*offered(solution.model, self.data)[0], *_extra(self._outside, self.data)]
+        return [c.effect.key for c in every if c.effect.family in _OUTSIDE]
+
     def ratios(self, step: Step) -> dict[str, BalanceError]:
         """Of the one balance, at the kernel of the claims."""
         return dict(step.held_out.balances)
+
+    def shown(self, step: Step) -> Step:
+        """The step: its one kernel is that of the verdict."""
+        return step
 
     def lines(self, step: Step) -> list[Line]:
         """None are looked for: the FMU has its own periodic parts."""

@@ -255,7 +255,7 @@ class Analysis:
         rows = self._gathered()
         residual = self._residuals()
         found = places_of(residual, rows)
-        error = assess(now.model, self.data, self.data.held_out, now.values)
+        error = self.bench.judged(now, assess(now.model, self.data, self.data.held_out, now.values))
         out: dict[str, Any] = clean({
             "error": error.as_json(), "places": [p.as_json() for p in found], "worst": self._worst(residual, error, rows),
             "records": list(self.data.held_out_names), "note": self.note,
@@ -321,8 +321,12 @@ class Analysis:
     ) -> StepEntry:  # fmt: skip
         """A step of the ledger; without `whole` a first look, judged on the held-out records only."""
         now = made or self._current()
-        train = clean(assess(now.model, data, data.train, now.values).as_json()) if whole else {}
-        held = assess(now.model, data, data.held_out, now.values)
+        bench = self.bench if data is self.data else JointBench(self.joint, data, self._train, self._held)
+        train: dict[str, Any] = {}
+        if whole:
+            seen = assess(now.model, data, data.train, now.values)
+            train = clean(bench.judged(now, seen, held_out=False).as_json())
+        held = bench.judged(now, assess(now.model, data, data.held_out, now.values))
         key = key_of(label) if label else None
         entry = StepEntry(
             action, tuple(now.model.effects), {k: float(v) for k, v in now.values.items()}, train, clean(held.as_json()),
