@@ -212,12 +212,17 @@ class Session:
             unnamed = None  # an addition has taken it along
         full = len(standing.claims) >= most and not stale
         left = ranking.best(frozenset(self._refused)) if full else None
-        found = self.finish(first, None if lean else (ranking, base), standing.steps, standing.claims, left=left, unnamed=unnamed)
+        stopped = None
+        if left is not None:
+            title = left.candidate.effect.title
+            stopped = f"Stopped at the limit of additions ({len(standing.claims)}): {title} would be the next."
+        last = None if lean else (ranking, base)
+        found = self.finish(first, last, standing.steps, standing.claims, following=stopped, unnamed=unnamed)
         return replace(found, decided=tuple(decided))
 
     def finish(
         self, first: Ranking, last: tuple[Ranking, Base] | None, steps: Sequence[Step], claims: Sequence[Claim], *,
-        left: Trial | None = None, unnamed: Claim | None = None,
+        following: str | None = None, unnamed: Claim | None = None,
     ) -> Improvement:  # fmt: skip
         """The result for these steps and claims: lines, minor effects, where it still fails, verdict.
 
@@ -229,8 +234,8 @@ class Session:
             Those of the last step; without them no minor effect is looked for.
         steps, claims
             A step for the start model and one for each claim.
-        left : Trial, optional
-            What would be added next, where a limit of additions was met.
+        following : str, optional
+            What would be added next, and why it was not.
         unnamed : Claim, optional
             A set too large to be a name.
 
@@ -255,10 +260,6 @@ class Session:
         where = self.bench.places(end, replace(end.held_out, balances=ratios), lines, RATIO_LIMIT) if over else []
         judged = [self._partial(c, steps[0], end, where) for c in claims]
         where = self._with_frequency(where, judged, steps)
-        following = None
-        if left is not None:
-            title = left.candidate.effect.title
-            following = f"Stopped at the limit of additions ({len(claims)}): {title} would be the next."
         verdict, reason = verdict_of(judged, where, ratios, steps, following, few=few_reversals(self.data), unnamed=unnamed)
         named = {c for x in judged for c in x.effects}
         shown = tuple(self.bench.shown(s) for s in steps)

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+from casadi_models import EFFECTS
 from identification.assess import BalanceError, Error, assess
 from identification.claims import Claim, Ranking, rank
 from identification.diagnosis_bench import JointBench
@@ -48,7 +49,11 @@ def improvement_of(analysis: Analysis, entries: Sequence[StepEntry], progress: P
     named = {e.label: e for e in entries if e.action == "add"}
     claims = [_claim(before, after, first, named.get(after.label)) for before, after in zip(steps[:-1], steps[1:], strict=True)]
     session = Session(JointBench(analysis.joint, data, train, held), progress, gate_warnings(analysis.records))
-    return session.finish(first, (last, base), steps, claims)
+    progress("what is missing now", 0.8)
+    now = session.diagnose(steps[-1].solution)
+    further = next((c for c in now.claims if not c.partial), None)
+    following = f"Not added yet: {EFFECTS[further.effects[0]].title}." if further else None
+    return session.finish(first, (last, base), steps, claims, following=following)
 
 
 def records_of(analysis: Analysis, entries: Sequence[StepEntry]) -> tuple[list[Record], list[Record]]:
