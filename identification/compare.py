@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, final
 
 import numpy as np
@@ -13,9 +13,10 @@ from identification.assess import Error, assess
 from identification.balances import Balances
 from identification.ceiling import Ceiling, ceiling
 from identification.diagnosis_bench import JointBench
+from identification.diagnosis_session import refuse_unlike
 from identification.engine import load_dataset, stack
 from identification.fit import Fit
-from identification.gate import gated
+from identification.gate import gate_warnings, gated
 from identification.places import Place, gather, places_of
 from identification.record import Record
 
@@ -38,6 +39,8 @@ class Comparison:
         Autocorrelation of each residual one kernel length later.
     linear : Ceiling or None
         What linear models without physics explain; None where not asked for, or where the records are too short.
+    warnings : tuple of str
+        What the check gate said about the records.
     """
 
     name: str
@@ -46,6 +49,7 @@ class Comparison:
     worst_window: tuple[float, float]
     whiteness: dict[str, float]
     linear: Ceiling | None = None
+    warnings: tuple[str, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
         """Errors and places as data."""
@@ -53,7 +57,7 @@ class Comparison:
             "record": self.name, **self.error.as_json(),
             "worst_window_s": list(self.worst_window), "whiteness": self.whiteness,
             "places": [p.as_json() for p in self.places],
-            "linear_ceiling": self.linear.as_json() if self.linear else None,
+            "linear_ceiling": self.linear.as_json() if self.linear else None, "warnings": list(self.warnings),
         }  # fmt: skip
 
     def __str__(self) -> str:
@@ -86,12 +90,14 @@ def compare(fitted: Fit, records: Record | Sequence[Record], *, linear: bool = T
     Raises
     ------
     InputError
-        Records with other channels than those of the fit.
+        Records that the gate refuses, with other channels than those of the fit, or in unlike units.
     """
     given = gated([records] if isinstance(records, Record) else list(records), fitted.joint)
     data = load_dataset(given, [], fitted.joint, fitted.model, kernel=fitted.data.kernel, like=fitted.data.sensing)
     bench = JointBench(fitted.joint, data, given, [], like=fitted.data.sensing)
     error = bench.judged(fitted.solution, assess(fitted.model, data, data.train, fitted.solution.values), held_out=False)
+    both = replace(fitted.data, held_out=data.train, held_out_names=data.train_names)
+    refuse_unlike(both, error.relative_error_percent)
     stacked = stack(Balances(fitted.model, data.sensing, wrt=()), data.train, fitted.solution.values)
     residual = stacked.residual
     places = places_of(stacked.shown, gather(data))
@@ -104,7 +110,7 @@ def compare(fitted: Fit, records: Record | Sequence[Record], *, linear: bool = T
     above = ceiling(fitted.data, data.train, residual, floor, unseen=unseen) if linear else None
     return Comparison(
         ", ".join(r.name for r in given), error, places, worst,
-        {b: _lagged(r) for b, r in residual.items()}, above,
+        {b: _lagged(r) for b, r in residual.items()}, above, gate_warnings(given),
     )  # fmt: skip
 
 

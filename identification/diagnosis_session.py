@@ -28,7 +28,7 @@ from identification.claims import (
     shortened,
     simplest,
 )
-from identification.dataset import with_effect, without
+from identification.dataset import Dataset, with_effect, without
 from identification.diagnosis_bench import Bench, JointBench, Progress
 from identification.diagnosis_outcome import refusals
 from identification.engine import Solution, load_dataset, prepared_model
@@ -65,6 +65,20 @@ SWAP_GAIN: Final = 3.0
 """Log-likelihood by which another effect must do better than a claim to take its place [nats]."""
 NOT_NEEDED: Final = 10.0
 """Log-likelihood of the best other effect below which a claim that is no longer significant is dropped [nats]."""
+
+
+def refuse_unlike(data: Dataset, relative_error_percent: float) -> None:
+    """Refuse records that move as far apart as degrees and radians, where the model fails on the held-out ones.
+
+    Raises
+    ------
+    InputError
+        One line that names the record.
+    """
+    unlike = unlike_units(data)
+    # not (x < y): an error that is no number is no reason to go on
+    if unlike and not relative_error_percent < NO_MODEL:
+        raise InputError(unlike)
 
 
 def with_held_out(train: list[Record], held_out: list[Record]) -> tuple[list[Record], list[Record], str]:
@@ -288,10 +302,7 @@ class Session:
         InputError
             Records in unlike units, with a start model that fails on them.
         """
-        unlike = unlike_units(self.data)
-        # not (x < y): an error that is no number is no reason to go on
-        if unlike and not start.held_out.relative_error_percent < NO_MODEL:
-            raise InputError(unlike)
+        refuse_unlike(self.data, start.held_out.relative_error_percent)
         return not_identifiable(self.data)
 
     def _without_answer(self, steps: Sequence[Step], why: str) -> Improvement:

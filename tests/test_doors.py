@@ -236,6 +236,8 @@ def test_records_in_unlike_units(tmp_path: Path, capsys: pytest.CaptureFixture[s
     found = doors(train, degrees, tmp_path, capsys)
     assert isinstance(found, str)
     assert "are its positions in degrees?" in found
+    with pytest.raises(InputError, match="are its positions in degrees"):
+        compare(fit(load_joint(DEMO / "joint.toml"), train), degrees)
 
 
 def test_repaired_records_and_refused_ones_with_three_effects_of_the_user(

@@ -178,7 +178,7 @@ def _print_parameters(parameters: Mapping[str, Mapping[str, Any]]) -> None:
 def run_compare(arguments: Namespace) -> int:
     """`irj compare`."""
     joint = open_joint(arguments.joint)
-    records, warnings = open_records(arguments.records, joint)
+    records, _ = open_records(arguments.records, joint)
     basis = open_records(arguments.fit_records, joint)[0] if arguments.fit_records else records
     alike(arguments.records, records, joint)
     alike([*(arguments.fit_records or arguments.records), *arguments.records], [*basis, *records], joint, once=False)
@@ -186,7 +186,7 @@ def run_compare(arguments: Namespace) -> int:
     print(comparison)
     for place in comparison.places[:5]:
         print(f"  {place.balance} balance against {place.title}: explains {max(place.share_percent, 0):.0f} % of what is left there")
-    write_json(arguments.json, {**comparison.as_json(), "warnings": warnings})
+    write_json(arguments.json, comparison.as_json())
     return 0
 
 

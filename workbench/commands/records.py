@@ -6,7 +6,9 @@ from argparse import Namespace
 from collections.abc import Callable, Sequence
 
 from identification.check import Finding
-from identification.gate import inspected
+from identification.dataset import load_dataset, prepared_model
+from identification.errors import InputError
+from identification.gate import inspected, passed
 from identification.joint_file import Joint
 from identification.read import read
 from identification.record import Record
@@ -15,7 +17,22 @@ from workbench.commands.files import open_joint, write_json
 
 def run_check(arguments: Namespace) -> int:
     """`irj check`: 1 where a record would be refused."""
-    return checked(arguments, open_joint(arguments.joint) if arguments.joint else None)
+    if not arguments.joint:
+        return checked(arguments, None)
+    joint = open_joint(arguments.joint)
+    return checked(arguments, joint, lambda record: _unfit(record, joint))
+
+
+def _unfit(record: Record, joint: Joint) -> list[Finding]:
+    """Why a verb would refuse a record that passes the gate: channels that the model needs, too few samples."""
+    if any(f.severity == "refuse" for f in inspected(record, joint)):
+        return []
+    whole = passed(record, joint)[0]
+    try:
+        load_dataset([whole], [], joint, prepared_model(joint, whole))
+    except InputError as error:
+        return [Finding("refuse", "unfit", str(error))]
+    return []
 
 
 def checked(arguments: Namespace, joint: Joint | None, more: Callable[[Record], Sequence[Finding]] = lambda record: ()) -> int:
