@@ -267,7 +267,7 @@ class Session:
         ratios = self.bench.ratios(end)
         over = any(not e.ratio <= RATIO_LIMIT for e in ratios.values())
         lines = self.bench.lines(end) if over or last is not None else []
-        minor = ()
+        minor: tuple[Claim, ...] = ()
         if last is not None:
             small = [t for t in minor_claims(*last) if self.bench.same_sign(t, solution)]
             minor = tuple(Claim((t.key,), t.candidate.label, t.balance, t.held_out_drop_percent) for t in small)

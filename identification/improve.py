@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from identification.assess import RATIO_LIMIT
-from identification.dataset import HOLD_DELAY
+from identification.dataset import HOLD_DELAY, visible_labels
 from identification.diagnosis_bench import Progress
 from identification.diagnosis_session import MAX_ADDITIONS, Session, with_held_out
 from identification.excitation import excitation_warnings
-from identification.improvement import Improvement, Step, held_drop, made_worse, ranked_json, visible_keys, visible_labels
+from identification.improvement import Improvement, Step, held_drop, made_worse, ranked_json, visible_keys
 from identification.joint_file import Joint
 from identification.record import Record
 
