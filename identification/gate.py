@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Final
+from weakref import WeakKeyDictionary
 
 from identification.check import Finding, check, repair, require
 from identification.joint_file import Joint
 from identification.record import Checked, Record
 from identification.sensing import DRIVES
+
+_PASSED: Final[WeakKeyDictionary[Record, dict[tuple[object, ...], tuple[Record, tuple[Finding, ...]]]]] = WeakKeyDictionary()
+"""Records that passed, by what they were held against: one that is given to two verbs is the same record in both."""
 
 
 def needed(record: Record, joint: Joint | None) -> tuple[str, ...]:
@@ -41,7 +46,7 @@ def passed(record: Record, joint: Joint | None) -> tuple[Record, tuple[Finding, 
     Returns
     -------
     record, findings
-        Repaired, with what the gate said in its provenance; no findings for a record that was checked before.
+        Repaired, with what the gate said in its provenance; no findings for a record that carries its check.
 
     Raises
     ------
@@ -51,9 +56,12 @@ def passed(record: Record, joint: Joint | None) -> tuple[Record, tuple[Finding, 
     before, by = record.provenance.checked, _key(record, joint)
     if before is not None and before.by == by:
         return record, ()
-    findings = inspected(record, joint)
-    require(findings)
-    return stamped(record, joint, findings), findings
+    known = _PASSED.setdefault(record, {})
+    if by not in known:
+        findings = inspected(record, joint)
+        require(findings)
+        known[by] = stamped(record, joint, findings), findings
+    return known[by]
 
 
 def stamped(record: Record, joint: Joint | None, findings: Sequence[Finding]) -> Record:
