@@ -30,6 +30,8 @@ MEMORY_STEP: Final = 1e-6
 """Time over which a memory without a rate of its own is differentiated to its continuous form [s]."""
 
 _FRICTION_SIDES: Final = ("motor", "link")
+SHOWN: Final = 22
+"""Parameters that `print` shows: the whole text stays within 25 lines."""
 
 
 @final
@@ -72,6 +74,19 @@ class JointModel:
     clamped_link: bool = False
     lagging_load: bool = False
     name: str = "joint"
+
+    def __repr__(self) -> str:
+        set_values = f", {len(self.values)} values set" if self.values else ""
+        return f"JointModel({self.name!r}, {self.kind}, gear ratio {self.gear_ratio:g}, effects: {', '.join(self.effects) or 'none'}{set_values})"
+
+    def __str__(self) -> str:
+        values = dict(zip(self.parameter_names, self.value_vector(), strict=True))
+        units = {p.name: p.unit for p in self.parameters}
+        lines = [repr(self)]
+        lines += [f"  {name:<28} {value:.6g} {units[name]}" for name, value in list(values.items())[:SHOWN]]
+        if len(values) > SHOWN:
+            lines.append(f"  and {len(values) - SHOWN} more parameters")
+        return "\n".join(lines)
 
     @staticmethod
     def harmonic_drive(number: int, *, gear_ratio: float = -160.0, configuration: str | int = "IRJ") -> JointModel:

@@ -115,6 +115,10 @@ def check_work(record: Record, gear_ratio: float | None, torque_per_current: flo
     return [Finding("refuse", "work", message, name)]
 
 
+CYCLE_SHARE: Final = 0.25
+"""Share of a stretch's range that a cycle covers at least: passages that noise makes as one level is crossed slowly cover none."""
+
+
 def _cycles(q: FloatArray) -> slice:
     """Longest stretch between two passages of one position in one direction; empty without."""
     best = slice(0, 0)
@@ -123,7 +127,7 @@ def _cycles(q: FloatArray) -> slice:
         for passing in (np.flatnonzero(~over[:-1] & over[1:]), np.flatnonzero(over[:-1] & ~over[1:])):
             if len(passing) > 1 and passing[-1] - passing[0] > best.stop - best.start:
                 best = slice(int(passing[0]), int(passing[-1]))
-    return best
+    return best if best.stop > best.start and np.ptp(q[best]) >= CYCLE_SHARE * np.ptp(q) else slice(0, 0)
 
 
 def _guess(size: float) -> str:

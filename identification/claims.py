@@ -86,6 +86,9 @@ class Ranking:
     not_testable: tuple[NotTestable, ...]
     everything: tuple[Trial, ...] = field(default=())
 
+    def __repr__(self) -> str:
+        return f"Ranking({[t.key for t in self.trials[:5]]}, {len(self.trials)} effects tried, {len(self.significant)} significant)"
+
     def best(self, refused: frozenset[str] = frozenset()) -> Trial | None:
         """Best significant trial whose label was not refused before; a visible torsion comes first."""
         for t in self.everything:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, final
 
 import numpy as np
@@ -12,9 +12,12 @@ import numpy.typing as npt
 from identification.assess import Error, assess
 from identification.balances import Balances
 from identification.ceiling import Ceiling, ceiling
+from identification.diagnosis_bench import JointBench
+from identification.diagnosis_session import refuse_unlike
 from identification.engine import load_dataset, stack
 from identification.excitation import rest_note
 from identification.fit import Fit
+from identification.gate import gate_warnings, gated
 from identification.places import Place, gather, places_of
 from identification.record import Record
 from identification.rest import rest_check, rest_warnings
@@ -42,6 +45,8 @@ class Comparison:
         Share of the rows in which the joint stands still: left out of errors and places.
     at_rest_beyond : tuple of str
         What these rows leave beyond sticking friction, a sentence for each balance in which they do.
+    warnings : tuple of str
+        What the check gate said about the records.
     """
 
     name: str
@@ -52,6 +57,7 @@ class Comparison:
     linear: Ceiling | None = None
     at_rest: float = 0.0
     at_rest_beyond: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
         """Errors and places as data."""
@@ -61,6 +67,7 @@ class Comparison:
             "places": [p.as_json() for p in self.places],
             "linear_ceiling": self.linear.as_json() if self.linear else None,
             "at_rest_percent": 100 * self.at_rest, "at_rest_beyond": list(self.at_rest_beyond),
+            "warnings": list(self.warnings),
         }  # fmt: skip
 
     def __str__(self) -> str:
@@ -69,6 +76,9 @@ class Comparison:
         linear = f"\n{self.linear}" if self.linear else ""
         still = "".join(f"\n{line}" for line in (rest_note(self.at_rest), *self.at_rest_beyond) if line)
         return f"{self.name}: fit {self.error.fit_percent:.3g} %, relative error {self.error.relative_error_percent:.3g} % ({ratios}){top}{still}{linear}"
+
+    def __repr__(self) -> str:
+        return f"Comparison({self.name!r}, {self.error.relative_error_percent:.3g} % relative error, {len(self.places)} places)"
 
     def _repr_html_(self) -> str:
         from identification.ceiling import ceiling_html
@@ -91,11 +101,14 @@ def compare(fitted: Fit, records: Record | Sequence[Record], *, linear: bool = T
     Raises
     ------
     InputError
-        Records with other channels than those of the fit.
+        Records that the gate refuses, with other channels than those of the fit, or in unlike units.
     """
-    given = [records] if isinstance(records, Record) else list(records)
+    given = gated([records] if isinstance(records, Record) else list(records), fitted.joint)
     data = load_dataset(given, [], fitted.joint, fitted.model, kernel=fitted.data.kernel, like=fitted.data.sensing)
-    error = assess(fitted.model, data, data.train, fitted.solution.values)
+    bench = JointBench(fitted.joint, data, given, [], like=fitted.data.sensing)
+    error = bench.judged(fitted.solution, assess(fitted.model, data, data.train, fitted.solution.values), held_out=False)
+    both = replace(fitted.data, held_out=data.train, held_out_names=data.train_names)
+    refuse_unlike(both, error.relative_error_percent)
     stacked = stack(Balances(fitted.model, data.sensing, wrt=()), data.train, fitted.solution.values)
     residual = stacked.residual
     places = places_of(stacked.shown, gather(data))
@@ -112,6 +125,7 @@ def compare(fitted: Fit, records: Record | Sequence[Record], *, linear: bool = T
         ", ".join(r.name for r in given), error, places, worst,
         {b: _lagged(r[stacked.taking[b]]) for b, r in residual.items()}, above, data.at_rest(),
         rest_warnings(rest_check(fitted.model, data, data.train, fitted.solution.values), "N.m" if data.joint.kind == "rotary" else "N"),
+        warnings=gate_warnings(given),
     )  # fmt: skip
 
 

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from casadi_models import JointModel, hold
 from identification.errors import InputError
 from identification.joint_file import Joint
-from identification.noise import noise_level
+from identification.noise import level_of
 from identification.record import Record
 from identification.sensing import Sensing, adapt, check_alike, sense, signals_of
 from identification.stamps import evened
@@ -58,6 +58,9 @@ class Dataset:
     held_out_names: tuple[str, ...] = ()
     note: str = ""
     orders: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        return f"Dataset({self.joint.name!r}, train: {list(self.train_names)}, held out: {list(self.held_out_names)}, balances: {self.sensing.balances})"
 
     @property
     def kernel(self) -> float:
@@ -181,13 +184,8 @@ def _with_rests(made: WeakRecord, noise: Mapping[str, float]) -> WeakRecord:
 
 def measured_noise(record: Record, joint: Joint, sensing: Sensing) -> dict[str, float]:
     """White-noise level of each measured signal, from samples that were measured: bridges are smoother than a reading."""
-    segments = tuple(record.segments())
-    time, signals = record.time, signals_of(record, joint, sensing)
-    if record.measured is not None and not record.measured.all():
-        edges = np.concatenate([[0], np.cumsum([int(record.measured[s].sum()) for s in segments])]).tolist()
-        segments = tuple(slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True))
-        time, signals = time[record.measured], {c: x[record.measured] for c, x in signals.items()}
-    return {c: noise_level(x, segments, time) for c, x in signals.items() if c in POSITION_CHAINS}
+    signals = signals_of(record, joint, sensing)
+    return {c: level_of(record, c, x, joint.gear_ratio) for c, x in signals.items() if c in POSITION_CHAINS}
 
 
 def pointwise_kernel(position: FloatArray, segments: tuple[slice, ...], dt: float, longest: float, noise: float) -> float:
@@ -224,6 +222,11 @@ def without(model: JointModel, label: str) -> JointModel:
     """The model without an effect; where a delay of the drive goes, the hold is a nuisance again."""
     smaller = model.drop(label)
     return smaller.add(HOLD_DELAY) if label == hold.DRIVE_DELAY else smaller
+
+
+def visible_labels(model: JointModel) -> tuple[str, ...]:
+    """Labels of the effects, without the nuisance delay of the drive."""
+    return tuple(label for label in model.effects if label != HOLD_DELAY)
 
 
 def prepared_model(joint: Joint, record: Record) -> JointModel:

@@ -60,6 +60,9 @@ class Solution:
     correlation: Mapping[str, tuple[str, float]] = field(default_factory=dict)
     iterations: int = 0
 
+    def __repr__(self) -> str:
+        return f"Solution({len(self.free)} free parameters, at bound: {list(self.at_bound)}, not identifiable: {list(self.unidentified)})"
+
 
 LEAST_SWING: Final = 0.05
 """Fall of the RMS by which a link that swings unseen must show itself; else the joint is taken as rigid."""

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, final
+from typing import Any, Final, final
 
 from casadi_models import JointModel
 from identification.assess import Error, assess
-from identification.dataset import HOLD_DELAY
+from identification.dataset import HOLD_DELAY, visible_labels
 from identification.engine import Dataset, Solution, load_dataset, prepared_model, solve
+from identification.errors import InputError
+from identification.gate import gated
 from identification.joint_file import Joint, toml_text
 from identification.parameters import parameter_table
 from identification.record import Record
+
+SHOWN: Final = 20
+"""Parameters that `print` shows: the whole text stays under 25 lines."""
 
 
 @final
@@ -60,6 +65,25 @@ class Fit:
     def to_joint_file(self) -> str:
         """The fitted joint as the text of a joint file."""
         return joint_text(self.joint, self.solution, self.data)
+
+    def __str__(self) -> str:
+        effects = ", ".join(visible_labels(self.model)) or "no effect beyond the model's own"
+        held = f", {self.held_out.relative_error_percent:.3g} % on held-out records" if self.held_out else ""
+        lines = [
+            f"{self.joint.name}: fitted to {', '.join(self.data.train_names)}",
+            f"model: {effects}",
+            f"relative error {self.train.relative_error_percent:.3g} %{held}",
+        ]
+        shown = [(n, p) for n, p in self.parameters.items() if not p["nuisance"]]
+        for name, p in shown[:SHOWN]:
+            error = f" +- {p['stderr']:.2g}" if p["stderr"] is not None else ""
+            lines.append(f"  {name:<28} {p['value']:.6g}{error} {p['unit']} ({p['side']} side)")
+        if len(shown) > SHOWN:
+            lines.append(f"  and {len(shown) - SHOWN} more in .parameters")
+        return "\n".join(lines)
+
+    def __repr__(self) -> str:
+        return f"Fit({self.joint.name!r}, {len(self.solution.free)} parameters, {self.train.relative_error_percent:.3g} % relative error)"
 
     def _repr_html_(self) -> str:
         from identification.html import fit_html
@@ -110,10 +134,12 @@ def fit(model: JointModel | Joint, records: Record | Sequence[Record], *, joint:
     --------
     >>> first = fit(load_joint("joint.toml"), read("joint3.csv"))   # doctest: +SKIP
     """
-    train = [records] if isinstance(records, Record) else list(records)
     whole = as_joint(model, joint)
+    train = gated([records] if isinstance(records, Record) else list(records), whole)
+    if not train:
+        raise InputError("no record to fit; give at least one")
     prepared = prepared_model(whole, train[0])
-    data = load_dataset(train, list(held_out), whole, prepared)
+    data = load_dataset(train, gated(list(held_out), whole), whole, prepared)
     solution = solve(prepared, data)
     return Fit(
         whole, solution, data, assess(solution.model, data, data.train, solution.values),

@@ -11,7 +11,8 @@ from casadi_models import JointModel
 from identification.assess import BalanceError, Error
 from identification.candidates import NotTestable
 from identification.claims import Claim, Ranking
-from identification.dataset import HOLD_DELAY, Dataset
+from identification.dataset import HOLD_DELAY, Dataset, visible_labels
+from identification.diagnosis_outcome import Refusal, outcome_of, why_not
 from identification.engine import Solution
 from identification.joint_file import Joint
 from identification.lines import Line
@@ -73,6 +74,10 @@ class Improvement:
     verdict : {"complete", "nothing_missing", "unexplained", "not_identifiable"}
     reason : str
         One sentence that a reader understands.
+    refused : tuple of Refusal
+        Every candidate that was tried and not named, with the reason.
+    decided : tuple of Claim
+        The claims as they were decided, one after the other; `claims` are what later ones left of them.
     """
 
     joint: Joint
@@ -88,7 +93,23 @@ class Improvement:
     final_ratios: Mapping[str, BalanceError]
     not_testable: tuple[NotTestable, ...] = ()
     warnings: tuple[str, ...] = ()
-    refused: tuple[str, ...] = ()
+    refused: tuple[Refusal, ...] = ()
+    decided: tuple[Claim, ...] = ()
+
+    @property
+    def outcome(self) -> str:
+        """One of :data:`identification.diagnosis_outcome.OUTCOMES`."""
+        return outcome_of(self.verdict, self.claims)
+
+    def why(self, key: str) -> str:
+        """Why an effect is named, or why it is not: one sentence.
+
+        Raises
+        ------
+        InputError
+            No effect of that key.
+        """
+        return why_not(key, self.claims, self.refused, self.not_testable, self.steps[0].effects)
 
     @property
     def added(self) -> tuple[str, ...]:
@@ -105,6 +126,21 @@ class Improvement:
         from identification.fit import joint_text
 
         return joint_text(self.joint, self.steps[-1].solution, self.data)
+
+    def __str__(self) -> str:
+        lines = [self.reason]
+        for step in self.steps:
+            ratios = "  ".join(f"{b} {e.ratio:.3g}" for b, e in step.held_out.balances.items())
+            name = f"+ {step.added}" if step.added else "start model"
+            lines.append(f"{name:<28} {step.held_out.relative_error_percent:8.3f} % held-out; over noise floor: {ratios}")
+        for claim in self.claims:
+            names = " or ".join(claim.effects)
+            apart = f"; separate by {claim.separate_by}" if len(claim.effects) > 1 and claim.separate_by else ""
+            lines.append(f"{'in part' if claim.partial else 'missing'}: {names} ({claim.balance} balance){apart}")
+        return "\n".join(lines)
+
+    def __repr__(self) -> str:
+        return f"Improvement({self.verdict}, added: {list(self.added)}, {len(self.steps)} steps)"
 
     def _repr_html_(self) -> str:
         from identification.html import improvement_html
@@ -124,7 +160,8 @@ class Improvement:
             "lines": [line.as_json() for line in self.lines],
             "ranking": [ranked_json(t, t.candidate.label in significant) for t in self.ranking.trials] if self.ranking else [],
             "not_testable": [{"effect": n.effect, "why": n.why} for n in self.not_testable],
-            "verdict": self.verdict, "reason": self.reason,
+            "verdict": self.verdict, "outcome": self.outcome, "reason": self.reason,
+            "refused": [r.as_json() for r in self.refused],
             "unexplained": [u.as_json() for u in self.unexplained],
             "floor_ratio": {b: e.as_json() for b, e in self.final_ratios.items()},
             "warnings": list(self.warnings), "best_candidate": best.key if best else None,
@@ -140,11 +177,6 @@ def ranked_json(trial: Trial, significant: bool) -> dict[str, Any]:
         "confusable_with": list(trial.candidate.effect.confused_with), "place": trial.candidate.place,
         "cv_drop_percent": trial.cv_drop_percent, "gain_nats": trial.gain, "p_value": trial.p_value,
     }  # fmt: skip
-
-
-def visible_labels(model: JointModel) -> tuple[str, ...]:
-    """Labels of the effects, without the nuisance delay of the drive."""
-    return tuple(label for label in model.effects if label != HOLD_DELAY)
 
 
 def visible_keys(model: JointModel) -> tuple[str, ...]:

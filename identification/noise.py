@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from typing import Final
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
+
+from identification.record import Record
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -41,6 +44,33 @@ def noise_level(values: FloatArray, segments: tuple[slice, ...], time: FloatArra
     if not len(cut):
         return 0.0
     return float(np.std(cut) / 0.87)
+
+
+_LEVELS: Final[WeakKeyDictionary[Record, dict[tuple[str, float], float]]] = WeakKeyDictionary()
+
+
+def level_of(record: Record, signal: str, values: FloatArray, ratio: float) -> float:
+    """`noise_level` of a signal made from a record, computed once per record, signal and gear ratio.
+
+    Parameters
+    ----------
+    record : Record
+    signal : str
+        Name of the signal.
+    values : (n,) array
+        The signal, which must follow from record, name and gear ratio.
+    ratio : float
+        Gear ratio by which it is referred to the link.
+    """
+    known = _LEVELS.setdefault(record, {})
+    if (signal, ratio) not in known:
+        segments, time = tuple(record.segments()), record.time
+        if record.measured is not None and not record.measured.all():
+            edges = np.concatenate([[0], np.cumsum([int(record.measured[s].sum()) for s in segments])]).tolist()
+            segments = tuple(slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True))
+            values, time = values[record.measured], time[record.measured]
+        known[signal, ratio] = noise_level(values, segments, time)
+    return known[signal, ratio]
 
 
 def _fourth(x: FloatArray, time: FloatArray | None) -> FloatArray:

@@ -16,10 +16,33 @@ from identification.errors import InputError
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-__all__ = ["CHANNELS", "KINDS", "Provenance", "Record", "channel_unit", "concat"]
+__all__ = ["CHANNELS", "KINDS", "Checked", "Provenance", "Record", "channel_unit", "concat"]
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
+
+
+@final
+@dataclass(frozen=True)
+class Checked:
+    """That a record went through the check gate.
+
+    Attributes
+    ----------
+    by : tuple
+        What it was held against: kind, gear ratio, torque per current, needed channels.
+    repairs, doubts : tuple of str
+        What the gate repaired and what it warns of, one line each.
+    """
+
+    by: tuple[object, ...] = ()
+    repairs: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Repairs first, as the gate ranks them."""
+        return (*self.repairs, *self.doubts)
 
 
 @final
@@ -37,6 +60,8 @@ class Provenance:
         The column map used, one sentence a channel.
     notes : tuple of str
         Repairs and conversions, in the order they were made.
+    checked : Checked, optional
+        Set by the gate, taken off where values change; a part of a checked record is checked.
     """
 
     paths: tuple[str, ...] = ()
@@ -44,6 +69,7 @@ class Provenance:
     reader: str = "memory"
     columns: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    checked: Checked | None = None
 
     def noted(self, *notes: str) -> Provenance:
         """Return the same provenance with notes added."""
@@ -312,11 +338,12 @@ class Record:
         """Return the record with a channel added or replaced (SI values, shape (n,))."""
         channels = {**self.channels, channel: np.asarray(values, dtype=np.float64)}
         provenance = self.provenance.noted(note) if note else self.provenance
-        return replace(self, channels=channels, provenance=provenance)
+        return replace(self, channels=channels, provenance=replace(provenance, checked=None))
 
     def without(self, *channels: str) -> Record:
         """Return the record without some channels."""
-        return replace(self, channels={key: v for key, v in self.channels.items() if key not in channels})
+        kept = {key: v for key, v in self.channels.items() if key not in channels}
+        return replace(self, channels=kept, provenance=replace(self.provenance, checked=None))
 
     def renamed(self, name: str) -> Record:
         """Return the record under another name."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, final
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
@@ -68,14 +69,25 @@ TEMPERATURE_CHANGE: Final = 2.0
 DRIVES: Final = ("motor_torque", "motor_current", "motor_voltage")
 
 
+_SENSED: Final[WeakKeyDictionary[Record, dict[bool, Sensing]]] = WeakKeyDictionary()
+"""What each record lets one see, by whether the model is elastic: all that is asked of the model."""
+
+
 def sense(record: Record, model: JointModel) -> Sensing:
-    """Balances that the record's channels and the model allow.
+    """Balances that the record's channels and the model allow; looked up once per record.
 
     Raises
     ------
     InputError
         No position; nothing to balance; an elastic model on one-sided data (says what is missing).
     """
+    known = _SENSED.setdefault(record, {})
+    if model.is_elastic not in known:
+        known[model.is_elastic] = _sensed(record, model.is_elastic)
+    return known[model.is_elastic]
+
+
+def _sensed(record: Record, elastic: bool) -> Sensing:
     drive = any(record.has(c) for c in DRIVES)
     torque = record.has("link_torque")
     motor, link = record.has("motor_position"), record.has("link_position")
@@ -87,7 +99,7 @@ def sense(record: Record, model: JointModel) -> Sensing:
     common = {"has_torque": torque, "has_drive": drive, "has_temperature": temperature, "both_positions": motor and link}
     moving = "motor_position" if motor else "link_position"
     if not drive and not (motor and link):
-        if link and not motor and not model.is_elastic:
+        if link and not motor and not elastic:
             return Sensing(("link",), moving=moving, **common)
         return Sensing(("transmission",), clamped_link=True, moving=moving, **common)
     if torque:
@@ -96,14 +108,14 @@ def sense(record: Record, model: JointModel) -> Sensing:
             found.append("motor")
         if link:
             found.append("link")
-        if motor and link and (model.is_elastic or _twists(record)):
+        if motor and link and (elastic or _twists(record)):
             found.append("transmission")
         if drive and not motor:
             found.insert(0, "axis")
-        if model.is_elastic and "transmission" not in found:
+        if elastic and "transmission" not in found:
             raise InputError(f'{record.name}: model is elastic but {"link" if motor else "motor"}_position is missing; add it or use model = "hd1"')
         return Sensing(tuple(found), moving=moving, **common)
-    if model.is_elastic:
+    if elastic:
         if not (motor and link):
             missing = "link_position" if motor else "motor_position"
             raise InputError(f"{record.name}: model is elastic but channel {missing} is missing; add it, or use a rigid model (hd1, hd2)")

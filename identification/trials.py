@@ -279,6 +279,9 @@ class Trial:
     contribution: float
     score: float
 
+    def __repr__(self) -> str:
+        return f"Trial({self.candidate.label!r}, {self.balance} balance, -{self.cv_drop_percent:.3g} % on blocks, p = {self.p_value:.2g})"
+
     @property
     def effect(self) -> Effect:
         """The effect tried."""

@@ -13,7 +13,6 @@ from identification.engine import Solution
 from identification.formats import number
 from identification.improvement import Step
 from identification.locate import Unexplained
-from identification.trials import Trial
 
 HARDLY: Final = 90.0
 """Relative error of the start model from which units and signs are doubted [%]."""
@@ -31,10 +30,14 @@ def _names(claims: Sequence[Claim]) -> str:
 
 
 def verdict_of(
-    claims: Sequence[Claim], where: Sequence[Unexplained], ratios: Mapping[str, BalanceError], steps: Sequence[Step], following: Trial | None,
+    claims: Sequence[Claim], where: Sequence[Unexplained], ratios: Mapping[str, BalanceError], steps: Sequence[Step], following: str | None,
     few: str, unnamed: Claim | None = None,
 ) -> tuple[str, str]:  # fmt: skip
-    """Verdict and its sentence (`few`: the motor reverses too seldom, which no library makes up for; `unnamed`: a set too large to be a name)."""
+    """Verdict and its sentence.
+
+    `following`: what would come next, where the additions stopped at a limit; `few`: the motor reverses too seldom, which no
+    library makes up for; `unnamed`: a set too large to be a name.
+    """
     names, parts = _names([c for c in claims if not c.partial]), _names([c for c in claims if c.partial])
     was, now = (step.held_out.relative_error_percent for step in (steps[0], steps[-1]))
     fall = f"the error on held-out data {'falls' if now < was else 'goes'} from {was:.3g} % to {now:.3g} %"
@@ -43,8 +46,7 @@ def verdict_of(
         found = f"Missing: {names}; {fall}. " if names else f"{fall[0].upper()}{fall[1:]}. " if parts else ""
         found += f"Only part of the structure is explained by: {parts}. " if parts else ""
         if following is not None:
-            stop = f"Stopped at the limit of additions ({len(claims)}): {following.candidate.effect.title} would be the next."
-            return "unexplained", f"{found}{stop} Left over: {left}."
+            return "unexplained", f"{found}{following} Left over: {left}."
         if unnamed is not None:
             return "unexplained", f"{found}{_remainder(unnamed, ratios[unnamed.balance].unit)} Left over: {left}."
         if few:

@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final, final
 
 import numpy as np
 
 from casadi_models import EFFECTS, JointModel
-from identification.assess import Error, assess
+from identification.assess import BalanceError, Error, assess
 from identification.candidates import Candidate, NotTestable, offered
-from identification.claims import Claim, Ranking, make_claim, rank
+from identification.claims import Claim, Ranking, rank
 from identification.diagnose import Diagnosis
+from identification.diagnosis_bench import Progress
+from identification.diagnosis_session import Session, with_held_out
 from identification.engine import Dataset, Solution, load_dataset, prepared_model, solve, weak_record
 from identification.errors import InputError
-from identification.improve import excitation_warnings, with_held_out
+from identification.gate import gate_warnings, gated
+from identification.improvement import Step, visible_keys
 from identification.joint_file import Joint
+from identification.lines import Line
+from identification.locate import Unexplained, locate
 from identification.record import Record
-from identification.trials import Base, make_base
+from identification.trials import Base, Trial, make_base
 
 from .signals import FloatArray
 from .user_correction import Correction, correction_of
@@ -88,7 +93,8 @@ class UserDiagnosis:
             Nothing is claimed, or no candidate has that label or key.
         """
         if label is None and not self.claims:
-            raise InputError(f"{self.model.fmu.path.name}: nothing significant is missing; name an effect of the ranking to add it all the same")
+            said = "nothing significant is missing" if self.diagnosis.outcome == "complete" else self.diagnosis.reason.rstrip(".")
+            raise InputError(f"{self.model.fmu.path.name}: {said}; name an effect of the ranking to add it all the same")
         wanted = label or self.claims[0].label
         trial = next((t for t in self.ranking.everything if wanted in (t.candidate.label, t.key)), None)
         if trial is None:
@@ -141,7 +147,9 @@ def diagnose(
         Where the FMU refuses a call.
     """
     say = progress or (lambda _text, _share: None)
-    train, held, note = with_held_out(listed(records), listed(held_out) if held_out else [])
+    given = gated(listed(records), model.joint)
+    apart = gated(listed(held_out), model.joint) if held_out else []
+    train, held, note = with_held_out(given, apart)
     every = [*train, *held]
     say("following the motion", 0.05)
     balanced = balanced_records(model, every)
@@ -149,19 +157,114 @@ def diagnose(
     count = len(train)
     outside = replace(prepared_model(joint, balanced[0]), lagging_load=False)
     data = replace(load_dataset(balanced[:count], balanced[count:], joint, outside), note=note)
-    solution = solve(outside, data)
     columns = []
     for i, p in enumerate(model.parameters):
         say(f"sensitivity to {p.name}", 0.1 + 0.6 * i / max(len(model.parameters), 1))
         columns.append(_column(model, every, balanced, p.name, data))
     say("ranking the library", 0.75)
-    base = with_nuisance(make_base(solution, data), columns, [p.name for p in model.parameters])
-    ranking = _only_outside(rank(base, _extra(outside, data)))
-    best = ranking.best()
-    claims = (make_claim(best, ranking, base),) if best is not None else ()
-    error = assess(solution.model, data, data.held_out, solution.values)
+    bench = FmuBench(outside, data, columns, [p.name for p in model.parameters])
+    session = Session(bench, lambda text, share: say(text, 0.75 + 0.25 * share), gate_warnings([*given, *apart]))
+    found = Diagnosis(session.diagnose(session.start()))
     say("done", 1.0)
-    return UserDiagnosis(model, Diagnosis(ranking, claims, data, excitation_warnings(data)), error, solution, tuple(listed(records)))
+    start = found.found.steps[0]
+    return UserDiagnosis(model, found, start.held_out, start.solution, tuple(listed(records)))
+
+
+@final
+class FmuBench:
+    """What an FMU leaves along the measured motion, as the model that a session judges.
+
+    A candidate rides outside as a torque; the FMU's own parameters move along linearly with it.
+
+    Parameters
+    ----------
+    outside : JointModel
+        Balance of what is left.
+    data : Dataset
+    columns : sequence of (rows,) array
+        Derivative of every row with respect to each of the FMU's parameters.
+    names : sequence of str
+        Of these parameters.
+    """
+
+    def __init__(self, outside: JointModel, data: Dataset, columns: Sequence[FloatArray], names: Sequence[str]) -> None:
+        self.joint, self.data = data.joint, data
+        self._outside, self._columns, self._names = outside, list(columns), list(names)
+
+    def start(self) -> Solution:
+        """The fit of the balance with nothing added."""
+        return solve(self._outside, self.data)
+
+    def fitted(self, model: JointModel, start: Mapping[str, float], *, again: bool = False) -> Solution:
+        """The fit of a balance with more terms."""
+        return solve(model, self.data, start=start)
+
+    def step(self, key: str | None, label: str | None, solution: Solution) -> Step:
+        """The balance with its errors."""
+        train = assess(solution.model, self.data, self.data.train, solution.values)
+        held = assess(solution.model, self.data, self.data.held_out, solution.values)
+        return Step(key, visible_keys(solution.model), train, held, solution, label)
+
+    def added(self, trial: Trial, now: Step) -> Step:
+        """The balance with a candidate as its trial found it, the FMU's parameters moved along.
+
+        Nothing is simulated here: what is left is what was left, less the fall that the trial had.
+        """
+        held = trial.held_out_drop_percent
+        falls = (trial.cv_drop_percent, trial.cv_drop_percent if math.isnan(held) else held)
+        train, apart = (_fallen(e, trial.balance, f) for e, f in zip((now.train, now.held_out), falls, strict=True))
+        return Step(trial.key, (*now.effects, trial.key), train, apart, now.solution, trial.candidate.label)
+
+    def listen(self, step: Step) -> None:
+        """Nothing: what a tracked FMU leaves is averaged already, and holds no line."""
+
+    def base(self, solution: Solution) -> Base:
+        """Rows of the balance, with the FMU's parameters as nuisance."""
+        return with_nuisance(make_base(solution, self.data), self._columns, self._names)
+
+    def ranking(self, base: Base, *, late: bool = False, progress: Progress | None = None) -> Ranking:
+        """The effects that can ride outside as a torque."""
+        return _only_outside(rank(base, _extra(self._outside, self.data), late=late, progress=progress))
+
+    def tried(self, solution: Solution) -> list[str]:
+        """Keys of the effects that can ride outside as a torque."""
+        every = [*offered(solution.model, self.data)[0], *_extra(self._outside, self.data)]
+        return [c.effect.key for c in every if c.effect.family in _OUTSIDE]
+
+    def ratios(self, step: Step) -> dict[str, BalanceError]:
+        """Of the one balance, at the kernel of the claims."""
+        return dict(step.held_out.balances)
+
+    def shown(self, step: Step) -> Step:
+        """The step: its one kernel is that of the verdict."""
+        return step
+
+    def lines(self, step: Step) -> list[Line]:
+        """None are looked for: the FMU has its own periodic parts."""
+        return []
+
+    def places(self, step: Step, error: Error, lines: Sequence[Line], limit: float) -> list[Unexplained]:
+        """Where the balance as it stands is over its floor; with a candidate, only that it still is."""
+        if step.label is None:
+            return locate(step.solution, self.data, error, lines, limit)
+        return [Unexplained(b, 0.0, rms=e.rms) for b, e in error.balances.items() if not e.ratio <= limit]
+
+    def same_sign(self, trial: Trial, solution: Solution) -> bool:
+        """No minor effects are looked for."""
+        return False
+
+
+def _fallen(error: Error, balance: str, percent: float) -> Error:
+    """An error after a fall of the RMS of one balance."""
+    share = 1 - percent / 100
+    before = error.balances[balance]
+    after = replace(before, rms=before.rms * share, ratio=before.ratio * share)
+    power = sum(e.rms**2 for e in error.balances.values())
+    left = math.sqrt(max(power - before.rms**2 + after.rms**2, 0.0) / power) if power > 0 else 1.0
+    return replace(
+        error, relative_error_percent=error.relative_error_percent * left, fit_percent=100 - (100 - error.fit_percent) * left,
+        vaf_percent=100 - (100 - error.vaf_percent) * left**2, balances={**error.balances, balance: after},
+    )  # fmt: skip
 
 
 def _outside_joint(joint: Joint) -> Joint:

@@ -14,17 +14,22 @@ import numpy.typing as npt
 from casadi_models import EFFECTS, JointModel
 from identification.assess import Error, assess
 from identification.balances import Balances
-from identification.claims import confusion_set, make_claim, rank, simplest
 from identification.dataset import with_effect, without
+from identification.diagnose import Diagnosis
+from identification.diagnosis_bench import JointBench
+from identification.diagnosis_outcome import key_of
+from identification.diagnosis_session import Session, with_held_out
 from identification.engine import Dataset, Solution, load_dataset, prepared_model, references, solve, stack
 from identification.errors import InputError
 from identification.fit import joint_text
-from identification.improve import HOLD_DELAY, excitation_warnings, ranked_json, with_held_out
+from identification.gate import gate_warnings, gated
+from identification.html import headline
+from identification.improve import HOLD_DELAY, ranked_json
 from identification.joint_file import Joint
 from identification.parameters import parameter_table
 from identification.places import Rows, gather, places_of
 from identification.record import Record
-from identification.trials import Trial, make_base
+from identification.trials import Trial
 from workbench.app_first import first_look
 from workbench.app_records import thinned
 from workbench.session import StepEntry
@@ -72,7 +77,7 @@ class Analysis:
         if not train:
             raise InputError("no record to fit: load one, or set the role of one to fit")
         self.joint = joint
-        whole, held, self.note = with_held_out(list(train), list(held_out))
+        whole, held, self.note = with_held_out(gated(train, joint), gated(held_out, joint))
         self.records = (*whole, *held)
         self._train, self._held = whole, held
         quick_train, quick_held = _share(whole, QUICK_TRAIN), _share(held, QUICK_HELD_OUT)
@@ -85,6 +90,7 @@ class Analysis:
             self.note = f"{self.note}; {part}" if self.note else part
         self.start_model = prepared_model(joint, whole[0])
         self.data = load_dataset(quick_train, quick_held, joint, self.start_model)
+        self.bench = JointBench(joint, self.data, quick_train, quick_held)
         self.solution: Solution | None = None
         self.trials: dict[str, Trial] = {}
         self._rows: Rows | None = None
@@ -196,18 +202,19 @@ class Analysis:
         return entry
 
     def diagnose(self, progress: Progress) -> dict[str, Any]:
-        """Try the whole library on the current model."""
+        """What is missing from the current model: the first decision of the loop, as every door gives it.
+
+        Raises
+        ------
+        InputError
+            Records in unlike units.
+        """
         now = self._current()
-        progress("projecting the model", 0.1)
-        base = make_base(now, self.data)
-        ranking = rank(base, progress=lambda text, share: progress(text, 0.2 + 0.75 * share))
-        progress("telling them apart", 0.95)
-        best = ranking.best()
-        claim = None
-        if best is not None:
-            names = confusion_set(best, ranking.everything, base)
-            best = simplest(best, names, ranking)
-            claim = make_claim(best, ranking, base, names).as_json() | {"label": best.candidate.label}
+        session = Session(self.bench, progress, gate_warnings(self.records))
+        found = Diagnosis(session.diagnose(now))
+        ranking, claim = found.ranking, None
+        if found.claims:
+            claim = found.claims[0].as_json() | {"label": found.claims[0].label}
         self.trials = {t.candidate.label: t for t in ranking.everything}
         rows = []
         for trial in ranking.trials:
@@ -218,8 +225,10 @@ class Analysis:
                 "family": e.family, "contribution": trial.contribution, "score": trial.score,
             })  # fmt: skip
         unit = "N" if self.joint.kind == "linear" else "N.m"
+        story = found.as_json()
         out: dict[str, Any] = clean({
-            "ranking": rows, "claim": claim, "unit": unit, "warnings": excitation_warnings(self.data),
+            **{key: story[key] for key in ("outcome", "verdict", "reason", "refused", "unexplained", "floor_ratio", "warnings")},
+            "headline": headline(story), "ranking": rows, "claim": claim, "unit": unit,
             "not_testable": [{"effect": n.effect, "title": EFFECTS[n.effect].title, "why": n.why} for n in ranking.not_testable],
         })  # fmt: skip
         return out
@@ -246,7 +255,7 @@ class Analysis:
         rows = self._gathered()
         residual = self._residuals()
         found = places_of(residual, rows)
-        error = assess(now.model, self.data, self.data.held_out, now.values)
+        error = self.bench.judged(now, assess(now.model, self.data, self.data.held_out, now.values))
         out: dict[str, Any] = clean({
             "error": error.as_json(), "places": [p.as_json() for p in found], "worst": self._worst(residual, error, rows),
             "records": list(self.data.held_out_names), "note": self.note,
@@ -314,9 +323,13 @@ class Analysis:
     ) -> StepEntry:  # fmt: skip
         """A step of the ledger; without `whole` a first look, judged on the held-out records only."""
         now = made or self._current()
-        train = clean(assess(now.model, data, data.train, now.values).as_json()) if whole else {}
-        held = assess(now.model, data, data.held_out, now.values)
-        key = label.partition("@")[0].partition("#")[0] if label else None
+        bench = self.bench if data is self.data else JointBench(self.joint, data, self._train, self._held)
+        train: dict[str, Any] = {}
+        if whole:
+            seen = assess(now.model, data, data.train, now.values)
+            train = clean(bench.judged(now, seen, held_out=False).as_json())
+        held = bench.judged(now, assess(now.model, data, data.held_out, now.values))
+        key = key_of(label) if label else None
         entry = StepEntry(
             action, tuple(now.model.effects), {k: float(v) for k, v in now.values.items()}, train, clean(held.as_json()),
             key, label, EFFECTS[key].title if key is not None and key in EFFECTS else None, now.model.virtual_work, self.whole,

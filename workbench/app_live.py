@@ -156,7 +156,7 @@ class Live:
         columns = entry.columns or (joint.columns if joint else None)
         made, record = opened(entry, self.session.path_of(entry), joint.kind if joint else "rotary", columns)
         if record is not None and not (soon and len(record) > SOON):
-            made, record = checked(made, record, self.session.path_of(entry), joint.gear_ratio if joint else None)
+            made, record = checked(made, record, self.session.path_of(entry), joint)
         with self.lock:
             self._records.pop(entry.id, None)
             if record is not None:
@@ -182,7 +182,7 @@ class Live:
             if record is None:
                 made = self.examine(entry)
             else:
-                made, whole = checked(entry, record, self.session.path_of(entry), joint.gear_ratio if joint else None)
+                made, whole = checked(entry, record, self.session.path_of(entry), joint)
                 with self.lock:
                     self._records.pop(identifier, None)
                     if whole is not None:

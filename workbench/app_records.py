@@ -11,9 +11,10 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from identification.check import check, repair
 from identification.columns import guess_columns
 from identification.errors import InputError
+from identification.gate import inspected, stamped
+from identification.joint_file import Joint
 from identification.read import open_table, read
 from identification.record import Record
 from workbench.app_uploads import check_unpacked
@@ -61,7 +62,7 @@ def opened(entry: FileEntry, path: Path, kind: str, columns: Mapping[str, Any] |
     return replace(entry, findings=(), summary=_summary(record), message="", status="checking", names=(), guess=()), record
 
 
-def checked(entry: FileEntry, record: Record, path: Path, ratio: float | None) -> tuple[FileEntry, Record | None]:
+def checked(entry: FileEntry, record: Record, path: Path, joint: Joint | None) -> tuple[FileEntry, Record | None]:
     """Run the check gate on a record that `opened` gave; None where it is refused.
 
     Parameters
@@ -69,16 +70,16 @@ def checked(entry: FileEntry, record: Record, path: Path, ratio: float | None) -
     entry : FileEntry
     record : Record
     path : Path
-    ratio : float or None
-        Gear ratio, where it is known already.
+    joint : Joint or None
+        Where it is known already.
     """
-    findings = check(record, ratio)
+    findings = inspected(record, joint)
     shown = tuple({"severity": f.severity, "code": f.code, "message": _plain(f.message, path, entry.name), "channel": f.channel} for f in findings)
     bad = next((f for f in findings if f.severity == "refuse"), None)
     entry = replace(entry, findings=shown, message="", status="ready")
     if bad is not None:
         return replace(entry, status="refused", message=_plain(bad.message, path, entry.name)), None
-    return entry, repair(record) if any(f.severity == "repair" for f in findings) else record
+    return entry, stamped(record, joint, findings)
 
 
 def _record(path: Path, entry: FileEntry, kind: str, columns: Mapping[str, Any] | None) -> Record:

@@ -7,10 +7,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+from casadi_models import EFFECTS
 from identification.assess import BalanceError, Error, assess
 from identification.claims import Claim, Ranking, rank
+from identification.diagnosis_bench import JointBench
+from identification.diagnosis_outcome import key_of
+from identification.diagnosis_session import Session
 from identification.engine import Dataset, Solution, load_dataset, solve
-from identification.improve import HOLD_DELAY, Improvement, Loop, Step, held_drop, visible_keys
+from identification.gate import gate_warnings
+from identification.improve import HOLD_DELAY, Improvement, Step, held_drop, visible_keys
 from identification.record import Record
 from identification.trials import make_base
 from workbench.app_analysis import Analysis, Progress
@@ -43,8 +48,12 @@ def improvement_of(analysis: Analysis, entries: Sequence[StepEntry], progress: P
         last = rank(base, progress=lambda text, share: progress(f"{text}, final model", 0.5 + 0.3 * share))
     named = {e.label: e for e in entries if e.action == "add"}
     claims = [_claim(before, after, first, named.get(after.label)) for before, after in zip(steps[:-1], steps[1:], strict=True)]
-    loop = Loop(analysis.joint, data, train, held, progress)
-    return loop.finish(first, last, base, claims, steps)
+    session = Session(JointBench(analysis.joint, data, train, held), progress, gate_warnings(analysis.records))
+    progress("what is missing now", 0.8)
+    now = session.diagnose(steps[-1].solution)
+    further = next((c for c in now.claims if not c.partial), None)
+    following = f"Not added yet: {EFFECTS[further.effects[0]].title}." if further else None
+    return session.finish(first, (last, base), steps, claims, following=following)
 
 
 def records_of(analysis: Analysis, entries: Sequence[StepEntry]) -> tuple[list[Record], list[Record]]:
@@ -74,7 +83,7 @@ def _solved(analysis: Analysis, data: Dataset, effects: Sequence[str], virtual_w
 
 
 def _step(solution: Solution, data: Dataset, label: str | None, entry: StepEntry | None) -> Step:
-    key = label.partition("@")[0].partition("#")[0] if label else None
+    key = key_of(label) if label else None
     train = _error(entry.train) if entry else assess(solution.model, data, data.train, solution.values)
     held = _error(entry.held_out) if entry else assess(solution.model, data, data.held_out, solution.values)
     return Step(key, visible_keys(solution.model), train, held, solution, label)

@@ -85,6 +85,7 @@ def _parser() -> argparse.ArgumentParser:
     diagnosed = verb("diagnose", "loop", "rank what is missing", records=True, joint=True)
     other_payload(diagnosed)
     diagnosed.add_argument("--held-out", nargs="+", action="extend", metavar="REC", default=[], help="records the fit must not see")
+    diagnosed.add_argument("--why", metavar="KEY", nargs="+", action="extend", default=[], help="say why this effect is named, or why it is not")
     diagnosed.add_argument("-o", "--output", metavar="FILE", help="write the joint file with the first claim added")
     improved = verb("improve", "loop", "name what is missing, add it, watch the error fall", records=True, joint=True)
     other_payload(improved)

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from identification.columns import Column, choose, load_map
 from identification.errors import InputError
+from identification.gate import passed
 from identification.read._formats import open_table
 from identification.record import Provenance, Record, channel_unit
 from identification.units import to_si
@@ -19,6 +20,7 @@ from identification.units import to_si
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from identification.joint_file import Joint
     from identification.read._table import Table
 
 __all__ = ["open_table", "read"]
@@ -32,6 +34,7 @@ def read(
     columns: Mapping[str, Any] | str | Path | None = None,
     kind: str | None = None,
     name: str | None = None,
+    joint: Joint | None = None,
 ) -> Record:
     """Read one measurement file.
 
@@ -46,18 +49,25 @@ def read(
         Kind of the axis; without it what the joint file says, or ``"rotary"``.
     name : str, optional
         Name of the record; the file's stem where it is left out.
+    joint : Joint, optional
+        Gives columns and kind where they are left out, and has the record go through the check gate: it comes back
+        repaired, with what was found in its provenance.
 
     Returns
     -------
     Record
-        In SI units.  A ``run`` column cuts it into segments.  Nothing is repaired: see `identification.check`.
+        In SI units.  A ``run`` column cuts it into segments.  Without `joint` nothing is checked or repaired here: the
+        verbs do that (see `identification.gate`).
 
     Raises
     ------
     InputError
-        If the file cannot be used; where columns are not recognised the message shows a guess as TOML.
+        If the file cannot be used, or with `joint` the record; where columns are not recognised the message shows a
+        guess as TOML.
     """
     file = Path(path)
+    if joint is not None:
+        columns, kind = (joint.columns if columns is None else columns), kind or joint.kind
     raw, said = load_map(columns)
     axis = kind or said or "rotary"
     channel_unit("time", axis)
@@ -72,7 +82,8 @@ def read(
         columns=tuple(entry.describe() for entry in chosen),
         notes=table.notes + notes + run_notes,
     )
-    return Record.from_channels(time, channels, name=name or file.stem, kind=axis, provenance=provenance)
+    record = Record.from_channels(time, channels, name=name or file.stem, kind=axis, provenance=provenance)
+    return record if joint is None else passed(record, joint)[0]
 
 
 def _load(

@@ -10,12 +10,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from identification.check import gate
 from identification.errors import InputError
+from identification.gate import needed, passed
 from identification.joint_file import Joint, load_joint
 from identification.read import read
 from identification.record import Record
-from identification.sensing import DRIVES, check_alike
+from identification.sensing import check_alike
 from irj_fmu.command_line import check_output, is_special, progress_bar, replace_file, write_json
 
 
@@ -36,8 +36,7 @@ def open_records(paths: Sequence[str], joint: Joint | None) -> tuple[list[Record
     for path in paths:
         record = read(path, columns=joint.columns if joint is not None else None, kind=joint.kind if joint is not None else None)
         try:
-            given = (joint.gear_ratio, needed(record, joint), joint.torque_per_current) if joint is not None else (None, needed(record, joint))
-            record, findings = gate(record, *given)
+            record, findings = passed(record, joint)
         except InputError as error:
             raise named(error, path, record) from None
         warnings += [f"{path}: {f.message.removeprefix(record.name + ': ')}" for f in findings if f.severity in ("warn", "repair")]
@@ -55,13 +54,6 @@ def alike(paths: Sequence[str], records: Sequence[Record], joint: Joint, *, once
 def named(error: InputError, path: str, record: Record) -> InputError:
     """The error with the path of its record in place of the record's name."""
     return InputError(f"{path}: {str(error).removeprefix(record.name + ': ')}")
-
-
-def needed(record: Record, joint: Joint | None) -> tuple[str, ...]:
-    """Channels that this joint file says are there: a motor constant goes with a current."""
-    if joint is None or joint.torque_per_current is None or any(record.has(c) for c in DRIVES):
-        return ()
-    return ("motor_current",)
 
 
 OUTPUTS: Final = ("json", "output", "report", "truth", "picture")

@@ -12,8 +12,10 @@ from typing import Any
 from identification.compare import compare
 from identification.diagnose import diagnose
 from identification.fit import Fit, fit
+from identification.gate import gate_warnings
 from identification.improve import Improvement, improve
 from identification.joint_file import Joint, toml_text
+from identification.locate import Unexplained
 from identification.record import Record
 from workbench.commands.files import alike, distinct, open_joint, open_records, progress_bar, write_json, write_text
 
@@ -24,15 +26,21 @@ def improve_files(
     """The loop on files: its JSON, the result and the records."""
     distinct(training=train, other_payload=other_payload, held_out=held_out)
     joint = open_joint(joint_path)
-    records, warnings = _training(train, other_payload, joint)
-    held, more = open_records(held_out, joint)
+    records, _ = _training(train, other_payload, joint)
+    held, _ = open_records(held_out, joint)
     alike([*train, *other_payload, *held_out], [*records, *held], joint)
     found = improve(records, joint, held, max_additions=max_additions, progress=progress_bar)
     progress_bar("done", 1.0)
-    for text in found.warnings:
-        print(f"irj: {text}", file=sys.stderr)
-    found = replace(found, warnings=(*found.warnings, *warnings, *more))
+    _print_warnings(found.warnings, [*records, *held])
     return found.as_json(), found, [*records, *held]
+
+
+def _print_warnings(warnings: Sequence[str], records: Sequence[Record]) -> None:
+    """Warnings on stderr, without those that were printed when the records were opened."""
+    said = gate_warnings(records)
+    for text in warnings:
+        if text not in said:
+            print(f"irj: {text}", file=sys.stderr)
 
 
 def _training(paths: Sequence[str], other_payload: Sequence[str], joint: Joint) -> tuple[list[Record], list[str]]:
@@ -114,15 +122,20 @@ def _print_improvement(found: Improvement) -> None:
     for line in found.lines:
         named = f", {' or '.join(line.effects)}" if line.effects else ", function of position"
         print(f"line: order {line.order:.3f} +- {line.tolerance:.3f} per {line.per}, {line.amplitude:.3g} {line.unit} ({line.balance}{named})")
-    for place in found.unexplained:
+    print_places(found.unexplained)
+    if found.not_testable:
+        print(f"not testable with these records ({len(found.not_testable)}): {', '.join(n.effect for n in found.not_testable)}")
+    print(found.reason)
+
+
+def print_places(places: Sequence[Unexplained]) -> None:
+    """Where structure is left that no effect explains."""
+    for place in places:
         where = "no measured variable"
         if place.axis and place.low is not None and place.high is not None:
             where = f"{place.axis} from {place.low:.3g} to {place.high:.3g} {place.unit}"
         extra = f", order {place.order:.2f}" if place.order else (f", near {place.frequency_hz:.1f} Hz" if place.frequency_hz else "")
         print(f"unexplained: {place.balance} balance, depends on {where} ({place.share_percent:.0f} % of it){extra}")
-    if found.not_testable:
-        print(f"not testable with these records ({len(found.not_testable)}): {', '.join(n.effect for n in found.not_testable)}")
-    print(found.reason)
 
 
 def run_fit(arguments: Namespace) -> int:
@@ -165,7 +178,7 @@ def _print_parameters(parameters: Mapping[str, Mapping[str, Any]]) -> None:
 def run_compare(arguments: Namespace) -> int:
     """`irj compare`."""
     joint = open_joint(arguments.joint)
-    records, warnings = open_records(arguments.records, joint)
+    records, _ = open_records(arguments.records, joint)
     basis = open_records(arguments.fit_records, joint)[0] if arguments.fit_records else records
     alike(arguments.records, records, joint)
     alike([*(arguments.fit_records or arguments.records), *arguments.records], [*basis, *records], joint, once=False)
@@ -173,7 +186,7 @@ def run_compare(arguments: Namespace) -> int:
     print(comparison)
     for place in comparison.places[:5]:
         print(f"  {place.balance} balance against {place.title}: explains {max(place.share_percent, 0):.0f} % of what is left there")
-    write_json(arguments.json, {**comparison.as_json(), "warnings": warnings})
+    write_json(arguments.json, comparison.as_json())
     return 0
 
 
@@ -181,19 +194,24 @@ def run_diagnose(arguments: Namespace) -> int:
     """`irj diagnose`."""
     distinct(training=arguments.records, other_payload=arguments.other_payload, held_out=arguments.held_out)
     joint = open_joint(arguments.joint)
-    records, warnings = _training(arguments.records, arguments.other_payload, joint)
-    held, more = open_records(arguments.held_out, joint)
+    records, _ = _training(arguments.records, arguments.other_payload, joint)
+    held, _ = open_records(arguments.held_out, joint)
     alike([*arguments.records, *arguments.other_payload, *arguments.held_out], [*records, *held], joint)
-    found = diagnose(fit(joint, records), held)
-    for text in found.warnings:
-        print(f"irj: {text}", file=sys.stderr)
+    found = diagnose(fit(joint, records), held, progress=progress_bar)
+    progress_bar("done", 1.0)
+    _print_warnings(found.warnings, [*records, *held])
+    if found.data.note:
+        print(f"note: {found.data.note}")
     print(found)
+    print_places(found.unexplained)
     for item in found.ranking.not_testable:
         print(f"not testable: {item.effect}: {item.why}")
+    for key in arguments.why:
+        print(found.why(key))
     if arguments.output and found.claims:
         write_text(arguments.output, toml_text(replace(joint, effects=(*joint.effects, found.claims[0].label))))
         print(f"joint file with {found.claims[0].label}: {arguments.output}")
     elif arguments.output:
-        print(f"nothing significant is missing: {arguments.output} is not written")
-    write_json(arguments.json, {**found.as_json(), "warnings": [*found.warnings, *warnings, *more]})
+        print(f"nothing is named: {arguments.output} is not written")
+    write_json(arguments.json, found.as_json())
     return 0

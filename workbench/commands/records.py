@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from identification.check import Finding, check, repair
+from identification.dataset import load_dataset, prepared_model
 from identification.errors import InputError
+from identification.gate import inspected, passed
 from identification.joint_file import Joint
 from identification.read import read
 from identification.record import Record
@@ -19,7 +21,22 @@ from workbench.commands.virtual import write_table
 
 def run_check(arguments: Namespace) -> int:
     """`irj check`: 1 where a record would be refused."""
-    return checked(arguments, open_joint(arguments.joint) if arguments.joint else None)
+    if not arguments.joint:
+        return checked(arguments, None)
+    joint = open_joint(arguments.joint)
+    return checked(arguments, joint, lambda record: _unfit(record, joint))
+
+
+def _unfit(record: Record, joint: Joint) -> list[Finding]:
+    """Why a verb would refuse a record that passes the gate: channels that the model needs, too few samples."""
+    if any(f.severity == "refuse" for f in inspected(record, joint)):
+        return []
+    whole = passed(record, joint)[0]
+    try:
+        load_dataset([whole], [], joint, prepared_model(joint, whole))
+    except InputError as error:
+        return [Finding("refuse", "unfit", str(error))]
+    return []
 
 
 def run_resample(arguments: Namespace) -> int:
@@ -64,8 +81,7 @@ def checked(arguments: Namespace, joint: Joint | None, more: Callable[[Record], 
     out = {}
     for path in arguments.records:
         record = read(path, columns=joint.columns if joint else None, kind=joint.kind if joint else None)
-        gate = check(record, joint.gear_ratio, torque_per_current=joint.torque_per_current) if joint else check(record)
-        findings = [*gate, *more(record)]
+        findings = [*inspected(record, joint), *more(record)]
         print(f"{path}: {len(record)} samples, {record.duration:.3g} s, channels {', '.join(record.channels)}")
         for finding in findings:
             print(f"  {finding.severity}: {finding.message}")

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from identification.check import Finding
 from identification.errors import InputError
+from identification.gate import gate_warnings
 from identification.record import Record
 from irj_fmu.command_line import OneLineParser, check_output, keep_inputs
 from workbench.commands.files import distinct, open_records, progress_bar, write_json, write_text
@@ -142,13 +143,15 @@ def run_compare(arguments: Namespace) -> int:
 def run_diagnose(arguments: Namespace) -> int:
     """`irj diagnose REC --joint J` with an FMU as the model."""
     distinct(training=arguments.records, held_out=arguments.held_out)
-    model, records, warnings = _open(arguments)
-    held, more = _records(arguments.held_out, model)
+    model, records, _ = _open(arguments)
+    held, _ = _records(arguments.held_out, model)
     if model.parameters:
         model = model.fit(records, progress=progress_bar).model
     found = model.diagnose(records, held, progress=progress_bar)
+    said = gate_warnings([*records, *held])
     for text in found.diagnosis.warnings:
-        print(f"irj: {text}", file=sys.stderr)
+        if text not in said:
+            print(f"irj: {text}", file=sys.stderr)
     if found.data.note:
         print(f"note: {found.data.note}")
     balance = found.error.balances["axis"]
@@ -158,7 +161,9 @@ def run_diagnose(arguments: Namespace) -> int:
         print(f"not testable: {item.effect}: {item.why}")
     if found.claims:
         _offer(found, arguments)
-    write_json(arguments.json, {**found.as_json(), "warnings": [*found.diagnosis.warnings, *warnings, *more]})
+    for key in arguments.why:
+        print(found.diagnosis.why(key))
+    write_json(arguments.json, found.as_json())
     return 0
 
 

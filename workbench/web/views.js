@@ -117,11 +117,13 @@ const views = {
     const claim = d.claim;
     return [
       h("div", { class: "row between head" }, h("div", {}, heading("What is missing?")), again),
-      claim ? h("div", { class: "card" }, h("p", { class: "figure", id: "claim" }, claim.effects.map(effectTitle).join(" or ")), h("p", {}, claim.effects.length > 1 ? `These records cannot tell the ${claim.effects.length} apart.${claim.separate_by ? ` ${claim.separate_by} would.` : ""}` : `The ${claim.balance} balance says so: with it the held-out residual there falls by ${digits(claim.held_out_drop_percent, 2)} %.`))
-        : h("div", { class: "card" }, h("p", { class: "figure", id: "claim" }, "Nothing that these records show"), h("p", {}, "No effect of the library helps enough on held-out data to be told from chance.")),
+      h("div", { class: "card" }, h("p", { class: "figure", id: "claim" }, claim ? claim.effects.map(effectTitle).join(" or ") : sentence(d.headline || "Nothing is named")),
+        claim ? h("p", {}, claim.effects.length > 1 ? `These records cannot tell the ${claim.effects.length} apart.${claim.separate_by ? ` ${claim.separate_by} would.` : ""}` : `The ${claim.balance} balance says so: with it the held-out residual there falls by ${digits(claim.held_out_drop_percent, 2)} %.`) : null,
+        h("p", { id: "reason" }, sentence(d.reason || ""))),
       d.warnings.map((w) => h("p", { class: "note small" }, sentence(w))),
       clear.length ? h("div", { class: "card" }, h("h2", {}, "Ranked effects"), h("p", { class: "soft small" }, "The bar is the fall of the residual on held-out records if the effect is added to the model as it stands. Falls do not add up: add one, then diagnose again."), h("ol", { class: "ranked" }, clear.map(row))) : null,
       faint.length ? h("details", { class: "card" }, h("summary", {}, `Not to be told from chance, or too small (${faint.length})`), h("ol", { class: "ranked" }, faint.map((r, k) => row(r, k + clear.length)))) : null,
+      d.refused && d.refused.length ? h("details", { class: "card", id: "refused" }, h("summary", {}, `Why not another? (${d.refused.length})`), h("ul", {}, d.refused.map((r) => h("li", {}, h("strong", {}, effectTitle(r.effect)), r.why.startsWith("with ") ? `: ${r.why}.` : `: it ${r.why}.`)))) : null,
       d.not_testable.length ? h("details", { class: "card" }, h("summary", {}, `Not testable with these records (${d.not_testable.length})`), h("ul", {}, d.not_testable.map((n) => h("li", {}, h("strong", {}, n.title), `: ${n.why}.`)))) : null,
     ];
   },
