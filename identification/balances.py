@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from casadi_models import JointModel, Signals
+from casadi_models.affine import AffineParts
 from casadi_models.vectorised import Vectorised
 from identification._memory_kept import states_of
 from identification.sensing import Sensing
@@ -89,22 +90,15 @@ class _Part:
             stacked += [ca.SX(1, 1) if columns_only else r, *(ca.vertsplit(ca.jacobian(r, parameters)[:, columns].T) if columns else [])]
         out: Any = ca.vertcat(*stacked)
         self._width = 1 + len(columns)
-        slopes = ca.jacobian(out, signals)
-        sparsity = ca.jacobian_sparsity(ca.vec(ca.densify(slopes)), ca.vertcat(signals, e.memory))
-        varying = np.zeros(slopes.shape[0] * slopes.shape[1], dtype=bool)
-        varying[list(set(sparsity.get_triplet()[0]))] = True
-        linear = ~varying.reshape(slopes.shape[1], slopes.shape[0]).T
-        present = np.zeros(slopes.shape, dtype=bool)
-        rows, cols = slopes.sparsity().get_triplet()
-        present[rows, cols] = True
-        linear &= present
-        keep = ca.DM(linear.astype(float))
-        self._linear = ca.Function("linear", [parameters], [ca.densify(slopes * keep)])
+        parts = AffineParts(signals, e.memory)
+        slopes = ca.SX(out.shape[0], len(_NAMES))
         zeroed: list[Expression] = []
-        substitute: Any = ca.substitute
         for i in range(out.shape[0]):
-            names: list[Any] = [signals[j] for j in range(len(_NAMES)) if linear[i, j]]
-            zeroed.append(substitute([out[i]], names, [ca.SX(0)] * len(names))[0] if names else out[i])
+            line, left = parts.split(out[i])
+            zeroed.append(left)
+            for j, slope in line.items():
+                slopes[i, j] = slope
+        self._linear = ca.Function("linear", [parameters], [ca.densify(slopes)])
         self.needed = [i for i, part in enumerate(zeroed) if not part.is_zero()]
         rest = ca.vertcat(*(zeroed[i] for i in self.needed)) if self.needed else ca.SX(0, 1)
         self._rest = Vectorised(ca.Function("rest", [signals, e.memory, parameters], [ca.densify(rest)]))

@@ -1,0 +1,129 @@
+"""The bench: every law with every set of sensors. Jacobian against differences of the rows, floor against noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from casadi_models import EFFECTS, JointModel
+from identification.balances import balances_of
+from identification.engine import memory_shapes_of
+from identification.errors import InputError
+from identification.record import Record
+from identification.sensing import Sensing, adapt, sense, signals_of
+from identification.joint_file import Joint
+from identification.stacked import stack
+from identification.weak import WeakRecord, prepare
+
+FloatArray = npt.NDArray[np.float64]
+
+RATIO: Final = 100.0
+STIFFNESS: Final = 2.0e4
+SETS: Final = {
+    "all": ("motor_torque", "motor_position", "link_position", "link_torque"),
+    "both encoders": ("motor_torque", "motor_position", "link_position"),
+    "motor side": ("motor_torque", "motor_position"),
+    "torque against twist": ("motor_position", "link_torque"),
+    "link side": ("link_position", "link_torque"),
+}
+NOISE: Final = {"motor_torque": 2e-3, "motor_position": 2e-4, "link_position": 2e-6, "link_torque": 0.05}
+"""White noise of the channels, in their own units."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A law on one set of sensors with records at generic operating points."""
+
+    model: JointModel
+    sensing: Sensing
+    joint: Joint
+    record: Record
+    values: dict[str, float]
+
+
+def motion(sensors: tuple[str, ...], seconds: float = 8.0) -> Record:
+    """Smooth motion over every operating point that a law may know; no dynamics are needed for a derivative."""
+    t = np.arange(round(seconds * 500)) * 2e-3
+    link = 0.7 * np.sin(1.1 * t) + 0.25 * np.sin(2.9 * t + 0.4) + 0.06 * np.sin(8.3 * t + 1.0)
+    torque = 40 * np.sin(1.7 * t + 0.3) + 15 * np.sin(5.3 * t)
+    twist = torque / STIFFNESS
+    motor = twist if sensors == SETS["torque against twist"] else RATIO * (link + twist)
+    drive = (torque + 30 * np.sin(1.1 * t + 0.2) + 8 * np.tanh(np.gradient(link, t) / 0.01)) / RATIO
+    whole = {"motor_torque": drive, "motor_position": motor, "link_position": link, "link_torque": torque}
+    return Record.from_channels(t, {c: whole[c] for c in sensors}, name="bench")
+
+
+def case_of(key: str, place: str, sensors: str) -> Case | None:
+    """The law in that place beside friction and, where they are seen, stiffness and gravity; None where the sensors do not show it."""
+    channels = SETS[sensors]
+    elastic = {"motor_position", "link_position"} <= set(channels) or sensors == "torque against twist"
+    model = JointModel(gear_ratio=1.0 if sensors == "torque against twist" else RATIO)
+    labels = ["viscous", "coulomb", *([] if sensors == "torque against twist" else ["gravity"])]
+    labels += ["transmission_compliance", "structural_damping"] if elastic else []
+    for label in (*labels, *EFFECTS[key].needs):
+        model = model if model.has(label) else model.add(label)
+    if not model.has(key, place):
+        model = model.add(f"{key}@{place}")
+    record = motion(channels)
+    try:
+        sensing = sense(record, model)
+    except InputError:
+        return None
+    model = adapt(model, sensing)
+    if not model.has(key, place):
+        return None
+    joint = Joint(name="bench", gear_ratio=model.gear_ratio)
+    return Case(model, sensing, joint, record, generic(model))
+
+
+def generic(model: JointModel) -> dict[str, float]:
+    """Values inside the bounds at which every law acts; twists of the size of the record's."""
+    out = {}
+    for k, p in enumerate(model.parameters):
+        if p.name.endswith("_smoothing_velocity"):
+            out[p.name] = 0.02
+        elif p.is_shape:
+            size = {"torsion": 1.5e-3, "velocity": 0.8, "position": 0.7, "duration": 8.0, "absolute": 1.0}[p.scale]
+            out[p.name] = p.grid[len(p.grid) // 2] * size
+        else:
+            unit = {"N.m/rad": STIFFNESS, "N.m": 3.0, "N.m/rad3": 1e9, "rad": 1e-4, "s": 1e-3, "1": 0.05}.get(p.unit, 0.7)
+            out[p.name] = unit * (1 + 0.07 * k)
+    if "stiffness" in out:
+        out["stiffness"] = STIFFNESS
+    return {p.name: min(max(out[p.name], p.low), p.high) for p in model.parameters}
+
+
+def prepared(case: Case, record: Record | None = None) -> WeakRecord:
+    """Rows of the record, or of another one with the same stamps, at one kernel."""
+    record = record or case.record
+    return prepare(record.time, signals_of(record, case.joint, case.sensing), tuple(record.segments()), length=0.06, pointwise=0.03)
+
+
+LAWS: Final = [(e.key, place) for e in EFFECTS.values() for place in e.acts_on]
+
+
+@pytest.mark.parametrize("sensors", SETS)
+@pytest.mark.parametrize(("key", "place"), LAWS, ids=lambda x: str(x))
+def test_jacobian_is_the_derivative_of_the_rows(key: str, place: str, sensors: str) -> None:
+    case = case_of(key, place, sensors)
+    if case is None:
+        return
+    data = prepared(case)
+    through_memory = set(memory_shapes_of(case.model, case.model.parameter_names))
+    term = next(t for t in case.model.terms if t.effect.key == key and t.place == place)
+    names = [n for n in (*term.names, "stiffness", "motor_coulomb") if n in case.model.parameter_names and n not in through_memory]
+    balances = balances_of(case.model, case.sensing)
+    bare = balances_of(case.model, case.sensing, wrt=())
+    jacobian = stack(balances, [data], case.values).jacobian
+    for name in names:
+        step = 1e-4 * (abs(case.values[name]) or 1.0)
+        sides = [stack(bare, [data], {**case.values, name: case.values[name] + s * step}).residual for s in (1, -1)]
+        for balance in balances.balances:
+            expected = (sides[0][balance] - sides[1][balance]) / (2 * step)
+            found = jacobian[balance][:, balances.wrt.index(name)]
+            scale = float(np.linalg.norm(expected))
+            assert np.linalg.norm(found - expected) <= 2e-3 * scale + 1e-9, (name, balance)
