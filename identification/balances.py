@@ -23,9 +23,6 @@ Expression = Any
 
 _NAMES: Final = Signals.names()
 
-_DIRECT: Final = ("motor_position", "link_position", "torque")
-"""Signals whose noise enters nonlinear laws directly."""
-
 UNROLLED: Final = 200
 """Steps of a memory law in one compiled stretch."""
 
@@ -100,6 +97,7 @@ class _Part:
                 slopes[i, j] = slope
         self._linear = ca.Function("linear", [parameters], [ca.densify(slopes)])
         self.needed = [i for i, part in enumerate(zeroed) if not part.is_zero()]
+        self._bent = {i: [n for n, d in zip(_NAMES, ca.which_depends(zeroed[i], signals), strict=True) if d] for i in self.needed}
         rest = ca.vertcat(*(zeroed[i] for i in self.needed)) if self.needed else ca.SX(0, 1)
         self._rest = Vectorised(ca.Function("rest", [signals, e.memory, parameters], [ca.densify(rest)]))
         self.remembers = bool(e.memory_terms) and ca.jacobian_sparsity(rest, e.memory).nnz() > 0
@@ -129,6 +127,10 @@ class _Part:
             b: {n: float(linear[i * self._width, j]) for j, n in enumerate(_NAMES) if linear[i * self._width, j]} for i, b in enumerate(balances)
         }  # fmt: skip
 
+    def bent(self, number: int) -> frozenset[str]:
+        """Signals that enter a balance, by its number, in another way than on a straight line."""
+        return frozenset(self._bent.get(number * self._width, ()))
+
 
 @final
 class Balances:
@@ -150,25 +152,13 @@ class Balances:
         self.sensing = sensing
         self.names: tuple[str, ...] = model.parameter_names
         self.wrt: tuple[str, ...] = tuple(wrt) if wrt is not None else self.names
-        e = model.equations
-        signals: Any = e.signals.vector()
-        parameters = e.parameters
         expressions = residual_expressions(model, sensing)
         columns = [self.names.index(n) for n in self.wrt]
         self.balances = tuple(expressions)
         curved = curved_expressions(model, sensing)
         self._plain = _Part(model, expressions, columns, columns_only=columns_only)
         self._curved = _Part(model, curved, columns, columns_only=columns_only) if curved else None
-        own = [expressions[b] for b in self.balances]
-        sources = ca.vertcat(*(signals[_NAMES.index(n)] for n in _DIRECT))
-        self._slopes = ca.Function("slopes", [signals, e.memory, parameters], [ca.densify(ca.jacobian(ca.vertcat(*own), sources))])
         self._memory = Memory(model) if self._plain.remembers else None
-
-    def curved_coefficients(self, values: Mapping[str, float]) -> dict[str, dict[str, float]]:
-        """How strongly the second derivative of each averaged signal enters each residual."""
-        if self._curved is None:
-            return {}
-        return self._curved.slopes(self.balances, [float(values[n]) for n in self.names])
 
     def memory_values(self, data: WeakRecord, values: Mapping[str, float]) -> FloatArray:
         """Internal states of displacement-memory effects at the points, (states, points); not to be written to."""
@@ -180,10 +170,15 @@ class Balances:
         law = (self.model.structure, tuple(p[memory.depends].tolist()))
         return states_of(data, law, lambda: memory.along(data, p))
 
-    def evaluate(self, data: WeakRecord, values: Mapping[str, float]) -> dict[str, tuple[FloatArray, FloatArray]]:
-        """Residual (rows,) and Jacobian (rows, wrt) of every balance at the given parameter values."""
+    def evaluate(
+        self, data: WeakRecord, values: Mapping[str, float], remembered: WeakRecord | None = None
+    ) -> dict[str, tuple[FloatArray, FloatArray]]:
+        """Residual (rows,) and Jacobian (rows, wrt) of every balance at the given parameter values.
+
+        `remembered` is a record with the same smoothed positions, whose internal states may be known already.
+        """
         p = [float(values[n]) for n in self.names]
-        memory = self.memory_values(data, values)
+        memory = self.memory_values(remembered or data, values)
         full = self._plain.rows(data.averaged, data.average, data, memory, p)
         if self._curved is not None:
             full += self._curved.rows(data.curved, data.curve, data, memory, p)
@@ -192,23 +187,10 @@ class Balances:
             b: (full[:, i * width], full[:, i * width + 1 : (i + 1) * width]) for i, b in enumerate(self.balances)
         }  # fmt: skip
 
-    def coefficients(self, values: Mapping[str, float], data: WeakRecord) -> dict[str, dict[str, float]]:
-        """How strongly each averaged signal enters each residual (for the noise floor); RMS over the record where it varies."""
+    def entering(self, values: Mapping[str, float]) -> dict[str, frozenset[str]]:
+        """By balance, the signals that its residual depends on at the given parameter values."""
         p = [float(values[n]) for n in self.names]
-        out = self._plain.slopes(self.balances, p)
-        if self._plain.needed:
-            count = min(len(data.points["motor_position"]), 2000)
-            pick = np.linspace(0, len(data.points["motor_position"]) - 1, count).astype(np.int64)
-            matrix = np.array([data.points[n][pick] if n in data.points else np.zeros(count) for n in _NAMES])
-            memory = np.zeros((self.model.equations.memory.shape[0], count))
-            flat = np.array(self._slopes.map(count)(matrix, memory, np.tile(np.array(p)[:, None], count)))
-            cube = flat.reshape(len(self.balances), count, len(_DIRECT))
-            for i, b in enumerate(self.balances):
-                for k, n in enumerate(_DIRECT):
-                    size = float(np.sqrt(np.mean(cube[i, :, k] ** 2)))
-                    if n not in out[b] and size > 0:
-                        out[b][n] = size * (np.sign(float(np.mean(cube[i, :, k]))) or 1.0)
-        return out
+        return {b: frozenset(self._plain.slopes(self.balances, p)[b]) | self._plain.bent(i) for i, b in enumerate(self.balances)}
 
 
 _KEPT: Final = 96

@@ -13,7 +13,8 @@ import numpy.typing as npt
 from casadi_models import JointModel
 from identification.balances import Balances, balances_of
 from identification.dataset import Dataset
-from identification.weak import POSITION_CHAINS, Grid, WeakRecord, differentiated_kernel
+from identification.drawn_noise import draws_of
+from identification.weak import Grid, WeakRecord
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -22,6 +23,15 @@ TURN_KERNEL: Final = 0.02
 """Longest kernel of the velocity that still follows a turn with sticking friction [s]."""
 TURN_SHARE: Final = 0.25
 """Share of what a kernel is longer than that by which the instant of a turn may be wrong, either way."""
+
+NORMAL_MEDIAN: Final = 0.6745
+"""Median of the absolute value of a normal variable of unit deviation."""
+INDEPENDENT_SHARE: Final = 0.4
+"""Share of the rows that count as independent: four rows to a kernel length."""
+SURE_ERRORS: Final = 3.0
+"""Standard errors by which a residual must lie under the noise level before that level counts as too high."""
+LEAST_MARGIN: Final = 0.5
+"""Share of a noise level that a residual may fall to by chance, however few its rows."""
 
 
 @final
@@ -64,40 +74,59 @@ def floors(model: JointModel, data: Dataset, values: Mapping[str, float]) -> dic
 
 
 def floor_rows(model: JointModel, data: Dataset, values: Mapping[str, float], records: Sequence[WeakRecord]) -> dict[str, FloatArray]:
-    """Standard deviation that measurement noise alone gives each row of the balances: that of a record hangs on its sample time."""
-    known: dict[tuple[float, float], dict[str, float]] = {}
-    keys = [(w.grid.length, float(f"{w.grid.dt:.9g}")) for w in records]
-    for key, w in zip(keys, records, strict=True):
-        if key not in known:
-            known[key] = _floors_of(model, data, values, w.grid)
+    """Standard deviation that measurement noise alone gives each row of the balances, record by record.
+
+    Residual of the smoothed signals with drawn noise less that without it, at the given values: every channel counts
+    through every law that it enters. Rows in which friction may act either way count less: their scatter has a weight of its own.
+    A level above what the training records leave is a contradiction (the noise of a channel reads too much): it is lowered to that.
+    """
+    known = {id(w): _drawn_floors(model, data, values, w) for w in (*data.train, *records)}
+    kept = _share_that_fits(model, data, values, [known[id(w)] for w in data.train])
     return {
-        b: np.concatenate([np.full(w.rows, known[key][b]) for key, w in zip(keys, records, strict=True)]) for b in data.sensing.balances
+        b: np.concatenate([np.full(w.rows, kept[b] * known[id(w)][b]) for w in records]) if records else np.empty(0)
+        for b in data.sensing.balances
     }  # fmt: skip
 
 
-def _floors_of(model: JointModel, data: Dataset, values: Mapping[str, float], grid: Grid) -> dict[str, float]:
+def _drawn_floors(model: JointModel, data: Dataset, values: Mapping[str, float], record: WeakRecord) -> dict[str, float]:
+    """RMS of what drawn noise changes in each balance of one record."""
     balances = balances_of(model, data.sensing, wrt=())
-    out = {}
-    curved = balances.curved_coefficients(values)
-    for balance, entering in balances.coefficients(values, data.train[0]).items():
-        bent = curved.get(balance, {})
-        variance = 0.0
-        for source, chain in POSITION_CHAINS.items():
-            if source not in data.noise:
-                continue
-            weights: list[FloatArray] = [
-                entering[n] * differentiated_kernel(grid.length, grid.dt, o) for o, n in enumerate(chain) if n in entering
-            ]  # fmt: skip
-            weights += [bent[n] * differentiated_kernel(grid.length, grid.dt, o + 2) for o, n in enumerate(chain) if n in bent]
-            if not weights:
-                continue
-            size = max(len(w) for w in weights)
-            combined = np.zeros(size)
-            for w in weights:
-                pad = (size - len(w)) // 2
-                combined[pad : size - pad] += w
-            variance += data.noise[source] ** 2 * float(np.sum(combined**2))
-        out[balance] = math.sqrt(variance)
+    power = dict.fromkeys(balances.balances, 0.0)
+    either = _either_way(model, data, values, [record])
+    drawn = draws_of(record, data.noise)
+    for draw in drawn:
+        calm = balances.evaluate(draw.calm, values, remembered=record)
+        noisy = balances.evaluate(draw.noisy, values)
+        for b in power:
+            power[b] += _sure_rms(noisy[b][0] - calm[b][0], either[b]) ** 2
+    return {b: math.sqrt(p / len(drawn)) for b, p in power.items()}
+
+
+def _sure_rms(change: FloatArray, either: FloatArray) -> float:
+    """RMS in which rows that may go either way count by how sure they are beside the typical row."""
+    if not len(change):
+        return 0.0
+    typical = float(np.median(np.abs(change))) / NORMAL_MEDIAN
+    if typical <= 0 or not np.any(either):
+        return rms(change)
+    weight = 1 / np.hypot(typical, either)
+    return rms(change * weight) / rms(weight)
+
+
+def _share_that_fits(
+    model: JointModel, data: Dataset, values: Mapping[str, float], levels: Sequence[Mapping[str, float]]
+) -> dict[str, float]:
+    """Share of the levels of noise of the training records that what these records leave allows, 1 where there is no contradiction."""
+    residual = stack(balances_of(model, data.sensing, wrt=()), data.train, values).residual
+    either = _either_way(model, data, values, data.train)
+    out = dict.fromkeys(residual, 1.0)
+    for b, r in residual.items():
+        rows = taking_part(b, data.train)
+        level = np.concatenate([np.full(w.rows, found[b]) for w, found in zip(data.train, levels, strict=True)])
+        if rows.any() and level[rows].min() > 0:
+            spread = SURE_ERRORS / math.sqrt(2 * INDEPENDENT_SHARE * float(rows.sum()))
+            left = _sure_rms(r[rows] / level[rows], either[b][rows] / level[rows])
+            out[b] = min(1.0, left / max(1 - spread, LEAST_MARGIN))
     return out
 
 

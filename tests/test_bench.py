@@ -15,12 +15,13 @@ import pytest
 from casadi_models import EFFECTS, JointModel
 from identification import fit, load_joint, read
 from identification.balances import balances_of
+from identification.dataset import Dataset
 from identification.engine import memory_shapes_of
 from identification.errors import InputError
 from identification.joint_file import Joint
 from identification.record import Record
 from identification.sensing import Sensing, adapt, sense, signals_of
-from identification.stacked import stack
+from identification.stacked import floors, rms, stack
 from identification.weak import WeakRecord, prepare
 from tests.hidden_effect.generator import generate_case
 
@@ -35,8 +36,8 @@ SETS: Final = {
     "torque against twist": ("motor_position", "link_torque"),
     "link side": ("link_position", "link_torque"),
 }
-NOISE: Final = {"motor_torque": 2e-3, "motor_position": 2e-4, "link_position": 2e-6, "link_torque": 0.05}
-"""White noise of the channels, in their own units."""
+NOISE: Final = {"motor_torque": 0.2, "motor_position": 2e-6, "link_position": 2e-6, "link_torque": 0.05}
+"""White noise of the channels, link-referred [N.m, rad]."""
 
 
 @dataclass(frozen=True)
@@ -132,6 +133,61 @@ def test_jacobian_is_the_derivative_of_the_rows(key: str, place: str, sensors: s
             found = jacobian[balance][:, balances.wrt.index(name)]
             scale = float(np.linalg.norm(expected))
             assert np.linalg.norm(found - expected) <= 2e-3 * scale + 1e-9, (name, balance)
+
+
+def dataset(case: Case, record: Record) -> Dataset:
+    """A training record of the case, with the true levels of noise."""
+    position = NOISE["link_position"]
+    noise = {"drive": NOISE["motor_torque"], "torque": NOISE["link_torque"], "motor_position": position, "link_position": position}
+    seen = signals_of(record, case.joint, case.sensing)
+    return Dataset(case.joint, case.sensing, (prepared(case, record),), (), {}, {c: x for c, x in noise.items() if c in seen})
+
+
+def noisy(case: Case, rng: np.random.Generator) -> Record:
+    """The record with noise on every channel."""
+    ratio = abs(case.joint.gear_ratio)
+    scale = {"motor_torque": 1 / ratio, "motor_position": ratio}
+    channels = {c: x + NOISE[c] * scale.get(c, 1.0) * rng.standard_normal(len(x)) for c, x in case.record.channels.items() if c in NOISE}
+    return Record.from_channels(case.record.time, channels, name="noisy")
+
+
+@pytest.mark.parametrize("sensors", SETS)
+@pytest.mark.parametrize(("key", "place"), [(e.key, e.acts_on[0]) for e in EFFECTS.values()], ids=lambda x: str(x))
+def test_floor_is_what_noise_leaves(key: str, place: str, sensors: str) -> None:
+    case = case_of(key, place, sensors)
+    if case is None:
+        pytest.skip("these sensors do not show the law")
+    rng = np.random.default_rng(5)
+    data = dataset(case, noisy(case, rng))
+    bare = balances_of(case.model, case.sensing, wrt=())
+    clean = stack(bare, [prepared(case)], case.values).residual
+    found = floors(case.model, data, case.values)
+    dirty = stack(bare, [prepared(case, noisy(case, rng)) for _ in range(3)], case.values).residual
+    for balance, level in found.items():
+        left = dirty[balance] - np.tile(clean[balance], 3)
+        assert level == pytest.approx(rms(left), rel=0.12), balance
+
+
+@pytest.mark.parametrize("name", ["load_compliance", "stiffness", "structural_damping", "backlash", "gravity_torque", "motor_smoothing_velocity"])
+def test_floor_moves_smoothly_with_every_parameter(name: str) -> None:
+    """From a millionth to a thousand times a parameter, and to zero: no signal drops out of the floor at any value."""
+    case = case_of("backlash", "transmission", "both encoders") if name != "load_compliance" else case_of("gravity", "link", "motor side")
+    assert case is not None
+    if name == "load_compliance":
+        case = replace(case, model=replace(case.model, lagging_load=True), values={**case.values, "load_compliance": 1e-5, "swinging_share": 0.6})
+    curved = name == "load_compliance"
+    made = prepare(case.record.time, signals_of(case.record, case.joint, case.sensing), tuple(case.record.segments()), curved=curved)
+    data = replace(dataset(case, case.record), train=(made,))
+    # the floor at values far from the record's must not be cut to the record's: what is left there is large
+    values = {**case.values, "inertia": 5.0} if curved else {**case.values, "motor_inertia": 30.0}
+    steps = np.concatenate([[0.0], np.geomspace(1e-6, 1e3, 28)])
+    found = [floors(case.model, data, {**values, name: float(case.values[name] * k)}) for k in steps]
+    for balance in found[0]:
+        levels = np.array([f[balance] for f in found])
+        assert np.all(levels > 0)
+        assert levels[1] == pytest.approx(levels[0], rel=1e-3)
+        # a step of a factor 2.15 in a parameter that enters at most by its square
+        assert np.all(np.abs(np.diff(np.log(levels))) < 2 * np.log(2.16)), balance
 
 
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="the generator's C integrator needs gcc")
