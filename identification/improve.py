@@ -108,6 +108,7 @@ class Loop:
         self.joint, self.data, self.progress = joint, data, progress
         self._train, self._held = train, held
         self.refused: set[str] = set()
+        self.refusals: dict[str, str] = {}
         self._solved: dict[tuple[object, ...], Solution] = {}
 
     def _solve(self, model: JointModel, start: Mapping[str, float]) -> Solution:
@@ -165,8 +166,11 @@ class Loop:
             solution = self._solve(best.candidate.model, {**before.solution.values, **best.values})
             after = self._step(best.key, best.candidate.label, solution)
             drop = held_drop(before.held_out, after.held_out, claim.balance)
-            if drop < 2.0 or made_worse(before.held_out, after.held_out):
+            why = f"the {claim.balance} balance falls by {drop:.2g} % after the whole fit (2 % asked)" if drop < 2.0 else ""
+            why = why or made_worse(before.held_out, after.held_out)
+            if why:
                 self.refused.add(best.candidate.label)
+                self.refusals[best.candidate.label] = why
                 continue
             told = self._instead(claim, after, claims, steps)
             if told is None:
@@ -267,6 +271,7 @@ class Loop:
             if gone and (best is None or best.score < 10):
                 current.pop(position)
                 self.refused.add(claim.label)
+                self.refusals[claim.label] = "what was claimed after it leaves nothing for it to explain"
                 return self._replay(current, steps)
             if best is not None and best.candidate.label != claim.label and (same is None or best.score > same.score + SWAP_GAIN):
                 names = confusion_set(best, ranking.everything, base)
@@ -274,6 +279,7 @@ class Loop:
                     continue
                 renewed = make_claim(best, ranking, base, names)
                 self.refused.add(claim.label)
+                self.refusals[claim.label] = f"given the other claims, {best.key} explains more in its place"
                 if len(renewed.effects) <= LARGEST_SET and all(c.label != renewed.label for c in current):
                     current[position] = renewed
                     return self._replay(current, steps)
@@ -322,7 +328,7 @@ class Loop:
             self.joint, self.data, tuple(steps), tuple(claims), minor, first, tuple(lines), tuple(where), verdict, reason, ratios,
             tuple(n for n in first.not_testable if n.effect not in {c for x in claims for c in x.effects}),
             (*hardly_a_model(steps[0]), *excitation_warnings(self.data), *self._about_temperature(claims), *without_link(solution)),
-            tuple(sorted(self.refused)),
+            tuple(sorted(self.refused)), dict(self.refusals),
         )  # fmt: skip
 
     def _about_temperature(self, claims: Sequence[Claim]) -> tuple[str, ...]:

@@ -7,9 +7,10 @@ import numpy.typing as npt
 import pytest
 
 from identification import Record, fit
-from identification.assess import assess
-from identification.engine import load_dataset, prepared_model
+from identification.assess import BalanceError, Error, assess
+from identification.engine import load_dataset, prepared_model, rms
 from identification.excitation import attenuation, excitation_warnings
+from identification.improvement import held_drop, made_worse
 from identification.noise import noise_level
 from identification.standard_errors import FEWEST_BLOCKS, block_errors
 from tests.test_other_payload import FAST, JOINT, record
@@ -91,3 +92,16 @@ def test_what_noise_takes_off_an_inertia_is_said() -> None:
         assert error is not None
         assert abs(found - 3.0) < 3 * error
         assert any("link inertia by about" in w for w in excitation_warnings(data))
+
+
+def test_an_addition_is_judged_by_what_it_leaves_and_not_by_its_floor() -> None:
+    def error(size: float, floor: float) -> Error:
+        residual = size * np.cos(np.arange(400.0))
+        weight = np.full(400, 1 / floor)
+        return Error(100 * size, 0.0, 0.0, {"motor": BalanceError(rms(residual), floor, rms(residual) / floor, "N.m", residual, weight)})
+
+    assert made_worse(error(1.0, 0.5), error(0.9, 0.01)) == ""
+    assert held_drop(error(1.0, 0.5), error(0.9, 0.01), "motor") == pytest.approx(10.0)
+    assert "motor" in made_worse(error(1.0, 0.01), error(1.3, 0.5))
+    assert made_worse(error(0.1, 1.0), error(0.1, 1.0)) == ""
+    assert made_worse(error(1.0, 0.5), error(1.05, 0.5)).startswith("the held-out error rises")
