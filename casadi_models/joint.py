@@ -21,7 +21,7 @@ from typing import Any, Final, final
 from .effect import EFFECTS
 from .equations import Equations, Symbols, build_equations, inverse_dynamics, linear_set, time_derivative
 from .parameter import Parameter
-from .term import INERTIAS, LOAD_COMPLIANCE, SWINGING_SHARE, Term, smoothing
+from .term import CALIBRATION, INERTIAS, LOAD_COMPLIANCE, SWINGING_SHARE, Term, smoothing
 
 __all__ = ["MEMORY_STEP", "Equations", "JointModel", "Term", "inverse_dynamics", "time_derivative"]
 
@@ -55,6 +55,8 @@ class JointModel:
         True for a torque-against-displacement test: the torsion is the position itself.
     lagging_load : bool
         True for a geared joint seen from the motor side: the link hangs on a compliance and its position is not recorded.
+    calibration : tuple of str
+        Calibration unknowns of the sensors (keys of :data:`casadi_models.term.CALIBRATION`): in the readings only, no physics.
     name : str
         Name in reports.
     """
@@ -68,6 +70,7 @@ class JointModel:
     load_from: str = "torque"
     clamped_link: bool = False
     lagging_load: bool = False
+    calibration: tuple[str, ...] = ()
     name: str = "joint"
 
     @staticmethod
@@ -138,7 +141,7 @@ class JointModel:
     @property
     def structure(self) -> tuple[object, ...]:
         """All that shapes the equations, without the values: equal for models that differ in values only."""
-        return (self.gear_ratio, self.terms, self.inertias, self.kind, self.virtual_work, self.load_from, self.clamped_link, self.lagging_load)
+        return (self.gear_ratio, self.terms, self.inertias, self.kind, self.virtual_work, self.load_from, self.clamped_link, self.lagging_load, self.calibration)
 
     def swinging_inertia(self, values: Mapping[str, Any]) -> Any:
         """What hangs on the compliance of a lagging load [kg.m2], from numbers or symbols."""
@@ -159,6 +162,7 @@ class JointModel:
             found[LOAD_COMPLIANCE.name] = LOAD_COMPLIANCE
             if "link_inertia" not in self.inertias:
                 found[SWINGING_SHARE.name] = SWINGING_SHARE
+        found.update({n: CALIBRATION[n].parameter for n in self.calibration})
         for term in self.terms:
             found.update({p.name: p for p in term.parameters})
         for place in ("motor", "link"):

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from casadi_models import JointModel
 from identification.balances import balances_of
+from identification.calibration import settled
 from identification.engine import Dataset, floor_rows, references, rms, row_weights, stack, taking_part
 from identification.weak import WeakRecord
 
@@ -83,6 +84,7 @@ class Error:
 def assess(model: JointModel, data: Dataset, records: Sequence[WeakRecord], values: Mapping[str, float]) -> Error:
     """Error of a model with the given values on prepared records."""
     balances = balances_of(model, data.sensing, wrt=())
+    values = settled(model, data.sensing, [*data.train, *records], values)
     whole = stack(balances, records, values).residual
     rows = {b: taking_part(b, records) for b in balances.balances}
     residual = {b: whole[b][rows[b]] for b in whole}

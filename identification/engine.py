@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from casadi_models import JointModel
 from identification.balances import Balances, balances_of
+from identification.calibration import bare, is_of_run, names_of_runs, start_values
 from identification.dataset import Dataset, load_dataset, prepared_model, weak_record
 from identification.errors import InputError
 from identification.excitation import attenuation
@@ -131,8 +132,12 @@ def _fitted(
     values.update({n: v for n, v in fixed.items() if v is not None})
     limits = bounds_of(model, known, data)
     shapes = {p.name for p in model.parameters if p.is_shape}
-    free = [n for n in model.parameter_names if n not in fixed and n not in held]
-    balances = balances_of(model, data.sensing, wrt=free)
+    runs = names_of_runs(model, data.train)
+    values = {**start_values(model, data.train, torque=data.sensing.has_torque), **values}
+    values.update({k: v for k, v in start.items() if k in runs})
+    free = [*(n for n in model.parameter_names if n not in fixed and n not in held and n not in model.calibration), *runs]
+    balances = balances_of(model, data.sensing, wrt=bare(free))
+    limits.update(dict.fromkeys(runs, (-math.inf, math.inf)))
     memory_shapes = memory_shapes_of(model, free)
     for n in free:
         low, high = limits[n]
@@ -141,7 +146,7 @@ def _fitted(
     tell("start values", 0.0)
     # first pass without shapes: linear amplitudes from any start
     sigma = dict.fromkeys(balances.balances, 1.0)
-    linear_only = [n for n in free if n not in shapes]
+    linear_only = [n for n in free if n not in shapes and not is_of_run(n)]
     _check_moves(balances, data, values, linear_only)
     values, _ = gauss_newton(balances, data, values, linear_only, limits, sigma, {}, 3, memory_shapes)
     values = _best_start(balances, data, values, free, limits, memory_shapes)
@@ -204,9 +209,8 @@ def memory_shapes_of(model: JointModel, free: Sequence[str]) -> tuple[str, ...]:
 
 def _jacobian(balances: Balances, data: Dataset, values: Mapping[str, float], free: Sequence[str], memory_shapes: Sequence[str]) -> Stacked:
     """Stacked residual and Jacobian with the columns of `free`."""
-    stacked = stack(balances, data.train, values)
-    columns = [balances.wrt.index(n) for n in free]
-    jacobian = {b: np.array(j[:, columns]) for b, j in stacked.jacobian.items()}
+    stacked = stack(balances, data.train, values, free)
+    jacobian = {b: np.array(j) for b, j in stacked.jacobian.items()}
     numeric = [n for n in memory_shapes if n in free]
     if numeric:
         bare = balances_of(balances.model, data.sensing, wrt=())
@@ -257,7 +261,7 @@ def gauss_newton(
     """
     now = dict(values)
     parameters = {p.name: p for p in balances.model.parameters}
-    logs = np.array([parameters[n].is_shape and parameters[n].scale != "absolute" for n in free])
+    logs = np.array([n in parameters and parameters[n].is_shape and parameters[n].scale != "absolute" for n in free])
     bare = balances_of(balances.model, data.sensing, wrt=())
 
     def scaled(residual: Mapping[str, FloatArray]) -> FloatArray:
@@ -360,15 +364,19 @@ def _with_errors(
         spread = np.sqrt(np.maximum(np.diag(inverse), 1e-300))
         corr = inverse / np.outer(spread, spread)
         np.fill_diagonal(corr, 0.0)
+        corr[:, [is_of_run(free[i]) for i in index.tolist()]] = 0.0
         for k, i in enumerate(index.tolist()):
             stderr[free[i]] = None if size is None else float(size[k])
             other = int(np.argmax(np.abs(corr[k])))
             correlation[free[i]] = (free[int(index[other])], float(corr[k, other]))
             weak = size is not None and values[free[i]] != 0 and size[k] > abs(values[free[i]])
-            if (spread[k] > 1e4 or weak) and not free[i].endswith("_smoothing_velocity"):
+            if (spread[k] > 1e4 or weak) and not free[i].endswith("_smoothing_velocity") and not is_of_run(free[i]):
                 unidentified.append(free[i])
     kept = dict(values)
+    for n in model.calibration:
+        kept[n] = float(np.mean([kept[k] for k in free if is_of_run(k) and k.startswith(f"{n}[")]))
+    own = {n: x for n, x in kept.items() if not is_of_run(n)}
     return Solution(
-        replace(model, values=kept), kept, stderr, tuple(free), weights, sigma, tuple(at_bound), tuple(unidentified),
+        replace(model, values=own), kept, stderr, tuple(n for n in free if not is_of_run(n)), weights, sigma, tuple(at_bound), tuple(unidentified),
         correlation, used,
     )  # fmt: skip

@@ -29,7 +29,7 @@ def parameter_table(solution: Solution, data: Dataset) -> dict[str, dict[str, An
     """
     out: dict[str, dict[str, Any]] = {}
     for p in solution.model.parameters:
-        if p.name == HOLD_NAME:
+        if p.name == HOLD_NAME or p.name in solution.model.calibration:
             continue
         nuisance = p.name.endswith("_smoothing_velocity")
         partner = solution.correlation.get(p.name)

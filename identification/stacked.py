@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from casadi_models import JointModel
 from identification.balances import Balances, balances_of
+from identification.calibration import bare, of_run, settled, values_on
 from identification.dataset import Dataset
 from identification.drawn_noise import draws_of
 from identification.weak import Grid, WeakRecord
@@ -50,9 +51,19 @@ class Stacked:
         return {b: np.where(self.taking[b], r, np.nan) for b, r in self.residual.items()}
 
 
-def stack(balances: Balances, records: Sequence[WeakRecord], values: Mapping[str, float]) -> Stacked:
-    """Evaluate the balances on records one after the other; rows that take no part are zero."""
-    parts = [balances.evaluate(w, values) for w in records]
+def stack(balances: Balances, records: Sequence[WeakRecord], values: Mapping[str, float], names: Sequence[str] | None = None) -> Stacked:
+    """Evaluate the balances on records one after the other; rows that take no part are zero.
+
+    `names` are the columns of the Jacobian, by default those of the balances; a calibration unknown of one run has zero in the
+    rows of all others. A record without calibration values gets its own, fitted on itself.
+    """
+    model = balances.model
+    values = settled(model, balances.sensing, records, values)
+    wanted = balances.wrt if names is None else tuple(names)
+    parts = []
+    for w in records:
+        found = balances.evaluate(w, values_on(model, w, values))
+        parts.append(found if names is None else {b: (r, _columns(balances, w, j, wanted)) for b, (r, j) in found.items()})
     share = [{b: 0.0 if b in w.masked else 1.0 for b in balances.balances} for w in records]
     return Stacked(
         {b: np.concatenate([p[b][0] * s[b] for p, s in zip(parts, share, strict=True)]) for b in balances.balances},
@@ -60,6 +71,16 @@ def stack(balances: Balances, records: Sequence[WeakRecord], values: Mapping[str
         np.concatenate([w.block for w in records]),
         {b: taking_part(b, records) for b in balances.balances},
     )
+
+
+def _columns(balances: Balances, record: WeakRecord, jacobian: FloatArray, names: Sequence[str]) -> FloatArray:
+    """Columns of the names, those of other runs zero."""
+    out = np.zeros((len(jacobian), len(names)))
+    for k, n in enumerate(names):
+        (common,) = bare([n])
+        if n in (common, of_run(common, record)):
+            out[:, k] = jacobian[:, balances.wrt.index(common)]
+    return out
 
 
 def taking_part(balance: str, records: Sequence[WeakRecord]) -> npt.NDArray[np.bool_]:
@@ -80,6 +101,7 @@ def floor_rows(model: JointModel, data: Dataset, values: Mapping[str, float], re
     through every law that it enters. Rows in which friction may act either way count less: their scatter has a weight of its own.
     A level above what the training records leave is a contradiction (the noise of a channel reads too much): it is lowered to that.
     """
+    values = settled(model, data.sensing, [*data.train, *records], values)
     known = {id(w): _drawn_floors(model, data, values, w) for w in (*data.train, *records)}
     kept = _share_that_fits(model, data, values, [known[id(w)] for w in data.train])
     return {
@@ -94,6 +116,7 @@ def _drawn_floors(model: JointModel, data: Dataset, values: Mapping[str, float],
     power = dict.fromkeys(balances.balances, 0.0)
     either = _either_way(model, data, values, [record])
     drawn = draws_of(record, data.noise)
+    values = values_on(model, record, values)
     for draw in drawn:
         calm = balances.evaluate(draw.calm, values, remembered=record)
         noisy = balances.evaluate(draw.noisy, values)

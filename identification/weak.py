@@ -164,6 +164,8 @@ class WeakRecord:
         Balances that these rows do not take part in: those of a link with another payload.
     curved : mapping of str to (rows,) array
         Second derivative of the average of every signal where it was asked for.
+    name : str
+        Tells the record from all others: its calibration unknowns go by it.
     """
 
     grid: Grid
@@ -175,6 +177,7 @@ class WeakRecord:
     starts: IntArray
     masked: frozenset[str] = frozenset()
     curved: Mapping[str, FloatArray] = field(default_factory=dict)
+    name: str = ""
 
     def average(self, values: FloatArray) -> FloatArray:
         """Kernel average of values at the points, one row per row.
