@@ -110,8 +110,12 @@ class JointModel:
         return replace(self, terms=kept)
 
     def with_values(self, values: Mapping[str, float]) -> JointModel:
-        """The model with other parameter values; unknown names are an error."""
+        """The model with other parameter values; unknown names are an error.
+
+        Calibration unknowns of single records (``name[run]``, as they stand beside the parameters in a fit) are left out.
+        """
         known = {p.name for p in self.parameters}
+        values = {n: x for n, x in values.items() if n in known or n.partition("[")[0] not in self.calibration}
         for name in values:
             if name not in known:
                 raise ValueError(f"no parameter {name!r} in the model; it has {', '.join(sorted(known))}")
@@ -141,7 +145,8 @@ class JointModel:
     @property
     def structure(self) -> tuple[object, ...]:
         """All that shapes the equations, without the values: equal for models that differ in values only."""
-        return (self.gear_ratio, self.terms, self.inertias, self.kind, self.virtual_work, self.load_from, self.clamped_link, self.lagging_load, self.calibration)
+        forms = (self.virtual_work, self.load_from, self.clamped_link, self.lagging_load, self.calibration)
+        return (self.gear_ratio, self.terms, self.inertias, self.kind, *forms)
 
     def swinging_inertia(self, values: Mapping[str, Any]) -> Any:
         """What hangs on the compliance of a lagging load [kg.m2], from numbers or symbols."""

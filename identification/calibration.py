@@ -7,7 +7,7 @@ fit they stand as ``name[run]``, next to one common value for a record that is n
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final, final
 
 import numpy as np
@@ -16,15 +16,16 @@ import numpy.typing as npt
 from casadi_models import JointModel
 from casadi_models.term import CALIBRATION
 from identification.balances import Balances, balances_of
+from identification.record import Record
 from identification.sensing import Sensing
 from identification.weak import WeakRecord
 
 FloatArray = npt.NDArray[np.float64]
 
-ROUNDS: Final = 6
+ROUNDS: Final = 8
 """Gauss-Newton steps for the unknowns of one record: the balances are nearly straight lines in them."""
-SETTLED: Final = 1e-6
-"""Change of the residual, as a share of its norm, at which these steps end."""
+SETTLED: Final = 1e-4
+"""Size of a step, as a share of the residual's norm, at which these steps end: far below what one row tells."""
 
 
 @final
@@ -111,6 +112,15 @@ def start_values(model: JointModel, records: Sequence[WeakRecord], *, torque: bo
     return out
 
 
+def without_calibration(record: Record, model: JointModel, values: Mapping[str, float], run: str) -> Record:
+    """The record with what the calibration of this run, or the common one, says taken off its readings."""
+    zero = "link_encoder_zero"
+    if zero not in model.calibration:
+        return record
+    off = values.get(f"{zero}[{run}]", values[zero])
+    return replace(record, channels={**record.channels, "link_position": record["link_position"] - off})
+
+
 def settled(model: JointModel, sensing: Sensing, records: Sequence[WeakRecord], values: Mapping[str, float]) -> dict[str, float]:
     """Values with the unknowns of every record: a record that has none yet gets its own, fitted on itself at these values.
 
@@ -131,24 +141,22 @@ def settled(model: JointModel, sensing: Sensing, records: Sequence[WeakRecord], 
 
 
 def _fitted_on_itself(balances: Balances, record: WeakRecord, values: Mapping[str, float], names: Sequence[str]) -> dict[str, float]:
-    """Unknowns of one record by least squares, each balance in units of its own residual."""
+    """Unknowns of one record by least squares, each balance in units of what it leaves at that step."""
     now = {n: float(values[n]) for n in names}
-    scale: dict[str, float] = {}
-    last = np.inf
+    seen = [b for b in balances.balances if b not in record.masked]
     for _ in range(ROUNDS):
         found = balances.evaluate(record, {**values, **now})
-        seen = [b for b in balances.balances if b not in record.masked]
-        if not scale:
-            scale = {b: max(float(np.sqrt(np.mean(found[b][0] ** 2))), 1e-300) for b in seen}
+        scale = {b: max(float(np.sqrt(np.mean(found[b][0] ** 2))), 1e-300) for b in seen}
         r = np.concatenate([found[b][0] / scale[b] for b in seen])
         j = np.concatenate([found[b][1] / scale[b] for b in seen])
         norms = np.linalg.norm(j, axis=0)
-        size = float(np.linalg.norm(r))
-        if not np.any(norms) or not np.all(np.isfinite(j)) or last - size < SETTLED * size:
+        if not np.any(norms) or not np.all(np.isfinite(j)):
             break
-        step = np.linalg.lstsq(j / np.where(norms > 0, norms, 1.0), -r, rcond=1e-9)[0]
+        scaled = j / np.where(norms > 0, norms, 1.0)
+        step = np.linalg.lstsq(scaled, -r, rcond=1e-9)[0]
         now = {n: now[n] + float(s) / (norm or 1.0) for n, s, norm in zip(names, step, norms, strict=True)}
-        last = size
+        if float(np.linalg.norm(scaled @ step)) < SETTLED * float(np.linalg.norm(r)):
+            break
     return {of_run(n, record): x for n, x in now.items()}
 
 
@@ -166,5 +174,5 @@ def calibration_found(model: JointModel, records: Sequence[WeakRecord], values: 
 
 __all__ = [
     "Found", "bare", "calibration_found", "is_of_run", "names_of_runs", "of_run", "settled", "start_values", "unknowns_of",
-    "values_on",
+    "values_on", "without_calibration",
 ]  # fmt: skip

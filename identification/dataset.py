@@ -89,7 +89,7 @@ def load_dataset(
     first = 0
     for record in (*train, *held_out):
         made = weak_record(record, joint, sensing, length, first, curved=model.lagging_load)
-        made = replace(made, name=_run_name(record))
+        made = replace(made, name=run_name(record))
         if record.payload != train[0].payload:
             made = replace(made, masked=_of_the_link(record, sensing))
         first = max(first, 1 + int(made.block.max(initial=first - 1)))
@@ -110,7 +110,7 @@ def load_dataset(
     )  # fmt: skip
 
 
-def _run_name(record: Record) -> str:
+def run_name(record: Record) -> str:
     """Name of a record with a mark of its samples: another run under the same name is another run."""
     position = next(record[c] for c in ("link_position", "motor_position") if record.has(c))
     return f"{record.name}:{zlib.crc32(np.ascontiguousarray(position).tobytes()):08x}"

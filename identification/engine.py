@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from casadi_models import JointModel
 from identification.balances import Balances, balances_of
-from identification.calibration import bare, is_of_run, names_of_runs, start_values
+from identification.calibration import bare, is_of_run, names_of_runs
 from identification.dataset import Dataset, load_dataset, prepared_model, weak_record
 from identification.errors import InputError
 from identification.excitation import attenuation
@@ -133,11 +133,8 @@ def _fitted(
     limits = bounds_of(model, known, data)
     shapes = {p.name for p in model.parameters if p.is_shape}
     runs = names_of_runs(model, data.train)
-    values = {**start_values(model, data.train, torque=data.sensing.has_torque), **values}
-    values.update({k: v for k, v in start.items() if k in runs})
     free = [*(n for n in model.parameter_names if n not in fixed and n not in held and n not in model.calibration), *runs]
     balances = balances_of(model, data.sensing, wrt=bare(free))
-    limits.update(dict.fromkeys(runs, (-math.inf, math.inf)))
     memory_shapes = memory_shapes_of(model, free)
     for n in free:
         low, high = limits[n]

@@ -30,7 +30,7 @@ from identification.dataset import HOLD_DELAY, with_effect, without
 from identification.engine import Dataset, Solution, load_dataset, prepared_model, solve
 from identification.errors import InputError
 from identification.excitation import excitation_warnings, few_reversals, not_identifiable, unlike_units
-from identification.improvement import Improvement, Step, held_drop, made_worse, ranked_json, visible_keys, visible_labels
+from identification.improvement import Improvement, Step, held_drop, judged_drop, made_worse, ranked_json, visible_keys, visible_labels
 from identification.joint_file import Joint
 from identification.lines import find_lines
 from identification.locate import Unexplained, locate, spectral_peak
@@ -166,7 +166,8 @@ class Loop:
             solution = self._solve(best.candidate.model, {**before.solution.values, **best.values})
             after = self._step(best.key, best.candidate.label, solution)
             drop = held_drop(before.held_out, after.held_out, claim.balance)
-            why = f"the {claim.balance} balance falls by {drop:.2g} % after the whole fit (2 % asked)" if drop < 2.0 else ""
+            fall = judged_drop(before.held_out, after.held_out, claim.balance)
+            why = f"the {claim.balance} balance falls by {fall:.2g} % after the whole fit (2 % asked)" if fall < 2.0 else ""
             why = why or made_worse(before.held_out, after.held_out)
             if why:
                 self.refused.add(best.candidate.label)

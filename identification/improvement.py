@@ -11,6 +11,7 @@ import numpy as np
 
 from casadi_models import JointModel
 from identification.assess import BalanceError, Error
+from identification.calibration import Found, calibration_found
 from identification.candidates import NotTestable
 from identification.claims import Claim, Ranking
 from identification.dataset import HOLD_DELAY, Dataset
@@ -101,6 +102,12 @@ class Improvement:
         return tuple(s.added for s in self.steps if s.added)
 
     @property
+    def calibration(self) -> tuple[Found, ...]:
+        """What the sensors of the training records are off by, on the final model: no physics, and never claimed."""
+        last = self.steps[-1].solution
+        return calibration_found(last.model, self.data.train, last.values, last.stderr)
+
+    @property
     def model(self) -> JointModel:
         """The final model with its values."""
         return self.steps[-1].solution.model
@@ -132,6 +139,7 @@ class Improvement:
             "verdict": self.verdict, "reason": self.reason,
             "unexplained": [u.as_json() for u in self.unexplained],
             "floor_ratio": {b: e.as_json() for b, e in self.final_ratios.items()},
+            "calibration": [c.as_json() for c in self.calibration],
             "refused": [{"effect": label.partition("@")[0].partition("#")[0], "why": why} for label, why in self.refusals.items()],
             "warnings": list(self.warnings), "best_candidate": best.key if best else None,
         }  # fmt: skip
@@ -185,7 +193,13 @@ def common_rms(before: Error, after: Error, balance: str) -> tuple[float, float]
     return old, new
 
 
-def held_drop(before: Error, after: Error, balance: str) -> float:
-    """Fall of a balance's RMS in percent, on one weighting."""
+def judged_drop(before: Error, after: Error, balance: str) -> float:
+    """Fall of a balance's RMS in percent, on one weighting: what an addition is judged by."""
     old, new = common_rms(before, after, balance)
     return 100 * (1 - new / old) if old > 0 else 0.0
+
+
+def held_drop(before: Error, after: Error, balance: str) -> float:
+    """Fall of a balance's RMS in percent, each as it is reported."""
+    old = before.balances[balance].rms
+    return 100 * (1 - after.balances[balance].rms / old) if old > 0 else 0.0

@@ -17,6 +17,8 @@ import numpy.typing as npt
 
 from identification._shooting import MOST_SUBSTEPS, Shooting, Windows, cut_windows, substeps_for, weighted
 from identification.assess import assess
+from identification.calibration import is_of_run, without_calibration
+from identification.dataset import run_name
 from identification.engine import row_weights
 from identification.errors import InputError
 from identification.fit import Fit
@@ -77,7 +79,7 @@ class Refinement:
     @property
     def values(self) -> Mapping[str, float]:
         """Every parameter."""
-        return self.fit.solution.values
+        return {n: x for n, x in self.fit.solution.values.items() if not is_of_run(n)}
 
     @property
     def parameters(self) -> dict[str, dict[str, Any]]:
@@ -136,7 +138,9 @@ def refine(fit: Fit, records: Record | Sequence[Record] | None = None, *, window
     _refuse(fit, given)
     model, limits = fit.model, bounds_of(fit.model, fit.joint.known, fit.data)
     free = tuple(n for n in fit.solution.free if n not in fit.solution.unidentified)
-    start = {n: float(v) for n, v in fit.solution.values.items()}
+    start = {n: float(v) for n, v in fit.solution.values.items() if not is_of_run(n)}
+    given = [without_calibration(r, model, fit.solution.values, run_name(r)) for r in given]
+    start.update(dict.fromkeys(model.calibration, 0.0))
     data = cut_windows(given, fit.joint, fit.data.sensing, window)
     start, substeps = _followable(model, start, data)
     limits = {
@@ -165,11 +169,17 @@ def refine(fit: Fit, records: Record | Sequence[Record] | None = None, *, window
     after, total = shooting.rms(state.products), before.size * data.count * data.length
     names = data.channels
     return Refinement(
-        _refined(fit, state.values, dict(zip(free, _stderr(state, shooting.states, sigma), strict=True)), limits, used),
+        _refined(fit, _with_calibration(fit, state.values), dict(zip(free, _stderr(state, shooting.states, sigma), strict=True)), limits, used),
         dict(zip(names, before.tolist(), strict=True)), dict(zip(names, after.tolist(), strict=True)),
         dict(zip(names, sigma.tolist(), strict=True)), math.sqrt(first.cost(sigma) / total), math.sqrt(state.cost(sigma) / total),
         used, data.count, data.count * data.length,
     )  # fmt: skip
+
+
+def _with_calibration(fit: Fit, values: Mapping[str, float]) -> dict[str, float]:
+    """Refined values with the calibration of the fit, which was taken off the records."""
+    kept = {n: x for n, x in fit.solution.values.items() if n in fit.model.calibration or is_of_run(n)}
+    return {**values, **kept}
 
 
 def _followable(model: Any, values: dict[str, float], data: Windows) -> tuple[dict[str, float], int]:
@@ -323,7 +333,7 @@ def _refined(fit: Fit, values: Mapping[str, float], stderr: Mapping[str, float],
     from identification.balances import Balances
 
     old = fit.solution
-    model = replace(old.model, values=dict(values))
+    model = replace(old.model, values={n: x for n, x in values.items() if not is_of_run(n)})
     weights = row_weights(Balances(model, fit.data.sensing, wrt=()), fit.data, values, old.sigma, fit.data.train)
     bound = tuple(
         n for n in old.free

@@ -10,7 +10,7 @@ from identification import Record, fit
 from identification.assess import BalanceError, Error, assess
 from identification.engine import load_dataset, prepared_model, rms
 from identification.excitation import attenuation, excitation_warnings
-from identification.improvement import held_drop, made_worse
+from identification.improvement import judged_drop, made_worse
 from identification.noise import noise_level
 from identification.standard_errors import FEWEST_BLOCKS, block_errors
 from tests.test_other_payload import FAST, JOINT, record
@@ -101,7 +101,7 @@ def test_an_addition_is_judged_by_what_it_leaves_and_not_by_its_floor() -> None:
         return Error(100 * size, 0.0, 0.0, {"motor": BalanceError(rms(residual), floor, rms(residual) / floor, "N.m", residual, weight)})
 
     assert made_worse(error(1.0, 0.5), error(0.9, 0.01)) == ""
-    assert held_drop(error(1.0, 0.5), error(0.9, 0.01), "motor") == pytest.approx(10.0)
+    assert judged_drop(error(1.0, 0.5), error(0.9, 0.01), "motor") == pytest.approx(10.0)
     assert "motor" in made_worse(error(1.0, 0.01), error(1.3, 0.5))
     assert made_worse(error(0.1, 1.0), error(0.1, 1.0)) == ""
     assert made_worse(error(1.0, 0.5), error(1.05, 0.5)).startswith("the held-out error rises")

@@ -8,6 +8,7 @@ from typing import Final
 
 from casadi_models import JointModel
 from identification.balances import balances_of
+from identification.calibration import bare, is_of_run, names_of_runs
 from identification.engine import Dataset, Solution, gauss_newton, memory_shapes_of
 from identification.start_values import bounds_of, starts
 
@@ -40,14 +41,16 @@ def first_look(model: JointModel, data: Dataset, now: Solution, start: Mapping[s
     fixed = {n for n, k in known.items() if k.value is not None}
     if now.values.get("load_compliance") == 0.0:
         fixed |= {"load_compliance", "swinging_share"}
-    free = [n for n in model.parameter_names if n not in fixed | shapes]
+    free = [n for n in model.parameter_names if n not in fixed | shapes and n not in model.calibration]
+    free += names_of_runs(model, data.train)
     for n in free:
         values[n] = min(max(values[n], limits[n][0]), limits[n][1])
-    balances = balances_of(model, data.sensing, wrt=free)
+    balances = balances_of(model, data.sensing, wrt=bare(free))
     steps = STEPS_MEMORY if model.equations.memory_terms else STEPS
     values, used = gauss_newton(balances, data, values, free, limits, now.sigma, now.weights, steps, memory_shapes_of(model, free))
     kept = {k: float(v) for k, v in values.items()}
-    return Solution(replace(model, values=kept), kept, dict.fromkeys(kept), tuple(free), now.weights, now.sigma, iterations=used)
+    own = {k: v for k, v in kept.items() if not is_of_run(k)}
+    return Solution(replace(model, values=own), kept, dict.fromkeys(kept), tuple(n for n in free if not is_of_run(n)), now.weights, now.sigma, iterations=used)
 
 
 __all__ = ["first_look"]

@@ -120,6 +120,10 @@ def _print_improvement(found: Improvement) -> None:
             where = f"{place.axis} from {place.low:.3g} to {place.high:.3g} {place.unit}"
         extra = f", order {place.order:.2f}" if place.order else (f", near {place.frequency_hz:.1f} Hz" if place.frequency_hz else "")
         print(f"unexplained: {place.balance} balance, depends on {where} ({place.share_percent:.0f} % of it){extra}")
+    for c in found.calibration:
+        if c.stderr is not None and abs(c.value) > 2 * c.stderr:
+            name = found.data.train_names[c.run]
+            print(f"calibration found: {c.what} of {c.sensor} in {name} {c.value:.4g} +- {2 * c.stderr:.2g} {c.unit} (taken off, no physics)")
     if found.not_testable:
         print(f"not testable with these records ({len(found.not_testable)}): {', '.join(n.effect for n in found.not_testable)}")
     print(found.reason)
