@@ -101,6 +101,8 @@ class Effect:
         True for sine and cosine of the position: no law of a linear axis.
     separate_by : str
         The run that separates it from what it is confused with.
+    formerly : tuple of str
+        Keys of effects of older files that are part of this one.
     candidate : bool
         False for another form of an effect of the library: used when it is named, not proposed by a
         diagnosis.
@@ -128,6 +130,7 @@ class Effect:
     periodic: bool = False
     angular: bool = False
     separate_by: str = ""
+    formerly: tuple[str, ...] = ()
     candidate: bool = True
 
     def __post_init__(self) -> None:
@@ -163,10 +166,11 @@ class Registry(Mapping[str, Effect]):
     def __init__(self) -> None:
         self._effects: dict[str, Effect] = {}
         self._loaded: dict[Path, tuple[str, ...]] = {}
+        self._former: dict[str, str] = {}
 
     def __getitem__(self, key: str) -> Effect:
         try:
-            return self._effects[key]
+            return self._effects[self._former.get(key, key)]
         except KeyError:
             near = difflib.get_close_matches(str(key), self._effects, 1)
             hint = f" (did you mean {near[0]!r}?)" if near else ""
@@ -183,6 +187,11 @@ class Registry(Mapping[str, Effect]):
         if effect.key in self._effects:
             raise ValueError(f"effect {effect.key!r} is registered already")
         self._effects[effect.key] = effect
+        self._former.update(dict.fromkeys(effect.formerly, effect.key))
+
+    def is_former(self, key: str) -> bool:
+        """True for the key of an effect that is part of another one now."""
+        return key in self._former
 
     def load(self, path: Path) -> tuple[str, ...]:
         """Run a user's Python file that declares effects; returns its keys.
@@ -230,6 +239,7 @@ def effect(
     periodic: bool = False,
     angular: bool = False,
     separate_by: str = "",
+    formerly: tuple[str, ...] = (),
     candidate: bool = True,
 ) -> Callable[[Law], Law]:
     """Declare and register the decorated law as an effect (see :class:`Effect` for the arguments)."""
@@ -240,7 +250,7 @@ def effect(
                 key=key, title=title, family=family, acts_on=acts_on, parameters=parameters, law=law, absence=absence,
                 excitation=excitation, source=source, memory=memory, rate=rate, states=states, potential=potential,
                 confused_with=confused_with, needs=needs, needs_load=needs_load, dissipative=dissipative,
-                periodic=periodic, angular=angular, separate_by=separate_by, candidate=candidate,
+                periodic=periodic, angular=angular, separate_by=separate_by, formerly=formerly, candidate=candidate,
             )
         )  # fmt: skip
         return law

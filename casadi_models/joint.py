@@ -98,8 +98,12 @@ class JointModel:
             Unknown key; place where the effect cannot act; effect that is in the model already.
         """
         new = [t for t in self._parse(label) if t not in self.terms]
+        if not new and EFFECTS.is_former(label):
+            return self
         if not new:
             raise ValueError(f"effect {label!r} is in the model already")
+        if self.has_form_of(label.partition("#")[0]):
+            raise ValueError(f"effect {label!r} is in the model already, in another form")
         return replace(self, terms=(*self.terms, *new))
 
     def drop(self, label: str) -> JointModel:
@@ -137,10 +141,21 @@ class JointModel:
         """True where the effect is in the model (in `place`, if given)."""
         return any(t.effect.key == key and place in (None, t.place) for t in self.terms)
 
+    def has_form_of(self, key: str) -> bool:
+        """True where another form of the effect, with parameters of the same names, is in the model."""
+        first = EFFECTS[key.partition("@")[0]]
+        names = {n for p in first.acts_on for n in first.parameter_names(p)}
+        return any(t.effect is not first and names & set(t.names) for t in self.terms)
+
     @property
     def is_elastic(self) -> bool:
         """True where motor and link move separately."""
         return self.has("transmission_compliance")
+
+    @property
+    def carries_load(self) -> bool:
+        """True where a term says what presses the gear's teeth without a torque sensor: a torque of the link's position."""
+        return any(t.place == "link" and t.effect.family == "torque" for t in self.terms)
 
     @property
     def structure(self) -> tuple[object, ...]:

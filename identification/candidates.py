@@ -137,8 +137,8 @@ def _why_not(effect: Effect, model: JointModel, data: Dataset) -> str:
         return "its parts (Coulomb, viscous, cubic viscous, cyclic friction) are tried one by one"
     if effect.key == "thermal_friction" and not data.sensing.has_temperature and _shortest(data) < WARM_UP:
         return f"no temperature channel that changes, and a run shorter than {WARM_UP:g} s; record the temperature over a warm-up"
-    if effect.needs_load and not data.sensing.has_torque and not model.has("gravity"):
-        return "no torque sensor and no gravity in the model: the load is not known"
+    if effect.needs_load and not data.sensing.has_torque and not model.carries_load:
+        return "no torque sensor, and no gravity or other torque of the position in the model: the load is not known"
     if effect.key == "extra_inertia" and not any(n in data.joint.known for n in ("motor_inertia", "link_inertia")):
         return "cannot be told from the inertia itself; give motor_inertia or link_inertia in [known]"
     if effect.key == "torque_sensor_compliance" and "stiffness" not in data.joint.known:
@@ -153,6 +153,8 @@ def _why_not(effect: Effect, model: JointModel, data: Dataset) -> str:
 def _placed(effect: Effect, place: Place, model: JointModel) -> list[Candidate]:
     label = f"{effect.key}@{place}" if len(effect.acts_on) > 1 else effect.key
     there = sum(t.effect.key == effect.key and t.place == place and t.label != HOLD_DELAY for t in model.terms)
+    if model.has_form_of(effect.key):
+        return []
     if there:
         if not effect.periodic:
             return []

@@ -70,10 +70,8 @@ def case_of(key: str, place: str, sensors: str) -> Case | None:
     model = JointModel(gear_ratio=1.0 if sensors == "torque against twist" else RATIO)
     labels = ["viscous", "coulomb", *([] if sensors == "torque against twist" else ["gravity"])]
     labels += ["transmission_compliance", "structural_damping"] if elastic else []
-    for label in (*labels, *EFFECTS[key].needs):
-        model = model if model.has(label) else model.add(label)
-    if not model.has(key, place):
-        model = model.add(f"{key}@{place}")
+    for label in (f"{key}@{place}", *labels, *EFFECTS[key].needs):
+        model = model if model.has(label.partition("@")[0]) and "@" not in label or model.has_form_of(label) else model.add(label)
     record = motion(channels)
     try:
         sensing = sense(record, model)

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from casadi_models import JointModel
+from casadi_models import EFFECTS, JointModel
 from casadi_models.simulate import sampled_step
 from identification.errors import InputError
 from identification.joint_file import Joint
@@ -35,7 +35,7 @@ HIDDEN: Final = {
     "ripple_order": 2.0, "stiffness_step_1": 6e3, "stiffness_step_2": 8e3, "stiffness_knot_1": 7e-4, "stiffness_knot_2": 2e-3,
     "hysteresis_torque_1": 2.0, "hysteresis_torque_2": 3.0, "hysteresis_torque_3": 3.0, "hysteresis_width": 1e-4,
     "backlash_stiffness_loss": 1.5e4, "backlash": 3e-4, "soft_windup_torque": 6.0, "soft_windup_width": 4e-4,
-    "torque_sensor_gain": 0.1, "link_position_gain": 0.002, "torque_sensor_offset": 3.0, "delay": 0.006, "gravity_cosine": 5.0, "extra_inertia": 1.0,
+    "torque_sensor_gain": 0.1, "link_position_gain": 0.002, "torque_sensor_offset": 3.0, "delay": 0.006, "extra_inertia": 1.0,
     "sensor_compliance": 1e-5, "thermal_coulomb": 0.3, "thermal_viscous": 0.0,
     "flexible_inertia": 1.5, "flexible_stiffness": 1.2e3, "load_friction_mean": 0.08, "load_friction_difference": 0.03,
     "smooth_stribeck": 300.0, "loss_constant": 12.0, "loss_viscous": 8.0, "loss_cubic": 2.0, "loss_sine": 1.0, "loss_cosine": 0.5,
@@ -55,7 +55,10 @@ def run_simulate(arguments: Namespace) -> int:
     model = joint.model()
     for key in arguments.hide:
         try:
-            model = model.add(key)
+            more = model.add(key)
+            if more is model:
+                raise ValueError(f"is a part of {EFFECTS[key].key}, which is in the model; set its parameters with --set")
+            model = more
         except (KeyError, ValueError) as error:
             raise InputError(f"--hide {key}: {error.args[0]}") from None
     try:
