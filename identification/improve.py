@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
@@ -208,7 +209,12 @@ class Loop:
             return ranking
         passed = replace(trial, held_out_drop_percent=drop)
         label = trial.candidate.label
-        renewed = tuple(passed if t.candidate.label == label else t for t in ranking.everything)
+        # what the linear form says of the others on held-out records is no more worth than what it said of this one
+        others = {t.candidate.label for t in ranking.everything if t.balance == trial.balance and t.held_out_drop_percent < 0}
+        renewed = tuple(
+            passed if t.candidate.label == label else replace(t, held_out_drop_percent=math.nan) if t.candidate.label in others else t
+            for t in ranking.everything
+        )
         return replace(ranking, everything=renewed, significant=ranking.significant | {label})
 
     def _step(self, key: str | None, label: str | None, solution: Solution) -> Step:

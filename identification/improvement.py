@@ -104,6 +104,8 @@ class Improvement:
     @property
     def calibration(self) -> tuple[Found, ...]:
         """What the sensors of the training records are off by, on the final model: no physics, and never claimed."""
+        if not self.steps:
+            return ()
         last = self.steps[-1].solution
         return calibration_found(last.model, self.data.train, last.values, last.stderr)
 

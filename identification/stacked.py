@@ -114,7 +114,7 @@ def _drawn_floors(model: JointModel, data: Dataset, values: Mapping[str, float],
     """RMS of what drawn noise changes in each balance of one record."""
     balances = balances_of(model, data.sensing, wrt=())
     power = dict.fromkeys(balances.balances, 0.0)
-    either = _either_way(model, data, values, [record])
+    either = _unsure(balances, data, values, [record])
     drawn = draws_of(record, data.noise)
     values = values_on(model, record, values)
     for draw in drawn:
@@ -141,7 +141,7 @@ def _share_that_fits(
 ) -> dict[str, float]:
     """Share of the levels of noise of the training records that what these records leave allows, 1 where there is no contradiction."""
     residual = stack(balances_of(model, data.sensing, wrt=()), data.train, values).residual
-    either = _either_way(model, data, values, data.train)
+    either = _unsure(balances_of(model, data.sensing, wrt=()), data, values, data.train)
     out = dict.fromkeys(residual, 1.0)
     for b, r in residual.items():
         rows = taking_part(b, data.train)
@@ -162,20 +162,27 @@ def references(data: Dataset, records: Sequence[WeakRecord]) -> dict[str, FloatA
     }  # fmt: skip
 
 
+def _unsure(
+    balances: Balances, data: Dataset, values: Mapping[str, float], records: Sequence[WeakRecord]
+) -> dict[str, FloatArray]:
+    """Scatter of each row from where exactly friction changes its sign: it may act either way, or be spread over a turn [N.m]."""
+    names = [n for n in balances.names if n.endswith("_smoothing_velocity")]
+    either = _either_way(balances.model, data, values, records)
+    if not names:
+        return either
+    bare = balances_of(balances.model, data.sensing, wrt=())
+    here = stack(bare, records, values).residual
+    there = stack(bare, records, {**values, **{n: 2 * values[n] for n in names}}).residual
+    return {b: np.hypot((here[b] - there[b]) / 2, either[b]) for b in here}
+
+
 def row_weights(
     balances: Balances, data: Dataset, values: Mapping[str, float], sigma: Mapping[str, float] | Mapping[str, FloatArray],
     records: Sequence[WeakRecord],
 ) -> dict[str, FloatArray]:  # fmt: skip
     """1/sigma of each row: rows that hang on where exactly friction changes its sign count less (`sigma`: of a balance, or of its rows)."""
-    names = [n for n in balances.names if n.endswith("_smoothing_velocity")]
-    doubled = {**values, **{n: 2 * values[n] for n in names}}
-    bare = balances_of(balances.model, data.sensing, wrt=())
-    here = stack(bare, records, values).residual
-    there = stack(bare, records, doubled).residual if names else here
-    either = _either_way(balances.model, data, values, records)
-    return {
-        b: 1 / np.sqrt(sigma[b] ** 2 + (here[b] - there[b]) ** 2 / 4 + either[b] ** 2) for b in here
-    }  # fmt: skip
+    unsure = _unsure(balances, data, values, records)
+    return {b: 1 / np.sqrt(sigma[b] ** 2 + unsure[b] ** 2) for b in unsure}
 
 
 def _either_way(model: JointModel, data: Dataset, values: Mapping[str, float], records: Sequence[WeakRecord]) -> dict[str, FloatArray]:

@@ -21,7 +21,7 @@ from identification.errors import InputError
 from identification.joint_file import Joint
 from identification.record import Record
 from identification.sensing import Sensing, adapt, sense, signals_of
-from identification.stacked import floors, rms, stack
+from identification.stacked import floors, rms, row_weights, stack
 from identification.weak import WeakRecord, prepare
 from tests.hidden_effect.generator import generate_case
 
@@ -163,7 +163,9 @@ def test_floor_is_what_noise_leaves(key: str, place: str, sensors: str) -> None:
     dirty = stack(bare, [prepared(case, noisy(case, rng)) for _ in range(3)], case.values).residual
     for balance, level in found.items():
         left = dirty[balance] - np.tile(clean[balance], 3)
-        assert level == pytest.approx(rms(left), rel=0.12), balance
+        # rows at a turn have a scatter of their own and count less, as in every fit
+        weight = np.tile(row_weights(bare, data, case.values, found, data.train)[balance], 3)
+        assert level == pytest.approx(rms(left * weight) / rms(weight), rel=0.12), balance
 
 
 @pytest.mark.parametrize("name", ["load_compliance", "stiffness", "structural_damping", "backlash", "gravity_torque", "motor_smoothing_velocity"])
