@@ -89,7 +89,7 @@ def generic(model: JointModel) -> dict[str, float]:
     out = {}
     for k, p in enumerate(model.parameters):
         if p.name.endswith("_smoothing_velocity"):
-            out[p.name] = 0.02
+            out[p.name] = 1e-4 if model.clamped_link else 0.02
         elif p.is_shape:
             size = {"torsion": 1.5e-3, "velocity": 0.8, "position": 0.7, "duration": 8.0, "absolute": 1.0}[p.scale]
             out[p.name] = p.grid[len(p.grid) // 2] * size
