@@ -142,8 +142,6 @@ class Effect:
         True for an effect that hardly a joint is without: named first in a set, and at a smaller fall.
     several_valleys : bool
         True where a fit of its shapes has several minima: it starts from several points.
-    carries_load : bool
-        True for a law from which the load of the gear follows where no torque sensor is there.
     of_displacement : bool
         True for a law of the torsion that also makes sense on the position of an axis without gear.
     shapes_reversal : bool
@@ -158,6 +156,8 @@ class Effect:
         True for sine and cosine of the position: no law of a linear axis.
     separate_by : str
         The run that separates it from what it is confused with.
+    formerly : tuple of str
+        Keys of effects of older files that are part of this one.
     candidate : bool
         False for another form of an effect of the library: used when it is named, not proposed by a
         diagnosis.
@@ -185,6 +185,7 @@ class Effect:
     periodic: bool = False
     angular: bool = False
     separate_by: str = ""
+    formerly: tuple[str, ...] = ()
     candidate: bool = True
     requires: tuple[Requirement, ...] = ()
     contains: tuple[str, ...] = ()
@@ -192,7 +193,6 @@ class Effect:
     stage: Stage = "law"
     common: bool = False
     several_valleys: bool = False
-    carries_load: bool = False
     of_displacement: bool = False
     shapes_reversal: bool = False
     everywhere: bool = False
@@ -266,10 +266,11 @@ class Registry(Mapping[str, Effect]):
     def __init__(self) -> None:
         self._effects: dict[str, Effect] = {}
         self._loaded: dict[Path, EffectFile] = {}
+        self._former: dict[str, str] = {}
 
     def __getitem__(self, key: str) -> Effect:
         try:
-            return self._effects[key]
+            return self._effects[self._former.get(key, key)]
         except KeyError:
             near = difflib.get_close_matches(str(key), self._effects, 1)
             hint = f" (did you mean {near[0]!r}?)" if near else ""
@@ -286,6 +287,11 @@ class Registry(Mapping[str, Effect]):
         if effect.key in self._effects:
             raise ValueError(f"effect {effect.key!r} is registered already")
         self._effects[effect.key] = effect
+        self._former.update(dict.fromkeys(effect.formerly, effect.key))
+
+    def is_former(self, key: str) -> bool:
+        """True for the key of an effect that is part of another one now."""
+        return key in self._former
 
     @property
     def files(self) -> tuple[EffectFile, ...]:
@@ -362,6 +368,7 @@ def effect(
     periodic: bool = False,
     angular: bool = False,
     separate_by: str = "",
+    formerly: tuple[str, ...] = (),
     candidate: bool = True,
     requires: tuple[Requirement, ...] = (),
     contains: tuple[str, ...] = (),
@@ -369,7 +376,6 @@ def effect(
     stage: Stage = "law",
     common: bool = False,
     several_valleys: bool = False,
-    carries_load: bool = False,
     of_displacement: bool = False,
     shapes_reversal: bool = False,
     everywhere: bool = False,
@@ -385,8 +391,9 @@ def effect(
                 confused_with=confused_with, needs=needs, needs_load=needs_load, dissipative=dissipative,
                 periodic=periodic, angular=angular, separate_by=separate_by, candidate=candidate,
                 requires=requires, contains=contains, parts=parts, stage=stage, common=common,
-                several_valleys=several_valleys, carries_load=carries_load, of_displacement=of_displacement,
+                several_valleys=several_valleys, of_displacement=of_displacement,
                 shapes_reversal=shapes_reversal, everywhere=everywhere, pairs=pairs,
+                formerly=formerly,
             )
         )  # fmt: skip
         return law

@@ -186,11 +186,13 @@ class _Builder:
 
     def true_signals(self) -> Signals:
         """Signals with what the sensors add taken off."""
-        return self.symbols.signals.with_values(
+        s = self.symbols.signals.with_values(
             **self.corrected("motor_position_sensor", *_MOTOR_CHAIN),
             **self.corrected("link_position_sensor", *_LINK_CHAIN),
             **self.corrected("torque_sensor", "torque", "torque_rate"),
         )
+        zero = self.symbols.parameters.get("link_encoder_zero")
+        return s if zero is None else s.with_values(link_position=s.link_position - zero)
 
     def gravity(self, view: _View) -> Expression:
         """Torques on the link that depend on its position only."""

@@ -22,7 +22,7 @@ from .effect import EFFECTS
 from .equations import Equations, Symbols, build_equations, inverse_dynamics, linear_set, time_derivative
 from .parameter import Parameter, Role
 from .sides import side_factor
-from .term import INERTIAS, LOAD_COMPLIANCE, SIDE_INERTIAS, SWINGING_SHARE, TOTAL_INERTIA, Term, smoothing
+from .term import CALIBRATION, INERTIAS, LOAD_COMPLIANCE, SIDE_INERTIAS, SWINGING_SHARE, TOTAL_INERTIA, Term, smoothing
 
 __all__ = ["MEMORY_STEP", "Equations", "JointModel", "Term", "inverse_dynamics", "time_derivative"]
 
@@ -60,6 +60,8 @@ class JointModel:
         True for a torque-against-displacement test: the torsion is the position itself.
     lagging_load : bool
         True for a geared joint seen from the motor side: the link hangs on a compliance and its position is not recorded.
+    calibration : tuple of str
+        Calibration unknowns of the sensors (keys of :data:`casadi_models.term.CALIBRATION`): in the readings only, no physics.
     name : str
         Name in reports.
     """
@@ -73,6 +75,7 @@ class JointModel:
     load_from: str = "torque"
     clamped_link: bool = False
     lagging_load: bool = False
+    calibration: tuple[str, ...] = ()
     name: str = "joint"
 
     def __repr__(self) -> str:
@@ -113,8 +116,12 @@ class JointModel:
             Unknown key; place where the effect cannot act; effect that is in the model already.
         """
         new = [t for t in self._parse(label) if t not in self.terms]
+        if not new and EFFECTS.is_former(label):
+            return self
         if not new:
             raise ValueError(f"effect {label!r} is in the model already")
+        if self.has_form_of(label.partition("#")[0]):
+            raise ValueError(f"effect {label!r} is in the model already, in another form")
         return replace(self, terms=(*self.terms, *new))
 
     def drop(self, label: str) -> JointModel:
@@ -125,8 +132,12 @@ class JointModel:
         return replace(self, terms=kept)
 
     def with_values(self, values: Mapping[str, float]) -> JointModel:
-        """The model with other parameter values; unknown names are an error."""
+        """The model with other parameter values; unknown names are an error.
+
+        Calibration unknowns of single records (``name[run]``, as they stand beside the parameters in a fit) are left out.
+        """
         known = {p.name for p in self.parameters}
+        values = {n: x for n, x in values.items() if n in known or n.partition("[")[0] not in self.calibration}
         for name in values:
             if name not in known:
                 raise ValueError(f"no parameter {name!r} in the model; it has {', '.join(sorted(known))}")
@@ -148,15 +159,27 @@ class JointModel:
         """True where the effect is in the model (in `place`, if given)."""
         return any(t.effect.key == key and place in (None, t.place) for t in self.terms)
 
+    def has_form_of(self, key: str) -> bool:
+        """True where another form of the effect, with parameters of the same names, is in the model."""
+        first = EFFECTS[key.partition("@")[0]]
+        names = {n for p in first.acts_on for n in first.parameter_names(p)}
+        return any(t.effect is not first and names & set(t.names) for t in self.terms)
+
     @property
     def is_elastic(self) -> bool:
         """True where motor and link move separately."""
         return self.has("transmission_compliance")
 
     @property
+    def knows_load(self) -> bool:
+        """True where a term says what presses the gear's teeth without a torque sensor: a torque of the link's position."""
+        return any(t.place == "link" and t.effect.family == "torque" for t in self.terms)
+
+    @property
     def structure(self) -> tuple[object, ...]:
         """All that shapes the equations, without the values: equal for models that differ in values only."""
-        return (self.gear_ratio, self.terms, self.inertias, self.kind, self.virtual_work, self.load_from, self.clamped_link, self.lagging_load)
+        forms = (self.virtual_work, self.load_from, self.clamped_link, self.lagging_load, self.calibration)
+        return (self.gear_ratio, self.terms, self.inertias, self.kind, *forms)
 
     def swinging_inertia(self, values: Mapping[str, Any]) -> Any:
         """What hangs on the compliance of a lagging load [kg.m2], from numbers or symbols."""
@@ -165,11 +188,6 @@ class JointModel:
     def load_compliance(self, values: Mapping[str, Any]) -> Any:
         """Compliance on which a link that is not recorded hangs [rad/(N.m)], 0 where there is none."""
         return values[LOAD_COMPLIANCE.name] if self.lagging_load else 0.0
-
-    @property
-    def knows_load(self) -> bool:
-        """True where the load of the gear follows from a law of the model."""
-        return any(t.effect.carries_load for t in self.terms)
 
     @cached_property
     def _places(self) -> Mapping[str, str]:
@@ -209,6 +227,7 @@ class JointModel:
             found[LOAD_COMPLIANCE.name] = LOAD_COMPLIANCE
             if "link_inertia" not in self.inertias:
                 found[SWINGING_SHARE.name] = SWINGING_SHARE
+        found.update({n: CALIBRATION[n].parameter for n in self.calibration})
         for term in self.terms:
             found.update({p.name: p for p in term.parameters})
         for place in _FRICTION_SIDES:

@@ -83,6 +83,39 @@ class Term:
         return SimpleNamespace(**{p.name: values[n] for p, n in pairs})
 
 
+@final
+@dataclass(frozen=True)
+class Unknown:
+    """What a sensor is off by: no physics of the joint, and another value in each record.
+
+    Attributes
+    ----------
+    what : {"zero", "skew", "offset"}
+    sensor : str
+        Channel of the record.
+    parameter : Parameter
+    """
+
+    what: str
+    sensor: str
+    parameter: Parameter
+
+
+CALIBRATION: Final = {
+    u.parameter.name: u
+    for u in (
+        Unknown(
+            "zero", "link_position",
+            Parameter(
+                "link_encoder_zero", "rad", 0.0, -math.inf, math.inf,
+                "reading of the link encoder, less that of the motor encoder, without twist", "sensor",
+            ),
+        ),
+    )
+}  # fmt: skip
+"""Calibration unknowns by the name of their parameter."""
+
+
 def smoothing(place: str) -> Parameter:
     """Velocity over which sign(v) is smoothed to tanh(v/v0): a nuisance of every friction law."""
     return Parameter(

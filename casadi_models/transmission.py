@@ -25,16 +25,16 @@ MODELS: Final[dict[str, tuple[str, ...]]] = {
     "hd4": (
         "transmission_compliance", "structural_damping", "kinematic_error", "kinematic_error#2", "kinematic_error#3",
     ),
-    "irj1a": ("gravity",),
-    "irj1b": ("gravity", "coulomb@motor"),
-    "irj2a": ("transmission_compliance", "cubic_stiffness", "gravity"),
+    "irj1a": ("gravity_upright",),
+    "irj1b": ("gravity_upright", "coulomb@motor"),
+    "irj2a": ("transmission_compliance", "cubic_stiffness", "gravity_upright"),
     "irj2b": (
         "transmission_compliance", "cubic_stiffness", "added_spring@motor", "viscous@motor", "viscous@link",
-        "coulomb@motor", "coulomb@link", "gravity",
+        "coulomb@motor", "coulomb@link", "gravity_upright",
     ),
     "irj_ts": (
         "transmission_compliance", "cubic_stiffness", "added_spring@motor", "viscous@motor", "coulomb@motor",
-        "smooth_stribeck@motor", "viscous@link", "cyclic_torque@link", "gravity",
+        "smooth_stribeck@motor", "viscous@link", "cyclic_torque@link", "gravity_upright",
     ),
 }  # fmt: skip
 """Effects of each model by name: the transmission ladder hd1 to hd4 and the identification ladder of 4.3.2."""
@@ -79,7 +79,7 @@ def build(name: str, gear_ratio: float, *, kind: str = "rotary", effects: tuple[
         raise KeyError(f"unknown model {name!r}; known: {', '.join(MODELS)}")
     for label in (*MODELS[name], *effects):
         key = label.partition("#")[0]
-        if label in model.effects or ("@" not in label and "#" not in label and model.has(key)):
+        if label in model.effects or ("@" not in label and "#" not in label and (model.has(key) or model.has_form_of(key))):
             continue
         model = model.add(label)
     known = set(model.parameter_names)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final, final
 
 import numpy as np
@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from casadi_models import JointModel
 from identification.balances import balances_of
+from identification.calibration import settled
 from identification.engine import Dataset, floor_rows, references, rms, row_weights, stack, taking_part
 from identification.weak import WeakRecord
 
@@ -38,12 +39,16 @@ class BalanceError:
     ratio : float
         RMS of residual over noise, row by row: 1 where only noise is left.
     unit : str
+    residual, weight : (rows,) array
+        Residual of each row [unit] and 1 over the scatter that noise allows it: two models are compared on one common weighting.
     """
 
     rms: float
     floor: float
     ratio: float
     unit: str
+    residual: FloatArray = field(default_factory=lambda: np.empty(0), repr=False, compare=False)
+    weight: FloatArray = field(default_factory=lambda: np.empty(0), repr=False, compare=False)
 
     def as_json(self) -> dict[str, Any]:
         """The shape of `improve --json`."""
@@ -82,6 +87,7 @@ class Error:
 def assess(model: JointModel, data: Dataset, records: Sequence[WeakRecord], values: Mapping[str, float]) -> Error:
     """Error of a model with the given values on prepared records."""
     balances = balances_of(model, data.sensing, wrt=())
+    values = settled(model, data.sensing, [*data.train, *records], values)
     whole = stack(balances, records, values).residual
     rows = {b: taking_part(b, records) for b in balances.balances}
     residual = {b: whole[b][rows[b]] for b in whole}
@@ -94,7 +100,7 @@ def assess(model: JointModel, data: Dataset, records: Sequence[WeakRecord], valu
     errors = {
         b: BalanceError(
             rms(residual[b] * weights[b]) / max(rms(weights[b]), 1e-300), rms(floor[b] * weights[b]) / max(rms(weights[b]), 1e-300),
-            rms(residual[b] * weights[b]) if np.any(floor[b] > 0) else math.inf, unit,
+            rms(residual[b] * weights[b]) if np.any(floor[b] > 0) else math.inf, unit, residual[b], weights[b],
         )
         for b in balances.balances
     }  # fmt: skip

@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property
 from typing import Any, Final, final
 
 import casadi as ca
@@ -13,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from casadi_models import JointModel, Signals
+from casadi_models.affine import AffineParts
 from casadi_models.vectorised import Vectorised
 from identification._memory_kept import states_of
 from identification.sensing import Sensing
@@ -22,9 +22,6 @@ FloatArray = npt.NDArray[np.float64]
 Expression = Any
 
 _NAMES: Final = Signals.names()
-
-_DIRECT: Final = ("motor_position", "link_position", "torque")
-"""Signals whose noise enters nonlinear laws directly."""
 
 UNROLLED: Final = 200
 """Steps of a memory law in one compiled stretch."""
@@ -90,23 +87,17 @@ class _Part:
             stacked += [ca.SX(1, 1) if columns_only else r, *(ca.vertsplit(ca.jacobian(r, parameters)[:, columns].T) if columns else [])]
         out: Any = ca.vertcat(*stacked)
         self._width = 1 + len(columns)
-        slopes = ca.jacobian(out, signals)
-        sparsity = ca.jacobian_sparsity(ca.vec(ca.densify(slopes)), ca.vertcat(signals, e.memory))
-        varying = np.zeros(slopes.shape[0] * slopes.shape[1], dtype=bool)
-        varying[list(set(sparsity.get_triplet()[0]))] = True
-        linear = ~varying.reshape(slopes.shape[1], slopes.shape[0]).T
-        present = np.zeros(slopes.shape, dtype=bool)
-        rows, cols = slopes.sparsity().get_triplet()
-        present[rows, cols] = True
-        linear &= present
-        keep = ca.DM(linear.astype(float))
-        self._linear = ca.Function("linear", [parameters], [ca.densify(slopes * keep)])
+        parts = AffineParts(signals, e.memory)
+        slopes = ca.SX(out.shape[0], len(_NAMES))
         zeroed: list[Expression] = []
-        substitute: Any = ca.substitute
         for i in range(out.shape[0]):
-            names: list[Any] = [signals[j] for j in range(len(_NAMES)) if linear[i, j]]
-            zeroed.append(substitute([out[i]], names, [ca.SX(0)] * len(names))[0] if names else out[i])
+            line, left = parts.split(out[i])
+            zeroed.append(left)
+            for j, slope in line.items():
+                slopes[i, j] = slope
+        self._linear = ca.Function("linear", [parameters], [ca.densify(slopes)])
         self.needed = [i for i, part in enumerate(zeroed) if not part.is_zero()]
+        self._bent = {i: [n for n, d in zip(_NAMES, ca.which_depends(zeroed[i], signals), strict=True) if d] for i in self.needed}
         rest = ca.vertcat(*(zeroed[i] for i in self.needed)) if self.needed else ca.SX(0, 1)
         self._rest = Vectorised(ca.Function("rest", [signals, e.memory, parameters], [ca.densify(rest)]))
         self.remembers = bool(e.memory_terms) and ca.jacobian_sparsity(rest, e.memory).nnz() > 0
@@ -131,6 +122,10 @@ class _Part:
         return {
             b: {n: float(linear[i * self._width, j]) for j, n in enumerate(_NAMES) if linear[i * self._width, j]} for i, b in enumerate(balances)
         }  # fmt: skip
+
+    def bent(self, number: int) -> frozenset[str]:
+        """Signals that enter a balance, by its number, in another way than on a straight line."""
+        return frozenset(self._bent.get(number * self._width, ()))
 
 
 @final
@@ -161,21 +156,6 @@ class Balances:
         self._curved = _Part(model, curved, columns, columns_only=columns_only) if curved else None
         self._memory = Memory(model) if self._plain.remembers else None
 
-    @cached_property
-    def _slopes(self) -> Any:
-        """Slopes of the residuals along the signals whose noise enters nonlinear laws directly."""
-        e = self.model.equations
-        signals: Any = e.signals.vector()
-        own = ca.vertcat(*residual_expressions(self.model, self.sensing).values())
-        sources = ca.vertcat(*(signals[_NAMES.index(n)] for n in _DIRECT))
-        return ca.Function("slopes", [signals, e.memory, e.parameters], [ca.densify(ca.jacobian(own, sources))])
-
-    def curved_coefficients(self, values: Mapping[str, float]) -> dict[str, dict[str, float]]:
-        """How strongly the second derivative of each averaged signal enters each residual."""
-        if self._curved is None:
-            return {}
-        return self._curved.slopes(self.balances, [float(values[n]) for n in self.names])
-
     def memory_values(self, data: WeakRecord, values: Mapping[str, float]) -> FloatArray:
         """Internal states of displacement-memory effects at the points, (states, points); not to be written to."""
         memory = self._memory
@@ -186,10 +166,15 @@ class Balances:
         law = (self.model.structure, tuple(p[memory.depends].tolist()))
         return states_of(data, law, lambda: memory.along(data, p))
 
-    def evaluate(self, data: WeakRecord, values: Mapping[str, float]) -> dict[str, tuple[FloatArray, FloatArray]]:
-        """Residual (rows,) and Jacobian (rows, wrt) of every balance at the given parameter values."""
+    def evaluate(
+        self, data: WeakRecord, values: Mapping[str, float], remembered: WeakRecord | None = None
+    ) -> dict[str, tuple[FloatArray, FloatArray]]:
+        """Residual (rows,) and Jacobian (rows, wrt) of every balance at the given parameter values.
+
+        `remembered` is a record with the same smoothed positions, whose internal states may be known already.
+        """
         p = [float(values[n]) for n in self.names]
-        memory = self.memory_values(data, values)
+        memory = self.memory_values(remembered or data, values)
         full = self._plain.rows(data.averaged, data.average, data, memory, p)
         if self._curved is not None:
             full += self._curved.rows(data.curved, data.curve, data, memory, p)
@@ -198,23 +183,10 @@ class Balances:
             b: (full[:, i * width], full[:, i * width + 1 : (i + 1) * width]) for i, b in enumerate(self.balances)
         }  # fmt: skip
 
-    def coefficients(self, values: Mapping[str, float], data: WeakRecord) -> dict[str, dict[str, float]]:
-        """How strongly each averaged signal enters each residual (for the noise floor); RMS over the record where it varies."""
+    def entering(self, values: Mapping[str, float]) -> dict[str, frozenset[str]]:
+        """By balance, the signals that its residual depends on at the given parameter values."""
         p = [float(values[n]) for n in self.names]
-        out = self._plain.slopes(self.balances, p)
-        if self._plain.needed:
-            count = min(len(data.points["motor_position"]), 2000)
-            pick = np.linspace(0, len(data.points["motor_position"]) - 1, count).astype(np.int64)
-            matrix = np.array([data.points[n][pick] if n in data.points else np.zeros(count) for n in _NAMES])
-            memory = np.zeros((self.model.equations.memory.shape[0], count))
-            flat = np.array(self._slopes.map(count)(matrix, memory, np.tile(np.array(p)[:, None], count)))
-            cube = flat.reshape(len(self.balances), count, len(_DIRECT))
-            for i, b in enumerate(self.balances):
-                for k, n in enumerate(_DIRECT):
-                    size = float(np.sqrt(np.mean(cube[i, :, k] ** 2)))
-                    if n not in out[b] and size > 0:
-                        out[b][n] = size * (np.sign(float(np.mean(cube[i, :, k]))) or 1.0)
-        return out
+        return {b: frozenset(self._plain.slopes(self.balances, p)[b]) | self._plain.bent(i) for i, b in enumerate(self.balances)}
 
 
 _KEPT: Final = 96

@@ -132,7 +132,7 @@ def _why_not(effect: Effect, model: JointModel, data: Dataset) -> str:
     if effect.warms and not data.sensing.has_temperature and _shortest(data) < WARM_UP:
         return f"no temperature channel that changes, and a run shorter than {WARM_UP:g} s; record the temperature over a warm-up"
     if effect.needs_load and not data.sensing.has_torque and not model.knows_load:
-        return "no torque sensor and no gravity in the model: the load is not known"
+        return "no torque sensor, and no gravity or other torque of the position in the model: the load is not known"
     there = _conditions(data)
     return next((r.why for r in effect.requires if not r.met(there)), "")
 
@@ -150,6 +150,8 @@ def _conditions(data: Dataset) -> frozenset[str]:
 def _placed(effect: Effect, place: Place, model: JointModel) -> list[Candidate]:
     label = f"{effect.key}@{place}" if len(effect.acts_on) > 1 else effect.key
     there = sum(t.effect.key == effect.key and t.place == place and t.label != HOLD_DELAY for t in model.terms)
+    if model.has_form_of(effect.key):
+        return []
     if there:
         if not effect.periodic:
             return []

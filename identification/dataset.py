@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final, final
@@ -10,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from casadi_models import JointModel, hold
+from identification.calibration import unknowns_of
 from identification.errors import InputError
 from identification.joint_file import Joint
 from identification.noise import level_of
@@ -99,6 +101,7 @@ def load_dataset(
     first = 0
     for record in (*train, *held_out):
         made = weak_record(record, joint, sensing, length, first, curved=model.lagging_load)
+        made = replace(made, name=run_name(record))
         if record.payload != train[0].payload:
             made = replace(made, masked=_of_the_link(record, sensing))
         first = max(first, 1 + int(made.block.max(initial=first - 1)))
@@ -119,6 +122,12 @@ def load_dataset(
         joint, sensing, tuple(prepared[:count]), tuple(prepared[count:]), _ranges(prepared[:count], model.clamped_link), noise,
         tuple(r.name for r in train), tuple(r.name for r in held_out),
     )  # fmt: skip
+
+
+def run_name(record: Record) -> str:
+    """Name of a record with a mark of its samples: another run under the same name is another run."""
+    position = next(record[c] for c in ("link_position", "motor_position") if record.has(c))
+    return f"{record.name}:{zlib.crc32(np.ascontiguousarray(position).tobytes()):08x}"
 
 
 def _of_the_link(record: Record, sensing: Sensing) -> frozenset[str]:
@@ -236,4 +245,5 @@ def prepared_model(joint: Joint, record: Record) -> JointModel:
     adapted = adapt(model, sensing, joint.known)
     if sensing.has_drive and not record.has("motor_torque") and not adapted.named("delay", "drive"):
         adapted = adapted.add(HOLD_DELAY)
-    return replace(adapted, lagging_load=seen_from_the_motor(sensing, joint) and sensing.has_drive)
+    lagging = seen_from_the_motor(sensing, joint) and sensing.has_drive
+    return replace(adapted, lagging_load=lagging, calibration=unknowns_of(adapted, sensing))

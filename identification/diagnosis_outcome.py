@@ -126,7 +126,8 @@ def why_not(
             return f"{title} is in a set: these records cannot tell it from {claim.effects[0]}{how}."
     for refusal in refused:
         if refusal.effect == wanted:
-            return f"{title} is not named: it {refusal.why}." if not refusal.why.startswith("with ") else (f"{title} is not named: {refusal.why}.")
+            whole = refusal.why.startswith(("with ", "the "))
+            return f"{title} is not named: {'' if whole else 'it '}{refusal.why}."
     for item in not_testable:
         if item.effect == wanted:
             return f"{title} is not testable with these records: {item.why}."

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -38,7 +39,7 @@ from identification.excitation import (
     unlike_units,
 )
 from identification.gate import gate_warnings, gated
-from identification.improvement import Improvement, Step, held_drop, made_worse
+from identification.improvement import Improvement, Step, held_drop, judged_drop, made_worse
 from identification.joint_file import Joint
 from identification.locate import Unexplained, spectral_peak
 from identification.record import Record
@@ -210,11 +211,12 @@ class Session:
                 continue
             after = self.bench.added(best, standing.now)
             drop = held_drop(standing.now.held_out, after.held_out, claim.balance)
-            if drop < LEAST_ADDED_DROP or made_worse(standing.now.held_out, after.held_out):
-                self._refused[label] = (
-                    f"lowers the {claim.balance} balance by {drop:.2g} % on held-out records after the whole fit ({LEAST_ADDED_DROP:g} % asked)"
-                    if drop < LEAST_ADDED_DROP else "raises the error of another balance, or the whole, on held-out records"
-                )  # fmt: skip
+            fall = judged_drop(standing.now.held_out, after.held_out, claim.balance)
+            asked = f"on held-out records after the whole fit ({LEAST_ADDED_DROP:g} % asked)"
+            little = f"lowers the {claim.balance} balance by {fall:.2g} % {asked}" if fall < LEAST_ADDED_DROP else ""
+            worse = little or made_worse(standing.now.held_out, after.held_out)
+            if worse:
+                self._refused[label] = worse
                 continue
             accepted = replace(claim, held_out_drop_percent=drop)
             decided.append(accepted)
@@ -330,7 +332,12 @@ class Session:
             self._doubted[label] = f"{lowered} ({HELD_OUT_DROP:g} % asked)"
             return ranking
         passed = replace(trial, held_out_drop_percent=drop)
-        renewed = tuple(passed if t.candidate.label == label else t for t in ranking.everything)
+        # what the linear form says of the others on held-out records is no more worth than what it said of this one
+        others = {t.candidate.label for t in ranking.everything if t.balance == trial.balance and t.held_out_drop_percent < 0}
+        renewed = tuple(
+            passed if t.candidate.label == label else replace(t, held_out_drop_percent=math.nan) if t.candidate.label in others else t
+            for t in ranking.everything
+        )
         return replace(ranking, everything=renewed, significant=ranking.significant | {label})
 
     def _told_apart(self, new: Claim, standing: _Standing) -> _Standing | None:

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from casadi_models import JointModel
 from casadi_models.term import HANGING, LOAD_COMPLIANCE
 from identification.balances import Balances, balances_of
+from identification.calibration import bare, is_of_run, names_of_runs
 from identification.covariance import block_errors, correlations
 from identification.dataset import Dataset, load_dataset, prepared_model, weak_record
 from identification.errors import InputError
@@ -136,15 +137,16 @@ def _fitted(
     values.update({n: v for n, v in fixed.items() if v is not None})
     limits = bounds_of(model, known, data)
     shapes = {p.name for p in model.parameters if p.is_shape}
-    free = [n for n in model.parameter_names if n not in fixed and n not in held]
-    balances = balances_of(model, data.sensing, wrt=free)
+    runs = names_of_runs(model, data.train)
+    free = [*(n for n in model.parameter_names if n not in fixed and n not in held and n not in model.calibration), *runs]
+    balances = balances_of(model, data.sensing, wrt=bare(free))
     for n in free:
         low, high = limits[n]
         values[n] = min(max(values[n], low), high)
     tell = progress or (lambda text, share: None)
     tell("start values", 0.0)
     # first pass without shapes: linear amplitudes from any start
-    linear_only = [n for n in free if n not in shapes]
+    linear_only = [n for n in free if n not in shapes and not is_of_run(n)]
     linear = WeakForm(balances, data, values, tuple(linear_only), dict.fromkeys(balances.balances, 1.0))
     _check_moves(linear)
     values, _ = linear.fitted(limits, 3)
@@ -237,15 +239,20 @@ def _with_errors(problem: WeakForm, limits: Mapping[str, tuple[float, float]], s
         biases = np.array([pulled.get(free[i], 0.0) * values[free[i]] for i in index.tolist()])
         size = None if errors is None else np.hypot(errors / norms[index], biases)
         spread, corr = correlations(scaled.T @ scaled)
+        corr[:, [is_of_run(free[i]) for i in index.tolist()]] = 0.0
         for k, i in enumerate(index.tolist()):
             stderr[free[i]] = None if size is None else float(size[k])
             other = int(np.argmax(np.abs(corr[k])))
             correlation[free[i]] = (free[int(index[other])], float(corr[k, other]))
             weak = size is not None and values[free[i]] != 0 and size[k] > abs(values[free[i]])
-            if (spread[k] > 1e4 or weak) and free[i] not in smoothing:
+            if (spread[k] > 1e4 or weak) and free[i] not in smoothing and not is_of_run(free[i]):
                 unidentified.append(free[i])
     kept = dict(values)
+    model = balances.model
+    for n in model.calibration:
+        kept[n] = float(np.mean([kept[k] for k in free if is_of_run(k) and k.startswith(f"{n}[")]))
+    own = {n: x for n, x in kept.items() if not is_of_run(n)}
     return Solution(
-        replace(balances.model, values=kept), kept, stderr, free, weights, sigma, tuple(at_bound), tuple(unidentified),
+        replace(model, values=own), kept, stderr, tuple(n for n in free if not is_of_run(n)), weights, sigma, tuple(at_bound), tuple(unidentified),
         correlation, used,
     )  # fmt: skip

@@ -8,6 +8,7 @@ from typing import Any, Final, final
 
 from casadi_models import JointModel
 from identification.assess import Error, assess
+from identification.calibration import Found, calibration_found
 from identification.dataset import HOLD_DELAY, visible_labels
 from identification.engine import Dataset, Solution, load_dataset, prepared_model, solve
 from identification.errors import InputError
@@ -60,6 +61,7 @@ class Fit:
         return {
             "records": list(self.data.train_names), "effects": list(self.model.effects), "train": self.train.as_json(),
             "held_out": self.held_out.as_json() if self.held_out else None, "parameters": self.parameters,
+            "calibration": [c.as_json() for c in calibration_of(self.solution, self.data)],
         }  # fmt: skip
 
     def to_joint_file(self) -> str:
@@ -98,7 +100,13 @@ def joint_text(joint: Joint, solution: Solution, data: Dataset) -> str:
     whole = replace(joint, effects=labels, virtual_work=solution.model.virtual_work)
     from identification import __version__
 
-    return toml_text(whole, fitted, {"records": ", ".join(data.train_names), "version": __version__})
+    calibration = {f"{c.what} of {c.sensor} in {data.train_names[c.run]}": c.as_json() for c in calibration_of(solution, data)}
+    return toml_text(whole, fitted, {"records": ", ".join(data.train_names), "version": __version__}, calibration)
+
+
+def calibration_of(solution: Solution, data: Dataset) -> tuple[Found, ...]:
+    """What the sensors of the training records are off by, as found in a fit."""
+    return calibration_found(solution.model, data.train, solution.values, solution.stderr)
 
 
 def as_joint(model: JointModel | Joint, joint: Joint | None = None) -> Joint:

@@ -186,6 +186,15 @@ def not_testable_html(result: Mapping[str, Any]) -> str:
     return table(["effect", "why these records cannot show it"], rows, "Not testable") if rows else ""
 
 
+def calibration_html(result: Mapping[str, Any], names: Sequence[str]) -> str:
+    """What the sensors of each training record are off by, with a band of 95 % (`names`: of the training records)."""
+    rows = []
+    for c in result.get("calibration", ()):
+        band = "–" if c["stderr"] is None else f"± {2 * c['stderr']:.2g}"
+        rows.append([f"{text(c['what'])} of the {text(words(c['sensor']))}", text(names[c["run"]]), f"{c['value']:.5g} {band} {text(c['unit'])}"])
+    return table(["what", "record", "value"], rows, "Calibration found: what the sensors are off by; no physics of the joint") if rows else ""
+
+
 def parameter_flags(p: Mapping[str, Any]) -> list[str]:
     """What to beware of in a fitted value, as phrases (escaped)."""
     out = []
@@ -255,7 +264,7 @@ def fit_html(fit: Fit) -> str:
     out = error_html(fit.train.as_json(), f"{text(fit.joint.name)}, training records")
     if fit.held_out is not None:
         out += error_html(fit.held_out.as_json(), "held-out records")
-    return spaced(f"<div>{out}{parameters_html(fit.parameters)}</div>")
+    return spaced(f"<div>{out}{parameters_html(fit.parameters)}{calibration_html(fit.as_json(), fit.data.train_names)}</div>")
 
 
 def comparison_html(comparison: Comparison) -> str:
@@ -285,5 +294,6 @@ def improvement_html(improvement: Improvement) -> str:
     result = improvement.as_json()
     parameters = parameters_html(result["steps"][-1]["parameters"]) if result["steps"] else ""
     return spaced(
-        f"<div>{verdict_html(result, 3)}{warnings_html(result['warnings'])}{staircase_html(result)}{ledger_html(result)}{claims_html(result)}{parameters}</div>"
+        f"<div>{verdict_html(result, 3)}{warnings_html(result['warnings'])}{staircase_html(result)}{ledger_html(result)}{claims_html(result)}{parameters}"
+        f"{calibration_html(result, improvement.data.train_names)}</div>"
     )

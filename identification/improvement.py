@@ -7,8 +7,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final, final
 
+import numpy as np
+
 from casadi_models import JointModel
 from identification.assess import BalanceError, Error
+from identification.calibration import Found, calibration_found
 from identification.candidates import NotTestable
 from identification.claims import Claim, Ranking
 from identification.dataset import HOLD_DELAY, Dataset, visible_labels
@@ -20,8 +23,10 @@ from identification.locate import Unexplained
 from identification.parameters import parameter_table
 from identification.trials import Trial
 
+SPOILT_RISE: Final = 1.2
+"""Rise of a balance's RMS by which an addition spoils it."""
 SPOILT_RATIO: Final = 1.3
-"""Ratio to the floor above which a balance that has risen by a fifth counts as spoilt by an addition."""
+"""Ratio to the floor up to which a balance that has risen is still noise: floors hold within some 10 to 20 %."""
 RISE_LIMIT: Final = 1.02
 """Rise of the relative held-out error that an addition may cause."""
 
@@ -117,6 +122,14 @@ class Improvement:
         return tuple(s.added for s in self.steps if s.added)
 
     @property
+    def calibration(self) -> tuple[Found, ...]:
+        """What the sensors of the training records are off by, on the final model: no physics, and never claimed."""
+        if not self.steps:
+            return ()
+        last = self.steps[-1].solution
+        return calibration_found(last.model, self.data.train, last.values, last.stderr)
+
+    @property
     def model(self) -> JointModel:
         """The final model with its values."""
         return self.steps[-1].solution.model
@@ -164,6 +177,7 @@ class Improvement:
             "refused": [r.as_json() for r in self.refused],
             "unexplained": [u.as_json() for u in self.unexplained],
             "floor_ratio": {b: e.as_json() for b, e in self.final_ratios.items()},
+            "calibration": [c.as_json() for c in self.calibration],
             "warnings": list(self.warnings), "best_candidate": best.key if best else None,
         }  # fmt: skip
 
@@ -184,13 +198,40 @@ def visible_keys(model: JointModel) -> tuple[str, ...]:
     return tuple(dict.fromkeys(t.effect.key for t in model.terms if t.label != HOLD_DELAY))
 
 
-def made_worse(before: Error, after: Error) -> bool:
-    """True where the error as a whole rises on held-out records, or a balance that was fine is spoilt."""
-    spoilt = any(e.ratio > max(1.2 * before.balances[b].ratio, SPOILT_RATIO) for b, e in after.balances.items())
-    return spoilt or after.relative_error_percent > RISE_LIMIT * before.relative_error_percent
+def made_worse(before: Error, after: Error) -> str:
+    """Why an addition is refused on held-out records: a balance that it spoils, or the error as a whole; empty where it is not.
+
+    Balances are compared by their RMS on one weighting, common to both models. A floor alone refuses nothing: a balance is
+    spoilt where its own RMS rises, and above what noise explains under the larger of both floors.
+    """
+    for b, e in after.balances.items():
+        old, new = common_rms(before, after, b)
+        floor = max(before.balances[b].floor, e.floor)
+        if new > SPOILT_RISE * old and e.rms > SPOILT_RATIO * floor:
+            return f"the RMS of the {b} balance rises by {100 * (new / old - 1):.3g} % on held-out records"
+    if after.relative_error_percent > RISE_LIMIT * before.relative_error_percent:
+        return f"the held-out error rises from {before.relative_error_percent:.3g} to {after.relative_error_percent:.3g} %"
+    return ""
+
+
+def common_rms(before: Error, after: Error, balance: str) -> tuple[float, float]:
+    """RMS of a balance before and after, each row weighted by the larger of the two scatters that noise allows it."""
+    one, two = before.balances[balance], after.balances[balance]
+    if len(one.residual) != len(two.residual) or not len(one.residual):
+        return one.rms, two.rms
+    weight = np.minimum(one.weight, two.weight)
+    size = max(float(np.sqrt(np.mean(weight**2))), 1e-300)
+    old, new = (float(np.sqrt(np.mean((e.residual * weight) ** 2))) / size for e in (one, two))
+    return old, new
+
+
+def judged_drop(before: Error, after: Error, balance: str) -> float:
+    """Fall of a balance's RMS in percent, on one weighting: what an addition is judged by."""
+    old, new = common_rms(before, after, balance)
+    return 100 * (1 - new / old) if old > 0 else 0.0
 
 
 def held_drop(before: Error, after: Error, balance: str) -> float:
-    """Fall of a balance's RMS in percent."""
+    """Fall of a balance's RMS in percent, each as it is reported."""
     old = before.balances[balance].rms
     return 100 * (1 - after.balances[balance].rms / old) if old > 0 else 0.0

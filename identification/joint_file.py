@@ -20,7 +20,7 @@ _JOINT_KEYS: Final = frozenset(
     ("name", "kind", "gear_ratio", "motor_constant", "torque_per_current", "torque_per_voltage", "model", "effects", "virtual_work")
 )  # fmt: skip
 _KNOWN_KEYS: Final = ("value", "low", "high", "unit", "side", "source", "note")
-_TABLES: Final = ("joint", "known", "columns", "fitted", "provenance", TABLE)
+_TABLES: Final = ("joint", "known", "columns", "fitted", "calibration", "provenance", TABLE)
 
 
 @final
@@ -260,11 +260,12 @@ def _flag(table: Mapping[str, Any], key: str, source: str) -> bool:
 
 
 def toml_text(
-    joint: Joint, parameters: Mapping[str, Mapping[str, Any]] | None = None, provenance: Mapping[str, str] | None = None, outside: Sequence[str] = ()
-) -> str:
-    """The joint as the text of a joint file, with fitted values, standard errors and provenance.
+    joint: Joint, parameters: Mapping[str, Mapping[str, Any]] | None = None, provenance: Mapping[str, str] | None = None,
+    calibration: Mapping[str, Mapping[str, Any]] | None = None, outside: Sequence[str] = (),
+) -> str:  # fmt: skip
+    """The joint as the text of a joint file, with fitted values, standard errors, what the sensors were off by, and provenance.
 
-    Labels of effects `outside` of a user's FMU have their files remembered too.
+    The calibration is a note: another record has its own. Labels of effects `outside` of a user's FMU have their files remembered too.
     """
     lines = ["[joint]", f'name = "{_escaped(joint.name)}"', f'kind = "{joint.kind}"', f"gear_ratio = {joint.gear_ratio!r}"]
     if joint.torque_per_current is not None:
@@ -294,6 +295,11 @@ def toml_text(
         for name, p in parameters.items():
             error = f", stderr = {p['stderr']:.6g}" if p.get("stderr") is not None else ""
             lines.append(f'{name} = {{ value = {p["value"]:.10g}{error}, unit = "{p["unit"]}", side = "{p["side"]}" }}')
+    if calibration:
+        lines += ["", "[calibration]"]
+        for name, c in calibration.items():
+            error = f", stderr = {c['stderr']:.6g}" if c.get("stderr") is not None else ""
+            lines.append(f'"{_escaped(name)}" = {{ value = {c["value"]:.10g}{error}, unit = "{c["unit"]}" }}')
     if provenance:
         lines += ["", "[provenance]", *(f'{k} = "{_escaped(v)}"' for k, v in provenance.items())]
     return "\n".join(lines) + "\n"

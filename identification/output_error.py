@@ -17,7 +17,9 @@ import numpy.typing as npt
 
 from identification._shooting import MOST_SUBSTEPS, Shooting, Windows, cut_windows, substeps_for
 from identification.assess import assess
+from identification.calibration import is_of_run, without_calibration
 from identification.covariance import BLOCK, block_numbers, errors_of_blocks
+from identification.dataset import run_name
 from identification.engine import row_weights
 from identification.errors import InputError
 from identification.fit import Fit
@@ -77,7 +79,7 @@ class Refinement:
     @property
     def values(self) -> Mapping[str, float]:
         """Every parameter."""
-        return self.fit.solution.values
+        return {n: x for n, x in self.fit.solution.values.items() if not is_of_run(n)}
 
     @property
     def parameters(self) -> dict[str, dict[str, Any]]:
@@ -170,7 +172,9 @@ def refine(fit: Fit, records: Record | Sequence[Record] | None = None, *, window
     _refuse(fit, given)
     model, limits = fit.model, bounds_of(fit.model, fit.joint.known, fit.data)
     free = tuple(n for n in fit.solution.free if n not in fit.solution.unidentified)
-    start = {n: float(v) for n, v in fit.solution.values.items()}
+    start = {n: float(v) for n, v in fit.solution.values.items() if not is_of_run(n)}
+    given = [without_calibration(r, model, fit.solution.values, run_name(r)) for r in given]
+    start.update(dict.fromkeys(model.calibration, 0.0))
     data = cut_windows(given, fit.joint, fit.data.sensing, window)
     start, substeps = _followable(model, start, data)
     smoothing = model.named("smoothing")
@@ -210,7 +214,7 @@ def refine(fit: Fit, records: Record | Sequence[Record] | None = None, *, window
     after, total = _rms(shooting, values, local), before.size * data.count * data.length
     names = data.channels
     return Refinement(
-        _refined(fit, values, dict(zip(free, problem.errors(x, local), strict=True)), limits, used),
+        _refined(fit, _with_calibration(fit, values), dict(zip(free, problem.errors(x, local), strict=True)), limits, used),
         dict(zip(names, before.tolist(), strict=True)), dict(zip(names, after.tolist(), strict=True)),
         dict(zip(names, sigma.tolist(), strict=True)), math.sqrt(costs[0] / total), math.sqrt(costs[1] / total),
         used, data.count, data.count * data.length,
@@ -221,6 +225,10 @@ def _rms(shooting: Shooting, values: Mapping[str, float], local: FloatArray) -> 
     """RMS error of each channel."""
     with np.errstate(over="ignore", invalid="ignore"):
         return np.asarray(np.sqrt(np.mean(shooting.errors(values, local) ** 2, axis=(0, 2))), dtype=np.float64)
+def _with_calibration(fit: Fit, values: Mapping[str, float]) -> dict[str, float]:
+    """Refined values with the calibration of the fit, which was taken off the records."""
+    kept = {n: x for n, x in fit.solution.values.items() if n in fit.model.calibration or is_of_run(n)}
+    return {**values, **kept}
 
 
 def _followable(model: Any, values: dict[str, float], data: Windows) -> tuple[dict[str, float], int]:
@@ -255,7 +263,7 @@ def _refined(fit: Fit, values: Mapping[str, float], stderr: Mapping[str, float],
     from identification.balances import Balances
 
     old = fit.solution
-    model = replace(old.model, values=dict(values))
+    model = replace(old.model, values={n: x for n, x in values.items() if not is_of_run(n)})
     weights = row_weights(Balances(model, fit.data.sensing, wrt=()), fit.data, values, old.sigma, fit.data.train)
     bound = tuple(
         n for n in old.free

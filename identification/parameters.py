@@ -20,7 +20,7 @@ def parameter_table(solution: Solution, data: Dataset) -> dict[str, dict[str, An
     """
     out: dict[str, dict[str, Any]] = {}
     for p in solution.model.parameters:
-        if p.name == HOLD_NAME:
+        if p.name == HOLD_NAME or p.name in solution.model.calibration:
             continue
         nuisance = p.role == "smoothing"
         partner = solution.correlation.get(p.name)

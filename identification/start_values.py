@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 from casadi_models import JointModel
+from identification.calibration import names_of_runs, start_values
 from identification.dataset import HOLD_NAME, Dataset
 from identification.joint_file import Known
 
@@ -19,6 +21,7 @@ def starts(model: JointModel, data: Dataset) -> dict[str, float]:
             out[p.name] = p.grid[len(p.grid) // 2] * data.ranges[p.scale]
         else:
             out[p.name] = p.start
+    out.update(start_values(model, data.train, torque=data.sensing.has_torque))
     return out
 
 
@@ -38,4 +41,5 @@ def bounds_of(model: JointModel, known: Mapping[str, Known], data: Dataset) -> d
             low = max(low, k.low) if k.low is not None else low
             high = min(high, k.high) if k.high is not None else high
         out[p.name] = (low, high)
+    out.update(dict.fromkeys(names_of_runs(model, data.train), (-math.inf, math.inf)))
     return out

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final, final
 
@@ -14,6 +14,7 @@ import numpy.typing as npt
 from casadi_models import Effect
 from identification._signed_fit import projected_gain, signed_fit
 from identification.balances import Balances, balances_of
+from identification.calibration import bare, names_of_runs, settled
 from identification.candidates import Candidate, NotTestable, shape_grid
 from identification.dataset import HOLD_NAME
 from identification.engine import Dataset, Solution, Stacked, row_weights, stack
@@ -50,6 +51,8 @@ class Base:
     orthonormal : (n, r) array
     inward : (n, m) array
         Like `jacobian`, for amplitudes that stand at a bound: a candidate may let them return from it.
+    held_own : (rows, r) array
+        Orthonormal: what the calibration of the held-out records themselves takes up, each fitted on itself.
     block : (n,) int array
     balance : (n,) int array
     effective : mapping of str to float
@@ -69,6 +72,7 @@ class Base:
     held_residual: FloatArray
     held_jacobian: FloatArray
     held_inward: FloatArray
+    held_own: FloatArray
     held_balance: IntArray
     held_weight: FloatArray
     names: tuple[str, ...]
@@ -153,11 +157,14 @@ class Base:
 def make_base(solution: Solution, data: Dataset) -> Base:
     """Evaluate and project the base model on training and held-out rows."""
     model = solution.model
+    solution = replace(solution, values=settled(model, data.sensing, [*data.train, *data.held_out], solution.values))
     smoothing = model.named("smoothing")
     free = [n for n in solution.free if n not in solution.at_bound or n in smoothing]
+    free += names_of_runs(model, data.train)
     signs = _inward_signs(solution, data)
-    balances = balances_of(model, data.sensing, wrt=[*free, *signs])
-    train = stack(balances, data.train, solution.values)
+    names = [*free, *signs]
+    balances = balances_of(model, data.sensing, wrt=bare(names))
+    train = stack(balances, data.train, solution.values, names)
     r, j, block, balance = flatten(train, balances.balances)
     weight = np.concatenate([solution.weights[b] for b in balances.balances])
     towards = np.concatenate([np.ones(len(free)), list(signs.values())])
@@ -173,18 +180,22 @@ def make_base(solution: Solution, data: Dataset) -> Base:
     rw = rw - orthonormal @ (orthonormal.T @ rw)
     shares = np.array([_effective_share(rw[balance == k][train.taking[b]]) for k, b in enumerate(balances.balances)])
     if data.held_out:
-        held = stack(balances, data.held_out, solution.values)
+        held = stack(balances, data.held_out, solution.values, names)
+        own = names_of_runs(model, data.held_out)
+        apart = flatten(stack(balances_of(model, data.sensing, wrt=bare(own)), data.held_out, solution.values, own), balances.balances)[1]
         hr, hj, _, hb = flatten(held, balances.balances)
         rows = row_weights(balances, data, solution.values, solution.sigma, data.held_out)
         held_weights = np.concatenate([rows[b] for b in balances.balances])
         hj = hj * towards * held_weights[:, None]
         hj, hi = hj[:, alive] / norms[alive], hj[:, back] / norms[back]
         hr = hr * held_weights
+        ho = span_of(apart * held_weights[:, None])
     else:
+        ho = np.empty((0, 0))
         hr, hj, hi = np.empty(0), np.empty((0, int(alive.sum()))), np.empty((0, int(back.sum())))
         hb, held_weights = np.empty(0, dtype=np.int64), np.empty(0)
     return Base(
-        solution, data, rw, jw, inward, orthonormal, block, balance, weight, shares, hr, hj, hi, hb, held_weights,
+        solution, data, rw, jw, inward, orthonormal, block, balance, weight, shares, hr, hj, hi, ho, hb, held_weights,
         tuple(n for n, a in zip(free, alive, strict=False) if a),
     )  # fmt: skip
 
@@ -428,8 +439,10 @@ def _held_out_drop(candidate: Candidate, base: Base, balances: Balances, shapes:
     p, own = base.parts
     raw = columns(candidate, base, shapes, base.data.held_out, balances) * base.held_weight[:, None] / size
     here = base.held_balance == where
-    before = base.held_residual[here]
-    after = before + base.held_jacobian[here] @ delta[:p] + base.held_inward[here] @ delta[p:own] + raw[here] @ delta[own:]
+    before = base.held_residual
+    after = before + base.held_jacobian @ delta[:p] + base.held_inward @ delta[p:own] + raw @ delta[own:]
+    before, after = (x - base.held_own @ (base.held_own.T @ x) for x in (before, after))
+    before, after = before[here], after[here]
     return 100 * (1 - math.sqrt(float(after @ after) / max(float(before @ before), 1e-300)))
 
 

@@ -184,6 +184,8 @@ class WeakRecord:
         Kernel average of "this side stands still" (0 to 1), by side: motor, link.
     support : (rows,) array, optional
         Share of each row's kernel that was measured and not bridged; 1 everywhere where it is None.
+    name : str
+        Tells the record from all others: its calibration unknowns go by it.
     """
 
     grid: Grid
@@ -197,6 +199,7 @@ class WeakRecord:
     curved: Mapping[str, FloatArray] = field(default_factory=dict)
     rest: Mapping[str, FloatArray] = field(default_factory=dict)
     support: FloatArray | None = None
+    name: str = ""
 
     def taking(self, balance: str) -> npt.NDArray[np.bool_]:
         """Rows that take part in a balance, shape (rows,): the one mask of every fit, error, line and picture."""
@@ -334,18 +337,7 @@ def prepare(
     half = step * int(np.ceil(reach / step))
     long_enough = tuple(s for s in segments if s.stop - s.start > 2 * half + stride)
     grid = Grid(length, dt, stride, step, long_enough, half, short)
-    averaged: dict[str, FloatArray] = {}
-    points: dict[str, FloatArray] = {}
-    smooth: dict[str, FloatArray] = {}
-    bent: dict[str, FloatArray] = {}
-    for source, chain in POSITION_CHAINS.items():
-        if source not in signals:
-            continue
-        for order, name in enumerate(chain):
-            averaged[name] = grid.correlate(signals[source], differentiated_kernel(length, dt, order))
-            if curved and order + 2 <= HIGHEST_DERIVATIVE:
-                bent[name] = grid.correlate(signals[source], differentiated_kernel(length, dt, order + 2))
-            points[name], smooth[name] = _pointwise(signals[source], long_enough, short[source], dt, order, step)
+    averaged, points, smooth, bent = filtered(grid, signals, curved=curved)
     for name, values in (("temperature", signals.get("temperature")), ("time", time)):
         if values is not None:
             averaged[name] = grid.correlate(values, differentiated_kernel(length, dt, 0))
@@ -358,6 +350,40 @@ def prepare(
         grid, averaged, points, smooth, stamps, np.where(inside, blocks + first_block, -1),
         np.concatenate([[0], np.cumsum(counts)]).astype(np.int64), curved=bent,
     )  # fmt: skip
+
+
+def filtered(
+    grid: Grid, signals: Mapping[str, FloatArray], *, curved: bool = False
+) -> tuple[dict[str, FloatArray], dict[str, FloatArray], dict[str, FloatArray], dict[str, FloatArray]]:
+    """Measured signals and their derivatives as the rows and the nonlinear laws of a grid see them.
+
+    Parameters
+    ----------
+    grid : Grid
+    signals : mapping
+        Keys of :data:`POSITION_CHAINS`, full rate; other keys are left out.
+    curved : bool
+        Second derivatives of the averages too.
+
+    Returns
+    -------
+    averaged, points, smooth, curved
+        As in :class:`WeakRecord`.
+    """
+    averaged: dict[str, FloatArray] = {}
+    points: dict[str, FloatArray] = {}
+    smooth: dict[str, FloatArray] = {}
+    bent: dict[str, FloatArray] = {}
+    length, dt, short = grid.length, grid.dt, grid.pointwise
+    for source, chain in POSITION_CHAINS.items():
+        if source not in signals:
+            continue
+        for order, name in enumerate(chain):
+            averaged[name] = grid.correlate(signals[source], differentiated_kernel(length, dt, order))
+            if curved and order + 2 <= HIGHEST_DERIVATIVE:
+                bent[name] = grid.correlate(signals[source], differentiated_kernel(length, dt, order + 2))
+            points[name], smooth[name] = _pointwise(signals[source], grid.segments, short[source], dt, order, grid.step)
+    return averaged, points, smooth, bent
 
 
 def _pointwise(values: FloatArray, segments: tuple[slice, ...], length: float, dt: float, order: int, step: int) -> tuple[FloatArray, FloatArray]:

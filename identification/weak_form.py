@@ -75,7 +75,10 @@ class WeakForm:
         known = {p.name: p for p in self.balances.model.parameters}
         return np.array(
             [
-                known[n].is_shape and known[n].scale != "absolute" and self.values[n] > 0
+                n in known
+                and known[n].is_shape
+                and known[n].scale != "absolute"
+                and self.values[n] > 0
                 for n in self.free
             ],
             dtype=bool,
@@ -88,9 +91,8 @@ class WeakForm:
     def stacked(self, x: FloatArray) -> Stacked:
         """Residual and Jacobian of every balance, unweighted, columns of `free`."""
         values = self.at(x)
-        found = stack(self.balances, self.data.train, values)
-        columns = [self.balances.wrt.index(n) for n in self.free]
-        jacobian = {b: np.array(j[:, columns]) for b, j in found.jacobian.items()}
+        found = stack(self.balances, self.data.train, values, self.free)
+        jacobian = {b: np.array(j) for b, j in found.jacobian.items()}
         for n in memory_shapes_of(self.balances.model, self.free):
             step = NUMERIC_STEP * values[n]
             moved = stack(self._bare, self.data.train, {**values, n: values[n] + step}).residual

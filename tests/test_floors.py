@@ -7,10 +7,11 @@ import numpy.typing as npt
 import pytest
 
 from identification import Record, fit
-from identification.assess import assess
+from identification.assess import BalanceError, Error, assess
 from identification.covariance import FEWEST_BLOCKS, block_errors
-from identification.engine import load_dataset, prepared_model
+from identification.engine import load_dataset, prepared_model, rms
 from identification.excitation import attenuation, excitation_warnings
+from identification.improvement import judged_drop, made_worse
 from identification.noise import noise_level
 from tests.test_other_payload import FAST, JOINT, record
 
@@ -106,3 +107,14 @@ def test_a_direction_that_one_block_alone_tells_of_does_not_spoil_the_errors_of_
     assert together is not None
     assert alone is not None
     assert together[:2] == pytest.approx(alone, rel=0.3)
+def test_an_addition_is_judged_by_what_it_leaves_and_not_by_its_floor() -> None:
+    def error(size: float, floor: float) -> Error:
+        residual = size * np.cos(np.arange(400.0))
+        weight = np.full(400, 1 / floor)
+        return Error(100 * size, 0.0, 0.0, {"motor": BalanceError(rms(residual), floor, rms(residual) / floor, "N.m", residual, weight)})
+
+    assert made_worse(error(1.0, 0.5), error(0.9, 0.01)) == ""
+    assert judged_drop(error(1.0, 0.5), error(0.9, 0.01), "motor") == pytest.approx(10.0)
+    assert "motor" in made_worse(error(1.0, 0.01), error(1.3, 0.5))
+    assert made_worse(error(0.1, 1.0), error(0.1, 1.0)) == ""
+    assert made_worse(error(1.0, 0.5), error(1.05, 0.5)).startswith("the held-out error rises")

@@ -78,7 +78,7 @@ def test_a_linear_axis_has_no_laws_of_an_angle_and_units_of_its_own() -> None:
     model = prepared_model(joint, axis)
     candidates, refused = offered(model, load_dataset([axis], [], joint, model))
     angular = {e.key for e in EFFECTS.values() if e.angular}
-    assert angular == {"gravity", "gravity_phase", "cyclic_torque", "cyclic_friction"}
+    assert angular == {"gravity", "gravity_upright", "cyclic_torque", "cyclic_friction"}
     assert not angular & {c.effect.key for c in candidates}
     assert {n.effect: n.why for n in refused}["gravity"] == "is a law of an angle; this axis is linear"
     found = improve(axis, joint)

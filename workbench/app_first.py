@@ -9,6 +9,7 @@ from typing import Final
 from casadi_models import JointModel
 from casadi_models.term import HANGING, LOAD_COMPLIANCE
 from identification.balances import balances_of
+from identification.calibration import bare, is_of_run, names_of_runs
 from identification.engine import Dataset, Solution
 from identification.start_values import bounds_of, starts
 from identification.weak_form import WeakForm
@@ -42,14 +43,16 @@ def first_look(model: JointModel, data: Dataset, now: Solution, start: Mapping[s
     fixed = {n for n, k in known.items() if k.value is not None}
     if now.values.get(LOAD_COMPLIANCE.name) == 0.0:
         fixed |= set(HANGING)
-    free = [n for n in model.parameter_names if n not in fixed | shapes]
+    free = [n for n in model.parameter_names if n not in fixed | shapes and n not in model.calibration]
+    free += names_of_runs(model, data.train)
     for n in free:
         values[n] = min(max(values[n], limits[n][0]), limits[n][1])
-    balances = balances_of(model, data.sensing, wrt=free)
+    balances = balances_of(model, data.sensing, wrt=bare(free))
     steps = STEPS_MEMORY if model.equations.memory_terms else STEPS
     values, used = WeakForm(balances, data, values, tuple(free), now.weights).fitted(limits, steps)
     kept = {k: float(v) for k, v in values.items()}
-    return Solution(replace(model, values=kept), kept, dict.fromkeys(kept), tuple(free), now.weights, now.sigma, iterations=used)
+    own = {k: v for k, v in kept.items() if not is_of_run(k)}
+    return Solution(replace(model, values=own), kept, dict.fromkeys(kept), tuple(n for n in free if not is_of_run(n)), now.weights, now.sigma, iterations=used)
 
 
 __all__ = ["first_look"]

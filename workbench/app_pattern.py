@@ -57,7 +57,7 @@ def _entering(analysis: Analysis) -> Mapping[str, set[str]]:
     if solution is None:
         return found
     balances = balances_of(solution.model, analysis.data.sensing, wrt=())
-    for balance, names in balances.coefficients(solution.values, analysis.data.train[0]).items():
+    for balance, names in balances.entering(solution.values).items():
         for name in names:
             found.setdefault(SOURCE[name], set()).add(balance)
     return found

@@ -18,6 +18,7 @@ from typing import Any, Final
 from identification.errors import InputError
 from identification.formats import percent, ratio
 from identification.html import (
+    calibration_html,
     claims_html,
     floor_percent,
     ledger_html,
@@ -123,6 +124,7 @@ def _sections(improvement: Improvement, result: dict[str, Any], plots: ReportPlo
         ("linear", "What a linear model would explain", fragments.linear_html(plots) if plots else ""),
         ("untested", "What these records cannot show", not_testable_html(result)),
         ("parameters", "Parameters", parameters_html(final, start) + _parameter_note(effort) if final else ""),
+        ("calibration", "Calibration found", calibration_html(result, improvement.data.train_names) if result["steps"] else ""),
     ]
 
 

@@ -16,7 +16,7 @@ from ..signals import Expression, LocalSignals
     absence="all balances with the torque sensor are shifted by one constant",
     excitation="rest periods",
     source="field knowledge",
-    confused_with=("current_offset", "gravity_phase"),
+    confused_with=("current_offset", "gravity"),
     separate_by="a reading without load",
 )
 def torque_sensor_offset(s: LocalSignals, p: SimpleNamespace) -> Expression:

@@ -123,6 +123,10 @@ def _print_improvement(found: Improvement) -> None:
         named = f", {' or '.join(line.effects)}" if line.effects else ", function of position"
         print(f"line: order {line.order:.3f} +- {line.tolerance:.3f} per {line.per}, {line.amplitude:.3g} {line.unit} ({line.balance}{named})")
     print_places(found.unexplained)
+    for c in found.calibration:
+        if c.stderr is not None and abs(c.value) > 2 * c.stderr:
+            name = found.data.train_names[c.run]
+            print(f"calibration found: {c.what} of {c.sensor} in {name} {c.value:.4g} +- {2 * c.stderr:.2g} {c.unit} (taken off, no physics)")
     if found.not_testable:
         print(f"not testable with these records ({len(found.not_testable)}): {', '.join(n.effect for n in found.not_testable)}")
     print(found.reason)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from casadi_models import JointModel
+from casadi_models import EFFECTS, JointModel
 from casadi_models.simulate import sampled_step
 from identification.errors import InputError
 from identification.joint_file import Joint
@@ -32,7 +32,10 @@ def run_simulate(arguments: Namespace) -> int:
     model = joint.model()
     for key in arguments.hide:
         try:
-            model = model.add(key)
+            more = model.add(key)
+            if more is model:
+                raise ValueError(f"is a part of {EFFECTS[key].key}, which is in the model; set its parameters with --set")
+            model = more
         except (KeyError, ValueError) as error:
             raise InputError(f"--hide {key}: {error.args[0]}") from None
     try:
