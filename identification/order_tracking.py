@@ -225,7 +225,7 @@ def threshold(alpha: float, orders: float) -> float:
     distribution of the ratio of two exponential levels).
     """
     known = 2 * (SURROUNDINGS - NEAREST) * MEDIAN_EFFICIENCY
-    return known * ((max(orders, 1.0) / alpha) ** (1 / known) - 1)
+    return float(known * ((max(orders, 1.0) / alpha) ** (1 / known) - 1))
 
 
 def independent_orders(lowest: float, highest: float, stroke: float) -> float:
