@@ -18,9 +18,10 @@ from identification.recursive import RecursiveLeastSquares, Settings
 from identification.two_step import OnlineSettings
 
 from .first_window import fast_recursion, first_estimate, least_range, reversal_weights
+from .grid import Grid
 from .guard import Guard
 from .online_options import OnlineOptions, estimated_parameters, held_parameters, prepared, searched_parameters
-from .pulse import Pulse
+from .pulse import GAP, Pulse
 from .row_check import LEAST, RowCheck
 from .rows import RowMaker
 from .samples import Samples
@@ -82,6 +83,7 @@ class OnlineEstimator:
             self._needs[reading] = used[k] and self.present[reading]
         self.samples = Samples(self.rows.timing, self._needs)
         self.watch = Watch(dt, self.present)
+        self.grid = Grid(dt, max(GAP * self.rows.timing.length, 1.5 * dt))
         self.pulse = Pulse(dt, self.rows.timing.length, self.present)
         own = {p.name: (p.low, p.high) for p in self.model.parameters}
         start = dict(zip(self.model.parameter_names, self.model.value_vector(), strict=True))
@@ -116,6 +118,7 @@ class OnlineEstimator:
         self.rows.reset()
         self.watch.reset()
         self.pulse.reset()
+        self.grid.reset()
         self.guard.reset()
         if self.two_step is not None:
             self.two_step.reset()
@@ -183,7 +186,7 @@ class OnlineEstimator:
             self._margin = factor
 
     def update(self, time: float, readings: Sequence[float], valid: Sequence[bool], *, enable: bool = True) -> bool:
-        """Take one sample.
+        """Take one sample; it need not lie on the grid of the sample time.
 
         Parameters
         ----------
@@ -209,6 +212,13 @@ class OnlineEstimator:
             self.unusable = tuple(i for i, v in enumerate(values) if not -top < v < top)
             values = [0.0 if i in self.unusable else v for i, v in enumerate(values)]
             valid = [flag and i not in self.unusable for i, flag in enumerate(valid)]
+        made = False
+        for at, row, flags in self.grid.due(time, values, valid):
+            made |= self._sample(at, row, flags, enable=enable)
+        return made
+
+    def _sample(self, time: float, values: list[float], valid: Sequence[bool], *, enable: bool) -> bool:
+        """Take a sample on the grid; True where a row was made."""
         good = self._all if valid == _ALL else [bool(valid[i]) and self.present[i] for i in range(6)]
         given = good
         if not self.pulse.add(time, values):
