@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Final
 
@@ -26,12 +27,12 @@ Spans = list[tuple[int, int, int]]
 
 def is_lost(radius: float, samples: int) -> bool:
     """True where a response grows so far over a shot that none of its digits are left."""
-    return samples * np.log(max(radius, 1.0)) > np.log(FARTHEST)
+    return samples * math.log(max(radius, 1.0)) > math.log(FARTHEST)
 
 
 def shot_length(radius: float, unknowns: int) -> int:
     """Samples of a shot of the fit, for a spectral radius above 1."""
-    return max(round(np.log(GROWTH) / np.log(radius)), SAMPLES * unknowns)
+    return max(round(math.log(GROWTH) / math.log(radius)), SAMPLES * unknowns)
 
 
 def shots(source: Source, spans: Spans, length: int) -> Iterator[tuple[FloatArray, FloatArray]]:

@@ -108,7 +108,7 @@ class Bench:
         self.drive = "motor_current" if joint.torque_per_current is not None else "motor_torque"
         self.table = self._record(plant, motion)
         self.shapes = searched_parameters(model)
-        self.shown = identifiable(joint, self.table * link_referred(joint), NOISE * np.abs(link_referred(joint)), STEP)
+        self.shown = identifiable(joint, self.table * link_referred(joint), np.array(NOISE) * np.abs(link_referred(joint)), STEP)
         self.scale = float(np.quantile(np.abs(self.table[:, 5]), 0.99)) / 170.0
 
     def _record(self, plant: Path, motion: Motion) -> FloatArray:
