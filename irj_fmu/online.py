@@ -220,8 +220,8 @@ class OnlineEstimator:
     def _sample(self, time: float, values: list[float], valid: Sequence[bool], *, enable: bool) -> bool:
         """Take a sample on the grid; True where a row was made."""
         good = self._all if valid == _ALL else [bool(valid[i]) and self.present[i] for i in range(6)]
-        given = good
-        if not self.pulse.add(time, values):
+        given, counts = good, self.pulse.add(time, values)
+        if self.pulse.failed or self.pulse.jumped:
             good = [False] * 6
         looked = self.watch.add(values, good)
         used = values if good is self._all and self._whole else [v if g else held for v, g, held in zip(values, good, self._last_good, strict=True)]
@@ -229,7 +229,7 @@ class OnlineEstimator:
         failed = self._detect(values, good)
         q = used
         self.samples.add((q[Q_M], q[Q_L] if self.present[Q_L] else q[Q_M], q[TAU], q[DRIVE]))
-        self.samples.mark(good, failed, self.watch, whole=good is self._all)
+        self.samples.mark(good if counts else [False] * 6, failed, self.watch, whole=counts and good is self._all)
         made = False
         self._since += 1
         if self._since >= self.rows.timing.stride:

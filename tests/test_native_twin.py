@@ -368,6 +368,25 @@ def test_host_steps_are_right_or_told(steps: tuple[float, ...], right: bool, spe
             assert steps != (5e-4,) or native.outputs() == exact.outputs()
 
 
+def test_equals_python_through_common_failures(spec: NativeSpec, fmu: Path, table: FloatArray, tmp_path: Path) -> None:
+    """Standstill from the first sample, a frozen bus, all readings zero, a stuck current: equal, held, and back."""
+    readings = np.vstack([np.zeros((1000, 6)), table[:9000]])
+    readings[4000:4500] = readings[4000]
+    readings[5500:5800] = 0.0
+    readings[6800:7300, 0] = readings[6800, 0]
+    found, expected, names = both(spec, fmu, tmp_path, readings, {"warm_up": 1.5})
+    reals = len(names["Real"])
+    assert largest(found, expected, reals) <= 1e-9
+    np.testing.assert_array_equal(found[:, reals:], expected[:, reals:])
+    fault, health = (found[:, reals + names["Integer"].index(n)] for n in ("fault", "health"))
+    assert set(fault[:4000]) == {0}
+    assert set(health[:4000]) == {0, 1}
+    assert set(fault[4020:4500]) == set(fault[5520:5800]) == {9}
+    assert (fault[6900:7300] != 0).any()
+    theta = found[:, [names["Real"].index(n) for n in names["Real"] if n.startswith("theta[")]]
+    np.testing.assert_allclose(theta[4000:, :3], np.tile(theta[3999, :3], (len(theta) - 4000, 1)), rtol=0.03)
+
+
 @pytest.mark.parametrize("steps", [(2e-3,), (5e-3,), (3e-4, 1.7e-3, 1.1e-3, 6e-4)], ids=["2 ms", "5 ms", "jitter"])
 def test_equals_python_at_coarse_and_uneven_steps(steps: tuple[float, ...], spec: NativeSpec, fmu: Path, table: FloatArray, tmp_path: Path) -> None:
     """All outputs to 1e-9 and right values, with a dropout and a stuck current on the way."""

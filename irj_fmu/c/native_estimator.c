@@ -282,14 +282,14 @@ static void link_from_motor(State *s) {
     if (LINK_FROM_TORSION && stiffness > 0) s->readings[Q_L] -= s->last_good[TAU] / stiffness;
 }
 
-static void push(State *s, const int good[SENSORS]) {
+static void push(State *s, const int good[SENSORS], int counts) {
     static const int reading[SOURCES] = {Q_M, Q_L, TAU, DRIVE};
     const double *q = s->last_good;
     const double sample[SOURCES] = {q[Q_M], present[Q_L] ? q[Q_L] : q[Q_M], q[TAU], q[DRIVE]};
     int k;
     append_sample(&s->rows, sample);
     for (k = 0; k < SOURCES; k++) {
-        const int i = reading[k], bad = (!good[i] && needs[i]) || (s->detect && s->detector.failed[i]);
+        const int i = reading[k], bad = (!(good[i] && counts) && needs[i]) || (s->detect && s->detector.failed[i]);
         if (bad || s->watch.constant[i] || s->watch.scaled[i]) s->lost[k] = WINDOW + STRIDE;
         else if (s->lost[k]) s->lost[k]--;
     }
@@ -300,7 +300,7 @@ static int take_sample(Twin *m, double time, const double readings[SENSORS], con
     State *s = &m->s;
     const int counts = pulse_sample(s, time, readings);
     int good[SENSORS], made = 0, looked, i;
-    for (i = 0; i < SENSORS; i++) good[i] = given[i] && counts;
+    for (i = 0; i < SENSORS; i++) good[i] = given[i] && !s->pulse.failed && !s->pulse.jumped;
     looked = watch_sample(m, readings, good);
     for (i = 0; i < SENSORS; i++)
         if (good[i]) s->last_good[i] = readings[i];
@@ -310,7 +310,7 @@ static int take_sample(Twin *m, double time, const double readings[SENSORS], con
         memcpy(s->readings, s->last_good, sizeof s->readings);
         if (!good[Q_L]) link_from_motor(s);
     }
-    push(s, good);
+    push(s, good, counts);
     if (++s->rows.since >= STRIDE) {
         s->rows.since = 0;
         made = take_row(m, time, enable);
