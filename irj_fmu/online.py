@@ -220,7 +220,10 @@ class OnlineEstimator:
     def _sample(self, time: float, values: list[float], valid: Sequence[bool], *, enable: bool) -> bool:
         """Take a sample on the grid; True where a row was made."""
         good = self._all if valid == _ALL else [bool(valid[i]) and self.present[i] for i in range(6)]
-        given, counts = good, self.pulse.add(time, values)
+        given, failed_before = good, self.pulse.failed
+        counts = self.pulse.add(time, values)
+        if failed_before and not self.pulse.failed and self.detector is not None:
+            self.detector.reset()  # its observers have followed readings that were none
         if self.pulse.failed or self.pulse.jumped:
             good = [False] * 6
         looked = self.watch.add(values, good)

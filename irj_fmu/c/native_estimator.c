@@ -298,9 +298,10 @@ static void push(State *s, const int good[SENSORS], int counts) {
 /* Take a sample on the grid; 1 where a row was made. */
 static int take_sample(Twin *m, double time, const double readings[SENSORS], const int given[SENSORS], int enable) {
     State *s = &m->s;
-    const int counts = pulse_sample(s, time, readings);
+    const int failed_before = s->pulse.failed, counts = pulse_sample(s, time, readings);
     int good[SENSORS], made = 0, looked, i;
     for (i = 0; i < SENSORS; i++) good[i] = given[i] && !s->pulse.failed && !s->pulse.jumped;
+    if (failed_before && !s->pulse.failed) clear_detector(&s->detector); /* its observers have followed readings that were none */
     looked = watch_sample(m, readings, good);
     for (i = 0; i < SENSORS; i++)
         if (good[i]) s->last_good[i] = readings[i];
