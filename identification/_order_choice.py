@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from identification._hankel_qr import HankelFactor
 from identification._io_records import Source
 from identification._response_fit import ResponseFit
+from identification._shots import JUDGED, SAMPLES, fit_shots, is_lost, vaf_of_shots
 from identification._triangle import FloatArray, single_thread
 from identification.errors import InputError
 
@@ -39,7 +40,7 @@ class OrderCandidate:
     spectral_radius : float
         Of the model fitted without the held-out samples.
     held_out_vaf_percent : ndarray, shape (outputs,)
-        Variance accounted for in simulation of held-out samples; NaN where the model is unstable.
+        Variance accounted for in simulation of held-out samples; where no order is stable, on short pieces of them; NaN where it was not judged.
     """
 
     order: int
@@ -51,6 +52,11 @@ class OrderCandidate:
     def clear_gap(self) -> bool:
         """Whether the singular values fall by more than a factor of 3 after this order."""
         return self.gap >= _CLEAR_GAP
+
+    @property
+    def is_marginal(self) -> bool:
+        """Whether the response does not fade within the shots that such a model is judged on: it integrates or is unstable."""
+        return self.spectral_radius >= 1.0 - 1.0 / JUDGED
 
     @property
     def unexplained_percent(self) -> float:
@@ -97,16 +103,56 @@ def judge(
     return tuple(candidates)
 
 
-def choose(candidates: tuple[OrderCandidate, ...], radius: Callable[[int], float]) -> int:
+def judge_by_shots(
+    source: Source, early: HankelFactor, candidates: tuple[OrderCandidate, ...], split: int, weights: FloatArray
+) -> tuple[OrderCandidate, ...]:
+    """The candidates judged on short pieces of the held-out samples, for plants that integrate or are unstable."""
+    left = early.directions()[0]
+    before = _spans(source.lengths, max(split - _BEFORE, 0), split)
+    after = _spans(source.lengths, split, split + _AFTER)
+    found = []
+    for one in candidates:
+        a, c = early.realise(left, one.order)
+        length = max(JUDGED, SAMPLES * (one.order + early.inputs))
+        made = None if is_lost(one.spectral_radius, length) else fit_shots(source, before, (a, c), weights, length)
+        vaf = np.full(early.outputs, np.nan) if made is None else vaf_of_shots(source, after, (a, made[0], c, made[1]), weights)
+        found.append(replace(one, held_out_vaf_percent=vaf))
+    return tuple(found)
+
+
+def choose_marginal(
+    stable: int | None, candidates: tuple[OrderCandidate, ...], judged: tuple[OrderCandidate, ...]
+) -> tuple[int, tuple[OrderCandidate, ...]]:
+    """The stable order, where on short pieces it does about as well as the best one; else the lowest order that does.
+
+    Parameters
+    ----------
+    stable
+        What :func:`choose` gave.
+    candidates, judged
+        Orders judged on the whole of the held-out samples, and on short pieces of them.
+
+    Returns
+    -------
+    order, and the candidates as they were judged for it
+    """
+    best = min(one.unexplained_percent for one in judged)
+    if not np.isfinite(best):
+        return (min(candidates, key=lambda one: one.spectral_radius).order if stable is None else stable), candidates
+    good = [one.order for one in judged if one.unexplained_percent <= _RATIO_CLEAR * best + _PERCENT]
+    return (stable, candidates) if stable in good and stable is not None else (good[0], judged)
+
+
+def choose(candidates: tuple[OrderCandidate, ...], radius: Callable[[int], float]) -> int | None:
     """Lowest stable order that simulates about as well as the best one.
 
     "About" is wider for an order after which the singular values fall clearly.
-    `radius` gives the spectral radius of the final model of an order. Where no order
-    is stable in both, the one with the smallest radius is returned.
+    `radius` gives the spectral radius of the final model of an order. None where no
+    order is stable in both.
     """
     stable = [one for one in candidates if np.isfinite(one.unexplained_percent) and radius(one.order) < 1.0]
     if not stable:
-        return min((one.order for one in candidates), key=radius)
+        return None
     best = min(one.unexplained_percent for one in stable)
     for one in stable:
         ratio = _RATIO_CLEAR if one.clear_gap else _RATIO

@@ -82,7 +82,7 @@ def solve_with_prior(
         weight = 1.0 / np.sqrt(overlap * noise)
         rows = np.vstack([(scaled * weight[:, None]).reshape(-1, n), np.eye(n)])
         target = np.concatenate([(left * weight).ravel(), np.zeros(n)])
-        triangle: FloatArray = np.asarray(np.linalg.qr(np.column_stack([rows, target]), mode="r"), dtype=np.float64)
+        triangle: FloatArray = np.asarray(np.linalg.qr(np.column_stack([rows, target]), mode="r"))
         step = np.linalg.solve(triangle[:n, :n], triangle[:n, n])
         degrees = max(1.0, len(y) - n / y.shape[1])
         noise = np.maximum(np.sum((left - scaled @ step) ** 2, axis=0) / degrees, floor)

@@ -22,8 +22,9 @@ import numpy.typing as npt
 from identification._hankel_gram import HankelGram, TooFewDigits
 from identification._hankel_qr import HankelFactor, HankelQR, Method
 from identification._io_records import ArraySource, Chunk, ChunkSource, Source
-from identification._order_choice import OrderCandidate, choose, judge, shortlist
+from identification._order_choice import OrderCandidate, choose, choose_marginal, judge, judge_by_shots, shortlist
 from identification._response_fit import ResponseFit, simulate
+from identification._shots import fit_shots, shot_length
 from identification._triangle import FloatArray, single_thread
 from identification.errors import InputError
 
@@ -44,8 +45,8 @@ __all__ = [
 InputMatrixMethod = Literal["simulation", "shift"]
 Compression = Literal["qr", "fast"]
 
-# growth of an unstable response over a record up to which it still fits into the digits
-_GROWTH = 1e6
+# growth of an unstable response over a record up to which it is simulated in one piece: of sixteen digits four are left
+_GROWTH = 1e12
 
 
 class UnstableModelWarning(UserWarning):
@@ -251,6 +252,8 @@ def _identify(source: Source, block_rows: int, order: int | None, dt: float, met
         orders = shortlist(singular_values, min(options.max_order, highest))
         candidates = judge(source, early, orders, singular_values, split, weights)
         order = choose(candidates, lambda tried: _spectral_radius(whole.realise(left, tried)[0]))
+        if order is None or any(one.is_marginal for one in candidates):
+            order, candidates = choose_marginal(order, candidates, judge_by_shots(source, early, candidates, split, weights))
     return _finish(source, whole, left, singular_values, order, candidates, (dt, weights, replace(options, compression=compression)))
 
 
@@ -270,6 +273,9 @@ def _finish(
     b, d = factor.shift_equation(left, order)
     x0 = tuple(np.full(order, np.nan) for _ in source.lengths)
     vaf = np.full(factor.outputs, np.nan)
+    if grows and options.input_matrices == "simulation":
+        spans = [(index, 0, length) for index, length in enumerate(source.lengths)]
+        b, d = fit_shots(source, spans, (a, c), weights, shot_length(radius, order + factor.inputs)) or (b, d)
     if not grows:
         fit = ResponseFit(a, c, factor.inputs)
         for index, length in enumerate(source.lengths):

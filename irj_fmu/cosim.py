@@ -6,7 +6,7 @@ import math
 import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, final
 
@@ -216,7 +216,7 @@ def cosimulate(plant: Joint, model: Joint, files: tuple[Path, Path], setting: Se
         messages = tuple(b.messages)
     ratios = {key: float(found[f"estimator.ratio.{key}"][-1]) for key in sensing.balances}
     readings = np.column_stack([found[c] for c in channels]) * link_referred(plant)
-    shown = identifiable(plant, readings, np.zeros(6), setting.step)
+    shown = identifiable(believed(plant, model), readings, np.zeros(6), setting.step)
     return Cosimulation(found, names, tuple(_rows(plant, shown, found)), ratios, messages)
 
 
@@ -225,6 +225,12 @@ def start_state(plant: Joint, motion: Motion) -> dict[str, float]:
     q, v = motion.start()
     sides = ("motor_", "link_") if plant.model().is_elastic else ("",)
     return {f"plant.state.{side}{n}": x for side in sides for n, x in (("position", q), ("velocity", v))}
+
+
+def believed(plant: Joint, model: Joint) -> Joint:
+    """The joint that the estimator believes in, with the plant's values of what both have."""
+    true = dict(zip(plant.model().parameter_names, plant.model().value_vector(), strict=True))
+    return replace(model, fitted={**model.fitted, **{n: true[n] for n in model.model().parameter_names if n in true}})
 
 
 def link_referred(joint: Joint) -> FloatArray:
@@ -238,11 +244,13 @@ def _rows(plant: Joint, shown: Identifiable, found: Trajectory) -> list[Row]:
     model, names = plant.model(), shown.names
     units = {p.name: p.unit for p in model.parameters}
     true = dict(zip(model.parameter_names, model.value_vector(), strict=True))
-    at = np.array([true[n] for n in names])
+    at = np.array([true.get(n, 0.0) for n in names])
     last, spread = (np.array([float(found[f"estimator.{s}[{i}]"][-1]) for i in range(1, len(names) + 1)]) for s in ("theta", "sigma"))
     seen = at + shown.seen(last - at)
     rows = []
     for i, n in enumerate(names):
+        if n not in true:
+            continue  # the plant has no such thing
         limit = limit_of(model, n) if true[n] else None
         name = n if shown.alone(i) else f"{n} (in combination)"
         rows.append(Row(plant.name, name, units[n], true[n], float(seen[i]), float(spread[i]), limit))

@@ -147,6 +147,7 @@ class Estimator(TableSlave):
     """Estimates a joint's parameters from its readings; see :class:`irj_fmu.online.OnlineEstimator`."""
 
     default_sample_time = 1e-3
+    resamples = True
     summary = "Online estimation of the parameters of a geared joint, with residuals of its balances and fault detection."
 
     def __init__(self, **kwargs: Any) -> None:
@@ -206,6 +207,10 @@ class Estimator(TableSlave):
         if len(made.names) != self._thetas or joint.gear_ratio != self._packed.gear_ratio:
             raise InputError(f"{path}: has other estimated parameters or another gear ratio than the packed joint file")
         return made
+
+    def longest(self, period: float) -> float:
+        """Longest step of a host between two samples that the estimator bridges [s]."""
+        return self._estimator.grid.gap if self._estimator is not None else period
 
     # --- a sample ----------------------------------------------------------------------------------------------------
 

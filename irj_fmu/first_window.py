@@ -55,8 +55,8 @@ def least_squares(y: FloatArray, h: FloatArray, least: FloatArray) -> FloatArray
         shrink = np.where(size > ABSENT, 1 / np.maximum(size, ABSENT), 0.0)
         target = (y * weight).ravel()
         ridge = np.vstack([rows * shrink, RIDGE * np.eye(count)])
-        column = np.concatenate([target, np.zeros(count)])
-        triangle = np.asarray(np.linalg.qr(np.column_stack([ridge, column]), mode="r"), dtype=np.float64)
+        stacked = np.column_stack([ridge, np.concatenate([target, np.zeros(count)])])
+        triangle: FloatArray = np.asarray(np.linalg.qr(stacked, mode="r"))
         theta = np.asarray(np.linalg.solve(triangle[:count, :count], triangle[:count, count]) * shrink, dtype=np.float64)
         weight = 1.0 / np.maximum(np.sqrt(np.mean((y - h @ theta) ** 2, axis=0)), least)
     return theta

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,6 +13,9 @@ from identification.joint_file import Joint
 from identification.record import Record
 
 from .online_options import OnlineOptions, prepared
+
+if TYPE_CHECKING:
+    from identification.fault import Fault
 
 Say = Callable[[str], object]
 
@@ -106,23 +109,46 @@ def _ms(seconds: float) -> str:
     return f"{1e3 * seconds:.4g} ms"
 
 
-def online_readings(record: Record, joint: Joint) -> tuple[list[list[float]], list[bool]]:
-    """Drive, motor position and velocity, link position and velocity, torque (link-referred SI), and which are there."""
+def online_readings(record: Record, joint: Joint, faults: Sequence[Fault] = ()) -> tuple[list[list[float]], list[bool]]:
+    """Drive, motor position and velocity, link position and velocity, torque (link-referred SI), and which are there.
+
+    Parameters
+    ----------
+    record : Record
+        Evenly sampled.
+    joint : Joint
+    faults : sequence of Fault
+        Put into the sensors before velocities are derived: a derived velocity follows its faulty position.
+
+    Raises
+    ------
+    InputError
+        A fault of a sensor that the record does not have.
+    """
+    from identification.fault import SENSORS, inject
     from identification.sensing import drive_torque
 
     count, ratio = len(record), joint.gear_ratio
     motor = record["motor_position"] / ratio if record.has("motor_position") else record["link_position"]
     link = record["link_position"] if record.has("link_position") else motor
-
-    def velocity(channel: str, scale: float, position: Any) -> Any:
-        return record[channel] / scale if record.has(channel) else np.gradient(position, record.time)
-
     torque = record["link_torque"] if record.has("link_torque") else np.zeros(count)
-    table = np.column_stack([
-        drive_torque(record, joint), motor, velocity("motor_velocity", ratio, motor), link, velocity("link_velocity", 1.0, link), torque,
-    ])  # fmt: skip
-    has_link = record.has("link_position")
-    return table.tolist(), [True, True, True, has_link, has_link, record.has("link_torque")]
+    measured = {2: ("motor_velocity", 1, ratio), 4: ("link_velocity", 3, 1.0)}
+    columns = [drive_torque(record, joint), motor, np.zeros(count), link, np.zeros(count), torque]
+    for at, (channel, _, scale) in measured.items():
+        if record.has(channel):
+            columns[at] = record[channel] / scale
+    table = np.column_stack(columns)
+    has_link, has_torque = record.has("link_position"), record.has("link_torque")
+    there = [True, True, record.has("motor_velocity"), has_link, record.has("link_velocity"), has_torque]
+    for fault in faults:
+        if not there[SENSORS.index(fault.sensor)]:
+            raise InputError(f"{record.name}: has no reading of its own for {fault.sensor}; a fault needs a sensor that is there")
+    if faults:
+        table = inject(table, record.dt, faults)
+    for at, (channel, position, _) in measured.items():
+        if not record.has(channel):
+            table[:, at] = np.gradient(table[:, position], record.time)
+    return table.tolist(), [True, True, True, has_link, has_link, has_torque]
 
 
 __all__ = ["detector_state", "online_readings", "read_healthy"]

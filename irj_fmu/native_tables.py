@@ -24,6 +24,7 @@ from identification.joint_file import Joint
 
 from . import watch as watch_settings
 from .first_window import ABSENT, RIDGE
+from .grid import ON_GRID
 from .native_expressions import cheaper
 from .online import _RESIDUAL_SECONDS, _STRAIN, OnlineEstimator
 from .row_check import LEAST
@@ -315,6 +316,8 @@ def _recursion_tables(header: _Header, made: OnlineEstimator) -> None:
     for key, number in made.pulse.figures().items():
         header.define(f"PULSE_{key}", number)
     header.define("HELD_CODE", HELD)
+    header.define("ON_GRID", ON_GRID)
+    header.define("GRID_GAP", float(made.grid.gap))
     header.define("ERROR_LIMIT", float(_STRAIN.error_limit))
     header.define("CONFIRM_ROWS", made._confirm)
 

@@ -18,9 +18,10 @@ from identification.recursive import RecursiveLeastSquares, Settings
 from identification.two_step import OnlineSettings
 
 from .first_window import fast_recursion, first_estimate, least_range, reversal_weights
+from .grid import Grid
 from .guard import Guard
 from .online_options import OnlineOptions, estimated_parameters, held_parameters, prepared, searched_parameters
-from .pulse import Pulse
+from .pulse import GAP, Pulse
 from .row_check import LEAST, RowCheck
 from .rows import RowMaker
 from .samples import Samples
@@ -82,6 +83,7 @@ class OnlineEstimator:
             self._needs[reading] = used[k] and self.present[reading]
         self.samples = Samples(self.rows.timing, self._needs)
         self.watch = Watch(dt, self.present)
+        self.grid = Grid(dt, max(GAP * self.rows.timing.length, 1.5 * dt))
         self.pulse = Pulse(dt, self.rows.timing.length, self.present)
         own = {p.name: (p.low, p.high) for p in self.model.parameters}
         start = dict(zip(self.model.parameter_names, self.model.value_vector(), strict=True))
@@ -116,6 +118,7 @@ class OnlineEstimator:
         self.rows.reset()
         self.watch.reset()
         self.pulse.reset()
+        self.grid.reset()
         self.guard.reset()
         if self.two_step is not None:
             self.two_step.reset()
@@ -183,7 +186,7 @@ class OnlineEstimator:
             self._margin = factor
 
     def update(self, time: float, readings: Sequence[float], valid: Sequence[bool], *, enable: bool = True) -> bool:
-        """Take one sample.
+        """Take one sample; it need not lie on the grid of the sample time.
 
         Parameters
         ----------
@@ -209,9 +212,19 @@ class OnlineEstimator:
             self.unusable = tuple(i for i, v in enumerate(values) if not -top < v < top)
             values = [0.0 if i in self.unusable else v for i, v in enumerate(values)]
             valid = [flag and i not in self.unusable for i, flag in enumerate(valid)]
+        made = False
+        for at, row, flags in self.grid.due(time, values, valid):
+            made |= self._sample(at, row, flags, enable=enable)
+        return made
+
+    def _sample(self, time: float, values: list[float], valid: Sequence[bool], *, enable: bool) -> bool:
+        """Take a sample on the grid; True where a row was made."""
         good = self._all if valid == _ALL else [bool(valid[i]) and self.present[i] for i in range(6)]
-        given = good
-        if not self.pulse.add(time, values):
+        given, failed_before = good, self.pulse.failed
+        counts = self.pulse.add(time, values)
+        if failed_before and not self.pulse.failed and self.detector is not None:
+            self.detector.reset()  # its observers have followed readings that were none
+        if self.pulse.failed or self.pulse.jumped:
             good = [False] * 6
         looked = self.watch.add(values, good)
         used = values if good is self._all and self._whole else [v if g else held for v, g, held in zip(values, good, self._last_good, strict=True)]
@@ -219,7 +232,7 @@ class OnlineEstimator:
         failed = self._detect(values, good)
         q = used
         self.samples.add((q[Q_M], q[Q_L] if self.present[Q_L] else q[Q_M], q[TAU], q[DRIVE]))
-        self.samples.mark(good, failed, self.watch, whole=good is self._all)
+        self.samples.mark(good if counts else [False] * 6, failed, self.watch, whole=counts and good is self._all)
         made = False
         self._since += 1
         if self._since >= self.rows.timing.stride:

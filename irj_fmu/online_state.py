@@ -36,7 +36,7 @@ def state(of: OnlineEstimator) -> bytes:
         arrays |= {_PREFIX + name: values for name, values in more.items()}
     parts = {} if of.estimator is None else {"rls": of.estimator.state()}
     plain["guard"], more, kept = of.guard.state()
-    arrays |= {_GUARD + name: values for name, values in more.items()} | {"pulse": np.array(of.pulse.numbers())}
+    arrays |= {_GUARD + name: values for name, values in more.items()} | {"pulse": np.array(of.pulse.numbers()), "grid": np.array(of.grid.numbers())}
     parts |= kept
     if of.detector is not None:
         parts["detector"] = of.detector.state()
@@ -71,6 +71,7 @@ def restore(of: OnlineEstimator, saved: bytes) -> None:
         of.estimator.restore(parts["rls"])
     of.guard.restore(plain["guard"], _own(arrays, _GUARD), parts)
     of.pulse.load(arrays["pulse"].tolist())
+    of.grid.load(arrays["grid"].tolist())
     if of.detector is not None and "detector" in parts:
         of.detector.restore(parts["detector"])
 

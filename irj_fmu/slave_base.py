@@ -65,10 +65,13 @@ class TableSlave(Fmi2Slave):  # type: ignore[misc, unused-ignore]
         Inputs, outputs and parameters besides `STANDARD`, in the order of the value references.
     default_sample_time : float
         Start value of the parameter ``sample_time`` in s.
+    resamples : bool
+        True where `process` takes samples at any times, up to :meth:`longest` apart.
     """
 
     variables: ClassVar[tuple[Variable, ...]] = ()
     default_sample_time: ClassVar[float] = 1e-3
+    resamples: ClassVar[bool] = False
     summary: ClassVar[str] = ""
 
     def __init__(self, **kwargs: Any) -> None:
@@ -127,6 +130,10 @@ class TableSlave(Fmi2Slave):  # type: ignore[misc, unused-ignore]
         mapping
             New values of outputs, by name, as many as have changed; ``health`` may be among them.
         """
+
+    def longest(self, period: float) -> float:
+        """Longest step of a host that is followed [s], at a sample time `period`."""
+        return period
 
     def get_state(self) -> bytes:
         """Return everything `process` remembers."""
@@ -188,9 +195,10 @@ class TableSlave(Fmi2Slave):  # type: ignore[misc, unused-ignore]
         period = float(values[0])
         if self._start != self._start:
             self._start = time
-        self._too_long = length > period * (1 + _SLACK)
+        longest = self.longest(period)
+        self._too_long = length > longest * (1 + _SLACK)
         due = self._start + self._count * period
-        if not self._too_long and time < due - period * _SLACK * 10:
+        if length <= period * (1 + _SLACK) and time < due - period * _SLACK * 10:
             return False
         if self._changed:
             self._configure()
@@ -198,8 +206,8 @@ class TableSlave(Fmi2Slave):  # type: ignore[misc, unused-ignore]
         self._last = time
         self._count = math.floor((time - self._start) / period + 1e-3) + 1
         if self._too_long:
-            self._report(f"the host's step {length:g} s is longer than sample_time {period:g} s")
-        elif abs(self._step - self._expected) > _UNEVEN * period and self._expected > 0:
+            self._report(f"the host's step {length:g} s is too long for sample_time {period:g} s; steps up to {longest:g} s are followed")
+        elif self._expected > 0 and (self._step > longest * (1 + _SLACK) if self.resamples else abs(self._step - self._expected) > _UNEVEN * period):
             self._uneven = time
             self._report(f"the host's steps of {length:g} s put samples {self._step:g} s apart, sample_time is {period:g} s; use steps that divide it")
         self._expected = max(period, length)

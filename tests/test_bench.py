@@ -16,13 +16,13 @@ from casadi_models import EFFECTS, JointModel
 from identification import fit, load_joint, read
 from identification.balances import balances_of
 from identification.dataset import Dataset
-from identification.engine import memory_shapes_of
 from identification.errors import InputError
 from identification.joint_file import Joint
 from identification.record import Record
 from identification.sensing import Sensing, adapt, sense, signals_of
 from identification.stacked import floors, rms, row_weights, stack
 from identification.weak import WeakRecord, prepare
+from identification.weak_form import memory_shapes_of
 from tests.hidden_effect.generator import generate_case
 
 FloatArray = npt.NDArray[np.float64]

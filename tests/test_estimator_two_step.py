@@ -197,7 +197,7 @@ def test_the_budget_is_kept(bench: Bench, readings: list[list[float]]) -> None:
 
 
 def test_on_request_and_off(bench: Bench, readings: list[list[float]]) -> None:
-    """A fitted joint searches when asked; with the optimiser off there is none, and no guard."""
+    """A fitted joint searches when asked; with the optimiser off there is none."""
     made = OnlineEstimator(bench.joint, STEP, OnlineOptions(detect=False, portions=20))
     feed(made, readings, 0, 7500)
     assert made.two_step is not None
@@ -208,7 +208,6 @@ def test_on_request_and_off(bench: Bench, readings: list[list[float]]) -> None:
     assert made.two_step.eta[0] == pytest.approx(0.05, rel=0.1)
     off = OnlineEstimator(bench.joint, STEP, OnlineOptions(optimise=False))
     assert off.two_step is None
-    assert off.guard is None
     assert not off.reoptimise()
 
 

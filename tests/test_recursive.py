@@ -54,7 +54,8 @@ def test_without_forgetting_it_is_the_posterior_of_all_samples() -> None:
 def test_constant_forgetting_is_exponentially_weighted_least_squares() -> None:
     _, h, y = _data(300, m=1)
     factor, scale = 0.97, np.array([2.0, 3.0, 1.0, 5.0])
-    estimator = RecursiveLeastSquares(np.zeros(4), scale, "constant", R2=1e-2, settings=Settings(freeze=False, forgetting=factor, covariance_limit=1e6, huber=0.0))
+    settings = Settings(freeze=False, forgetting=factor, covariance_limit=1e6, huber=0.0)
+    estimator = RecursiveLeastSquares(np.zeros(4), scale, "constant", R2=1e-2, settings=settings)
     estimator.run(y, h)
     weight = factor ** np.arange(299, -1, -1.0)
     information = factor**300 * np.diag(scale**-2) + np.einsum("k,ki,kj->ij", weight / 1e-2, h[:, 0], h[:, 0])

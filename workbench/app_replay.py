@@ -169,7 +169,7 @@ def _limits(joint: Joint, options: OnlineOptions, healthy: Sequence[Record], dt:
 def _readings(part: Record, joint: Joint, asked: Request) -> tuple[FloatArray, str]:
     """Readings (n, 6), with the fault that is to be tried; what was done, as a sentence."""
     from identification.fault import SENSORS
-    from identification.fault_injector import Fault, Kind, inject
+    from identification.fault_injector import Fault, Kind
 
     healthy, _ = online_readings(part, joint)
     table = np.array(healthy, dtype=np.float64)
@@ -181,7 +181,7 @@ def _readings(part: Record, joint: Joint, asked: Request) -> tuple[FloatArray, s
     at = asked.at if math.isfinite(asked.at) else 0.6 * part.duration
     if at >= part.duration:
         raise InputError(f"replay: the fault begins at {at:g} s, after the end at {part.duration:.4g} s")
-    table = inject(table, part.dt, [Fault(SENSORS[column], cast("Kind", asked.kind), at, size)])
+    table = np.array(online_readings(part, joint, [Fault(SENSORS[column], cast("Kind", asked.kind), at, size)])[0], dtype=np.float64)
     shown = {"gain": f" of {100 * GAIN:g} %", "drift": f" of {100 * SHARE['drift']:g} % of its range per second"}.get(
         asked.kind, f" of {100 * SHARE[asked.kind]:g} % of its range" if asked.kind in SHARE else ""
     )  # fmt: skip

@@ -155,7 +155,7 @@ def _bar(axes: Axes, y: float, a: float, b: float, kind: str, colour: str, title
 
 def _lane_of(code: int) -> int:
     """Reading that a fault code is about; -1 for the joint itself, the current for the pair it cannot be told from."""
-    if code == 8:
+    if code in (8, 9):
         return -1
     return 0 if code == 7 else code % 10 - 1
 

@@ -23,8 +23,7 @@ static void tell(Twin *m, int once, const char *format, ...) { /* a text once pe
     va_end(values);
 }
 
-#define UNEVEN 0.25 /* deviation of the time between samples, as a share of it, that passes without a word */
-#define UNEVEN_HOLD 200 /* samples for which health remembers it */
+#define UNEVEN_HOLD 200 /* samples for which health remembers a gap */
 enum { HEALTH_OK, WARMING_UP, NUMERIC_TROUBLE, STEP_MISMATCH, INTERNAL_ERROR };
 enum { TELL_STEP = N_VARIABLES, TELL_SETUP, TELL_WINDOW, TELL_UNEVEN, TELL_FAULT }; /* places in `told` after those of the variables */
 
@@ -35,6 +34,7 @@ static void clear_estimator(Twin *m) {
     int i;
     clear_rows(m);
     memset(&s->watch, 0, sizeof s->watch);
+    memset(&s->grid, 0, sizeof s->grid);
     memset(&s->pulse, 0, sizeof s->pulse);
     clear_guard(&s->guard);
     memset(&s->window, 0, sizeof s->window);
@@ -282,25 +282,26 @@ static void link_from_motor(State *s) {
     if (LINK_FROM_TORSION && stiffness > 0) s->readings[Q_L] -= s->last_good[TAU] / stiffness;
 }
 
-static void push(State *s, const int good[SENSORS]) {
+static void push(State *s, const int good[SENSORS], int counts) {
     static const int reading[SOURCES] = {Q_M, Q_L, TAU, DRIVE};
     const double *q = s->last_good;
     const double sample[SOURCES] = {q[Q_M], present[Q_L] ? q[Q_L] : q[Q_M], q[TAU], q[DRIVE]};
     int k;
     append_sample(&s->rows, sample);
     for (k = 0; k < SOURCES; k++) {
-        const int i = reading[k], bad = (!good[i] && needs[i]) || (s->detect && s->detector.failed[i]);
+        const int i = reading[k], bad = (!(good[i] && counts) && needs[i]) || (s->detect && s->detector.failed[i]);
         if (bad || s->watch.constant[i] || s->watch.scaled[i]) s->lost[k] = WINDOW + STRIDE;
         else if (s->lost[k]) s->lost[k]--;
     }
 }
 
-/* Take a sample; 1 where a row was made. */
-static int update(Twin *m, double time, const double readings[SENSORS], const int given[SENSORS], int enable) {
+/* Take a sample on the grid; 1 where a row was made. */
+static int take_sample(Twin *m, double time, const double readings[SENSORS], const int given[SENSORS], int enable) {
     State *s = &m->s;
-    const int counts = pulse_sample(s, time, readings);
+    const int failed_before = s->pulse.failed, counts = pulse_sample(s, time, readings);
     int good[SENSORS], made = 0, looked, i;
-    for (i = 0; i < SENSORS; i++) good[i] = given[i] && counts;
+    for (i = 0; i < SENSORS; i++) good[i] = given[i] && !s->pulse.failed && !s->pulse.jumped;
+    if (failed_before && !s->pulse.failed) clear_detector(&s->detector); /* its observers have followed readings that were none */
     looked = watch_sample(m, readings, good);
     for (i = 0; i < SENSORS; i++)
         if (good[i]) s->last_good[i] = readings[i];
@@ -310,13 +311,45 @@ static int update(Twin *m, double time, const double readings[SENSORS], const in
         memcpy(s->readings, s->last_good, sizeof s->readings);
         if (!good[Q_L]) link_from_motor(s);
     }
-    push(s, good);
+    push(s, good, counts);
     if (++s->rows.since >= STRIDE) {
         s->rows.since = 0;
         made = take_row(m, time, enable);
         judge(s, s->pulse.jumped ? good : given);
     }
     if (looked) floors(m);
+    return made;
+}
+
+/* Take a sample, which need not lie on the grid: irj_fmu.grid.Grid. */
+static int update(Twin *m, double time, const double readings[SENSORS], const int good[SENSORS], int enable) {
+    Grid *g = &m->s.grid;
+    const double slack = ON_GRID * SAMPLE_TIME, before = g->time, apart = time - g->time;
+    const int fresh = g->count == 0 || apart > GRID_GAP || !(apart > 0);
+    double point;
+    int made = 0, i;
+    if (fresh) { g->start = time; g->count = 0; }
+    point = g->start + g->count * SAMPLE_TIME;
+    if (fresh || fabs(time - point) <= slack) {
+        g->count++;
+        made = take_sample(m, time, readings, good, enable);
+    } else {
+        while (point <= time + slack) {
+            const double share = (point - before) / apart;
+            double line[SENSORS];
+            int both[SENSORS];
+            for (i = 0; i < SENSORS; i++) {
+                line[i] = g->readings[i] + share * (readings[i] - g->readings[i]);
+                both[i] = g->valid[i] && good[i];
+            }
+            made |= take_sample(m, point, line, both, enable);
+            g->count++;
+            point = g->start + g->count * SAMPLE_TIME;
+        }
+    }
+    g->time = time;
+    memcpy(g->readings, readings, sizeof g->readings);
+    memcpy(g->valid, good, sizeof g->valid);
     return made;
 }
 
@@ -350,8 +383,8 @@ static void sample(Twin *m, double time, double length) {
     int too_long, health;
     double apart;
     if (isnan(s->start)) s->start = time;
-    too_long = length > SAMPLE_TIME * (1 + 1e-6);
-    if (!too_long && time < s->start + s->samples * SAMPLE_TIME - SAMPLE_TIME * 1e-5) return;
+    too_long = length > GRID_GAP * (1 + 1e-6);
+    if (length <= SAMPLE_TIME * (1 + 1e-6) && time < s->start + s->samples * SAMPLE_TIME - SAMPLE_TIME * 1e-5) return;
     if ((s->changed || !s->configured) && !configure(m)) {
         s->whole[V_HEALTH] = INTERNAL_ERROR;
         return;
@@ -364,8 +397,8 @@ static void sample(Twin *m, double time, double length) {
     apart = time - s->last;
     s->last = time;
     if (too_long) {
-        tell(m, TELL_STEP, "the host's step %g s is longer than sample_time %g s", length, SAMPLE_TIME);
-    } else if (s->expected > 0 && fabs(apart - s->expected) > UNEVEN * SAMPLE_TIME) {
+        tell(m, TELL_STEP, "the host's step %g s is too long for sample_time %g s; steps up to %g s are followed", length, SAMPLE_TIME, GRID_GAP);
+    } else if (s->expected > 0 && apart > GRID_GAP * (1 + 1e-6)) {
         s->uneven = time;
         tell(m, TELL_UNEVEN, "the host's steps of %g s put samples %g s apart, sample_time is %g s; use steps that divide it", length, apart, SAMPLE_TIME);
     }

@@ -40,6 +40,12 @@ typedef struct { /* RecursiveLeastSquares */
     int running;
 } Recursion;
 
+typedef struct { /* Grid */
+    Count count;
+    double start, time, readings[SENSORS];
+    int valid[SENSORS];
+} Grid;
+
 typedef struct { /* Pulse */
     int still, failed, jumped, any;
     Count same;
@@ -86,6 +92,7 @@ typedef struct {
     Watch watch;
     FirstWindow window;
     Recursion rls;
+    Grid grid;
     Pulse pulse;
     Guard guard;
     Fault detector;

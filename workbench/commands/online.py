@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from argparse import Namespace
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ import numpy.typing as npt
 from identification.errors import InputError
 from irj_fmu.command_line import counted
 from irj_fmu.healthy import online_readings
-from workbench.commands.files import named, open_joint, open_records, progress_bar, write_bytes, write_json
+from workbench.commands.files import named, needed, open_joint, open_records, progress_bar, write_bytes, write_json
 
 if TYPE_CHECKING:
     from identification.excite import Excitation, Selection
@@ -100,7 +101,7 @@ def run_track(arguments: Namespace) -> int:
     """`irj track`: 1 where ``--fail-on-fault`` was given and a fault was found."""
     joint = open_joint(arguments.joint)
     tried = [parse_fault(text) for text in getattr(arguments, "inject", None) or []]
-    records, warnings = open_records(arguments.records, joint)
+    records, warnings = _open_doubtful(arguments.records, joint)
     healthy, more = open_records(arguments.healthy, joint)
     state = limits(joint, records[0], [r.renamed(path) for r, path in zip(healthy, arguments.healthy, strict=True)])
     found = []
@@ -120,6 +121,37 @@ def run_track(arguments: Namespace) -> int:
         write_bytes(page, track_page(found, joint, command=getattr(arguments, "command", None), notes=[*warnings, *more]).encode())
         print(f"{page}: report written")
     return 1 if arguments.fail_on_fault and any(r["events"] for r in results) else 0
+
+
+def _open_doubtful(paths: Sequence[str], joint: Joint) -> tuple[list[Record], list[str]]:
+    """Records in SI of which only the head must be sane: what a sensor does later is for the estimator to find.
+
+    Raises
+    ------
+    InputError
+        The first seconds cannot be used, or the record cannot be sampled evenly; the line starts with the path.
+    """
+    from identification.check import check, gate, repair
+    from identification.read import read
+    from irj_fmu.online import OnlineOptions
+
+    records, warnings = [], []
+    for path in paths:
+        record = read(path, columns=joint.columns, kind=joint.kind)
+        given = (joint.gear_ratio, needed(record, joint), joint.torque_per_current)
+        try:
+            head = record.time - record.time[0] <= OnlineOptions().warm_up
+            gate(record if head.all() else record.take(head, "the first window of the estimator"), *given)
+            findings = check(record, *given)
+            record = repair(record)
+            record.resampled()
+        except InputError as error:
+            raise named(error, path, record) from None
+        warnings += [f"{path}: {f.message.removeprefix(record.name + ': ')}" for f in findings if f.severity != "ok"]
+        records.append(record)
+    for text in warnings:
+        sys.stderr.write(f"irj: {text}\n")
+    return records, warnings
 
 
 def parse_fault(text: str) -> Fault:
@@ -201,7 +233,6 @@ def replay(record: Record, joint: Joint, detector_state: bytes | None = None, tr
     InputError
         The record is too short for the first window, or a fault begins after its end.
     """
-    from identification.fault import inject
     from irj_fmu.online import OnlineEstimator, OnlineOptions
 
     even = record.resampled()
@@ -212,7 +243,7 @@ def replay(record: Record, joint: Joint, detector_state: bytes | None = None, tr
     estimator = OnlineEstimator(joint, even.dt, options, detector_state)
     table, there = online_readings(even, joint)
     healthy = np.array(table)
-    readings = inject(healthy, even.dt, tried) if tried else healthy
+    readings = np.array(online_readings(even, joint, tried)[0]) if tried else healthy
     valid = (np.isfinite(readings) & np.array(there)).tolist()
     rows = np.nan_to_num(readings).tolist()
     used, failed = readings.copy(), np.zeros(readings.shape, dtype=bool)
@@ -238,7 +269,7 @@ def replay(record: Record, joint: Joint, detector_state: bytes | None = None, tr
             if estimator.fault != fault:
                 fault = estimator.fault
                 # a reading that is replaced has been reported when that began
-                known = fault not in (7, 8) and (before[fault % 10 - 1] or now < quiet[fault % 10 - 1])
+                known = fault not in (7, 8, 9) and (before[fault % 10 - 1] or now < quiet[fault % 10 - 1])
                 codes += [fault] if fault and not known else []
             events += [{"time": now, "fault": code, "text": fault_text(code)} for code in codes]
             if (k + 1) % every == 0 and not estimator.warming_up:
@@ -262,6 +293,8 @@ def fault_text(code: int) -> str:
         return "motor current sensor failed or motor friction changed"
     if code == 8:
         return "the joint changed, the sensors agree with each other"
+    if code == 9:
+        return "the readings cannot be those of the joint, or stand still while it moves; the estimate is held"
     kind, sensor = divmod(code, 10)
     what = ("sensor failed", "reading missing", "reading constant while the joint moves", "reading of wrong scale")[kind]
     return f"{READINGS[sensor - 1]}: {what}"
