@@ -1,4 +1,5 @@
-"""Build the FMUs of a joint: ``python build_fmu.py estimator|plant|native|ssp|all --joint J --out dist``.
+"""Build the FMUs of a joint: ``python build_fmu.py estimator|plant|native|ssp|all --joint J --out
+dist``.
 
     estimator   online estimator of the joint file's parameters (FMI 2.0 co-simulation)
     plant       the joint itself, open loop (FMI 2.0 model exchange and co-simulation)
@@ -6,9 +7,9 @@
     ssp         source, plant and estimator as one system (SSP 1.0)
     all         everything above, and the plant with controller and sensors
 
-Options: --cc gcc|zig, --target linux64|win64|darwin64|TRIPLE|all, --controller, --sensors, --healthy RECORD,
---sample-time S (native); see ``--help``.
-Every FMU is checked by fmpy's ``validate_fmu`` and run in a fresh process before it appears in the folder.
+Options: --cc gcc|zig, --target linux64|win64|darwin64|TRIPLE|all, --controller, --sensors,
+--healthy RECORD, --sample-time S (native); see ``--help``. Every FMU is checked by fmpy's
+``validate_fmu`` and run in a fresh process before it appears in the folder.
 """
 
 from __future__ import annotations

@@ -1,11 +1,13 @@
-"""The workbench at a million samples: first plot, click to new error, size of the page, memory of the server, and a peer page.
+"""The workbench at a million samples: first plot, click to new error, size of the page, memory of
+the server, and a peer page.
 
-Run: ``python benchmarks/app.py [--samples 1000000] [--repeats 2] [--peer verbs|windows|both|none] [--json FILE]``.
-``--cancel`` measures how long Cancel takes instead; ``--pictures docs`` draws the pictures of docs/workbench.md instead.
-Needs Chromium (``IRJ_CHROMIUM``, by default /usr/bin/chromium) and playwright; the peer page needs ``pip install nicegui``
-(extra ``bench``).  The record is simulated once and kept in the temporary folder.  Pages take turns on the same machine;
-each time is the smallest of the repeats.  The workbench's first plot is the browser's own preview of the file; the plot of
-the record as the server read it is timed too.
+Run: ``python benchmarks/app.py [--samples 1000000] [--repeats 2] [--peer verbs|windows|both|none]
+[--json FILE]``. ``--cancel`` measures how long Cancel takes instead; ``--pictures docs`` draws the
+pictures of docs/workbench.md instead. Needs Chromium (``IRJ_CHROMIUM``, by default
+/usr/bin/chromium) and playwright; the peer page needs ``pip install nicegui`` (extra ``bench``).
+The record is simulated once and kept in the temporary folder.  Pages take turns on the same
+machine; each time is the smallest of the repeats.  The workbench's first plot is the browser's own
+preview of the file; the plot of the record as the server read it is timed too.
 """
 
 from __future__ import annotations
@@ -32,51 +34,80 @@ ROOT = Path(__file__).resolve().parents[1]
 DT = 1e-3
 GEAR_RATIO, MOTOR_CONSTANT, HIDDEN = -160.0, 0.0553, "stribeck@motor"
 VALUES = {
-    "motor_inertia": 4.6, "link_inertia": 10.5, "stiffness": 21000.0, "structural_damping": 60.0, "motor_viscous": 10.0,
-    "link_viscous": 2.0, "motor_coulomb": 19.0, "link_coulomb": 0.5, "gravity_torque": 95.0, "motor_stribeck_extra": 11.0,
+    "motor_inertia": 4.6,
+    "link_inertia": 10.5,
+    "stiffness": 21000.0,
+    "structural_damping": 60.0,
+    "motor_viscous": 10.0,
+    "link_viscous": 2.0,
+    "motor_coulomb": 19.0,
+    "link_coulomb": 0.5,
+    "gravity_torque": 95.0,
+    "motor_stribeck_extra": 11.0,
     "motor_stribeck_velocity": 0.06,
-}  # fmt: skip
+}
 """Of the size of the joint in the thesis's table 4.1; link-referred SI."""
 JOINT = files("workbench") / "demo" / "joint.toml"
-LIMITS = {"first plot [s]": 1.0, "click to new error [s]": 0.3, "page [kB]": 1000.0, "server [MB]": 500.0}
+LIMITS = {
+    "first plot [s]": 1.0,
+    "click to new error [s]": 0.3,
+    "page [kB]": 1000.0,
+    "server [MB]": 500.0,
+}
 
 
 def record(samples: int) -> Path:
     """A closed-loop record of a joint like the demo's, as NPZ."""
     from casadi_models.transmission import build
-    from identification._excite_follow import Controller, Follower
+    from identification.planning.follow import Controller, Follower
 
     path = Path(tempfile.gettempdir()) / f"irj-bench-{samples}.npz"
     if path.exists():
         return path
-    model = build("hd3", GEAR_RATIO, effects=("viscous", "coulomb", "gravity", HIDDEN)).with_values(dict(VALUES))
+    model = build("hd3", GEAR_RATIO, effects=("viscous", "coulomb", "gravity", HIDDEN)).with_values(
+        dict(VALUES)
+    )
     t = np.arange(samples) * DT
-    f, a, phase = np.array([0.11, 0.29, 0.63]), np.array([0.5, 0.22, 0.08]), np.array([0.3, 1.9, 4.0])
+    f, a, phase = (
+        np.array([0.11, 0.29, 0.63]),
+        np.array([0.5, 0.22, 0.08]),
+        np.array([0.3, 1.9, 4.0]),
+    )
     w = 2 * np.pi * f
     angle = w[:, None] * t + phase[:, None]
-    reference = np.column_stack([a @ np.sin(angle), (a * w) @ np.cos(angle), -(a * w**2) @ np.sin(angle)])
+    reference = np.column_stack(
+        [a @ np.sin(angle), (a * w) @ np.cos(angle), -(a * w**2) @ np.sin(angle)]
+    )
     run = Follower(model, DT, controller=Controller(25.0, 0.9), substeps=4).run(reference)
     rng = np.random.default_rng(1)
     step_motor, step_link = 2 * np.pi / 9000, 2 * np.pi / 100_000
     np.savez(
-        path, time_s=t, motor_current_A=run.drive / (GEAR_RATIO * MOTOR_CONSTANT) + rng.normal(0, 0.002, samples),
+        path,
+        time_s=t,
+        motor_current_A=run.drive / (GEAR_RATIO * MOTOR_CONSTANT) + rng.normal(0, 0.002, samples),
         motor_position_rad=np.round(run.states[:, 0] * GEAR_RATIO / step_motor) * step_motor,
         link_position_rad=np.round(run.states[:, 2] / step_link) * step_link,
         link_torque_Nm=run.torque + rng.normal(0, 0.08, samples),
-    )  # fmt: skip
+    )
     return path
 
 
 def memory(process: int) -> float:
     """Highest resident memory of a process [MB]."""
-    rows = dict(line.split(":", 1) for line in Path(f"/proc/{process}/status").read_text().splitlines())
+    rows = dict(
+        line.split(":", 1) for line in Path(f"/proc/{process}/status").read_text().splitlines()
+    )
     return int(rows["VmHWM"].split()[0]) / 1024
 
 
 @contextmanager
 def served(command: list[str], address: str | None = None) -> Iterator[tuple[str, int]]:
-    """A server in its own process: its address (from its first line where none is given) and process number."""
-    server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": paths()})
+    """A server in its own process: its address (from its first line where none is given) and
+    process number.
+    """
+    server = subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": paths()}
+    )
     assert server.stdout is not None
     try:
         if address is None:
@@ -119,7 +150,10 @@ def browser() -> Iterator[Any]:
 
 def weight(page: Any) -> float:
     """What the page loaded over the wire so far [kB]."""
-    kinds = "[...performance.getEntriesByType('navigation'), ...performance.getEntriesByType('resource')]"
+    kinds = (
+        "[...performance.getEntriesByType('navigation'), "
+        "...performance.getEntriesByType('resource')]"
+    )
     return float(page.evaluate(f"() => {kinds}.reduce((sum, e) => sum + e.transferSize, 0)")) / 1000
 
 
@@ -154,11 +188,19 @@ def ours(data: Path) -> dict[str, Any]:
     """One session of the workbench, timed from the clicks."""
     out: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as folder:
-        code = f"from pathlib import Path\nfrom workbench.app import serve\nserve([], 0, False, root=Path({str(Path(folder) / 'sessions')!r}))"
+        code = (
+            "from pathlib import Path\nfrom workbench.page.server import serve\nserve([], 0, "
+            f"False, root=Path({str(Path(folder) / 'sessions')!r}))"
+        )
         with served([sys.executable, "-c", code]) as (address, process), browser() as page:
-            out["empty page [s]"] = timed(lambda: page.goto(address), lambda: page.wait_for_selector("#files"))
+            out["empty page [s]"] = timed(
+                lambda: page.goto(address), lambda: page.wait_for_selector("#files")
+            )
             out["page [kB]"] = weight(page)
-            page.set_input_files("#files", [{"name": "joint.toml", "mimeType": "text/plain", "buffer": JOINT.read_bytes()}])
+            page.set_input_files(
+                "#files",
+                [{"name": "joint.toml", "mimeType": "text/plain", "buffer": JOINT.read_bytes()}],
+            )
             page.wait_for_function("() => app.state.joint_text && !app.state.job")
             began = time.perf_counter()
             page.set_input_files("#files", [data])
@@ -168,9 +210,15 @@ def ours(data: Path) -> dict[str, Any]:
             out["plot of the record as read [s]"] = time.perf_counter() - began
             page.wait_for_function("() => app.state.files[0].status === 'ready'")
             out["checked [s]"] = time.perf_counter() - began
-            for name, button, view in (("fit [s]", "#fit", "compare"), ("diagnose [s]", "#diagnose", "diagnose")):
+            for name, button, view in (
+                ("fit [s]", "#fit", "compare"),
+                ("diagnose [s]", "#diagnose", "diagnose"),
+            ):
                 begun = "v => document.querySelector('#main').dataset.view === v && !app.state.job"
-                out[name] = timed(lambda b=button: page.click(b), lambda v=view, f=begun: page.wait_for_function(f, arg=v, timeout=600_000))
+                out[name] = timed(
+                    lambda b=button: page.click(b),
+                    lambda v=view, f=begun: page.wait_for_function(f, arg=v, timeout=600_000),
+                )
             page.wait_for_timeout(float(os.environ.get("IRJ_LOOK_S", "4")) * 1000)
             out.update(clicks(page))
             out["server [MB]"] = memory(process)
@@ -178,14 +226,21 @@ def ours(data: Path) -> dict[str, Any]:
 
 
 CLICKS = (
-    ("prepared", ".candidate button.primary", None), ("undo", "#undo", None), ("redo", "#redo", None), ("undo again", "#undo", None),
-    ("never tried", "#add-by-hand", HIDDEN), ("and another", "#add-by-hand", "cubic_viscous@motor"), ("costly memory law", "#add-by-hand", "hysteresis"),
+    ("prepared", ".candidate button.primary", None),
+    ("undo", "#undo", None),
+    ("redo", "#redo", None),
+    ("undo again", "#undo", None),
+    ("never tried", "#add-by-hand", HIDDEN),
+    ("and another", "#add-by-hand", "cubic_viscous@motor"),
+    ("costly memory law", "#add-by-hand", "hysteresis"),
     ("remove", "li button[aria-label^='Remove ']:enabled >> nth=-1", None),
-)  # fmt: skip
+)
 
 
 def clicks(page: Any) -> dict[str, Any]:
-    """Time from a click to the new error on the page, and the error that follows when the whole fit is there."""
+    """Time from a click to the new error on the page, and the error that follows when the whole
+    fit is there.
+    """
     out: dict[str, Any] = {}
     for name, selector, label in CLICKS:
         if label or name == "remove":
@@ -197,15 +252,24 @@ def clicks(page: Any) -> dict[str, Any]:
         shown = "() => document.querySelector('#headline').dataset.text.startsWith(digits(app.state.steps.at(-1).held_out.relative_error_percent))"
 
         def seen(mark: int = mark, shown: str = shown) -> None:
-            page.wait_for_function("n => app.state.revision !== n && !app.state.job", arg=mark, timeout=120_000)
+            page.wait_for_function(
+                "n => app.state.revision !== n && !app.state.job", arg=mark, timeout=120_000
+            )
             page.wait_for_function(shown)
 
         out[f"click: {name} [s]"] = timed(lambda s=selector: page.click(s), seen)
         first = error_of(page)
-        whole = timed(lambda: None, lambda: page.wait_for_function("() => app.state.steps.at(-1).settled", timeout=120_000))
+        whole = timed(
+            lambda: None,
+            lambda: page.wait_for_function("() => app.state.steps.at(-1).settled", timeout=120_000),
+        )
         page.wait_for_function(shown)
         out[f"error: {name}"] = f"{first}, whole fit {error_of(page)} after {whole:.2f} s"
-    adding = [v for k, v in out.items() if k.startswith("click") and not any(w in k for w in ("undo", "redo"))]
+    adding = [
+        v
+        for k, v in out.items()
+        if k.startswith("click") and not any(w in k for w in ("undo", "redo"))
+    ]
     out["click to new error [s]"] = max(adding)
     return out
 
@@ -216,16 +280,31 @@ def peer(data: Path, engine: str) -> dict[str, Any]:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = int(free.getsockname()[1])
-    command = [sys.executable, str(ROOT / "benchmarks" / "peer_page.py"), "--port", str(port), "--engine", engine]
+    command = [
+        sys.executable,
+        str(ROOT / "benchmarks" / "peer_page.py"),
+        "--port",
+        str(port),
+        "--engine",
+        engine,
+    ]
     with served(command, f"http://127.0.0.1:{port}") as (address, process), browser() as page:
-        out["empty page [s]"] = timed(lambda: page.goto(address), lambda: page.wait_for_selector("#fit"))
+        out["empty page [s]"] = timed(
+            lambda: page.goto(address), lambda: page.wait_for_selector("#fit")
+        )
         page.wait_for_timeout(2000)
         out["page [kB]"] = weight(page)
         assert not page.evaluate(PAINTED, "canvas"), "the empty chart counts as drawn"
-        out["first plot [s]"] = timed(lambda: page.set_input_files("input[type=file]", [data]), lambda: drawn(page, "canvas"))
+        out["first plot [s]"] = timed(
+            lambda: page.set_input_files("input[type=file]", [data]), lambda: drawn(page, "canvas")
+        )
 
         def shows(word: str) -> None:
-            page.wait_for_function("w => document.querySelector('#error').textContent.startsWith(w + ':')", arg=word, timeout=600_000)
+            page.wait_for_function(
+                "w => document.querySelector('#error').textContent.startsWith(w + ':')",
+                arg=word,
+                timeout=600_000,
+            )
 
         out["fit [s]"] = timed(lambda: page.click("#fit"), lambda: shows("start"))
         out["error: start"] = page.inner_text("#error")
@@ -236,13 +315,15 @@ def peer(data: Path, engine: str) -> dict[str, Any]:
 
 
 def cancels(data: Path) -> dict[str, Any]:
-    """Longest wait from Cancel until the session is free again, for every long action, cancelled at several moments."""
+    """Longest wait from Cancel until the session is free again, for every long action,
+    cancelled at several moments.
+    """
     import shutil
 
-    from workbench import app_verbs
-    from workbench.app_input import add_upload, set_joint
-    from workbench.app_live import Live
-    from workbench.session import Store
+    from workbench.page import verbs as app_verbs
+    from workbench.page.input import add_upload, set_joint
+    from workbench.page.live import Live
+    from workbench.page.session import Store
 
     out: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as folder:
@@ -260,7 +341,16 @@ def cancels(data: Path) -> dict[str, Any]:
         app_verbs.run(live, "fit", {})
         ended(600)
         file = live.state.files[0].id
-        for action in ("diagnose", "confirm", "improve", "report", "replay", "plan", "plant", "estimator"):
+        for action in (
+            "diagnose",
+            "confirm",
+            "improve",
+            "report",
+            "replay",
+            "plan",
+            "plant",
+            "estimator",
+        ):
             waits = []
             for after in (0.05, 0.3, 0.8, 1.6, 3.0, 6.0):
                 app_verbs.run(live, action, {"file": file})
@@ -276,9 +366,14 @@ def cancels(data: Path) -> dict[str, Any]:
 
 
 def pictures(folder: Path) -> None:
-    """The pictures of docs/workbench.md: the demo's start model, and a replay in which a sensor fails."""
+    """The pictures of docs/workbench.md: the demo's start model, and a replay in which a sensor
+    fails.
+    """
     with tempfile.TemporaryDirectory() as sessions:
-        code = f"from pathlib import Path\nfrom workbench.app import serve\nserve([], 0, False, root=Path({sessions!r}))"
+        code = (
+            "from pathlib import Path\nfrom workbench.page.server import serve\nserve([], 0, "
+            f"False, root=Path({sessions!r}))"
+        )
         with served([sys.executable, "-c", code]) as (address, _), browser() as page:
             page.set_viewport_size({"width": 1000, "height": 1400})
             page.emulate_media(color_scheme="light", reduced_motion="reduce")
@@ -286,14 +381,20 @@ def pictures(folder: Path) -> None:
 
             def step(selector: str, view: str) -> None:
                 page.click(selector)
-                done = "v => document.querySelector('#main').dataset.view === v && !app.state.job && app.state.steps.every((s) => s.settled)"
+                done = (
+                    "v => document.querySelector('#main').dataset.view === v && "
+                    "!app.state.job && app.state.steps.every((s) => s.settled)"
+                )
                 page.wait_for_function(done, arg=view, timeout=120_000)
                 page.wait_for_timeout(600)
 
             page.click("#demo")
             page.wait_for_selector("#fit:enabled", timeout=60_000)
             step("#fit", "compare")
-            page.screenshot(path=str(folder / "page-compare.png"), clip={"x": 0, "y": 102, "width": 1000, "height": 740})
+            page.screenshot(
+                path=str(folder / "page-compare.png"),
+                clip={"x": 0, "y": 102, "width": 1000, "height": 740},
+            )
             step("#diagnose", "diagnose")
             step("button.primary:has-text('Add')", "ledger")
             step("#nav-replay", "replay")
@@ -321,13 +422,22 @@ def shown(value: Any) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--samples", type=int, default=1_000_000)
     parser.add_argument("--repeats", type=int, default=2)
     parser.add_argument("--peer", choices=("verbs", "windows", "both", "none"), default="both")
     parser.add_argument("--json", type=Path)
-    parser.add_argument("--cancel", action="store_true", help="measure how long Cancel takes instead")
-    parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="draw the pictures of the documentation there, and measure nothing")
+    parser.add_argument(
+        "--cancel", action="store_true", help="measure how long Cancel takes instead"
+    )
+    parser.add_argument(
+        "--pictures",
+        type=Path,
+        metavar="FOLDER",
+        help="draw the pictures of the documentation there, and measure nothing",
+    )
     given = parser.parse_args()
     if given.cancel:
         for key, value in cancels(record(given.samples)).items():
@@ -357,7 +467,10 @@ def main() -> None:
         for key in ("empty page [s]", "first plot [s]", "fit [s]", "click to new error [s]"):
             print(f"  {key:32} {found[f'peer, {engine}'][key] / found['workbench'][key]:.2f}")
         as_read = "plot of the record as read [s]"
-        print(f"  {as_read:32} {found[f'peer, {engine}']['first plot [s]'] / found['workbench'][as_read]:.2f}")
+        print(
+            f"  {as_read:32} "
+            f"{found[f'peer, {engine}']['first plot [s]'] / found['workbench'][as_read]:.2f}"
+        )
     if given.json:
         given.json.write_text(json.dumps({"samples": given.samples, **found}, indent=1))
 

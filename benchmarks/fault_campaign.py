@@ -1,11 +1,13 @@
-"""Fault campaign: healthy hours, fault cases, plant changes, replacement, identification under failure, sizes.
+"""Fault campaign: healthy hours, fault cases, plant changes, replacement, identification under
+failure, sizes.
 
     python -m benchmarks.fault_campaign --out docs/faults.md [--jobs 2]
     python -m benchmarks.fault_campaign faults sizes --keep results.json
 
-Without names, everything: about ten minutes of processor time. Simulated IRJ-like joints with the noise of table B.1;
-the detector's model differs from the plant (`ERRORS`), and the trajectories of the test are none of those of the
-calibration. `--keep` stores what was found and adds to what is there, so that parts can be run one by one.
+Without names, everything: about ten minutes of processor time. Simulated IRJ-like joints with the
+noise of table B.1; the detector's model differs from the plant (`ERRORS`), and the trajectories of
+the test are none of those of the calibration. `--keep` stores what was found and adds to what is
+there, so that parts can be run one by one.
 """
 
 from __future__ import annotations
@@ -27,20 +29,48 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.fault_identify import MODEL_NAMES, NAMES, SCALE, identify, least_squares, regression
 from benchmarks.fault_page import printed, write_page
-from benchmarks.fault_plant import DT, FACTORS, SIZES, START, detector_model, pairs, plant, readings, reference
-from identification._excite_follow import Follower
-from identification.fault import KINDS, SENSORS, Fault, FaultDetector, FaultEvent, Verdict, inject
+from benchmarks.fault_plant import (
+    DT,
+    FACTORS,
+    SIZES,
+    START,
+    detector_model,
+    pairs,
+    plant,
+    readings,
+    reference,
+)
+from identification.faults.detector import (
+    KINDS,
+    SENSORS,
+    Fault,
+    FaultDetector,
+    FaultEvent,
+    Verdict,
+    inject,
+)
+from identification.planning.follow import Follower
 
 __all__ = [
-    "MODEL_NAMES", "NAMES", "SCALE", "Campaign", "detector_model", "least_squares", "plant", "readings", "reference", "regression",
-]  # fmt: skip
-
+    "MODEL_NAMES",
+    "NAMES",
+    "SCALE",
+    "Campaign",
+    "detector_model",
+    "least_squares",
+    "plant",
+    "readings",
+    "reference",
+    "regression",
+]
 FloatArray = npt.NDArray[np.float64]
 
 CHANGES: dict[str, dict[str, float]] = {
-    "stiffness -20 %": {"stiffness": 0.8, "cubic_stiffness": 0.8}, "motor Coulomb +50 %": {"motor_coulomb": 1.5},
-    "payload +20 %": {"link_inertia": 1.2, "gravity_torque": 1.2}, "link viscous x 3": {"link_viscous": 3.0},
-}  # fmt: skip
+    "stiffness -20 %": {"stiffness": 0.8, "cubic_stiffness": 0.8},
+    "motor Coulomb +50 %": {"motor_coulomb": 1.5},
+    "payload +20 %": {"link_inertia": 1.2, "gravity_torque": 1.2},
+    "link viscous x 3": {"link_viscous": 3.0},
+}
 REPLACED = ("noise", "stuck", "zero", "dropout", "bias", "gain")
 
 
@@ -66,28 +96,53 @@ class Campaign:
         detector.run(record[: round(START / DT)])
         return detector.state()
 
-    def after(self, detector: FaultDetector, record: FloatArray, faults: list[Fault], state: bytes, seed: int, seconds: float = 6.0) -> list[FaultEvent]:
+    def after(
+        self,
+        detector: FaultDetector,
+        record: FloatArray,
+        faults: list[Fault],
+        state: bytes,
+        seed: int,
+        seconds: float = 6.0,
+    ) -> list[FaultEvent]:
         """Events after the fault, from the state just before it."""
         first = round(START / DT)
         faulty = inject(record, DT, faults, seed=seed)[first : first + round(seconds / DT)]
         detector.restore(state)
         return [e for e in detector.run(faulty).events if e.verdict is not Verdict.ARMED]
 
-    def case(self, detector: FaultDetector, record: FloatArray, faults: list[Fault], state: bytes, seed: int, seconds: float = 6.0) -> dict[str, Any]:
+    def case(
+        self,
+        detector: FaultDetector,
+        record: FloatArray,
+        faults: list[Fault],
+        state: bytes,
+        seed: int,
+        seconds: float = 6.0,
+    ) -> dict[str, Any]:
         """One fault case, judged: every sensor that failed and no other has to be named."""
         sensors = {f.sensor for f in faults}
         events = self.after(detector, record, faults, state, seed, seconds)
         naming = [e for e in events if e.is_sensor or e.verdict is Verdict.CURRENT_OR_FRICTION]
         named = {n for e in naming for n in (e.sensors if e.is_sensor else ("current",))}
         found: dict[str, Any] = {
-            "seed": seed, "sensors": sorted(sensors), "kind": faults[0].kind if len(faults) == 1 else "pair",
-            "detected": bool(naming) or any(e.verdict is Verdict.PLANT for e in events), "right": named == sensors,
-        }  # fmt: skip
+            "seed": seed,
+            "sensors": sorted(sensors),
+            "kind": faults[0].kind if len(faults) == 1 else "pair",
+            "detected": bool(naming) or any(e.verdict is Verdict.PLANT for e in events),
+            "right": named == sensors,
+        }
         if found["right"]:
             first = naming[0]
-            found |= {"delay": first.sample * DT - START, "first": max(first.first * DT - START, 0.0), "residuals": list(first.residuals)}
+            found |= {
+                "delay": first.sample * DT - START,
+                "first": max(first.first * DT - START, 0.0),
+                "residuals": list(first.residuals),
+            }
         else:
-            found["said"] = [[round(e.sample * DT - START, 3), e.verdict.name, *e.sensors] for e in events][:4]
+            found["said"] = [
+                [round(e.sample * DT - START, 3), e.verdict.name, *e.sensors] for e in events
+            ][:4]
         return found
 
 
@@ -106,10 +161,20 @@ def healthy_case(seed: int) -> dict[str, Any]:
     track = c.detector.run(record)
     spent = time.process_time() - start
     c.thesis.reset()
-    events = [[e.sample * DT, e.verdict.name, *e.sensors] for e in track.events if e.verdict is not Verdict.ARMED]
+    events = [
+        [e.sample * DT, e.verdict.name, *e.sensors]
+        for e in track.events
+        if e.verdict is not Verdict.ARMED
+    ]
     alarms = sum(e.is_sensor for e in track.events)
-    return {"seed": seed, "samples": len(record), "spent": spent, "events": events, "alarms": alarms,
-            "thesis": sum(e.is_sensor for e in c.thesis.run(record).events)}  # fmt: skip
+    return {
+        "seed": seed,
+        "samples": len(record),
+        "spent": spent,
+        "events": events,
+        "alarms": alarms,
+        "thesis": sum(e.is_sensor for e in c.thesis.run(record).events),
+    }
 
 
 def fault_cases(seed: int) -> list[dict[str, Any]]:
@@ -136,8 +201,14 @@ def plant_case(asked: tuple[str, int]) -> dict[str, Any]:
     after = np.arange(len(path)) * DT >= START
     courses = {n: np.where(after, f, 1.0) * c.joint.values[n] for n, f in CHANGES[name].items()}
     c.detector.reset()
-    events = [e for e in c.detector.run(readings(c.follower.run(path, courses), seed)).events if e.verdict is not Verdict.ARMED]
-    said = "; ".join(sorted({f"{e.verdict.name} {'+'.join(e.sensors)}" for e in events})) or "nothing"
+    events = [
+        e
+        for e in c.detector.run(readings(c.follower.run(path, courses), seed)).events
+        if e.verdict is not Verdict.ARMED
+    ]
+    said = (
+        "; ".join(sorted({f"{e.verdict.name} {'+'.join(e.sensors)}" for e in events})) or "nothing"
+    )
     return {"change": name, "seed": seed, "said": said, "sensor": any(e.is_sensor for e in events)}
 
 
@@ -170,7 +241,15 @@ def size_cases(seed: int) -> list[dict[str, Any]]:
             for factor in FACTORS:
                 fault = Fault(sensor, kind, START, size * factor)  # type: ignore[arg-type]
                 found = c.case(c.detector, record, [fault], state, seed)
-                out.append({"sensor": sensor, "kind": kind, "factor": factor, "detected": found["detected"], "right": found["right"]})
+                out.append(
+                    {
+                        "sensor": sensor,
+                        "kind": kind,
+                        "factor": factor,
+                        "detected": found["detected"],
+                        "right": found["right"],
+                    }
+                )
     return out
 
 
@@ -209,12 +288,23 @@ def _joined(found: Iterable[Any]) -> list[Any]:
 
 def main() -> None:
     """Run the named parts, or all; print, keep and write the page."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("parts", nargs="*", metavar="PART", help="parts to run (default: all of " + ", ".join(PARTS) + ")")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "parts",
+        nargs="*",
+        metavar="PART",
+        help="parts to run (default: all of " + ", ".join(PARTS) + ")",
+    )
     parser.add_argument("--jobs", type=int, default=2, help="processes (default 2)")
-    parser.add_argument("--keep", metavar="FILE.json", help="read earlier results from here and add the new ones")
+    parser.add_argument(
+        "--keep", metavar="FILE.json", help="read earlier results from here and add the new ones"
+    )
     parser.add_argument("--out", metavar="FILE.md", help="write the page and its picture")
-    parser.add_argument("--no-run", action="store_true", help="only print and write what --keep holds")
+    parser.add_argument(
+        "--no-run", action="store_true", help="only print and write what --keep holds"
+    )
     asked = parser.parse_args()
     if unknown := set(asked.parts) - set(PARTS):
         parser.error(f"unknown part {', '.join(sorted(unknown))}; use {', '.join(PARTS)}")

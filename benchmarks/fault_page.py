@@ -15,11 +15,18 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.fault_plant import DT, FACTORS, SIZES
-from identification.fault import ABRUPT, KINDS, SENSORS
-from identification.formats import number
+from identification.data.formats import number
+from identification.faults.detector import ABRUPT, KINDS, SENSORS
 
 Results = dict[str, Any]
-UNITS = {"current": "N.m", "motor_position": "rad", "motor_velocity": "rad/s", "link_position": "rad", "link_velocity": "rad/s", "torque": "N.m"}
+UNITS = {
+    "current": "N.m",
+    "motor_position": "rad",
+    "motor_velocity": "rad/s",
+    "link_position": "rad",
+    "link_velocity": "rad/s",
+    "torque": "N.m",
+}
 COMMAND = "python -m benchmarks.fault_campaign --out docs/faults.md"
 WHAT = {
     "noise": "the reading is replaced by noise of this standard deviation",
@@ -35,13 +42,20 @@ WHAT = {
 RESIDUALS = {
     "r1": "torque reading less spring torque of the two positions",
     "r2": "link velocity over a window less the integral of link acceleration",
-    "r3": "link position over a window less the integral of link velocity (no parameter of the joint)",
-    "r4": "motor position over a window less the integral of motor velocity (no parameter of the joint)",
+    "r3": "link position over a window less the integral of link velocity (no parameter of the "
+    "joint)",
+    "r4": "motor position over a window less the integral of motor velocity (no parameter of the "
+    "joint)",
     "r5": "motor velocity over a window less the integral of motor acceleration",
 }
 COLOURS = {
-    "noise": "#0072b2", "spike": "#d55e00", "bias": "#009e73", "gain": "#cc79a7", "drift": "#e69f00", "delay": "#56b4e9",
-}  # fmt: skip
+    "noise": "#0072b2",
+    "spike": "#d55e00",
+    "bias": "#009e73",
+    "gain": "#cc79a7",
+    "drift": "#e69f00",
+    "delay": "#56b4e9",
+}
 """Colours that people with colour-blindness can tell apart."""
 
 
@@ -66,33 +80,90 @@ def summary(results: Results) -> list[tuple[str, str, str]]:
         found = results["healthy"]
         hours = sum(c["samples"] for c in found) * DT / 3600
         rows.append(("healthy data", f"{hours:.2f} h on {len(found)} unseen trajectories", ""))
-        rows.append(("sensor alarms in it", f"{sum(c['alarms'] for c in found)}", "at most 1 per hour"))
-        others = Counter(e[1] for c in found for e in c["events"] if e[1] not in ("SENSOR", "DROPOUT", "RECOVERED"))
-        rows.append(("other reports in it", ", ".join(f"{n} {k}" for k, n in others.items()) or "0", ""))
-        rows.append(("sensor alarms of the thesis's rule in it", f"{sum(c['thesis'] for c in found)}", ""))
+        rows.append(
+            ("sensor alarms in it", f"{sum(c['alarms'] for c in found)}", "at most 1 per hour")
+        )
+        others = Counter(
+            e[1]
+            for c in found
+            for e in c["events"]
+            if e[1] not in ("SENSOR", "DROPOUT", "RECOVERED")
+        )
+        rows.append(
+            ("other reports in it", ", ".join(f"{n} {k}" for k, n in others.items()) or "0", "")
+        )
+        rows.append(
+            ("sensor alarms of the thesis's rule in it", f"{sum(c['thesis'] for c in found)}", "")
+        )
     if "faults" in results:
         cases = results["faults"]
         right = [c for c in cases if c["right"]]
         abrupt = [c["delay"] for c in right if c["kind"] in ABRUPT]
         rows.append(("fault cases", f"{len(cases)}", "at least 450"))
         rows.append(("detected", f"{sum(c['detected'] for c in cases)}", "all"))
-        rows.append(("every failed sensor and no other named", f"{len(right)} ({100 * len(right) / len(cases):.1f} %)", "at least 95 %"))
-        rows.append(("abrupt faults, median time to the named sensor", f"{milliseconds(abrupt)} ms", "at most 20 ms"))
-        rows.append(("abrupt faults, median time to the first residual", f"{milliseconds([c['first'] for c in right if c['kind'] in ABRUPT])} ms", ""))
+        rows.append(
+            (
+                "every failed sensor and no other named",
+                f"{len(right)} ({100 * len(right) / len(cases):.1f} %)",
+                "at least 95 %",
+            )
+        )
+        rows.append(
+            (
+                "abrupt faults, median time to the named sensor",
+                f"{milliseconds(abrupt)} ms",
+                "at most 20 ms",
+            )
+        )
+        rows.append(
+            (
+                "abrupt faults, median time to the first residual",
+                f"{milliseconds([c['first'] for c in right if c['kind'] in ABRUPT])} ms",
+                "",
+            )
+        )
         thesis = [c["thesis"] for c in cases if "thesis" in c]
-        rows.append(("the thesis's rule on the link sensors", f"{len(thesis)} cases, {sum(c['detected'] for c in thesis)} detected, "
-                     f"{sum(c['right'] for c in thesis)} right", ""))  # fmt: skip
+        rows.append(
+            (
+                "the thesis's rule on the link sensors",
+                f"{len(thesis)} cases, {sum(c['detected'] for c in thesis)} detected, "
+                f"{sum(c['right'] for c in thesis)} right",
+                "",
+            )
+        )
     if "plant" in results:
         changes = results["plant"]
-        rows.append(("changes of the joint called a sensor fault", f"{sum(c['sensor'] for c in changes)} of {len(changes)}", "at most 1 %"))
+        rows.append(
+            (
+                "changes of the joint called a sensor fault",
+                f"{sum(c['sensor'] for c in changes)} of {len(changes)}",
+                "at most 1 %",
+            )
+        )
     if "replace" in results:
         worst = max(c["error"] for c in results["replace"])
-        rows.append(("error of the replaced link position over 40 s", f"{worst:.1e} rad at most", "at most 2e-4 rad"))
+        rows.append(
+            (
+                "error of the replaced link position over 40 s",
+                f"{worst:.1e} rad at most",
+                "at most 2e-4 rad",
+            )
+        )
     if "identify" in results:
-        errors = [(abs(v), n) for r in results["identify"] if r["failed"] for n, v in r["errors"].items()]
+        errors = [
+            (abs(v), n) for r in results["identify"] if r["failed"] for n, v in r["errors"].items()
+        ]
         springs = [abs(r["errors"]["ka"]) for r in results["identify"] if r["failed"]]
-        rows.append(("parameters with failed sensors, worst", f"{max(errors)[0]:.1f} % ({max(errors)[1]})", "at most 10.5 %"))
-        rows.append(("added spring with failed sensors, worst", f"{max(springs):.2f} %", "at most 1 %"))
+        rows.append(
+            (
+                "parameters with failed sensors, worst",
+                f"{max(errors)[0]:.1f} % ({max(errors)[1]})",
+                "at most 10.5 %",
+            )
+        )
+        rows.append(
+            ("added spring with failed sensors, worst", f"{max(springs):.2f} %", "at most 1 %")
+        )
     return rows
 
 
@@ -114,24 +185,46 @@ def shares(results: Results) -> dict[tuple[str, str], list[tuple[float, float]]]
     for sensor in SENSORS:
         for kind in SIZES[sensor]:
             cells = [found[sensor, kind, f] for f in FACTORS]
-            out[sensor, kind] = [(100 * float(np.mean([d for d, _ in c])), 100 * float(np.mean([r for _, r in c]))) for c in cells if c]
+            out[sensor, kind] = [
+                (100 * float(np.mean([d for d, _ in c])), 100 * float(np.mean([r for _, r in c])))
+                for c in cells
+                if c
+            ]
     return out
 
 
 def printed(results: Results) -> str:
     """Everything as text."""
-    out = [f"{what}: {figure}" + (f" (wanted: {wanted})" if wanted else "") for what, figure, wanted in summary(results)]
+    out = [
+        f"{what}: {figure}" + (f" (wanted: {wanted})" if wanted else "")
+        for what, figure, wanted in summary(results)
+    ]
     if "faults" in results:
-        out += ["median delay to the named sensor [ms]:", f"{'':16}" + "".join(f"{k:>9}" for k in KINDS)]
+        out += [
+            "median delay to the named sensor [ms]:",
+            f"{'':16}" + "".join(f"{k:>9}" for k in KINDS),
+        ]
         out += [f"{row[0]:16}" + "".join(f"{v:>9}" for v in row[1:]) for row in delays(results)]
-        out += [f"   not right: seed {c['seed']} {'+'.join(c['sensors'])} {c['kind']}: {c['said']}" for c in results["faults"] if not c["right"]]
+        out += [
+            f"   not right: seed {c['seed']} {'+'.join(c['sensors'])} {c['kind']}: {c['said']}"
+            for c in results["faults"]
+            if not c["right"]
+        ]
     if "sizes" in results:
-        out.append("right sensor named, percent, at sizes " + ", ".join(f"{f:g} x" for f in FACTORS) + " the stated one:")
-        out += [f"   {s:16}{k:8}{SIZES[s][k]:8g} {unit_of(s, k):8}" + "".join(f"{r:6.0f}" for _, r in row) for (s, k), row in shares(results).items()]
+        out.append(
+            "right sensor named, percent, at sizes "
+            + ", ".join(f"{f:g} x" for f in FACTORS)
+            + " the stated one:"
+        )
+        out += [
+            f"   {s:16}{k:8}{SIZES[s][k]:8g} {unit_of(s, k):8}"
+            + "".join(f"{r:6.0f}" for _, r in row)
+            for (s, k), row in shares(results).items()
+        ]
     return "\n".join(out)
 
 
-# --- the page --------------------------------------------------------------------------------------------------------
+# --- the page -------------------------------------------------------------------------------------
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -151,11 +244,21 @@ def _kinds(results: Results) -> str:
         cases = [c for c in results["faults"] if c["kind"] == kind]
         right = [c for c in cases if c["right"]]
         seen = Counter(r for c in right for r in {name.split()[0] for name in c["residuals"]})
-        by = "the missing value itself" if kind == "dropout" else ", ".join(f"{r} ({100 * n / len(right):.0f} %)" for r, n in sorted(seen.items()))
+        by = (
+            "the missing value itself"
+            if kind == "dropout"
+            else ", ".join(f"{r} ({100 * n / len(right):.0f} %)" for r, n in sorted(seen.items()))
+        )
         times = [c["delay"] for c in right]
         spread = f"{milliseconds(times)} ({1e3 * min(times):.0f} to {1e3 * max(times):.0f})"
         rows.append([kind, WHAT[kind], by, f"{len(right)} of {len(cases)}", spread])
-    head = ["kind", "what happens", "residuals over their limit when the sensor is named (share of the cases)", "named rightly", "median delay [ms] (range)"]
+    head = [
+        "kind",
+        "what happens",
+        "residuals over their limit when the sensor is named (share of the cases)",
+        "named rightly",
+        "median delay [ms] (range)",
+    ]
     return table(head, rows)
 
 
@@ -167,30 +270,52 @@ def _sizes(results: Results) -> str:
         sure = next((f for i, f in enumerate(FACTORS) if all(r == 100 for r in rights[i:])), None)
         smallest = f"{number(size * sure, 2)} {unit_of(sensor, kind)}" if sure is not None else "–"
         shown = [f"{r:.0f}" if r == d else f"{r:.0f} ({d:.0f})" for d, r in cells]
-        rows.append([_plain(sensor), kind, f"{number(size, 3)} {unit_of(sensor, kind)}", *shown, smallest])
-    return table(["sensor", "kind", "stated size", *(f"{f:g} ×" for f in FACTORS), "from here on always"], rows)
+        rows.append(
+            [_plain(sensor), kind, f"{number(size, 3)} {unit_of(sensor, kind)}", *shown, smallest]
+        )
+    return table(
+        ["sensor", "kind", "stated size", *(f"{f:g} ×" for f in FACTORS), "from here on always"],
+        rows,
+    )
 
 
 def _plant(results: Results) -> str:
     rows = []
     for change in dict.fromkeys(c["change"] for c in results["plant"]):
         said = Counter(c["said"] for c in results["plant"] if c["change"] == change)
-        rows.append([change, "; ".join(f"{text.replace('_', ' ').lower()}: {n}" for text, n in said.most_common())])
+        rows.append(
+            [
+                change,
+                "; ".join(
+                    f"{text.replace('_', ' ').lower()}: {n}" for text, n in said.most_common()
+                ),
+            ]
+        )
     return table(["change of the joint", "what is said (of 12 trajectories)"], rows)
 
 
 def _replace(results: Results) -> str:
     rows = []
     for kind in dict.fromkeys(c["kind"] for c in results["replace"]):
-        alone, both = (next(c for c in results["replace"] if c["kind"] == kind and c["both"] is flag) for flag in (False, True))
+        alone, both = (
+            next(c for c in results["replace"] if c["kind"] == kind and c["both"] is flag)
+            for flag in (False, True)
+        )
         rows.append([kind, f"{alone['error']:.1e}", f"{both['error']:.1e}"])
-    return table(["link position fails by", "largest error [rad]", "with link velocity lost too [rad]"], rows)
+    return table(
+        ["link position fails by", "largest error [rad]", "with link velocity lost too [rad]"], rows
+    )
 
 
 def _identify(results: Results) -> str:
     names = list(results["identify"][0]["errors"])
     rows = [
-        [_together(r["failed"]) or "nothing", str(r["alternative"]), *(f"{r['errors'][n]:+.2f}" for n in names), f"{abs(r['errors'][r['worst']]):.1f}"]
+        [
+            _together(r["failed"]) or "nothing",
+            str(r["alternative"]),
+            *(f"{r['errors'][n]:+.2f}" for n in names),
+            f"{abs(r['errors'][r['worst']]):.1f}",
+        ]
         for r in results["identify"]
     ]
     return table(["failed from 20 s on", "alternative", *names, "worst"], rows)
@@ -208,12 +333,18 @@ def _wrong(results: Results) -> str:
     wrong = [c for c in results["faults"] if not c["right"]]
     if not wrong:
         return "All cases are right.\n"
-    rows = [[_together(c["sensors"]), c["kind"], "; ".join(_said(e) for e in c["said"])] for c in wrong]
-    return "The cases that are not right:\n\n" + table(["sensor", "kind", "what was said, after the fault"], rows)
+    rows = [
+        [_together(c["sensors"]), c["kind"], "; ".join(_said(e) for e in c["said"])] for c in wrong
+    ]
+    return "The cases that are not right:\n\n" + table(
+        ["sensor", "kind", "what was said, after the fault"], rows
+    )
 
 
 def write_page(results: Results, path: Path) -> None:
-    """Write the page, and the picture of the detection-size curves in a folder of the page's name."""
+    """Write the page, and the picture of the detection-size curves in a folder of the page's
+    name.
+    """
     folder = path.with_suffix("")
     folder.mkdir(exist_ok=True)
     (folder / "sizes.svg").write_text(curves_picture(shares(results)), encoding="utf-8")
@@ -285,46 +416,75 @@ covariance while a sensor is replaced; alternative 2 also holds the stiffness wh
     path.write_text(page, encoding="utf-8")
 
 
-# --- the picture -----------------------------------------------------------------------------------------------------
+# --- the picture ----------------------------------------------------------------------------------
 
 
 def curves_picture(found: dict[tuple[str, str], list[tuple[float, float]]]) -> str:
-    """Percent named rightly against the share of the stated size: one panel per sensor, one curve per kind."""
+    """Percent named rightly against the share of the stated size: one panel per sensor, one
+    curve per kind.
+    """
     width, height, gap = 244, 150, 54
     body = []
     for i, sensor in enumerate(SENSORS):
         left, top = 46 + (i % 3) * (width + gap), 64 + (i // 3) * (height + 70)
         body.append(_panel(sensor, found, left, top, width, height))
     legend = "".join(
-        f'<path stroke="{c}" stroke-width="2.4" d="M{60 + 130 * j} 18h22"/><text x="{88 + 130 * j}" y="22" font-size="12" fill="#333">{k}</text>'
+        f'<path stroke="{c}" stroke-width="2.4" d="M{60 + 130 * j} 18h22"/><text '
+        f'x="{88 + 130 * j}" y="22" font-size="12" fill="#333">{k}</text>'
         for j, (k, c) in enumerate(COLOURS.items())
     )
     whole = 46 + 3 * (width + gap)
     return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {whole} {60 + 2 * (height + 70)}" font-family="system-ui, sans-serif" role="img" '
-        f'aria-label="Percent of faults named rightly against their size, per sensor and kind"><rect width="100%" height="100%" fill="#fff"/>'
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {whole} {60 + 2 * (height + 70)}" '
+        'font-family="system-ui, sans-serif" role="img" '
+        'aria-label="Percent of faults named rightly against their size, per sensor and '
+        'kind"><rect width="100%" height="100%" fill="#fff"/>'
         f"{legend}{''.join(body)}</svg>\n"
     )
 
 
-def _panel(sensor: str, found: dict[tuple[str, str], list[tuple[float, float]]], left: int, top: int, width: int, height: int) -> str:
+def _panel(
+    sensor: str,
+    found: dict[tuple[str, str], list[tuple[float, float]]],
+    left: int,
+    top: int,
+    width: int,
+    height: int,
+) -> str:
     low, high = math.log10(FACTORS[0]), math.log10(FACTORS[-1])
 
     def across(factor: float) -> float:
         return left + (math.log10(factor) - low) / (high - low) * width
 
-    out = [f'<text x="{left}" y="{top - 15}" font-size="13" font-weight="600" fill="#222">{html.escape(_plain(sensor))}</text>']
+    out = [
+        f'<text x="{left}" y="{top - 15}" font-size="13" font-weight="600" '
+        f'fill="#222">{html.escape(_plain(sensor))}</text>'
+    ]
     for percent in (0, 50, 100):
         y = top + height * (1 - percent / 100)
         out.append(f'<path stroke="#ccc" d="M{left} {y}h{width}"/>')
-        out.append(f'<text x="{left - 6}" y="{y + 4}" font-size="11" text-anchor="end" fill="#555">{percent} %</text>')
+        out.append(
+            f'<text x="{left - 6}" y="{y + 4}" font-size="11" text-anchor="end" '
+            f'fill="#555">{percent} %</text>'
+        )
     for factor in FACTORS:
-        out.append(f'<text x="{across(factor):.1f}" y="{top + height + 21}" font-size="11" text-anchor="middle" fill="#555">{factor:g} ×</text>')
+        out.append(
+            f'<text x="{across(factor):.1f}" y="{top + height + 21}" font-size="11" '
+            f'text-anchor="middle" fill="#555">{factor:g} ×</text>'
+        )
     kinds = [k for k in COLOURS if (sensor, k) in found]
     for j, kind in enumerate(kinds):
         shift = 2.2 * (j - (len(kinds) - 1) / 2)  # curves that coincide stay visible side by side
-        points = [(across(f), top + height * (1 - right / 100) + shift) for f, (_, right) in zip(FACTORS, found[sensor, kind], strict=True)]
+        points = [
+            (across(f), top + height * (1 - right / 100) + shift)
+            for f, (_, right) in zip(FACTORS, found[sensor, kind], strict=True)
+        ]
         line = "L".join(f"{x:.1f} {y:.1f}" for x, y in points)
-        dots = "".join(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="2.6" fill="{COLOURS[kind]}"/>' for x, y in points)
-        out.append(f'<path fill="none" stroke="{COLOURS[kind]}" stroke-width="1.8" d="M{line}"><title>{kind}</title></path>{dots}')
+        dots = "".join(
+            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="2.6" fill="{COLOURS[kind]}"/>' for x, y in points
+        )
+        out.append(
+            f'<path fill="none" stroke="{COLOURS[kind]}" stroke-width="1.8" '
+            f'd="M{line}"><title>{kind}</title></path>{dots}'
+        )
     return "".join(out)

@@ -1,4 +1,6 @@
-"""The simulated joint of the fault campaign, its motions and readings, the detector's model, the stated fault sizes."""
+"""The simulated joint of the fault campaign, its motions and readings, the detector's model,
+the stated fault sizes.
+"""
 
 from __future__ import annotations
 
@@ -12,26 +14,69 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from casadi_models import JointModel
 from casadi_models.thesis import model_ts
-from identification._excite_follow import Followed
-from identification.fault import NOISE, SENSORS, Fault
+from identification.faults.detector import NOISE, SENSORS, Fault
+from identification.planning.follow import Followed
 
 FloatArray = npt.NDArray[np.float64]
 
 DT = 1e-3
 ERRORS = {
-    "stiffness": 0.01, "cubic_stiffness": 0.05, "motor_inertia": 0.01, "link_inertia": 0.01, "gravity_torque": 0.005,
-    "motor_added_spring": 0.03, "motor_viscous": 0.05, "motor_coulomb": 0.05, "motor_smooth_stribeck": 0.1,
-    "link_viscous": 0.05, "structural_damping": 0.3,
-}  # fmt: skip
+    "stiffness": 0.01,
+    "cubic_stiffness": 0.05,
+    "motor_inertia": 0.01,
+    "link_inertia": 0.01,
+    "gravity_torque": 0.005,
+    "motor_added_spring": 0.03,
+    "motor_viscous": 0.05,
+    "motor_coulomb": 0.05,
+    "motor_smooth_stribeck": 0.1,
+    "link_viscous": 0.05,
+    "structural_damping": 0.3,
+}
 """Relative error of the detector's parameters, either sign."""
 SIZES = {
-    "motor_position": {"noise": 0.1, "spike": 0.01, "bias": 2e-3, "gain": 0.05, "drift": 2e-3, "delay": 0.02},
-    "motor_velocity": {"noise": 0.1, "spike": 0.2, "bias": 0.05, "gain": 0.2, "drift": 0.05, "delay": 0.02},
-    "link_position": {"noise": 0.1, "spike": 0.01, "bias": 2e-3, "gain": 0.05, "drift": 2e-3, "delay": 0.02},
-    "link_velocity": {"noise": 0.1, "spike": 0.2, "bias": 0.05, "gain": 0.2, "drift": 0.05, "delay": 0.02},
+    "motor_position": {
+        "noise": 0.1,
+        "spike": 0.01,
+        "bias": 2e-3,
+        "gain": 0.05,
+        "drift": 2e-3,
+        "delay": 0.02,
+    },
+    "motor_velocity": {
+        "noise": 0.1,
+        "spike": 0.2,
+        "bias": 0.05,
+        "gain": 0.2,
+        "drift": 0.05,
+        "delay": 0.02,
+    },
+    "link_position": {
+        "noise": 0.1,
+        "spike": 0.01,
+        "bias": 2e-3,
+        "gain": 0.05,
+        "drift": 2e-3,
+        "delay": 0.02,
+    },
+    "link_velocity": {
+        "noise": 0.1,
+        "spike": 0.2,
+        "bias": 0.05,
+        "gain": 0.2,
+        "drift": 0.05,
+        "delay": 0.02,
+    },
     "torque": {"noise": 0.1, "spike": 60.0, "bias": 10.0, "gain": 0.3, "drift": 5.0, "delay": 0.05},
-    "current": {"noise": 50.0, "spike": 300.0, "bias": 20.0, "gain": 0.4, "drift": 10.0, "delay": 0.05},
-}  # fmt: skip
+    "current": {
+        "noise": 50.0,
+        "spike": 300.0,
+        "bias": 20.0,
+        "gain": 0.4,
+        "drift": 10.0,
+        "delay": 0.05,
+    },
+}
 """Stated sizes in rad, rad/s, N.m (per second for drift, share for gain, s for delay)."""
 FACTORS = (0.03, 0.1, 0.3, 1.0, 3.0)
 """Parts and multiples of the stated sizes for the detection-size curve."""
@@ -40,21 +85,29 @@ START = 5.0
 
 
 def plant() -> JointModel:
-    """The simulated joint: TS model of the thesis (tables 4.1, 4.3, 4.6), with structural damping."""
-    return model_ts().add("structural_damping").with_values(
-        {"structural_damping": 30.0, "link_smoothing_velocity": 5e-3}
-    )  # fmt: skip
+    """The simulated joint: TS model of the thesis (tables 4.1, 4.3, 4.6), with structural
+    damping.
+    """
+    return (
+        model_ts()
+        .add("structural_damping")
+        .with_values({"structural_damping": 30.0, "link_smoothing_velocity": 5e-3})
+    )
 
 
 def detector_model(joint: JointModel) -> JointModel:
     """The joint with the errors an identification leaves."""
     rng = np.random.default_rng(7)
     values = dict(joint.values)
-    return joint.with_values({n: values[n] * (1 + e * rng.choice([-1.0, 1.0])) for n, e in ERRORS.items() if n in values})
+    return joint.with_values(
+        {n: values[n] * (1 + e * rng.choice([-1.0, 1.0])) for n, e in ERRORS.items() if n in values}
+    )
 
 
 def reference(seed: int, seconds: float) -> FloatArray:
-    """Random triangles and sines of 3.8 in turn, 10 s each, smoothed: (n, 3) position, velocity, acceleration."""
+    """Random triangles and sines of 3.8 in turn, 10 s each, smoothed: (n, 3) position,
+    velocity, acceleration.
+    """
     rng = np.random.default_rng(seed)
     n = round(seconds / DT)
     raw = np.zeros(n)
@@ -68,7 +121,9 @@ def reference(seed: int, seconds: float) -> FloatArray:
             raw[first : first + len(t)] = -amplitude * shape
         else:
             period = rng.uniform(0.8, 6.0)
-            raw[first : first + len(t)] = rng.uniform(-0.5, 0.5) + speed * period / (2 * np.pi) * np.sin(2 * np.pi * t / period)
+            raw[first : first + len(t)] = rng.uniform(-0.5, 0.5) + speed * period / (
+                2 * np.pi
+            ) * np.sin(2 * np.pi * t / period)
     from scipy.signal import lfilter
 
     w = 8.0
@@ -94,7 +149,9 @@ def clean_readings(run: Followed) -> FloatArray:
 
 
 def pairs() -> list[list[Fault]]:
-    """Staggered, simultaneous and temporary faults of the link sensors, and one across the joint."""
+    """Staggered, simultaneous and temporary faults of the link sensors, and one across the
+    joint.
+    """
 
     def noisy(sensor: str, start: float, end: float = float("inf")) -> Fault:
         return Fault(sensor, "noise", start, 0.1, end)
@@ -106,4 +163,4 @@ def pairs() -> list[list[Fault]]:
         [noisy("link_position", START, START + 2.0)],
         [noisy("link_velocity", START, START + 2.0)],
         [noisy("motor_velocity", START), Fault("link_position", "stuck", START + 2.0)],
-    ]  # fmt: skip
+    ]

@@ -1,8 +1,10 @@
-"""Cost of the FMUs per step under fmpy, and of a batch: ``python benchmarks/fmu.py [estimator plant batch]``.
+"""Cost of the FMUs per step under fmpy, and of a batch: ``python benchmarks/fmu.py [estimator plant
+batch]``.
 
-estimator   set six readings, step 1 ms, get all estimates and health; without and with fault detection
-plant       set the current, step 1 ms, get five readings; the same plant written in pythonfmu beside it
-batch       1000 runs of a plant over a parameter, against a plain loop of fmpy's simulate_fmu, in the same run
+estimator   set six readings, step 1 ms, get all estimates and health; without and with fault
+detection plant       set the current, step 1 ms, get five readings; the same plant written in
+pythonfmu beside it batch       1000 runs of a plant over a parameter, against a plain loop of
+fmpy's simulate_fmu, in the same run
 """
 
 from __future__ import annotations
@@ -17,14 +19,14 @@ from typing import Any
 
 import numpy as np
 
+from irj_fmu.batch.fleet import Batch, run_fleet
 from irj_fmu.build import Request, build
-from irj_fmu.fleet import Batch, run_fleet
-from irj_fmu.host import Fmu, Instance
-from irj_fmu.joint_plant import PlantOptions, plant_spec
-from irj_fmu.package import SlaveSpec, package_slave
-from irj_fmu.plant import build_plant
-from irj_fmu.reference import reference_joint, start_of
-from irj_fmu.signals import Table
+from irj_fmu.fmi.package import SlaveSpec, package_slave
+from irj_fmu.host.run import Fmu, Instance
+from irj_fmu.host.signals import Table
+from irj_fmu.plant.joint import PlantOptions, plant_spec
+from irj_fmu.plant.library import build_plant
+from irj_fmu.plant.reference import reference_joint, start_of
 
 STEP = 1e-3
 _PYTHON_PLANT = '''
@@ -36,8 +38,8 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from irj_fmu.slave_base import TableSlave
-from irj_fmu.variables import Value, Variable
+from irj_fmu.fmi.slave_base import TableSlave
+from irj_fmu.fmi.variables import Value, Variable
 
 V = VALUES
 
@@ -76,8 +78,17 @@ class PythonPlant(TableSlave):
 '''
 
 
-def timed(path: Path, inputs: list[str], outputs: list[str], table: np.ndarray[Any, Any], skip: int, **parameters: Any) -> tuple[float, float, float]:
-    """Median, mean processor time and 99 % quantile of set + step + get [us], raw calls of fmpy on buffers made once."""
+def timed(
+    path: Path,
+    inputs: list[str],
+    outputs: list[str],
+    table: np.ndarray[Any, Any],
+    skip: int,
+    **parameters: Any,
+) -> tuple[float, float, float]:
+    """Median, mean processor time and 99 % quantile of set + step + get [us], raw calls of fmpy
+    on buffers made once.
+    """
     with Fmu(path) as fmu, Instance(fmu) as instance:
         instance.begin(0.0, parameters)
         instance.ready()
@@ -92,7 +103,9 @@ def timed(path: Path, inputs: list[str], outputs: list[str], table: np.ndarray[A
             raw.fmi2SetReal(raw.component, write.references, len(inputs), write.values)
             raw.fmi2DoStep(raw.component, k * STEP, step, 1)
             for block in reads:
-                getattr(raw, f"fmi2Get{block.type}")(raw.component, block.references, len(block.names), block.values)
+                getattr(raw, f"fmi2Get{block.type}")(
+                    raw.component, block.references, len(block.names), block.values
+                )
             spent[k] = time.perf_counter() - begin
         used = (time.thread_time() - used) / (len(table) - skip)
     spent = spent[skip:] * 1e6
@@ -109,51 +122,105 @@ def readings(count: int) -> np.ndarray[Any, Any]:
     found = simulate(joint.model().with_values({"gravity_torque": -105.0}), drive, STEP).readings
     table = np.column_stack([drive / (joint.torque_per_current or 1.0), found])
     table[:, 1:3] *= joint.gear_ratio
-    noise: np.ndarray[Any, Any] = np.random.default_rng(1).normal(size=table.shape) * [2e-3, 3e-4, 0.1, 2e-6, 1e-3, 0.05]
+    noise: np.ndarray[Any, Any] = np.random.default_rng(1).normal(size=table.shape) * [
+        2e-3,
+        3e-4,
+        0.1,
+        2e-6,
+        1e-3,
+        0.05,
+    ]
     return table + noise
 
 
 def estimator(folder: Path) -> None:
     """Cost of the estimator with twelve parameters and three balances."""
-    from identification.joint_file import toml_text
+    from identification.data.joint_file import toml_text
 
     joint = replace(reference_joint("irj_ts"), name="bench")
     path = folder / "bench.toml"
-    for about, held in (("without fault detection", start_of(joint)), ("with fault detection", joint)):
-        path.write_text(toml_text(held, {k: {"value": v, "unit": "", "side": ""} for k, v in held.fitted.items()}), encoding="utf-8")
+    for about, held in (
+        ("without fault detection", start_of(joint)),
+        ("with fault detection", joint),
+    ):
+        path.write_text(
+            toml_text(
+                held, {k: {"value": v, "unit": "", "side": ""} for k, v in held.fitted.items()}
+            ),
+            encoding="utf-8",
+        )
         (made,) = build("estimator", Request(held, path, folder))
         with Fmu(made) as fmu:
-            names = [n for n in fmu.variables if n.startswith(("theta[", "ratio."))] + ["health", "fault"]
-        low, mean, top = timed(made, ["i_m", "q_m", "w_m", "q_l", "w_l", "tau_l"], names, readings(20000), 8000)
-        print(f"estimator {about}: set + step + get({len(names)}) median {low:.1f} us, mean {mean:.1f} us of processor time, 99 % {top:.0f} us (wanted: 60)")
+            names = [n for n in fmu.variables if n.startswith(("theta[", "ratio."))] + [
+                "health",
+                "fault",
+            ]
+        low, mean, top = timed(
+            made, ["i_m", "q_m", "w_m", "q_l", "w_l", "tau_l"], names, readings(20000), 8000
+        )
+        print(
+            f"estimator {about}: set + step + get({len(names)}) median {low:.1f} us, mean "
+            f"{mean:.1f} us of processor time, 99 % {top:.0f} us (wanted: 60)"
+        )
 
 
 def plant(folder: Path) -> None:
     """Cost of the plant in C and of the same plant in Python."""
     joint = reference_joint("irj_ts")
-    made = build_plant(plant_spec(joint, PlantOptions(name="bench_plant")), folder / "bench_plant.fmu")
+    made = build_plant(
+        plant_spec(joint, PlantOptions(name="bench_plant")), folder / "bench_plant.fmu"
+    )
     module = folder / "python_plant.py"
-    module.write_text(_PYTHON_PLANT.replace("VALUES", repr({**joint.fitted, "torque_per_current": joint.torque_per_current})))
-    slow = package_slave(SlaveSpec("python_plant", "python_plant", "PythonPlant", (module,)), folder / "python_plant.fmu", shim=False).path
+    module.write_text(
+        _PYTHON_PLANT.replace(
+            "VALUES", repr({**joint.fitted, "torque_per_current": joint.torque_per_current})
+        )
+    )
+    slow = package_slave(
+        SlaveSpec("python_plant", "python_plant", "PythonPlant", (module,)),
+        folder / "python_plant.fmu",
+        shim=False,
+    ).path
     outputs = ["motor_position", "motor_velocity", "link_position", "link_velocity", "link_torque"]
     current = 15 * np.sin(2 * np.pi * 0.4 * STEP * np.arange(20000))[:, None]
-    found = {about: timed(path, ["i_m"], outputs, current, 1000) for about, path in (("C", made), ("pythonfmu", slow))}
+    found = {
+        about: timed(path, ["i_m"], outputs, current, 1000)
+        for about, path in (("C", made), ("pythonfmu", slow))
+    }
     for about, (low, mean, top) in found.items():
-        print(f"plant in {about}: set + step + get(5) median {low:.1f} us, mean {mean:.1f} us of processor time, 99 % {top:.0f} us")
-    print(f"plant: {found['pythonfmu'][1] / found['C'][1]:.1f} times faster in C (wanted: 2; C under 12 us)")
+        print(
+            f"plant in {about}: set + step + get(5) median {low:.1f} us, mean {mean:.1f} us of "
+            f"processor time, 99 % {top:.0f} us"
+        )
+    print(
+        f"plant: {found['pythonfmu'][1] / found['C'][1]:.1f} times faster in C (wanted: 2; C "
+        "under 12 us)"
+    )
 
 
 def batch(folder: Path, runs: int = 1000) -> None:
-    """A batch against the naive loop: same FMU, same 1000 runs, same results; with all processors and with one process."""
+    """A batch against the naive loop: same FMU, same 1000 runs, same results; with all
+    processors and with one process.
+    """
     from fmpy import simulate_fmu
 
     joint = reference_joint("irj_ts")
-    made = build_plant(plant_spec(joint, PlantOptions(name="bench_batch")), folder / "bench_batch.fmu")
+    made = build_plant(
+        plant_spec(joint, PlantOptions(name="bench_batch")), folder / "bench_batch.fmu"
+    )
     t = 1e-2 * np.arange(101)
     current = 15 * np.sin(2 * np.pi * 0.4 * t)
     values = np.linspace(1e4, 4e4, runs)
     signal = np.array(list(zip(t, current, strict=True)), dtype=[("time", "f8"), ("i_m", "f8")])
-    many = Batch(made, [{"stiffness": float(v)} for v in values], ["link_position"], {"i_m": Table(t, current, hold=True)}, step=1e-2, stop=1.0, chunk=20)
+    many = Batch(
+        made,
+        [{"stiffness": float(v)} for v in values],
+        ["link_position"],
+        {"i_m": Table(t, current, hold=True)},
+        step=1e-2,
+        stop=1.0,
+        chunk=20,
+    )
     took = {}
     for about, workers in (("all processors", None), ("one process", 1)):
         begin = time.perf_counter()
@@ -161,16 +228,29 @@ def batch(folder: Path, runs: int = 1000) -> None:
         took[about] = time.perf_counter() - begin
     begin = time.perf_counter()
     kept = [
-        simulate_fmu(str(made), stop_time=1.0, output_interval=1e-2, fmi_type="CoSimulation", input=signal,
-                     start_values={"stiffness": float(v)}, output=["link_position"])["link_position"]
+        simulate_fmu(
+            str(made),
+            stop_time=1.0,
+            output_interval=1e-2,
+            fmi_type="CoSimulation",
+            input=signal,
+            start_values={"stiffness": float(v)},
+            output=["link_position"],
+        )["link_position"]
         for v in values
-    ]  # fmt: skip
+    ]
     slow = time.perf_counter() - begin
     print(f"naive loop of {runs}: {slow:.1f} s, {runs / slow:.0f} runs/s")
     for about, fast in took.items():
-        print(f"batch of {runs}, {about}: {fast:.1f} s, {runs / fast:.0f} runs/s, {slow / fast:.1f} times the naive loop (wanted: 4)")
+        print(
+            f"batch of {runs}, {about}: {fast:.1f} s, {runs / fast:.0f} runs/s, "
+            f"{slow / fast:.1f} times the naive loop (wanted: 4)"
+        )
     apart = np.abs(found.signals["link_position"][:, -1] - np.array(kept)[:, -1]).max()
-    print(f"largest difference at the end: {apart:.1e} rad (the naive loop ramps the input where the batch holds it)")
+    print(
+        f"largest difference at the end: {apart:.1e} rad (the naive loop ramps the input where "
+        "the batch holds it)"
+    )
 
 
 def main() -> None:

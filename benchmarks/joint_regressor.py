@@ -1,7 +1,9 @@
-"""A simulated joint as a linear regression, for tests and benchmarks of the recursive least squares.
+"""A simulated joint as a linear regression, for tests and benchmarks of the recursive least
+squares.
 
-Plant: the parameters of thesis table 4.3 (model 2b) with the inertias and load of table 4.1; sensor noise of
-table B.1. As in 4.3.3, Coulomb friction on the link side is left out: it is negligible. Nothing here is measured data.
+Plant: the parameters of thesis table 4.3 (model 2b) with the inertias and load of table 4.1; sensor
+noise of table B.1. As in 4.3.3, Coulomb friction on the link side is left out: it is negligible.
+Nothing here is measured data.
 """
 
 from __future__ import annotations
@@ -17,7 +19,11 @@ FloatArray = npt.NDArray[np.float64]
 NAMES = ("k1", "k2", "ka", "coulomb_motor", "viscous_motor", "viscous_link")
 THETA = np.array([2.1513e4, 3.3543e8, 86.2313, 21.5057, 23.6303, 9.7285])
 SCALE = np.array([2e4, 5e8, 1e2, 3e1, 3e1, 1e1])  # prior ranges
-MOTOR_INERTIA, LINK_INERTIA, LOAD = 4.447, 10.277, 105.18  # kg m^2, kg m^2, N m; link side, table 4.1
+MOTOR_INERTIA, LINK_INERTIA, LOAD = (
+    4.447,
+    10.277,
+    105.18,
+)  # kg m^2, kg m^2, N m; link side, table 4.1
 SIGN_WIDTH = 0.02  # rad/s, of the smoothed sign of the velocity
 ENCODER, HALL, TORQUE = np.deg2rad(0.0036), np.deg2rad(0.0010), 0.05  # resolutions of table B.1
 
@@ -25,7 +31,9 @@ ENCODER, HALL, TORQUE = np.deg2rad(0.0036), np.deg2rad(0.0010), 0.05  # resoluti
 @final
 @dataclass(frozen=True)
 class JointRecord:
-    """y (samples, 2): motor and link torque, N m, link side; h (samples, 2, 6); truth (samples, 6)."""
+    """y (samples, 2): motor and link torque, N m, link side; h (samples, 2, 6); truth (samples,
+    6).
+    """
 
     time: FloatArray
     y: FloatArray
@@ -52,7 +60,8 @@ def simulate(
     stiction
         Torque on the motor side during the standstill that the regressor cannot explain, N m.
     quick
-        Amplitude of the part of the trajectory with 0.5 s period (thesis 3.8: periods 0.5 to 6 s), rad.
+        Amplitude of the part of the trajectory with 0.5 s period (thesis 3.8: periods 0.5 to 6 s),
+        rad.
     cutoff
         Corner of the fourth-order filter on both sides of the regression, Hz.
     """
@@ -66,7 +75,12 @@ def simulate(
     twist, twist_rate = _twist(carried, truth, dt)
     motor, motor_velocity = link + twist, velocity + twist_rate
     motor_acceleration = acceleration + np.gradient(twist_rate, dt)
-    drive = MOTOR_INERTIA * motor_acceleration + carried + truth[:, 3] * np.tanh(motor_velocity / SIGN_WIDTH) + truth[:, 4] * motor_velocity
+    drive = (
+        MOTOR_INERTIA * motor_acceleration
+        + carried
+        + truth[:, 3] * np.tanh(motor_velocity / SIGN_WIDTH)
+        + truth[:, 4] * motor_velocity
+    )
     still = (time >= standstill[0] + 1.0) & (time < standstill[1])
     drive = drive + stiction * still
     root = np.sqrt(12.0)  # uniform quantisation noise
@@ -77,16 +91,28 @@ def simulate(
     seen_torque = net + TORQUE * rng.standard_normal(time.size)
     y, h = _regression(seen_motor, seen_link, seen_drive, seen_torque, dt)
     # Both sides of the regression pass the same filter (thesis 4.3.1), so the equation stays true.
-    return JointRecord(time[lead:], _filtered(y, cutoff, dt)[lead:], _filtered(h, cutoff, dt)[lead:], truth[lead:])
+    return JointRecord(
+        time[lead:], _filtered(y, cutoff, dt)[lead:], _filtered(h, cutoff, dt)[lead:], truth[lead:]
+    )
 
 
-def _motion(time: FloatArray, standstill: tuple[float, float], quick: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Link angle of three sines whose phase runs with a speed that falls smoothly to zero for the standstill."""
+def _motion(
+    time: FloatArray, standstill: tuple[float, float], quick: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Link angle of three sines whose phase runs with a speed that falls smoothly to zero for
+    the standstill.
+    """
     dt = float(time[1] - time[0])
     ramp = np.clip(np.minimum(np.abs(time - standstill[0]), np.abs(time - standstill[1])), 0.0, 1.0)
-    speed = np.where((time > standstill[0]) & (time < standstill[1]), 0.0, 0.5 - 0.5 * np.cos(np.pi * ramp))
+    speed = np.where(
+        (time > standstill[0]) & (time < standstill[1]), 0.0, 0.5 - 0.5 * np.cos(np.pi * ramp)
+    )
     phase = np.cumsum(speed) * dt
-    link = 0.7 * np.sin(2.1 * phase) + 0.25 * np.sin(5.3 * phase + 0.4) + quick * np.sin(4.0 * np.pi * phase)
+    link = (
+        0.7 * np.sin(2.1 * phase)
+        + 0.25 * np.sin(5.3 * phase + 0.4)
+        + quick * np.sin(4.0 * np.pi * phase)
+    )
     velocity = np.gradient(link, dt)
     return link, velocity, np.gradient(velocity, dt)
 
@@ -116,7 +142,9 @@ def _filtered(signal: FloatArray, cutoff: float, dt: float) -> FloatArray:
     return found
 
 
-def _regression(motor: FloatArray, link: FloatArray, drive: FloatArray, torque: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
+def _regression(
+    motor: FloatArray, link: FloatArray, drive: FloatArray, torque: FloatArray, dt: float
+) -> tuple[FloatArray, FloatArray]:
     """Both torque balances, linear in the parameters."""
     motor_velocity, link_velocity = np.gradient(motor, dt), np.gradient(link, dt)
     twist, twist_rate = motor - link, motor_velocity - link_velocity

@@ -1,12 +1,14 @@
-"""Lines in joints of this bench's own simulation: which order is found, which name it gets, and none where there is none.
+"""Lines in joints of this bench's own simulation: which order is found, which name it gets, and
+none where there is none.
 
     python -m benchmarks.lines [--seeds 4] [--first 0] [--emps FOLDER]
 
-Each seed draws new joints: a 100:1 gear (motor, spring, link with gravity, Stribeck friction that the start model does not have,
-encoders that count, noise, a position controller) and a linear axis of a ball screw. A line of 1 to 3 % of the rms torque is put
-into the physics: torque ripple of the motor, kinematic error of the gear, ripple of the torque sensor, at 1, 2 or 4 per motor turn;
-a ripple at the pitch of the screw, given in the joint file or not. Records at 100, 125 and 250 Hz; the same joints without a line.
-"Right order": within half of 2 pi / stroke of the truth.
+Each seed draws new joints: a 100:1 gear (motor, spring, link with gravity, Stribeck friction that
+the start model does not have, encoders that count, noise, a position controller) and a linear axis
+of a ball screw. A line of 1 to 3 % of the rms torque is put into the physics: torque ripple of the
+motor, kinematic error of the gear, ripple of the torque sensor, at 1, 2 or 4 per motor turn; a
+ripple at the pitch of the screw, given in the joint file or not. Records at 100, 125 and 250 Hz;
+the same joints without a line. "Right order": within half of 2 pi / stroke of the truth.
 """
 
 from __future__ import annotations
@@ -23,9 +25,9 @@ import numpy as np
 import numpy.typing as npt
 
 from identification import Record, read
-from identification.engine import load_dataset, prepared_model, solve
-from identification.joint_file import Joint
-from identification.lines import Line, find_lines
+from identification.data.joint_file import Joint
+from identification.diagnosis.lines import Line, find_lines
+from identification.fitting.engine import load_dataset, prepared_model, solve
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -36,14 +38,19 @@ RATIO: Final = 100.0
 RATES: Final = (100, 125, 250)
 ORDERS: Final = (1.0, 2.0, 4.0)
 SENSORS: Final = ("all", "both encoders", "motor only")
-HIDDEN: Final = {"all": ("torque_ripple", "kinematic_error", "torque_sensor_ripple"), "both encoders": ("torque_ripple", "kinematic_error"),
-                 "motor only": ("torque_ripple",)}  # fmt: skip
+HIDDEN: Final = {
+    "all": ("torque_ripple", "kinematic_error", "torque_sensor_ripple"),
+    "both encoders": ("torque_ripple", "kinematic_error"),
+    "motor only": ("torque_ripple",),
+}
 LIMIT: Final = 90.0
 
 
 @dataclass(frozen=True)
 class Case:
-    """What is put into one joint: effect (or None), order, share of the rms torque, rate [Hz], sensors."""
+    """What is put into one joint: effect (or None), order, share of the rms torque, rate [Hz],
+    sensors.
+    """
 
     effect: str | None
     order: float
@@ -67,7 +74,12 @@ class Result:
     def covered(self) -> bool:
         """True where the band of the amplitude holds the true one."""
         x = self.right
-        return x is not None and x.amplitude_low is not None and x.amplitude_high is not None and x.amplitude_low <= self.amplitude <= x.amplitude_high
+        return (
+            x is not None
+            and x.amplitude_low is not None
+            and x.amplitude_high is not None
+            and x.amplitude_low <= self.amplitude <= x.amplitude_high
+        )
 
     @property
     def size_error(self) -> float:
@@ -97,16 +109,30 @@ def cases(seed: int) -> list[Case]:
     for rate in RATES:
         for sensors in SENSORS:
             for effect in HIDDEN[sensors]:
-                out += [Case(effect, order, rng.uniform(0.01, 0.03), rate, sensors) for order in ORDERS]
+                out += [
+                    Case(effect, order, rng.uniform(0.01, 0.03), rate, sensors) for order in ORDERS
+                ]
             out.append(Case(None, 0.0, 0.0, rate, sensors))
         for known in (False, True):
             pitch = float(rng.choice([0.005, 0.01, 0.016]))
-            out.append(Case("torque_ripple", 1 / pitch, rng.uniform(0.01, 0.03), rate, "motor only", True, known))
+            out.append(
+                Case(
+                    "torque_ripple",
+                    1 / pitch,
+                    rng.uniform(0.01, 0.03),
+                    rate,
+                    "motor only",
+                    True,
+                    known,
+                )
+            )
             out.append(Case(None, 1 / pitch, 0.0, rate, "motor only", True, known))
     return out
 
 
-def reference(rng: np.random.Generator, amplitude: float, fastest: float, steps: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+def reference(
+    rng: np.random.Generator, amplitude: float, fastest: float, steps: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Multisine of eight tones with its rates; peak `amplitude`, speed at most `fastest`."""
     t = np.arange(steps) * STEP
     f = np.exp(np.linspace(np.log(0.07), np.log(1.2), 8) + rng.uniform(-0.15, 0.15, 8))
@@ -143,17 +169,34 @@ class Plant:
         q, v = desired[0][0].copy(), desired[1][0].copy()
         x, u = q - self.gravity * np.sin(q) / self.spring, v.copy()
         total = self.motor + self.link
-        drive, kept = np.zeros(count), {n: np.empty((steps, count)) for n in ("drive", "torque", "motor", "link")}
+        drive, kept = (
+            np.zeros(count),
+            {n: np.empty((steps, count)) for n in ("drive", "torque", "motor", "link")},
+        )
         for k in range(steps):
             if k % 2 == 0:
-                drive = total * (desired[2][k] + 60.0 * (desired[1][k] - v) + 1200.0 * (desired[0][k] - q))
+                drive = total * (
+                    desired[2][k] + 60.0 * (desired[1][k] - v) + 1200.0 * (desired[0][k] - q)
+                )
             turn = self.order * self.angle * q + self.phase
             wave = np.sin(turn)
             lever = 1 - self.error * self.order * self.angle * np.cos(turn)
             torque = self.spring * (q - x - self.error * wave) + self.damping * (v * lever - u)
-            kept["drive"][k], kept["torque"][k], kept["motor"][k], kept["link"][k] = drive, torque, q, x
-            free = v + STEP * (drive - torque * lever - self.ripple * wave - self.viscous * v) / self.motor
-            held = STEP * (self.coulomb + self.stribeck * np.exp(-np.abs(v / self.slow))) / self.motor
+            kept["drive"][k], kept["torque"][k], kept["motor"][k], kept["link"][k] = (
+                drive,
+                torque,
+                q,
+                x,
+            )
+            free = (
+                v
+                + STEP
+                * (drive - torque * lever - self.ripple * wave - self.viscous * v)
+                / self.motor
+            )
+            held = (
+                STEP * (self.coulomb + self.stribeck * np.exp(-np.abs(v / self.slow))) / self.motor
+            )
             v = np.sign(free) * np.maximum(np.abs(free) - held, 0)
             u = u + STEP * (torque - self.gravity * np.sin(x)) / self.link
             q, x = q + STEP * v, x + STEP * u
@@ -165,16 +208,38 @@ def _draw(rng: np.random.Generator, case: Case) -> dict[str, float]:
     if case.linear:
         mass, coulomb = rng.uniform(60, 120), rng.uniform(15, 25)
         return {
-            "motor": mass / 2, "link": mass / 2, "spring": 5e6, "damping": 4e3, "gravity": 0.0, "coulomb": coulomb, "stribeck": 0.2 * coulomb,
-            "slow": 0.01, "viscous": rng.uniform(150, 250), "angle": 2 * math.pi, "ripple": 0.0, "error": 0.0, "order": case.order,
+            "motor": mass / 2,
+            "link": mass / 2,
+            "spring": 5e6,
+            "damping": 4e3,
+            "gravity": 0.0,
+            "coulomb": coulomb,
+            "stribeck": 0.2 * coulomb,
+            "slow": 0.01,
+            "viscous": rng.uniform(150, 250),
+            "angle": 2 * math.pi,
+            "ripple": 0.0,
+            "error": 0.0,
+            "order": case.order,
             "phase": rng.uniform(0, 2 * math.pi),
-        }  # fmt: skip
+        }
     coulomb = rng.uniform(6, 12)
     return {
-        "motor": rng.uniform(0.8, 1.6), "link": rng.uniform(1, 3), "spring": rng.uniform(1e4, 2.5e4), "damping": rng.uniform(10, 30),
-        "gravity": rng.uniform(10, 30), "coulomb": coulomb, "stribeck": 0.2 * coulomb, "slow": 0.05, "viscous": rng.uniform(5, 12),
-        "angle": RATIO, "ripple": 0.0, "error": 0.0, "order": case.order, "phase": rng.uniform(0, 2 * math.pi),
-    }  # fmt: skip
+        "motor": rng.uniform(0.8, 1.6),
+        "link": rng.uniform(1, 3),
+        "spring": rng.uniform(1e4, 2.5e4),
+        "damping": rng.uniform(10, 30),
+        "gravity": rng.uniform(10, 30),
+        "coulomb": coulomb,
+        "stribeck": 0.2 * coulomb,
+        "slow": 0.05,
+        "viscous": rng.uniform(5, 12),
+        "angle": RATIO,
+        "ripple": 0.0,
+        "error": 0.0,
+        "order": case.order,
+        "phase": rng.uniform(0, 2 * math.pi),
+    }
 
 
 def simulate(drawn: Sequence[Case], seed: int) -> list[tuple[Joint, list[Record], float]]:
@@ -182,31 +247,62 @@ def simulate(drawn: Sequence[Case], seed: int) -> list[tuple[Joint, list[Record]
     rng = np.random.default_rng((seed, 2))
     steps = round(SPAN / STEP)
     joints = [_draw(rng, c) for c in drawn]
-    desired = [[reference(rng, 0.1 if c.linear else 1.1, 0.25 if c.linear else 1.2, steps) for c in drawn] for _ in range(3)]
+    desired = [
+        [reference(rng, 0.1 if c.linear else 1.1, 0.25 if c.linear else 1.2, steps) for c in drawn]
+        for _ in range(3)
+    ]
     plain = Plant(**{n: np.array([j[n] for j in joints]) for n in joints[0]})
     together = [tuple(np.column_stack([d[i] for d in one]) for i in range(3)) for one in desired]
     # a short run without the line gives the rms torque that its size refers to
     short = tuple(x[: steps // 4] for x in together[0])
-    size = np.sqrt(np.mean(plain.run((short[0], short[1], short[2]))["drive"] ** 2, axis=0)) * [c.share for c in drawn]
+    size = np.sqrt(np.mean(plain.run((short[0], short[1], short[2]))["drive"] ** 2, axis=0)) * [
+        c.share for c in drawn
+    ]
     put = np.array([c.effect or "" for c in drawn])
-    plant = replace(plain, ripple=np.where(put == "torque_ripple", size, 0), error=np.where(put == "kinematic_error", size / plain.spring, 0))
+    plant = replace(
+        plain,
+        ripple=np.where(put == "torque_ripple", size, 0),
+        error=np.where(put == "kinematic_error", size / plain.spring, 0),
+    )
     wave = np.where(put == "torque_sensor_ripple", size, 0)
     out: list[tuple[Joint, list[Record]]] = [(_joint(c), []) for c in drawn]
     for d in together:
         run = plant.run((d[0], d[1], d[2]))
         for i, c in enumerate(drawn):
-            out[i][1].append(_record(rng, c, {n: x[:: round(1 / c.rate / STEP), i] for n, x in run.items()}, (wave[i], plant.phase[i])))
+            out[i][1].append(
+                _record(
+                    rng,
+                    c,
+                    {n: x[:: round(1 / c.rate / STEP), i] for n, x in run.items()},
+                    (wave[i], plant.phase[i]),
+                )
+            )
     return [(joint, records, float(a)) for (joint, records), a in zip(out, size, strict=True)]
 
 
 def _joint(case: Case) -> Joint:
     if case.linear:
-        return Joint("axis", "linear", model_name="hd1", effects=("viscous", "coulomb"), pitch=1 / case.order if case.pitch_known else None)
-    return Joint("joint", gear_ratio=RATIO, model_name="hd1" if case.sensors == "motor only" else "hd3", effects=("viscous", "coulomb", "gravity"))
+        return Joint(
+            "axis",
+            "linear",
+            model_name="hd1",
+            effects=("viscous", "coulomb"),
+            pitch=1 / case.order if case.pitch_known else None,
+        )
+    return Joint(
+        "joint",
+        gear_ratio=RATIO,
+        model_name="hd1" if case.sensors == "motor only" else "hd3",
+        effects=("viscous", "coulomb", "gravity"),
+    )
 
 
-def _record(rng: np.random.Generator, case: Case, run: dict[str, FloatArray], sensor: tuple[float, float]) -> Record:
-    """Through the sensors: noise of 0.5 % of the rms torque, encoders of 16384 (motor) and 2^19 (link) counts, 1 um on the axis."""
+def _record(
+    rng: np.random.Generator, case: Case, run: dict[str, FloatArray], sensor: tuple[float, float]
+) -> Record:
+    """Through the sensors: noise of 0.5 % of the rms torque, encoders of 16384 (motor) and 2^19
+    (link) counts, 1 um on the axis.
+    """
 
     def noisy(x: FloatArray) -> FloatArray:
         return np.asarray(x + 0.005 * np.sqrt(np.mean(x**2)) * rng.standard_normal(len(x)))
@@ -215,7 +311,9 @@ def _record(rng: np.random.Generator, case: Case, run: dict[str, FloatArray], se
         return np.asarray(np.round(x / count + 0.3 * rng.standard_normal(len(x))) * count)
 
     time = np.arange(len(run["drive"])) / case.rate
-    channels: dict[str, FloatArray] = {"motor_torque": noisy(run["drive"]) / (1.0 if case.linear else RATIO)}
+    channels: dict[str, FloatArray] = {
+        "motor_torque": noisy(run["drive"]) / (1.0 if case.linear else RATIO)
+    }
     if case.linear:
         channels["motor_position"] = counted(run["motor"], 1e-6)
     else:
@@ -223,7 +321,9 @@ def _record(rng: np.random.Generator, case: Case, run: dict[str, FloatArray], se
     if case.sensors != "motor only":
         channels["link_position"] = counted(run["link"], 2 * np.pi / 2**19)
     if case.sensors == "all":
-        channels["link_torque"] = noisy(run["torque"]) + sensor[0] * np.sin(case.order * RATIO * run["motor"] + sensor[1])
+        channels["link_torque"] = noisy(run["torque"]) + sensor[0] * np.sin(
+            case.order * RATIO * run["motor"] + sensor[1]
+        )
     return Record.from_channels(time, channels, name="joint")
 
 
@@ -232,7 +332,9 @@ def judge(case: Case, joint: Joint, records: Sequence[Record], amplitude: float)
     train, held = list(records[:2]), list(records[2:])
     model = prepared_model(joint, train[0])
     data = load_dataset(train, held, joint, model)
-    return Result(case, tuple(find_lines(solve(model, data), data, train, held)), case.order, amplitude)
+    return Result(
+        case, tuple(find_lines(solve(model, data), data, train, held)), case.order, amplitude
+    )
 
 
 def results(seed: int, chosen: Sequence[Case] | None = None) -> list[Result]:
@@ -246,11 +348,16 @@ def table(found: Sequence[Result]) -> str:
     groups: dict[tuple[str, ...], list[Result]] = {}
     for r in found:
         c = r.case
-        kind = "linear axis, pitch " + ("given" if c.pitch_known else "not given") if c.linear else f"100:1, {c.sensors}"
+        kind = (
+            "linear axis, pitch " + ("given" if c.pitch_known else "not given")
+            if c.linear
+            else f"100:1, {c.sensors}"
+        )
         order = "" if c.effect is None else "pitch" if c.linear else f"{c.order:g}"
         groups.setdefault((kind, c.effect or "none", order), []).append(r)
     lines = [
-        "| joint | hidden | order | joints | right order | name in set | name alone | lines elsewhere | amplitude in its band | median error, % |",
+        "| joint | hidden | order | joints | right order | name in set | name alone | lines "
+        "elsewhere | amplitude in its band | median error, % |",
         "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for key, rs in sorted(groups.items()):
@@ -270,31 +377,58 @@ def table(found: Sequence[Result]) -> str:
     without = [r for r in found if not r.case.effect]
     for rate in RATES:
         own = [r for r in with_line if r.case.rate == rate]
-        lines.append(f"{rate} Hz: right order in {100 * np.mean([r.right is not None for r in own]):.1f} % of {len(own)}")
+        lines.append(
+            f"{rate} Hz: right order in {100 * np.mean([r.right is not None for r in own]):.1f} "
+            f"% of {len(own)}"
+        )
     hit = 100 * float(np.mean([r.right is not None for r in with_line]))
     lines.append(f"all: right order in {hit:.1f} % of {len(with_line)} (limit {LIMIT:.0f})")
-    lines.append(f"none: lines on {sum(bool(r.lines) for r in without)} of {len(without)} joints without one (limit 0)")
+    lines.append(
+        f"none: lines on {sum(bool(r.lines) for r in without)} of {len(without)} joints without "
+        "one (limit 0)"
+    )
     return "\n".join(lines)
 
 
 def emps(folder: Path) -> str:
-    """The published recordings of a positioning system with a force planted at the pitch of its screw, 10 mm."""
+    """The published recordings of a positioning system with a force planted at the pitch of its
+    screw, 10 mm.
+    """
     columns: dict[str, Any] = {
-        "time": {"column": "t_s", "unit": "s"}, "motor_position": {"column": "q_m", "unit": "m"},
+        "time": {"column": "t_s", "unit": "s"},
+        "motor_position": {"column": "q_m", "unit": "m"},
         "motor_torque": {"column": "u_V", "scale": 35.15065188, "unit": "N"},
-    }  # fmt: skip
-    whole = [read(folder / f, columns=columns, kind="linear") for f in ("train.csv", "test_pulses.csv")]
-    out = ["| rate, Hz | planted, N | pitch given | lines: period, mm (prominence; amplitude, N; names) |", "|---|---|---|---|"]
+    }
+    whole = [
+        read(folder / f, columns=columns, kind="linear") for f in ("train.csv", "test_pulses.csv")
+    ]
+    out = [
+        "| rate, Hz | planted, N | pitch given | lines: period, mm (prominence; amplitude, N; "
+        "names) |",
+        "|---|---|---|---|",
+    ]
     for thin in (8, 4, 1):
         for size in (0.0, 1.0, 3.0):
             for pitch in (None, 0.01):
                 records = [_planted(r, size, thin) for r in whole]
-                joint = Joint("emps", "linear", model_name="hd1", effects=("viscous", "coulomb", "asymmetric_viscous"), pitch=pitch)
+                joint = Joint(
+                    "emps",
+                    "linear",
+                    model_name="hd1",
+                    effects=("viscous", "coulomb", "asymmetric_viscous"),
+                    pitch=pitch,
+                )
                 model = prepared_model(joint, records[0])
                 data = load_dataset(records[:1], records[1:], joint, model)
                 found = find_lines(solve(model, data), data, records[:1], records[1:])
-                said = ", ".join(f"{1000 / x.order:.2f} ({x.prominence:.0f}; {x.amplitude:.2f}; {' or '.join(x.effects) or 'position'})" for x in found)
-                out.append(f"| {1000 // thin} | {size:g} | {'yes' if pitch else 'no'} | {said or '-'} |")
+                said = ", ".join(
+                    f"{1000 / x.order:.2f} ({x.prominence:.0f}; {x.amplitude:.2f}; "
+                    f"{' or '.join(x.effects) or 'position'})"
+                    for x in found
+                )
+                out.append(
+                    f"| {1000 // thin} | {size:g} | {'yes' if pitch else 'no'} | {said or '-'} |"
+                )
     return "\n".join(out)
 
 
@@ -302,7 +436,9 @@ def _planted(record: Record, size: float, thin: int) -> Record:
     """Every so many samples of a record, with the force that belongs to its position."""
     position = record["motor_position"][::thin]
     force = record["motor_torque"][::thin] + size * np.sin(2 * np.pi * position / 0.01 + 0.7)
-    return Record.from_channels(record.time[::thin], {"motor_position": position, "motor_torque": force}, name=record.name)
+    return Record.from_channels(
+        record.time[::thin], {"motor_position": position, "motor_torque": force}, name=record.name
+    )
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -315,7 +451,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     if options.emps is not None:
         sys.stdout.write(emps(options.emps) + "\n")
         return 0
-    found = [r for seed in range(options.first, options.first + options.seeds) for r in results(seed)]
+    found = [
+        r for seed in range(options.first, options.first + options.seeds) for r in results(seed)
+    ]
     sys.stdout.write(table(found) + "\n")
     hit = np.mean([r.right is not None for r in found if r.case.effect])
     return 0 if hit >= LIMIT / 100 and not any(r.lines for r in found if not r.case.effect) else 1

@@ -1,10 +1,12 @@
-"""Evaluations and overhead of the multilevel coordinate search on the test set of Jones et al. (1993).
+"""Evaluations and overhead of the multilevel coordinate search on the test set of Jones et al.
+(1993).
 
     python benchmarks/mcs.py                      everything, about 10 s
     python benchmarks/mcs.py --seeds 10           250 shifted boxes per function instead of 25
 
-A function counts as solved at a relative error of 1e-4. Set OMP_NUM_THREADS=1 for times that compare.
-The functions are those of D. R. Jones, C. D. Perttunen and B. E. Stuckman, J. Optim. Theory Appl. 79 (1993) 157-181.
+A function counts as solved at a relative error of 1e-4. Set OMP_NUM_THREADS=1 for times that
+compare. The functions are those of D. R. Jones, C. D. Perttunen and B. E. Stuckman, J. Optim.
+Theory Appl. 79 (1993) 157-181.
 """
 
 from __future__ import annotations
@@ -21,24 +23,47 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import direct
 
-from identification.mcs import MCSResult, mcs
+from identification.search.mcs import MCSResult, mcs
 
 FloatArray = npt.NDArray[np.float64]
 Box = list[tuple[float, float]]
 
 _SHEKEL_PLACES = np.array(
-    [[4, 4, 4, 4], [1, 1, 1, 1], [8, 8, 8, 8], [6, 6, 6, 6], [3, 7, 3, 7],
-     [2, 9, 2, 9], [5, 5, 3, 3], [8, 1, 8, 1], [6, 2, 6, 2], [7, 3.6, 7, 3.6]]
-)  # fmt: skip
+    [
+        [4, 4, 4, 4],
+        [1, 1, 1, 1],
+        [8, 8, 8, 8],
+        [6, 6, 6, 6],
+        [3, 7, 3, 7],
+        [2, 9, 2, 9],
+        [5, 5, 3, 3],
+        [8, 1, 8, 1],
+        [6, 2, 6, 2],
+        [7, 3.6, 7, 3.6],
+    ]
+)
 _SHEKEL_WIDTHS = np.array([0.1, 0.2, 0.2, 0.4, 0.4, 0.6, 0.3, 0.7, 0.5, 0.5])
 _HARTMAN_WEIGHTS = np.array([1.0, 1.2, 3.0, 3.2])
 _HARTMAN3 = np.array([[3, 10, 30], [0.1, 10, 35], [3, 10, 30], [0.1, 10, 35]])
-_HARTMAN3_PLACES = 1e-4 * np.array([[3689, 1170, 2673], [4699, 4387, 7470], [1091, 8732, 5547], [381.5, 5743, 8828]])
-_HARTMAN6 = np.array([[10, 3, 17, 3.5, 1.7, 8], [0.05, 10, 17, 0.1, 8, 14], [3, 3.5, 1.7, 10, 17, 8], [17, 8, 0.05, 10, 0.1, 14]])
+_HARTMAN3_PLACES = 1e-4 * np.array(
+    [[3689, 1170, 2673], [4699, 4387, 7470], [1091, 8732, 5547], [381.5, 5743, 8828]]
+)
+_HARTMAN6 = np.array(
+    [
+        [10, 3, 17, 3.5, 1.7, 8],
+        [0.05, 10, 17, 0.1, 8, 14],
+        [3, 3.5, 1.7, 10, 17, 8],
+        [17, 8, 0.05, 10, 0.1, 14],
+    ]
+)
 _HARTMAN6_PLACES = 1e-4 * np.array(
-    [[1312, 1696, 5569, 124, 8283, 5886], [2329, 4135, 8307, 3736, 1004, 9991],
-     [2348, 1451, 3522, 2883, 3047, 6650], [4047, 8828, 8732, 5743, 1091, 381]]
-)  # fmt: skip
+    [
+        [1312, 1696, 5569, 124, 8283, 5886],
+        [2329, 4135, 8307, 3736, 1004, 9991],
+        [2348, 1451, 3522, 2883, 3047, 6650],
+        [4047, 8828, 8732, 5743, 1091, 381],
+    ]
+)
 
 
 def shekel(terms: int) -> Callable[[FloatArray], float]:
@@ -56,7 +81,9 @@ def goldstein_price(x: FloatArray) -> float:
     """Goldstein and Price's function, n = 2."""
     a, b = x.tolist()
     first = 1 + (a + b + 1) ** 2 * (19 - 14 * a + 3 * a * a - 14 * b + 6 * a * b + 3 * b * b)
-    second = 30 + (2 * a - 3 * b) ** 2 * (18 - 32 * a + 12 * a * a + 48 * b - 36 * a * b + 27 * b * b)
+    second = 30 + (2 * a - 3 * b) ** 2 * (
+        18 - 32 * a + 12 * a * a + 48 * b - 36 * a * b + 27 * b * b
+    )
     return float(first * second)
 
 
@@ -76,7 +103,9 @@ def six_hump_camel(x: FloatArray) -> float:
 def shubert(x: FloatArray) -> float:
     """Shubert's function in two coordinates: 760 local minima, 18 of them global."""
     a, b = x.tolist()
-    return sum(j * math.cos((j + 1) * a + j) for j in range(1, 6)) * sum(j * math.cos((j + 1) * b + j) for j in range(1, 6))
+    return sum(j * math.cos((j + 1) * a + j) for j in range(1, 6)) * sum(
+        j * math.cos((j + 1) * b + j) for j in range(1, 6)
+    )
 
 
 @final
@@ -84,8 +113,8 @@ def shubert(x: FloatArray) -> float:
 class Case:
     """A test function with its default box, known minimum, and figures to hold.
 
-    `paper` is the count of Huyer and Neumaier (1999), Table II; `band` and `median` are the largest acceptable counts
-    in the default box and as the median over shifted boxes.
+    `paper` is the count of Huyer and Neumaier (1999), Table II; `band` and `median` are the largest
+    acceptable counts in the default box and as the median over shifted boxes.
     """
 
     name: str
@@ -103,7 +132,9 @@ class Case:
         return self.minimum + 1e-4 * abs(self.minimum)
 
     def shifted_boxes(self, seed: int, count: int = 25) -> Iterator[Box]:
-        """Yield default boxes shifted by up to half their width that keep a global minimiser inside."""
+        """Yield default boxes shifted by up to half their width that keep a global minimiser
+        inside.
+        """
         rng = np.random.default_rng(seed)
         low, high = np.array(self.box, dtype=float).T
         width = high - low
@@ -128,8 +159,26 @@ JONES = (
     Case("S5", shekel(5), [(0, 10)] * 4, -10.153199679, _FOUR, 83, 250, 900),
     Case("S7", shekel(7), [(0, 10)] * 4, -10.402940567, _FOUR, 129, 250, 900),
     Case("S10", shekel(10), [(0, 10)] * 4, -10.536409817, _FOUR, 103, 250, 900),
-    Case("H3", hartman(_HARTMAN3, _HARTMAN3_PLACES), [(0, 1)] * 3, -3.862782148, (_H3_AT,), 79, 250, 250),
-    Case("H6", hartman(_HARTMAN6, _HARTMAN6_PLACES), [(0, 1)] * 6, -3.322368011, (_H6_AT,), 111, 200, 250),
+    Case(
+        "H3",
+        hartman(_HARTMAN3, _HARTMAN3_PLACES),
+        [(0, 1)] * 3,
+        -3.862782148,
+        (_H3_AT,),
+        79,
+        250,
+        250,
+    ),
+    Case(
+        "H6",
+        hartman(_HARTMAN6, _HARTMAN6_PLACES),
+        [(0, 1)] * 6,
+        -3.322368011,
+        (_H6_AT,),
+        111,
+        200,
+        250,
+    ),
     Case("GP", goldstein_price, [(-2, 2)] * 2, 3.0, ((0.0, -1.0),), 81, 150, 120),
     Case("BR", branin, [(-5, 10), (0, 15)], 0.397887357730, _BRANIN_AT, 41, 80, 60),
     Case("C6", six_hump_camel, [(-3, 3), (-2, 2)], -1.031628453490, _CAMEL_AT, 42, 80, 60),
@@ -146,15 +195,26 @@ def solve(case: Case, box: Box) -> MCSResult:
 
 
 def count_direct(case: Case, *, locally_biased: bool, cap: int = 20000) -> int | None:
-    """Return the evaluations scipy's DIRECT needs for the same accuracy; None where `cap` is not enough."""
+    """Return the evaluations scipy's DIRECT needs for the same accuracy; None where `cap` is
+    not enough.
+    """
     values: list[float] = []
 
     def fun(x: FloatArray) -> float:
         values.append(case.fun(x))
         return values[-1]
 
-    direct(fun, case.box, maxfun=cap, maxiter=cap, locally_biased=locally_biased, f_min=case.minimum, f_min_rtol=1e-4,
-           vol_tol=0.0, len_tol=0.0)  # fmt: skip
+    direct(
+        fun,
+        case.box,
+        maxfun=cap,
+        maxiter=cap,
+        locally_biased=locally_biased,
+        f_min=case.minimum,
+        f_min_rtol=1e-4,
+        vol_tol=0.0,
+        len_tol=0.0,
+    )
     hits = [k for k, value in enumerate(values[:cap]) if value <= case.target]
     return hits[0] + 1 if hits else None
 
@@ -168,8 +228,12 @@ def default_boxes() -> None:
         result = solve(case, case.box)
         total += result.nfev
         hit = "" if result.fun <= case.target else " not solved"
-        plain, biased = (count_direct(case, locally_biased=flag) or ">20000" for flag in (False, True))
-        print(f"{case.name:6}{result.nfev:8}{case.paper:8}{case.band:8}{plain:>10}{biased:>10}{hit}")
+        plain, biased = (
+            count_direct(case, locally_biased=flag) or ">20000" for flag in (False, True)
+        )
+        print(
+            f"{case.name:6}{result.nfev:8}{case.paper:8}{case.band:8}{plain:>10}{biased:>10}{hit}"
+        )
     print(f"{'sum':6}{total:8}{sum(case.paper for case in JONES):8}{SUM_BAND:8}\n")
 
 
@@ -183,22 +247,34 @@ def shifted_boxes(seeds: int) -> None:
         counts = [result.nfev for result in results]
         hits = sum(result.fun <= case.target for result in results)
         solved += hits
-        print(f"{case.name:6}{hits:8}{statistics.median(counts):8.0f}{case.median:8}{statistics.mean(counts):8.0f}{max(counts):8}")
+        print(
+            f"{case.name:6}{hits:8}{statistics.median(counts):8.0f}{case.median:8}"
+            f"{statistics.mean(counts):8.0f}{max(counts):8}"
+        )
     print(f"{'sum':6}{solved:8} of {25 * seeds * len(JONES)}\n")
 
 
 def overhead() -> None:
-    """Print the time of the search itself per evaluation, for default stopping rules and for a long search."""
+    """Print the time of the search itself per evaluation, for default stopping rules and for a
+    long search.
+    """
     print("Processor time per evaluation outside the objective in us, least of 7 runs")
     print(f"{'':6}{'n':>4}{'evaluations':>14}{'default rules':>16}{'3000 evaluations':>18}")
     for case in JONES:
         usual = [measure_overhead(case, None, None) for _ in range(7)]
         long = [measure_overhead(case, 3000, 0) for _ in range(7)]
-        print(f"{case.name:6}{len(case.box):4}{usual[0][1]:14}{min(usual)[0]:16.0f}{min(long)[0]:18.0f}")
+        print(
+            f"{case.name:6}{len(case.box):4}{usual[0][1]:14}{min(usual)[0]:16.0f}"
+            f"{min(long)[0]:18.0f}"
+        )
 
 
-def measure_overhead(case: Case, max_evaluations: int | None, stall_sweeps: int | None) -> tuple[float, int]:
-    """Return microseconds per evaluation that are not spent in the objective, and the number of evaluations."""
+def measure_overhead(
+    case: Case, max_evaluations: int | None, stall_sweeps: int | None
+) -> tuple[float, int]:
+    """Return microseconds per evaluation that are not spent in the objective, and the number of
+    evaluations.
+    """
     points: list[FloatArray] = []
 
     def kept(x: FloatArray) -> float:
@@ -216,8 +292,12 @@ def measure_overhead(case: Case, max_evaluations: int | None, stall_sweeps: int 
 
 def main() -> None:
     """Run all parts."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=1, help="seeds of 25 shifted boxes each (default 1)")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--seeds", type=int, default=1, help="seeds of 25 shifted boxes each (default 1)"
+    )
     seeds = parser.parse_args().seeds
     default_boxes()
     shifted_boxes(seeds)

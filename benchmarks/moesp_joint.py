@@ -1,16 +1,19 @@
-"""MOESP on simulated joints: variance accounted for on trajectories that had no part in the identification.
+"""MOESP on simulated joints: variance accounted for on trajectories that had no part in the
+identification.
 
     python benchmarks/moesp_joint.py            every joint
     python benchmarks/moesp_joint.py table_4_3  one joint
 
-Closed-loop simulations with the thesis's parameters and the sensor noise of table B.1. Inputs are motor position,
-velocity and acceleration (thesis 4.1.1), all link-referred. Outputs are link velocity and the relative position of
-motor and link, weighted to like size: as outputs, positions alone hide the torsion, which is a thousandth of them.
-The order is chosen without the unseen trajectories.
+Closed-loop simulations with the thesis's parameters and the sensor noise of table B.1. Inputs are
+motor position, velocity and acceleration (thesis 4.1.1), all link-referred. Outputs are link
+velocity and the relative position of motor and link, weighted to like size: as outputs, positions
+alone hide the torsion, which is a thousandth of them. The order is chosen without the unseen
+trajectories.
 
-The acceleration is a reading of its own ("sensor"), the filtered derivative of the velocity ("derived"), or left out
-("none"). A derived one leaves the Hankel matrix of the inputs without full rank: the models are as good, but the third
-digit of their relative position moves with the order of the records.
+The acceleration is a reading of its own ("sensor"), the filtered derivative of the velocity
+("derived"), or left out ("none"). A derived one leaves the Hankel matrix of the inputs without full
+rank: the models are as good, but the third digit of their relative position moves with the order of
+the records.
 """
 
 from __future__ import annotations
@@ -30,11 +33,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from casadi_models import JointModel
 from casadi_models.thesis import catalogue_stiffness, model_2b, model_ts
-from identification._excite_follow import Follower
-from identification.excite import Motion, sinusoidal, triangular
-from identification.fault import NOISE, SENSORS
-from identification.prepare import butterworth, central_difference
-from identification.subspace import MoespOptions, Subspace, UnstableModelWarning, moesp
+from identification.data.prepare import butterworth, central_difference
+from identification.faults.detector import NOISE, SENSORS
+from identification.linear.subspace import MoespOptions, Subspace, UnstableModelWarning, moesp
+from identification.planning.follow import Follower
+from identification.planning.trajectories import Motion, sinusoidal, triangular
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -44,7 +47,9 @@ HIGHEST = 8
 WEIGHTS = (0.1, 100.0)
 """Factors on link velocity [rad/s] and relative position [rad]."""
 START = 1.0
-"""Part of an unseen record that its initial state is estimated from [s]; it does not count in the VAF."""
+"""Part of an unseen record that its initial state is estimated from [s]; it does not count in
+the VAF.
+"""
 LIMITS = {"position": 99.99, "velocity": 99.4, "relative position": 96.0}
 """What must be reached on unseen trajectories [%]."""
 SPEEDS = {"seen": (15.0, 20.0, 27.0, 33.0, 39.0, 45.0), "unseen": (18.0, 30.0, 42.0)}
@@ -57,7 +62,9 @@ Acceleration = Literal["sensor", "derived", "none"]
 
 @dataclass(frozen=True)
 class Run:
-    """Noisy readings along one trajectory: inputs (n, 2 or 3), link position and velocity (n, 2)."""
+    """Noisy readings along one trajectory: inputs (n, 2 or 3), link position and velocity (n,
+    2).
+    """
 
     inputs: FloatArray
     link: FloatArray
@@ -69,7 +76,9 @@ class Run:
 
 
 def joints() -> dict[str, Callable[[], JointModel]]:
-    """Joints of the ladder hd3, hd4 with parameters of the thesis; damping and kinematic error are assumed."""
+    """Joints of the ladder hd3, hd4 with parameters of the thesis; damping and kinematic error
+    are assumed.
+    """
 
     def damped(model: JointModel) -> JointModel:
         added = model if model.has("structural_damping") else model.add("structural_damping")
@@ -90,7 +99,12 @@ def joints() -> dict[str, Callable[[], JointModel]]:
         model = damped(model_2b()).add("kinematic_error")
         return model.with_values({"kinematic_error_order": 2.0, "kinematic_error_sine": 1.0e-4})
 
-    return {"table_4_3": lambda: damped(model_2b()), "table_4_6": table_4_6, "table_2_3": piecewise, "hd4": kinematic}
+    return {
+        "table_4_3": lambda: damped(model_2b()),
+        "table_4_6": table_4_6,
+        "table_2_3": piecewise,
+        "hd4": kinematic,
+    }
 
 
 def motions(kind: Literal["seen", "unseen"], seconds: float = 15.0) -> list[Motion]:
@@ -103,7 +117,9 @@ def motions(kind: Literal["seen", "unseen"], seconds: float = 15.0) -> list[Moti
     return found
 
 
-def run(follower: Follower, motion: Motion, seed: int, acceleration: Acceleration = "sensor") -> Run:
+def run(
+    follower: Follower, motion: Motion, seed: int, acceleration: Acceleration = "sensor"
+) -> Run:
     """The joint along a trajectory under its controller, as its sensors show it."""
     followed = follower.run(motion.table)
     noise = np.random.default_rng(seed).standard_normal((len(followed.time), 5))
@@ -119,10 +135,20 @@ def run(follower: Follower, motion: Motion, seed: int, acceleration: Acceleratio
 def identify(runs: Sequence[Run], method: Method, order: int | None = None) -> Subspace:
     """MOESP on several runs."""
     names = ("motor_position", "motor_velocity", "motor_acceleration")[: runs[0].inputs.shape[1]]
-    options = MoespOptions(names, ("link_velocity", "relative_position"), WEIGHTS, max_order=HIGHEST)
+    options = MoespOptions(
+        names, ("link_velocity", "relative_position"), WEIGHTS, max_order=HIGHEST
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UnstableModelWarning)
-        return moesp([r.inputs for r in runs], [r.outputs for r in runs], BLOCK_ROWS, order, DT, method, options=options)
+        return moesp(
+            [r.inputs for r in runs],
+            [r.outputs for r in runs],
+            BLOCK_ROWS,
+            order,
+            DT,
+            method,
+            options=options,
+        )
 
 
 def best_stable(runs: Sequence[Run], method: Method) -> Subspace:
@@ -146,21 +172,36 @@ def initial_state(model: Subspace, inputs: FloatArray, outputs: FloatArray) -> F
         row = row @ model.system.A
     weights = np.array(WEIGHTS)
     matrix = (np.array(free) * weights[:, None]).reshape(-1, model.order)
-    return np.asarray(np.linalg.lstsq(matrix, ((outputs - forced) * weights).ravel(), rcond=None)[0], dtype=np.float64)
+    return np.asarray(
+        np.linalg.lstsq(matrix, ((outputs - forced) * weights).ravel(), rcond=None)[0],
+        dtype=np.float64,
+    )
 
 
 def unseen_vaf(model: Subspace, runs: Sequence[Run]) -> dict[str, float]:
-    """VAF [%] of free simulations; the initial state comes from the first second, which is left out."""
+    """VAF [%] of free simulations; the initial state comes from the first second, which is left
+    out.
+    """
     first = round(START / DT)
     measured: list[FloatArray] = []
     error: list[FloatArray] = []
     for r in runs:
-        simulated = model.simulate(r.inputs, initial_state(model, r.inputs[:first], r.outputs[:first]))
+        simulated = model.simulate(
+            r.inputs, initial_state(model, r.inputs[:first], r.outputs[:first])
+        )
         y = np.column_stack([r.link, r.outputs[:, 1]])
-        e = np.column_stack([simulated[:, 1] - r.outputs[:, 1], r.link[:, 1] - simulated[:, 0], r.outputs[:, 1] - simulated[:, 1]])
+        e = np.column_stack(
+            [
+                simulated[:, 1] - r.outputs[:, 1],
+                r.link[:, 1] - simulated[:, 0],
+                r.outputs[:, 1] - simulated[:, 1],
+            ]
+        )
         measured.append(y[first:])
         error.append(e[first:])
-    vaf = 100.0 * (1.0 - np.var(np.concatenate(error), axis=0) / np.var(np.concatenate(measured), axis=0))
+    vaf = 100.0 * (
+        1.0 - np.var(np.concatenate(error), axis=0) / np.var(np.concatenate(measured), axis=0)
+    )
     return dict(zip(LIMITS, vaf.tolist(), strict=True))
 
 
@@ -171,13 +212,24 @@ def line(head: str, model: Subspace, unseen: Sequence[Run], *, judged: bool) -> 
         return f"{head}   unstable"
     vaf = unseen_vaf(model, unseen)
     passed = "all reached" if all(vaf[k] >= v for k, v in LIMITS.items()) else "NOT reached"
-    return f"{head} {vaf['position']:9.4f} {vaf['velocity']:9.4f} {vaf['relative position']:9.3f}   {passed if judged else ''}"
+    return (
+        f"{head} {vaf['position']:9.4f} {vaf['velocity']:9.4f} "
+        f"{vaf['relative position']:9.3f}   {passed if judged else ''}"
+    )
 
 
 def report(name: str, follower: Follower) -> None:
-    """Print every order, the automatic choice and the best stable one, for each kind of acceleration."""
-    print(f"\n{name}, block rows {BLOCK_ROWS}: unseen VAF % (limits {', '.join(f'{k} {v}' for k, v in LIMITS.items())})")
-    print(f"{'acceleration':<12} {'method':<12} {'choice':<10} {'order':>5} {'radius':>8} {'position':>9} {'velocity':>9} {'relative':>9}")
+    """Print every order, the automatic choice and the best stable one, for each kind of
+    acceleration.
+    """
+    print(
+        f"\n{name}, block rows {BLOCK_ROWS}: unseen VAF % (limits "
+        f"{', '.join(f'{k} {v}' for k, v in LIMITS.items())})"
+    )
+    print(
+        f"{'acceleration':<12} {'method':<12} {'choice':<10} {'order':>5} {'radius':>8} "
+        f"{'position':>9} {'velocity':>9} {'relative':>9}"
+    )
     kinds: tuple[Acceleration, ...] = ("sensor", "derived", "none")
     methods: tuple[Method, ...] = ("ordinary", "past_output")
     for kind in kinds:
@@ -186,7 +238,11 @@ def report(name: str, follower: Follower) -> None:
         for method in methods:
             head = f"{kind:<12} {method:<12}"
             for order in range(1, HIGHEST + 1):
-                print(line(f"{head} {'given':<10}", identify(seen, method, order), unseen, judged=False))
+                print(
+                    line(
+                        f"{head} {'given':<10}", identify(seen, method, order), unseen, judged=False
+                    )
+                )
             print(line(f"{head} {'automatic':<10}", identify(seen, method), unseen, judged=False))
             print(line(f"{head} {'best':<10}", best_stable(seen, method), unseen, judged=True))
 

@@ -1,9 +1,11 @@
-"""Cost of the native estimator and its distance to the Python one: ``python benchmarks/native.py [JOINT...]``.
+"""Cost of the native estimator and its distance to the Python one: ``python benchmarks/native.py
+[JOINT...]``.
 
-For each reference joint, 40 s at 1 kHz with every kind of sensor fault, optimiser off: processor time of set + step + get
-in a C host (best of five), that of the longest step (the start of the recursion), and the largest difference of any real
-output after any sample to the Python estimator's, as a share of that output's largest value or, where it is small, of 1.
-With ``--wine`` the same for the Windows library under wine, against the Linux one.
+For each reference joint, 40 s at 1 kHz with every kind of sensor fault, optimiser off: processor
+time of set + step + get in a C host (best of five), that of the longest step (the start of the
+recursion), and the largest difference of any real output after any sample to the Python
+estimator's, as a share of that output's largest value or, where it is small, of 1. With ``--wine``
+the same for the Windows library under wine, against the Linux one.
 """
 
 from __future__ import annotations
@@ -22,13 +24,13 @@ import numpy.typing as npt
 from fmpy import read_model_description
 
 from casadi_models.simulate import simulate
-from identification.fault import FaultDetector
-from identification.joint_file import toml_text
-from irj_fmu.compiler import find_compiler, header_folder
-from irj_fmu.estimator import DETECTOR_FILE, JOINT_FILE, OPTIONS_FILE, Estimator, options_text
-from irj_fmu.native import NativeSpec, build_native
-from irj_fmu.online import OnlineOptions, prepared
-from irj_fmu.reference import reference_joint
+from identification.data.joint_file import toml_text
+from identification.faults.detector import FaultDetector
+from identification.online.estimator import OnlineOptions, prepared
+from irj_fmu.estimator.native import NativeSpec, build_native
+from irj_fmu.estimator.slave import DETECTOR_FILE, JOINT_FILE, OPTIONS_FILE, Estimator, options_text
+from irj_fmu.fmi.compiler import find_compiler, header_folder
+from irj_fmu.plant.reference import reference_joint
 
 FloatArray = npt.NDArray[np.float64]
 STEP = 1e-3
@@ -51,7 +53,9 @@ def readings_of(key: str, seconds: float, seed: int = 3) -> FloatArray:
 
 
 def hurt(table: FloatArray, *, stuck: bool = True) -> FloatArray:
-    """Bias, dropout, gain, spike, drift, infinity, zero, noise, delay; two at a time; and a stuck motor encoder."""
+    """Bias, dropout, gain, spike, drift, infinity, zero, noise, delay; two at a time; and a
+    stuck motor encoder.
+    """
     t, rng = table.copy(), np.random.default_rng(1)
     t[10_000:11_000, 3] += 0.01
     t[13_000:14_000, 4] = np.nan
@@ -77,11 +81,16 @@ def specification(key: str) -> NativeSpec:
         return NativeSpec(joint, "native", PLAIN)
     gear = joint.gear_ratio
     detector = FaultDetector(model, STEP)
-    detector.calibrate(readings_of(key, 30.0, 9) * np.array([joint.torque_per_current or gear, 1 / gear, 1 / gear, 1.0, 1.0, 1.0]))
+    detector.calibrate(
+        readings_of(key, 30.0, 9)
+        * np.array([joint.torque_per_current or gear, 1 / gear, 1 / gear, 1.0, 1.0, 1.0])
+    )
     return NativeSpec(joint, "native", PLAIN, detector.state())
 
 
-def python_outputs(spec: NativeSpec, folder: Path, table: FloatArray, inputs: Sequence[int], outputs: Sequence[int]) -> FloatArray:
+def python_outputs(
+    spec: NativeSpec, folder: Path, table: FloatArray, inputs: Sequence[int], outputs: Sequence[int]
+) -> FloatArray:
     """Real outputs of the Python estimator after each sample."""
     values = {k: {"value": v, "unit": "", "side": ""} for k, v in spec.joint.fitted.items()}
     (folder / JOINT_FILE).write_text(toml_text(spec.joint, values), encoding="utf-8")
@@ -100,42 +109,101 @@ def python_outputs(spec: NativeSpec, folder: Path, table: FloatArray, inputs: Se
     return found
 
 
-def replay(host: Sequence[str], library: str, guid: str, folder: Path, inputs: Sequence[int], outputs: Sequence[int]) -> tuple[FloatArray, list[float]]:
+def replay(
+    host: Sequence[str],
+    library: str,
+    guid: str,
+    folder: Path,
+    inputs: Sequence[int],
+    outputs: Sequence[int],
+) -> tuple[FloatArray, list[float]]:
     """Real outputs in the C host; its time per step and that of the longest one [ns]."""
-    command = [*host, library, guid, "readings.bin", "results.bin", str(STEP), ",".join(map(str, inputs)), ",".join(map(str, outputs))]
+    command = [
+        *host,
+        library,
+        guid,
+        "readings.bin",
+        "results.bin",
+        str(STEP),
+        ",".join(map(str, inputs)),
+        ",".join(map(str, outputs)),
+    ]
     environment = {**os.environ, "WINEDEBUG": "-all", "WINEPREFIX": str(folder / "wine")}
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True, env=environment)
+    done = subprocess.run(
+        command, cwd=folder, capture_output=True, text=True, check=True, env=environment
+    )
     words = done.stdout.split()
-    return np.fromfile(folder / "results.bin").reshape(-1, len(outputs)), [float(words[2]), float(words[-2])]
+    return np.fromfile(folder / "results.bin").reshape(-1, len(outputs)), [
+        float(words[2]),
+        float(words[-2]),
+    ]
 
 
 def difference(found: FloatArray, expected: FloatArray) -> float:
     """Largest difference, each output as a share of its largest value or of 1."""
-    return float(np.max(np.abs(found - expected) / np.maximum(np.max(np.abs(expected), axis=0), 1.0)))
+    return float(
+        np.max(np.abs(found - expected) / np.maximum(np.max(np.abs(expected), axis=0), 1.0))
+    )
 
 
 def measure(key: str, folder: Path, host: Path) -> None:
     """One line for one joint."""
     spec, with_wine = specification(key), "--wine" in sys.argv
-    path = build_native(spec, folder / "native.fmu", target=("linux64", "win64") if with_wine else None)
+    path = build_native(
+        spec, folder / "native.fmu", target=("linux64", "win64") if with_wine else None
+    )
     with zipfile.ZipFile(path) as archive:
         archive.extractall(folder / "fmu")
     description = read_model_description(str(path))
     known = {v.name: v.valueReference for v in description.modelVariables}
-    inputs = [known[n] for n in ("i_m" if "i_m" in known else "tau_m", "q_m", "w_m", "q_l", "w_l", "tau_l")]
-    outputs = [v.valueReference for v in description.modelVariables if v.causality == "output" and v.type == "Real"]
+    inputs = [
+        known[n]
+        for n in ("i_m" if "i_m" in known else "tau_m", "q_m", "w_m", "q_l", "w_l", "tau_l")
+    ]
+    outputs = [
+        v.valueReference
+        for v in description.modelVariables
+        if v.causality == "output" and v.type == "Real"
+    ]
     table = hurt(readings_of(key, 40.0, 3), stuck=spec.detector_state is not None)
     table.tofile(folder / "readings.bin")
-    (library,) = (p for p in (folder / "fmu" / "binaries").rglob("native.*") if p.suffix in (".so", ".dylib") or (os.name == "nt" and p.suffix == ".dll"))
-    runs = [replay([str(host)], str(library), description.guid, folder, inputs, outputs) for _ in range(5)]
+    (library,) = (
+        p
+        for p in (folder / "fmu" / "binaries").rglob("native.*")
+        if p.suffix in (".so", ".dylib") or (os.name == "nt" and p.suffix == ".dll")
+    )
+    runs = [
+        replay([str(host)], str(library), description.guid, folder, inputs, outputs)
+        for _ in range(5)
+    ]
     found, times = runs[0][0], np.array([times for _, times in runs]).min(axis=0)
     apart = difference(found, python_outputs(spec, folder, table, inputs, outputs))
-    line = f"{key:8s} {times[0]:6.0f} ns per step, longest {times[1] / 1e3:5.0f} us, largest difference to Python {apart:.1e}"
+    line = (
+        f"{key:8s} {times[0]:6.0f} ns per step, longest {times[1] / 1e3:5.0f} us, largest "
+        f"difference to Python {apart:.1e}"
+    )
     if with_wine:
         wine = shutil.which("wine64") or shutil.which("wine") or sys.exit("there is no wine")
         program = folder / "native_host.exe"
-        subprocess.run([*find_compiler("x86_64-windows-gnu", "zig"), str(HOST), "-O1", f"-I{header_folder()}", "-o", str(program)], check=True)
-        other, _ = replay([wine, str(program)], "fmu\\binaries\\win64\\native.dll", description.guid, folder, inputs, outputs)
+        subprocess.run(
+            [
+                *find_compiler("x86_64-windows-gnu", "zig"),
+                str(HOST),
+                "-O1",
+                f"-I{header_folder()}",
+                "-o",
+                str(program),
+            ],
+            check=True,
+        )
+        other, _ = replay(
+            [wine, str(program)],
+            "fmu\\binaries\\win64\\native.dll",
+            description.guid,
+            folder,
+            inputs,
+            outputs,
+        )
         line += f", Windows under wine {difference(other, found):.1e}"
     print(line, flush=True)
 
@@ -146,7 +214,18 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         host = Path(temporary) / "native_host"
         libraries = ["-ldl"] if sys.platform == "linux" else []
-        subprocess.run([*find_compiler(), str(HOST), "-O1", f"-I{header_folder()}", "-o", str(host), *libraries], check=True)
+        subprocess.run(
+            [
+                *find_compiler(),
+                str(HOST),
+                "-O1",
+                f"-I{header_folder()}",
+                "-o",
+                str(host),
+                *libraries,
+            ],
+            check=True,
+        )
         for key in keys:
             folder = Path(temporary) / key
             folder.mkdir()

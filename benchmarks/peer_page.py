@@ -1,11 +1,14 @@
-"""The same loop as a NiceGUI page, for comparison: load a record, plot it, fit, add an effect, see the new error.
+"""The same loop as a NiceGUI page, for comparison: load a record, plot it, fit, add an effect, see
+the new error.
 
-Run by ``benchmarks/app.py``; by itself: ``python benchmarks/peer_page.py --port 8100``.  It needs ``pip install nicegui``
-(extra ``bench``), which is no dependency of the project.  It is what one writes with the framework's own elements: an
-upload, a chart with the smallest and the largest value per pixel, buttons, and the library's verbs in a thread.
+Run by ``benchmarks/app.py``; by itself: ``python benchmarks/peer_page.py --port 8100``.  It needs
+``pip install nicegui`` (extra ``bench``), which is no dependency of the project.  It is what one
+writes with the framework's own elements: an upload, a chart with the smallest and the largest value
+per pixel, buttons, and the library's verbs in a thread.
 
-``--engine verbs`` (default) fits every sample with `identification.fit`; ``--engine windows`` uses the same windows of the
-record and the same solver as the workbench, so that only the page around it differs.
+``--engine verbs`` (default) fits every sample with `identification.fitting.fit`; ``--engine
+windows`` uses the same windows of the record and the same solver as the workbench, so that only the
+page around it differs.
 """
 
 from __future__ import annotations
@@ -22,11 +25,18 @@ import numpy as np
 from nicegui import run, ui
 
 from identification import fit, read
-from identification.joint_file import Joint, parse_joint
-from identification.record import Record
+from identification.data.joint_file import Joint, parse_joint
+from identification.data.record import Record
 
-JOINT = parse_joint(tomllib.loads((files("workbench") / "demo" / "joint.toml").read_text(encoding="utf-8")))
-EFFECTS = ("stribeck@motor", "cubic_viscous@motor", "load_dependent_friction@motor", "kinematic_error")
+JOINT = parse_joint(
+    tomllib.loads((files("workbench") / "demo" / "joint.toml").read_text(encoding="utf-8"))
+)
+EFFECTS = (
+    "stribeck@motor",
+    "cubic_viscous@motor",
+    "load_dependent_friction@motor",
+    "kinematic_error",
+)
 PIXELS = 1200
 
 
@@ -43,15 +53,19 @@ class Verbs:
         return float(self.fitted.held_out.relative_error_percent)
 
     def add(self, label: str) -> float:
-        self.fitted = fit(self.fitted.model.add(label), self.train, joint=self.joint, held_out=[self.held])
+        self.fitted = fit(
+            self.fitted.model.add(label), self.train, joint=self.joint, held_out=[self.held]
+        )
         return float(self.fitted.held_out.relative_error_percent)
 
 
 class Windows:
-    """The windows and the solver of the workbench, without what it prepares ahead and without its first look."""
+    """The windows and the solver of the workbench, without what it prepares ahead and without
+    its first look.
+    """
 
     def __init__(self, joint: Joint, record: Record) -> None:
-        from workbench.app_analysis import Analysis
+        from workbench.page.analysis import Analysis
 
         self.analysis = Analysis(joint, [record], [])
 
@@ -68,14 +82,18 @@ def smallest_and_largest(record: Record, channel: str) -> list[list[float]]:
     values, time = record[channel], record.time
     edges = np.linspace(0, len(values), PIXELS + 1).astype(np.int64)[:-1]
     low, high = np.minimum.reduceat(values, edges), np.maximum.reduceat(values, edges)
-    return np.column_stack([np.repeat(time[edges], 2), np.column_stack([low, high]).ravel()]).tolist()
+    return np.column_stack(
+        [np.repeat(time[edges], 2), np.column_stack([low, high]).ravel()]
+    ).tolist()
 
 
 def page(engine: Callable[[Joint, Record], Any]) -> None:
     """The page of one visitor."""
     held: dict[str, Any] = {}
     ui.label("Peer page").classes("text-h5")
-    chart = ui.echart({"xAxis": {"type": "value"}, "yAxis": {"type": "value"}, "animation": False, "series": []}).classes("w-full h-80")
+    chart = ui.echart(
+        {"xAxis": {"type": "value"}, "yAxis": {"type": "value"}, "animation": False, "series": []}
+    ).classes("w-full h-80")
     error = ui.label("").props("id=error")
 
     async def loaded(event: Any) -> None:
@@ -85,7 +103,9 @@ def page(engine: Callable[[Joint, Record], Any]) -> None:
         held["record"] = record
         channel = next(iter(record.channels))
         points = await run.io_bound(smallest_and_largest, record, channel)
-        chart.options["series"] = [{"type": "line", "name": channel, "showSymbol": False, "data": points}]
+        chart.options["series"] = [
+            {"type": "line", "name": channel, "showSymbol": False, "data": points}
+        ]
         chart.update()
 
     def prepared() -> Any:
@@ -114,7 +134,14 @@ def main() -> None:
     parser.add_argument("--engine", choices=("verbs", "windows"), default="verbs")
     given = parser.parse_args()
     engine = Verbs if given.engine == "verbs" else Windows
-    ui.run(lambda: page(engine), host="127.0.0.1", port=given.port, show=False, reload=False, show_welcome_message=False)
+    ui.run(
+        lambda: page(engine),
+        host="127.0.0.1",
+        port=given.port,
+        show=False,
+        reload=False,
+        show_welcome_message=False,
+    )
 
 
 if __name__ in ("__main__", "__mp_main__"):

@@ -1,7 +1,8 @@
-"""Figures of the recursive least squares: cost per sample, a million updates, standstill, recovery after a step.
+"""Figures of the recursive least squares: cost per sample, a million updates, standstill, recovery
+after a step.
 
-Run from the project folder: `python benchmarks/recursive.py` (needs padasip for the comparison: extra `bench`).
-`--quick` leaves out the recovery over several seeds.
+Run from the project folder: `python benchmarks/recursive.py` (needs padasip for the comparison:
+extra `bench`). `--quick` leaves out the recovery over several seeds.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import joint_regressor as joint  # noqa: E402
 
-from identification.recursive import METHODS, RecursiveLeastSquares, RunOutcome, Settings  # noqa: E402
+from identification.recursive.estimator import METHODS, RecursiveLeastSquares, RunOutcome, Settings  # noqa: E402
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -57,7 +58,8 @@ def cost() -> None:
         if method == "random_walk":
             update_us = interpreted * 1e6
         print(
-            f"  {method:12s} update {interpreted * 1e6:5.2f} us (FunctionBuffer), {compiled * 1e6:5.2f} us (compiled); "
+            f"  {method:12s} update {interpreted * 1e6:5.2f} us (FunctionBuffer), "
+            f"{compiled * 1e6:5.2f} us (compiled); "
             f"run {replay * 1e9:5.0f} ns = {1e-6 / replay:.2f} million samples/s  [{outcome.value}]"
         )
     try:
@@ -75,14 +77,22 @@ def cost() -> None:
     theirs = best(others, 20) / 500 * 1e6
     estimator = RecursiveLeastSquares(np.zeros(n), np.ones(n), outputs=m)
     ours = best(lambda: estimator.run(y, h, compiled=True), 20) / samples * 1e6
-    print(f"  padasip RLS  {theirs:5.1f} us per sample (two scalar updates): run is {theirs / ours:.0f} times faster, update {theirs / update_us:.1f} times")
+    print(
+        f"  padasip RLS  {theirs:5.1f} us per sample (two scalar updates): run is "
+        f"{theirs / ours:.0f} times faster, update {theirs / update_us:.1f} times"
+    )
 
 
 def agreement() -> None:
     """Interpreted and compiled, bit by bit."""
     record = joint.simulate(seconds=20.0, standstill=(8.0, 10.0), step_at=15.0)
     for method in METHODS:
-        pair = [RecursiveLeastSquares(0.7 * joint.THETA, joint.SCALE, method).run(record.y, record.h, compiled=compiled) for compiled in (False, True)]
+        pair = [
+            RecursiveLeastSquares(0.7 * joint.THETA, joint.SCALE, method).run(
+                record.y, record.h, compiled=compiled
+            )
+            for compiled in (False, True)
+        ]
         same = np.array_equal(pair[0].theta, pair[1].theta)
         print(f"  {method:12s} interpreted and compiled trajectories equal bit by bit: {same}")
 
@@ -90,28 +100,42 @@ def agreement() -> None:
 def endurance() -> None:
     """A million updates on the joint's regressor, a fifth of them standstill."""
     record = joint.simulate(seconds=50.0, standstill=(20.0, 30.0), step_at=np.inf)
-    print("A million updates (joint regressor, unscaled columns differ by 1e8; a fifth is standstill)")
+    print(
+        "A million updates (joint regressor, unscaled columns differ by 1e8; a fifth is standstill)"
+    )
     for method in METHODS:
         estimator = RecursiveLeastSquares(0.7 * joint.THETA, joint.SCALE, method)
         worst = 0.0
         for _ in range(20):
             run = estimator.run(record.y, record.h)
             worst = max(worst, float(np.abs((run.theta - joint.THETA) / joint.SCALE).max()))
-        low = float(np.linalg.eigvalsh(estimator.covariance / np.outer(joint.SCALE, joint.SCALE)).min())
+        low = float(
+            np.linalg.eigvalsh(estimator.covariance / np.outer(joint.SCALE, joint.SCALE)).min()
+        )
         print(
-            f"  {method:12s} finite {np.isfinite(run.theta).all()}, largest error on the way {worst:.2f} scales, "
-            f"at the end {np.abs(estimator.theta / joint.THETA - 1).max():.4f} relative, smallest eigenvalue of P {low:.1e}"
+            f"  {method:12s} finite {np.isfinite(run.theta).all()}, largest error on the way "
+            f"{worst:.2f} scales, "
+            f"at the end {np.abs(estimator.theta / joint.THETA - 1).max():.4f} relative, "
+            f"smallest eigenvalue of P {low:.1e}"
         )
 
 
 def standstill_and_step() -> None:
     """80 s at 1 kHz, standstill from 30 to 50 s, all parameters +30 % at 60 s."""
-    print("Standstill of 20 s and +30 % at 60 s (worst over the parameters; 5 % recovery of k1, ka, motor Coulomb)")
+    print(
+        "Standstill of 20 s and +30 % at 60 s (worst over the parameters; 5 % recovery of k1, "
+        "ka, motor Coulomb)"
+    )
     record = joint.simulate(stiction=5.0)
     for method in METHODS:
         for freeze in (True, False):
-            estimator = RecursiveLeastSquares(0.7 * joint.THETA, joint.SCALE, method, settings=Settings(freeze=freeze))
-            print(f"  {method:12s} freeze {'on ' if freeze else 'off'} {outcome_line(record, estimator, 60_000)}")
+            estimator = RecursiveLeastSquares(
+                0.7 * joint.THETA, joint.SCALE, method, settings=Settings(freeze=freeze)
+            )
+            print(
+                f"  {method:12s} freeze {'on ' if freeze else 'off'} "
+                f"{outcome_line(record, estimator, 60_000)}"
+            )
 
 
 def seeds() -> None:
@@ -122,7 +146,10 @@ def seeds() -> None:
             at = 60_000 + 370 * seed
             record = joint.simulate(seed=seed, step_at=at * 1e-3, quick=quick)
             estimator = RecursiveLeastSquares(0.7 * joint.THETA, joint.SCALE)
-            print(f"  seed {seed} {outcome_line(record, estimator, at)}; batch LS of the 0.43 s after the step: ka {batch_error(record, at):+.1%}")
+            print(
+                f"  seed {seed} {outcome_line(record, estimator, at)}; batch LS of the 0.43 s "
+                f"after the step: ka {batch_error(record, at):+.1%}"
+            )
 
 
 def outcome_line(record: joint.JointRecord, estimator: RecursiveLeastSquares, at: int) -> str:
@@ -138,12 +165,15 @@ def outcome_line(record: joint.JointRecord, estimator: RecursiveLeastSquares, at
         outside = np.flatnonzero(~inside[:, joint.NAMES.index(name)])
         times.append("> 5 s" if outside[-1] == 4999 else f"{(outside[-1] + 1) * 1e-3:.2f} s")
     return (
-        f"drift {drift:8.2%}, error {relative:8.2%}, inside 5 % for good after {', '.join(times)}; alarms {estimator.alarms}, resets {estimator.resets}{note}"
+        f"drift {drift:8.2%}, error {relative:8.2%}, inside 5 % for good after "
+        f"{', '.join(times)}; alarms {estimator.alarms}, resets {estimator.resets}{note}"
     )
 
 
 def batch_error(record: joint.JointRecord, at: int) -> float:
-    """Relative error of ka by batch least squares of the samples from 0.07 s to 0.5 s after the step."""
+    """Relative error of ka by batch least squares of the samples from 0.07 s to 0.5 s after the
+    step.
+    """
     window = slice(at + 70, at + 500)
     matrix = (record.h[window] * joint.SCALE).reshape(-1, joint.THETA.size)
     found = np.linalg.lstsq(matrix, record.y[window].ravel())[0] * joint.SCALE
@@ -152,7 +182,9 @@ def batch_error(record: joint.JointRecord, at: int) -> float:
 
 def main() -> None:
     """Print all figures."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--quick", action="store_true", help="leave out the six seeds")
     quick = parser.parse_args().quick
     cost()

@@ -1,12 +1,14 @@
-"""Recursive least squares on five scenarios beside plain filters: `python benchmarks/recursive_scenarios.py`.
+"""Recursive least squares on five scenarios beside plain filters: `python
+benchmarks/recursive_scenarios.py`.
 
-Four parameters of scale 1, regressors with correlations of 0.9, 40 s at 1 kHz, sensor noise 0.1: constant parameters; slow sines of half a
-scale; a step of 0.3 scales at 20 s; constant with 1 % outliers of 100 standard deviations; a standstill from 10 s to
-30 s. Printed is the root mean square error over the parameters in % of scale: over the second half, for the step over
-the five seconds after it, for the standstill at its end.
+Four parameters of scale 1, regressors with correlations of 0.9, 40 s at 1 kHz, sensor noise 0.1:
+constant parameters; slow sines of half a scale; a step of 0.3 scales at 20 s; constant with 1 %
+outliers of 100 standard deviations; a standstill from 10 s to 30 s. Printed is the root mean square
+error over the parameters in % of scale: over the second half, for the step over the five seconds
+after it, for the standstill at its end.
 
-Beside it: a Kalman filter with the true R2 and the same random walk (`UD`), the same with Huber's update (`Huber`),
-and padasip's filter with forgetting 0.999 where it is installed (extra `bench`).
+Beside it: a Kalman filter with the true R2 and the same random walk (`UD`), the same with Huber's
+update (`Huber`), and padasip's filter with forgetting 0.999 where it is installed (extra `bench`).
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ import numpy.typing as npt
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 
-from identification.recursive import METHODS, RecursiveLeastSquares, Settings  # noqa: E402
+from identification.recursive.estimator import METHODS, RecursiveLeastSquares, Settings  # noqa: E402
 
 FloatArray = npt.NDArray[np.float64]
 COUNT, PARAMETERS, DT, NOISE = 40_000, 4, 1e-3, 0.1
@@ -50,14 +52,24 @@ def scenario(name: str, seed: int) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 def figure(name: str, found: FloatArray, theta: FloatArray) -> float:
     """The error of a trajectory, % of scale."""
-    part = {"step": slice(20_000, 25_000), "standstill": slice(29_900, 30_000)}.get(name, slice(COUNT // 2, COUNT))
+    part = {"step": slice(20_000, 25_000), "standstill": slice(29_900, 30_000)}.get(
+        name, slice(COUNT // 2, COUNT)
+    )
     return 100 * float(np.sqrt(np.mean((found[part] - theta[part]) ** 2)))
 
 
 def own(y: FloatArray, h: FloatArray, method: str, *, known: bool = False) -> FloatArray:
     """Trajectory of this library."""
-    settings = Settings(sample_time=DT, drift=0.1) if method == "random_walk" else Settings(sample_time=DT)
-    estimator = RecursiveLeastSquares(np.zeros(PARAMETERS), np.ones(PARAMETERS), method, settings=settings, R2=NOISE**2 if known else None)
+    settings = (
+        Settings(sample_time=DT, drift=0.1) if method == "random_walk" else Settings(sample_time=DT)
+    )
+    estimator = RecursiveLeastSquares(
+        np.zeros(PARAMETERS),
+        np.ones(PARAMETERS),
+        method,
+        settings=settings,
+        R2=NOISE**2 if known else None,
+    )
     return estimator.run(y[:, None], h[:, None, :]).theta
 
 
@@ -92,7 +104,8 @@ def forgetting(y: FloatArray, h: FloatArray) -> FloatArray:
 def main() -> None:
     """Print the table."""
     columns: dict[str, Callable[[FloatArray, FloatArray], FloatArray]] = {
-        m: lambda y, h, m=m: own(y, h, m) for m in METHODS  # type: ignore[misc]
+        m: lambda y, h, m=m: own(y, h, m)
+        for m in METHODS  # type: ignore[misc]
     }
     columns["R2 known"] = lambda y, h: own(y, h, "random_walk", known=True)
     columns["UD"] = kalman
@@ -107,7 +120,10 @@ def main() -> None:
     for name in SCENARIOS:
         cells = []
         for run in columns.values():
-            errors = [figure(name, run(y, h), theta) for y, h, theta in (scenario(name, seed) for seed in range(2))]
+            errors = [
+                figure(name, run(y, h), theta)
+                for y, h, theta in (scenario(name, seed) for seed in range(2))
+            ]
             cells.append(float(np.mean(errors)))
         print(f"{name:18s}" + "".join(f"{c:12.3g}" for c in cells))
 

@@ -25,8 +25,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from identification._hankel_qr import Method
-from identification.subspace import moesp
+from identification.linear.hankel_qr import Method
+from identification.linear.subspace import moesp
 
 FloatArray = npt.NDArray[np.float64]
 BLOCK_ROWS, ORDER = 20, 4
@@ -84,7 +84,10 @@ def alone(samples: int) -> None:
     u, y = record(samples)
     moesp(u[:3000], y[:3000])
     print(f"\nmoesp, {samples} samples x 5 channels")
-    print(f"{'method':>12} {'i':>3} {'order':>6} {'seconds':>8} {'extra MB':>9} {'pole error':>11}  VAF %")
+    print(
+        f"{'method':>12} {'i':>3} {'order':>6} {'seconds':>8} {'extra MB':>9} {'pole error':>11} "
+        " VAF %"
+    )
     for method in METHODS:
         for rows in (10, 20, 30):
             for order in (ORDER, None):
@@ -97,7 +100,10 @@ def alone(samples: int) -> None:
                 tracemalloc.stop()
                 name = f"{sub.order}" if order else f"({sub.order})"
                 error, vaf = pole_error(sub.system.A), np.round(sub.vaf_percent, 3)
-                print(f"{method:>12} {rows:>3} {name:>6} {seconds:8.3f} {peak:9.1f} {error:11.2e}  {vaf}")
+                print(
+                    f"{method:>12} {rows:>3} {name:>6} {seconds:8.3f} {peak:9.1f} {error:11.2e}  "
+                    f"{vaf}"
+                )
 
 
 def against_nfoursid(samples: int) -> None:
@@ -113,7 +119,9 @@ def against_nfoursid(samples: int) -> None:
     frame = pd.DataFrame(np.hstack((u, y)), columns=inputs + outputs)
 
     def theirs() -> FloatArray:
-        identifier = NFourSID(frame, output_columns=outputs, input_columns=inputs, num_block_rows=BLOCK_ROWS)
+        identifier = NFourSID(
+            frame, output_columns=outputs, input_columns=inputs, num_block_rows=BLOCK_ROWS
+        )
         identifier.subspace_identification()
         return np.asarray(identifier.system_identification(rank=ORDER)[0].a)
 
@@ -128,24 +136,43 @@ def against_nfoursid(samples: int) -> None:
     for method in METHODS:
         our_time, our_a = timed(partial(ours, method))
         ratio = their_time / our_time
-        print(f"moesp {method:<12} {our_time:9.3f} s   pole error {pole_error(our_a):.2e}   {ratio:.0f} times faster")
+        print(
+            f"moesp {method:<12} {our_time:9.3f} s   pole error {pole_error(our_a):.2e}   "
+            f"{ratio:.0f} times faster"
+        )
 
 
 def against_slicot(samples: int) -> None:
-    """The compression and singular values of SLICOT's IB01AD, through ctrlsys, against QR and fast compression."""
+    """The compression and singular values of SLICOT's IB01AD, through ctrlsys, against QR and
+    fast compression.
+    """
     if find_spec("ctrlsys") is None:
         print("\nctrlsys is not installed: left out")
         return
     import ctrlsys
 
-    from identification._hankel_gram import HankelGram
-    from identification.subspace import HankelQR
+    from identification.linear.hankel_gram import HankelGram
+    from identification.linear.subspace import HankelQR
 
     u, y = record(samples)
     columns_u, columns_y = np.asfortranarray(u), np.asfortranarray(y)
 
     def theirs(algorithm: str) -> FloatArray:
-        arguments = ("M", algorithm, "N", "O", "N", "N", BLOCK_ROWS, 3, 2, columns_u, columns_y, 0.0, -1.0)
+        arguments = (
+            "M",
+            algorithm,
+            "N",
+            "O",
+            "N",
+            "N",
+            BLOCK_ROWS,
+            3,
+            2,
+            columns_u,
+            columns_y,
+            0.0,
+            -1.0,
+        )
         return np.asarray(ctrlsys.ib01ad(*arguments)[2])
 
     def ours(fast: bool) -> FloatArray:
@@ -155,16 +182,25 @@ def against_slicot(samples: int) -> None:
             accumulator.add(u[start : start + 8192], y[start : start + 8192])
         return accumulator.factor().directions()[1]
 
-    print(f"\nsingular values against SLICOT (ctrlsys), {samples} samples, i = {BLOCK_ROWS}, past outputs; shortest of some runs")
+    print(
+        f"\nsingular values against SLICOT (ctrlsys), {samples} samples, i = {BLOCK_ROWS}, past "
+        "outputs; shortest of some runs"
+    )
     qr_time, qr_values = timed(partial(ours, False))
     fast_time, fast_values = timed(partial(ours, True), repeats=7)
     print(f"QR                     {qr_time:6.3f} s")
-    print(f"fast                   {fast_time:6.3f} s   relative difference to QR {np.abs(fast_values / qr_values - 1.0).max():.1e}")
+    print(
+        f"fast                   {fast_time:6.3f} s   relative difference to QR "
+        f"{np.abs(fast_values / qr_values - 1.0).max():.1e}"
+    )
     for algorithm, name in (("Q", "Householder QR"), ("F", "fast QR"), ("C", "Cholesky")):
-        their_time, their_values = timed(partial(theirs, algorithm), repeats=2 if algorithm == "Q" else 7)
+        their_time, their_values = timed(
+            partial(theirs, algorithm), repeats=2 if algorithm == "Q" else 7
+        )
         difference = np.abs(qr_values / their_values - 1.0).max()
         print(
-            f"SLICOT {name:<15} {their_time:6.3f} s   {their_time / qr_time:4.1f} times our QR, {their_time / fast_time:4.1f} times our fast one"
+            f"SLICOT {name:<15} {their_time:6.3f} s   {their_time / qr_time:4.1f} times our QR, "
+            f"{their_time / fast_time:4.1f} times our fast one"
             f"   relative difference to QR {difference:.1e}"
         )
 
@@ -215,14 +251,21 @@ def from_disk(samples: int) -> None:
                 watcher.join()
                 name = f"{sub.order}" if order else f"({sub.order})"
                 error, extra = pole_error(sub.system.A), highest[0] - base
-                print(f"{method:>12} order {name:>4} {seconds:7.1f} s   extra {extra:6.1f} MB   whole process {highest[0]:6.1f} MB   pole error {error:.2e}")
+                print(
+                    f"{method:>12} order {name:>4} {seconds:7.1f} s   extra {extra:6.1f} MB   "
+                    f"whole process {highest[0]:6.1f} MB   pole error {error:.2e}"
+                )
 
 
 def main() -> None:
     """Run what the command line asks for."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--disk", action="store_true", help="only the run from disk")
-    parser.add_argument("--samples", type=int, default=10_000_000, help="samples of the run from disk")
+    parser.add_argument(
+        "--samples", type=int, default=10_000_000, help="samples of the run from disk"
+    )
     arguments = parser.parse_args()
     if arguments.disk:
         from_disk(arguments.samples)

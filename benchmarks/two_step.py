@@ -20,10 +20,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import casadi as ca
 
 from casadi_models.transmission import build
-from identification._excite_follow import Follower
-from identification._varpro import BudgetSpent, Projection
-from identification._varpro_search import hypercube, polish
-from identification.two_step import (
+from identification.planning.follow import Follower
+from identification.two_step.algorithm import (
     JOINT_CHANNELS,
     Coefficient,
     Mode,
@@ -35,6 +33,8 @@ from identification.two_step import (
     from_casadi,
     smooth_friction,
 )
+from identification.two_step.varpro import BudgetSpent, Projection
+from identification.two_step.varpro_search import hypercube, polish
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -70,10 +70,15 @@ def best_known(model: SeparableModel, y: FloatArray, w: FloatArray, seed: int) -
 
 
 def table(seeds: int) -> None:
-    """20 seeds, two trajectories, two and three nonlinear parameters: how often the best known fit is reached."""
+    """20 seeds, two trajectories, two and three nonlinear parameters: how often the best known
+    fit is reached.
+    """
     for exponent in (False, True):
         print(f"\n{'three' if exponent else 'two'} nonlinear parameters, 1 % noise, {seeds} seeds")
-        print("trajectory  method               equal   strict  evaluations (median, max)  seconds  negative coefficient")
+        print(
+            "trajectory  method               equal   strict  evaluations (median, max)  seconds "
+            " negative coefficient"
+        )
         for name, w in trajectories().items():
             rows: dict[str, list[tuple[float, int, float, bool]]] = {}
             for seed in range(seeds):
@@ -88,22 +93,35 @@ def table(seeds: int) -> None:
                     start = time.perf_counter()
                     fit = TwoStep(model, method, settings=settings).fit(y, w)
                     found.append((method, fit, time.perf_counter() - start))
-                reference = min(reference, *(f.sum_of_squares for _, f, _ in found if min(f.linear.values()) >= 0))
+                reference = min(
+                    reference,
+                    *(f.sum_of_squares for _, f, _ in found if min(f.linear.values()) >= 0),
+                )
                 for method, fit, took in found:
                     excess = fit.sum_of_squares / reference - 1
-                    rows.setdefault(method, []).append((excess, fit.evaluations, took, bool(fit.negative)))
+                    rows.setdefault(method, []).append(
+                        (excess, fit.evaluations, took, bool(fit.negative))
+                    )
             for method, results in rows.items():
-                over, evaluations, spent, repeated = (np.array(v) for v in zip(*results, strict=True))
+                over, evaluations, spent, repeated = (
+                    np.array(v) for v in zip(*results, strict=True)
+                )
                 print(
-                    f"{name:11} {method:20} {np.sum(over < 1 / len(w)):3d}/{seeds}  {np.sum(over < 1e-5):3d}/{seeds} "
-                    f"{np.median(evaluations):8.0f} {np.max(evaluations):6.0f} {'':10} {np.mean(spent):8.2f}"
+                    f"{name:11} {method:20} {np.sum(over < 1 / len(w)):3d}/{seeds}  "
+                    f"{np.sum(over < 1e-5):3d}/{seeds} "
+                    f"{np.median(evaluations):8.0f} {np.max(evaluations):6.0f} {'':10} "
+                    f"{np.mean(spent):8.2f}"
                     f" {np.sum(repeated):8d}",
                     flush=True,
-                )  # fmt: skip
+                )
 
 
-def joint_model(velocity: FloatArray, inertia: tuple[float, float], gravity: float) -> SeparableModel:
-    """The TS model (4.20) with two outputs: drive less Jm am, and Jl al less gravity; inertias and gravity known."""
+def joint_model(
+    velocity: FloatArray, inertia: tuple[float, float], gravity: float
+) -> SeparableModel:
+    """The TS model (4.20) with two outputs: drive less Jm am, and Jl al less gravity; inertias
+    and gravity known.
+    """
     s, eta = ca.SX.sym("s", len(JOINT_CHANNELS)), ca.SX.sym("eta", 2)
     qm, v, am, ql, vl, al = (s[i] for i in range(6))
     d = qm - ql
@@ -117,48 +135,88 @@ def joint_model(velocity: FloatArray, inertia: tuple[float, float], gravity: flo
     low, high = 0.01 * float(np.abs(velocity).max()), float(np.abs(velocity).max())
     shapes = [Shape(n, low, high, math.sqrt(low * high), "rad/s") for n in ("w1", "wS")]
     return from_casadi(
-        ca.Function("ts", [s, eta], [rows, known]), [Coefficient(n, "", n in positive) for n in names], shapes,
+        ca.Function("ts", [s, eta], [rows, known]),
+        [Coefficient(n, "", n in positive) for n in names],
+        shapes,
         JOINT_CHANNELS,
-    )  # fmt: skip
+    )
 
 
-TRUE = {"k1": 4.278e4, "k2": 1.174e9, "ka": 86.2313, "b_in": B, "C1": C1, "C2": C2, "b_out": 9.7285, "A1": 2.0, "A2": 1.5}
+TRUE = {
+    "k1": 4.278e4,
+    "k2": 1.174e9,
+    "ka": 86.2313,
+    "b_in": B,
+    "C1": C1,
+    "C2": C2,
+    "b_out": 9.7285,
+    "A1": 2.0,
+    "A2": 1.5,
+}
 
 
-def variant_record(seed: int, dt: float, seconds: float) -> tuple[SeparableModel, FloatArray, FloatArray]:
-    """Motion of a simulated joint; torques of the TS model: linear +30 % from 16 s, nonlinear +20 % from 27 s."""
+def variant_record(
+    seed: int, dt: float, seconds: float
+) -> tuple[SeparableModel, FloatArray, FloatArray]:
+    """Motion of a simulated joint; torques of the TS model: linear +30 % from 16 s, nonlinear
+    +20 % from 27 s.
+    """
     plant = build("irj2b", -160.0, effects=("structural_damping",)).with_values(
         {
-            "motor_inertia": 4.447, "link_inertia": 10.277, "gravity_torque": 105.18, "stiffness": TRUE["k1"],
-            "cubic_stiffness": TRUE["k2"], "motor_added_spring": TRUE["ka"], "motor_coulomb": 21.5,
-            "motor_viscous": 23.6, "link_coulomb": 0.41, "link_viscous": 9.73, "structural_damping": 30.0,
-            "motor_smoothing_velocity": 5e-3, "link_smoothing_velocity": 5e-3,
+            "motor_inertia": 4.447,
+            "link_inertia": 10.277,
+            "gravity_torque": 105.18,
+            "stiffness": TRUE["k1"],
+            "cubic_stiffness": TRUE["k2"],
+            "motor_added_spring": TRUE["ka"],
+            "motor_coulomb": 21.5,
+            "motor_viscous": 23.6,
+            "link_coulomb": 0.41,
+            "link_viscous": 9.73,
+            "structural_damping": 30.0,
+            "motor_smoothing_velocity": 5e-3,
+            "link_smoothing_velocity": 5e-3,
         }
-    )  # fmt: skip
+    )
     t = np.arange(round(seconds / dt)) * dt
     rng = np.random.default_rng(seed)
-    a, w, phase = np.array([0.15, 0.02]), 2 * np.pi / np.array([3.1, 0.83]), rng.uniform(0, 2 * np.pi, 2)
+    a, w, phase = (
+        np.array([0.15, 0.02]),
+        2 * np.pi / np.array([3.1, 0.83]),
+        rng.uniform(0, 2 * np.pi, 2),
+    )
     arg = np.outer(t, w) + phase
-    reference = np.stack([np.sin(arg) @ a, np.cos(arg) @ (a * w), -np.sin(arg) @ (a * w * w)], axis=1)
+    reference = np.stack(
+        [np.sin(arg) @ a, np.cos(arg) @ (a * w), -np.sin(arg) @ (a * w * w)], axis=1
+    )
     run = Follower(plant, dt).run(reference)
     signals = np.column_stack(
         [run.states[:, :2], run.accelerations[:, 0], run.states[:, 2:], run.accelerations[:, 1]]
-    )  # fmt: skip
+    )
     model = joint_model(run.states[:, 1], (4.447, 10.277), 105.18)
     shapes = np.array([W1, WS])
     y = np.zeros((len(t), 2))
-    for part, linear, shape in (((0, 16), 1.0, 1.0), ((16, 27), 1.3, 1.0), ((27, seconds), 1.3, 1.2)):
+    for part, linear, shape in (
+        ((0, 16), 1.0, 1.0),
+        ((16, 27), 1.3, 1.0),
+        ((27, seconds), 1.3, 1.2),
+    ):
         rows = slice(round(part[0] / dt), round(part[1] / dt))
         theta = linear * np.array([TRUE[n] for n in model.names])
-        y[rows] = model.matrix(signals[rows], shape * shapes) @ theta + model.remainder(signals[rows], shape * shapes)
+        y[rows] = model.matrix(signals[rows], shape * shapes) @ theta + model.remainder(
+            signals[rows], shape * shapes
+        )
     return model, y + rng.normal(0, NOISE, y.shape), signals
 
 
 def variant(seeds: int) -> None:
     """Time-variant test of 4.3.4.2 on line at 1 kHz."""
     dt, seconds = 1e-3, 40.0
-    print("seed  5 % recovery after the linear step [s]: k1     ka     C1   | searches before 27 s, after |"
-          "  w1, wS error [%] | nonlinear re-identified at [s] | us/sample")  # fmt: skip
+    print(
+        "seed  5 % recovery after the linear step [s]: k1     ka     C1   | searches before 27 "
+        "s, after |"
+        "  w1, wS error [%] | nonlinear re-identified at [s] | us/sample"
+    )
     for seed in range(seeds):
         model, y, signals = variant_record(seed, dt, seconds)
         two = TwoStep(model, online=OnlineSettings(sample_time=dt))
@@ -171,16 +229,24 @@ def variant(seeds: int) -> None:
         names = list(model.names)
         recovery = []
         for name in ("k1", "ka", "C1"):
-            error = np.abs(path[round(16 / dt) : round(26.9 / dt), names.index(name)] / (1.3 * TRUE[name]) - 1)
+            error = np.abs(
+                path[round(16 / dt) : round(26.9 / dt), names.index(name)] / (1.3 * TRUE[name]) - 1
+            )
             outside = np.flatnonzero(error > 0.05)
             recovery.append((outside[-1] + 1) * dt if outside.size else 0.0)
         before = sum(e.mode is Mode.REOPTIMISING for e in two.events if e.sample * dt < 27)
         after = sum(e.mode is Mode.REOPTIMISING for e in two.events if e.sample * dt >= 27)
-        done = [e.sample * dt for e in two.events if e.sample * dt > 27 and e.mode is Mode.RECURSIVE]
+        done = [
+            e.sample * dt for e in two.events if e.sample * dt > 27 and e.mode is Mode.RECURSIVE
+        ]
         shapes = (two.nonlinear / (1.2 * np.array([W1, WS])) - 1) * 100
-        print(f"{seed:4d} {'':40} {recovery[0]:6.3f} {recovery[1]:6.3f} {recovery[2]:6.3f} | {before:10d} {after:10d} |"
-              f" {shapes[0]:8.2f} {shapes[1]:8.2f} | {done[0] if done else math.nan:8.2f} | {np.median(cost) * 1e6:6.0f}",
-              flush=True)  # fmt: skip
+        print(
+            f"{seed:4d} {'':40} {recovery[0]:6.3f} {recovery[1]:6.3f} {recovery[2]:6.3f} | "
+            f"{before:10d} {after:10d} |"
+            f" {shapes[0]:8.2f} {shapes[1]:8.2f} | {done[0] if done else math.nan:8.2f} | "
+            f"{np.median(cost) * 1e6:6.0f}",
+            flush=True,
+        )
         if "-v" in sys.argv:
             for e in two.events:
                 print("     ", round(e.sample * dt, 3), e.mode.name, e.why)
@@ -188,7 +254,9 @@ def variant(seeds: int) -> None:
 
 def main() -> None:
     """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("what", choices=("table", "variant"))
     parser.add_argument("--seeds", type=int, default=0)
     parser.add_argument("-v", action="store_true")

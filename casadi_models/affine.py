@@ -1,7 +1,8 @@
-"""The part of an expression that is a straight line in some inputs, read from its graph and not from its derivative.
+"""The part of an expression that is a straight line in some inputs, read from its graph and not
+from its derivative.
 
-A derivative cannot tell: that of a dead band, a saturation or a sign is constant, or zero, on either
-side of a kink, and looks like that of a straight line.
+A derivative cannot tell: that of a dead band, a saturation or a sign is constant, or zero, on
+either side of a kink, and looks like that of a straight line.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ Line = dict[int, Expression]
 
 @final
 class AffineParts:
-    """Splits expressions into slopes times inputs and a rest that holds all that is not a straight line.
+    """Splits expressions into slopes times inputs and a rest that holds all that is not a straight
+    line.
 
     Parameters
     ----------
@@ -36,7 +38,9 @@ class AffineParts:
         self._alive: list[Any] = []
 
     def split(self, expression: Expression) -> tuple[Line, Expression]:
-        """Slopes (free of inputs and others) and rest of a scalar: expression = sum of slopes times inputs + rest."""
+        """Slopes (free of inputs and others) and rest of a scalar: expression = sum of slopes
+        times inputs + rest.
+        """
         mark = expression.element_hash()
         if mark in self._inputs:
             return {self._inputs[mark]: ca.SX(1)}, ca.SX(0)
@@ -49,7 +53,9 @@ class AffineParts:
             sign = 1.0 if op == ca.OP_ADD else -1.0
             line, rest = self.split(first)
             more, left = self.split(expression.dep(1))
-            return {i: line.get(i, ca.SX(0)) + sign * more.get(i, ca.SX(0)) for i in {**line, **more}}, rest + sign * left
+            return {
+                i: line.get(i, ca.SX(0)) + sign * more.get(i, ca.SX(0)) for i in {**line, **more}
+            }, rest + sign * left
         if op == ca.OP_MUL:
             for factor, other in ((first, expression.dep(1)), (expression.dep(1), first)):
                 if not self._varying(factor):
@@ -65,7 +71,11 @@ class AffineParts:
             self._alive.append(expression)  # a hash is an address: it must not be used again
             leaf = expression.n_dep() == 0
             known = mark in self._inputs or mark in self._others
-            self._varies[mark] = known if leaf else any(self._varying(expression.dep(i)) for i in range(expression.n_dep()))
+            self._varies[mark] = (
+                known
+                if leaf
+                else any(self._varying(expression.dep(i)) for i in range(expression.n_dep()))
+            )
         return self._varies[mark]
 
 

@@ -36,7 +36,9 @@ Family = Literal["friction", "torque", "transmission", "sensor", "inertia"]
 Law = Callable[[LocalSignals, SimpleNamespace], Expression]
 Potential = Law
 Rate = Callable[[tuple[Expression, ...], LocalSignals, SimpleNamespace], tuple[Expression, ...]]
-Update = Callable[[tuple[Expression, ...], Expression, LocalSignals, SimpleNamespace], tuple[Expression, ...]]
+Update = Callable[
+    [tuple[Expression, ...], Expression, LocalSignals, SimpleNamespace], tuple[Expression, ...]
+]
 
 # the side the values are referred to, not the place where the effect acts: the name says that
 PLACE_SIDE: Final[dict[str, Side]] = {
@@ -110,11 +112,12 @@ class Effect:
         identification and the continuous form share it. A memory that also runs with time reads the
         duration of the step from ``signals.clock``.
     rate : callable or None
-        ``rate(z, signals, parameters)``: the continuous form dz/dt that belongs to `memory`. Without
-        it the step form is differentiated over :data:`casadi_models.joint.MEMORY_STEP`.
+        ``rate(z, signals, parameters)``: the continuous form dz/dt that belongs to `memory`.
+        Without it the step form is differentiated over :data:`casadi_models.joint.MEMORY_STEP`.
     potential : callable or None
-        ``potential(signals, parameters)``: energy stored by a law that depends on position or torsion
-        only, 0 at zero; its derivative is the law [J]. Without it the law is integrated numerically.
+        ``potential(signals, parameters)``: energy stored by a law that depends on position or
+        torsion only, 0 at zero; its derivative is the law [J]. Without it the law is integrated
+        numerically.
     states : int
         Number of internal states.
     absence, excitation : str
@@ -130,16 +133,18 @@ class Effect:
     requires : tuple of Requirement
         What must be known or recorded so that it can be told from the rest of the model.
     contains : tuple of str
-        Keys of simpler effects that this law holds as a special case: they explain nothing beside it.
+        Keys of simpler effects that this law holds as a special case: they explain nothing beside
+        it.
     parts : tuple of str
         Keys of effects that this one sums up: proposed on a rigid model without any of them only.
     stage : {"structure", "plain", "law", "late"}
         Order in which significant candidates are taken: a change of the joint's structure that the
-        positions themselves show; a plain law, before richer ones that gain less than twice as much;
-        any other law; one with free dynamics of its own, which fits a little of anything, when
-        nothing else is left.
+        positions themselves show; a plain law, before richer ones that gain less than twice as
+        much; any other law; one with free dynamics of its own, which fits a little of anything,
+        when nothing else is left.
     common : bool
-        True for an effect that hardly a joint is without: named first in a set, and at a smaller fall.
+        True for an effect that hardly a joint is without: named first in a set, and at a smaller
+        fall.
     several_valleys : bool
         True where a fit of its shapes has several minima: it starts from several points.
     of_displacement : bool
@@ -200,7 +205,9 @@ class Effect:
 
     def __post_init__(self) -> None:
         if (self.memory is None) != (self.states == 0):
-            raise ValueError(f"effect {self.key!r}: states need a memory, and a memory needs states")
+            raise ValueError(
+                f"effect {self.key!r}: states need a memory, and a memory needs states"
+            )
         if self.rate is not None and self.memory is None:
             raise ValueError(f"effect {self.key!r}: a rate needs its step form, memory")
 
@@ -246,13 +253,18 @@ class Effect:
     def placed(self, place: Place) -> tuple[Parameter, ...]:
         """The parameters as they stand in a model with the effect in `place`."""
         names = self.parameter_names(place)
-        return tuple(p.renamed(name, PLACE_SIDE[place]) for p, name in zip(self.parameters, names, strict=True))
+        return tuple(
+            p.renamed(name, PLACE_SIDE[place])
+            for p, name in zip(self.parameters, names, strict=True)
+        )
 
 
 @final
 @dataclass(frozen=True)
 class EffectFile:
-    """A user's file that declares effects: where it lies, its SHA-256, what it declares, and the code that was run."""
+    """A user's file that declares effects: where it lies, its SHA-256, what it declares, and
+    the code that was run.
+    """
 
     path: Path
     sha256: str
@@ -274,7 +286,9 @@ class Registry(Mapping[str, Effect]):
         except KeyError:
             near = difflib.get_close_matches(str(key), self._effects, 1)
             hint = f" (did you mean {near[0]!r}?)" if near else ""
-            raise KeyError(f"unknown effect {key!r}{hint}; known: {', '.join(sorted(self._effects))}") from None
+            raise KeyError(
+                f"unknown effect {key!r}{hint}; known: {', '.join(sorted(self._effects))}"
+            ) from None
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._effects)
@@ -295,14 +309,20 @@ class Registry(Mapping[str, Effect]):
 
     @property
     def files(self) -> tuple[EffectFile, ...]:
-        """The users' files that were loaded, with those of their effects that are registered still."""
-        kept = (replace(f, keys=tuple(k for k in f.keys if k in self._effects)) for f in self._loaded.values())
+        """The users' files that were loaded, with those of their effects that are registered
+        still.
+        """
+        kept = (
+            replace(f, keys=tuple(k for k in f.keys if k in self._effects))
+            for f in self._loaded.values()
+        )
         return tuple(f for f in kept if f.keys)
 
     def load(self, path: Path) -> tuple[str, ...]:
         """Run a user's Python file that declares effects; returns its keys.
 
-        A file that is loaded again replaces what it declared before; one that fails leaves nothing behind.
+        A file that is loaded again replaces what it declared before; one that fails leaves nothing
+        behind.
         """
         _only_python(path)
         return self.load_code(path, path.read_bytes()).keys
@@ -329,14 +349,18 @@ class Registry(Mapping[str, Effect]):
 
     def periodic_in(self, place: Place) -> tuple[str, ...]:
         """Keys of the candidates that make a line at an order of the motor turn in a place."""
-        return tuple(e.key for e in self.values() if e.candidate and e.periodic and place in e.acts_on)
+        return tuple(
+            e.key for e in self.values() if e.candidate and e.periodic and place in e.acts_on
+        )
 
     def _check_references(self, keys: set[str], path: Path) -> None:
         """Every effect that a new one names must be in the library."""
         for key in sorted(keys):
             for other in self._effects[key].related:
                 if other not in self._effects:
-                    raise ValueError(f"{path}: effect {key!r} names {other!r}, which is not in the library")
+                    raise ValueError(
+                        f"{path}: effect {key!r} names {other!r}, which is not in the library"
+                    )
 
 
 def _only_python(path: Path) -> None:
@@ -381,21 +405,47 @@ def effect(
     everywhere: bool = False,
     pairs: tuple[tuple[str, str, str], ...] = (),
 ) -> Callable[[Law], Law]:
-    """Declare and register the decorated law as an effect (see :class:`Effect` for the arguments)."""
+    """Declare and register the decorated law as an effect (see :class:`Effect` for the
+    arguments).
+    """
 
     def register(law: Law) -> Law:
         EFFECTS.add(
             Effect(
-                key=key, title=title, family=family, acts_on=acts_on, parameters=parameters, law=law, absence=absence,
-                excitation=excitation, source=source, memory=memory, rate=rate, states=states, potential=potential,
-                confused_with=confused_with, needs=needs, needs_load=needs_load, dissipative=dissipative,
-                periodic=periodic, angular=angular, separate_by=separate_by, candidate=candidate,
-                requires=requires, contains=contains, parts=parts, stage=stage, common=common,
-                several_valleys=several_valleys, of_displacement=of_displacement,
-                shapes_reversal=shapes_reversal, everywhere=everywhere, pairs=pairs,
+                key=key,
+                title=title,
+                family=family,
+                acts_on=acts_on,
+                parameters=parameters,
+                law=law,
+                absence=absence,
+                excitation=excitation,
+                source=source,
+                memory=memory,
+                rate=rate,
+                states=states,
+                potential=potential,
+                confused_with=confused_with,
+                needs=needs,
+                needs_load=needs_load,
+                dissipative=dissipative,
+                periodic=periodic,
+                angular=angular,
+                separate_by=separate_by,
+                candidate=candidate,
+                requires=requires,
+                contains=contains,
+                parts=parts,
+                stage=stage,
+                common=common,
+                several_valleys=several_valleys,
+                of_displacement=of_displacement,
+                shapes_reversal=shapes_reversal,
+                everywhere=everywhere,
+                pairs=pairs,
                 formerly=formerly,
             )
-        )  # fmt: skip
+        )
         return law
 
     return register

@@ -25,8 +25,16 @@ effects that must be in the model first. "Confused with" names effects that data
 "Thesis" is A. R. da Silva, INPE-8981-TDI/812/B.
 """
 COLUMNS: Final = (
-    "key", "title", "places", "parameters", "how its absence looks", "excitation", "confused with", "needs", "source",
-)  # fmt: skip
+    "key",
+    "title",
+    "places",
+    "parameters",
+    "how its absence looks",
+    "excitation",
+    "confused with",
+    "needs",
+    "source",
+)
 
 
 def page() -> str:
@@ -37,7 +45,10 @@ def page() -> str:
     parts = [HEADER]
     for family in sorted(families):
         parts.append(f"## {family.capitalize()}\n")
-        parts.append("\n".join([_line(COLUMNS), _line(["---"] * len(COLUMNS)), *map(row, families[family])]) + "\n")
+        parts.append(
+            "\n".join([_line(COLUMNS), _line(["---"] * len(COLUMNS)), *map(row, families[family])])
+            + "\n"
+        )
     return "\n".join(parts)
 
 
@@ -50,7 +61,8 @@ def row(effect: Effect) -> str:
             ", ".join(p.replace("_", " ") for p in effect.acts_on),
             "<br>".join(map(_parameter, effect.parameters)),
             effect.absence,
-            effect.excitation + (f". To tell it apart: {effect.separate_by}" if effect.separate_by else ""),
+            effect.excitation
+            + (f". To tell it apart: {effect.separate_by}" if effect.separate_by else ""),
             _keys(effect.confused_with),
             _keys(effect.needs),
             effect.source,
@@ -74,7 +86,9 @@ def _line(cells: Sequence[str]) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Write the page to a file, or to standard output."""
     parser = argparse.ArgumentParser(description="The effect library as a Markdown page.")
-    parser.add_argument("--write", type=Path, metavar="FILE", help="file to write; standard output by default")
+    parser.add_argument(
+        "--write", type=Path, metavar="FILE", help="file to write; standard output by default"
+    )
     target: Path | None = parser.parse_args(arguments).write
     if target is None:
         sys.stdout.write(page())

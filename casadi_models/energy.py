@@ -76,7 +76,9 @@ def _potential(model: JointModel, term: Term, upto: Expression) -> Expression:
     for panel in range(_PANELS):
         for node, weight in zip(_NODES, _WEIGHTS, strict=True):
             share = (panel + (node + 1) / 2) / _PANELS
-            total = total + weight / 2 / _PANELS * term.effect.law(_still(model, upto * share), values)
+            total = total + weight / 2 / _PANELS * term.effect.law(
+                _still(model, upto * share), values
+            )
     return total * upto
 
 
@@ -84,7 +86,19 @@ def _still(model: JointModel, at: Expression) -> LocalSignals:
     """A joint at rest in one position (or torsion)."""
     nothing = ca.SX(0)
     return LocalSignals(
-        position=at, velocity=nothing, acceleration=nothing, direction=nothing, torsion=at, torsion_rate=nothing,
-        torque=nothing, load=nothing, reading=nothing, reading_rate=nothing, motor_angle=at * model.gear_ratio,
-        time=nothing, temperature=nothing, memory=(), gear_ratio=ca.SX(model.gear_ratio),
-    )  # fmt: skip
+        position=at,
+        velocity=nothing,
+        acceleration=nothing,
+        direction=nothing,
+        torsion=at,
+        torsion_rate=nothing,
+        torque=nothing,
+        load=nothing,
+        reading=nothing,
+        reading_rate=nothing,
+        motor_angle=at * model.gear_ratio,
+        time=nothing,
+        temperature=nothing,
+        memory=(),
+        gear_ratio=ca.SX(model.gear_ratio),
+    )

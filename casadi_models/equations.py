@@ -47,7 +47,8 @@ class Equations:
     signals : Signals
         The symbols.
     parameters, memory, clock : expression
-        Columns of all parameters and of all internal states; duration of one step of the memory [s].
+        Columns of all parameters and of all internal states; duration of one step of the memory
+        [s].
     drive, motor_resistance, link_resistance : expression
         Torque of the motor; torques that resist the motion of either side [N.m].
     motor_acceleration, link_acceleration : expression
@@ -63,8 +64,9 @@ class Equations:
     inertia : mapping of str to expression
         Inertias of the model by name [kg.m2].
     load_lag : expression
-        Where the link hangs on a compliance c and is not recorded: its inertia times c times the torque that the motor passes on [N.m.s2];
-        else zero. Its second derivative enters the balance of the axis (link angle eliminated from 2.41 and 2.42).
+        Where the link hangs on a compliance c and is not recorded: its inertia times c times the
+        torque that the motor passes on [N.m.s2]; else zero. Its second derivative enters the
+        balance of the axis (link angle eliminated from 2.41 and 2.42).
     memory_terms : tuple
         One :data:`MemoryTerm` per term with states, in the order of `memory`.
     """
@@ -108,10 +110,11 @@ class Symbols:
             {p.name: ca.SX.sym(p.name) for p in model.parameters},
             {
                 t: tuple(ca.SX.sym(f"{t.label}_{i}") for i in range(t.effect.states))
-                for t in model.terms if t.effect.states
+                for t in model.terms
+                if t.effect.states
             },
             ca.SX.sym("clock"),
-        )  # fmt: skip
+        )
 
 
 def _zero() -> Expression:
@@ -140,7 +143,8 @@ class _Builder:
 
     def torsion_rate(self, view: _View) -> Expression:
         """Rate of what twists the gear's damping; made once for all laws of a view."""
-        # the approximation (2.58) lets the kinematic error wind up the stiffness only, not the damping
+        # the approximation (2.58) lets the kinematic error wind up the stiffness only, not the
+        # damping
         twist = view.torsion if self.model.virtual_work else bare_twist(self.model, view.signals)
         return time_derivative(twist, self.symbols.signals)
 
@@ -157,12 +161,19 @@ class _Builder:
             velocity=rate if gear else velocity,
             acceleration=s.link_acceleration if link else s.motor_acceleration,
             direction=ca.tanh(velocity / smooth) if smooth is not None else ca.sign(velocity),
-            torsion=view.torsion, torsion_rate=rate, torque=s.torque, load=view.load,
-            reading=view.reading, reading_rate=view.reading_rate,
+            torsion=view.torsion,
+            torsion_rate=rate,
+            torque=s.torque,
+            load=view.load,
+            reading=view.reading,
+            reading_rate=view.reading_rate,
             motor_angle=s.motor_position * self.model.gear_ratio,
-            time=s.time, temperature=s.temperature, memory=self.symbols.memory.get(term, ()),
-            gear_ratio=ca.SX(self.model.gear_ratio), clock=self.symbols.clock,
-        )  # fmt: skip
+            time=s.time,
+            temperature=s.temperature,
+            memory=self.symbols.memory.get(term, ()),
+            gear_ratio=ca.SX(self.model.gear_ratio),
+            clock=self.symbols.clock,
+        )
 
     def total(self, place: str, view: _View) -> Expression:
         """Sum of the laws of one place."""
@@ -170,11 +181,15 @@ class _Builder:
         terms = [t for t in self.model.terms if t.place == place]
         rate = self.torsion_rate(view) if terms else None
         for t in terms:
-            found = found + t.effect.law(self.local(t, view, rate), t.bound(self.symbols.parameters))
+            found = found + t.effect.law(
+                self.local(t, view, rate), t.bound(self.symbols.parameters)
+            )
         return found
 
     def corrected(self, place: str, *channels: str) -> dict[str, Expression]:
-        """True channels from their readings; the laws of sensors are affine, so rates follow by linearity."""
+        """True channels from their readings; the laws of sensors are affine, so rates follow by
+        linearity.
+        """
         raw = self.symbols.signals
         chain = [getattr(raw, c) for c in channels]
         offset = self.total(place, _View(raw, _zero(), _zero(), _zero(), _zero()))
@@ -260,7 +275,9 @@ def build_equations(model: JointModel, symbols: Symbols, *, sensors: bool) -> Eq
     lag, beyond = ca.SX(0), view
     if model.lagging_load and sensors:
         swinging = model.swinging_inertia(symbols.parameters)
-        passed_on = drive - (sum(inertia.values()) - swinging) * s.motor_acceleration - motor_resistance
+        passed_on = (
+            drive - (sum(inertia.values()) - swinging) * s.motor_acceleration - motor_resistance
+        )
         twisted = symbols.parameters["load_compliance"] * passed_on
         lag = swinging * twisted
         beyond = replace(view, signals=s.with_values(link_position=s.link_position - twisted))
@@ -291,8 +308,16 @@ def inverse_dynamics(model: JointModel) -> Expression:
     """Right-hand sides of the equations of motion, (drive, 0): what a regressor reproduces."""
     e = model.equations
     if model.is_elastic:
-        motor = e.inertia["motor_inertia"] * e.motor_acceleration + e.motor_resistance + e.transmitted * e.motor_lever
-        link = e.inertia["link_inertia"] * e.link_acceleration + e.link_resistance - e.transmitted * e.link_lever
+        motor = (
+            e.inertia["motor_inertia"] * e.motor_acceleration
+            + e.motor_resistance
+            + e.transmitted * e.motor_lever
+        )
+        link = (
+            e.inertia["link_inertia"] * e.link_acceleration
+            + e.link_resistance
+            - e.transmitted * e.link_lever
+        )
         return ca.vertcat(motor - (e.drive - e.signals.drive), link)
     inertia = sum(e.inertia.values())
     resistance = e.motor_resistance + e.link_resistance
@@ -300,7 +325,9 @@ def inverse_dynamics(model: JointModel) -> Expression:
 
 
 def linear_set(model: JointModel) -> tuple[str, ...]:
-    """Greedy largest independent set of the graph whose edges are non-zero mutual Hessian entries."""
+    """Greedy largest independent set of the graph whose edges are non-zero mutual Hessian
+    entries.
+    """
     p = model.equations.parameters
     right = inverse_dynamics(model)
     names = model.parameter_names

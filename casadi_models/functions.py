@@ -1,4 +1,6 @@
-"""CasADi functions that follow from a joint model: dynamics, regressor, Jacobian, energy, one step."""
+"""CasADi functions that follow from a joint model: dynamics, regressor, Jacobian, energy, one
+step.
+"""
 
 from __future__ import annotations
 
@@ -36,10 +38,14 @@ class JointFunctions:
         self._model = model
         self._equations: Equations = model.true_equations
         mechanical = ("motor_position", "motor_velocity", "link_position", "link_velocity")
-        self.state_names: tuple[str, ...] = mechanical if model.is_elastic else ("position", "velocity")
-        self.memory_names: tuple[str, ...] = tuple(str(z) for z in ca.vertsplit(self._equations.memory))
+        self.state_names: tuple[str, ...] = (
+            mechanical if model.is_elastic else ("position", "velocity")
+        )
+        self.memory_names: tuple[str, ...] = tuple(
+            str(z) for z in ca.vertsplit(self._equations.memory)
+        )
 
-    # --- accelerations and torque ------------------------------------------------------------------------------------
+    # --- accelerations and torque -----------------------------------------------------------------
 
     @cached_property
     def _symbols(self) -> tuple[Expression, Expression, Expression, Expression]:
@@ -49,11 +55,21 @@ class JointFunctions:
         return x, e.memory, u, e.parameters
 
     def _substituted(self, *expressions: Expression) -> list[Expression]:
-        """Expressions of the signals as expressions of (x, memory, u, p), accelerations and torque left."""
+        """Expressions of the signals as expressions of (x, memory, u, p), accelerations and
+        torque left.
+        """
         x, _, u, _ = self._symbols
         s = self._equations.signals
         link = (x[2], x[3]) if self._model.is_elastic else (x[0], x[1])
-        old = [s.motor_position, s.motor_velocity, s.link_position, s.link_velocity, s.drive, s.temperature, s.time]
+        old = [
+            s.motor_position,
+            s.motor_velocity,
+            s.link_position,
+            s.link_velocity,
+            s.drive,
+            s.temperature,
+            s.time,
+        ]
         new = [x[0], x[1], *link, u[0], u[1], u[2]]
         old += [getattr(s, name) for name in _GONE]
         new += [ca.SX(0)] * len(_GONE)
@@ -61,7 +77,9 @@ class JointFunctions:
 
     @cached_property
     def _solution(self) -> tuple[tuple[Expression, ...], Expression]:
-        """Accelerations (motor and link, or the one of a rigid joint) and the torque into the link."""
+        """Accelerations (motor and link, or the one of a rigid joint) and the torque into the
+        link.
+        """
         e = self._equations
         s = e.signals
         if self._model.is_elastic:
@@ -75,10 +93,18 @@ class JointFunctions:
             return (motor, link), torque
         one = [s.link_acceleration], [s.motor_acceleration]
         share = e.inertia.get("link_inertia", ca.SX(0))
-        right, carried = ca.substitute([e.drive - e.motor_resistance - e.link_resistance, share * s.link_acceleration + e.link_resistance], *one)
+        right, carried = ca.substitute(
+            [
+                e.drive - e.motor_resistance - e.link_resistance,
+                share * s.link_acceleration + e.link_resistance,
+            ],
+            *one,
+        )
         right, carried = self._substituted(right, carried)
         inertia: Expression = sum(e.inertia.values())
-        acceleration, torque = rigid_solution(right, carried, inertia, s.motor_acceleration, s.torque)
+        acceleration, torque = rigid_solution(
+            right, carried, inertia, s.motor_acceleration, s.torque
+        )
         return (acceleration,), torque
 
     def _resolved(self, *expressions: Expression) -> list[Expression]:
@@ -86,7 +112,11 @@ class JointFunctions:
         s = self._equations.signals
         accelerations, torque = self._solution
         old = [s.motor_acceleration, s.link_acceleration, s.torque]
-        return list(ca.substitute(self._substituted(*expressions), old, [*self._both(accelerations), torque]))
+        return list(
+            ca.substitute(
+                self._substituted(*expressions), old, [*self._both(accelerations), torque]
+            )
+        )
 
     @staticmethod
     def _both(pair: tuple[Expression, ...]) -> tuple[Expression, Expression]:
@@ -95,24 +125,32 @@ class JointFunctions:
     def _mechanical_rates(self) -> Expression:
         x = self._symbols[0]
         a = self._solution[0]
-        return ca.vertcat(x[1], a[0], x[3], a[1]) if self._model.is_elastic else ca.vertcat(x[1], a[0])
+        return (
+            ca.vertcat(x[1], a[0], x[3], a[1]) if self._model.is_elastic else ca.vertcat(x[1], a[0])
+        )
 
-    # --- internal states ---------------------------------------------------------------------------------------------
+    # --- internal states --------------------------------------------------------------------------
 
     @cached_property
     def _memory_coordinates(self) -> list[Expression]:
         return self._resolved(*(t[1] for t in self._equations.memory_terms))
 
     def _moved_memory(self, steps: list[Expression], duration: Expression) -> Expression:
-        """All internal states after their coordinates have moved by `steps` in the time `duration`."""
+        """All internal states after their coordinates have moved by `steps` in the time
+        `duration`.
+        """
         out: list[Expression] = []
-        for (term, _, z, view, values), step in zip(self._equations.memory_terms, steps, strict=True):
+        for (term, _, z, view, values), step in zip(
+            self._equations.memory_terms, steps, strict=True
+        ):
             if term.effect.memory is not None:
                 out.extend(term.effect.memory(z, step, view, values))
         return self._stacked(out, duration)
 
     def _memory_rates(self, mechanical: Expression) -> Expression:
-        """Continuous form of the memory: the declared rate, or the step form over a very short time."""
+        """Continuous form of the memory: the declared rate, or the step form over a very short
+        time.
+        """
         x = self._symbols[0]
         out: list[Expression] = []
         terms = zip(self._equations.memory_terms, self._memory_coordinates, strict=True)
@@ -122,15 +160,19 @@ class JointFunctions:
             elif term.effect.memory is not None:
                 step = ca.jtimes(coordinate, x, mechanical) * MEMORY_STEP
                 moved = term.effect.memory(z, step, view, values)
-                out.extend((after - before) / MEMORY_STEP for after, before in zip(moved, z, strict=True))
+                out.extend(
+                    (after - before) / MEMORY_STEP for after, before in zip(moved, z, strict=True)
+                )
         return self._stacked(out, ca.SX(MEMORY_STEP))
 
     def _stacked(self, states: list[Expression], duration: Expression) -> Expression:
         if not states:
             return ca.SX(0, 1)
-        return ca.vertcat(*ca.substitute(self._resolved(*states), [self._equations.clock], [duration]))
+        return ca.vertcat(
+            *ca.substitute(self._resolved(*states), [self._equations.clock], [duration])
+        )
 
-    # --- functions ---------------------------------------------------------------------------------------------------
+    # --- functions --------------------------------------------------------------------------------
 
     @cached_property
     def rates(self) -> Expression:
@@ -142,7 +184,9 @@ class JointFunctions:
     def dynamics(self) -> Any:
         """(x, u, p) -> dx/dt."""
         x, z, u, p = self._symbols
-        return ca.Function("dynamics", [ca.vertcat(x, z), u, p], [self.rates], ["x", "u", "p"], ["dx"])
+        return ca.Function(
+            "dynamics", [ca.vertcat(x, z), u, p], [self.rates], ["x", "u", "p"], ["dx"]
+        )
 
     @cached_property
     def jacobian(self) -> Any:
@@ -154,7 +198,8 @@ class JointFunctions:
 
     @cached_property
     def step(self) -> Any:
-        """(x, u, p, h) -> x after one Runge-Kutta step of 4th order; memory moves with its coordinate.
+        """(x, u, p, h) -> x after one Runge-Kutta step of 4th order; memory moves with its
+        coordinate.
 
         Without internal states the step is of 4th order. With them it is of the order of their step
         form: 1 for bristles, 2 for an oscillator.
@@ -179,11 +224,14 @@ class JointFunctions:
         new = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
         if has_memory:
             new = ca.vertcat(new, moved(new, h))
-        return ca.Function("step", [ca.vertcat(x, z), u, p, h], [new], ["x", "u", "p", "h"], ["x_next"])
+        return ca.Function(
+            "step", [ca.vertcat(x, z), u, p, h], [new], ["x", "u", "p", "h"], ["x_next"]
+        )
 
     @cached_property
     def memory_step(self) -> Any:
-        """(x, x_before, z, u, p, h) -> internal states z after their coordinates have moved from x_before to x in the time h.
+        """(x, x_before, z, u, p, h) -> internal states z after their coordinates have moved from
+        x_before to x in the time h.
 
         x without the internal states; the step form of the declared memory.
         """
@@ -192,13 +240,21 @@ class JointFunctions:
         before, h = ca.SX.sym("before", x.shape[0]), ca.SX.sym("h")
         steps = ca.vertsplit(where(x, z, u, p) - where(before, z, u, p))
         moved = self._moved_memory(steps, h)
-        return ca.Function("memory_step", [x, before, z, u, p, h], [moved], ["x", "x_before", "z", "u", "p", "h"], ["z_next"])
+        return ca.Function(
+            "memory_step",
+            [x, before, z, u, p, h],
+            [moved],
+            ["x", "x_before", "z", "u", "p", "h"],
+            ["z_next"],
+        )
 
     @cached_property
     def outputs(self) -> Any:
-        """(x, u, p) -> readings (motor position, velocity, link position, velocity, torque), sensor errors included.
+        """(x, u, p) -> readings (motor position, velocity, link position, velocity, torque), sensor
+        errors included.
 
-        A delay is turned round to first order: the reading is the true value less the delay times its rate.
+        A delay is turned round to first order: the reading is the true value less the delay times
+        its rate.
         """
         x, z, u, p = self._symbols
         accelerations, true_torque = self._both(self._solution[0]), self._solution[1]
@@ -213,15 +269,27 @@ class JointFunctions:
             self._reading("torque_sensor", true_torque, torque_rate),
         ]
         rows = self._substituted(*rows)  # a sensor may read the angle too
-        return ca.Function("outputs", [ca.vertcat(x, z), u, p], [ca.vertcat(*rows)], ["x", "u", "p"], ["y"])
+        return ca.Function(
+            "outputs", [ca.vertcat(x, z), u, p], [ca.vertcat(*rows)], ["x", "u", "p"], ["y"]
+        )
 
     @cached_property
     def drive_lag(self) -> Any:
-        """(p) -> time by which the reading of the drive is late [s]; to first order it is the true drive less this times its rate."""
+        """(p) -> time by which the reading of the drive is late [s]; to first order it is the
+        true drive less this times its rate.
+        """
         e, p = self._model.equations, self._symbols[3]
-        return ca.Function("drive_lag", [p], [ca.densify(ca.jacobian(e.drive, e.signals.drive_rate))], ["p"], ["lag"])
+        return ca.Function(
+            "drive_lag",
+            [p],
+            [ca.densify(ca.jacobian(e.drive, e.signals.drive_rate))],
+            ["p"],
+            ["lag"],
+        )
 
-    def _reading(self, place: str, true: Expression, rate: Expression, *, offset: bool = True) -> Expression:
+    def _reading(
+        self, place: str, true: Expression, rate: Expression, *, offset: bool = True
+    ) -> Expression:
         """Reading from the true value: the affine law of the sensor turned round."""
         e = self._model.equations
         s = e.signals
@@ -238,9 +306,9 @@ class JointFunctions:
     def regressor(self) -> Any:
         """(x, a, u, p) -> (Y, rest): Y theta_linear + rest = inverse dynamics (drive, 0).
 
-        x as in :attr:`dynamics` (memory included), a the accelerations, one per degree of freedom; with
-        sensor effects in the model, x and a are readings. The load of load-dependent laws is the one
-        that the model carries with p.
+        x as in :attr:`dynamics` (memory included), a the accelerations, one per degree of freedom;
+        with sensor effects in the model, x and a are readings. The load of load-dependent laws is
+        the one that the model carries with p.
         """
         x, z, u, p = self._symbols
         e = self._model.equations
@@ -252,11 +320,17 @@ class JointFunctions:
         linear = [names.index(n) for n in self._model.linear_parameters]
         matrix: Expression = ca.jacobian(right, p)[:, linear]
         rest: Expression
-        (rest,) = ca.substitute([right], [ca.vertcat(*(p[i] for i in linear))], [ca.SX.zeros(len(linear), 1)])
+        (rest,) = ca.substitute(
+            [right], [ca.vertcat(*(p[i] for i in linear))], [ca.SX.zeros(len(linear), 1)]
+        )
         load = carried_torque(e) if elastic else self._carried_rigidly(e)
         reading = self._reading("torque_sensor", load, ca.SX(0))
         matrix, rest = ca.substitute([matrix, rest], [s.torque], [reading])
-        matrix, rest = ca.substitute(self._substituted(matrix, rest), [s.motor_acceleration, s.link_acceleration], [a[0], a[elastic]])
+        matrix, rest = ca.substitute(
+            self._substituted(matrix, rest),
+            [s.motor_acceleration, s.link_acceleration],
+            [a[0], a[elastic]],
+        )
         full = ca.vertcat(x, z)
         out = [ca.densify(matrix), ca.densify(rest)]
         return ca.Function("regressor", [full, a, u, p], out, ["x", "a", "u", "p"], ["Y", "rest"])
@@ -269,13 +343,17 @@ class JointFunctions:
 
     @cached_property
     def energy(self) -> Any:
-        """(x, p) -> kinetic energy plus the potential of springs and position-dependent torques [J]."""
+        """(x, p) -> kinetic energy plus the potential of springs and position-dependent torques
+        [J].
+        """
         x, z, _, p = self._symbols
         (total,) = self._resolved(total_energy(self._model))
         return ca.Function("energy", [ca.vertcat(x, z), p], [total], ["x", "p"], ["E"])
 
     def linearize(self, x: FloatArray | None = None, u: FloatArray | None = None) -> Any:
-        """control.StateSpace of the joint about (x, u): input drive [N.m], outputs the mechanical states."""
+        """control.StateSpace of the joint about (x, u): input drive [N.m], outputs the
+        mechanical states.
+        """
         import control
 
         size = len(self.state_names) + len(self.memory_names)
@@ -284,7 +362,12 @@ class JointFunctions:
         a, b, _ = (np.array(m) for m in self.jacobian(at, inputs, self._model.value_vector()))
         outputs = len(self.state_names)
         return control.ss(
-            a, b[:, :1], np.eye(outputs, size), np.zeros((outputs, 1)), name=self._model.name or "joint",
-            states=[*self.state_names, *self.memory_names], inputs=["drive"],
+            a,
+            b[:, :1],
+            np.eye(outputs, size),
+            np.zeros((outputs, 1)),
+            name=self._model.name or "joint",
+            states=[*self.state_names, *self.memory_names],
+            inputs=["drive"],
             outputs=[f"{n}_y" for n in self.state_names],
-        )  # fmt: skip
+        )

@@ -1,7 +1,7 @@
 """The hold of a logged command: a delay of at most a sample, in every model with a commanded drive.
 
-It is no effect that a diagnosis names, but a nuisance: the same law as that of a late drive, under a
-number of its own, so that both can be told apart in a model.
+It is no effect that a diagnosis names, but a nuisance: the same law as that of a late drive, under
+a number of its own, so that both can be told apart in a model.
 """
 
 from __future__ import annotations

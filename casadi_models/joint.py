@@ -19,15 +19,33 @@ from types import MappingProxyType
 from typing import Any, Final, final
 
 from .effect import EFFECTS
-from .equations import Equations, Symbols, build_equations, inverse_dynamics, linear_set, time_derivative
+from .equations import (
+    Equations,
+    Symbols,
+    build_equations,
+    inverse_dynamics,
+    linear_set,
+    time_derivative,
+)
 from .parameter import Parameter, Role
 from .sides import side_factor
-from .term import CALIBRATION, INERTIAS, LOAD_COMPLIANCE, SIDE_INERTIAS, SWINGING_SHARE, TOTAL_INERTIA, Term, smoothing
+from .term import (
+    CALIBRATION,
+    INERTIAS,
+    LOAD_COMPLIANCE,
+    SIDE_INERTIAS,
+    SWINGING_SHARE,
+    TOTAL_INERTIA,
+    Term,
+    smoothing,
+)
 
 __all__ = ["MEMORY_STEP", "Equations", "JointModel", "Term", "inverse_dynamics", "time_derivative"]
 
 MEMORY_STEP: Final = 1e-6
-"""Time over which a memory without a rate of its own is differentiated to its continuous form [s]."""
+"""Time over which a memory without a rate of its own is differentiated to its continuous form
+[s].
+"""
 
 _FRICTION_SIDES: Final = ("motor", "link")
 SHOWN: Final = 22
@@ -59,9 +77,11 @@ class JointModel:
     clamped_link : bool
         True for a torque-against-displacement test: the torsion is the position itself.
     lagging_load : bool
-        True for a geared joint seen from the motor side: the link hangs on a compliance and its position is not recorded.
+        True for a geared joint seen from the motor side: the link hangs on a compliance and its
+        position is not recorded.
     calibration : tuple of str
-        Calibration unknowns of the sensors (keys of :data:`casadi_models.term.CALIBRATION`): in the readings only, no physics.
+        Calibration unknowns of the sensors (keys of :data:`casadi_models.term.CALIBRATION`): in the
+        readings only, no physics.
     name : str
         Name in reports.
     """
@@ -80,25 +100,35 @@ class JointModel:
 
     def __repr__(self) -> str:
         set_values = f", {len(self.values)} values set" if self.values else ""
-        return f"JointModel({self.name!r}, {self.kind}, gear ratio {self.gear_ratio:g}, effects: {', '.join(self.effects) or 'none'}{set_values})"
+        return (
+            f"JointModel({self.name!r}, {self.kind}, gear ratio {self.gear_ratio:g}, effects: "
+            f"{', '.join(self.effects) or 'none'}{set_values})"
+        )
 
     def __str__(self) -> str:
         values = dict(zip(self.parameter_names, self.value_vector(), strict=True))
         units = {p.name: p.unit for p in self.parameters}
         lines = [repr(self)]
-        lines += [f"  {name:<28} {value:.6g} {units[name]}" for name, value in list(values.items())[:SHOWN]]
+        lines += [
+            f"  {name:<28} {value:.6g} {units[name]}"
+            for name, value in list(values.items())[:SHOWN]
+        ]
         if len(values) > SHOWN:
             lines.append(f"  and {len(values) - SHOWN} more parameters")
         return "\n".join(lines)
 
     @staticmethod
-    def harmonic_drive(number: int, *, gear_ratio: float = -160.0, configuration: str | int = "IRJ") -> JointModel:
-        """Harmonic-drive model 1 to 4 of the thesis (see :func:`casadi_models.transmission.harmonic_drive`)."""
+    def harmonic_drive(
+        number: int, *, gear_ratio: float = -160.0, configuration: str | int = "IRJ"
+    ) -> JointModel:
+        """Harmonic-drive model 1 to 4 of the thesis (see
+        :func:`casadi_models.transmission.harmonic_drive`).
+        """
         from .transmission import harmonic_drive
 
         return harmonic_drive(number, gear_ratio=gear_ratio, configuration=configuration)
 
-    # --- composition -------------------------------------------------------------------------------------------------
+    # --- composition ------------------------------------------------------------------------------
 
     def add(self, label: str) -> JointModel:
         """The model with one more effect.
@@ -107,8 +137,8 @@ class JointModel:
         ----------
         label : str
             Effect key, ``key@place``, or ``key#2`` for a second one with its own parameters. A key
-            alone goes to the effect's first place, or to all where its declaration says so (viscous and
-            Coulomb friction).
+            alone goes to the effect's first place, or to all where its declaration says so (viscous
+            and Coulomb friction).
 
         Raises
         ------
@@ -134,13 +164,20 @@ class JointModel:
     def with_values(self, values: Mapping[str, float]) -> JointModel:
         """The model with other parameter values; unknown names are an error.
 
-        Calibration unknowns of single records (``name[run]``, as they stand beside the parameters in a fit) are left out.
+        Calibration unknowns of single records (``name[run]``, as they stand beside the parameters
+        in a fit) are left out.
         """
         known = {p.name for p in self.parameters}
-        values = {n: x for n, x in values.items() if n in known or n.partition("[")[0] not in self.calibration}
+        values = {
+            n: x
+            for n, x in values.items()
+            if n in known or n.partition("[")[0] not in self.calibration
+        }
         for name in values:
             if name not in known:
-                raise ValueError(f"no parameter {name!r} in the model; it has {', '.join(sorted(known))}")
+                raise ValueError(
+                    f"no parameter {name!r} in the model; it has {', '.join(sorted(known))}"
+                )
         return replace(self, values=MappingProxyType({**self.values, **values}))
 
     def _parse(self, label: str) -> list[Term]:
@@ -150,17 +187,23 @@ class JointModel:
         instance = int(number) if number else 1
         if place:
             if place not in found.acts_on:
-                raise ValueError(f"effect {key!r} acts on {', '.join(found.acts_on)}, not on {place!r}")
+                raise ValueError(
+                    f"effect {key!r} acts on {', '.join(found.acts_on)}, not on {place!r}"
+                )
             return [Term(found, p, instance) for p in found.acts_on if p == place]
         everywhere = found.everywhere and self.inertias != TOTAL_INERTIA
-        return [Term(found, p, instance) for p in (found.acts_on if everywhere else found.acts_on[:1])]
+        return [
+            Term(found, p, instance) for p in (found.acts_on if everywhere else found.acts_on[:1])
+        ]
 
     def has(self, key: str, place: str | None = None) -> bool:
         """True where the effect is in the model (in `place`, if given)."""
         return any(t.effect.key == key and place in (None, t.place) for t in self.terms)
 
     def has_form_of(self, key: str) -> bool:
-        """True where another form of the effect, with parameters of the same names, is in the model."""
+        """True where another form of the effect, with parameters of the same names, is in the
+        model.
+        """
         first = EFFECTS[key.partition("@")[0]]
         names = {n for p in first.acts_on for n in first.parameter_names(p)}
         return any(t.effect is not first and names & set(t.names) for t in self.terms)
@@ -172,32 +215,58 @@ class JointModel:
 
     @property
     def knows_load(self) -> bool:
-        """True where a term says what presses the gear's teeth without a torque sensor: a torque of the link's position."""
+        """True where a term says what presses the gear's teeth without a torque sensor: a
+        torque of the link's position.
+        """
         return any(t.place == "link" and t.effect.family == "torque" for t in self.terms)
 
     @property
     def structure(self) -> tuple[object, ...]:
-        """All that shapes the equations, without the values: equal for models that differ in values only."""
-        forms = (self.virtual_work, self.load_from, self.clamped_link, self.lagging_load, self.calibration)
+        """All that shapes the equations, without the values: equal for models that differ in
+        values only.
+        """
+        forms = (
+            self.virtual_work,
+            self.load_from,
+            self.clamped_link,
+            self.lagging_load,
+            self.calibration,
+        )
         return (self.gear_ratio, self.terms, self.inertias, self.kind, *forms)
 
     def swinging_inertia(self, values: Mapping[str, Any]) -> Any:
         """What hangs on the compliance of a lagging load [kg.m2], from numbers or symbols."""
-        return values["link_inertia"] if "link_inertia" in self.inertias else values["swinging_share"] * values["inertia"]
+        return (
+            values["link_inertia"]
+            if "link_inertia" in self.inertias
+            else values["swinging_share"] * values["inertia"]
+        )
 
     def load_compliance(self, values: Mapping[str, Any]) -> Any:
-        """Compliance on which a link that is not recorded hangs [rad/(N.m)], 0 where there is none."""
+        """Compliance on which a link that is not recorded hangs [rad/(N.m)], 0 where there is
+        none.
+        """
         return values[LOAD_COMPLIANCE.name] if self.lagging_load else 0.0
 
     @cached_property
     def _places(self) -> Mapping[str, str]:
-        """Place of each parameter; that of a smoothing velocity is its side, the joint's own have none."""
+        """Place of each parameter; that of a smoothing velocity is its side, the joint's own
+        have none.
+        """
         sides = {smoothing(side).name: side for side in _FRICTION_SIDES}
-        return {**dict.fromkeys(self.parameter_names, ""), **sides, **{n: t.place for t in self.terms for n in t.names}}
+        return {
+            **dict.fromkeys(self.parameter_names, ""),
+            **sides,
+            **{n: t.place for t in self.terms for n in t.names},
+        }
 
     def named(self, role: Role, place: str | None = None) -> tuple[str, ...]:
         """Names of the parameters with a role, of all places or of one (see :class:`Parameter`)."""
-        return tuple(p.name for p in self.parameters if p.role == role and place in (None, self._places[p.name]))
+        return tuple(
+            p.name
+            for p in self.parameters
+            if p.role == role and place in (None, self._places[p.name])
+        )
 
     @property
     def stiffness_name(self) -> str | None:
@@ -217,7 +286,7 @@ class JointModel:
         """Labels of the effects in the model."""
         return tuple(t.label for t in self.terms)
 
-    # --- parameters --------------------------------------------------------------------------------------------------
+    # --- parameters -------------------------------------------------------------------------------
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -259,11 +328,13 @@ class JointModel:
         """Parameter values in the order of :attr:`parameter_names`."""
         return [float(self.values.get(p.name, p.start)) for p in self.parameters]
 
-    # --- equations ---------------------------------------------------------------------------------------------------
+    # --- equations --------------------------------------------------------------------------------
 
     @cached_property
     def equations(self) -> Equations:
-        """The symbolic joint on readings: what the sensors add is taken off (built once per model)."""
+        """The symbolic joint on readings: what the sensors add is taken off (built once per
+        model).
+        """
         return build_equations(self, self._symbols, sensors=True)
 
     @cached_property
@@ -294,7 +365,9 @@ class JointModel:
 
     @property
     def regressor(self) -> Any:
-        """CasADi function (x, a, u, p) -> (Y, rest) with Y theta_linear + rest = inverse dynamics."""
+        """CasADi function (x, a, u, p) -> (Y, rest) with Y theta_linear + rest = inverse
+        dynamics.
+        """
         return self.functions.regressor
 
     @property

@@ -11,9 +11,22 @@ from .quantities import linear_unit
 
 Side = Literal["motor", "gear", "link", "sensor", "none"]
 Scale = Literal["absolute", "velocity", "torsion", "position", "duration"]
-Role = Literal["", "inertia", "stiffness", "stiffening", "gravity", "static", "delay", "smoothing", "compliance", "exponent", "order"]
+Role = Literal[
+    "",
+    "inertia",
+    "stiffness",
+    "stiffening",
+    "gravity",
+    "static",
+    "delay",
+    "smoothing",
+    "compliance",
+    "exponent",
+    "order",
+]
 Typical = float | Mapping[str, float] | None
 """A usual size, or one for each place, or none."""
+
 
 @final
 @dataclass(frozen=True)
@@ -42,11 +55,11 @@ class Parameter:
     role : str
         What the library may ask the parameter for, whatever its name:
         ``inertia`` (a joint without it does not move), ``stiffness`` (linear stiffness of the
-        transmission), ``stiffening`` (of its cube), ``gravity`` (torque at 90 degrees, upright positive), ``static`` (friction
-        torque that holds a joint at rest, in either direction), ``delay`` (time by which a channel is
-        late), ``smoothing`` (velocity over which friction changes its sign, a nuisance),
-        ``compliance`` (between motor and a link that is not recorded), ``exponent`` and ``order``
-        (shapes that are taken from their grid as they stand).
+        transmission), ``stiffening`` (of its cube), ``gravity`` (torque at 90 degrees, upright
+        positive), ``static`` (friction torque that holds a joint at rest, in either direction),
+        ``delay`` (time by which a channel is late), ``smoothing`` (velocity over which friction
+        changes its sign, a nuisance), ``compliance`` (between motor and a link that is not
+        recorded), ``exponent`` and ``order`` (shapes that are taken from their grid as they stand).
     typical : float, mapping of place to float, or None
         A usual size, link-referred: what `irj simulate` takes where the joint file gives no value.
     """
@@ -65,7 +78,9 @@ class Parameter:
 
     def __post_init__(self) -> None:
         if not self.low <= self.start <= self.high:
-            raise ValueError(f"parameter {self.name}: start {self.start} outside [{self.low}, {self.high}]")
+            raise ValueError(
+                f"parameter {self.name}: start {self.start} outside [{self.low}, {self.high}]"
+            )
 
     @property
     def is_shape(self) -> bool:
@@ -82,7 +97,9 @@ class Parameter:
         return self.typical.get(place) if isinstance(self.typical, Mapping) else self.typical
 
     def renamed(self, name: str, side: Side) -> Parameter:
-        """The same parameter under another name and side (used when an effect is put in a place)."""
+        """The same parameter under another name and side (used when an effect is put in a
+        place).
+        """
         return replace(self, name=name, side=side)
 
     def for_kind(self, kind: str) -> Parameter:
@@ -91,21 +108,42 @@ class Parameter:
 
 
 def amplitude(
-    name: str, unit: str, meaning: str, *, low: float = 0.0, high: float = math.inf, role: Role = "",
+    name: str,
+    unit: str,
+    meaning: str,
+    *,
+    low: float = 0.0,
+    high: float = math.inf,
+    role: Role = "",
     typical: Typical = None,
-) -> Parameter:  # fmt: skip
+) -> Parameter:
     """An amplitude: enters linearly, 0 means that the effect is absent."""
     return Parameter(name, unit, 0.0, low, high, meaning, role=role, typical=typical)
 
 
-def signed(name: str, unit: str, meaning: str, *, role: Role = "", typical: Typical = None) -> Parameter:
+def signed(
+    name: str, unit: str, meaning: str, *, role: Role = "", typical: Typical = None
+) -> Parameter:
     """An amplitude that may have either sign."""
     return Parameter(name, unit, 0.0, -math.inf, math.inf, meaning, role=role, typical=typical)
 
 
 def shape(
-    name: str, unit: str, meaning: str, grid: tuple[float, ...], scale: Scale, *, start: float, low: float, high: float,
-    role: Role = "", typical: Typical = None,
-) -> Parameter:  # fmt: skip
-    """A shape parameter: enters nonlinearly, searched on a grid of fractions of a signal's range."""
-    return Parameter(name, unit, start, low, high, meaning, grid=grid, scale=scale, role=role, typical=typical)
+    name: str,
+    unit: str,
+    meaning: str,
+    grid: tuple[float, ...],
+    scale: Scale,
+    *,
+    start: float,
+    low: float,
+    high: float,
+    role: Role = "",
+    typical: Typical = None,
+) -> Parameter:
+    """A shape parameter: enters nonlinearly, searched on a grid of fractions of a signal's
+    range.
+    """
+    return Parameter(
+        name, unit, start, low, high, meaning, grid=grid, scale=scale, role=role, typical=typical
+    )

@@ -1,19 +1,23 @@
 """Units as exponents: one table, one parser, and what follows from the exponents by arithmetic.
 
-A unit is written like ``N.m/rad``, ``kg.m2``, ``rad/s2``, ``Nm/A`` or ``N*m*s/rad``: names from the table, joined by
-``.`` or ``*``, divided by ``/``, each with an optional power (``m2``, ``m^2``, ``s-1``). The exponents are those of a
-base unit in FMI 2.0 (specification 2.2.2): ``value in SI = factor * value in unit + offset``.
+A unit is written like ``N.m/rad``, ``kg.m2``, ``rad/s2``, ``Nm/A`` or ``N*m*s/rad``: names from the
+table, joined by ``.`` or ``*``, divided by ``/``, each with an optional power (``m2``, ``m^2``,
+``s-1``). The exponents are those of a base unit in FMI 2.0 (specification 2.2.2): ``value in SI =
+factor * value in unit + offset``.
 
 Two rules follow from the exponents and need no table of their own:
 
-*Side of the gear.* A lossless gear of ratio n keeps energy, time, temperature and current; it multiplies the angle by n.
-A value whose unit holds the angle to the power e is therefore multiplied by n^-e on its way from the motor shaft to the
-link. SI leaves radians out: a torque is an energy per angle (N.m = J/rad), an inertia an energy per squared angular
-velocity (kg.m2 = J.s2/rad2). So each newton stands for one radian that is not written, below the line, and each kilogram
-for two. A torque goes with n, a stiffness and an inertia with n^2, a cubic stiffness with n^4, a compliance with n^-2.
+*Side of the gear.* A lossless gear of ratio n keeps energy, time, temperature and current; it
+multiplies the angle by n. A value whose unit holds the angle to the power e is therefore multiplied
+by n^-e on its way from the motor shaft to the link. SI leaves radians out: a torque is an energy
+per angle (N.m = J/rad), an inertia an energy per squared angular velocity (kg.m2 = J.s2/rad2). So
+each newton stands for one radian that is not written, below the line, and each kilogram for two. A
+torque goes with n, a stiffness and an inertia with n^2, a cubic stiffness with n^4, a compliance
+with n^-2.
 
-*Linear twin.* The same parameter of a linear axis has a length where the rotary one has an angle: rad becomes m, N.m
-becomes N and kg.m2 becomes kg; each newton loses one metre and each kilogram two.
+*Linear twin.* The same parameter of a linear axis has a length where the rotary one has an angle:
+rad becomes m, N.m becomes N and kg.m2 becomes kg; each newton loses one metre and each kilogram
+two.
 
 The module imports nothing of the project: it is bundled alone into an FMU.
 """
@@ -49,8 +53,8 @@ class BaseUnit:
     factor, offset : float
         To SI.
     unwritten : int
-        Power of the radian that the names used leave out: -1 for each newton, -2 for each kilogram. It is no part of
-        the unit itself, so two units are equal without it.
+        Power of the radian that the names used leave out: -1 for each newton, -2 for each kilogram.
+        It is no part of the unit itself, so two units are equal without it.
     """
 
     kg: int = 0
@@ -94,7 +98,7 @@ def _unit(exponents: tuple[int, ...], factor: float = 1.0, unwritten: int = 0) -
     return BaseUnit(**names, factor=factor, unwritten=unwritten)
 
 
-# --- the table -------------------------------------------------------------------------------------------------------
+# --- the table ------------------------------------------------------------------------------------
 
 _GRAVITY: Final = 9.80665  # m/s2, exact by definition
 _POUND: Final = 0.45359237  # kg, exact by definition
@@ -184,7 +188,9 @@ TABLE: Final[Mapping[str, BaseUnit]] = {
 
 _PREFIXES: Final = {"u": 1e-6, "m": 1e-3, "c": 1e-2, "k": 1e3, "M": 1e6}
 """Prefixes of SI that a joint meets; nano is written out above for metre and second."""
-_PREFIXED: Final = frozenset(["rad", "m", "s", "Hz", "A", "V", "Ohm", "H", "Wb", "g", "N", "Nm", "J", "W", "Pa", "K", "mol"])
+_PREFIXED: Final = frozenset(
+    ["rad", "m", "s", "Hz", "A", "V", "Ohm", "H", "Wb", "g", "N", "Nm", "J", "W", "Pa", "K", "mol"]
+)
 """Names that take a prefix."""
 
 ALIASES: Final[Mapping[str, str]] = {
@@ -216,7 +222,9 @@ ALIASES: Final[Mapping[str, str]] = {
     "volt": "V",
     "volts": "V",
 }
-COUNTS: Final = frozenset(["count", "counts", "cnt", "cts", "inc", "incs", "increment", "increments", "tick", "ticks"])
+COUNTS: Final = frozenset(
+    ["count", "counts", "cnt", "cts", "inc", "incs", "increment", "increments", "tick", "ticks"]
+)
 
 QUANTITIES: Final[Mapping[str, str]] = {
     "time": "s",
@@ -267,7 +275,7 @@ def named(name: str, counts_per_turn: float | None = None) -> BaseUnit:
     raise UnitError(f"unit {name!r} is not known")
 
 
-# --- the parser ------------------------------------------------------------------------------------------------------
+# --- the parser -----------------------------------------------------------------------------------
 
 _TOKEN: Final = re.compile(r"g0(?!\d)|[A-Za-zµμ°%Ω]+|[-+]?\d+|\*\*|[\^.*·⋅/()]|\S")
 _WHOLE: Final = re.compile(r"[-+]?\d+")
@@ -275,7 +283,9 @@ Factors = tuple[tuple[str, int], ...]
 
 
 class _Parser:
-    """Recursive descent over ``product := factor (('.'|'*'|'/') factor)*``; gives names with their powers."""
+    """Recursive descent over ``product := factor (('.'|'*'|'/') factor)*``; gives names with
+    their powers.
+    """
 
     def __init__(self, text: str, *, lenient: bool) -> None:
         self.tokens = _TOKEN.findall(text)
@@ -388,7 +398,7 @@ def base_unit(
     return result
 
 
-# --- what follows from the exponents ---------------------------------------------------------------------------------
+# --- what follows from the exponents --------------------------------------------------------------
 
 
 def side_power(unit: str) -> int:

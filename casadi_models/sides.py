@@ -24,15 +24,47 @@ from .signals import LocalSignals
 
 _POINTS: Final = (
     LocalSignals(
-        0.31, 0.043, 0.9, 0.6, 0.27, 0.051, 8.3, 7.1, 6.7, 2.3, 1.9, 0.4, 11.0, (), 3.0, 1e-3
+        0.31,
+        0.043,
+        acceleration=0.9,
+        direction=0.6,
+        torsion=0.27,
+        torsion_rate=0.051,
+        torque=8.3,
+        load=7.1,
+        reading=6.7,
+        reading_rate=2.3,
+        motor_angle=1.9,
+        time=0.4,
+        temperature=11.0,
+        memory=(),
+        gear_ratio=3.0,
+        clock=1e-3,
     ),
     LocalSignals(
-        0.83, 0.017, 1.7, 0.3, 0.61, 0.023, 3.9, 5.3, 2.9, 4.1, 0.7, 1.1, 17.0, (), 3.0, 1e-3
+        0.83,
+        0.017,
+        acceleration=1.7,
+        direction=0.3,
+        torsion=0.61,
+        torsion_rate=0.023,
+        torque=3.9,
+        load=5.3,
+        reading=2.9,
+        reading_rate=4.1,
+        motor_angle=0.7,
+        time=1.1,
+        temperature=17.0,
+        memory=(),
+        gear_ratio=3.0,
+        clock=1e-3,
     ),
 )
 """Two motions without symmetry, on which a law is compared with its mirror image."""
 _ALIKE: Final = 1e-9
-"""Relative difference up to which two values of a law count as equal: rounding, a thousand times over."""
+"""Relative difference up to which two values of a law count as equal: rounding, a thousand
+times over.
+"""
 
 
 def side_factor(effect: Effect | None, parameter: Parameter, gear_ratio: float) -> float:
@@ -81,9 +113,22 @@ def _points(effect: Effect) -> list[LocalSignals]:
 
 
 def _mirror(s: LocalSignals) -> LocalSignals:
-    """The same motion counted the other way on the link; the motor shaft itself stays what it is."""
-    turned = ("position", "velocity", "acceleration", "direction", "torsion", "torsion_rate",
-              "torque", "load", "reading", "reading_rate", "gear_ratio")  # fmt: skip
+    """The same motion counted the other way on the link; the motor shaft itself stays what it
+    is.
+    """
+    turned = (
+        "position",
+        "velocity",
+        "acceleration",
+        "direction",
+        "torsion",
+        "torsion_rate",
+        "torque",
+        "load",
+        "reading",
+        "reading_rate",
+        "gear_ratio",
+    )
     return replace(s, memory=tuple(-z for z in s.memory), **{n: -getattr(s, n) for n in turned})
 
 

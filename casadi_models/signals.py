@@ -98,7 +98,8 @@ class LocalSignals:
     gear_ratio : expression
         Signed ratio theta_motor/theta_link.
     clock : expression
-        Duration h > 0 of the step that a memory makes [s]; only a memory that runs with time uses it.
+        Duration h > 0 of the step that a memory makes [s]; only a memory that runs with time uses
+        it.
     """
 
     position: Expression

@@ -1,4 +1,6 @@
-"""Simulation of a joint model: Runge-Kutta steps in a compiled CasADi loop, memory moved step by step."""
+"""Simulation of a joint model: Runge-Kutta steps in a compiled CasADi loop, memory moved step
+by step.
+"""
 
 from __future__ import annotations
 

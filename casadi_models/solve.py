@@ -1,4 +1,6 @@
-"""Accelerations and carried torque where the laws refer to them: affine, or by a few Newton steps."""
+"""Accelerations and carried torque where the laws refer to them: affine, or by a few Newton
+steps.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,9 @@ from .equations import Equations
 from .signals import Expression
 
 NEWTON_STEPS: Final = 8
-"""Steps of the unrolled Newton iteration; it converges quadratically and is exact after one where the law is affine."""
+"""Steps of the unrolled Newton iteration; it converges quadratically and is exact after one
+where the law is affine.
+"""
 
 
 def affine_solution(right: Expression, acceleration: Expression, inertia: Expression) -> Expression:
@@ -23,8 +27,8 @@ def affine_solution(right: Expression, acceleration: Expression, inertia: Expres
 def carried_torque(e: Equations, carried: Expression | None = None) -> Expression:
     """Torque into the link in terms of positions, velocities, memory and parameters.
 
-    Where the law of the carried torque refers to the torque itself (compliance of the torque sensor in
-    series, load-dependent friction on the link), T = f(T) is solved by Newton steps from T = 0.
+    Where the law of the carried torque refers to the torque itself (compliance of the torque sensor
+    in series, load-dependent friction on the link), T = f(T) is solved by Newton steps from T = 0.
 
     Parameters
     ----------
@@ -44,7 +48,13 @@ def carried_torque(e: Equations, carried: Expression | None = None) -> Expressio
     return found
 
 
-def rigid_solution(right: Expression, carried: Expression, inertia: Expression, acceleration: Expression, torque: Expression) -> tuple[Expression, Expression]:
+def rigid_solution(
+    right: Expression,
+    carried: Expression,
+    inertia: Expression,
+    acceleration: Expression,
+    torque: Expression,
+) -> tuple[Expression, Expression]:
     """Acceleration a and torque into the link T of a rigid joint.
 
     Solves inertia * a = right(a, T) and T = carried(a, T) together.

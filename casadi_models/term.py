@@ -14,18 +14,39 @@ from .signals import Expression
 
 INERTIAS: Final = {
     "motor_inertia": Parameter(
-        "motor_inertia", "kg.m2", 1.0, 1e-12, math.inf,
-        "inertia of rotor and wave generator, times the ratio squared", "link",
-        role="inertia", typical=4.447,
+        "motor_inertia",
+        "kg.m2",
+        start=1.0,
+        low=1e-12,
+        high=math.inf,
+        meaning="inertia of rotor and wave generator, times the ratio squared",
+        side="link",
+        role="inertia",
+        typical=4.447,
     ),
     "link_inertia": Parameter(
-        "link_inertia", "kg.m2", 1.0, 1e-12, math.inf, "inertia of the link with its payload", "link",
-        role="inertia", typical=10.277,
+        "link_inertia",
+        "kg.m2",
+        start=1.0,
+        low=1e-12,
+        high=math.inf,
+        meaning="inertia of the link with its payload",
+        side="link",
+        role="inertia",
+        typical=10.277,
     ),
-    "inertia": Parameter("inertia", "kg.m2", 1.0, 1e-12, math.inf, "inertia of motor and link together", "link",
-        role="inertia", typical=14.7,
+    "inertia": Parameter(
+        "inertia",
+        "kg.m2",
+        start=1.0,
+        low=1e-12,
+        high=math.inf,
+        meaning="inertia of motor and link together",
+        side="link",
+        role="inertia",
+        typical=14.7,
     ),
-}  # fmt: skip
+}
 """Inertias by name, all link-referred; typical sizes as in tables 4.1 and 4.2 of the thesis."""
 MOTOR_INERTIA: Final = "motor_inertia"
 LINK_INERTIA: Final = "link_inertia"
@@ -35,12 +56,24 @@ TOTAL_INERTIA: Final = ("inertia",)
 """Inertia of an axis measured on one side."""
 
 LOAD_COMPLIANCE: Final = Parameter(
-    "load_compliance", "rad/(N.m)", 0.0, 0.0, math.inf, "compliance between motor and link where the link position is not recorded", "link",
+    "load_compliance",
+    "rad/(N.m)",
+    start=0.0,
+    low=0.0,
+    high=math.inf,
+    meaning="compliance between motor and link where the link position is not recorded",
+    side="link",
     role="compliance",
-)  # fmt: skip
+)
 SWINGING_SHARE: Final = Parameter(
-    "swinging_share", "1", 0.5, 0.02, 1.0, "share of the inertia that hangs on that compliance", "link"
-)  # fmt: skip
+    "swinging_share",
+    "1",
+    start=0.5,
+    low=0.02,
+    high=1.0,
+    meaning="share of the inertia that hangs on that compliance",
+    side="link",
+)
 HANGING: Final = (LOAD_COMPLIANCE.name, SWINGING_SHARE.name)
 """Parameters of a link that is not recorded."""
 
@@ -56,8 +89,12 @@ class Term:
 
     @property
     def label(self) -> str:
-        """``key``, ``key@place`` where the effect may act on several places, ``#2`` for a second one."""
-        label = f"{self.effect.key}@{self.place}" if len(self.effect.acts_on) > 1 else self.effect.key
+        """``key``, ``key@place`` where the effect may act on several places, ``#2`` for a
+        second one.
+        """
+        label = (
+            f"{self.effect.key}@{self.place}" if len(self.effect.acts_on) > 1 else self.effect.key
+        )
         return label if self.instance == 1 else f"{label}#{self.instance}"
 
     @property
@@ -73,8 +110,13 @@ class Term:
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """Parameters with the names they have in the model; the typical size is that of the first term."""
-        named = (p.renamed(n, p.side) for p, n in zip(self.effect.placed(self.place), self.names, strict=True))
+        """Parameters with the names they have in the model; the typical size is that of the
+        first term.
+        """
+        named = (
+            p.renamed(n, p.side)
+            for p, n in zip(self.effect.placed(self.place), self.names, strict=True)
+        )
         return tuple(p if self.instance == 1 else replace(p, typical=None) for p in named)
 
     def bound(self, values: Mapping[str, Expression]) -> SimpleNamespace:
@@ -105,22 +147,35 @@ CALIBRATION: Final = {
     u.parameter.name: u
     for u in (
         Unknown(
-            "zero", "link_position",
+            "zero",
+            "link_position",
             Parameter(
-                "link_encoder_zero", "rad", 0.0, -math.inf, math.inf,
-                "reading of the link encoder, less that of the motor encoder, without twist", "sensor",
+                "link_encoder_zero",
+                "rad",
+                0.0,
+                -math.inf,
+                math.inf,
+                "reading of the link encoder, less that of the motor encoder, without twist",
+                "sensor",
             ),
         ),
     )
-}  # fmt: skip
+}
 """Calibration unknowns by the name of their parameter."""
 
 
 def smoothing(place: str) -> Parameter:
     """Velocity over which sign(v) is smoothed to tanh(v/v0): a nuisance of every friction law."""
     return Parameter(
-        f"{place}_smoothing_velocity", "rad/s", 1e-3, 1e-9, math.inf,
-        f"velocity over which {place}-side friction changes its sign (nuisance)",
-        "link",
-        grid=(0.0003, 0.001, 0.003, 0.01, 0.03), scale="velocity", role="smoothing", typical=0.005,
-    )  # fmt: skip
+        f"{place}_smoothing_velocity",
+        "rad/s",
+        start=1e-3,
+        low=1e-9,
+        high=math.inf,
+        meaning=f"velocity over which {place}-side friction changes its sign (nuisance)",
+        side="link",
+        grid=(0.0003, 0.001, 0.003, 0.01, 0.03),
+        scale="velocity",
+        role="smoothing",
+        typical=0.005,
+    )

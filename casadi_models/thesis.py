@@ -1,12 +1,13 @@
-"""Parameter sets of the thesis (A. R. da Silva, INPE-8981-TDI/812/B), each with its source, and ready models.
+"""Parameter sets of the thesis (A. R. da Silva, INPE-8981-TDI/812/B), each with its source, and
+ready models.
 
 The thesis sets N = 1 after eq. 4.12, so its tables are referred to the link. :func:`to_link` and
-:func:`to_motor` convert between the sides: a motor angle is |N| times a link angle, a link torque |N|
-times a motor torque, so that a stiffness changes by N^2, a cubic stiffness by N^4, a viscous
+:func:`to_motor` convert between the sides: a motor angle is |N| times a link angle, a link torque
+|N| times a motor torque, so that a stiffness changes by N^2, a cubic stiffness by N^4, a viscous
 coefficient by N^2 and a Coulomb torque by N.
 
-The raw measurements of the thesis are not public. Models built here simulate with its numbers; they do
-not repeat its experiments.
+The raw measurements of the thesis are not public. Models built here simulate with its numbers; they
+do not repeat its experiments.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from .quantities import UnitError, side_power
 from .transmission import build
 
 Variant = Literal["coupled", "y1", "y2"]
+
 
 @final
 @dataclass(frozen=True)
@@ -52,7 +54,9 @@ def _set(source: str, **rows: tuple[float, str, Side]) -> Mapping[str, Value]:
     return MappingProxyType({name: Value(*row, source) for name, row in rows.items()})
 
 
-def _rigid(row: str, inertia: float, gravity: float, coulomb: float | None = None) -> Mapping[str, Value]:
+def _rigid(
+    row: str, inertia: float, gravity: float, coulomb: float | None = None
+) -> Mapping[str, Value]:
     source = f"table 4.2, {row}"
     found = {"link_inertia": Value(inertia, "kg.m2", "link", source)}
     found["gravity_torque"] = Value(gravity, "N.m", "link", source)
@@ -68,21 +72,30 @@ GEAR_RATIO: Final = -REDUCTION
 
 TABLE_2_3: Final = _set(
     "table 2.3 (catalogue; T1, T2 as printed)",
-    k1=(3.1e4, "N.m/rad", "gear"), k2=(5.0e4, "N.m/rad", "gear"), k3=(5.7e4, "N.m/rad", "gear"),
-    knot_1=(7.0, "N.m", "gear"), knot_2=(25.0, "N.m", "gear"), range=(150.0, "N.m", "gear"),
+    k1=(3.1e4, "N.m/rad", "gear"),
+    k2=(5.0e4, "N.m/rad", "gear"),
+    k3=(5.7e4, "N.m/rad", "gear"),
+    knot_1=(7.0, "N.m", "gear"),
+    knot_2=(25.0, "N.m", "gear"),
+    range=(150.0, "N.m", "gear"),
     relative_position=(math.radians(0.15), "rad", "gear"),
-)  # fmt: skip
+)
 """Piecewise stiffness of the gear, and the ranges of torque and of relative position."""
 
 TABLE_4_1: Final = _set(
     "table 4.1",
-    torque_per_count=(0.00746, "N.m", "motor"), motor_inertia=(4.447, "kg.m2", "motor"),
-    link_inertia=(10.277, "kg.m2", "link"), gravity_torque=(105.18, "N.m", "link"),
-    stiffness=(4.278e4, "N.m/rad", "gear"), cubic_stiffness=(1.174e9, "N.m/rad3", "gear"),
-)  # fmt: skip
+    torque_per_count=(0.00746, "N.m", "motor"),
+    motor_inertia=(4.447, "kg.m2", "motor"),
+    link_inertia=(10.277, "kg.m2", "link"),
+    gravity_torque=(105.18, "N.m", "link"),
+    stiffness=(4.278e4, "N.m/rad", "gear"),
+    cubic_stiffness=(1.174e9, "N.m/rad3", "gear"),
+)
 """Catalogue, curve fit and design values; `torque_per_count` is N Km per current increment."""
 
-TORQUE_PER_COUNT: Final = Value(0.00884, "N.m", "motor", "section 4.3.2, identified, per current increment")
+TORQUE_PER_COUNT: Final = Value(
+    0.00884, "N.m", "motor", "section 4.3.2, identified, per current increment"
+)
 STIFFNESS_2A: Final = Value(5.2815e4, "N.m/rad", "gear", "section 4.3.2, model 2a")
 
 TABLE_4_2: Final[Mapping[str, Mapping[str, Value]]] = MappingProxyType(
@@ -99,55 +112,77 @@ TABLE_4_2: Final[Mapping[str, Mapping[str, Value]]] = MappingProxyType(
 
 TABLE_4_3: Final = _set(
     "table 4.3",
-    stiffness=(2.1513e4, "N.m/rad", "gear"), cubic_stiffness=(3.3543e8, "N.m/rad3", "gear"),
-    motor_added_spring=(86.2313, "N.m/rad", "motor"), motor_coulomb=(21.5057, "N.m", "motor"),
-    motor_viscous=(23.6303, "N.m.s/rad", "motor"), link_coulomb=(0.4124, "N.m", "link"),
+    stiffness=(2.1513e4, "N.m/rad", "gear"),
+    cubic_stiffness=(3.3543e8, "N.m/rad3", "gear"),
+    motor_added_spring=(86.2313, "N.m/rad", "motor"),
+    motor_coulomb=(21.5057, "N.m", "motor"),
+    motor_viscous=(23.6303, "N.m.s/rad", "motor"),
+    link_coulomb=(0.4124, "N.m", "link"),
     link_viscous=(9.7285, "N.m.s/rad", "link"),
-)  # fmt: skip
+)
 """Model 2b (eq. 4.17). The thesis prints ka theta_in in both rows; here it acts on the motor."""
 
 TABLE_4_4: Final = _set(
     "table 4.4",
-    stiffness=(0.0338, "1", "none"), cubic_stiffness=(1.33e-7, "1", "none"),
-    motor_added_spring=(18.0883, "1", "none"), motor_coulomb=(36.0278, "1", "none"),
-    motor_viscous=(15.6012, "1", "none"), link_viscous=(15.6400, "1", "none"), link_coulomb=(36.0278, "1", "none"),
-)  # fmt: skip
+    stiffness=(0.0338, "1", "none"),
+    cubic_stiffness=(1.33e-7, "1", "none"),
+    motor_added_spring=(18.0883, "1", "none"),
+    motor_coulomb=(36.0278, "1", "none"),
+    motor_viscous=(15.6012, "1", "none"),
+    link_viscous=(15.6400, "1", "none"),
+    link_coulomb=(36.0278, "1", "none"),
+)
 """Singular values of the measurement matrix of model 2b."""
 
 TABLE_4_5: Final = _set(
     "table 4.5",
-    stiffness=(0.0338, "1", "none"), cubic_stiffness=(1.33e-7, "1", "none"),
-    motor_added_spring=(18.0883, "1", "none"), motor_coulomb=(35.8555, "1", "none"),
-    motor_smooth_stribeck=(0.0272, "1", "none"), motor_viscous=(15.5951, "1", "none"),
-    link_viscous=(15.6339, "1", "none"), link_cyclic_torque_sine=(12.3118, "1", "none"),
+    stiffness=(0.0338, "1", "none"),
+    cubic_stiffness=(1.33e-7, "1", "none"),
+    motor_added_spring=(18.0883, "1", "none"),
+    motor_coulomb=(35.8555, "1", "none"),
+    motor_smooth_stribeck=(0.0272, "1", "none"),
+    motor_viscous=(15.5951, "1", "none"),
+    link_viscous=(15.6339, "1", "none"),
+    link_cyclic_torque_sine=(12.3118, "1", "none"),
     link_cyclic_torque_cosine=(33.8440, "1", "none"),
-)  # fmt: skip
+)
 """Singular values of the measurement matrix of the TS model."""
 
 TABLE_4_6: Final = _set(
     "table 4.6; exponent: section 4.3.4.2",
-    motor_viscous=(9.0, "N.m.s/rad", "motor"), motor_coulomb=(29.0, "N.m", "motor"),
-    motor_smooth_stribeck=(480.0, "N.m.s/rad", "motor"), motor_smoothing_velocity=(0.0595, "rad/s", "motor"),
-    motor_smooth_stribeck_velocity=(0.0251, "rad/s", "motor"), motor_smooth_stribeck_exponent=(1.0, "1", "motor"),
-)  # fmt: skip
+    motor_viscous=(9.0, "N.m.s/rad", "motor"),
+    motor_coulomb=(29.0, "N.m", "motor"),
+    motor_smooth_stribeck=(480.0, "N.m.s/rad", "motor"),
+    motor_smoothing_velocity=(0.0595, "rad/s", "motor"),
+    motor_smooth_stribeck_velocity=(0.0251, "rad/s", "motor"),
+    motor_smooth_stribeck_exponent=(1.0, "1", "motor"),
+)
 """Friction of the time-variant test, eq. 4.18: b, C1, C2, w1, wS, dS."""
 
 CYCLIC: Final = MappingProxyType(
     {
-        "link_cyclic_torque_sine": Value(3.7 * math.cos(math.radians(0.05)), "N.m", "link", "section 4.3.4.1"),
-        "link_cyclic_torque_cosine": Value(3.7 * math.sin(math.radians(0.05)), "N.m", "link", "section 4.3.4.1"),
+        "link_cyclic_torque_sine": Value(
+            3.7 * math.cos(math.radians(0.05)), "N.m", "link", "section 4.3.4.1"
+        ),
+        "link_cyclic_torque_cosine": Value(
+            3.7 * math.sin(math.radians(0.05)), "N.m", "link", "section 4.3.4.1"
+        ),
     }
 )
 """Cyclic torque of 3.7 N.m at a phase of 0.05 degrees."""
 
 TIME_VARIANT: Final = MappingProxyType({"linear": (16.0, 1.3), "nonlinear": (27.0, 1.2)})
-"""Section 4.3.4.2: time [s] at which linear and nonlinear friction parameters change, and the factor."""
+"""Section 4.3.4.2: time [s] at which linear and nonlinear friction parameters change, and the
+factor.
+"""
 
 TABLE_B_1: Final = MappingProxyType(
     {
         "torque": Value(0.05, "N.m", "sensor", "table B.1"),
         "link_position": Value(math.radians(0.0036), "rad", "link", "table B.1, encoder"),
-        "motor_position": Value(math.radians(0.0010), "rad", "motor", "table B.1, Hall sensor", "motor"),
+        "motor_position": Value(
+            math.radians(0.0010), "rad", "motor", "table B.1, Hall sensor", "motor"
+        ),
         "current_bits": Value(15.0, "1", "motor", "table B.1", "motor"),
         "acceleration": Value(9.6e-3, "m/s2", "link", "table B.1 (0.00098 g)"),
     }
@@ -163,7 +198,8 @@ def to_link(value: float, unit: str, reduction: float = REDUCTION) -> float:
     value : float
         In `unit`, referred to the motor shaft.
     unit : str
-        Unit of the value; it decides the power: k N^2, k2 N^4, b N^2, Coulomb N, inertia N^2, angle 1/N.
+        Unit of the value; it decides the power: k N^2, k2 N^4, b N^2, Coulomb N, inertia N^2, angle
+        1/N.
     reduction : float
         N; its sign is of no account (a torque amplitude has none).
 
@@ -176,7 +212,9 @@ def to_link(value: float, unit: str, reduction: float = REDUCTION) -> float:
 
 
 def to_motor(value: float, unit: str, reduction: float = REDUCTION) -> float:
-    """A link-referred value on the motor shaft: k/N^2, k2/N^4, b/N^2, Coulomb/N, inertia/N^2, angle times N."""
+    """A link-referred value on the motor shaft: k/N^2, k2/N^4, b/N^2, Coulomb/N, inertia/N^2,
+    angle times N.
+    """
     return value / _factor(unit, reduction)
 
 
@@ -220,17 +258,27 @@ def model_1b(variant: Variant = "coupled") -> JointModel:
 
 
 def model_2a() -> JointModel:
-    """Model 2a: stiffness only, k1 of section 4.3.2, without the cubic part that did not improve it."""
-    return _model("irj2a", {"stiffness": STIFFNESS_2A, "cubic_stiffness": Value(0.0, "N.m/rad3", "gear", "4.3.2")})
+    """Model 2a: stiffness only, k1 of section 4.3.2, without the cubic part that did not
+    improve it.
+    """
+    return _model(
+        "irj2a",
+        {"stiffness": STIFFNESS_2A, "cubic_stiffness": Value(0.0, "N.m/rad3", "gear", "4.3.2")},
+    )
 
 
 def model_2b() -> JointModel:
-    """Model 2b: stiffness, added spring, viscous and Coulomb friction on both sides (eq. 4.17, table 4.3)."""
+    """Model 2b: stiffness, added spring, viscous and Coulomb friction on both sides (eq.
+
+    4.17, table 4.3).
+    """
     return _model("irj2b", TABLE_4_3)
 
 
 def model_ts() -> JointModel:
-    """TS model (eq. 4.18 to 4.21): springs and link side of table 4.3, motor friction of table 4.6, cyclic torque."""
+    """TS model (eq. 4.18 to 4.21): springs and link side of table 4.3, motor friction of table
+    4.6, cyclic torque.
+    """
     return _model("irj_ts", TABLE_4_3, TABLE_4_6, CYCLIC)
 
 
@@ -240,8 +288,8 @@ def catalogue_stiffness(knots: tuple[float, float] | None = None) -> JointModel:
     Parameters
     ----------
     knots : (T1, T2), optional
-        Torques of the knots [N.m]; 7 and 25 as printed by default. Gears of size 25 have 14 and 48, and the
-        curve fit of eq. 2.69 lies closer to those.
+        Torques of the knots [N.m]; 7 and 25 as printed by default. Gears of size 25 have 14 and 48,
+        and the curve fit of eq. 2.69 lies closer to those.
     """
     t = numbers(TABLE_2_3)
     low, high = knots or (t["knot_1"], t["knot_2"])
@@ -250,8 +298,12 @@ def catalogue_stiffness(knots: tuple[float, float] | None = None) -> JointModel:
     known = numbers(TABLE_4_1)
     return model.with_values(
         {
-            "motor_inertia": known["motor_inertia"], "link_inertia": known["link_inertia"],
-            "stiffness": t["k1"], "stiffness_step_1": t["k2"] - t["k1"], "stiffness_step_2": t["k3"] - t["k2"],
-            "stiffness_knot_1": first, "stiffness_knot_2": first + (high - low) / t["k2"],
+            "motor_inertia": known["motor_inertia"],
+            "link_inertia": known["link_inertia"],
+            "stiffness": t["k1"],
+            "stiffness_step_1": t["k2"] - t["k1"],
+            "stiffness_step_2": t["k3"] - t["k2"],
+            "stiffness_knot_1": first,
+            "stiffness_knot_2": first + (high - low) / t["k2"],
         }
-    )  # fmt: skip
+    )

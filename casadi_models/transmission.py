@@ -23,23 +23,46 @@ MODELS: Final[dict[str, tuple[str, ...]]] = {
     "hd2": ("transmission_losses",),
     "hd3": ("transmission_compliance", "structural_damping"),
     "hd4": (
-        "transmission_compliance", "structural_damping", "kinematic_error", "kinematic_error#2", "kinematic_error#3",
+        "transmission_compliance",
+        "structural_damping",
+        "kinematic_error",
+        "kinematic_error#2",
+        "kinematic_error#3",
     ),
     "irj1a": ("gravity_upright",),
     "irj1b": ("gravity_upright", "coulomb@motor"),
     "irj2a": ("transmission_compliance", "cubic_stiffness", "gravity_upright"),
     "irj2b": (
-        "transmission_compliance", "cubic_stiffness", "added_spring@motor", "viscous@motor", "viscous@link",
-        "coulomb@motor", "coulomb@link", "gravity_upright",
+        "transmission_compliance",
+        "cubic_stiffness",
+        "added_spring@motor",
+        "viscous@motor",
+        "viscous@link",
+        "coulomb@motor",
+        "coulomb@link",
+        "gravity_upright",
     ),
     "irj_ts": (
-        "transmission_compliance", "cubic_stiffness", "added_spring@motor", "viscous@motor", "coulomb@motor",
-        "smooth_stribeck@motor", "viscous@link", "cyclic_torque@link", "gravity_upright",
+        "transmission_compliance",
+        "cubic_stiffness",
+        "added_spring@motor",
+        "viscous@motor",
+        "coulomb@motor",
+        "smooth_stribeck@motor",
+        "viscous@link",
+        "cyclic_torque@link",
+        "gravity_upright",
     ),
-}  # fmt: skip
-"""Effects of each model by name: the transmission ladder hd1 to hd4 and the identification ladder of 4.3.2."""
+}
+"""Effects of each model by name: the transmission ladder hd1 to hd4 and the identification
+ladder of 4.3.2.
+"""
 
-ORDERS: Final = {"kinematic_error_order": 1.0, "kinematic_error_order_2": 2.0, "kinematic_error_order_3": 4.0}
+ORDERS: Final = {
+    "kinematic_error_order": 1.0,
+    "kinematic_error_order_2": 2.0,
+    "kinematic_error_order_3": 4.0,
+}
 
 
 def signed_ratio(configuration: str | int, reduction: float) -> float:
@@ -62,11 +85,15 @@ def port_angles(theta_cs: float, theta_fs: float, reduction: float) -> float:
 
 
 def port_torques(torque_wg: float, reduction: float) -> tuple[float, float]:
-    """Torques of circular spline and flexspline from that of the wave generator (2.31), without losses."""
+    """Torques of circular spline and flexspline from that of the wave generator (2.31), without
+    losses.
+    """
     return (reduction + 1) * torque_wg, reduction * torque_wg
 
 
-def build(name: str, gear_ratio: float, *, kind: str = "rotary", effects: tuple[str, ...] = ()) -> JointModel:
+def build(
+    name: str, gear_ratio: float, *, kind: str = "rotary", effects: tuple[str, ...] = ()
+) -> JointModel:
     """A joint model by name, with further effects.
 
     Raises
@@ -79,20 +106,27 @@ def build(name: str, gear_ratio: float, *, kind: str = "rotary", effects: tuple[
         raise KeyError(f"unknown model {name!r}; known: {', '.join(MODELS)}")
     for label in (*MODELS[name], *effects):
         key = label.partition("#")[0]
-        if label in model.effects or ("@" not in label and "#" not in label and (model.has(key) or model.has_form_of(key))):
+        if label in model.effects or (
+            "@" not in label and "#" not in label and (model.has(key) or model.has_form_of(key))
+        ):
             continue
         model = model.add(label)
     known = set(model.parameter_names)
     return model.with_values({n: v for n, v in ORDERS.items() if n in known and name == "hd4"})
 
 
-def harmonic_drive(number: int, *, gear_ratio: float = -160.0, configuration: str | int = "IRJ") -> JointModel:
-    """Model 1 to 4; `gear_ratio` gives the reduction, `configuration` the sense (IRJ keeps the sign given).
+def harmonic_drive(
+    number: int, *, gear_ratio: float = -160.0, configuration: str | int = "IRJ"
+) -> JointModel:
+    """Model 1 to 4; `gear_ratio` gives the reduction, `configuration` the sense (IRJ keeps the sign
+    given).
 
     Model 1 is ideal; 2 adds losses; 3 adds stiffness and structural damping; 4 adds the kinematic
     error at 1, 2 and 4 per turn of the wave generator. Friction beyond model 2 is added by name.
     """
     if number not in (1, 2, 3, 4):
         raise ValueError(f"harmonic-drive model {number}: use 1, 2, 3 or 4")
-    ratio = gear_ratio if str(configuration) == "IRJ" else signed_ratio(configuration, abs(gear_ratio))
+    ratio = (
+        gear_ratio if str(configuration) == "IRJ" else signed_ratio(configuration, abs(gear_ratio))
+    )
     return build(f"hd{number}", ratio)

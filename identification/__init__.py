@@ -1,37 +1,39 @@
-"""From measurements of a joint to estimates: read, fit, compare, diagnose, improve, and the online estimators."""
+"""From measurements of a joint to estimates: read, fit, compare, diagnose, improve, and the
+online estimators.
+"""
 
 from __future__ import annotations
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from .compare import Comparison
-from .compare import compare as compare
-from .diagnose import Diagnosis
-from .diagnose import diagnose as diagnose
-from .errors import InputError
-from .fit import Fit
-from .fit import fit as fit
-from .improve import Improvement
-from .improve import improve as improve
-from .joint_file import Joint, load_joint
-from .mcs import mcs as mcs
-from .read import read as read
-from .record import Record
+from identification.data.joint_file import Joint, load_joint
+from identification.data.read import read as read
+from identification.data.record import Record
+from identification.diagnosis.compare import Comparison
+from identification.diagnosis.compare import compare as compare
+from identification.diagnosis.diagnose import Diagnosis
+from identification.diagnosis.diagnose import diagnose as diagnose
+from identification.diagnosis.improve import Improvement
+from identification.diagnosis.improve import improve as improve
+from identification.errors import InputError
+from identification.fitting.fit import Fit
+from identification.fitting.fit import fit as fit
+from identification.search.mcs import mcs as mcs
 
 if TYPE_CHECKING:
-    from .fault import FaultDetector
-    from .recursive import RecursiveLeastSquares
-    from .subspace import moesp
-    from .two_step import TwoStep
+    from identification.faults.detector import FaultDetector
+    from identification.linear.subspace import moesp
+    from identification.recursive.estimator import RecursiveLeastSquares
+    from identification.two_step.algorithm import TwoStep
 
 __version__ = "0.1.0"
 
 _LATE = {
-    "moesp": "subspace",
-    "RecursiveLeastSquares": "recursive",
-    "TwoStep": "two_step",
-    "FaultDetector": "fault",
+    "moesp": "linear.subspace",
+    "RecursiveLeastSquares": "recursive.estimator",
+    "TwoStep": "two_step.algorithm",
+    "FaultDetector": "faults.detector",
 }
 
 __all__ = [

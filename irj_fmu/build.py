@@ -13,19 +13,27 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, final
 
+from identification.data.joint_file import Joint, load_joint
+from identification.data.own_effects import files_of
 from identification.errors import InputError
-from identification.joint_file import Joint, load_joint
-from identification.own_effects import files_of
-
-from .command_line import OneLineParser, check_output, checkpoint, fail, keep_inputs, run_alone, write_json
-from .compiler import find_compiler
+from irj_fmu.command_line import (
+    OneLineParser,
+    check_output,
+    checkpoint,
+    fail,
+    keep_inputs,
+    run_alone,
+    write_json,
+)
+from irj_fmu.fmi.compiler import find_compiler
 
 if TYPE_CHECKING:
-    from .online import OnlineOptions
+    from identification.online.estimator import OnlineOptions
 
 KINDS: Final = ("estimator", "plant", "native", "ssp", "all")
 _TRY: Final = (
-    "no C compiler: the estimator still builds (`irj export estimator`), for Python hosts; plants, native estimators "
+    "no C compiler: the estimator still builds (`irj export estimator`), for Python hosts; "
+    "plants, native estimators "
     "and systems need one: run `pip install ziglang`, or install gcc and pass --cc gcc"
 )
 _SMOKE: Final = """
@@ -60,7 +68,8 @@ class Request:
     out : Path
         Folder of the results.
     cc, target : str, optional
-        See :func:`irj_fmu.plant.build_plant`; targets by the names of their folders as well, e.g. ``win64``.
+        See :func:`irj_fmu.plant.library.build_plant`; targets by the names of their folders as
+        well, e.g. ``win64``.
     controller, sensors : bool
         Of the plant.
     healthy : tuple of Path
@@ -87,7 +96,9 @@ class Request:
     say: Callable[[str], object] = lambda _text: None
 
 
-def build(kind: str, request: Request, say: Callable[[str], object] = lambda _text: None) -> list[Path]:
+def build(
+    kind: str, request: Request, say: Callable[[str], object] = lambda _text: None
+) -> list[Path]:
     """Build, validate, run and only then put into place.
 
     Parameters
@@ -106,24 +117,35 @@ def build(kind: str, request: Request, say: Callable[[str], object] = lambda _te
     Raises
     ------
     InputError
-        Where something is missing or a check fails; what was complete before stays, nothing is left half-written.
+        Where something is missing or a check fails; what was complete before stays, nothing is left
+        half-written.
     """
     if kind not in KINDS:
         raise InputError(f"{kind!r} cannot be built; choose one of {', '.join(KINDS)}")
-    keep_inputs([request.out / name for name in _names(kind, _base(request))], [request.source, *request.healthy])
+    keep_inputs(
+        [request.out / name for name in _names(kind, _base(request))],
+        [request.source, *request.healthy],
+    )
     made_folders = _prepare(request.out)
     done: list[Path] = []
     try:
         with tempfile.TemporaryDirectory(prefix=".build-", dir=request.out) as temporary:
             for maker in _makers(kind):
                 for path, note in maker(request, Path(temporary)):
-                    ran = "smoke run passed" if _check(path) else "not run: it holds no library for this machine"
+                    ran = (
+                        "smoke run passed"
+                        if _check(path)
+                        else "not run: it holds no library for this machine"
+                    )
                     final_path = request.out / path.name
                     path.replace(final_path)
                     done.append(final_path)
                     say(f"{final_path} ({note}; validated, {ran})")
     except OSError as error:
-        raise InputError(f"{request.out}: cannot write there ({error.strerror or error}); choose a writable folder with space on its disk") from None
+        raise InputError(
+            f"{request.out}: cannot write there ({error.strerror or error}); choose a writable "
+            "folder with space on its disk"
+        ) from None
     finally:
         for folder in made_folders:
             if not any(folder.iterdir()):
@@ -136,19 +158,27 @@ _Maker = Callable[[Request, Path], list[tuple[Path, str]]]
 
 def _makers(kind: str) -> list[_Maker]:
     table: dict[str, list[_Maker]] = {
-        "estimator": [_estimator], "plant": [_plant], "native": [_native], "ssp": [_ssp],
+        "estimator": [_estimator],
+        "plant": [_plant],
+        "native": [_native],
+        "ssp": [_ssp],
         "all": [_estimator, _plant, _controlled, _ssp, _native],
-    }  # fmt: skip
+    }
     return table[kind]
 
 
 def _names(kind: str, base: str) -> list[str]:
     """Files that a kind makes."""
     every = {
-        "estimator": ["estimator.fmu"], "plant": ["plant.fmu"], "native": ["native.fmu"],
+        "estimator": ["estimator.fmu"],
+        "plant": ["plant.fmu"],
+        "native": ["native.fmu"],
         "all": ["estimator.fmu", "plant.fmu", "plant_controlled.fmu", "native.fmu"],
-    }  # fmt: skip
-    return [*(f"{base}_{end}" for end in every.get(kind, [])), *([f"{base}.ssp"] if kind in ("ssp", "all") else [])]
+    }
+    return [
+        *(f"{base}_{end}" for end in every.get(kind, [])),
+        *([f"{base}.ssp"] if kind in ("ssp", "all") else []),
+    ]
 
 
 def _prepare(out: Path) -> list[Path]:
@@ -161,21 +191,23 @@ def _prepare(out: Path) -> list[Path]:
     except OSError as error:
         for folder in filter(Path.is_dir, missing):
             folder.rmdir()
-        raise InputError(f"{out}: cannot write there ({error.strerror}); choose a writable folder with --out") from None
+        raise InputError(
+            f"{out}: cannot write there ({error.strerror}); choose a writable folder with --out"
+        ) from None
 
 
-# --- the kinds -------------------------------------------------------------------------------------------------------
+# --- the kinds ------------------------------------------------------------------------------------
 
 
 def _base(request: Request) -> str:
-    from .joint_plant import identifier
+    from irj_fmu.plant.joint import identifier
 
     return identifier(request.joint.name)
 
 
 def _compiler(request: Request) -> tuple[str, ...]:
     """Targets of the request; there is a compiler for them."""
-    from .native_targets import native_targets
+    from irj_fmu.fmi.targets import native_targets
 
     targets = native_targets(request.target)
     try:
@@ -187,30 +219,57 @@ def _compiler(request: Request) -> tuple[str, ...]:
 
 
 def _plant(request: Request, folder: Path) -> list[tuple[Path, str]]:
-    return [_one_plant(request, folder, f"{_base(request)}_plant", controller=request.controller, sensors=request.sensors)]
+    return [
+        _one_plant(
+            request,
+            folder,
+            f"{_base(request)}_plant",
+            controller=request.controller,
+            sensors=request.sensors,
+        )
+    ]
 
 
 def _controlled(request: Request, folder: Path) -> list[tuple[Path, str]]:
-    return [_one_plant(request, folder, f"{_base(request)}_plant_controlled", controller=True, sensors=True)]
+    return [
+        _one_plant(
+            request, folder, f"{_base(request)}_plant_controlled", controller=True, sensors=True
+        )
+    ]
 
 
-def _one_plant(request: Request, folder: Path, name: str, *, controller: bool, sensors: bool) -> tuple[Path, str]:
-    from .joint_plant import PlantOptions, plant_spec
-    from .plant import build_plant
-    from .reference import Motion
+def _one_plant(
+    request: Request, folder: Path, name: str, *, controller: bool, sensors: bool
+) -> tuple[Path, str]:
+    from irj_fmu.plant.joint import PlantOptions, plant_spec
+    from irj_fmu.plant.library import build_plant
+    from irj_fmu.plant.reference import Motion
 
     targets = _compiler(request)
     motion = Motion() if controller else None
-    spec = plant_spec(request.joint, PlantOptions(controller=controller, motion=motion, sensors=sensors, name=name))
+    spec = plant_spec(
+        request.joint,
+        PlantOptions(controller=controller, motion=motion, sensors=sensors, name=name),
+    )
     path = build_plant(spec, folder / f"{name}.fmu", cc=request.cc, target=targets)
     kinds = "co-simulation" if spec.memory else "model exchange and co-simulation"
-    return path, f"FMI 2.0 {kinds}, {len(spec.states) + len(spec.memory)} states, {len(spec.parameters)} parameters"
+    return (
+        path,
+        f"FMI 2.0 {kinds}, {len(spec.states) + len(spec.memory)} states, {len(spec.parameters)} "
+        "parameters",
+    )
 
 
 def _estimator(request: Request, folder: Path) -> list[tuple[Path, str]]:
-    from .estimator import DETECTOR_FILE, JOINT_FILE, OPTIONS_FILE, Estimator, options_text
-    from .online import OnlineOptions, prepared
-    from .package import SlaveSpec, package_slave
+    from identification.online.estimator import OnlineOptions, prepared
+    from irj_fmu.estimator.slave import (
+        DETECTOR_FILE,
+        JOINT_FILE,
+        OPTIONS_FILE,
+        Estimator,
+        options_text,
+    )
+    from irj_fmu.fmi.package import SlaveSpec, package_slave
 
     name = f"{_base(request)}_estimator"
     options = OnlineOptions(has_link=request.has_link, has_torque=request.has_torque)
@@ -223,22 +282,34 @@ def _estimator(request: Request, folder: Path) -> list[tuple[Path, str]]:
     if state is not None:
         (texts / DETECTOR_FILE).write_bytes(state)
         files[DETECTOR_FILE] = texts / DETECTOR_FILE
-    spec = SlaveSpec(name, "irj_fmu.estimator", "Estimator", tuple(_package(p) for p in ("casadi_models", "identification", "irj_fmu")), files,
-                     effects=files_of(request.joint.effects))  # fmt: skip
+    spec = SlaveSpec(
+        name,
+        "irj_fmu.estimator.slave",
+        "Estimator",
+        tuple(_package(p) for p in ("casadi_models", "identification", "irj_fmu")),
+        files,
+        effects=files_of(request.joint.effects),
+    )
     packaged = package_slave(spec, folder / f"{name}.fmu", cc=request.cc)
     return [(packaged.path, f"FMI 2.0 co-simulation; {packaged.message}")]
 
 
 def _limits(request: Request, options: OnlineOptions, dt: float) -> bytes | None:
     """State of a fault detector that was calibrated with the healthy records; None without any."""
-    from .healthy import detector_state, read_healthy
+    from irj_fmu.estimator.healthy import detector_state, read_healthy
 
-    return detector_state(request.joint, options, read_healthy(request.healthy, request.joint, request.say), dt, request.say)
+    return detector_state(
+        request.joint,
+        options,
+        read_healthy(request.healthy, request.joint, request.say),
+        dt,
+        request.say,
+    )
 
 
 def _native(request: Request, folder: Path) -> list[tuple[Path, str]]:
-    from .native import NativeSpec, build_native
-    from .online import OnlineOptions
+    from identification.online.estimator import OnlineOptions
+    from irj_fmu.estimator.native import NativeSpec, build_native
 
     targets = _compiler(request)
     name = f"{_base(request)}_native"
@@ -250,23 +321,38 @@ def _native(request: Request, folder: Path) -> list[tuple[Path, str]]:
 
 
 def _ssp(request: Request, folder: Path) -> list[tuple[Path, str]]:
-    from .plant import build_plant
-    from .ssp import System, multisine_source, write_ssp
+    from irj_fmu.fmi.ssp import System, multisine_source, write_ssp
+    from irj_fmu.plant.library import build_plant
 
     _compiler(request)
     base = _base(request)
-    plant, _ = _one_plant(request, folder, f"{base}_plant", controller=False, sensors=request.sensors)
+    plant, _ = _one_plant(
+        request, folder, f"{base}_plant", controller=False, sensors=request.sensors
+    )
     estimator = _estimator(request, folder)[0][0]
     by_current = request.joint.torque_per_current is not None
     scale = request.joint.torque_per_current if by_current else request.joint.gear_ratio
     tones = [size / abs(float(scale or 1.0)) for size in (60.0, 30.0, 10.0)]
-    spec = multisine_source(tones, (0.2, 0.7, 2.3), (0.0, 1.0, 2.0), unit="A" if by_current else "N.m")
+    spec = multisine_source(
+        tones, (0.2, 0.7, 2.3), (0.0, 1.0, 2.0), unit="A" if by_current else "N.m"
+    )
     source = build_plant(spec, folder / "source.fmu", cc=request.cc)
     drive = "i_m" if by_current else "tau_m"
-    channels = {"q_m": "motor_position", "w_m": "motor_velocity", "q_l": "link_position", "w_l": "link_velocity", "tau_l": "link_torque"}
+    channels = {
+        "q_m": "motor_position",
+        "w_m": "motor_velocity",
+        "q_l": "link_position",
+        "w_l": "link_velocity",
+        "tau_l": "link_torque",
+    }
     connections = {f"plant.{drive}": "source.signal", f"estimator.{drive}": "source.signal"}
     connections |= {f"estimator.{k}": f"plant.{v}" for k, v in channels.items()}
-    system = System({"source": source, "plant": plant, "estimator": estimator}, connections, name=base, stop=40.0)
+    system = System(
+        {"source": source, "plant": plant, "estimator": estimator},
+        connections,
+        name=base,
+        stop=40.0,
+    )
     path = write_ssp(system, folder / f"{base}.ssp")
     return [(path, "SSP 1.0: source, plant, estimator")]
 
@@ -278,7 +364,7 @@ def _package(name: str) -> Path:
     raise InputError(f"package {name} is missing; install the project again")
 
 
-# --- checks ----------------------------------------------------------------------------------------------------------
+# --- checks ---------------------------------------------------------------------------------------
 
 
 def _check(path: Path) -> bool:
@@ -323,13 +409,17 @@ def _run(path: Path, command: Sequence[str]) -> None:
     checkpoint()
     with tempfile.TemporaryDirectory(prefix="irj-smoke-") as elsewhere:
         environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
-        done = subprocess.run(command, cwd=elsewhere, capture_output=True, text=True, check=False, env=environment)
+        done = subprocess.run(
+            command, cwd=elsewhere, capture_output=True, text=True, check=False, env=environment
+        )
     if done.returncode != 0:
-        last = (done.stderr.strip() or done.stdout.strip() or f"exit {done.returncode}").splitlines()[-1]
+        last = (
+            done.stderr.strip() or done.stdout.strip() or f"exit {done.returncode}"
+        ).splitlines()[-1]
         raise InputError(f"{path.name}: the smoke run failed: {last}")
 
 
-# --- command line ----------------------------------------------------------------------------------------------------
+# --- command line ---------------------------------------------------------------------------------
 
 
 def parser(prog: str = "build_fmu.py") -> argparse.ArgumentParser:
@@ -337,26 +427,58 @@ def parser(prog: str = "build_fmu.py") -> argparse.ArgumentParser:
     made = OneLineParser(prog=prog, description="Build, validate and try the FMUs of a joint file.")
     made.add_argument("kind", choices=KINDS)
     made.add_argument("--joint", required=True, type=Path, help="joint file (TOML), fitted or not")
-    made.add_argument("--out", default=Path("dist"), type=Path, help="folder of the results (default: dist)")
-    made.add_argument("--cc", help="C compiler: a command such as gcc, or zig for the ziglang package")
-    made.add_argument("--target", help="platform of plants and native estimators: linux64, win64, darwin64, x86_64-linux-gnu, ..., or all")
-    made.add_argument("--sample-time", type=float, metavar="S", help="native: time between two samples, built in (default: 0.001)")
-    made.add_argument("--controller", action="store_true", help="plant: drive it by a position controller")
-    made.add_argument("--sensors", action="store_true", help="plant: readings with noise, quantisation and faults as parameters")
     made.add_argument(
-        "--healthy", nargs="+", action="extend", default=[], type=Path, metavar="RECORD",
-        help="estimators: records of the healthy joint, for the limits of its fault detector; resampled to the estimator's step",
-    )  # fmt: skip
-    made.add_argument("--no-link", action="store_true", help="estimators: the joint has no link encoder")
-    made.add_argument("--no-torque", action="store_true", help="estimators: the joint has no torque sensor")
+        "--out", default=Path("dist"), type=Path, help="folder of the results (default: dist)"
+    )
+    made.add_argument(
+        "--cc", help="C compiler: a command such as gcc, or zig for the ziglang package"
+    )
+    made.add_argument(
+        "--target",
+        help="platform of plants and native estimators: linux64, win64, darwin64, "
+        "x86_64-linux-gnu, ..., or all",
+    )
+    made.add_argument(
+        "--sample-time",
+        type=float,
+        metavar="S",
+        help="native: time between two samples, built in (default: 0.001)",
+    )
+    made.add_argument(
+        "--controller", action="store_true", help="plant: drive it by a position controller"
+    )
+    made.add_argument(
+        "--sensors",
+        action="store_true",
+        help="plant: readings with noise, quantisation and faults as parameters",
+    )
+    made.add_argument(
+        "--healthy",
+        nargs="+",
+        action="extend",
+        default=[],
+        type=Path,
+        metavar="RECORD",
+        help="estimators: records of the healthy joint, for the limits of its fault detector; "
+        "resampled to the estimator's step",
+    )
+    made.add_argument(
+        "--no-link", action="store_true", help="estimators: the joint has no link encoder"
+    )
+    made.add_argument(
+        "--no-torque", action="store_true", help="estimators: the joint has no torque sensor"
+    )
     made.add_argument("--json", type=Path, metavar="FILE", help="write what was built as JSON")
     return made
 
 
 _OF: Final = {  # options that only some kinds heed
-    "sample_time": ("native", "all"), "controller": ("plant", "all"), "sensors": ("plant", "ssp", "all"),
-    "healthy": ("estimator", "native", "ssp", "all"), "target": ("plant", "native", "ssp", "all"),
-}  # fmt: skip
+    "sample_time": ("native", "all"),
+    "controller": ("plant", "all"),
+    "sensors": ("plant", "ssp", "all"),
+    "healthy": ("estimator", "native", "ssp", "all"),
+    "target": ("plant", "native", "ssp", "all"),
+}
 
 
 def _request(given: argparse.Namespace) -> Request:
@@ -365,19 +487,32 @@ def _request(given: argparse.Namespace) -> Request:
     Raises
     ------
     InputError
-        An option that this kind does not heed; a result that would replace an input; an unusable joint file.
+        An option that this kind does not heed; a result that would replace an input; an unusable
+        joint file.
     """
     for option, kinds in _OF.items():
         if getattr(given, option) not in (None, False, []) and given.kind not in kinds:
-            raise InputError(f"--{option.replace('_', '-')}: goes with {', '.join(kinds)}, not with {given.kind}; leave it out")
+            raise InputError(
+                f"--{option.replace('_', '-')}: goes with {', '.join(kinds)}, not with "
+                f"{given.kind}; leave it out"
+            )
     if given.sample_time is not None and not 1e-5 <= given.sample_time <= 1.0:
         raise InputError(f"--sample-time {given.sample_time:g}: give 0.00001 to 1 s")
     joint = load_joint(given.joint)
     request = Request(
-        joint=joint, source=given.joint, out=given.out, cc=given.cc, target=given.target, controller=given.controller, sensors=given.sensors,
-        healthy=tuple(given.healthy), has_link=not given.no_link, has_torque=not given.no_torque,
-        sample_time=1e-3 if given.sample_time is None else given.sample_time, say=lambda text: sys.stderr.write(f"irj: {text}\n"),
-    )  # fmt: skip
+        joint=joint,
+        source=given.joint,
+        out=given.out,
+        cc=given.cc,
+        target=given.target,
+        controller=given.controller,
+        sensors=given.sensors,
+        healthy=tuple(given.healthy),
+        has_link=not given.no_link,
+        has_torque=not given.no_torque,
+        sample_time=1e-3 if given.sample_time is None else given.sample_time,
+        say=lambda text: sys.stderr.write(f"irj: {text}\n"),
+    )
     if given.json is not None:
         made = [request.out / name for name in _names(given.kind, _base(request))]
         check_output(given.json, [request.source, *request.healthy])

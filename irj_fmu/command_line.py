@@ -1,4 +1,6 @@
-"""What every command line of the project does alike: one line on errors, checks before work, results in one piece."""
+"""What every command line of the project does alike: one line on errors, checks before work,
+results in one piece.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +49,9 @@ def one_line(text: str) -> str:
 
 
 def checkpoint() -> None:
-    """Stop here after a signal that was swallowed: an exception inside a destructor or a callback goes no further."""
+    """Stop here after a signal that was swallowed: an exception inside a destructor or a
+    callback goes no further.
+    """
     if signal.SIGINT in STOPPED:
         raise KeyboardInterrupt
     if STOPPED:
@@ -59,7 +63,9 @@ def progress_bar(text: str, share: float) -> None:
     checkpoint()
     if sys.stderr.isatty():
         width, _BAR[0] = round(30 * min(max(share, 0.0), 1.0)), share < 1
-        sys.stderr.write(f"\r[{'#' * width}{'.' * (30 - width)}] {text:<40}{'' if _BAR[0] else chr(10)}")
+        sys.stderr.write(
+            f"\r[{'#' * width}{'.' * (30 - width)}] {text:<40}{'' if _BAR[0] else chr(10)}"
+        )
         sys.stderr.flush()
 
 
@@ -73,7 +79,8 @@ def end_bar() -> None:
 def fail(text: str) -> int:
     """Print one line on standard error; the exit code for unusable input.
 
-    After a signal that is what counts: compiled code, or Python inside an FMU, may turn it into an error of its own.
+    After a signal that is what counts: compiled code, or Python inside an FMU, may turn it into an
+    error of its own.
     """
     end_bar()
     if STOPPED:
@@ -92,7 +99,9 @@ def stopped() -> int:
 
 
 def run_alone(main: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
-    """Run a command that is not reached through `irj`: Ctrl-C and what the system refuses are one line, too."""
+    """Run a command that is not reached through `irj`: Ctrl-C and what the system refuses are
+    one line, too.
+    """
     try:
         with terminable():
             return main(argv)
@@ -108,13 +117,21 @@ def run_alone(main: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
 def system_refusal(error: OSError) -> str:
     """What the operating system refuses, and what to do."""
     where = f"{error.filename}: " if error.filename else ""
-    return f"{where}{error.strerror or error}; check the path, its permissions and the space on the disk"
+    return (
+        f"{where}{error.strerror or error}; check the path, its permissions and the space on "
+        "the disk"
+    )
 
 
 @contextlib.contextmanager
 def terminable() -> Iterator[None]:
-    """Let SIGTERM end the work as an exception does: what is half written is removed, and workers end, too."""
-    if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+    """Let SIGTERM end the work as an exception does: what is half written is removed, and
+    workers end, too.
+    """
+    if (
+        threading.current_thread() is not threading.main_thread()
+        or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL
+    ):
         yield
         return
 
@@ -130,7 +147,7 @@ def terminable() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-# --- before the work -------------------------------------------------------------------------------------------------
+# --- before the work ------------------------------------------------------------------------------
 
 
 def check_output(path: str | Path, inputs: Sequence[str | Path] = ()) -> None:
@@ -156,7 +173,9 @@ def check_output(path: str | Path, inputs: Sequence[str | Path] = ()) -> None:
             with tempfile.TemporaryFile(prefix=".write-", dir=target.absolute().parent):
                 pass
     except OSError as error:
-        raise InputError(f"{path}: its folder is not writable ({error.strerror}); write somewhere else") from None
+        raise InputError(
+            f"{path}: its folder is not writable ({error.strerror}); write somewhere else"
+        ) from None
     keep_inputs([target], inputs)
 
 
@@ -171,7 +190,9 @@ def keep_inputs(targets: Sequence[str | Path], inputs: Sequence[str | Path]) -> 
     for target in map(Path, targets):
         for other in map(Path, inputs):
             if target.exists() and other.exists() and target.samefile(other):
-                raise InputError(f"{target}: is an input of this command and would be lost; write somewhere else")
+                raise InputError(
+                    f"{target}: is an input of this command and would be lost; write somewhere else"
+                )
 
 
 def is_special(path: Path) -> bool:
@@ -179,11 +200,12 @@ def is_special(path: Path) -> bool:
     return path.exists() and not path.is_file()
 
 
-# --- results ---------------------------------------------------------------------------------------------------------
+# --- results --------------------------------------------------------------------------------------
 
 
 def replace_file(path: str | Path, write: Callable[[IO[bytes]], object]) -> None:
-    """Write a file that appears when it is whole: a reader, or a crash, sees the old one or the new one, never a part.
+    """Write a file that appears when it is whole: a reader, or a crash, sees the old one or the new
+    one, never a part.
 
     Raises
     ------
@@ -206,11 +228,15 @@ def replace_file(path: str | Path, write: Callable[[IO[bytes]], object]) -> None
         finally:
             temporary.unlink(missing_ok=True)
     except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror or error}); check the folder, its permissions and the space on the disk") from None
+        raise InputError(
+            f"{path}: cannot be written ({error.strerror or error}); check the folder, its "
+            "permissions and the space on the disk"
+        ) from None
 
 
 def replace_files(folder: Path, content: Mapping[str, bytes]) -> list[Path]:
-    """Write files that belong together: all of them appear, or none; the folder is made where it is missing.
+    """Write files that belong together: all of them appear, or none; the folder is made where it is
+    missing.
 
     Raises
     ------
@@ -229,7 +255,10 @@ def replace_files(folder: Path, content: Mapping[str, bytes]) -> list[Path]:
             part.replace(target)
         whole = True
     except OSError as error:
-        raise InputError(f"{folder}: cannot write there ({error.strerror or error}); choose a writable folder with --out, with space on its disk") from None
+        raise InputError(
+            f"{folder}: cannot write there ({error.strerror or error}); choose a writable folder "
+            "with --out, with space on its disk"
+        ) from None
     finally:
         for part in parts.values():
             part.unlink(missing_ok=True)
@@ -266,6 +295,24 @@ def finite(data: Any) -> Any:
 
 
 __all__ = [
-    "INTERRUPTED", "STOPPED", "OneLineParser", "check_output", "checkpoint", "counted", "end_bar", "fail", "finite", "is_special",
-    "keep_inputs", "one_line", "progress_bar", "replace_file", "replace_files", "run_alone", "stopped", "system_refusal", "terminable", "write_json",
-]  # fmt: skip
+    "INTERRUPTED",
+    "STOPPED",
+    "OneLineParser",
+    "check_output",
+    "checkpoint",
+    "counted",
+    "end_bar",
+    "fail",
+    "finite",
+    "is_special",
+    "keep_inputs",
+    "one_line",
+    "progress_bar",
+    "replace_file",
+    "replace_files",
+    "run_alone",
+    "stopped",
+    "system_refusal",
+    "terminable",
+    "write_json",
+]

@@ -1,10 +1,13 @@
-"""Does the estimator FMU find each reference plant's values, sensor failures included? ``python -m irj_fmu.convergence``.
+"""Does the estimator FMU find each reference plant's values, sensor failures included? ``python -m
+irj_fmu.convergence``.
 
-A plant FMU follows its motion in closed loop and its readings are recorded; the estimator FMU gets them sample by
-sample, with a failure put into them. The readings do not depend on the estimator, so this equals the co-simulation.
+A plant FMU follows its motion in closed loop and its readings are recorded; the estimator FMU gets
+them sample by sample, with a failure put into them. The readings do not depend on the estimator, so
+this equals the co-simulation.
 
 ``start``    nothing is known of what the estimator estimates; a failure lasts from 22 s to 27 s
-``fitted``   the joint file of an elastic joint holds fitted values, the fault detector runs; a failure lasts from 25 s
+``fitted``   the joint file of an elastic joint holds fitted values, the fault detector runs; a
+failure lasts from 25 s
              to the end
 """
 
@@ -21,29 +24,51 @@ from typing import Any, Final, final
 import numpy as np
 import numpy.typing as npt
 
+from identification.data.joint_file import Joint
 from identification.errors import InputError
-from identification.fault import KINDS, SENSORS, Fault, inject
-from identification.joint_file import Joint
-
-from .command_line import OneLineParser, check_output, fail, run_alone, write_json
-from .cosim import CHANNELS, LOOSE, Row, _rows, limit_of, link_referred, make_pair, start_state
-from .host import Fmu, Instance, Trajectory
-from .identifiable import identifiable
-from .online import searched_parameters
-from .reference import NAMES, Motion, published_joint, reference_joint, selected_motion, start_of
+from identification.faults.detector import KINDS, SENSORS, Fault, inject
+from identification.online.estimator import searched_parameters
+from identification.online.identifiable import identifiable
+from irj_fmu.command_line import OneLineParser, check_output, fail, run_alone, write_json
+from irj_fmu.cosim import (
+    CHANNELS,
+    LOOSE,
+    Row,
+    _rows,
+    limit_of,
+    link_referred,
+    make_pair,
+    start_state,
+)
+from irj_fmu.host.run import Fmu, Instance, Trajectory
+from irj_fmu.plant.reference import (
+    NAMES,
+    Motion,
+    published_joint,
+    reference_joint,
+    selected_motion,
+    start_of,
+)
 
 FloatArray = npt.NDArray[np.float64]
 
 STEP: Final = 1e-3
 STOP: Final = 40.0
 NOISE: Final = (0.01, 3e-4, 0.1, 2e-6, 1e-3, 0.05)
-"""Sensor noise: current [A], motor position, velocity (motor shaft), link position, velocity [rad, rad/s], torque [N.m]."""
+"""Sensor noise: current [A], motor position, velocity (motor shaft), link position, velocity
+[rad, rad/s], torque [N.m].
+"""
 SIZES: Final[Mapping[str, tuple[float, ...]]] = {
-    "noise": (20.0, 0.1, 0.1, 0.1, 0.1, 20.0), "bias": (15.0, 0.01, 0.1, 0.01, 0.1, 15.0),
-    "drift": (5.0, 0.005, 0.05, 0.005, 0.05, 5.0), "spike": (100.0, 0.05, 1.0, 0.05, 1.0, 100.0),
-    "gain": (-0.3,) * 6, "delay": (0.02,) * 6,
-}  # fmt: skip
-"""Size of each kind of failure, by sensor, link-referred: current as its drive torque [N.m], rad, rad/s, N.m."""
+    "noise": (20.0, 0.1, 0.1, 0.1, 0.1, 20.0),
+    "bias": (15.0, 0.01, 0.1, 0.01, 0.1, 15.0),
+    "drift": (5.0, 0.005, 0.05, 0.005, 0.05, 5.0),
+    "spike": (100.0, 0.05, 1.0, 0.05, 1.0, 100.0),
+    "gain": (-0.3,) * 6,
+    "delay": (0.02,) * 6,
+}
+"""Size of each kind of failure, by sensor, link-referred: current as its drive torque [N.m],
+rad, rad/s, N.m.
+"""
 
 
 @final
@@ -72,8 +97,12 @@ class Run:
     searches: int
 
     def worst(self, *, loose: bool) -> float:
-        """Largest error of the parameters with the tight or the loose limit [%]; NaN without one."""
-        found = [abs(r.error) for r in self.rows if r.limit is not None and (r.limit == LOOSE) == loose]
+        """Largest error of the parameters with the tight or the loose limit [%]; NaN without
+        one.
+        """
+        found = [
+            abs(r.error) for r in self.rows if r.limit is not None and (r.limit == LOOSE) == loose
+        ]
         return max(found, default=float("nan"))
 
     @property
@@ -108,7 +137,12 @@ class Bench:
         self.drive = "motor_current" if joint.torque_per_current is not None else "motor_torque"
         self.table = self._record(plant, motion)
         self.shapes = searched_parameters(model)
-        self.shown = identifiable(joint, self.table * link_referred(joint), np.array(NOISE) * np.abs(link_referred(joint)), STEP)
+        self.shown = identifiable(
+            joint,
+            self.table * link_referred(joint),
+            np.array(NOISE) * np.abs(link_referred(joint)),
+            STEP,
+        )
         self.scale = float(np.quantile(np.abs(self.table[:, 5]), 0.99)) / 170.0
 
     def _record(self, plant: Path, motion: Motion) -> FloatArray:
@@ -116,7 +150,10 @@ class Bench:
         table = np.empty((count, 6))
         channels = [self.drive, *CHANNELS.values()]
         with Fmu(plant) as fmu, Instance(fmu, name="plant") as instance:
-            instance.begin(0.0, {k.removeprefix("plant."): v for k, v in start_state(self.joint, motion).items()})
+            instance.begin(
+                0.0,
+                {k.removeprefix("plant."): v for k, v in start_state(self.joint, motion).items()},
+            )
             instance.ready()
             references = [fmu.variables[c].valueReference for c in channels]
             for k in range(count):
@@ -138,7 +175,12 @@ class Bench:
             instance.begin(0.0)
             instance.ready()
             at = {n: v.valueReference for n, v in fmu.variables.items()}
-            raw, write = instance.raw, instance.blocks(["i_m" if self.drive == "motor_current" else "tau_m", *CHANNELS])[0]
+            raw, write = (
+                instance.raw,
+                instance.blocks(["i_m" if self.drive == "motor_current" else "tau_m", *CHANNELS])[
+                    0
+                ],
+            )
             step = ctypes.c_double(STEP)
             for k, row in enumerate(table.tolist()):
                 write.values[:] = row
@@ -150,9 +192,20 @@ class Bench:
                 if name.startswith(("theta[", "sigma[", "eta[", "sigma_eta[")):
                     signals[f"estimator.{name}"] = np.array(instance.call("getReal", [at[name]]))
             searches = int(instance.call("getInteger", [at["n_searches"]])[0])
-        rows = [*_rows(joint, self.shown, Trajectory(np.array([STOP]), signals)), *self._shape_rows(signals)]
+        rows = [
+            *_rows(joint, self.shown, Trajectory(np.array([STOP]), signals)),
+            *self._shape_rows(signals),
+        ]
         sensor, kind = (fault.sensor, fault.kind) if fault is not None else ("", "")
-        return Run(joint.name, self.start, sensor, kind, tuple(rows), tuple(sorted(codes - {0})), searches)
+        return Run(
+            joint.name,
+            self.start,
+            sensor=sensor,
+            kind=kind,
+            rows=tuple(rows),
+            faults=tuple(sorted(codes - {0})),
+            searches=searches,
+        )
 
     def _shape_rows(self, signals: Mapping[str, FloatArray]) -> list[Row]:
         model = self.joint.model()
@@ -161,12 +214,31 @@ class Bench:
         found = []
         for i, name in enumerate(self.shapes, 1):
             limit = limit_of(model, name)
-            value, spread = (float(signals[f"estimator.{s}[{i}]"][-1]) for s in ("eta", "sigma_eta"))
-            found.append(Row(self.joint.name, name, unit[name], true[name], value, spread, limit))
+            value, spread = (
+                float(signals[f"estimator.{s}[{i}]"][-1]) for s in ("eta", "sigma_eta")
+            )
+            found.append(
+                Row(
+                    self.joint.name,
+                    name,
+                    unit=unit[name],
+                    plant=true[name],
+                    estimate=value,
+                    sigma=spread,
+                    limit=limit,
+                )
+            )
         return found
 
 
-def campaign(joints: Sequence[Joint], start: str, *, every: bool = False, only: Sequence[str] | None = None, cc: str | None = None) -> Iterator[Run]:
+def campaign(
+    joints: Sequence[Joint],
+    start: str,
+    *,
+    every: bool = False,
+    only: Sequence[str] | None = None,
+    cc: str | None = None,
+) -> Iterator[Run]:
     """Each joint without a failure and with every kind of it, the sensors in turn.
 
     Parameters
@@ -196,35 +268,65 @@ def campaign(joints: Sequence[Joint], start: str, *, every: bool = False, only: 
 
 
 HEAD: Final = (
-    "| plant | start | failed sensor | failure | largest error, limit 2 % | largest error, limit 10 % | fault codes | searches | |\n"
+    "| plant | start | failed sensor | failure | largest error, limit 2 % | largest error, limit "
+    "10 % | fault codes | searches | |\n"
     "|---|---|---|---|---|---|---|---|---|\n"
 )
 
 
 def line(run: Run) -> str:
     """A run as a line of a Markdown table."""
-    tight, loose = (f"{v:.2f}" if v == v else "-" for v in (run.worst(loose=False), run.worst(loose=True)))
+    tight, loose = (
+        f"{v:.2f}" if v == v else "-" for v in (run.worst(loose=False), run.worst(loose=True))
+    )
     codes = ", ".join(map(str, run.faults)) or "-"
     mark = "" if run.passed else "over"
-    return f"| {run.joint} | {run.start} | {run.sensor or '-'} | {run.kind or '-'} | {tight} | {loose} | {codes} | {run.searches} | {mark} |\n"
+    return (
+        f"| {run.joint} | {run.start} | {run.sensor or '-'} | {run.kind or '-'} | {tight} | "
+        f"{loose} | {codes} | {run.searches} | {mark} |\n"
+    )
 
 
 def main(argv: Sequence[str]) -> int:
     """Print the table; 0 where every limit holds, 1 where not, 2 on unusable input."""
-    parser = OneLineParser(prog="python -m irj_fmu.convergence", description="Estimator FMU against reference plants, with sensor failures.")
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"reference joints: {', '.join(NAMES)} (default: all)")
-    parser.add_argument("--published", nargs="+", default=[], metavar=("FILE", "KEY"), help="rows of a table of published friction parameters")
-    parser.add_argument("--start", choices=("start", "fitted", "both"), default="both", help="what the estimator knows")
+    parser = OneLineParser(
+        prog="python -m irj_fmu.convergence",
+        description="Estimator FMU against reference plants, with sensor failures.",
+    )
+    parser.add_argument(
+        "names",
+        nargs="*",
+        metavar="NAME",
+        help=f"reference joints: {', '.join(NAMES)} (default: all)",
+    )
+    parser.add_argument(
+        "--published",
+        nargs="+",
+        default=[],
+        metavar=("FILE", "KEY"),
+        help="rows of a table of published friction parameters",
+    )
+    parser.add_argument(
+        "--start",
+        choices=("start", "fitted", "both"),
+        default="both",
+        help="what the estimator knows",
+    )
     parser.add_argument("--kinds", nargs="*", choices=KINDS, help="kinds of failure (default: all)")
     parser.add_argument("--every", action="store_true", help="every sensor with every kind")
     parser.add_argument("--cc", help="C compiler")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write every parameter of every run as JSON")
+    parser.add_argument(
+        "--json", type=Path, metavar="FILE", help="write every parameter of every run as JSON"
+    )
     arguments = parser.parse_args(argv)
     try:
         if arguments.json is not None:
             check_output(arguments.json, arguments.published[:1])
         if len(arguments.published) == 1:
-            raise InputError(f"{arguments.published[0]}: --published wants rows of the table, too, such as erob80_50/m1")
+            raise InputError(
+                f"{arguments.published[0]}: --published wants rows of the table, too, such as "
+                "erob80_50/m1"
+            )
         joints = [published_joint(Path(arguments.published[0]), k) for k in arguments.published[1:]]
         names = arguments.names or (() if joints else NAMES)
         joints = [*(reference_joint(n) for n in names), *joints]
@@ -232,11 +334,15 @@ def main(argv: Sequence[str]) -> int:
         runs: list[Run] = []
         sys.stdout.write(HEAD)
         for start in starts:
-            for run in campaign(joints, start, every=arguments.every, only=arguments.kinds, cc=arguments.cc):
+            for run in campaign(
+                joints, start, every=arguments.every, only=arguments.kinds, cc=arguments.cc
+            ):
                 runs.append(run)
                 sys.stdout.write(line(run))
                 sys.stdout.flush()
-        sys.stdout.write(f"\n{sum(r.passed for r in runs)} of {len(runs)} runs within all limits.\n")
+        sys.stdout.write(
+            f"\n{sum(r.passed for r in runs)} of {len(runs)} runs within all limits.\n"
+        )
         if arguments.json is not None:
             write_json(arguments.json, {"runs": [_plain(r) for r in runs]})
     except InputError as error:

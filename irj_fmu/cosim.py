@@ -1,4 +1,6 @@
-"""Co-simulate a plant FMU with its estimator FMU and compare the estimate with the plant's values."""
+"""Co-simulate a plant FMU with its estimator FMU and compare the estimate with the plant's
+values.
+"""
 
 from __future__ import annotations
 
@@ -15,36 +17,68 @@ import numpy.typing as npt
 
 from casadi_models import JointModel
 from casadi_models.term import INERTIAS
+from identification.data.joint_file import Joint, load_joint, toml_text
+from identification.data.own_effects import files_of
 from identification.errors import InputError
-from identification.joint_file import Joint, load_joint, toml_text
-from identification.own_effects import files_of
-
-from .command_line import OneLineParser, check_output, counted, fail, progress_bar, write_json
-from .compiler import find_compiler
-from .estimator import DETECTOR_FILE, JOINT_FILE, OPTIONS_FILE, Estimator, options_text
-from .healthy import detector_state, read_healthy
-from .host import Fmu, FmuError, Instance, Trajectory, Wiring, simulate_cs
-from .identifiable import Identifiable, identifiable
-from .joint_plant import PlantOptions, identifier, plant_spec
-from .online import OnlineOptions, estimated_parameters, prepared
-from .plant import build_plant
-from .reference import NAMES, Motion, published_joint, reference_joint, start_of
-from .signals import Fault
+from identification.online.estimator import OnlineOptions, estimated_parameters, prepared
+from identification.online.identifiable import Identifiable, identifiable
+from irj_fmu.command_line import (
+    OneLineParser,
+    check_output,
+    counted,
+    fail,
+    progress_bar,
+    write_json,
+)
+from irj_fmu.estimator.healthy import detector_state, read_healthy
+from irj_fmu.estimator.slave import DETECTOR_FILE, JOINT_FILE, OPTIONS_FILE, Estimator, options_text
+from irj_fmu.fmi.compiler import find_compiler
+from irj_fmu.host.run import Fmu, FmuError, Instance, Trajectory, Wiring, simulate_cs
+from irj_fmu.host.signals import Fault
+from irj_fmu.plant.joint import PlantOptions, identifier, plant_spec
+from irj_fmu.plant.library import build_plant
+from irj_fmu.plant.reference import NAMES, Motion, published_joint, reference_joint, start_of
 
 FloatArray = npt.NDArray[np.float64]
 
-CHANNELS: Final = {"q_m": "motor_position", "w_m": "motor_velocity", "q_l": "link_position", "w_l": "link_velocity", "tau_l": "link_torque"}
+CHANNELS: Final = {
+    "q_m": "motor_position",
+    "w_m": "motor_velocity",
+    "q_l": "link_position",
+    "w_l": "link_velocity",
+    "tau_l": "link_torque",
+}
 """Inputs of the estimator and the outputs of the plant that feed them."""
 TIGHT: Final = 2.0
 LOOSE: Final = 10.0
 """Largest errors [%]; the loose one holds for the Stribeck part and the cubic stiffness."""
 _LIMITS: Final[Mapping[str, float]] = {
-    **dict.fromkeys((*INERTIAS, "stiffness", "gravity_torque", "coulomb", "viscous", "loss_constant", "loss_viscous"), TIGHT),
     **dict.fromkeys(
-        ("stribeck_extra", "stribeck_velocity", "smooth_stribeck", "cubic_stiffness", "loss_cubic", "structural_damping"), LOOSE,
+        (
+            *INERTIAS,
+            "stiffness",
+            "gravity_torque",
+            "coulomb",
+            "viscous",
+            "loss_constant",
+            "loss_viscous",
+        ),
+        TIGHT,
     ),
-}  # fmt: skip
+    **dict.fromkeys(
+        (
+            "stribeck_extra",
+            "stribeck_velocity",
+            "smooth_stribeck",
+            "cubic_stiffness",
+            "loss_cubic",
+            "structural_damping",
+        ),
+        LOOSE,
+    ),
+}
 """Largest error of each parameter of the reference joints, by the name in its declaration."""
+
 
 @final
 @dataclass(frozen=True)
@@ -54,7 +88,8 @@ class Row:
     Attributes
     ----------
     plant, estimate, sigma : float
-        In `unit`; where the motion shows a parameter in combinations only, the estimate is without what it does not show.
+        In `unit`; where the motion shows a parameter in combinations only, the estimate is without
+        what it does not show.
     limit : float or None
         Largest error asked for [%].
     """
@@ -86,7 +121,8 @@ class Cosimulation:
     Attributes
     ----------
     trajectory : Trajectory
-        ``estimator.theta[k]``, ``estimator.health``, ``estimator.fault``, the ratios, and what else was asked for.
+        ``estimator.theta[k]``, ``estimator.health``, ``estimator.fault``, the ratios, and what else
+        was asked for.
     names : tuple of str
         Estimated parameters.
     rows : tuple of Row
@@ -114,7 +150,8 @@ class Setting:
     stop, step : float
         Length and communication step [s].
     parameters : mapping
-        Start values by ``plant.name`` or ``estimator.name``, e.g. noise and faults of the plant's sensors.
+        Start values by ``plant.name`` or ``estimator.name``, e.g. noise and faults of the plant's
+        sensors.
     faults : mapping
         By input of the estimator, e.g. ``{"q_l": bias(20.0, 0.01)}``.
     record : sequence of str
@@ -161,12 +198,17 @@ def make_pair(
     tuple of Path
         Plant and estimator.
     """
-    from .build import _package
-    from .package import SlaveSpec, package_slave
+    from irj_fmu.build import _package
+    from irj_fmu.fmi.package import SlaveSpec, package_slave
 
     folder.mkdir(parents=True, exist_ok=True)
     name = identifier(plant.name)
-    spec = plant_spec(plant, PlantOptions(controller=True, motion=motion or Motion(), sensors=True, name=f"{name}_plant"))
+    spec = plant_spec(
+        plant,
+        PlantOptions(
+            controller=True, motion=motion or Motion(), sensors=True, name=f"{name}_plant"
+        ),
+    )
     built = build_plant(spec, folder / f"{name}_plant.fmu", cc=cc)
     options = OnlineOptions()
     texts = folder / f"{name}_texts"
@@ -175,20 +217,38 @@ def make_pair(
     (texts / JOINT_FILE).write_text(toml_text(model, values), encoding="utf-8")
     (texts / OPTIONS_FILE).write_text(options_text(options), encoding="utf-8")
     files = {n: texts / n for n in (JOINT_FILE, OPTIONS_FILE)}
-    state = detector_state(model, options, read_healthy(healthy, model), Estimator.default_sample_time)
+    state = detector_state(
+        model, options, read_healthy(healthy, model), Estimator.default_sample_time
+    )
     if state is not None:
         (texts / DETECTOR_FILE).write_bytes(state)
         files[DETECTOR_FILE] = texts / DETECTOR_FILE
     packages = tuple(_package(p) for p in ("casadi_models", "identification", "irj_fmu"))
     made = package_slave(
-        SlaveSpec(f"{name}_estimator", "irj_fmu.estimator", "Estimator", packages, files, effects=files_of(model.effects)),
-        folder / f"{name}_estimator.fmu", cc=cc, shim=shim,
-    )  # fmt: skip
+        SlaveSpec(
+            f"{name}_estimator",
+            "irj_fmu.estimator.slave",
+            "Estimator",
+            packages,
+            files,
+            effects=files_of(model.effects),
+        ),
+        folder / f"{name}_estimator.fmu",
+        cc=cc,
+        shim=shim,
+    )
     return built, made.path
 
 
-def cosimulate(plant: Joint, model: Joint, files: tuple[Path, Path], setting: Setting | None = None, motion: Motion | None = None) -> Cosimulation:
-    """Run plant and estimator together along the plant's built-in motion; `files` are those of :func:`make_pair`.
+def cosimulate(
+    plant: Joint,
+    model: Joint,
+    files: tuple[Path, Path],
+    setting: Setting | None = None,
+    motion: Motion | None = None,
+) -> Cosimulation:
+    """Run plant and estimator together along the plant's built-in motion; `files` are those of
+    :func:`make_pair`.
 
     Raises
     ------
@@ -200,19 +260,38 @@ def cosimulate(plant: Joint, model: Joint, files: tuple[Path, Path], setting: Se
     setting, motion = setting or Setting(), motion or Motion()
     sensing = prepared(model, OnlineOptions())[1]
     names = estimated_parameters(model)
-    drive = ("i_m", "motor_current") if model.torque_per_current is not None else ("tau_m", "motor_torque")
-    connections = {f"estimator.{k}": f"plant.{v}" for k, v in {**CHANNELS, drive[0]: drive[1]}.items()}
-    outputs = [f"theta[{i}]" for i in range(1, len(names) + 1)] + [f"sigma[{i}]" for i in range(1, len(names) + 1)]
+    drive = (
+        ("i_m", "motor_current")
+        if model.torque_per_current is not None
+        else ("tau_m", "motor_torque")
+    )
+    connections = {
+        f"estimator.{k}": f"plant.{v}" for k, v in {**CHANNELS, drive[0]: drive[1]}.items()
+    }
+    outputs = [f"theta[{i}]" for i in range(1, len(names) + 1)] + [
+        f"sigma[{i}]" for i in range(1, len(names) + 1)
+    ]
     outputs += ["health", "fault", *(f"ratio.{b}" for b in sensing.balances)]
     channels = [f"plant.{v}" for v in (drive[1], *CHANNELS.values())]
     wiring = Wiring(
         connections=connections,
         faults={f"estimator.{k}": f for k, f in setting.faults.items()},
         parameters={**start_state(plant, motion), **setting.parameters},
-        record=[*(f"estimator.{n}" for n in outputs), *(c for c in channels if c not in setting.record), *setting.record],
-    )  # fmt: skip
-    with Fmu(files[0]) as first, Fmu(files[1]) as second, Instance(first, name="plant") as a, Instance(second, name="estimator") as b:
-        found = simulate_cs({"plant": a, "estimator": b}, wiring, step=setting.step, stop=setting.stop)
+        record=[
+            *(f"estimator.{n}" for n in outputs),
+            *(c for c in channels if c not in setting.record),
+            *setting.record,
+        ],
+    )
+    with (
+        Fmu(files[0]) as first,
+        Fmu(files[1]) as second,
+        Instance(first, name="plant") as a,
+        Instance(second, name="estimator") as b,
+    ):
+        found = simulate_cs(
+            {"plant": a, "estimator": b}, wiring, step=setting.step, stop=setting.stop
+        )
         messages = tuple(b.messages)
     ratios = {key: float(found[f"estimator.ratio.{key}"][-1]) for key in sensing.balances}
     readings = np.column_stack([found[c] for c in channels]) * link_referred(plant)
@@ -224,17 +303,24 @@ def start_state(plant: Joint, motion: Motion) -> dict[str, float]:
     """Start values that put the plant on the motion."""
     q, v = motion.start()
     sides = ("motor_", "link_") if plant.model().is_elastic else ("",)
-    return {f"plant.state.{side}{n}": x for side in sides for n, x in (("position", q), ("velocity", v))}
+    return {
+        f"plant.state.{side}{n}": x for side in sides for n, x in (("position", q), ("velocity", v))
+    }
 
 
 def believed(plant: Joint, model: Joint) -> Joint:
     """The joint that the estimator believes in, with the plant's values of what both have."""
     true = dict(zip(plant.model().parameter_names, plant.model().value_vector(), strict=True))
-    return replace(model, fitted={**model.fitted, **{n: true[n] for n in model.model().parameter_names if n in true}})
+    return replace(
+        model,
+        fitted={**model.fitted, **{n: true[n] for n in model.model().parameter_names if n in true}},
+    )
 
 
 def link_referred(joint: Joint) -> FloatArray:
-    """From readings at the sensors, in the order drive and :data:`CHANNELS`, to link-referred ones, (6,)."""
+    """From readings at the sensors, in the order drive and :data:`CHANNELS`, to link-referred
+    ones, (6,).
+    """
     ratio = joint.gear_ratio
     return np.array([joint.torque_per_current or ratio, 1 / ratio, 1 / ratio, 1.0, 1.0, 1.0])
 
@@ -245,7 +331,10 @@ def _rows(plant: Joint, shown: Identifiable, found: Trajectory) -> list[Row]:
     units = {p.name: p.unit for p in model.parameters}
     true = dict(zip(model.parameter_names, model.value_vector(), strict=True))
     at = np.array([true.get(n, 0.0) for n in names])
-    last, spread = (np.array([float(found[f"estimator.{s}[{i}]"][-1]) for i in range(1, len(names) + 1)]) for s in ("theta", "sigma"))
+    last, spread = (
+        np.array([float(found[f"estimator.{s}[{i}]"][-1]) for i in range(1, len(names) + 1)])
+        for s in ("theta", "sigma")
+    )
     seen = at + shown.seen(last - at)
     rows = []
     for i, n in enumerate(names):
@@ -253,13 +342,25 @@ def _rows(plant: Joint, shown: Identifiable, found: Trajectory) -> list[Row]:
             continue  # the plant has no such thing
         limit = limit_of(model, n) if true[n] else None
         name = n if shown.alone(i) else f"{n} (in combination)"
-        rows.append(Row(plant.name, name, units[n], true[n], float(seen[i]), float(spread[i]), limit))
+        rows.append(
+            Row(
+                plant.name,
+                name,
+                unit=units[n],
+                plant=true[n],
+                estimate=float(seen[i]),
+                sigma=float(spread[i]),
+                limit=limit,
+            )
+        )
     return rows
 
 
 def limit_of(model: JointModel, name: str) -> float | None:
     """Largest error of a parameter of a reference joint [%], None where none is set."""
-    declared = {n: p.name for t in model.terms for p, n in zip(t.effect.parameters, t.names, strict=True)}
+    declared = {
+        n: p.name for t in model.terms for p, n in zip(t.effect.parameters, t.names, strict=True)
+    }
     return _LIMITS.get(declared.get(name, name))
 
 
@@ -281,7 +382,9 @@ def convergence(
     for i, joint in enumerate(joints):
         model = start_of(joint)
         with tempfile.TemporaryDirectory(prefix="irj-cosim-") as folder:
-            rows += cosimulate(joint, model, make_pair(joint, model, Path(folder), cc=cc), setting).rows
+            rows += cosimulate(
+                joint, model, make_pair(joint, model, Path(folder), cc=cc), setting
+            ).rows
         if progress is not None:
             progress(i + 1, len(joints))
     return rows
@@ -289,39 +392,79 @@ def convergence(
 
 def table(rows: Sequence[Row]) -> str:
     """The rows as text."""
-    lines = [f"{'joint':12s} {'parameter':40s} {'unit':12s} {'plant':>12s} {'estimate':>12s} {'error %':>9s} {'limit %':>8s}"]
+    lines = [
+        f"{'joint':12s} {'parameter':40s} {'unit':12s} {'plant':>12s} {'estimate':>12s} "
+        f"{'error %':>9s} {'limit %':>8s}"
+    ]
     for r in rows:
         limit = f"{r.limit:8.0f}" if r.limit is not None else "       -"
         mark = "" if r.passed else "  over"
-        lines.append(f"{r.joint:12s} {r.name:40s} {r.unit:12s} {r.plant:12.6g} {r.estimate:12.6g} {r.error:9.3f} {limit}{mark}")
+        lines.append(
+            f"{r.joint:12s} {r.name:40s} {r.unit:12s} {r.plant:12.6g} {r.estimate:12.6g} "
+            f"{r.error:9.3f} {limit}{mark}"
+        )
     return "\n".join(lines)
 
 
 def main(argv: Sequence[str]) -> int:
-    """``irj cosim``: print the table of convergence; 0 where every limit holds, 1 where not, 2 on unusable input."""
-    parser = OneLineParser(prog="irj cosim", description="Co-simulate plants and estimators and compare.")
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"reference joints: {', '.join(NAMES)} (default: all)")
-    parser.add_argument("--joint", action="append", default=[], type=Path, help="a fitted joint file as a plant")
-    parser.add_argument("--published", nargs=2, action="append", default=[], metavar=("FILE", "KEY"), help="a row of a table of published friction parameters")
+    """``irj cosim``: print the table of convergence; 0 where every limit holds, 1 where not, 2
+    on unusable input.
+    """
+    parser = OneLineParser(
+        prog="irj cosim", description="Co-simulate plants and estimators and compare."
+    )
+    parser.add_argument(
+        "names",
+        nargs="*",
+        metavar="NAME",
+        help=f"reference joints: {', '.join(NAMES)} (default: all)",
+    )
+    parser.add_argument(
+        "--joint", action="append", default=[], type=Path, help="a fitted joint file as a plant"
+    )
+    parser.add_argument(
+        "--published",
+        nargs=2,
+        action="append",
+        default=[],
+        metavar=("FILE", "KEY"),
+        help="a row of a table of published friction parameters",
+    )
     parser.add_argument("--stop", type=float, default=40.0, help="length in s (default: 40)")
     parser.add_argument("--cc", help="C compiler")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the table as JSON")
     arguments = parser.parse_args(argv)
     try:
         if arguments.json is not None:
-            check_output(arguments.json, [*arguments.joint, *(file for file, _ in arguments.published)])
+            check_output(
+                arguments.json, [*arguments.joint, *(file for file, _ in arguments.published)]
+            )
         setting = _setting(arguments.stop)
-        joints = [load_joint(p) for p in arguments.joint] + [published_joint(Path(f), k) for f, k in arguments.published]
+        joints = [load_joint(p) for p in arguments.joint] + [
+            published_joint(Path(f), k) for f, k in arguments.published
+        ]
         names = arguments.names or (() if joints else NAMES)
         joints = [*(reference_joint(n) for n in names), *joints]
         for joint in joints:
             if not joint.fitted:
-                raise InputError(f"{joint.source}: has no fitted values; a plant needs them (run `irj fit` first)")
+                raise InputError(
+                    f"{joint.source}: has no fitted values; a plant needs them (run `irj fit` "
+                    "first)"
+                )
         find_compiler(None, arguments.cc)
         progress_bar(f"0 of {counted(len(joints), 'joint')}", 0.0)
-        rows = convergence(joints, setting, cc=arguments.cc, progress=lambda done, total: progress_bar(f"{done} of {counted(total, 'joint')}", done / total))
+        rows = convergence(
+            joints,
+            setting,
+            cc=arguments.cc,
+            progress=lambda done, total: progress_bar(
+                f"{done} of {counted(total, 'joint')}", done / total
+            ),
+        )
         sys.stdout.write(table(rows) + "\n")
-        content: list[dict[str, Any]] = [{**r.__dict__, "error_percent": r.error, "passed": r.passed} for r in rows]
+        content: list[dict[str, Any]] = [
+            {**r.__dict__, "error_percent": r.error, "passed": r.passed} for r in rows
+        ]
         write_json(arguments.json, {"rows": content})
     except (InputError, FmuError) as error:
         return fail(str(error))
@@ -332,10 +475,24 @@ def _setting(stop: float) -> Setting:
     """A run of this length."""
     setting, first = Setting(stop=stop), OnlineOptions().warm_up
     if not (math.isfinite(stop) and first < stop <= 1e5):
-        raise InputError(f"--stop {stop:g}: the estimator's first window takes {first:g} s; give a longer time in s, as 40")
+        raise InputError(
+            f"--stop {stop:g}: the estimator's first window takes {first:g} s; give a longer "
+            "time in s, as 40"
+        )
     if abs(round(stop / setting.step) * setting.step - stop) > 1e-6 * setting.step:
-        raise InputError(f"--stop {stop!r}: is not a whole number of steps of {setting.step:g} s; give as many")
+        raise InputError(
+            f"--stop {stop!r}: is not a whole number of steps of {setting.step:g} s; give as many"
+        )
     return setting
 
 
-__all__ = ["Cosimulation", "Row", "Setting", "convergence", "cosimulate", "main", "make_pair", "table"]
+__all__ = [
+    "Cosimulation",
+    "Row",
+    "Setting",
+    "convergence",
+    "cosimulate",
+    "main",
+    "make_pair",
+    "table",
+]

@@ -1,8 +1,9 @@
 """Does the estimator find every effect of the library? ``python -m irj_fmu.effect_table``.
 
-For each effect and each place of it: a plant FMU of a harmonic-drive joint with that effect at typical size follows
-its motion for 40 s; the estimator, which knows the shapes of the laws and nothing that it estimates, gets the readings.
-Once as the Python estimator runs it, and once as the native FMU.
+For each effect and each place of it: a plant FMU of a harmonic-drive joint with that effect at
+typical size follows its motion for 40 s; the estimator, which knows the shapes of the laws and
+nothing that it estimates, gets the readings. Once as the Python estimator runs it, and once as the
+native FMU.
 """
 
 from __future__ import annotations
@@ -18,20 +19,19 @@ import numpy as np
 import numpy.typing as npt
 
 from casadi_models import EFFECTS, load_library
+from identification.data.joint_file import Joint
+from identification.data.typical import true_values
 from identification.errors import InputError
-from identification.joint_file import Joint
-from identification.typical import true_values
-
-from .command_line import OneLineParser, check_output, fail, run_alone, write_json
-from .convergence import NOISE, STEP, STOP
-from .cosim import CHANNELS, link_referred, start_state
-from .host import Fmu, Instance
-from .identifiable import identifiable
-from .joint_plant import PlantOptions, plant_spec
-from .native import NativeSpec, build_native
-from .online import OnlineEstimator, OnlineOptions, estimated_parameters
-from .plant import build_plant
-from .reference import Motion, reference_joint, start_of
+from identification.online.estimator import OnlineEstimator, OnlineOptions, estimated_parameters
+from identification.online.identifiable import identifiable
+from irj_fmu.command_line import OneLineParser, check_output, fail, run_alone, write_json
+from irj_fmu.convergence import NOISE, STEP, STOP
+from irj_fmu.cosim import CHANNELS, link_referred, start_state
+from irj_fmu.estimator.native import NativeSpec, build_native
+from irj_fmu.host.run import Fmu, Instance
+from irj_fmu.plant.joint import PlantOptions, plant_spec
+from irj_fmu.plant.library import build_plant
+from irj_fmu.plant.reference import Motion, reference_joint, start_of
 
 FloatArray = npt.NDArray[np.float64]
 Side = Literal["python", "native"]
@@ -101,10 +101,14 @@ def labels() -> tuple[str, ...]:
 
 
 def joint_with(label: str) -> Joint:
-    """A harmonic-drive joint with viscous and Coulomb friction and gravity, and this effect at typical size."""
+    """A harmonic-drive joint with viscous and Coulomb friction and gravity, and this effect at
+    typical size.
+    """
     base = reference_joint("hd3")
     base = replace(base, effects=tuple(e for e in base.effects if "stribeck" not in e))
-    base = replace(base, fitted={n: v for n, v in base.fitted.items() if n in base.model().parameter_names})
+    base = replace(
+        base, fitted={n: v for n, v in base.fitted.items() if n in base.model().parameter_names}
+    )
     try:
         model = base.model().add(label)
     except (KeyError, ValueError):
@@ -115,16 +119,22 @@ def joint_with(label: str) -> Joint:
 
 
 def readings_of(joint: Joint, motion: Motion | None = None) -> FloatArray:
-    """Drive, positions, velocities and torque that the plant FMU reads in closed loop, link-referred, without noise, (samples, 6)."""
+    """Drive, positions, velocities and torque that the plant FMU reads in closed loop,
+    link-referred, without noise, (samples, 6).
+    """
     motion = motion or Motion()
     count = round(STOP / STEP) + 1
     table = np.empty((count, 6))
     drive = "motor_current" if joint.torque_per_current is not None else "motor_torque"
     with tempfile.TemporaryDirectory(prefix="irj-effects-") as folder:
-        spec = plant_spec(joint, PlantOptions(controller=True, motion=motion, sensors=True, name="plant"))
+        spec = plant_spec(
+            joint, PlantOptions(controller=True, motion=motion, sensors=True, name="plant")
+        )
         path = build_plant(spec, Path(folder) / "plant.fmu")
         with Fmu(path) as fmu, Instance(fmu, name="plant") as instance:
-            instance.begin(0.0, {k.removeprefix("plant."): v for k, v in start_state(joint, motion).items()})
+            instance.begin(
+                0.0, {k.removeprefix("plant."): v for k, v in start_state(joint, motion).items()}
+            )
             instance.ready()
             references = [fmu.variables[c].valueReference for c in (drive, *CHANNELS.values())]
             for k in range(count):
@@ -176,37 +186,69 @@ def run(label: str, seeds: Sequence[int | None], sides: Sequence[Side]) -> Itera
     plant = np.array([true[n] for n in names])
     for seed in seeds:
         noise = np.abs(np.array(NOISE) * link_referred(joint)) * (seed is not None)
-        readings = clean if seed is None else clean + np.random.default_rng(seed).normal(size=clean.shape) * noise
+        readings = (
+            clean
+            if seed is None
+            else clean + np.random.default_rng(seed).normal(size=clean.shape) * noise
+        )
         shown = identifiable(joint, clean, noise, STEP)
         for side in sides:
             theta, sigma = (by_python if side == "python" else by_native)(known, readings)
             seen = plant + shown.seen(theta - plant)
             for i, name in enumerate(names):
-                yield EffectRow(label, side, seed, name, units[name], plant[i], float(seen[i]), float(sigma[i]), not shown.alone(i))
+                yield EffectRow(
+                    label,
+                    side,
+                    seed=seed,
+                    name=name,
+                    unit=units[name],
+                    plant=plant[i],
+                    estimate=float(seen[i]),
+                    sigma=float(sigma[i]),
+                    combined=not shown.alone(i),
+                )
 
 
 HEAD: Final = (
-    "| effect | noise | estimator | farthest parameter | error % | sigmas | not determined alone | |\n"
+    "| effect | noise | estimator | farthest parameter | error % | sigmas | not determined alone "
+    "| |\n"
     "|---|---|---|---|---|---|---|---|\n"
 )
 
 
 def line(rows: Sequence[EffectRow]) -> str:
-    """The rows of one run as a line of a Markdown table: the parameter that is farthest beyond its limit."""
+    """The rows of one run as a line of a Markdown table: the parameter that is farthest beyond
+    its limit.
+    """
     far = max(rows, key=lambda r: min(r.error / LIMIT, r.sigmas / SIGMAS))
     alone = ", ".join(r.name for r in rows if r.combined) or "-"
     mark = "" if all(r.passed for r in rows) else "over"
     noise = "-" if far.seed is None else f"seed {far.seed}"
-    return f"| {far.effect} | {noise} | {far.side} | {far.name} | {far.error:.2f} | {far.sigmas:.1f} | {alone} | {mark} |\n"
+    return (
+        f"| {far.effect} | {noise} | {far.side} | {far.name} | {far.error:.2f} | "
+        f"{far.sigmas:.1f} | {alone} | {mark} |\n"
+    )
 
 
 def main(argv: Sequence[str]) -> int:
     """Print the table; 0 where every parameter is found, 1 where not, 2 on unusable input."""
-    parser = OneLineParser(prog="python -m irj_fmu.effect_table", description="Estimators against plants with every effect of the library.")
-    parser.add_argument("labels", nargs="*", metavar="EFFECT@PLACE", help="effects (default: every effect at every place)")
-    parser.add_argument("--seeds", nargs="*", type=int, default=[1], help="seeds of the sensor noise (default: 1)")
+    parser = OneLineParser(
+        prog="python -m irj_fmu.effect_table",
+        description="Estimators against plants with every effect of the library.",
+    )
+    parser.add_argument(
+        "labels",
+        nargs="*",
+        metavar="EFFECT@PLACE",
+        help="effects (default: every effect at every place)",
+    )
+    parser.add_argument(
+        "--seeds", nargs="*", type=int, default=[1], help="seeds of the sensor noise (default: 1)"
+    )
     parser.add_argument("--native", action="store_true", help="the native FMU, too")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write every parameter of every run as JSON")
+    parser.add_argument(
+        "--json", type=Path, metavar="FILE", help="write every parameter of every run as JSON"
+    )
     arguments = parser.parse_args(argv)
     try:
         if arguments.json is not None:
@@ -228,9 +270,15 @@ def main(argv: Sequence[str]) -> int:
                 sys.stdout.write(line(part))
                 sys.stdout.flush()
         honest = sum(r.honest or r.error <= 1e-2 for r in every)
-        sys.stdout.write(f"\n{sum(runs)} of {len(runs)} runs with every parameter found; {honest} of {len(every)} errors under three sigmas.\n")
+        sys.stdout.write(
+            f"\n{sum(runs)} of {len(runs)} runs with every parameter found; {honest} of "
+            f"{len(every)} errors under three sigmas.\n"
+        )
         if arguments.json is not None:
-            content: list[dict[str, Any]] = [{**r.__dict__, "error_percent": r.error, "sigmas": r.sigmas, "passed": r.passed} for r in every]
+            content: list[dict[str, Any]] = [
+                {**r.__dict__, "error_percent": r.error, "sigmas": r.sigmas, "passed": r.passed}
+                for r in every
+            ]
             write_json(arguments.json, {"rows": content})
     except InputError as error:
         return fail(str(error))

@@ -5,7 +5,9 @@ from collections.abc import Iterator
 
 import pytest
 
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # pytest was started in the background: Ctrl-C would not reach the programs that tests start
+if (
+    signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+):  # pytest was started in the background: Ctrl-C would not reach the programs that tests start
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
@@ -13,5 +15,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # pytest was started in t
 def _allowed_effects(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """What tests allow to run is noted in a file of their own."""
     with pytest.MonkeyPatch.context() as patched:
-        patched.setenv("IRJ_ALLOWED_EFFECTS", str(tmp_path_factory.mktemp("state") / "allowed-effects.txt"))
+        patched.setenv(
+            "IRJ_ALLOWED_EFFECTS", str(tmp_path_factory.mktemp("state") / "allowed-effects.txt")
+        )
         yield

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from fmu_toy_helper import SCALE
 
-from irj_fmu.slave_base import TableSlave
-from irj_fmu.variables import Value, Variable
+from irj_fmu.fmi.slave_base import TableSlave
+from irj_fmu.fmi.variables import Value, Variable
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,14 @@ class ToySlave(TableSlave):
         Variable("u", "A", 0.7, causality="input"),
         Variable("y", "N.m", 1.9, causality="input"),
         Variable("fail", start=False, causality="input", kind="boolean"),
-        Variable("forgetting", start=0.999, minimum=0.5, maximum=1.0, causality="parameter", variability="tunable"),
+        Variable(
+            "forgetting",
+            start=0.999,
+            minimum=0.5,
+            maximum=1.0,
+            causality="parameter",
+            variability="tunable",
+        ),
         Variable("theta[1]", "N.m/A", causality="output"),
         Variable("theta[2]", "N.m", causality="output"),
         Variable("scale", start=0.0, causality="output"),
@@ -53,8 +60,14 @@ class ToySlave(TableSlave):
         h = np.array([float(inputs["u"]), 1.0])
         gain = self.covariance @ h / (self.gains.forgetting + h @ self.covariance @ h)
         self.theta = self.theta + gain * (float(inputs["y"]) - h @ self.theta)
-        self.covariance = (self.covariance - np.outer(gain, h @ self.covariance)) / self.gains.forgetting
-        return {"theta[1]": self.theta[0], "theta[2]": self.theta[1], "scale": SCALE + scale_again()}
+        self.covariance = (
+            self.covariance - np.outer(gain, h @ self.covariance)
+        ) / self.gains.forgetting
+        return {
+            "theta[1]": self.theta[0],
+            "theta[2]": self.theta[1],
+            "scale": SCALE + scale_again(),
+        }
 
     def get_state(self) -> bytes:
         return np.concatenate([self.theta, self.covariance.ravel()]).tobytes()

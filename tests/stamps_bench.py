@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from identification import Joint, Record, improve, load_joint, read
-from identification.check import gate
+from identification.data.check.checks import gate
 from tests.hidden_effect.generator import generate_case
 
 EFFECTS = ("stribeck", None, "kinematic_error", "load_dependent_friction")
@@ -26,7 +26,9 @@ RECORDS = ("train", "train2", "test", "test2")
 
 def kept(record: Record, rows: npt.NDArray[np.int64], stamps: npt.NDArray[np.float64]) -> Record:
     """What a logger would have written: some rows, with other stamps."""
-    return Record.from_channels(stamps, {c: v[rows] for c, v in record.channels.items()}, name=record.name)
+    return Record.from_channels(
+        stamps, {c: v[rows] for c, v in record.channels.items()}, name=record.name
+    )
 
 
 def lost(share: float, burst: int = 1) -> Callable[[Record, int], Record]:
@@ -97,17 +99,29 @@ DAMAGES: dict[str, Callable[[Record, int], Record]] = {
 }
 
 
-def answer(records: dict[str, Record], joint: Joint) -> tuple[str, tuple[str, ...], float, float, list[str]]:
-    """Verdict, claimed names, final held-out error [%], inertia of the link and what the gate warns of."""
+def answer(
+    records: dict[str, Record], joint: Joint
+) -> tuple[str, tuple[str, ...], float, float, list[str]]:
+    """Verdict, claimed names, final held-out error [%], inertia of the link and what the gate
+    warns of.
+    """
     checked, warned = {}, []
     for name, record in records.items():
-        checked[name], findings = gate(record, joint.gear_ratio, torque_per_current=joint.torque_per_current)
+        checked[name], findings = gate(
+            record, joint.gear_ratio, torque_per_current=joint.torque_per_current
+        )
         warned += [f.code for f in findings if f.severity == "warn"]
     held = [checked[n] for n in records if n.startswith("test")]
     found = improve([checked[n] for n in records if n.startswith("train")], joint, held)
     last = found.steps[-1]
     names = tuple(c.effects[0] for c in found.claims)
-    return found.verdict, names, last.held_out.relative_error_percent, last.solution.values["link_inertia"], warned
+    return (
+        found.verdict,
+        names,
+        last.held_out.relative_error_percent,
+        last.solution.values["link_inertia"],
+        warned,
+    )
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -119,7 +133,10 @@ def main(argv: list[str] | None = None) -> int:
     options = parser.parse_args(argv)
     chosen = options.damages.split(",") if options.damages else list(DAMAGES)
     write = sys.stdout.write
-    write("| joint | damage | verdict | named | held-out error % | link inertia off by % | warned | seconds |\n|---|---|---|---|---|---|---|---|\n")
+    write(
+        "| joint | damage | verdict | named | held-out error % | link inertia off by % | warned "
+        "| seconds |\n|---|---|---|---|---|---|---|---|\n"
+    )
     with tempfile.TemporaryDirectory() as folder:
         for number in range(options.joints):
             effect = EFFECTS[number % len(EFFECTS)]
@@ -129,16 +146,22 @@ def main(argv: list[str] | None = None) -> int:
             whole_inertia = None
             for name in chosen:
                 began = time.perf_counter()
-                damaged = {n: DAMAGES[name](r, 17 * i + number) for i, (n, r) in enumerate(whole.items())}
+                damaged = {
+                    n: DAMAGES[name](r, 17 * i + number) for i, (n, r) in enumerate(whole.items())
+                }
                 try:
                     verdict, names, error, inertia, warned = answer(damaged, joint)
                 except Exception as problem:  # a refusal is a row of the table
-                    write(f"| {effect} {options.start + number} | {name} | {type(problem).__name__}: {str(problem)[:80]} | | | | | |\n")
+                    write(
+                        f"| {effect} {options.start + number} | {name} | "
+                        f"{type(problem).__name__}: {str(problem)[:80]} | | | | | |\n"
+                    )
                     continue
                 whole_inertia = inertia if whole_inertia is None else whole_inertia
                 off = 100 * (inertia / whole_inertia - 1)
                 write(
-                    f"| {effect} {options.start + number} | {name} | {verdict} | {', '.join(names)} | {error:.3f} | {off:.3f} "
+                    f"| {effect} {options.start + number} | {name} | {verdict} | "
+                    f"{', '.join(names)} | {error:.3f} | {off:.3f} "
                     f"| {', '.join(warned)} | {time.perf_counter() - began:.1f} |\n"
                 )
                 sys.stdout.flush()

@@ -19,12 +19,27 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 LAYERS = ("casadi_models", "identification", "irj_fmu", "workbench")
 LIBRARIES = LAYERS[:3]
-HEAVY = ("control", "matplotlib", "scipy.signal", "fmpy", "h5py", "pyarrow", "asammdf", "pandas", "starlette", "uvicorn")
+HEAVY = (
+    "control",
+    "matplotlib",
+    "scipy.signal",
+    "fmpy",
+    "h5py",
+    "pyarrow",
+    "asammdf",
+    "pandas",
+    "starlette",
+    "uvicorn",
+)
 
 
 @cache
 def trees() -> dict[Path, ast.Module]:
-    return {f: ast.parse(f.read_text(encoding="utf-8")) for layer in LAYERS for f in sorted((ROOT / layer).rglob("*.py"))}
+    return {
+        f: ast.parse(f.read_text(encoding="utf-8"))
+        for layer in LAYERS
+        for f in sorted((ROOT / layer).rglob("*.py"))
+    }
 
 
 def layer_of(path: Path) -> str:
@@ -54,9 +69,11 @@ def test_physics_imports_casadi_and_numpy_only() -> None:
     allowed = {"casadi", "numpy", "casadi_models", "control", *sys.stdlib_module_names}
     wrong = [
         f"{path.relative_to(ROOT)}:{line} {name}"
-        for path, tree in trees().items() if layer_of(path) == "casadi_models"
-        for line, name in imported(tree) if name.partition(".")[0] not in allowed
-    ]  # fmt: skip
+        for path, tree in trees().items()
+        if layer_of(path) == "casadi_models"
+        for line, name in imported(tree)
+        if name.partition(".")[0] not in allowed
+    ]
     assert wrong == []  # control: inside linearize, whose result is a control.StateSpace
 
 
@@ -65,18 +82,27 @@ def test_no_bare_except_star_import_print_or_mutable_default() -> None:
     for path, tree in trees().items():
         for node in ast.walk(tree):
             bare = isinstance(node, ast.ExceptHandler) and node.type is None
-            star = isinstance(node, ast.ImportFrom) and any(alias.name == "*" for alias in node.names)
+            star = isinstance(node, ast.ImportFrom) and any(
+                alias.name == "*" for alias in node.names
+            )
             printed = (
-                layer_of(path) in LIBRARIES and isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print"
-            )  # fmt: skip
-            mutable = isinstance(node, ast.FunctionDef) and any(isinstance(d, ast.List | ast.Dict | ast.Set) for d in node.args.defaults)
+                layer_of(path) in LIBRARIES
+                and isinstance(node, ast.Call)
+                and isinstance(node.func, ast.Name)
+                and node.func.id == "print"
+            )
+            mutable = isinstance(node, ast.FunctionDef) and any(
+                isinstance(d, ast.List | ast.Dict | ast.Set) for d in node.args.defaults
+            )
             if bare or star or printed or mutable:
                 wrong.append(f"{path.relative_to(ROOT)}:{getattr(node, 'lineno', 0)}")
     assert wrong == []
 
 
 def _strings(node: ast.AST) -> Iterator[str]:
-    """String constants of an expression and of the tuples and sets inside it; what a call is asked by is no part of it."""
+    """String constants of an expression and of the tuples and sets inside it; what a call is
+    asked by is no part of it.
+    """
     if isinstance(node, ast.Constant) and isinstance(node.value, str):
         yield node.value
     elif not isinstance(node, ast.Call):
@@ -85,15 +111,23 @@ def _strings(node: ast.AST) -> Iterator[str]:
 
 
 def _tested(tree: ast.Module) -> Iterator[tuple[int, str]]:
-    """Strings that decide something: compared, matched, members of a set, or asked of a name's ends."""
+    """Strings that decide something: compared, matched, members of a set, or asked of a name's
+    ends.
+    """
     for node in ast.walk(tree):
         found: list[ast.AST] = []
         if isinstance(node, ast.Compare):
-            found = [side for side in (node.left, *node.comparators) if isinstance(side, ast.Constant | ast.Tuple | ast.List | ast.Set)]
+            found = [
+                side
+                for side in (node.left, *node.comparators)
+                if isinstance(side, ast.Constant | ast.Tuple | ast.List | ast.Set)
+            ]
         elif isinstance(node, ast.MatchValue | ast.Set):
             found = [node]
         elif isinstance(node, ast.Call):
-            name = node.func.id if isinstance(node.func, ast.Name) else getattr(node.func, "attr", "")
+            name = (
+                node.func.id if isinstance(node.func, ast.Name) else getattr(node.func, "attr", "")
+            )
             found = list(node.args) if name in ("frozenset", "set", "has") else []
         yield from ((node.lineno, word) for part in found for word in _strings(part))
 
@@ -101,7 +135,11 @@ def _tested(tree: ast.Module) -> Iterator[tuple[int, str]]:
 def _cut(tree: ast.Module) -> Iterator[tuple[int, str]]:
     """Strings by which the end or the beginning of a name is told."""
     for node in ast.walk(tree):
-        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in ("endswith", "startswith", "removesuffix", "removeprefix"):
+        if (
+            isinstance(node, ast.Call)
+            and isinstance(node.func, ast.Attribute)
+            and node.func.attr in ("endswith", "startswith", "removesuffix", "removeprefix")
+        ):
             yield from ((node.lineno, word) for part in node.args for word in _strings(part))
 
 
@@ -113,7 +151,12 @@ def test_no_effect_key_decides_anything_outside_the_declarations() -> None:
     from casadi_models import EFFECTS
 
     labels = {f"{k}@{p}" for k, e in EFFECTS.items() for p in e.acts_on} | set(EFFECTS)
-    wrong = [f"{path.relative_to(ROOT)}:{line} {word!r}" for path, tree in _above_physics() for line, word in _tested(tree) if word in labels]
+    wrong = [
+        f"{path.relative_to(ROOT)}:{line} {word!r}"
+        for path, tree in _above_physics()
+        for line, word in _tested(tree)
+        if word in labels
+    ]
     assert wrong == []
 
 
@@ -121,9 +164,20 @@ def test_no_parameter_name_or_ending_decides_anything_outside_the_declarations()
     from casadi_models import EFFECTS, Signals
     from casadi_models.term import INERTIAS, LOAD_COMPLIANCE, SWINGING_SHARE, smoothing
 
-    own = {*INERTIAS, LOAD_COMPLIANCE.name, SWINGING_SHARE.name, smoothing("motor").name, smoothing("link").name}
+    own = {
+        *INERTIAS,
+        LOAD_COMPLIANCE.name,
+        SWINGING_SHARE.name,
+        smoothing("motor").name,
+        smoothing("link").name,
+    }
     names = own | {n for e in EFFECTS.values() for p in e.acts_on for n in e.parameter_names(p)}
-    wrong = [f"{path.relative_to(ROOT)}:{line} {word!r}" for path, tree in _above_physics() for line, word in _tested(tree) if word in names]
+    wrong = [
+        f"{path.relative_to(ROOT)}:{line} {word!r}"
+        for path, tree in _above_physics()
+        for line, word in _tested(tree)
+        if word in names
+    ]
     for path, tree in _above_physics():
         for line, word in _cut(tree):
             if any(x.endswith(word) or x.startswith(word) for x in Signals.names()):
@@ -142,42 +196,69 @@ def f(t, n, model):
     return "stiffness" in n
 """
     tree = ast.parse(bad)
-    assert {w for _, w in _tested(tree)} == {"flexible_mode", "coulomb", "stribeck", "lugre", "gravity", "stiffness"}
+    assert {w for _, w in _tested(tree)} == {
+        "flexible_mode",
+        "coulomb",
+        "stribeck",
+        "lugre",
+        "gravity",
+        "stiffness",
+    }
     assert [w for _, w in _cut(tree)] == ["_smoothing_velocity"]
 
 
-@pytest.mark.parametrize("tool", [("ruff", "check", "--no-cache", "."), ("lint-imports", "--no-cache")], ids=["ruff", "import-linter"])
+@pytest.mark.parametrize(
+    "tool",
+    [("ruff", "check", "--no-cache", "."), ("lint-imports", "--no-cache")],
+    ids=["ruff", "import-linter"],
+)
 def test_lint(tool: tuple[str, ...]) -> None:
     program = Path(sys.executable).with_name(tool[0])
     if not program.exists():
         pytest.skip(f"{tool[0]} is not installed beside this Python; .ci/run installs it")
-    done = subprocess.run([program, *tool[1:]], cwd=ROOT, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [program, *tool[1:]], cwd=ROOT, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
 
 
 def test_there_is_one_least_squares_solver_and_one_covariance() -> None:
-    """No other bounded solver and no own covariance beside `least_squares` and `covariance` (searches without slopes may be scipy's)."""
+    """No other bounded solver and no own covariance beside `least_squares` and `covariance`
+    (searches without slopes may be scipy's).
+    """
     wrong = []
     for path, tree in trees().items():
         for node in ast.walk(tree):
             if isinstance(node, ast.ImportFrom) and node.module == "scipy.optimize":
-                wrong += [f"{path.relative_to(ROOT)}: {a.name}" for a in node.names if a.name in ("least_squares", "lsq_linear", "leastsq", "curve_fit")]
+                wrong += [
+                    f"{path.relative_to(ROOT)}: {a.name}"
+                    for a in node.names
+                    if a.name in ("least_squares", "lsq_linear", "leastsq", "curve_fit")
+                ]
         if path.name != "covariance.py" and "stdtrit" in path.read_text(encoding="utf-8"):
             wrong.append(f"{path.relative_to(ROOT)}: stdtrit")
     assert wrong == []
 
 
-# --- documentation ---------------------------------------------------------------------------------------------------
+# --- documentation --------------------------------------------------------------------------------
 
 
 def public(tree: ast.Module) -> Iterator[tuple[str, ast.AST]]:
     for node in tree.body:
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) and not node.name.startswith("_"):
+        if isinstance(
+            node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
+        ) and not node.name.startswith("_"):
             yield node.name, node
             if isinstance(node, ast.ClassDef):
                 for inner in node.body:
-                    overload = isinstance(inner, ast.FunctionDef) and any("overload" in ast.dump(d) for d in inner.decorator_list)
-                    if isinstance(inner, ast.FunctionDef) and not inner.name.startswith("_") and not overload:
+                    overload = isinstance(inner, ast.FunctionDef) and any(
+                        "overload" in ast.dump(d) for d in inner.decorator_list
+                    )
+                    if (
+                        isinstance(inner, ast.FunctionDef)
+                        and not inner.name.startswith("_")
+                        and not overload
+                    ):
                         yield f"{node.name}.{inner.name}", inner
 
 
@@ -196,14 +277,26 @@ def test_every_public_name_is_documented() -> None:
 
 CONTRACT = {
     "identification": (
-        "read", "fit", "compare", "diagnose", "improve", "Record", "Fit", "mcs", "moesp", "RecursiveLeastSquares", "TwoStep",
+        "read",
+        "fit",
+        "compare",
+        "diagnose",
+        "improve",
+        "Record",
+        "Fit",
+        "mcs",
+        "moesp",
+        "RecursiveLeastSquares",
+        "TwoStep",
         "FaultDetector",
     ),
     "casadi_models": ("JointModel", "Effect", "Parameter", "effect"),
-}  # fmt: skip
+}
 
 
-@pytest.mark.parametrize(("package", "name"), [(p, n) for p, names in CONTRACT.items() for n in names])
+@pytest.mark.parametrize(
+    ("package", "name"), [(p, n) for p, names in CONTRACT.items() for n in names]
+)
 def test_every_argument_of_a_name_that_others_import_is_documented(package: str, name: str) -> None:
     thing = getattr(importlib.import_module(package), name)
     text = inspect.getdoc(thing) or ""
@@ -214,40 +307,72 @@ def test_every_argument_of_a_name_that_others_import_is_documented(package: str,
     assert missing == []
 
 
-# --- cost of importing -----------------------------------------------------------------------------------------------
+# --- cost of importing ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("module", ["identification", "casadi_models", "workbench.cli"])
+@pytest.mark.parametrize("module", ["identification", "casadi_models", "workbench.cli.main"])
 def test_importing_does_not_pull_heavy_packages(module: str) -> None:
-    code = f"import sys, json, {module}; print(json.dumps([m for m in {HEAVY!r} if m in sys.modules]))"
+    code = (
+        f"import sys, json, {module}; print(json.dumps([m for m in {HEAVY!r} if m in sys.modules]))"
+    )
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment
+    )
     assert json.loads(done.stdout) == []
 
 
 def test_importing_loads_no_optimiser_that_the_verbs_do_not_call() -> None:
-    rare = ("_mcs_search", "blackbox", "_prediction_error", "subspace", "recursive", "two_step", "fault", "output_error", "_compiler")
-    code = "import sys, json, identification; print(json.dumps([m for m in sys.modules if m.startswith(('identification.', 'scipy'))]))"
+    rare = (
+        "_mcs_search",
+        "blackbox",
+        "_prediction_error",
+        "subspace",
+        "recursive",
+        "two_step",
+        "fault",
+        "output_error",
+        "_compiler",
+    )
+    code = (
+        "import sys, json, identification; print(json.dumps([m for m in sys.modules if "
+        "m.startswith(('identification.', 'scipy'))]))"
+    )
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment
+    )
     loaded = json.loads(done.stdout)
-    assert [m for m in loaded if m.removeprefix("identification.") in rare or m == "scipy.optimize"] == []
-    assert "identification.fit" in loaded
+    assert [
+        m for m in loaded if m.removeprefix("identification.") in rare or m == "scipy.optimize"
+    ] == []
+    assert "identification.fitting.fit" in loaded
 
 
 def _hidden(file: Path) -> bool:
-    return any(part.startswith(".") or part == "__pycache__" for part in file.relative_to(ROOT).parts)
+    return any(
+        part.startswith(".") or part == "__pycache__" for part in file.relative_to(ROOT).parts
+    )
 
 
 def test_package_data_is_declared() -> None:
-    """What is not Python inside a package must be named in pyproject.toml, or an installed copy lacks it."""
+    """What is not Python inside a package must be named in pyproject.toml, or an installed copy
+    lacks it.
+    """
     import tomllib
 
-    declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"][
+        "package-data"
+    ]
     missing = []
     for layer in LAYERS:
         globbed = {f for pattern in declared.get(layer, []) for f in (ROOT / layer).glob(pattern)}
         for file in (ROOT / layer).rglob("*"):
-            if file.is_file() and file.suffix not in (".py", ".pyc") and not _hidden(file) and file not in globbed:
+            if (
+                file.is_file()
+                and file.suffix not in (".py", ".pyc")
+                and not _hidden(file)
+                and file not in globbed
+            ):
                 missing.append(str(file.relative_to(ROOT)))
     assert missing == []

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from casadi_models import EFFECTS
-from workbench.cli import _parser, main
+from workbench.cli.main import _parser, main
 
 ROOT = Path(__file__).resolve().parents[1]
 DEMO = Path(str(files("workbench"))) / "demo"
@@ -29,11 +29,20 @@ def run(*arguments: str) -> str:
 
 @cache
 def demo_output() -> str:
-    return run("improve", str(DEMO / "train.npz"), "--held-out", str(DEMO / "held_out.npz"), "--joint", str(DEMO / "joint.toml"))
+    return run(
+        "improve",
+        str(DEMO / "train.npz"),
+        "--held-out",
+        str(DEMO / "held_out.npz"),
+        "--joint",
+        str(DEMO / "joint.toml"),
+    )
 
 
 def same(shown: str, printed: str) -> bool:
-    """Equal words, and numbers that agree to 3 %: another machine's linear algebra moves the last digit."""
+    """Equal words, and numbers that agree to 3 %: another machine's linear algebra moves the
+    last digit.
+    """
     if NUMBER.sub("#", shown).split() != NUMBER.sub("#", printed).split():
         return False
     pairs = zip(map(float, NUMBER.findall(shown)), map(float, NUMBER.findall(printed)), strict=True)
@@ -53,18 +62,37 @@ def test_ledger_of_the_demo_is_what_it_prints(page: str) -> None:
 
 def test_figures_of_the_guide_are_what_fit_compare_and_diagnose_print() -> None:
     guide = " ".join((ROOT / "docs" / "guide.md").read_text(encoding="utf-8").split())
-    train, held_out, joint = str(DEMO / "train.npz"), str(DEMO / "held_out.npz"), str(DEMO / "joint.toml")
+    train, held_out, joint = (
+        str(DEMO / "train.npz"),
+        str(DEMO / "held_out.npz"),
+        str(DEMO / "joint.toml"),
+    )
     fitted = run("fit", train, "--joint", joint)
-    values = {name: float(value) for name, value in re.findall(r"^  (\w+) +(\S+) \+- \S+ ", fitted, re.MULTILINE) if name != "value"}
-    coulomb, viscous = re.findall(r"comes out at (\S+) Nm and the viscous coefficient at (\S+) Nms/rad", guide)[0]
+    values = {
+        name: float(value)
+        for name, value in re.findall(r"^  (\w+) +(\S+) \+- \S+ ", fitted, re.MULTILINE)
+        if name != "value"
+    }
+    coulomb, viscous = re.findall(
+        r"comes out at (\S+) Nm and the viscous coefficient at (\S+) Nms/rad", guide
+    )[0]
     assert values["motor_coulomb"] == pytest.approx(float(coulomb), rel=0.03)
     assert values["motor_viscous"] == pytest.approx(float(viscous), rel=0.03)
     compared = run("compare", held_out, "--fit", train, "--joint", joint)
-    times, share = re.findall(r"fails: (\S+) times the noise floor .* and (\d+) % of what is left depends on the velocity", guide)[0]
-    assert float(re.findall(r"motor (\S+) times its floor", compared)[0]) == pytest.approx(float(times), rel=0.03)
-    assert float(re.findall(r"motor balance against velocity: explains (\d+) %", compared)[0]) == pytest.approx(float(share), abs=2)
+    times, share = re.findall(
+        r"fails: (\S+) times the noise floor .* and (\d+) % of what is left depends on the velocity",
+        guide,
+    )[0]
+    assert float(re.findall(r"motor (\S+) times its floor", compared)[0]) == pytest.approx(
+        float(times), rel=0.03
+    )
+    assert float(
+        re.findall(r"motor balance against velocity: explains (\d+) %", compared)[0]
+    ) == pytest.approx(float(share), abs=2)
     ranked = run("diagnose", train, "--held-out", held_out, "--joint", joint)
-    first, second = re.findall(r"takes (\d+) % off the residual of the motor balance, the second (\d+) %", guide)[0]
+    first, second = re.findall(
+        r"takes (\d+) % off the residual of the motor balance, the second (\d+) %", guide
+    )[0]
     drops = [float(d) for d in re.findall(r"^\d\. .*-(\d+) % in the motor", ranked, re.MULTILINE)]
     assert drops[:2] == pytest.approx([float(first), float(second)], abs=2)
 
@@ -77,10 +105,18 @@ def test_picture_is_what_the_demo_draws(tmp_path: Path) -> None:
     assert len(kept) < 40_000
 
 
-def test_python_example_of_the_readme_runs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+def test_python_example_of_the_readme_runs(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (code,) = re.findall(
+        r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL
+    )
     assert len([line for line in code.splitlines() if line.strip()]) <= 9
-    for shown, real in (("axis3.toml", "joint.toml"), ("run1.csv", "train.npz"), ("run2.csv", "held_out.npz")):
+    for shown, real in (
+        ("axis3.toml", "joint.toml"),
+        ("run1.csv", "train.npz"),
+        ("run2.csv", "held_out.npz"),
+    ):
         code = code.replace(shown, real)
     monkeypatch.chdir(DEMO)
     exec(compile(code, "README.md", "exec"), {})  # the user's own page, not somebody's input
@@ -96,7 +132,9 @@ def commands(page: Path) -> list[list[str]]:
     return [shlex.split(line)[1:] for line in lines if not line.startswith("irj:")]
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/guide.md", "docs/choose-a-model.md", "docs/extending.md"])
+@pytest.mark.parametrize(
+    "page", ["README.md", "docs/guide.md", "docs/choose-a-model.md", "docs/extending.md"]
+)
 def test_every_command_shown_is_one_that_exists(page: str) -> None:
     for arguments in commands(ROOT / page):
         _, rest = _parser().parse_known_args(arguments)
@@ -117,12 +155,23 @@ def test_every_effect_of_the_extending_page_loads(tmp_path: Path) -> None:
         record = tmp_path / "r.npz"
         again = ["--set", "motor_seal_drag=10", "--seconds", "2", "-o", str(record)]
         EFFECTS._effects.pop("seal_drag")
-        run("--effects", str(path), "simulate", "--joint", str(DEMO / "joint.toml"), "--hide", "seal_drag", *again)
+        run(
+            "--effects",
+            str(path),
+            "simulate",
+            "--joint",
+            str(DEMO / "joint.toml"),
+            "--hide",
+            "seal_drag",
+            *again,
+        )
     finally:
         EFFECTS._effects.pop("seal_drag", None)
 
 
-@pytest.mark.parametrize("page", sorted(p.name for p in (ROOT / "docs").glob("*.md")) + ["../README.md"])
+@pytest.mark.parametrize(
+    "page", sorted(p.name for p in (ROOT / "docs").glob("*.md")) + ["../README.md"]
+)
 def test_links_and_pictures_are_there(page: str) -> None:
     path = ROOT / "docs" / page
     for target in re.findall(r"\]\(([^)#]+)\)", path.read_text(encoding="utf-8")):

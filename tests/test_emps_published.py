@@ -1,4 +1,5 @@
-"""The certified case: the published EMPS parameters and errors, by plain least squares on prepared data.
+"""The certified case: the published EMPS parameters and errors, by plain least squares on prepared
+data.
 
 Janot, Gautier, Brunot, "Data set and reference models of EMPS", nonlinearbenchmark.org, 2019.
 """
@@ -12,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from identification.prepare import decimate, drop_ends, filtered, with_derivatives
-from identification.read import read
+from identification.data.prepare import decimate, drop_ends, filtered, with_derivatives
+from identification.data.read import read
 
 FOLDER = Path(__file__).resolve().parents[1].parent / "shared" / "measurements" / "emps"
 FORCE_PER_VOLT = 35.15065188
@@ -23,7 +24,10 @@ COLUMNS = {
     "motor_torque": {"column": "u_V", "scale": FORCE_PER_VOLT, "unit": "N"},
 }
 
-pytestmark = pytest.mark.skipif(not FOLDER.is_dir() and not os.environ.get("CI"), reason="the measurements are not beside the checkout")
+pytestmark = pytest.mark.skipif(
+    not FOLDER.is_dir() and not os.environ.get("CI"),
+    reason="the measurements are not beside the checkout",
+)
 
 Array = npt.NDArray[np.float64]
 
@@ -59,11 +63,15 @@ def test_symmetric_friction() -> None:
 
 def test_symmetric_friction_on_the_record_with_pulses() -> None:
     parameters = estimate(*balance("train.csv", asymmetric=False))
-    assert relative_error(*balance("test_pulses.csv", asymmetric=False), parameters) == pytest.approx(5.9824, abs=0.1)
+    assert relative_error(
+        *balance("test_pulses.csv", asymmetric=False), parameters
+    ) == pytest.approx(5.9824, abs=0.1)
 
 
 def test_asymmetric_friction() -> None:
     regressor, force = balance("train.csv", asymmetric=True)
     parameters = estimate(regressor, force)
-    np.testing.assert_allclose(parameters, [95.1540, 166.7061, 20.1440, 240.4236, 20.6277], rtol=0.01)
+    np.testing.assert_allclose(
+        parameters, [95.1540, 166.7061, 20.1440, 240.4236, 20.6277], rtol=0.01
+    )
     assert relative_error(regressor, force, parameters) == pytest.approx(3.1117, abs=0.1)

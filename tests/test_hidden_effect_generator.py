@@ -1,4 +1,6 @@
-"""The generator of hidden-effect joints: its physics, its sensors, its files, and the scoring of answers."""
+"""The generator of hidden-effect joints: its physics, its sensors, its files, and the scoring
+of answers.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +42,15 @@ def still(rows: int) -> tuple[FloatArray, FloatArray]:
 
 def free_run(changes: dict[str, float], state: list[float], step: float = STEP) -> FloatArray:
     joint = {"JM": 4.4, "JL": 10.3, "TG": -105.0, "K": 2.15e4, "N": 160.0, "NKM": 8.8, **changes}
-    return simulate([pack(joint)], [still(1000)], [np.array(state)], [np.zeros((0, 3))], dt=DT, pre_roll=0.0, step=step)[0]
+    return simulate(
+        [pack(joint)],
+        [still(1000)],
+        [np.array(state)],
+        [np.zeros((0, 3))],
+        dt=DT,
+        pre_roll=0.0,
+        step=step,
+    )[0]
 
 
 def energy(table: FloatArray, k3: float = 0.0) -> FloatArray:
@@ -60,8 +70,17 @@ def test_energy_is_kept_without_friction_and_input(k3: float) -> None:
     assert np.ptp(e) / np.ptp(finer) == pytest.approx(4.0, rel=0.05)  # second order
 
 
-@pytest.mark.parametrize("friction", [{"M_TC": 3.0}, {"M_TC": 3.0, "M_V0": 0.005}, {"M_B": 5.0}, {"C": 30.0},
-                                      {"M_TC": 3.0, "M_MU": 0.05}, {"M_B2": 5.0, "M_B3": 5.0}])  # fmt: skip
+@pytest.mark.parametrize(
+    "friction",
+    [
+        {"M_TC": 3.0},
+        {"M_TC": 3.0, "M_V0": 0.005},
+        {"M_B": 5.0},
+        {"C": 30.0},
+        {"M_TC": 3.0, "M_MU": 0.05},
+        {"M_B2": 5.0, "M_B3": 5.0},
+    ],
+)
 def test_friction_takes_energy(friction: dict[str, float]) -> None:
     e = energy(free_run(friction, [0.31, 0.0, 0.3, 0.0]))  # 1.08 J in the spring
     assert np.max(np.diff(e)) < 1e-4
@@ -81,13 +100,39 @@ def test_numpy_twin_agrees_with_the_compiled_integrator() -> None:
     t = np.arange(60) * DT
     motion = (0.2 * np.sin(20.0 * t) + 0.4, 4.0 * np.cos(20.0 * t))
     hidden: list[dict[str, float]] = [
-        {}, {"M_V0": 0.0, "L_V0": 0.0, "M_TCA": 3.0, "M_MU": 0.1}, {"M_ZS": 2e-3, "M_TS": 9.0, "M_VS": 0.05},
+        {},
+        {"M_V0": 0.0, "L_V0": 0.0, "M_TCA": 3.0, "M_MU": 0.1},
+        {"M_ZS": 2e-3, "M_TS": 9.0, "M_VS": 0.05},
         {"HK1": 5e3, "HS1": 3e-4, "HK3": 900.0, "HS3": 1e-3, "GAP": 1e-4},
         {"WIND": 2e-4, "WIND_X": 4e-4, "LAG_T": 90.0},
-        {"PW_X1": 7e-4, "PW_X2": 2e-3, "PW_D1": 9e3, "PW_D2": 5e3, "COG": 2.0, "COG_O": 4.0, "HEAT": 0.3},
-        {"FLEX": 0.2, "FLEX_F": 11.0, "FLEX_Z": 0.02, "STOP": 90.0, "STOP_X": 0.3, "BUMP": 8.0, "BUMP_X": 0.4},
-        {"KE1": 3e-4, "KE1_O": 2.0, "M_CYC": 3.0, "L_SIN": 4.0, "M_COS": 2.0, "M_KA": 50.0, "LAG_I": 33.0},
-    ]  # fmt: skip
+        {
+            "PW_X1": 7e-4,
+            "PW_X2": 2e-3,
+            "PW_D1": 9e3,
+            "PW_D2": 5e3,
+            "COG": 2.0,
+            "COG_O": 4.0,
+            "HEAT": 0.3,
+        },
+        {
+            "FLEX": 0.2,
+            "FLEX_F": 11.0,
+            "FLEX_Z": 0.02,
+            "STOP": 90.0,
+            "STOP_X": 0.3,
+            "BUMP": 8.0,
+            "BUMP_X": 0.4,
+        },
+        {
+            "KE1": 3e-4,
+            "KE1_O": 2.0,
+            "M_CYC": 3.0,
+            "L_SIN": 4.0,
+            "M_COS": 2.0,
+            "M_KA": 50.0,
+            "LAG_I": 33.0,
+        },
+    ]
     vectors = [pack(draw_joint(rng) | h) for h in hidden]
     n = len(vectors)
     states = [np.array([0.4, 0.0, 0.402, 0.0])] * n
@@ -120,14 +165,29 @@ def test_every_effect_changes_the_recording(effect: str) -> None:
 
 @pytest.mark.parametrize(
     "effect",
-    ["added_spring", "cyclic_torque", "current_offset", "torque_sensor_gain", "torque_sensor_offset", "kinematic_error",
-     "cubic_stiffness", "torque_ripple", "cyclic_friction", "asymmetric_viscous"],
-)  # fmt: skip
+    [
+        "added_spring",
+        "cyclic_torque",
+        "current_offset",
+        "torque_sensor_gain",
+        "torque_sensor_offset",
+        "kinematic_error",
+        "cubic_stiffness",
+        "torque_ripple",
+        "cyclic_friction",
+        "asymmetric_viscous",
+    ],
+)
 def test_change_is_proportional_to_the_size(effect: str) -> None:
     smooth = {"M_V0": 0.005, "L_V0": 0.005}
-    runs = [simulate_case(effect, 4, size=s, overrides=smooth, records=("train2",), span=5.0) for s in (0.0, 0.05, 0.1)]
+    runs = [
+        simulate_case(effect, 4, size=s, overrides=smooth, records=("train2",), span=5.0)
+        for s in (0.0, 0.05, 0.1)
+    ]
     base, half, full = (r.measured["train2"] for r in runs)
-    column = COLUMNS.index("link_torque_Nm" if effect.startswith("torque_sensor") else "motor_current_A")
+    column = COLUMNS.index(
+        "link_torque_Nm" if effect.startswith("torque_sensor") else "motor_current_A"
+    )
     ratio = np.linalg.norm((full - base)[:, column]) / np.linalg.norm((half - base)[:, column])
     assert ratio == pytest.approx(2.0, rel=0.1)
 
@@ -151,11 +211,17 @@ def kernels(length: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     a, h = np.pi / 2.0, 0.5 * (length - 1) * DT
     c, s = np.cos(a * x), np.sin(a * x)
     total = np.sum(c**4)
-    return c**4 / total, -4.0 * a * c**3 * s / h / total, (12.0 * a**2 * c**2 * s**2 - 4.0 * a**2 * c**4) / h**2 / total
+    return (
+        c**4 / total,
+        -4.0 * a * c**3 * s / h / total,
+        (12.0 * a**2 * c**2 * s**2 - 4.0 * a**2 * c**4) / h**2 / total,
+    )
 
 
 def balance_ratios(table: FloatArray, ratio: float, truth: dict[str, float]) -> dict[str, float]:
-    """Residual of the motor, link and transmission balance with the true parameters, over what the noise explains."""
+    """Residual of the motor, link and transmission balance with the true parameters, over what
+    the noise explains.
+    """
     w, d, dd = kernels(31)
     _, i, qm, _, ql, _, t = table.T
     q = qm / ratio
@@ -166,17 +232,33 @@ def balance_ratios(table: FloatArray, ratio: float, truth: dict[str, float]) -> 
     def f(y: FloatArray, k: FloatArray) -> FloatArray:
         return np.convolve(y, k, "valid")
 
-    jm, jl, k = truth["motor_inertia_kg_m2"], truth["link_inertia_kg_m2"], truth["stiffness_Nm_per_rad"]
+    jm, jl, k = (
+        truth["motor_inertia_kg_m2"],
+        truth["link_inertia_kg_m2"],
+        truth["stiffness_Nm_per_rad"],
+    )
     bm, bl, c = (
         truth["motor_viscous_Nms_per_rad"],
         truth["link_viscous_Nms_per_rad"],
         truth["structural_damping_Nms_per_rad"],
     )
     v, vl = f(q, d), f(ql, d)
-    # away from reversals, over the whole window, where the friction does not depend on its smoothing
-    away = np.convolve((np.abs(np.convolve(table[:, 5], np.ones(15) / 15, "same")) < 0.08), np.ones(31), "valid") < 0.5
+    # away from reversals, over the whole window, where the friction does not depend on its
+    # smoothing
+    away = (
+        np.convolve(
+            (np.abs(np.convolve(table[:, 5], np.ones(15) / 15, "same")) < 0.08),
+            np.ones(31),
+            "valid",
+        )
+        < 0.5
+    )
     m = f(ratio * KM * i - t, w) - f(q, jm * dd + bm * d) - truth["motor_coulomb_Nm"] * np.sign(v)
-    li = f(t + truth["gravity_torque_Nm"] * np.sin(ql), w) - f(ql, jl * dd + bl * d) - truth["link_coulomb_Nm"] * np.sign(vl)
+    li = (
+        f(t + truth["gravity_torque_Nm"] * np.sin(ql), w)
+        - f(ql, jl * dd + bl * d)
+        - truth["link_coulomb_Nm"] * np.sign(vl)
+    )
     tr = f(t, w) - f(q - ql, k * w + c * d)
     norm = np.linalg.norm
     expected = {
@@ -205,11 +287,17 @@ def test_shared_recordings_pass_the_same_balances_and_have_like_ranges() -> None
     mine = simulate_case(None, 0).measured
     for name in ("train", "train2", "test", "test2"):
         theirs = np.loadtxt(SHARED / "none" / f"{name}.csv", delimiter=",", skiprows=1)
-        for balance, ratio in balance_ratios(theirs[50:], given["gear_ratio"], given["link_referred"]).items():
+        for balance, ratio in balance_ratios(
+            theirs[50:], given["gear_ratio"], given["link_referred"]
+        ).items():
             assert 0.85 < ratio < 1.15, (name, balance)
         assert theirs.shape == mine[name].shape
-    both = [np.concatenate([np.loadtxt(SHARED / "none" / f"{n}.csv", delimiter=",", skiprows=1) for n in mine]),
-            np.concatenate(list(mine.values()))]  # fmt: skip
+    both = [
+        np.concatenate(
+            [np.loadtxt(SHARED / "none" / f"{n}.csv", delimiter=",", skiprows=1) for n in mine]
+        ),
+        np.concatenate(list(mine.values())),
+    ]
     for column, name in list(enumerate(COLUMNS))[1:]:
         span = [np.sqrt(np.mean(table[:, column] ** 2)) for table in both]
         assert 0.5 < span[1] / span[0] < 2.0, name
@@ -228,7 +316,9 @@ def test_files_say_what_an_engineer_knows(tmp_path: Path) -> None:
     assert lines[0] == ",".join(COLUMNS)
     assert len(lines) == 12001
     no_torque = generate_case("lugre", 3, torque_sensor=False, folder=tmp_path / "no_torque")
-    assert "link_torque_Nm" not in (no_torque / "test.csv").read_text(encoding="utf-8").splitlines()[0]
+    assert (
+        "link_torque_Nm" not in (no_torque / "test.csv").read_text(encoding="utf-8").splitlines()[0]
+    )
     one = generate_case("lugre", 3, one_sided=True, folder=tmp_path / "one")
     assert (one / "test.csv").read_text(encoding="utf-8").splitlines()[0] == ",".join(COLUMNS[:4])
     with pytest.raises(ValueError, match="torque sensor"):
@@ -246,10 +336,15 @@ def test_both_mountings_and_both_frictions_occur() -> None:
 def test_unloaded_is_the_same_joint_without_gravity() -> None:
     story = {"KM": 0.82}
     loaded = simulate_case("motor_constant_error", 1, overrides=story, records=("train",), span=3.0)
-    free = simulate_case("motor_constant_error", 1, overrides=story, unloaded=True, records=("train",), span=3.0)
+    free = simulate_case(
+        "motor_constant_error", 1, overrides=story, unloaded=True, records=("train",), span=3.0
+    )
     assert free.parameters["TG"] == 0.0
     assert free.truth["hidden"] == {"motor_constant_error": {"motor_constant_factor": 0.82}}
-    assert {k for k in loaded.parameters if loaded.parameters[k] != free.parameters[k]} == {"TG", "JL"}
+    assert {k for k in loaded.parameters if loaded.parameters[k] != free.parameters[k]} == {
+        "TG",
+        "JL",
+    }
     # steady slow motion: the current carries friction only
     torque = free.exact["train"][:, 6]
     assert np.median(np.abs(torque)) < 0.1 * np.median(np.abs(loaded.exact["train"][500:, 6]))
@@ -265,26 +360,53 @@ def test_dirt_is_small_but_there() -> None:
 def test_written_table_reads_back(tmp_path: Path) -> None:
     table = np.random.default_rng(0).normal(size=(20, 3)) * np.array([1e-5, 1.0, 1e4])
     write_csv(tmp_path / "t.csv", "a,b,c", table)
-    np.testing.assert_allclose(np.loadtxt(tmp_path / "t.csv", delimiter=",", skiprows=1), table, rtol=1e-8)
+    np.testing.assert_allclose(
+        np.loadtxt(tmp_path / "t.csv", delimiter=",", skiprows=1), table, rtol=1e-8
+    )
 
 
 def answer(*claims: list[str], first: str | None = None, **more: Any) -> dict[str, Any]:
-    step: dict[str, Any] = {"added": None, "effects": [], "parameters": {},
-            "held_out": {"balances": {"motor": {"rms": 4.0, "unit": "N.m", "floor": 1.0, "ratio": 4.0}}}}  # fmt: skip
-    last = {**step, "held_out": {"balances": {"motor": {"rms": 1.0, "unit": "N.m", "floor": 1.0, "ratio": 1.0}}}}
+    step: dict[str, Any] = {
+        "added": None,
+        "effects": [],
+        "parameters": {},
+        "held_out": {
+            "balances": {"motor": {"rms": 4.0, "unit": "N.m", "floor": 1.0, "ratio": 4.0}}
+        },
+    }
+    last = {
+        **step,
+        "held_out": {
+            "balances": {"motor": {"rms": 1.0, "unit": "N.m", "floor": 1.0, "ratio": 1.0}}
+        },
+    }
     found = [{"effects": c, "balance": "motor", "held_out_drop_percent": 50.0} for c in claims]
     ranking = [{"effect": first, "title": "", "balance": "motor"}] if first else []
-    empty: dict[str, Any] = {"minor": [], "lines": [], "unexplained": [], "verdict": "complete", "not_testable": []}
+    empty: dict[str, Any] = {
+        "minor": [],
+        "lines": [],
+        "unexplained": [],
+        "verdict": "complete",
+        "not_testable": [],
+    }
     return {"steps": [step, last], "claims": found, "ranking": ranking, **empty, **more}
 
 
 def about(*names: str, **hidden: dict[str, float]) -> dict[str, Any]:
-    return {"hidden_effect": list(names) or None, "gear_ratio": -160.0, "link_referred": {"stiffness_Nm_per_rad": 2e4},
-            "balance": dict.fromkeys(names, "motor"), "hidden": hidden, "outside": []}  # fmt: skip
+    return {
+        "hidden_effect": list(names) or None,
+        "gear_ratio": -160.0,
+        "link_referred": {"stiffness_Nm_per_rad": 2e4},
+        "balance": dict.fromkeys(names, "motor"),
+        "hidden": hidden,
+        "outside": [],
+    }
 
 
 def test_score_of_a_right_answer() -> None:
-    parameters = {"stiffness": {"value": 2.1e4 / 160.0**2, "stderr": 1.0, "unit": "N.m/rad", "side": "motor"}}
+    parameters = {
+        "stiffness": {"value": 2.1e4 / 160.0**2, "stderr": 1.0, "unit": "N.m/rad", "side": "motor"}
+    }
     result = answer(["stribeck"], first="stribeck")
     result["steps"][-1]["parameters"] = parameters
     s = score(about("stribeck"), result)
@@ -294,12 +416,25 @@ def test_score_of_a_right_answer() -> None:
 
 
 def test_score_of_sets_classes_and_extras() -> None:
-    s = score(about("backlash"), answer(["soft_windup"], ["stribeck", "lugre"], first="soft_windup"))
+    s = score(
+        about("backlash"), answer(["soft_windup"], ["stribeck", "lugre"], first="soft_windup")
+    )
     assert (s.in_set, s.in_set_class, s.one_name_right, s.one_name_right_class) == (0, 1, 0, 1)
-    assert (s.extra, s.extra_names, s.top1, s.top1_class) == (1, (("lugre", "stribeck"),), False, True)
+    assert (s.extra, s.extra_names, s.top1, s.top1_class) == (
+        1,
+        (("lugre", "stribeck"),),
+        False,
+        True,
+    )
     sine = {"cyclic_sine_Nm": 5.0, "cyclic_cosine_Nm": 1.0}
-    assert score(about("cyclic_torque", cyclic_torque=sine), answer(["added_spring"])).in_set_class == 1
-    assert score(about("cyclic_torque", cyclic_torque=sine), answer(["current_offset"])).in_set_class == 0
+    assert (
+        score(about("cyclic_torque", cyclic_torque=sine), answer(["added_spring"])).in_set_class
+        == 1
+    )
+    assert (
+        score(about("cyclic_torque", cyclic_torque=sine), answer(["current_offset"])).in_set_class
+        == 0
+    )
     twice = score(about("stribeck"), answer(["stribeck"], ["stribeck", "lugre"]))
     assert (twice.in_set, twice.extra) == (1, 1)
     assert score(about(), answer(["lugre"])).extra == 1
@@ -325,12 +460,23 @@ def test_score_of_lines() -> None:
 
 
 def test_score_of_what_no_name_covers() -> None:
-    truth = about("local_bump", local_bump={"bump_low_rad": 0.2, "bump_high_rad": 0.4}) | {"outside": ["local_bump"]}
-    seen = {"balance": "motor", "share_percent": 50, "axis": "link_position", "low": 0.35, "high": 0.6, "order": None,
-            "frequency_hz": None}  # fmt: skip
+    truth = about("local_bump", local_bump={"bump_low_rad": 0.2, "bump_high_rad": 0.4}) | {
+        "outside": ["local_bump"]
+    }
+    seen = {
+        "balance": "motor",
+        "share_percent": 50,
+        "axis": "link_position",
+        "low": 0.35,
+        "high": 0.6,
+        "order": None,
+        "frequency_hz": None,
+    }
     good = score(truth, answer(verdict="unexplained", unexplained=[seen]))
     assert (good.balance_right, good.axis_right, good.extra) == (True, True, 0)
-    off = score(truth, answer(verdict="unexplained", unexplained=[{**seen, "low": -0.6, "high": -0.2}]))
+    off = score(
+        truth, answer(verdict="unexplained", unexplained=[{**seen, "low": -0.6, "high": -0.2}])
+    )
     assert (off.balance_right, off.axis_right) == (True, False)
     blind = score(truth, answer(["cyclic_friction"], verdict="complete"))
     assert (blind.balance_right, blind.extra, blind.downgraded) == (False, 1, 0)
@@ -342,13 +488,29 @@ def oracle(train: list[Path], held_out: list[Path], joint: Path) -> dict[str, An
     truth = json.loads((joint.parent / "truth.json").read_text(encoding="utf-8"))
     name = truth["hidden_effect"]
     if truth["outside"]:
-        return answer(verdict="unexplained", unexplained=[{"balance": truth["balance"][name], "share_percent": 90}])
-    return answer(*([name],) if name else (), first=name or "stribeck", verdict="complete" if name else "nothing_missing")
+        return answer(
+            verdict="unexplained",
+            unexplained=[{"balance": truth["balance"][name], "share_percent": 90}],
+        )
+    return answer(
+        *([name],) if name else (),
+        first=name or "stribeck",
+        verdict="complete" if name else "nothing_missing",
+    )
 
 
 def test_campaign_counts_and_reports(tmp_path: Path) -> None:
     cache, entry = str(tmp_path / "cache"), f"{__name__}:oracle"
-    options = ["--effects", "backlash,torque_sensor_offset", "--seeds", "1", "--none", "1", "--pairs", "0"]
+    options = [
+        "--effects",
+        "backlash,torque_sensor_offset",
+        "--seeds",
+        "1",
+        "--none",
+        "1",
+        "--pairs",
+        "0",
+    ]
     options += ["--outside", "0", "--cache", cache, "--entry", entry]
     options += ["--out", str(tmp_path / "report.md"), "--json", str(tmp_path / "scores.json")]
     campaign.main(options)
@@ -360,7 +522,9 @@ def test_campaign_counts_and_reports(tmp_path: Path) -> None:
 
 
 def test_campaign_counts_an_error_as_a_miss() -> None:
-    right = Outcome("single", "lugre", 1, False, 1.0, score(about("lugre"), answer(["lugre"], first="lugre")))
+    right = Outcome(
+        "single", "lugre", 1, False, 1.0, score(about("lugre"), answer(["lugre"], first="lugre"))
+    )
     failed = Outcome("single", "lugre", 2, False, 1.0, None, "ValueError: no")
     found = {c.what: c for c in checks([right, failed], size=1.0, dirt=False)}
     assert found["single: true name in a set, %"].value == 50.0

@@ -1,4 +1,6 @@
-"""The reproduction of the thesis: its fast part runs, agrees with the printed tables where the page says so, and is what the page shows."""
+"""The reproduction of the thesis: its fast part runs, agrees with the printed tables where the
+page says so, and is what the page shows.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,7 @@ from benchmarks.thesis.friction import variant
 from benchmarks.thesis.page import Section
 from benchmarks.thesis.record import MODEL_2B, batch, joined
 from casadi_models import thesis
-from identification.excite import triangular
+from identification.planning.trajectories import triangular
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 NUMBER = re.compile(r"-?\d+\.?\d*(?:e-?\d+)?")
@@ -69,13 +71,20 @@ def test_tables_of_the_page_are_what_the_command_prints(quick: dict[str, list[li
         for printed, kept in zip(rows, shown[title], strict=True):
             head = printed if len(printed) != len(head) or not NUMBER.search(printed[1]) else head
             for cell, other, column in zip(printed, kept, head, strict=True):
-                assert same(cell, other, column), f"{title}: the page shows {kept}, the command prints {printed}"
+                assert same(cell, other, column), (
+                    f"{title}: the page shows {kept}, the command prints {printed}"
+                )
 
 
 def test_table_4_2_comes_out() -> None:
     whole = offline.rigid_sides()
     plain = whole.only("link_inertia", "gravity_torque")
-    fits = {"1a_y1": plain.solve([0]), "1a_coupled": plain.solve(), "1b_y1": whole.solve([0]), "1b_coupled": whole.solve()}
+    fits = {
+        "1a_y1": plain.solve([0]),
+        "1a_coupled": plain.solve(),
+        "1b_y1": whole.solve([0]),
+        "1b_coupled": whole.solve(),
+    }
     for key, found in fits.items():
         for name, value in found.items():
             assert value == pytest.approx(thesis.TABLE_4_2[key][name].value, rel=0.1), (key, name)
@@ -100,7 +109,9 @@ def test_printed_singular_values_are_column_norms_of_a_window() -> None:
     for key, table in (("2b", thesis.TABLE_4_4), ("ts", thesis.TABLE_4_5)):
         for name, value in thesis.numbers(table).items():
             assert found[f"{key} as printed"][name][0] == pytest.approx(value, rel=0.1), (key, name)
-    assert found["2b as printed"]["link_coulomb"][0] == pytest.approx(math.sqrt(offline.ROWS), rel=1e-3)
+    assert found["2b as printed"]["link_coulomb"][0] == pytest.approx(
+        math.sqrt(offline.ROWS), rel=1e-3
+    )
     assert found["2b on the motor"]["stiffness"][0] > 2 * thesis.TABLE_4_4["stiffness"].value
 
 
@@ -112,7 +123,11 @@ def test_stiffness_alone_tells_where_the_added_spring_acts() -> None:
 
 def test_table_4_6_is_followed_through_both_steps() -> None:
     run, b, c1, c2, w1, ws = variant(), 9.0, 29.0, 480.0, 0.0595, 0.0251
-    for at, linear, shape, room in ((15.9, 1.0, 1.0, 0.02), (26.9, 1.3, 1.0, 0.02), (39.9, 1.3, 1.2, 0.05)):
+    for at, linear, shape, room in (
+        (15.9, 1.0, 1.0, 0.02),
+        (26.9, 1.3, 1.0, 0.02),
+        (39.9, 1.3, 1.2, 0.05),
+    ):
         true = [linear * b, linear * c1, linear * c2, shape * w1, shape * ws]
         assert run.path[round(at * 1000)] == pytest.approx(true, rel=room), at
     assert (run.before, run.after) == (0, 1)
@@ -135,7 +150,11 @@ def test_every_figure_of_the_thesis_is_named_and_drawn() -> None:
     text = (DOCS / "thesis.md").read_text(encoding="utf-8")
     captions = "\n".join(part for part in text.split("\n\n") if part.startswith("*Figure"))
     assert [n for n in FIGURES if not re.search(rf"\b{re.escape(n)}\b", captions)] == []
-    assert [n for n in ("4.2", "4.3", "4.4", "4.5", "4.6") if f"able {n}" not in text and f"nd {n}" not in text] == []
+    assert [
+        n
+        for n in ("4.2", "4.3", "4.4", "4.5", "4.6")
+        if f"able {n}" not in text and f"nd {n}" not in text
+    ] == []
     drawn = set(re.findall(r"\]\(thesis/([\w-]+)\.svg\)", text))
     files = {f.stem: f for f in (DOCS / "thesis").glob("*")}
     assert drawn == set(files)
@@ -157,17 +176,26 @@ def test_a_picture_keeps_peaks_and_stays_small() -> None:
     x = np.linspace(0, 1, 40_000)
     y = np.sin(9 * x)
     peak = np.where(np.abs(x - 0.5) < 1e-4, 5.0, y)
-    pictures = [picture([Panel("a", "x", "y", (Curve(x, v),), y_range=(-1.3, 5.3))], "label") for v in (y, peak)]
+    pictures = [
+        picture([Panel("a", "x", "y", (Curve(x, v),), y_range=(-1.3, 5.3))], "label")
+        for v in (y, peak)
+    ]
     assert highest(pictures[1]) < highest(pictures[0]) - 400
     shades = Map("m", "x", "y", np.arange(3.0), np.arange(2.0), np.arange(6.0).reshape(2, 3))
-    text = picture([Panel("a", "x", "y", (Curve(x, y), Curve(x[[0, -1]], np.zeros(2), "limit"))), shades], "label", (("model", "words"),))
+    text = picture(
+        [Panel("a", "x", "y", (Curve(x, y), Curve(x[[0, -1]], np.zeros(2), "limit"))), shades],
+        "label",
+        (("model", "words"),),
+    )
     assert len(text) < 6_000
     assert ET.fromstring(text).get("aria-label") == "label"
 
 
 @pytest.mark.slow
 def test_parameters_hold_while_sensors_fail() -> None:
-    """Section 4.4 with structured residuals: within 10.5 %, the added spring within 1 %, in both alternatives."""
+    """Section 4.4 with structured residuals: within 10.5 %, the added spring within 1 %, in
+    both alternatives.
+    """
     bench = Bench()
     for _, _, failed, alternative in CASES:
         tracked = bench.track("structured", failed, alternative)

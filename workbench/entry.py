@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run `irj`; see :func:`workbench.cli.main`."""
+    """Run `irj`; see :func:`workbench.cli.main.main`."""
     try:
-        from workbench.cli import main as run
+        from workbench.cli.main import main as run
 
         return run(argv)
     except KeyboardInterrupt:

@@ -1,7 +1,8 @@
 """Re-enact the thesis's tables and figures on simulated data and write the page.
 
-python -m benchmarks.thesis --out docs/thesis.md     everything: the page and its pictures (some minutes)
-python -m benchmarks.thesis --quick                  the sections with tables 4.2 to 4.6, on the terminal (some 20 s)
+python -m benchmarks.thesis --out docs/thesis.md     everything: the page and its pictures (some
+minutes) python -m benchmarks.thesis --quick                  the sections with tables 4.2 to 4.6,
+on the terminal (some 20 s)
 """
 
 from __future__ import annotations
@@ -18,12 +19,25 @@ from benchmarks.thesis.page import Section
 
 Experiment = Callable[[], Section]
 
-QUICK: Final[tuple[Experiment, ...]] = (offline.rigid, offline.stiffness, offline.excitation, friction.time_variant)
+QUICK: Final[tuple[Experiment, ...]] = (
+    offline.rigid,
+    offline.stiffness,
+    offline.excitation,
+    friction.time_variant,
+)
 """The fast part: tables 4.2 to 4.6."""
 WHOLE: Final[tuple[Experiment, ...]] = (
-    selection.triangular_section, selection.sinusoidal_section, offline.rigid, offline.stiffness, offline.excitation, online.recursive,
-    friction.low_velocity, friction.two_step, friction.time_variant, failure.under_failure,
-)  # fmt: skip
+    selection.triangular_section,
+    selection.sinusoidal_section,
+    offline.rigid,
+    offline.stiffness,
+    offline.excitation,
+    online.recursive,
+    friction.low_velocity,
+    friction.two_step,
+    friction.time_variant,
+    failure.under_failure,
+)
 """All experiments in the order of the thesis."""
 
 HEAD: Final = """# The thesis once more
@@ -76,16 +90,28 @@ def page(experiments: Sequence[Experiment], folder: Path | None) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run what the command line asks for."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.thesis", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, help="the page; its pictures go into a folder of the same name beside it")
-    parser.add_argument("--quick", action="store_true", help="tables 4.2 to 4.6 only, on the terminal")
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.thesis",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        help="the page; its pictures go into a folder of the same name beside it",
+    )
+    parser.add_argument(
+        "--quick", action="store_true", help="tables 4.2 to 4.6 only, on the terminal"
+    )
     asked = parser.parse_args(arguments)
     if asked.quick:
         print(page(QUICK, None))
         return 0
     if asked.out is None:
         parser.error("give --out FILE or --quick")
-    asked.out.write_text(f"{HEAD}\n{page(WHOLE, asked.out.with_suffix(''))}\n{TAIL}", encoding="utf-8")
+    asked.out.write_text(
+        f"{HEAD}\n{page(WHOLE, asked.out.with_suffix(''))}\n{TAIL}", encoding="utf-8"
+    )
     return 0
 
 

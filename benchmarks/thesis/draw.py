@@ -10,9 +10,20 @@ from typing import Final, final
 import numpy as np
 import numpy.typing as npt
 
-from identification.formats import number
-from identification.pictures import AFTER, BEFORE, HEIGHT, INK, LEFT, RIGHT, WIDTH, Frame, _axes, _text
-from workbench.plots import min_max
+from identification.data.formats import number
+from workbench.show.pictures import (
+    AFTER,
+    BEFORE,
+    HEIGHT,
+    INK,
+    LEFT,
+    RIGHT,
+    WIDTH,
+    Frame,
+    _axes,
+    _text,
+)
+from workbench.show.plots import min_max
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -22,10 +33,20 @@ _LEGEND: Final = 22
 _LEVELS: Final = 12
 """Shades of a map."""
 _SHORTER: Final = (
-    (f' class="s-ink" fill="{INK}"', ""), (' font-size="11"', ""), (' class="s-grid"', ""), ("#cccccc", "#ccc"), (' stroke-width="0.6"', ""),
-)  # fmt: skip
+    (f' class="s-ink" fill="{INK}"', ""),
+    (' font-size="11"', ""),
+    (' class="s-grid"', ""),
+    ("#cccccc", "#ccc"),
+    (' stroke-width="0.6"', ""),
+)
 """What a file of its own can say once, or leave out."""
-COLOURS: Final = {"measured": BEFORE, "model": AFTER, "limit": INK, "second": "#009e73", "third": "#cc79a7"}
+COLOURS: Final = {
+    "measured": BEFORE,
+    "model": AFTER,
+    "limit": INK,
+    "second": "#009e73",
+    "third": "#cc79a7",
+}
 
 
 @final
@@ -91,7 +112,13 @@ class Map:
     values: FloatArray
 
 
-def picture(panels: Sequence[Panel | Map], label: str, legend: Sequence[tuple[str, str]] = (), *, columns: int = 2) -> str:
+def picture(
+    panels: Sequence[Panel | Map],
+    label: str,
+    legend: Sequence[tuple[str, str]] = (),
+    *,
+    columns: int = 2,
+) -> str:
     """One SVG file with panels side by side.
 
     Parameters
@@ -113,15 +140,25 @@ def picture(panels: Sequence[Panel | Map], label: str, legend: Sequence[tuple[st
     for i, panel in enumerate(panels):
         x, y = i % columns * WIDTH, i // columns * (HEIGHT + _LEGEND) + head
         inner = _map(panel) if isinstance(panel, Map) else _panel(panel)
-        scale = f", {number(float(panel.values.min()), 2)} (white) to {number(float(panel.values.max()), 2)}" if isinstance(panel, Map) else ""
+        scale = (
+            f", {number(float(panel.values.min()), 2)} (white) to "
+            f"{number(float(panel.values.max()), 2)}"
+            if isinstance(panel, Map)
+            else ""
+        )
         title = _text((LEFT + WIDTH - RIGHT) / 2, 15, panel.title + scale)
-        body.append(f'<g transform="translate({x} {y})">{title}<g transform="translate(0 {_LEGEND - 6})">{inner}</g></g>')
+        body.append(
+            f'<g transform="translate({x} {y})">{title}<g transform="translate(0 '
+            f'{_LEGEND - 6})">{inner}</g></g>'
+        )
     inside = "".join(body)
     for long, short in _SHORTER:
         inside = inside.replace(long, short)
     return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" role="img" aria-label="{html.escape(label, quote=True)}" viewBox="0 0 {wide} {high}" '
-        f'width="{wide}" height="{high}" font-family="system-ui, sans-serif" font-size="11" fill="{INK}">{inside}</svg>\n'
+        '<svg xmlns="http://www.w3.org/2000/svg" role="img" '
+        f'aria-label="{html.escape(label, quote=True)}" viewBox="0 0 {wide} {high}" '
+        f'width="{wide}" height="{high}" font-family="system-ui, sans-serif" font-size="11" '
+        f'fill="{INK}">{inside}</svg>\n'
     )
 
 
@@ -136,10 +173,17 @@ def _panel(panel: Panel) -> str:
     for c in panel.curves:
         kept = min_max(len(c.x), [c.y], panel.points)
         rows = np.arange(len(c.x)) if kept is None else kept[0]
-        points = [(frame.across(float(c.x[k])), frame.up(float(c.y[k]))) for k in rows if np.isfinite(c.y[k])]
+        points = [
+            (frame.across(float(c.x[k])), frame.up(float(c.y[k])))
+            for k in rows
+            if np.isfinite(c.y[k])
+        ]
         out.append(_line(points, c.kind))
         if c.dots:
-            out.extend(f'<circle fill="{COLOURS[c.kind]}" cx="{a:.0f}" cy="{b:.0f}" r="2.5"/>' for a, b in points)
+            out.extend(
+                f'<circle fill="{COLOURS[c.kind]}" cx="{a:.0f}" cy="{b:.0f}" r="2.5"/>'
+                for a, b in points
+            )
     return "".join(out)
 
 
@@ -153,7 +197,10 @@ def _line(points: Sequence[tuple[float, float]], kind: str) -> str:
         step = f"{now[0] - last[0]} {now[1] - last[1]}"
         path.append(step if step.startswith("-") or len(path) == 1 else f" {step}")
         last = now
-    return f'<path fill="none" stroke="{COLOURS[kind]}" stroke-width="5"{dash} transform="scale(.25)" d="{"".join(path).replace(" -", "-")}"/>'
+    return (
+        f'<path fill="none" stroke="{COLOURS[kind]}" stroke-width="5"{dash} '
+        f'transform="scale(.25)" d="{"".join(path).replace(" -", "-")}"/>'
+    )
 
 
 def _map(panel: Map) -> str:
@@ -168,11 +215,18 @@ def _map(panel: Map) -> str:
             left, right = round(frame.across(x_edge[i])), round(frame.across(x_edge[i + 1]))
             top, bottom = round(frame.up(y_edge[j + 1])), round(frame.up(y_edge[j]))
             cells.setdefault(level, []).append(f"M{left} {top}H{right}V{bottom}H{left}z")
-    out = [f'<path fill="{AFTER}" fill-opacity="{n / _LEVELS:.2f}" d="{"".join(d)}"/>' for n, d in sorted(cells.items())]
+    out = [
+        f'<path fill="{AFTER}" fill-opacity="{n / _LEVELS:.2f}" d="{"".join(d)}"/>'
+        for n, d in sorted(cells.items())
+    ]
     out.append(_axes(frame, panel.x_label, panel.y_label))
     return "".join(out)
 
 
 def _edges(centres: FloatArray) -> list[float]:
     middle = (centres[1:] + centres[:-1]) / 2
-    return [float(centres[0] - (middle[0] - centres[0])), *middle.tolist(), float(2 * centres[-1] - middle[-1])]
+    return [
+        float(centres[0] - (middle[0] - centres[0])),
+        *middle.tolist(),
+        float(2 * centres[-1] - middle[-1]),
+    ]

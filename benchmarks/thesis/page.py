@@ -43,13 +43,21 @@ class Table:
         heads = [self.first, *([self.printed] if self._has_printed else []), *self.columns]
         out = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
         for r in self.rows:
-            cells = [r.what, *([shown(r.printed)] if self._has_printed else []), *(self._cell(v, c) for v, c in zip(r.found, self.columns, strict=True))]
+            cells = [
+                r.what,
+                *([shown(r.printed)] if self._has_printed else []),
+                *(self._cell(v, c) for v, c in zip(r.found, self.columns, strict=True)),
+            ]
             out.append("| " + " | ".join(cells) + " |")
         return "\n".join(out)
 
     @staticmethod
     def _cell(value: float, column: str) -> str:
-        return f"{value:.2f}" if math.isfinite(value) and column.endswith(("[%]", "[s]")) else shown(value)
+        return (
+            f"{value:.2f}"
+            if math.isfinite(value) and column.endswith(("[%]", "[s]"))
+            else shown(value)
+        )
 
     @property
     def _has_printed(self) -> bool:
@@ -107,7 +115,10 @@ class Section:
         out = [f"## {self.title}"]
         for p in self.parts:
             if isinstance(p, Figure):
-                out.append(f"![{p.thesis}]({folder}/{p.stem}.svg)\n\n{wrapped(f'*{p.thesis}.* {p.caption}')}")
+                out.append(
+                    f"![{p.thesis}]({folder}/{p.stem}.svg)\n\n"
+                    f"{wrapped(f'*{p.thesis}.* {p.caption}')}"
+                )
             else:
                 out.append(str(p) if isinstance(p, Table) else wrapped(p))
         return "\n\n".join(out) + "\n"

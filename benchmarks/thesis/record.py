@@ -1,4 +1,6 @@
-"""Simulated records for the reproduction: motions, readings, both sides of the regression, least squares."""
+"""Simulated records for the reproduction: motions, readings, both sides of the regression,
+least squares.
+"""
 
 from __future__ import annotations
 
@@ -12,10 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from casadi_models import JointModel, thesis
-from identification._excite_follow import Followed
-from identification.excite import Experiment, Motion, sinusoidal, triangular
-from identification.fault import NOISE
-from identification.prepare import central_difference, filter_alike
+from identification.data.prepare import central_difference, filter_alike
+from identification.faults.detector import NOISE
+from identification.planning.follow import Followed
+from identification.planning.trajectories import Experiment, Motion, sinusoidal, triangular
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -66,7 +68,9 @@ class Sides:
 
     def vaf(self, values: dict[str, float]) -> FloatArray:
         """Variance accounted for (4.2) of each balance [%]."""
-        found: FloatArray = 100.0 * (1.0 - np.var(self.y - self.model(values), axis=0) / np.var(self.y, axis=0))
+        found: FloatArray = 100.0 * (
+            1.0 - np.var(self.y - self.model(values), axis=0) / np.var(self.y, axis=0)
+        )
         return found
 
     def error(self, values: dict[str, float]) -> FloatArray:
@@ -83,7 +87,9 @@ def times(count: int, first: float = 0.0) -> FloatArray:
 
 def joined(parts: Sequence[Sides]) -> Sides:
     """Several records as one."""
-    return Sides(np.concatenate([p.y for p in parts]), np.concatenate([p.phi for p in parts]), parts[0].names)
+    return Sides(
+        np.concatenate([p.y for p in parts]), np.concatenate([p.phi for p in parts]), parts[0].names
+    )
 
 
 def motions() -> list[Motion]:
@@ -102,45 +108,63 @@ def motions() -> list[Motion]:
 @cache
 def joint_2b() -> Experiment:
     """Model 2b with tables 4.1 and 4.3; its added spring acts on the motor."""
-    model = thesis.model_2b().with_values({"motor_smoothing_velocity": SMOOTHING, "link_smoothing_velocity": SMOOTHING})
+    model = thesis.model_2b().with_values(
+        {"motor_smoothing_velocity": SMOOTHING, "link_smoothing_velocity": SMOOTHING}
+    )
     return Experiment(model, parameters=model.linear_parameters, stride=1, dt=DT)
 
 
 def as_printed(run: Followed, model: JointModel) -> Followed:
-    """The same motion of the link in a joint whose added spring stands in both rows, as (4.17) prints it.
+    """The same motion of the link in a joint whose added spring stands in both rows, as (4.17)
+    prints it.
 
-    The gear carries T = k1 d + k2 d^3 - ka qm: with input and output turning in opposite senses the printed
-    + ka theta_in takes load off the spring. The motor moves as the torsion demands. The law has no potential, so it
-    is no joint model of the project; it is here because the thesis's own numbers follow from it.
+    The gear carries T = k1 d + k2 d^3 - ka qm: with input and output turning in opposite senses the
+    printed + ka theta_in takes load off the spring. The motor moves as the torsion demands. The law
+    has no potential, so it is no joint model of the project; it is here because the thesis's own
+    numbers follow from it.
     """
     v = model.values
     link, speed = run.states[:, 2], run.states[:, 3]
-    resistance = v["link_viscous"] * speed + v["link_coulomb"] * np.tanh(speed / v["link_smoothing_velocity"])
+    resistance = v["link_viscous"] * speed + v["link_coulomb"] * np.tanh(
+        speed / v["link_smoothing_velocity"]
+    )
     carried = load_torque(run, model) + resistance
     k1, k2, ka = (v[n] for n in SPRINGS)
     torsion = (carried + ka * link) / k1
     for _ in range(30):
-        torsion -= (k1 * torsion + k2 * torsion**3 - ka * (link + torsion) - carried) / (k1 + 3 * k2 * torsion**2 - ka)
+        torsion -= (k1 * torsion + k2 * torsion**3 - ka * (link + torsion) - carried) / (
+            k1 + 3 * k2 * torsion**2 - ka
+        )
     motor = link + torsion
     rate = speed + central_difference(torsion, DT)
     acceleration = run.accelerations[:, 1] + central_difference(central_difference(torsion, DT), DT)
-    friction = v["motor_viscous"] * rate + v["motor_coulomb"] * np.tanh(rate / v["motor_smoothing_velocity"])
+    friction = v["motor_viscous"] * rate + v["motor_coulomb"] * np.tanh(
+        rate / v["motor_smoothing_velocity"]
+    )
     drive = v["motor_inertia"] * acceleration + carried + friction
     states = np.column_stack([motor, rate, link, speed])
-    return Followed(run.time, drive, states, np.column_stack([acceleration, run.accelerations[:, 1]]), carried)
+    return Followed(
+        run.time, drive, states, np.column_stack([acceleration, run.accelerations[:, 1]]), carried
+    )
 
 
 def load_torque(run: Followed, model: JointModel) -> FloatArray:
     """Jout q'' - Tg sin q: what the torque sensor on the load reads (4.14) [N.m]."""
     v = model.values
-    found: FloatArray = v["link_inertia"] * run.accelerations[:, 1] - v["gravity_torque"] * np.sin(run.states[:, 2])
+    found: FloatArray = v["link_inertia"] * run.accelerations[:, 1] - v["gravity_torque"] * np.sin(
+        run.states[:, 2]
+    )
     return found
 
 
 def measured(run: Followed, model: JointModel, seed: int) -> Followed:
-    """Readings with the noise of table B.1; accelerations are differences, `torque` is the load's (4.14)."""
+    """Readings with the noise of table B.1; accelerations are differences, `torque` is the
+    load's (4.14).
+    """
     rng = np.random.default_rng(seed)
-    levels = [NOISE[n] for n in ("motor_position", "motor_velocity", "link_position", "link_velocity")]
+    levels = [
+        NOISE[n] for n in ("motor_position", "motor_velocity", "link_position", "link_velocity")
+    ]
     states = run.states + rng.normal(size=run.states.shape) * levels
     drive = run.drive + rng.normal(0.0, NOISE["current"], len(run.time))
     load = load_torque(run, model) + rng.normal(0.0, NOISE["torque"], len(run.time))
@@ -153,10 +177,15 @@ def zero_phase(values: FloatArray) -> FloatArray:
 
 
 def regression(
-    experiment: Experiment, seen: Followed, names: Sequence[str] = MODEL_2B, *, both_rows: bool = False,
+    experiment: Experiment,
+    seen: Followed,
+    names: Sequence[str] = MODEL_2B,
+    *,
+    both_rows: bool = False,
     smooth: Callable[[FloatArray], FloatArray] = zero_phase,
-) -> Sides:  # fmt: skip
-    """y = phi theta from readings, all terms filtered alike; columns from the joint model's own equations.
+) -> Sides:
+    """y = phi theta from readings, all terms filtered alike; columns from the joint model's own
+    equations.
 
     Parameters
     ----------
@@ -165,7 +194,8 @@ def regression(
     seen : Followed
         From :func:`measured`.
     names : sequence of str
-        Columns; all other linear parameters count as known but the link's inertia and gravity, which are in the load.
+        Columns; all other linear parameters count as known but the link's inertia and gravity,
+        which are in the load.
     both_rows : bool
         The added spring in both rows, as printed in (4.17), instead of on the motor.
     smooth : callable
@@ -175,7 +205,9 @@ def regression(
     at = {n: i for i, n in enumerate(experiment.parameters)}
     phi = full[:, :, [at[n] for n in names]]
     if both_rows:
-        phi[:, :, list(names).index("motor_added_spring")] = np.column_stack([-seen.states[:, 0], seen.states[:, 0]])
+        phi[:, :, list(names).index("motor_added_spring")] = np.column_stack(
+            [-seen.states[:, 0], seen.states[:, 0]]
+        )
     rest = [n for n in at if n not in names and n not in ("link_inertia", "gravity_torque")]
     given = full[:, :, [at[n] for n in rest]] @ np.array([known[n] for n in rest])
     y = np.column_stack([seen.drive, -seen.torque]) - given
@@ -191,7 +223,9 @@ def batch(both_rows: bool) -> tuple[Sides, ...]:
     found = []
     for seed, run in enumerate(runs()):
         true = as_printed(run, experiment.model) if both_rows else run
-        found.append(regression(experiment, measured(true, experiment.model, seed), both_rows=both_rows))
+        found.append(
+            regression(experiment, measured(true, experiment.model, seed), both_rows=both_rows)
+        )
     return tuple(found)
 
 

@@ -16,7 +16,14 @@ def _stored(s: LocalSignals, p: SimpleNamespace) -> Expression:
     title="additional spring to ground",
     family="torque",
     acts_on=("motor", "link"),
-    parameters=(signed("added_spring", "N.m/rad", "stiffness of cables or seals that pull the joint to its zero", typical=60.0),),
+    parameters=(
+        signed(
+            "added_spring",
+            "N.m/rad",
+            "stiffness of cables or seals that pull the joint to its zero",
+            typical=60.0,
+        ),
+    ),
     absence="the residual grows with the position, at any speed",
     excitation="full travel, better without gravity",
     source="thesis eq. 4.17",

@@ -14,7 +14,14 @@ from ..signals import Expression, LocalSignals
     title="direction-dependent Coulomb friction",
     family="friction",
     acts_on=("motor", "link"),
-    parameters=(signed("asymmetric_coulomb", "N.m", "half the difference of the Coulomb torques of the two directions", typical=3.0),),
+    parameters=(
+        signed(
+            "asymmetric_coulomb",
+            "N.m",
+            "half the difference of the Coulomb torques of the two directions",
+            typical=3.0,
+        ),
+    ),
     absence="the residual is shifted by a constant",
     excitation="both directions, constant speed",
     source="offset of the EMPS model (A. Janot, M. Gautier, M. Brunot 2019)",

@@ -14,7 +14,14 @@ from ..signals import Expression, LocalSignals
     title="direction-dependent viscous friction",
     family="friction",
     acts_on=("motor", "link"),
-    parameters=(signed("asymmetric_viscous", "N.m.s/rad", "half the difference of the viscous coefficients of the two directions", typical=3.0),),
+    parameters=(
+        signed(
+            "asymmetric_viscous",
+            "N.m.s/rad",
+            "half the difference of the viscous coefficients of the two directions",
+            typical=3.0,
+        ),
+    ),
     absence="the slope of the residual against velocity differs between the directions",
     excitation="both directions at several speeds",
     source="field knowledge",

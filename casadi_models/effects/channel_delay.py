@@ -12,7 +12,15 @@ from ..signals import Expression, LocalSignals
     title="delay of a channel",
     family="sensor",
     acts_on=("drive", "torque_sensor", "link_position_sensor"),
-    parameters=(signed("delay", "s", "time by which the channel is late (negative: early)", role="delay", typical=0.006),),
+    parameters=(
+        signed(
+            "delay",
+            "s",
+            "time by which the channel is late (negative: early)",
+            role="delay",
+            typical=0.006,
+        ),
+    ),
     absence="the residuals with that channel follow its rate",
     excitation="fast motion",
     source="field knowledge",

@@ -12,7 +12,15 @@ from ..signals import Expression, LocalSignals
     title="Coulomb friction",
     family="friction",
     acts_on=("motor", "link"),
-    parameters=(amplitude("coulomb", "N.m", "Coulomb friction torque", role="static", typical={"motor": 21.5, "link": 0.4}),),
+    parameters=(
+        amplitude(
+            "coulomb",
+            "N.m",
+            "Coulomb friction torque",
+            role="static",
+            typical={"motor": 21.5, "link": 0.4},
+        ),
+    ),
     common=True,
     everywhere=True,
     stage="plain",

@@ -16,7 +16,15 @@ def _stored(s: LocalSignals, p: SimpleNamespace) -> Expression:
     title="stiffening spring (cubic)",
     family="transmission",
     acts_on=("transmission",),
-    parameters=(signed("cubic_stiffness", "N.m/rad3", "coefficient of the cubed torsion", role="stiffening", typical=3.0e8),),
+    parameters=(
+        signed(
+            "cubic_stiffness",
+            "N.m/rad3",
+            "coefficient of the cubed torsion",
+            role="stiffening",
+            typical=3.0e8,
+        ),
+    ),
     absence="the residual of the transmission grows with the cube of the torsion",
     excitation="high torque in both directions",
     source="thesis eq. 2.41",

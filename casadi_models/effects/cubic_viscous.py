@@ -12,7 +12,14 @@ from ..signals import Expression, LocalSignals
     title="cubic viscous friction",
     family="friction",
     acts_on=("motor", "link"),
-    parameters=(signed("cubic_viscous", "N.m.s3/rad3", "coefficient of the cubed velocity (negative: shear thinning)", typical=8.0),),
+    parameters=(
+        signed(
+            "cubic_viscous",
+            "N.m.s3/rad3",
+            "coefficient of the cubed velocity (negative: shear thinning)",
+            typical=8.0,
+        ),
+    ),
     contains=("viscous",),
     absence="the residual bends against velocity, odd in it",
     excitation="at least three speeds, up to the highest",

@@ -12,7 +12,14 @@ from ..signals import Expression, LocalSignals
     title="offset of the current",
     family="sensor",
     acts_on=("drive",),
-    parameters=(signed("current_offset", "N.m", "constant torque by an offset of the measured current", typical=3.0),),
+    parameters=(
+        signed(
+            "current_offset",
+            "N.m",
+            "constant torque by an offset of the measured current",
+            typical=3.0,
+        ),
+    ),
     absence="the residual of the motor is shifted by a constant",
     excitation="both directions, constant speed; standstill",
     source="field knowledge",

@@ -15,8 +15,18 @@ from ..signals import Expression, LocalSignals
     family="friction",
     acts_on=("motor", "link"),
     parameters=(
-        signed("cyclic_friction_sine", "N.m", "sine part of the change of friction per turn of the link", typical=3.0),
-        signed("cyclic_friction_cosine", "N.m", "cosine part of the change of friction per turn of the link", typical=2.0),
+        signed(
+            "cyclic_friction_sine",
+            "N.m",
+            "sine part of the change of friction per turn of the link",
+            typical=3.0,
+        ),
+        signed(
+            "cyclic_friction_cosine",
+            "N.m",
+            "cosine part of the change of friction per turn of the link",
+            typical=2.0,
+        ),
     ),
     pairs=(("cyclic_friction", "cyclic_friction_sine", "cyclic_friction_cosine"),),
     absence="the friction band breathes with the position",
@@ -29,4 +39,6 @@ from ..signals import Expression, LocalSignals
 )
 def cyclic_friction(s: LocalSignals, p: SimpleNamespace) -> Expression:
     """Friction whose size follows the position; it changes sign with the velocity."""
-    return (p.cyclic_friction_sine * ca.sin(s.position) + p.cyclic_friction_cosine * ca.cos(s.position)) * s.direction
+    return (
+        p.cyclic_friction_sine * ca.sin(s.position) + p.cyclic_friction_cosine * ca.cos(s.position)
+    ) * s.direction

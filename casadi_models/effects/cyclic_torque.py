@@ -10,7 +10,9 @@ from ..signals import Expression, LocalSignals
 
 
 def _stored(s: LocalSignals, p: SimpleNamespace) -> Expression:
-    return p.cyclic_torque_sine * (1 - ca.cos(s.position)) + p.cyclic_torque_cosine * ca.sin(s.position)
+    return p.cyclic_torque_sine * (1 - ca.cos(s.position)) + p.cyclic_torque_cosine * ca.sin(
+        s.position
+    )
 
 
 @effect(
@@ -23,7 +25,8 @@ def _stored(s: LocalSignals, p: SimpleNamespace) -> Expression:
         signed("cyclic_torque_cosine", "N.m", "cosine part per turn of the link", typical=2.0),
     ),
     pairs=(("cyclic_torque", "cyclic_torque_sine", "cyclic_torque_cosine"),),
-    absence="the residual follows sine and cosine of the position and does not change sign at a reversal",
+    absence="the residual follows sine and cosine of the position and does not change sign at a "
+    "reversal",
     excitation="a long stroke, better without gravity",
     source="thesis eq. 2.81",
     angular=True,

@@ -14,7 +14,12 @@ from ..term import SIDE_INERTIAS
     family="inertia",
     acts_on=("motor", "link"),
     parameters=(signed("extra_inertia", "kg.m2", "inertia beyond the known one", typical=1.0),),
-    requires=(Requirement(SIDE_INERTIAS, "cannot be told from the inertia itself; give motor_inertia or link_inertia in [known]"),),
+    requires=(
+        Requirement(
+            SIDE_INERTIAS,
+            "cannot be told from the inertia itself; give motor_inertia or link_inertia in [known]",
+        ),
+    ),
     absence="the residual follows the acceleration",
     excitation="fast motion, with the inertia of one side known",
     source="thesis table 4.2 (design against identified inertia)",

@@ -14,7 +14,9 @@ from ..parameter import amplitude, shape
 from ..signals import Expression, LocalSignals
 
 
-def _oscillator(z: tuple[Expression, ...], step: Expression, s: LocalSignals, p: SimpleNamespace) -> tuple[Expression, ...]:
+def _oscillator(
+    z: tuple[Expression, ...], step: Expression, s: LocalSignals, p: SimpleNamespace
+) -> tuple[Expression, ...]:
     speed, deflection = step / s.clock, z[0]
     sliding = speed - z[1]
     omega = 2 * math.pi * p.flexible_frequency
@@ -43,10 +45,26 @@ def _acceleration(z: tuple[Expression, ...], s: LocalSignals, p: SimpleNamespace
     acts_on=("link", "motor"),
     parameters=(
         amplitude("flexible_inertia", "kg.m2", "inertia of the extra mass", typical=1.5),
-        shape("flexible_frequency", "Hz", "frequency of the extra mass with the joint held",
-              (5.0, 8.0, 12.0, 18.0, 27.0, 40.0), "absolute", start=12.0, low=0.1, high=1e4),
-        shape("flexible_damping", "1", "damping ratio of the extra mass with the joint held",
-              (0.01, 0.03, 0.1), "absolute", start=0.03, low=1e-6, high=0.99),
+        shape(
+            "flexible_frequency",
+            "Hz",
+            "frequency of the extra mass with the joint held",
+            (5.0, 8.0, 12.0, 18.0, 27.0, 40.0),
+            "absolute",
+            start=12.0,
+            low=0.1,
+            high=1e4,
+        ),
+        shape(
+            "flexible_damping",
+            "1",
+            "damping ratio of the extra mass with the joint held",
+            (0.01, 0.03, 0.1),
+            "absolute",
+            start=0.03,
+            low=1e-6,
+            high=0.99,
+        ),
     ),
     stage="late",
     absence="a peak in the spectrum of the residual at one frequency, whatever the speed",
@@ -58,7 +76,7 @@ def _acceleration(z: tuple[Expression, ...], s: LocalSignals, p: SimpleNamespace
     dissipative=True,
     confused_with=("extra_inertia", "structural_damping"),
     separate_by="a chirp through the frequency, link acceleration recorded",
-)  # fmt: skip
+)
 def flexible_mode(s: LocalSignals, p: SimpleNamespace) -> Expression:
     """Torque that accelerates the extra mass."""
     return p.flexible_inertia * _acceleration(s.memory, s, p)

@@ -19,8 +19,20 @@ def _stored(s: LocalSignals, p: SimpleNamespace) -> Expression:
     family="torque",
     acts_on=("link",),
     parameters=(
-        signed("gravity_torque", "N.m", "sine part of the gravity torque: all of it where the link stands or hangs at zero; positive: upright", role="gravity", typical=105.18),
-        signed("gravity_cosine", "N.m", "cosine part of the gravity torque: all of it where the link is level at zero", typical=5.0),
+        signed(
+            "gravity_torque",
+            "N.m",
+            "sine part of the gravity torque: all of it where the link stands or hangs at zero; "
+            "positive: upright",
+            role="gravity",
+            typical=105.18,
+        ),
+        signed(
+            "gravity_cosine",
+            "N.m",
+            "cosine part of the gravity torque: all of it where the link is level at zero",
+            typical=5.0,
+        ),
     ),
     common=True,
     absence="the residual of the link follows sine and cosine of its angle",

@@ -18,7 +18,9 @@ def _stored(s: LocalSignals, p: SimpleNamespace) -> Expression:
     title="gravity of a link that is upright at zero",
     family="torque",
     acts_on=("link",),
-    parameters=(signed("gravity_torque", "N.m", "gravity torque at 90 degrees; positive: upright at zero"),),
+    parameters=(
+        signed("gravity_torque", "N.m", "gravity torque at 90 degrees; positive: upright at zero"),
+    ),
     absence="the residual of the link follows the sine of its angle",
     excitation="a long slow swing",
     source="thesis eq. 2.82",

@@ -9,9 +9,14 @@ from ..parameter import amplitude, shape
 from ..signals import Expression, LocalSignals
 
 
-def _stops(z: tuple[Expression, ...], step: Expression, s: LocalSignals, p: SimpleNamespace) -> tuple[Expression, ...]:
+def _stops(
+    z: tuple[Expression, ...], step: Expression, s: LocalSignals, p: SimpleNamespace
+) -> tuple[Expression, ...]:
     """Stop operators: each follows the torsion until it slips."""
-    return tuple(ca.fmin(ca.fmax(state + step / (width * p.hysteresis_width), -1), 1) for state, width in zip(z, (1, 3, 9), strict=True))
+    return tuple(
+        ca.fmin(ca.fmax(state + step / (width * p.hysteresis_width), -1), 1)
+        for state, width in zip(z, (1, 3, 9), strict=True)
+    )
 
 
 @effect(
@@ -20,9 +25,15 @@ def _stops(z: tuple[Expression, ...], step: Expression, s: LocalSignals, p: Simp
     family="transmission",
     acts_on=("transmission",),
     parameters=(
-        amplitude("hysteresis_torque_1", "N.m", "half width of the loop, short element", typical=2.0),
-        amplitude("hysteresis_torque_2", "N.m", "half width of the loop, middle element", typical=3.0),
-        amplitude("hysteresis_torque_3", "N.m", "half width of the loop, long element", typical=3.0),
+        amplitude(
+            "hysteresis_torque_1", "N.m", "half width of the loop, short element", typical=2.0
+        ),
+        amplitude(
+            "hysteresis_torque_2", "N.m", "half width of the loop, middle element", typical=3.0
+        ),
+        amplitude(
+            "hysteresis_torque_3", "N.m", "half width of the loop, long element", typical=3.0
+        ),
         shape(
             "hysteresis_width",
             "rad",
@@ -39,7 +50,8 @@ def _stops(z: tuple[Expression, ...], step: Expression, s: LocalSignals, p: Simp
     of_displacement=True,
     absence="the residual of the transmission is a closed loop against the torsion, at any speed",
     excitation="slow load cycles",
-    source="H. Taghirad, P. Belanger 1996; Maxwell-slip elements (F. Al-Bender, V. Lampaert, J. Swevers 2005)",
+    source="H. Taghirad, P. Belanger 1996; Maxwell-slip elements (F. Al-Bender, V. Lampaert, J. "
+    "Swevers 2005)",
     memory=_stops,
     states=3,
     dissipative=True,
@@ -49,4 +61,8 @@ def _stops(z: tuple[Expression, ...], step: Expression, s: LocalSignals, p: Simp
 )
 def hysteresis(s: LocalSignals, p: SimpleNamespace) -> Expression:
     """Sum of three elements that stick and slip."""
-    return p.hysteresis_torque_1 * s.memory[0] + p.hysteresis_torque_2 * s.memory[1] + p.hysteresis_torque_3 * s.memory[2]
+    return (
+        p.hysteresis_torque_1 * s.memory[0]
+        + p.hysteresis_torque_2 * s.memory[1]
+        + p.hysteresis_torque_3 * s.memory[2]
+    )

@@ -1,4 +1,6 @@
-"""Kinematic error of the wave generator (step from model 3 to model 4), and one line of any order."""
+"""Kinematic error of the wave generator (step from model 3 to model 4), and one line of any
+order.
+"""
 
 from types import SimpleNamespace
 
@@ -15,10 +17,26 @@ from ..signals import Expression, LocalSignals
     family="transmission",
     acts_on=("torsion",),
     parameters=(
-        signed("kinematic_error_sine", "rad", "sine part of the error, link-referred", typical=4.0e-4),
-        signed("kinematic_error_cosine", "rad", "cosine part of the error, link-referred", typical=3.0e-4),
-        shape("kinematic_error_order", "1", "order per turn of the wave generator", (1.0, 2.0, 4.0), "absolute",
-              start=2.0, low=0.05, high=64.0, role="order"),
+        signed(
+            "kinematic_error_sine", "rad", "sine part of the error, link-referred", typical=4.0e-4
+        ),
+        signed(
+            "kinematic_error_cosine",
+            "rad",
+            "cosine part of the error, link-referred",
+            typical=3.0e-4,
+        ),
+        shape(
+            "kinematic_error_order",
+            "1",
+            "order per turn of the wave generator",
+            (1.0, 2.0, 4.0),
+            "absolute",
+            start=2.0,
+            low=0.05,
+            high=64.0,
+            role="order",
+        ),
     ),
     pairs=(("kinematic_error", "kinematic_error_sine", "kinematic_error_cosine"),),
     absence="a line in the residual of the transmission at an order of the motor turn",
@@ -28,7 +46,7 @@ from ..signals import Expression, LocalSignals
     needs=("transmission_compliance",),
     confused_with=("torque_ripple",),
     separate_by="a slow constant-speed run with the torque sensor recorded",
-)  # fmt: skip
+)
 def kinematic_error(s: LocalSignals, p: SimpleNamespace) -> Expression:
     """Angle taken off the torsion: one order; orders 1, 2 and 4 are three terms."""
     angle = p.kinematic_error_order * s.motor_angle

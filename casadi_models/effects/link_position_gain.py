@@ -12,7 +12,14 @@ from ..signals import Expression, LocalSignals, gain_error
     title="wrong gear ratio or scale of a position",
     family="sensor",
     acts_on=("link_position_sensor",),
-    parameters=(signed("link_position_gain", "1", "relative error: link reading = (1 + error) motor reading / gear_ratio, without torsion", typical=0.002),),
+    parameters=(
+        signed(
+            "link_position_gain",
+            "1",
+            "relative error: link reading = (1 + error) motor reading / gear_ratio, without torsion",
+            typical=0.002,
+        ),
+    ),
     absence="the transmission balance follows the link position",
     excitation="a long stroke, better without gravity",
     source="field knowledge",

@@ -14,7 +14,15 @@ from ..signals import Expression, LocalSignals
     title="load-dependent friction",
     family="friction",
     acts_on=("motor", "link"),
-    parameters=(amplitude("load_friction", "1", "share of the load that comes back as friction", high=1.0, typical=0.08),),
+    parameters=(
+        amplitude(
+            "load_friction",
+            "1",
+            "share of the load that comes back as friction",
+            high=1.0,
+            typical=0.08,
+        ),
+    ),
     absence="the friction band widens with the load",
     excitation="two payloads, or a long swing through gravity",
     source="A. C. Bittencourt et al. 2010; M. Duclusaud et al. 2025",

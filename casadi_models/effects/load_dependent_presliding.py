@@ -9,7 +9,9 @@ from ..parameter import shape, signed
 from ..signals import Expression, LocalSignals
 
 
-def _bristle(z: tuple[Expression, ...], step: Expression, s: LocalSignals, p: SimpleNamespace) -> tuple[Expression, ...]:
+def _bristle(
+    z: tuple[Expression, ...], step: Expression, s: LocalSignals, p: SimpleNamespace
+) -> tuple[Expression, ...]:
     moved = step / p.load_presliding_distance
     return ((z[0] + moved) / (1 + ca.fabs(moved)),)
 
@@ -24,8 +26,15 @@ def _rate(z: tuple[Expression, ...], s: LocalSignals, p: SimpleNamespace) -> tup
     family="friction",
     acts_on=("motor", "link"),
     parameters=(
-        signed("load_friction_mean", "1", "share of the load that resists the motion", typical=0.08),
-        signed("load_friction_difference", "1", "share of the load lost when driving more than when back-driven", typical=0.03),
+        signed(
+            "load_friction_mean", "1", "share of the load that resists the motion", typical=0.08
+        ),
+        signed(
+            "load_friction_difference",
+            "1",
+            "share of the load lost when driving more than when back-driven",
+            typical=0.03,
+        ),
         shape(
             "load_presliding_distance",
             "rad",
@@ -38,7 +47,8 @@ def _rate(z: tuple[Expression, ...], s: LocalSignals, p: SimpleNamespace) -> tup
         ),
     ),
     several_valleys=True,
-    absence="the residual is a loop against distance; its width follows the load and differs when back-driven",
+    absence="the residual is a loop against distance; its width follows the load and differs "
+    "when back-driven",
     excitation="small reversals under two or more payloads",
     source="MuJoCo issue 3528 (torque-proportional loss of strain-wave gears), 2026",
     memory=_bristle,
@@ -51,4 +61,7 @@ def _rate(z: tuple[Expression, ...], s: LocalSignals, p: SimpleNamespace) -> tup
 )
 def load_dependent_presliding(s: LocalSignals, p: SimpleNamespace) -> Expression:
     """Friction in proportion to the load, turned round over a distance."""
-    return p.load_friction_mean * ca.sqrt(s.load**2 + 1e-6) * s.memory[0] + p.load_friction_difference * s.load * s.memory[0] ** 2
+    return (
+        p.load_friction_mean * ca.sqrt(s.load**2 + 1e-6) * s.memory[0]
+        + p.load_friction_difference * s.load * s.memory[0] ** 2
+    )

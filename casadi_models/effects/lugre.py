@@ -9,7 +9,9 @@ from ..parameter import amplitude, shape
 from ..signals import Expression, LocalSignals
 
 
-def _bristle(z: tuple[Expression, ...], step: Expression, s: LocalSignals, p: SimpleNamespace) -> tuple[Expression, ...]:
+def _bristle(
+    z: tuple[Expression, ...], step: Expression, s: LocalSignals, p: SimpleNamespace
+) -> tuple[Expression, ...]:
     moved = step / p.presliding_distance
     return ((z[0] + moved) / (1 + ca.fabs(moved)),)
 
@@ -24,7 +26,12 @@ def _rate(z: tuple[Expression, ...], s: LocalSignals, p: SimpleNamespace) -> tup
     family="friction",
     acts_on=("motor", "link"),
     parameters=(
-        amplitude("presliding_torque", "N.m", "part of the Coulomb torque that builds up over the presliding distance", typical=18.0),
+        amplitude(
+            "presliding_torque",
+            "N.m",
+            "part of the Coulomb torque that builds up over the presliding distance",
+            typical=18.0,
+        ),
         shape(
             "presliding_distance",
             "rad",

@@ -12,10 +12,25 @@ from ..signals import Expression, LocalSignals
     title="motor constant",
     family="sensor",
     acts_on=("drive",),
-    parameters=(signed("motor_constant_error", "1", "relative error: true torque = (1 + error) times the stated one", typical=0.15),),
+    parameters=(
+        signed(
+            "motor_constant_error",
+            "1",
+            "relative error: true torque = (1 + error) times the stated one",
+            typical=0.15,
+        ),
+    ),
     requires=(
-        Requirement((SECOND_BALANCE, ANYTHING_KNOWN), "one balance alone scales with the motor constant; give a known inertia or a torque sensor"),
-        Requirement((TORQUE_SENSOR, "motor_inertia"), "without a torque sensor the whole balance scales with the motor constant; give a known inertia"),
+        Requirement(
+            (SECOND_BALANCE, ANYTHING_KNOWN),
+            "one balance alone scales with the motor constant; give a known inertia or a torque "
+            "sensor",
+        ),
+        Requirement(
+            (TORQUE_SENSOR, "motor_inertia"),
+            "without a torque sensor the whole balance scales with the motor constant; give a "
+            "known inertia",
+        ),
     ),
     absence="the residual of the motor follows the drive torque, its inertial part too",
     excitation="fast motion and a gravity-free run",

@@ -24,8 +24,18 @@ def _stored(s: LocalSignals, p: SimpleNamespace) -> Expression:
     family="transmission",
     acts_on=("transmission",),
     parameters=(
-        signed("stiffness_step_1", "N.m/rad", "change of the stiffness beyond the first knot", typical=6e3),
-        signed("stiffness_step_2", "N.m/rad", "change of the stiffness beyond the second knot", typical=8e3),
+        signed(
+            "stiffness_step_1",
+            "N.m/rad",
+            "change of the stiffness beyond the first knot",
+            typical=6e3,
+        ),
+        signed(
+            "stiffness_step_2",
+            "N.m/rad",
+            "change of the stiffness beyond the second knot",
+            typical=8e3,
+        ),
         shape(
             "stiffness_knot_1",
             "rad",
@@ -59,4 +69,6 @@ def _stored(s: LocalSignals, p: SimpleNamespace) -> Expression:
 )
 def piecewise_stiffness(s: LocalSignals, p: SimpleNamespace) -> Expression:
     """Torque of the stiffness steps beyond the knots."""
-    return p.stiffness_step_1 * _beyond(s, p.stiffness_knot_1) + p.stiffness_step_2 * _beyond(s, p.stiffness_knot_2)
+    return p.stiffness_step_1 * _beyond(s, p.stiffness_knot_1) + p.stiffness_step_2 * _beyond(
+        s, p.stiffness_knot_2
+    )

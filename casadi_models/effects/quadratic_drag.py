@@ -14,7 +14,14 @@ from ..signals import Expression, LocalSignals
     title="quadratic drag",
     family="friction",
     acts_on=("motor", "link"),
-    parameters=(signed("quadratic_drag", "N.m.s2/rad2", "coefficient of velocity times its magnitude", typical=8.0),),
+    parameters=(
+        signed(
+            "quadratic_drag",
+            "N.m.s2/rad2",
+            "coefficient of velocity times its magnitude",
+            typical=8.0,
+        ),
+    ),
     absence="the residual bends against velocity, odd in it",
     excitation="at least three speeds, up to the highest",
     source="field knowledge (churning, windage)",

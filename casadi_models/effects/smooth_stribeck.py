@@ -15,11 +15,33 @@ from ..signals import Expression, LocalSignals
     family="friction",
     acts_on=("motor", "link"),
     parameters=(
-        amplitude("smooth_stribeck", "N.m.s/rad", "slope of the extra friction at zero velocity (C2)", typical=300.0),
-        shape("smooth_stribeck_velocity", "rad/s", "velocity near which the extra friction peaks",
-              (0.01, 0.02, 0.04, 0.08, 0.15, 0.3), "velocity", start=0.02, low=1e-6, high=1e3),
-        shape("smooth_stribeck_exponent", "1", "exponent of the decay", (1.0, 2.0), "absolute",
-              start=1.0, low=0.5, high=2.0, role="exponent"),
+        amplitude(
+            "smooth_stribeck",
+            "N.m.s/rad",
+            "slope of the extra friction at zero velocity (C2)",
+            typical=300.0,
+        ),
+        shape(
+            "smooth_stribeck_velocity",
+            "rad/s",
+            "velocity near which the extra friction peaks",
+            (0.01, 0.02, 0.04, 0.08, 0.15, 0.3),
+            "velocity",
+            start=0.02,
+            low=1e-6,
+            high=1e3,
+        ),
+        shape(
+            "smooth_stribeck_exponent",
+            "1",
+            "exponent of the decay",
+            (1.0, 2.0),
+            "absolute",
+            start=1.0,
+            low=0.5,
+            high=2.0,
+            role="exponent",
+        ),
     ),
     shapes_reversal=True,
     absence="the residual peaks at low speed on both sides of a reversal",
@@ -30,7 +52,7 @@ from ..signals import Expression, LocalSignals
     confused_with=("stribeck", "lugre", "viscous"),
     needs=("coulomb",),
     separate_by="slow constant-speed runs, and small slow reversals",
-)  # fmt: skip
+)
 def smooth_stribeck(s: LocalSignals, p: SimpleNamespace) -> Expression:
     """Extra friction that rises from zero with the velocity and decays."""
     relative = s.velocity**2 / p.smooth_stribeck_velocity**2 + 1e-12

@@ -12,7 +12,11 @@ from ..signals import Expression, LocalSignals
 
 def _stored(s: LocalSignals, p: SimpleNamespace) -> Expression:
     share = ca.fabs(s.torsion / p.soft_windup_width)
-    return -p.soft_windup_torque * p.soft_windup_width * (share + ca.log1p(ca.exp(-2 * share)) - math.log(2))
+    return (
+        -p.soft_windup_torque
+        * p.soft_windup_width
+        * (share + ca.log1p(ca.exp(-2 * share)) - math.log(2))
+    )
 
 
 @effect(

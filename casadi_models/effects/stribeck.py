@@ -15,7 +15,13 @@ from ..signals import Expression, LocalSignals
     family="friction",
     acts_on=("motor", "link"),
     parameters=(
-        amplitude("stribeck_extra", "N.m", "static friction above the Coulomb torque", role="static", typical=12.0),
+        amplitude(
+            "stribeck_extra",
+            "N.m",
+            "static friction above the Coulomb torque",
+            role="static",
+            typical=12.0,
+        ),
         shape(
             "stribeck_velocity",
             "rad/s",
@@ -27,7 +33,17 @@ from ..signals import Expression, LocalSignals
             high=1e3,
             typical=0.07,
         ),
-        shape("stribeck_exponent", "1", "exponent of the decay", (1.0, 2.0), "absolute", start=1.0, low=0.5, high=2.0, role="exponent"),
+        shape(
+            "stribeck_exponent",
+            "1",
+            "exponent of the decay",
+            (1.0, 2.0),
+            "absolute",
+            start=1.0,
+            low=0.5,
+            high=2.0,
+            role="exponent",
+        ),
     ),
     several_valleys=True,
     absence="the residual peaks at low speed on both sides of a reversal",
@@ -40,4 +56,8 @@ from ..signals import Expression, LocalSignals
 )
 def stribeck(s: LocalSignals, p: SimpleNamespace) -> Expression:
     """Extra friction at low speed."""
-    return p.stribeck_extra * s.direction * ca.exp(-((s.velocity**2 / p.stribeck_velocity**2 + 1e-12) ** (p.stribeck_exponent / 2)))
+    return (
+        p.stribeck_extra
+        * s.direction
+        * ca.exp(-((s.velocity**2 / p.stribeck_velocity**2 + 1e-12) ** (p.stribeck_exponent / 2)))
+    )

@@ -12,7 +12,11 @@ from ..signals import Expression, LocalSignals
     title="structural damping of the transmission",
     family="transmission",
     acts_on=("transmission",),
-    parameters=(amplitude("structural_damping", "N.m.s/rad", "damping in parallel to the stiffness", typical=60.0),),
+    parameters=(
+        amplitude(
+            "structural_damping", "N.m.s/rad", "damping in parallel to the stiffness", typical=60.0
+        ),
+    ),
     absence="the residual of the transmission follows the rate of the torsion",
     excitation="motion near the resonance, 5 to 15 Hz",
     source="Compliant Joint Toolbox (J. Malzahn, W. Roozing, N. Tsagarakis 2019)",

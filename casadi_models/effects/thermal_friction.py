@@ -1,4 +1,6 @@
-"""Friction that changes with temperature (the signal counts from the first sample of the first training record)."""
+"""Friction that changes with temperature (the signal counts from the first sample of the first
+training record).
+"""
 
 from types import SimpleNamespace
 
@@ -13,11 +15,16 @@ from ..signals import Expression, LocalSignals
     family="friction",
     acts_on=("motor", "link"),
     parameters=(
-        signed("thermal_coulomb", "N.m/K", "change of the Coulomb torque with temperature", typical=0.3),
-        signed("thermal_viscous", "N.m.s/(rad.K)", "change of the viscous coefficient with temperature"),
+        signed(
+            "thermal_coulomb", "N.m/K", "change of the Coulomb torque with temperature", typical=0.3
+        ),
+        signed(
+            "thermal_viscous", "N.m.s/(rad.K)", "change of the viscous coefficient with temperature"
+        ),
     ),
     absence="the friction residual changes during the run while its shape stays",
-    excitation="a long run that repeats its first block at the end, with temperature recorded; without that channel the time since a cold start stands in",
+    excitation="a long run that repeats its first block at the end, with temperature recorded; "
+    "without that channel the time since a cold start stands in",
     source="A. C. Bittencourt, P. Axelsson 2014; L. Simoni et al. 2015",
     needs=("coulomb",),
     separate_by="a long run that repeats its first block when warm",

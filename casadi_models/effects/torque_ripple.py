@@ -46,4 +46,6 @@ def _stored(s: LocalSignals, p: SimpleNamespace) -> Expression:
 )
 def torque_ripple(s: LocalSignals, p: SimpleNamespace) -> Expression:
     """Torque of one order of the motor turn."""
-    return p.ripple_sine * ca.sin(p.ripple_order * s.motor_angle) + p.ripple_cosine * ca.cos(p.ripple_order * s.motor_angle)
+    return p.ripple_sine * ca.sin(p.ripple_order * s.motor_angle) + p.ripple_cosine * ca.cos(
+        p.ripple_order * s.motor_angle
+    )

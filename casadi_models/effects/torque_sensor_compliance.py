@@ -12,8 +12,15 @@ from ..signals import Expression, LocalSignals
     title="compliance of the torque sensor",
     family="transmission",
     acts_on=("torsion",),
-    parameters=(amplitude("sensor_compliance", "rad/(N.m)", "twist of the sensor per torque", typical=1e-5),),
-    requires=(Requirement(("stiffness",), "cannot be told from the stiffness itself; give the catalogue stiffness in [known]"),),
+    parameters=(
+        amplitude("sensor_compliance", "rad/(N.m)", "twist of the sensor per torque", typical=1e-5),
+    ),
+    requires=(
+        Requirement(
+            ("stiffness",),
+            "cannot be told from the stiffness itself; give the catalogue stiffness in [known]",
+        ),
+    ),
     absence="the transmission seems softer than its catalogue stiffness",
     excitation="torque against torsion, with the catalogue stiffness known",
     source="thesis section 2.5.3",

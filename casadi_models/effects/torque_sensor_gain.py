@@ -12,7 +12,14 @@ from ..signals import Expression, LocalSignals, gain_error
     title="gain of the torque sensor",
     family="sensor",
     acts_on=("torque_sensor",),
-    parameters=(signed("torque_sensor_gain", "1", "relative error of the sensor: reading = (1 + error) times the true torque", typical=0.1),),
+    parameters=(
+        signed(
+            "torque_sensor_gain",
+            "1",
+            "relative error of the sensor: reading = (1 + error) times the true torque",
+            typical=0.1,
+        ),
+    ),
     absence="all balances with the torque sensor fail in proportion to the torque",
     excitation="a gravity-free run and known payload",
     source="field knowledge",

@@ -16,7 +16,9 @@ def _stored(s: LocalSignals, p: SimpleNamespace) -> Expression:
     title="compliance of the transmission",
     family="transmission",
     acts_on=("transmission",),
-    parameters=(amplitude("stiffness", "N.m/rad", "torsional stiffness", role="stiffness", typical=2.2e4),),
+    parameters=(
+        amplitude("stiffness", "N.m/rad", "torsional stiffness", role="stiffness", typical=2.2e4),
+    ),
     stage="structure",
     absence="motor and link do not move together: the residual follows the torsion",
     excitation="torque in both directions",

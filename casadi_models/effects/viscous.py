@@ -12,7 +12,14 @@ from ..signals import Expression, LocalSignals
     title="viscous friction",
     family="friction",
     acts_on=("motor", "link"),
-    parameters=(amplitude("viscous", "N.m.s/rad", "viscous friction coefficient", typical={"motor": 11.0, "link": 2.0}),),
+    parameters=(
+        amplitude(
+            "viscous",
+            "N.m.s/rad",
+            "viscous friction coefficient",
+            typical={"motor": 11.0, "link": 2.0},
+        ),
+    ),
     common=True,
     everywhere=True,
     absence="the residual has a slope against velocity",

@@ -1,4 +1,4 @@
-/* One sample of the estimator: irj_fmu.online.OnlineEstimator, and the sample grid and health of irj_fmu.slave_base. */
+/* One sample of the estimator: identification.online.estimator.OnlineEstimator, and the sample grid and health of irj_fmu.fmi.slave_base. */
 
 /* A message that a host may use as a format; hosts in other languages get no further arguments. */
 static void write_log(Twin *m, fmi2Status status, const char *category, const char *format, va_list values) {
@@ -321,7 +321,7 @@ static int take_sample(Twin *m, double time, const double readings[SENSORS], con
     return made;
 }
 
-/* Take a sample, which need not lie on the grid: irj_fmu.grid.Grid. */
+/* Take a sample, which need not lie on the grid: identification.online.grid.Grid. */
 static int update(Twin *m, double time, const double readings[SENSORS], const int good[SENSORS], int enable) {
     Grid *g = &m->s.grid;
     const double slack = ON_GRID * SAMPLE_TIME, before = g->time, apart = time - g->time;

@@ -1,4 +1,4 @@
-/* Fault detector: identification._fault_structured on the observer that CasADi has written.
+/* Fault detector: identification.faults.structured on the observer that CasADi has written.
  *
  * Bits, waits, limits and signatures come from native_config.h. A verdict on the joint itself is kept as an event.
  */
@@ -274,7 +274,7 @@ static void begin_anew(Fault *f, const double reading[SENSORS], double used[SENS
     close_suspicion(f);
 }
 
-/* Use readings again that were missing, where no position is in use; identification._fault_return. */
+/* Use readings again that were missing, where no position is in use; identification.faults.fresh_start. */
 static void take_back(Fault *f, const double reading[SENSORS], int gone) {
     static const int others[4][2] = {{Q_M, Q_L}, {Q_L, Q_M}, {W_M, W_L}, {W_L, W_M}};
     const int here = (f->lost[Q_M] && !(gone & 1 << Q_M)) || (f->lost[Q_L] && !(gone & 1 << Q_L));

@@ -1,4 +1,4 @@
-/* What holds the estimate: irj_fmu.pulse.Pulse for failures of all readings at once, irj_fmu.guard.Guard for those that
+/* What holds the estimate: identification.online.pulse.Pulse for failures of all readings at once, identification.online.guard.Guard for those that
  * nothing else has told. */
 
 #define LONG_AGO (-1000000)

@@ -1,4 +1,4 @@
-/* Residuals of the fault detector: identification._fault_residuals; bits and what they mean. */
+/* Residuals of the fault detector: identification.faults.residuals; bits and what they mean. */
 #define MASK (FAULT_RING - 1)
 
 enum { LINK_PARITY = 1, MOTOR_PARITY = 2, TORSION = 4, LINK_JUMP = 8, MOTOR_JUMP = 16, LINK = 32, MOTOR = 64 };

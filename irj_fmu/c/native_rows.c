@@ -1,4 +1,4 @@
-/* Rows of the balances from the last samples, as irj_fmu.rows.RowMaker makes them. */
+/* Rows of the balances from the last samples, as identification.online.rows.RowMaker makes them. */
 
 static void clear_rows(Twin *m) {
     memset(&m->s.rows, 0, sizeof m->s.rows);

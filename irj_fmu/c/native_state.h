@@ -1,4 +1,4 @@
-/* Memory of a native estimator; sizes come from native_config.h, which irj_fmu.native_tables writes.
+/* Memory of a native estimator; sizes come from native_config.h, which irj_fmu.estimator.native_tables writes.
  *
  * State is everything that changes from step to step: one copy of it is one FMU state. Nothing here is allocated after
  * fmi2Instantiate.

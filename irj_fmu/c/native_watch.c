@@ -1,4 +1,4 @@
-/* Checks of the readings that need no model, as irj_fmu.watch.Watch makes them. */
+/* Checks of the readings that need no model, as identification.online.watch.Watch makes them. */
 
 /* The k-th smallest of n values goes to its place, smaller ones before it. */
 static double select_value(double v[], int n, int k) {
@@ -31,7 +31,7 @@ static double smallest(const double v[], int n) {
     return found;
 }
 
-/* Standard deviation of white noise from fourth differences; identification.noise.noise_level. */
+/* Standard deviation of white noise from fourth differences; identification.balance.noise.noise_level. */
 static double noise_level(Twin *m, int sensor) {
     const int n = WATCH - 4;
     double *d = m->fourth, cut, gamma, below, above, mean = 0, variance = 0;

@@ -1,4 +1,4 @@
-/* Start of the recursion from the first window: irj_fmu.first_window, identification._prior_start, OnlineEstimator._begin. */
+/* Start of the recursion from the first window: identification.online.first_window, identification.recursive.prior_start, OnlineEstimator._begin. */
 
 /* Weights of the balances' rows at a reversal, where friction may take any value between its limits. */
 static void weight_of(const double shares[2], const double theta[N_THETA], const double size[N_BALANCES], double out[N_BALANCES]) {

@@ -1,9 +1,9 @@
 /* FMI 2.0 co-simulation of a native estimator: no Python in the host, no memory allocated in a step.
  *
- * native_config.h and native_model.c are written by irj_fmu.native_tables: sizes, tables, and CasADi's code of
- *   rls_step, rls_check   identification._ud_codegen     points, slopes   irj_fmu.rows
- *   sample_observer       identification._fault_core
- * Value references are the positions in the variable table of irj_fmu.estimator, so that a host can exchange the two.
+ * native_config.h and native_model.c are written by irj_fmu.estimator.native_tables: sizes, tables, and CasADi's code of
+ *   rls_step, rls_check   identification.recursive.ud_codegen     points, slopes   identification.online.rows
+ *   sample_observer       identification.faults.core
+ * Value references are the positions in the variable table of irj_fmu.estimator.slave, so that a host can exchange the two.
  */
 #include <float.h>
 #include <math.h>

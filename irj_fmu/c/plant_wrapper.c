@@ -1,6 +1,6 @@
 /* FMI 2.0 wrapper, model exchange and co-simulation, round a plant in generated C.
  *
- * plant_config.h (written by irj_fmu.plant) gives sizes, start values and the GUID,
+ * plant_config.h (written by irj_fmu.plant.library) gives sizes, start values and the GUID,
  * plant_model.c (written by CasADi) the functions
  *   model_f (x, u, p, z) -> dx           model_y (x, u, p, z) -> y
  *   model_df(x, u, p, z, sx, su, sp)     model_dy(...)   directional derivatives

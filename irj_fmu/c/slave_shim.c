@@ -2,7 +2,7 @@
  *
  * It finds a Python interpreter where the host has none, decodes the resource URI, keeps the host's logger
  * safe from missing categories and stray '%', and finalizes the interpreter before the library is torn down.
- * shim_config.h (written by irj_fmu.package) gives INNER_LIBRARY and LIBPYTHON_CANDIDATES.
+ * shim_config.h (written by irj_fmu.fmi.package) gives INNER_LIBRARY and LIBPYTHON_CANDIDATES.
  */
 #include <dlfcn.h>
 #include <limits.h>

@@ -1,4 +1,5 @@
-"""The integrator of ``_sim.c`` in numpy, vectorised over the records: slow, for machines without a C compiler.
+"""The integrator of ``_sim.c`` in numpy, vectorised over the records: slow, for machines without a
+C compiler.
 
 It is also the check on the C code: both follow the same equations and agree to rounding.
 """
@@ -21,21 +22,32 @@ if TYPE_CHECKING:
 Values = dict[str, "FloatArray"]
 
 
-def _level(p: Values, v: FloatArray, direction: float, fixed: FloatArray, heat: FloatArray) -> FloatArray:
+def _level(
+    p: Values, v: FloatArray, direction: float, fixed: FloatArray, heat: FloatArray
+) -> FloatArray:
     extra = p["TS"] * np.exp(-((np.abs(v) / p["VS"]) ** p["DS"]))
     return np.maximum(fixed + heat * p["TC"] + direction * p["TCA"] + extra, 0.0)
 
 
 def _kick(
-    p: Values, j: FloatArray, v: FloatArray, force: FloatArray, vm: FloatArray, fixed: FloatArray, heat: FloatArray,
-    z: FloatArray, h: float,
-) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    p: Values,
+    j: FloatArray,
+    v: FloatArray,
+    force: FloatArray,
+    vm: FloatArray,
+    fixed: FloatArray,
+    heat: FloatArray,
+    z: FloatArray,
+    h: float,
+) -> tuple[FloatArray, FloatArray]:
     """New velocity and bristle deflection of one body; see ``kick`` in ``_sim.c``."""
     a = np.abs(vm)
     f = force - heat * p["B"] * vm - p["B2"] * vm * a - p["B3"] * vm**3 - p["BA"] * a
     up, down = _level(p, vm, 1.0, fixed, heat), _level(p, vm, -1.0, fixed, heat)
     need = f + j * v / h
-    rough = np.where(need > up, v + h / j * (f - up), np.where(need < -down, v + h / j * (f + down), 0.0))
+    rough = np.where(
+        need > up, v + h / j * (f - up), np.where(need < -down, v + h / j * (f + down), 0.0)
+    )
     s = np.tanh(vm / np.where(p["V0"] > 0.0, p["V0"], 1.0))
     smooth = v + h / j * (f - np.where(s >= 0.0, up, down) * s)
     distance = np.where(p["ZS"] > 0.0, p["ZS"], 1.0)
@@ -50,7 +62,9 @@ def _spring(p: Values, x: FloatArray) -> tuple[FloatArray, FloatArray]:
     contact = np.where((p["GAP"] > 0.0) & (y == 0.0), 0.0, 1.0)
     y = y - p["WIND"] * np.tanh(y / p["WIND_X"])
     a = np.abs(y)
-    extra = p["PW_D1"] * np.maximum(a - p["PW_X1"], 0.0) + p["PW_D2"] * np.maximum(a - p["PW_X2"], 0.0)
+    extra = p["PW_D1"] * np.maximum(a - p["PW_X1"], 0.0) + p["PW_D2"] * np.maximum(
+        a - p["PW_X2"], 0.0
+    )
     return p["K"] * y + p["K3"] * y**3 + np.sign(y) * extra, contact
 
 
@@ -90,12 +104,18 @@ class _Fleet:
         self.j_tip = self.p["JL"] * self.p["FLEX"]
         self.j_link = self.p["JL"] - self.j_tip
 
-    def step(self, t: float, h: float, r: FloatArray, dr: FloatArray, snag: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def step(
+        self, t: float, h: float, r: FloatArray, dr: FloatArray, snag: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """Advance by h; returns current and transmission torque at the midpoint."""
         p, m, li = self.p, self.sides["M"], self.sides["L"]
         heat = 1.0 - p["HEAT"] * (1.0 - np.exp(-max(t, 0.0) / p["HEAT_TAU"]))
         one = np.ones_like(heat)
-        qm, tm, xm = self.q + 0.5 * h * self.v, self.th + 0.5 * h * self.w, self.x + 0.5 * h * self.u
+        qm, tm, xm = (
+            self.q + 0.5 * h * self.v,
+            self.th + 0.5 * h * self.w,
+            self.x + 0.5 * h * self.u,
+        )
         error = sum(p[k] * np.sin(p[f"{k}_O"] * p["N"] * qm + p[f"{k}_P"]) for k in ("KE1", "KE2"))
         static, contact = _spring(p, qm - tm + error)
         for i in range(3):
@@ -105,7 +125,11 @@ class _Fleet:
         self.stretch = qm - tm
         ripple = p["COG"] * np.sin(p["COG_O"] * p["N"] * qm + p["COG_P"])
         on_motor = _position_torque(m, qm, tm) + ripple
-        on_link = _position_torque(li, tm, tm) + p["STOP"] * np.maximum(tm - p["STOP_X"], 0.0) - p["TG"] * np.sin(tm)
+        on_link = (
+            _position_torque(li, tm, tm)
+            + p["STOP"] * np.maximum(tm - p["STOP_X"], 0.0)
+            - p["TG"] * np.sin(tm)
+        )
         bump = p["BUMP"] / (1.0 + ((tm - p["BUMP_X"]) / p["BUMP_W"]) ** 8)
         rub_m = m["CYC"] * np.sin(tm + m["CYC_P"]) + bump + snag
         rub_l = li["CYC"] * np.sin(tm + li["CYC_P"])
@@ -118,10 +142,28 @@ class _Fleet:
             torque = static + contact * p["C"] * (vm - wm)
             pull = wf * wf * (xm - tm) + 2.0 * p["FLEX_Z"] * wf * (um - wm)
             un = self.u - h * pull
-            vn, zm = _kick(m, p["JM"], self.v, p["KM"] * drive - torque - on_motor, vm,
-                           rub_m + m["MU"] * np.abs(torque), heat, self.zm, h)  # fmt: skip
-            wn, zl = _kick(li, self.j_link, self.w, torque + self.j_tip * pull - on_link, wm,
-                           rub_l + li["MU"] * np.abs(torque), one, self.zl, h)  # fmt: skip
+            vn, zm = _kick(
+                m,
+                p["JM"],
+                self.v,
+                p["KM"] * drive - torque - on_motor,
+                vm,
+                rub_m + m["MU"] * np.abs(torque),
+                heat,
+                self.zm,
+                h,
+            )
+            wn, zl = _kick(
+                li,
+                self.j_link,
+                self.w,
+                torque + self.j_tip * pull - on_link,
+                wm,
+                rub_l + li["MU"] * np.abs(torque),
+                one,
+                self.zl,
+                h,
+            )
             vm, wm, um = 0.5 * (self.v + vn), 0.5 * (self.w + wn), 0.5 * (self.u + un)
         tip = self.j_tip > 0.0
         self.v, self.w, self.zm, self.zl = vn, wn, zm, zl
@@ -141,7 +183,9 @@ def simulate_fleet(
     stride: int,
     before: int,
 ) -> list[FloatArray]:
-    """Same meaning and result as the C integrator; all records must have the same number of rows."""
+    """Same meaning and result as the C integrator; all records must have the same number of
+    rows.
+    """
     rows = len(references[0][0])
     if any(len(r[0]) != rows for r in references):
         raise GeneratorError("records of different lengths: simulate them in separate calls")

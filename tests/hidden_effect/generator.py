@@ -1,8 +1,9 @@
 """Closed-loop recordings of simulated harmonic-drive joints with something hidden in them.
 
-The generator is the other hand of the tests: it imports nothing of the project, has its own equations (set-valued,
-smoothed or bristle friction in a midpoint time-stepping scheme, see ``_engine.py``), its own sensors and its own
-reference motions. Every case has other joint parameters. Units are SI; joint parameters are link-referred.
+The generator is the other hand of the tests: it imports nothing of the project, has its own
+equations (set-valued, smoothed or bristle friction in a midpoint time-stepping scheme, see
+``_engine.py``), its own sensors and its own reference motions. Every case has other joint
+parameters. Units are SI; joint parameters are link-referred.
 
 ``python -m tests.hidden_effect.generator FOLDER --seeds 2`` writes a set of every effect.
 """
@@ -37,25 +38,38 @@ SPAN = 24.0
 KM = 0.0553
 TURNS = 160.0
 COLUMNS = (
-    "time_s", "motor_current_A", "motor_position_rad", "motor_velocity_rad_s", "link_position_rad",
-    "link_velocity_rad_s", "link_torque_Nm",
-)  # fmt: skip
+    "time_s",
+    "motor_current_A",
+    "motor_position_rad",
+    "motor_velocity_rad_s",
+    "link_position_rad",
+    "link_velocity_rad_s",
+    "link_torque_Nm",
+)
 NOISE: dict[str, float] = {
     "motor_current_A": 0.004,
     "motor_velocity_rad_s": 0.24,
     "link_velocity_rad_s": 0.0025,
     "link_torque_Nm": 0.05,
 }
-"""Standard deviations; positions get half (motor) and a quarter (link) of a step before they are rounded to steps."""
+"""Standard deviations; positions get half (motor) and a quarter (link) of a step before they
+are rounded to steps.
+"""
 QUANTUM: dict[str, float] = {
     "motor_position_rad": TURNS * float(np.radians(0.001)),
     "link_position_rad": float(np.radians(0.0036)),
 }
 _TRUTH = {
-    "JM": "motor_inertia_kg_m2", "JL": "link_inertia_kg_m2", "TG": "gravity_torque_Nm", "K": "stiffness_Nm_per_rad",
-    "C": "structural_damping_Nms_per_rad", "M_B": "motor_viscous_Nms_per_rad", "M_TC": "motor_coulomb_Nm",
-    "L_B": "link_viscous_Nms_per_rad", "L_TC": "link_coulomb_Nm",
-}  # fmt: skip
+    "JM": "motor_inertia_kg_m2",
+    "JL": "link_inertia_kg_m2",
+    "TG": "gravity_torque_Nm",
+    "K": "stiffness_Nm_per_rad",
+    "C": "structural_damping_Nms_per_rad",
+    "M_B": "motor_viscous_Nms_per_rad",
+    "M_TC": "motor_coulomb_Nm",
+    "L_B": "link_viscous_Nms_per_rad",
+    "L_TC": "link_coulomb_Nm",
+}
 
 
 @final
@@ -86,7 +100,9 @@ class Case:
 
 def _stream(seed: int, *labels: object) -> np.random.Generator:
     text = "/".join(str(x) for x in (seed, *labels))
-    return np.random.default_rng(int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "little"))
+    return np.random.default_rng(
+        int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "little")
+    )
 
 
 def names_of(effect: Hidden) -> tuple[str, ...]:
@@ -97,26 +113,48 @@ def names_of(effect: Hidden) -> tuple[str, ...]:
 
 
 def draw_joint(rng: np.random.Generator) -> dict[str, float]:
-    """Parameters of a plain joint near the thesis's tables 4.1 to 4.3, link-referred; NKM carries the ratio's sign."""
+    """Parameters of a plain joint near the thesis's tables 4.1 to 4.3, link-referred; NKM
+    carries the ratio's sign.
+    """
     ratio = TURNS if rng.random() < 0.5 else -TURNS
     smooth = float(rng.uniform(0.002, 0.006)) if rng.random() < 0.6 else 0.0
     return {
-        "JM": 4.447 * rng.uniform(0.88, 1.15), "JL": 10.277 * rng.uniform(0.88, 1.15),
-        "TG": 105.18 * rng.uniform(0.90, 1.15), "K": 2.1513e4 * rng.uniform(0.85, 1.18),
-        "C": rng.uniform(50.0, 75.0), "M_B": rng.uniform(9.5, 12.5), "M_TC": rng.uniform(18.0, 26.0),
-        "L_B": rng.uniform(1.5, 3.5), "L_TC": rng.uniform(0.3, 0.6), "N": TURNS, "NKM": ratio * KM,
-        "KP": 13000.0 * rng.uniform(0.9, 1.1), "KD": 620.0 * rng.uniform(0.95, 1.05), "M_V0": smooth, "L_V0": smooth,
-    }  # fmt: skip
+        "JM": 4.447 * rng.uniform(0.88, 1.15),
+        "JL": 10.277 * rng.uniform(0.88, 1.15),
+        "TG": 105.18 * rng.uniform(0.90, 1.15),
+        "K": 2.1513e4 * rng.uniform(0.85, 1.18),
+        "C": rng.uniform(50.0, 75.0),
+        "M_B": rng.uniform(9.5, 12.5),
+        "M_TC": rng.uniform(18.0, 26.0),
+        "L_B": rng.uniform(1.5, 3.5),
+        "L_TC": rng.uniform(0.3, 0.6),
+        "N": TURNS,
+        "NKM": ratio * KM,
+        "KP": 13000.0 * rng.uniform(0.9, 1.1),
+        "KD": 620.0 * rng.uniform(0.95, 1.05),
+        "M_V0": smooth,
+        "L_V0": smooth,
+    }
 
 
 def _dirt(rng: np.random.Generator) -> tuple[dict[str, float], dict[str, float]]:
-    """Small disturbances of every dirty record: bump, odd-order error, stiff link mode, other friction smoothing."""
+    """Small disturbances of every dirty record: bump, odd-order error, stiff link mode, other
+    friction smoothing.
+    """
     smooth = float(rng.uniform(0.002, 0.008))
     changes = {
-        "BUMP": 1.0, "BUMP_X": rng.uniform(-0.8, 0.8), "BUMP_W": rng.uniform(0.06, 0.12),
-        "KE2": 1.5e-5, "KE2_O": float(np.round(rng.uniform(2.3, 5.7), 2)), "KE2_P": rng.uniform(0.0, 6.28),
-        "FLEX": 0.03, "FLEX_F": 24.0, "FLEX_Z": 0.02, "M_V0": smooth, "L_V0": smooth,
-    }  # fmt: skip
+        "BUMP": 1.0,
+        "BUMP_X": rng.uniform(-0.8, 0.8),
+        "BUMP_W": rng.uniform(0.06, 0.12),
+        "KE2": 1.5e-5,
+        "KE2_O": float(np.round(rng.uniform(2.3, 5.7), 2)),
+        "KE2_P": rng.uniform(0.0, 6.28),
+        "FLEX": 0.03,
+        "FLEX_F": 24.0,
+        "FLEX_Z": 0.02,
+        "M_V0": smooth,
+        "L_V0": smooth,
+    }
     return changes, {"dirt_bump_Nm": 1.0, "dirt_snag_Nm": 0.8, "dirt_smoothing_rad_s": smooth}
 
 
@@ -133,7 +171,9 @@ def _sense(rng: np.random.Generator, exact: FloatArray, sensor: Mapping[str, flo
     column = {name: i for i, name in enumerate(COLUMNS)}
     table[:, column["motor_current_A"]] += sensor.get("current_offset", 0.0)
     torque = column["link_torque_Nm"]
-    table[:, torque] = sensor.get("torque_gain", 1.0) * table[:, torque] + sensor.get("torque_offset", 0.0)
+    table[:, torque] = sensor.get("torque_gain", 1.0) * table[:, torque] + sensor.get(
+        "torque_offset", 0.0
+    )
     for name, deviation in NOISE.items():
         table[:, column[name]] += deviation * rng.standard_normal(len(table))
     for name, share in (("motor_position_rad", 0.5), ("link_position_rad", 0.25)):
@@ -142,7 +182,9 @@ def _sense(rng: np.random.Generator, exact: FloatArray, sensor: Mapping[str, flo
     return table
 
 
-def _draws(effect: Hidden, seed: int, base: Mapping[str, float], size: float, side: str) -> dict[str, Draw]:
+def _draws(
+    effect: Hidden, seed: int, base: Mapping[str, float], size: float, side: str
+) -> dict[str, Draw]:
     found: dict[str, Draw] = {}
     for name in names_of(effect):
         make = LIBRARY.get(name) or OUTSIDE.get(name)
@@ -174,7 +216,8 @@ def simulate_case(
     effect
         Key of the library, kind from outside, tuple of several, or None.
     seed
-        Same seed and effect, same case, bit by bit. ``unloaded`` keeps the joint and changes the motion.
+        Same seed and effect, same case, bit by bit. ``unloaded`` keeps the joint and changes the
+        motion.
     size
         Factor on the strength of the effect.
     dirt
@@ -210,7 +253,9 @@ def simulate_case(
     if unloaded:
         values["TG"], values["JL"] = 0.0, 0.5 * values["JL"]
     values |= overrides or {}
-    exact = _run(_stream(seed, label, "motion", unloaded), values, draws, dirt, tuple(records), span, rests)
+    exact = _run(
+        _stream(seed, label, "motion", unloaded), values, draws, dirt, tuple(records), span, rests
+    )
     ratio = float(np.sign(values["NKM"])) * TURNS
     for table in exact.values():
         table[:, 2:4] *= ratio
@@ -225,11 +270,14 @@ def simulate_case(
         "balance": {n: d.balance for n, d in draws.items()},
         "gear_ratio": ratio,
         "seed": seed,
-        "options": {"size": size, "dirt": dirt, "unloaded": unloaded, "side": side} | ({"rests": rests} if rests else {}),
-        "link_referred": {text: values[key] for key, text in _TRUTH.items()} | {"friction_smoothing_rad_s": values["M_V0"]},
+        "options": {"size": size, "dirt": dirt, "unloaded": unloaded, "side": side}
+        | ({"rests": rests} if rests else {}),
+        "link_referred": {text: values[key] for key, text in _TRUTH.items()}
+        | {"friction_smoothing_rad_s": values["M_V0"]},
         "hidden": hidden | ({"dirt": dict(extra)} if dirt else {}),
         "overrides": dict(overrides or {}),
-        "note": "kinematic error: T = k (q_m - q_l + A sin(order |N| q_m + phase)); cyclic: A sin(q_l + phase)",
+        "note": "kinematic error: T = k (q_m - q_l + A sin(order |N| q_m + phase)); cyclic: A "
+        "sin(q_l + phase)",
     }
     return Case(ratio, values, exact, measured, truth)
 
@@ -246,13 +294,17 @@ def _run(
     rows = round(span / DT)
     references = plan(rng, rows, DT)
     if rests > 0.0:
-        references = {name: with_rests(rng, reference, DT, rests) for name, reference in references.items()}
+        references = {
+            name: with_rests(rng, reference, DT, rests) for name, reference in references.items()
+        }
     vector = pack(values)
     states: list[FloatArray] = []
     snags: list[FloatArray] = []
     for name in RECORDS:
         start = references[name][0][0]
-        states.append(np.array([start - values["TG"] * np.sin(start) / values["K"], 0.0, start, 0.0]))
+        states.append(
+            np.array([start - values["TG"] * np.sin(start) / values["K"], 0.0, start, 0.0])
+        )
         rows_of = [np.zeros((0, 3))]
         if dirt:
             rows_of.append(_snag_rows(rng, 0.8, 12))
@@ -261,9 +313,12 @@ def _run(
         snags.append(np.concatenate(rows_of))
     pick = [RECORDS.index(name) for name in records]
     tables = simulate(
-        [vector] * len(pick), [references[n] for n in records], [states[i] for i in pick], [snags[i] for i in pick],
+        [vector] * len(pick),
+        [references[n] for n in records],
+        [states[i] for i in pick],
+        [snags[i] for i in pick],
         dt=DT,
-    )  # fmt: skip
+    )
     return dict(zip(records, tables, strict=True))
 
 
@@ -289,12 +344,20 @@ def generate_case(
 ) -> Path:
     """Write a case: train, train2, test, test2 (csv), joint.toml, truth.json; see `simulate_case`.
 
-    ``one_sided`` keeps the motor's columns only, with a rigid start model (hd1). Returns the folder.
+    ``one_sided`` keeps the motor's columns only, with a rigid start model (hd1). Returns the
+    folder.
     """
     case = simulate_case(
-        effect, seed, size=size, dirt=dirt, torque_sensor=torque_sensor, unloaded=unloaded, side=side,
-        overrides=overrides, rests=rests,
-    )  # fmt: skip
+        effect,
+        seed,
+        size=size,
+        dirt=dirt,
+        torque_sensor=torque_sensor,
+        unloaded=unloaded,
+        side=side,
+        overrides=overrides,
+        rests=rests,
+    )
     folder.mkdir(parents=True, exist_ok=True)
     keep = kept_columns(torque_sensor, one_sided)
     header = ",".join(COLUMNS[i] for i in keep)
@@ -302,13 +365,20 @@ def generate_case(
         write_csv(folder / f"{name}.csv", header, table[:, keep])
     effects = '["viscous", "coulomb"]' if unloaded else '["viscous", "coulomb", "gravity"]'
     lines = [
-        "[joint]", f'name = "{folder.name}"', f"gear_ratio = {case.gear_ratio}",
-        f"motor_constant = {KM}   # Nm/A on the motor shaft", f'model = "{"hd1" if one_sided else "hd3"}"',
+        "[joint]",
+        f'name = "{folder.name}"',
+        f"gear_ratio = {case.gear_ratio}",
+        f"motor_constant = {KM}   # Nm/A on the motor shaft",
+        f'model = "{"hd1" if one_sided else "hd3"}"',
         f"effects = {effects}",
-    ]  # fmt: skip
+    ]
     (folder / "joint.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
     truth = dict(case.truth)
-    truth["options"] = {**dict(case.truth["options"]), "torque_sensor": torque_sensor, "one_sided": one_sided}  # type: ignore[call-overload]
+    truth["options"] = {
+        **dict(case.truth["options"]),
+        "torque_sensor": torque_sensor,
+        "one_sided": one_sided,
+    }  # type: ignore[call-overload]
     (folder / "truth.json").write_text(json.dumps(truth, indent=1) + "\n", encoding="utf-8")
     return folder
 
@@ -328,7 +398,9 @@ def main(argv: list[str] | None = None) -> int:
     jobs += [(e, s) for e in OUTSIDE for s in range(options.outside)]
     for effect, seed in jobs:
         name = f"{'+'.join(names_of(effect)) or 'none'}_{seed}"
-        generate_case(effect, seed, size=options.size, dirt=options.dirt, folder=options.folder / name)
+        generate_case(
+            effect, seed, size=options.size, dirt=options.dirt, folder=options.folder / name
+        )
     sys.stdout.write(f"{len(jobs)} cases in {options.folder}\n")
     return 0
 

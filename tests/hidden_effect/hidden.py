@@ -1,6 +1,8 @@
-"""What can be hidden in a joint: parameter changes, their sizes and what the truth file says about them.
+"""What can be hidden in a joint: parameter changes, their sizes and what the truth file says about
+them.
 
-All values are link-referred. Each function draws one effect; ``size`` scales its strength, never its shape.
+All values are link-referred. Each function draws one effect; ``size`` scales its strength, never
+its shape.
 """
 
 from __future__ import annotations
@@ -65,7 +67,9 @@ class Setting:
 
 
 def _on_side(s: Setting, changes: dict[str, float], truth: dict[str, float | str]) -> Draw:
-    return Draw({f"{s.side}_{k}": v for k, v in changes.items()}, {**truth, "place": s.place}, s.place)
+    return Draw(
+        {f"{s.side}_{k}": v for k, v in changes.items()}, {**truth, "place": s.place}, s.place
+    )
 
 
 def cubic_viscous(s: Setting) -> Draw:
@@ -92,8 +96,10 @@ def stribeck(s: Setting) -> Draw:
     extra, velocity = s.between(8.0, 14.0), s.shape(0.04, 0.09)
     exponent = float(s.rng.choice([1.0, 2.0]))
     truth: dict[str, float | str] = {
-        "stribeck_extra_Nm": extra, "stribeck_velocity_rad_s": velocity, "stribeck_exponent": exponent,
-    }  # fmt: skip
+        "stribeck_extra_Nm": extra,
+        "stribeck_velocity_rad_s": velocity,
+        "stribeck_exponent": exponent,
+    }
     return _on_side(s, {"TS": extra, "VS": velocity, "DS": exponent}, truth)
 
 
@@ -109,18 +115,28 @@ def lugre(s: Setting) -> Draw:
 
 def thermal_friction(s: Setting) -> Draw:
     fall, constant = s.between(0.20, 0.32), s.shape(5.0, 10.0)
-    return Draw({"HEAT": fall, "HEAT_TAU": constant}, {"friction_fall": fall, "thermal_time_constant_s": constant}, "motor")
+    return Draw(
+        {"HEAT": fall, "HEAT_TAU": constant},
+        {"friction_fall": fall, "thermal_time_constant_s": constant},
+        "motor",
+    )
 
 
 def cyclic_friction(s: Setting) -> Draw:
     amplitude, phase = s.between(2.5, 5.0), s.shape(0.0, 2.0 * np.pi)
-    return _on_side(s, {"CYC": amplitude, "CYC_P": phase}, {"cyclic_friction_Nm": amplitude, "cyclic_friction_phase_rad": phase})
+    return _on_side(
+        s,
+        {"CYC": amplitude, "CYC_P": phase},
+        {"cyclic_friction_Nm": amplitude, "cyclic_friction_phase_rad": phase},
+    )
 
 
 def cyclic_torque(s: Setting) -> Draw:
     amplitude, phase = s.between(4.0, 9.0), s.shape(0.0, 2.0 * np.pi)
     sine, cosine = amplitude * np.cos(phase), amplitude * np.sin(phase)
-    return _on_side(s, {"SIN": sine, "COS": cosine}, {"cyclic_sine_Nm": sine, "cyclic_cosine_Nm": cosine})
+    return _on_side(
+        s, {"SIN": sine, "COS": cosine}, {"cyclic_sine_Nm": sine, "cyclic_cosine_Nm": cosine}
+    )
 
 
 def added_spring(s: Setting) -> Draw:
@@ -139,7 +155,11 @@ def current_offset(s: Setting) -> Draw:
 
 
 def torque_ripple(s: Setting) -> Draw:
-    amplitude, order, phase = s.between(1.5, 3.5), float(s.rng.choice([1, 2, 4, 6])), s.shape(0.0, 2.0 * np.pi)
+    amplitude, order, phase = (
+        s.between(1.5, 3.5),
+        float(s.rng.choice([1, 2, 4, 6])),
+        s.shape(0.0, 2.0 * np.pi),
+    )
     return Draw(
         {"COG": amplitude, "COG_O": order, "COG_P": phase},
         {"ripple_Nm": amplitude, "ripple_order_per_motor_turn": order, "ripple_phase_rad": phase},
@@ -159,9 +179,11 @@ def piecewise_stiffness(s: Setting) -> Draw:
     first_knot = low / k
     second_knot = first_knot + (high - low) / (k + second)
     truth: dict[str, float | str] = {
-        "knot1_rad": first_knot, "knot2_rad": second_knot,
-        "stiffness2_Nm_per_rad": k + second, "stiffness3_Nm_per_rad": k + second + third,
-    }  # fmt: skip
+        "knot1_rad": first_knot,
+        "knot2_rad": second_knot,
+        "stiffness2_Nm_per_rad": k + second,
+        "stiffness3_Nm_per_rad": k + second + third,
+    }
     changes = {"PW_X1": first_knot, "PW_X2": second_knot, "PW_D1": second, "PW_D2": third}
     return Draw(changes, truth, "transmission")
 
@@ -172,7 +194,11 @@ def hysteresis(s: Setting) -> Draw:
     share = np.array([0.45, 0.35, 0.20])
     changes = {f"HK{i + 1}": float(width * share[i] / slip[i]) for i in range(3)}
     changes |= {f"HS{i + 1}": float(slip[i]) for i in range(3)}
-    return Draw(changes, {"hysteresis_half_width_Nm": width, "longest_slip_rad": float(slip[2])}, "transmission")
+    return Draw(
+        changes,
+        {"hysteresis_half_width_Nm": width, "longest_slip_rad": float(slip[2])},
+        "transmission",
+    )
 
 
 def backlash(s: Setting) -> Draw:
@@ -190,8 +216,10 @@ def kinematic_error(s: Setting) -> Draw:
     amplitude, phase = s.between(2.5e-4, 6.5e-4), s.shape(0.0, 2.0 * np.pi)
     order = float(s.rng.choice([1.0, 2.0, 2.0, 4.0]))
     truth: dict[str, float | str] = {
-        "kinematic_error_amplitude_rad": amplitude, "kinematic_error_order": order, "kinematic_error_phase_rad": phase,
-    }  # fmt: skip
+        "kinematic_error_amplitude_rad": amplitude,
+        "kinematic_error_order": order,
+        "kinematic_error_phase_rad": phase,
+    }
     return Draw({"KE1": amplitude, "KE1_O": order, "KE1_P": phase}, truth, "transmission")
 
 
@@ -211,12 +239,18 @@ def channel_delay(s: Setting) -> Draw:
     delay = round(s.between(5e-3, 1e-2) / STEP) * STEP
     name = "LAG_I" if channel == "motor_current" else "LAG_T"
     balance = "motor" if channel == "motor_current" else "sensor"
-    return Draw({name: float(round(delay / STEP))}, {"delay_s": delay, "delayed_channel": channel}, balance)
+    return Draw(
+        {name: float(round(delay / STEP))}, {"delay_s": delay, "delayed_channel": channel}, balance
+    )
 
 
 def _local_bump(s: Setting) -> Draw:
     torque, place, half = s.between(6.0, 10.0), s.shape(-0.6, 0.6), s.shape(0.10, 0.20)
-    truth: dict[str, float | str] = {"bump_Nm": torque, "bump_low_rad": place - half, "bump_high_rad": place + half}
+    truth: dict[str, float | str] = {
+        "bump_Nm": torque,
+        "bump_low_rad": place - half,
+        "bump_high_rad": place + half,
+    }
     return Draw({"BUMP": torque, "BUMP_X": place, "BUMP_W": half}, truth, "motor")
 
 
@@ -226,9 +260,14 @@ def _snags(s: Setting) -> Draw:
 
 
 def _odd_order(s: Setting) -> Draw:
-    amplitude, order = s.between(3e-4, 6e-4), float(np.round(s.rng.choice([2.63, 3.37, 3.71, 5.43]), 2))
+    amplitude, order = (
+        s.between(3e-4, 6e-4),
+        float(np.round(s.rng.choice([2.63, 3.37, 3.71, 5.43]), 2)),
+    )
     changes = {"KE1": amplitude, "KE1_O": order, "KE1_P": s.shape(0.0, 2.0 * np.pi)}
-    return Draw(changes, {"error_amplitude_rad": amplitude, "order_per_motor_turn": order}, "transmission")
+    return Draw(
+        changes, {"error_amplitude_rad": amplitude, "order_per_motor_turn": order}, "transmission"
+    )
 
 
 def _link_mode(s: Setting) -> Draw:
@@ -237,41 +276,91 @@ def _link_mode(s: Setting) -> Draw:
     free = frequency / np.sqrt(1.0 - share)
     return Draw(
         changes,
-        {"mode_inertia_share": share, "mode_frequency_hz": frequency, "mode_frequency_free_hz": float(free)},
+        {
+            "mode_inertia_share": share,
+            "mode_frequency_hz": frequency,
+            "mode_frequency_free_hz": float(free),
+        },
         "link",
     )
 
 
 def _soft_stop(s: Setting) -> Draw:
     rate, start = s.between(60.0, 120.0), s.shape(0.45, 0.65)
-    return Draw({"STOP": rate, "STOP_X": start}, {"stop_Nm_per_rad": rate, "stop_begins_rad": start}, "link")
+    return Draw(
+        {"STOP": rate, "STOP_X": start}, {"stop_Nm_per_rad": rate, "stop_begins_rad": start}, "link"
+    )
 
 
 LIBRARY: dict[str, Callable[[Setting], Draw]] = {
     f.__name__: f
     for f in (
-        cubic_viscous, quadratic_drag, asymmetric_coulomb, asymmetric_viscous, stribeck, load_dependent_friction, lugre,
-        thermal_friction, cyclic_friction, cyclic_torque, added_spring, motor_constant_error, current_offset,
-        torque_ripple, cubic_stiffness, piecewise_stiffness, hysteresis, backlash, soft_windup, kinematic_error,
-        torque_sensor_gain, torque_sensor_offset, channel_delay,
+        cubic_viscous,
+        quadratic_drag,
+        asymmetric_coulomb,
+        asymmetric_viscous,
+        stribeck,
+        load_dependent_friction,
+        lugre,
+        thermal_friction,
+        cyclic_friction,
+        cyclic_torque,
+        added_spring,
+        motor_constant_error,
+        current_offset,
+        torque_ripple,
+        cubic_stiffness,
+        piecewise_stiffness,
+        hysteresis,
+        backlash,
+        soft_windup,
+        kinematic_error,
+        torque_sensor_gain,
+        torque_sensor_offset,
+        channel_delay,
     )
-}  # fmt: skip
+}
 """Effects that have a key in the project's library."""
 
 OUTSIDE: dict[str, Callable[[Setting], Draw]] = {
-    "local_bump": _local_bump, "snags": _snags, "odd_order": _odd_order, "link_mode": _link_mode,
+    "local_bump": _local_bump,
+    "snags": _snags,
+    "odd_order": _odd_order,
+    "link_mode": _link_mode,
     "soft_stop": _soft_stop,
-}  # fmt: skip
-"""Kinds that no key names: rubbing in a sector, random snags, gear error of odd order, flexible link, soft stop."""
+}
+"""Kinds that no key names: rubbing in a sector, random snags, gear error of odd order, flexible
+link, soft stop.
+"""
 
 NEEDS_TORQUE_SENSOR = frozenset({"torque_sensor_gain", "torque_sensor_offset"})
-ONE_SIDED_HIDDEN = frozenset({
-    "cubic_stiffness", "piecewise_stiffness", "hysteresis", "backlash", "soft_windup", "kinematic_error",
-    "torque_sensor_gain", "torque_sensor_offset",
-})  # fmt: skip
-"""Effects that a record of the motor side alone is not asked to show (transmission and torque sensor)."""
-SIDED = frozenset({
-    "cubic_viscous", "quadratic_drag", "asymmetric_coulomb", "asymmetric_viscous", "stribeck", "lugre",
-    "load_dependent_friction", "cyclic_friction", "cyclic_torque", "added_spring",
-})  # fmt: skip
+ONE_SIDED_HIDDEN = frozenset(
+    {
+        "cubic_stiffness",
+        "piecewise_stiffness",
+        "hysteresis",
+        "backlash",
+        "soft_windup",
+        "kinematic_error",
+        "torque_sensor_gain",
+        "torque_sensor_offset",
+    }
+)
+"""Effects that a record of the motor side alone is not asked to show (transmission and torque
+sensor).
+"""
+SIDED = frozenset(
+    {
+        "cubic_viscous",
+        "quadratic_drag",
+        "asymmetric_coulomb",
+        "asymmetric_viscous",
+        "stribeck",
+        "lugre",
+        "load_dependent_friction",
+        "cyclic_friction",
+        "cyclic_torque",
+        "added_spring",
+    }
+)
 """Effects that can sit on either side."""

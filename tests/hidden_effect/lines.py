@@ -2,9 +2,10 @@
 
     python -m tests.hidden_effect.lines [--joints 20] [--out FILE.md]
 
-The joints come from the independent generator with nothing hidden. A torque ripple (in the motor current) or a
-kinematic error (in the link position) is put in at a random order of 0.5 to 9 per motor turn, sized so that taking it
-out again lowers the residual of its balance at the shortest kernel by 2 to 5 %.
+The joints come from the independent generator with nothing hidden. A torque ripple (in the motor
+current) or a kinematic error (in the link position) is put in at a random order of 0.5 to 9 per
+motor turn, sized so that taking it out again lowers the residual of its balance at the shortest
+kernel by 2 to 5 %.
 """
 
 from __future__ import annotations
@@ -19,10 +20,10 @@ from pathlib import Path
 import numpy as np
 
 from identification import Record, load_joint, read
-from identification.assess import assess
-from identification.engine import Dataset, load_dataset, prepared_model, solve
-from identification.joint_file import Joint
-from identification.lines import Line, find_lines
+from identification.data.joint_file import Joint
+from identification.diagnosis.lines import Line, find_lines
+from identification.fitting.assess import assess
+from identification.fitting.engine import Dataset, load_dataset, prepared_model, solve
 from tests.hidden_effect.generator import generate_case
 
 LIMIT = 90.0
@@ -40,8 +41,13 @@ class Case:
 
     @property
     def found(self) -> bool:
-        """A line of the right balance within its own tolerance (2 pi over the stroke) of the order."""
-        return any(abs(x.order - self.order) <= x.tolerance and x.balance == self.balance for x in self.lines)
+        """A line of the right balance within its own tolerance (2 pi over the stroke) of the
+        order.
+        """
+        return any(
+            abs(x.order - self.order) <= x.tolerance and x.balance == self.balance
+            for x in self.lines
+        )
 
 
 def kernels(joint: Joint, train: Sequence[Record], held: Sequence[Record]) -> list[Dataset]:
@@ -51,12 +57,16 @@ def kernels(joint: Joint, train: Sequence[Record], held: Sequence[Record]) -> li
     return [load_dataset(train, held, joint, model, kernel=k) for k in (shortest, 0.03, None)]
 
 
-def lines_of(joint: Joint, train: Sequence[Record], held: Sequence[Record]) -> tuple[list[Line], dict[str, float]]:
+def lines_of(
+    joint: Joint, train: Sequence[Record], held: Sequence[Record]
+) -> tuple[list[Line], dict[str, float]]:
     """Lines, and the RMS of each balance at the shortest kernel."""
     data = kernels(joint, train, held)
     solution = solve(prepared_model(joint, train[0]), data[-1])
     error = assess(solution.model, data[0], data[0].train, solution.values)
-    return find_lines(solution, data[-1], train, held), {b: e.rms for b, e in error.balances.items()}
+    return find_lines(solution, data[-1], train, held), {
+        b: e.rms for b, e in error.balances.items()
+    }
 
 
 def case(seed: int, folder: Path) -> Case:
@@ -74,7 +84,9 @@ def case(seed: int, folder: Path) -> Case:
     def with_line(record: Record) -> Record:
         wave = amplitude * np.sin(order * record["motor_position"] + phase)
         if balance == "motor":
-            return record.with_channel("motor_current", record["motor_current"] + wave / (joint.torque_per_current or 1.0))
+            return record.with_channel(
+                "motor_current", record["motor_current"] + wave / (joint.torque_per_current or 1.0)
+            )
         return record.with_channel("link_position", record["link_position"] + wave / STIFFNESS)
 
     lines, _ = lines_of(joint, [with_line(r) for r in train], [with_line(r) for r in held])
@@ -88,13 +100,27 @@ STIFFNESS = 2e4
 def report(cases: Sequence[Case], command: str) -> str:
     """The table and its two figures."""
     hit, false = 100 * np.mean([c.found for c in cases]), sum(len(c.empty) for c in cases)
-    said = [", ".join(f"{x.order:.3f} ± {x.tolerance:.3f} ({x.balance})" for x in c.lines) or "-" for c in cases]
-    rows = [f"| {c.balance} | {c.order:.3f} | {c.drop:.1f} | {s} | {'yes' if c.found else '**no**'} |" for c, s in zip(cases, said, strict=True)]
-    return "\n".join([
-        f"Printed by `{command}`.", "",
-        f"Right order and balance: {hit:.0f} % of {len(cases)} joints (limit {LIMIT:.0f} %). Lines on the same joints without one: {false} (limit 0).", "",
-        "| balance | order per motor turn | drop of the RMS, % | found | right |", "|---|---|---|---|---|", *rows, "",
-    ])  # fmt: skip
+    said = [
+        ", ".join(f"{x.order:.3f} ± {x.tolerance:.3f} ({x.balance})" for x in c.lines) or "-"
+        for c in cases
+    ]
+    rows = [
+        f"| {c.balance} | {c.order:.3f} | {c.drop:.1f} | {s} | {'yes' if c.found else '**no**'} |"
+        for c, s in zip(cases, said, strict=True)
+    ]
+    return "\n".join(
+        [
+            f"Printed by `{command}`.",
+            "",
+            f"Right order and balance: {hit:.0f} % of {len(cases)} joints (limit {LIMIT:.0f} %). "
+            f"Lines on the same joints without one: {false} (limit 0).",
+            "",
+            "| balance | order per motor turn | drop of the RMS, % | found | right |",
+            "|---|---|---|---|---|",
+            *rows,
+            "",
+        ]
+    )
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -109,7 +135,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     sys.stdout.write(text)
     if options.out:
         options.out.write_text(text, encoding="utf-8")
-    return 0 if np.mean([c.found for c in cases]) >= LIMIT / 100 and not any(c.empty for c in cases) else 1
+    return (
+        0
+        if np.mean([c.found for c in cases]) >= LIMIT / 100 and not any(c.empty for c in cases)
+        else 1
+    )
 
 
 if __name__ == "__main__":

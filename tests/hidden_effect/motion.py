@@ -12,8 +12,11 @@ if TYPE_CHECKING:
     FloatArray = npt.NDArray[np.float64]
 
 
-def triangle(rng: np.random.Generator, rows: int, dt: float, slowest: float, fastest: float) -> tuple[FloatArray, FloatArray]:
-    """Triangle between two angles near +-70 deg, starting upright; speeds in deg/s, changed every second leg.
+def triangle(
+    rng: np.random.Generator, rows: int, dt: float, slowest: float, fastest: float
+) -> tuple[FloatArray, FloatArray]:
+    """Triangle between two angles near +-70 deg, starting upright; speeds in deg/s, changed every
+    second leg.
 
     Returns position [rad] and velocity [rad/s], each of shape (rows,).
     """
@@ -36,8 +39,12 @@ def triangle(rng: np.random.Generator, rows: int, dt: float, slowest: float, fas
     return _rounded(position_at, velocity_at, round(rng.uniform(0.12, 0.2) / dt), dt)
 
 
-def _rounded(position: FloatArray, velocity: FloatArray, half: int, dt: float) -> tuple[FloatArray, FloatArray]:
-    """Round the corners with a raised-cosine window of ``half`` samples each side (the ends go on straight)."""
+def _rounded(
+    position: FloatArray, velocity: FloatArray, half: int, dt: float
+) -> tuple[FloatArray, FloatArray]:
+    """Round the corners with a raised-cosine window of ``half`` samples each side (the ends go
+    on straight).
+    """
     window = np.hanning(2 * half + 3)[1:-1]
     window /= window.sum()
     ramp = np.arange(1, half + 1) * dt
@@ -48,7 +55,9 @@ def _rounded(position: FloatArray, velocity: FloatArray, half: int, dt: float) -
 
 
 def multisine(rng: np.random.Generator, rows: int, dt: float) -> tuple[FloatArray, FloatArray]:
-    """Twelve sines of 0.04 to 2.2 Hz, amplitude falling with frequency, peak 40 to 55 deg, speed at most 60 deg/s."""
+    """Twelve sines of 0.04 to 2.2 Hz, amplitude falling with frequency, peak 40 to 55 deg,
+    speed at most 60 deg/s.
+    """
     t = np.arange(rows) * dt
     frequency = np.exp(np.linspace(np.log(0.04), np.log(2.2), 12) + rng.uniform(-0.12, 0.12, 12))
     weight = rng.uniform(0.6, 1.4, 12) / frequency**0.9
@@ -62,10 +71,14 @@ def multisine(rng: np.random.Generator, rows: int, dt: float) -> tuple[FloatArra
     return scale * (position - middle), scale * velocity
 
 
-def with_rests(rng: np.random.Generator, reference: tuple[FloatArray, FloatArray], dt: float, share: float) -> tuple[FloatArray, FloatArray]:
-    """The same path with stops: slowed down to a standstill in 0.15 s, held for 0.6 to 3 s, started again.
+def with_rests(
+    rng: np.random.Generator, reference: tuple[FloatArray, FloatArray], dt: float, share: float
+) -> tuple[FloatArray, FloatArray]:
+    """The same path with stops: slowed down to a standstill in 0.15 s, held for 0.6 to 3 s, started
+    again.
 
-    Stops fill about `share` of the time, the last one ends the record; the path is cut where the time is up.
+    Stops fill about `share` of the time, the last one ends the record; the path is cut where the
+    time is up.
     """
     position, velocity = reference
     rows = len(position)
@@ -79,7 +92,9 @@ def with_rests(rng: np.random.Generator, reference: tuple[FloatArray, FloatArray
         stops.append(length)
         held -= length
     moving = rows - sum(stops) - 2 * ramp * len(stops)
-    legs = np.diff(np.concatenate([[0], np.sort(rng.integers(0, moving, len(stops) - 1)), [moving]]))
+    legs = np.diff(
+        np.concatenate([[0], np.sort(rng.integers(0, moving, len(stops) - 1)), [moving]])
+    )
     at = 0
     for leg, length in zip(legs.tolist(), stops, strict=True):
         at += int(leg)
@@ -91,8 +106,12 @@ def with_rests(rng: np.random.Generator, reference: tuple[FloatArray, FloatArray
     return np.interp(place, index, position), pace * np.interp(place, index, velocity)
 
 
-def plan(rng: np.random.Generator, rows: int, dt: float) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """The four references of a case: training triangle and multisine, test multisine and triangle at other speeds."""
+def plan(
+    rng: np.random.Generator, rows: int, dt: float
+) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """The four references of a case: training triangle and multisine, test multisine and
+    triangle at other speeds.
+    """
     return {
         "train": triangle(rng, rows, dt, 11.0, 44.0),
         "train2": multisine(rng, rows, dt),

@@ -1,9 +1,9 @@
 """Compare what ``irj improve --json`` says with what was hidden.
 
-A claim is matched to at most one hidden name, and a hidden name takes at most one claim; what is left over is extra.
-Names of one equivalence class (declared here, before any run) count for each other only in the figures called
-"class". Minor claims are reported apart. A line (position-periodic torque) counts as a claim; a line of the hidden
-order is never extra, whatever balance it stands in.
+A claim is matched to at most one hidden name, and a hidden name takes at most one claim; what is
+left over is extra. Names of one equivalence class (declared here, before any run) count for each
+other only in the figures called "class". Minor claims are reported apart. A line (position-periodic
+torque) counts as a claim; a line of the hidden order is never extra, whatever balance it stands in.
 """
 
 from __future__ import annotations
@@ -19,10 +19,17 @@ Json = dict[str, Any]
 CLASSES: tuple[frozenset[str], ...] = (
     frozenset({"backlash", "soft_windup"}),
     frozenset({"quadratic_drag", "cubic_viscous"}),
-    frozenset({"current_offset", "asymmetric_coulomb"}),  # with cyclic_torque where its cosine part leads
-    frozenset({"motor_constant_error", "added_spring"}),  # with cyclic_torque where its sine part leads
+    frozenset(
+        {"current_offset", "asymmetric_coulomb"}
+    ),  # with cyclic_torque where its cosine part leads
+    frozenset(
+        {"motor_constant_error", "added_spring"}
+    ),  # with cyclic_torque where its sine part leads
 )
-ORDERED = {"kinematic_error": "kinematic_error_order", "torque_ripple": "ripple_order_per_motor_turn"}
+ORDERED = {
+    "kinematic_error": "kinematic_error_order",
+    "torque_ripple": "ripple_order_per_motor_turn",
+}
 ORDER_SLACK = 0.05
 SEEN_IN: dict[str, frozenset[str]] = {
     "motor": frozenset({"motor", "sum", "deflection", "axis"}),
@@ -32,13 +39,19 @@ SEEN_IN: dict[str, frozenset[str]] = {
 }
 """Balances in which a place shows, with all sensors or with fewer."""
 _PARAMETERS = {
-    "motor_inertia": ("motor_inertia_kg_m2", 2), "link_inertia": ("link_inertia_kg_m2", 0),
-    "gravity_torque": ("gravity_torque_Nm", 0), "stiffness": ("stiffness_Nm_per_rad", 2),
-    "structural_damping": ("structural_damping_Nms_per_rad", 2), "motor_viscous": ("motor_viscous_Nms_per_rad", 2),
-    "motor_coulomb": ("motor_coulomb_Nm", 1), "link_viscous": ("link_viscous_Nms_per_rad", 0),
+    "motor_inertia": ("motor_inertia_kg_m2", 2),
+    "link_inertia": ("link_inertia_kg_m2", 0),
+    "gravity_torque": ("gravity_torque_Nm", 0),
+    "stiffness": ("stiffness_Nm_per_rad", 2),
+    "structural_damping": ("structural_damping_Nms_per_rad", 2),
+    "motor_viscous": ("motor_viscous_Nms_per_rad", 2),
+    "motor_coulomb": ("motor_coulomb_Nm", 1),
+    "link_viscous": ("link_viscous_Nms_per_rad", 0),
     "link_coulomb": ("link_coulomb_Nm", 0),
-}  # fmt: skip
-"""Parameter in the JSON, name in the truth file, power of the gear ratio where it is given on the motor side."""
+}
+"""Parameter in the JSON, name in the truth file, power of the gear ratio where it is given on
+the motor side.
+"""
 
 
 @final
@@ -69,11 +82,13 @@ class Score:
     verdict
         As given.
     balance_right, axis_right
-        For kinds outside the library: the unexplained part is in the right balance, and at the right place.
+        For kinds outside the library: the unexplained part is in the right balance, and at the
+        right place.
     drop_percent
         Drop of the held-out RMS in the hidden effect's balance from the first to the last step.
     ratios
-        Residual over floor on held-out records: first step for a case with nothing hidden, else last step.
+        Residual over floor on held-out records: first step for a case with nothing hidden, else
+        last step.
     parameter_errors
         Relative errors of the joint's parameters after the last step, in per cent.
     """
@@ -110,7 +125,9 @@ def equivalents(name: str, truth: Mapping[str, Any]) -> frozenset[str]:
     """Names that count for ``name`` in the class figures (itself among them)."""
     if name == "cyclic_torque":
         values = truth.get("hidden", {}).get(name, {})
-        cosine_leads = abs(values.get("cyclic_cosine_Nm", 0.0)) > abs(values.get("cyclic_sine_Nm", 1.0))
+        cosine_leads = abs(values.get("cyclic_cosine_Nm", 0.0)) > abs(
+            values.get("cyclic_sine_Nm", 1.0)
+        )
         return frozenset({name}) | CLASSES[2 if cosine_leads else 3]
     found = {name}
     for group in CLASSES:
@@ -136,11 +153,17 @@ def _true_orders(truth: Mapping[str, Any]) -> dict[str, float]:
 
 def _order_near(line: Mapping[str, Any], order: float) -> bool:
     per_motor = line.get("per", "motor turn") == "motor turn"
-    return per_motor and abs(float(line["order"]) - order) <= max(ORDER_SLACK, float(line.get("tolerance", 0.0)))
+    return per_motor and abs(float(line["order"]) - order) <= max(
+        ORDER_SLACK, float(line.get("tolerance", 0.0))
+    )
 
 
-def _match(claims: Sequence[frozenset[str]], accepted: Mapping[str, frozenset[str]]) -> tuple[dict[str, int], dict[str, int]]:
-    """One claim per hidden name: first those that hold the name itself, then those that hold its class."""
+def _match(
+    claims: Sequence[frozenset[str]], accepted: Mapping[str, frozenset[str]]
+) -> tuple[dict[str, int], dict[str, int]]:
+    """One claim per hidden name: first those that hold the name itself, then those that hold
+    its class.
+    """
     strict: dict[str, int] = {}
     for name in accepted:
         own = [i for i, c in enumerate(claims) if name in c and i not in strict.values()]
@@ -155,18 +178,23 @@ def _match(claims: Sequence[frozenset[str]], accepted: Mapping[str, frozenset[st
     return strict, both
 
 
-def _claims(result: Json, orders: Mapping[str, float]) -> tuple[list[frozenset[str]], list[Json], set[str]]:
-    """Names by which each claim can be right, the entries they come from, and hidden names of right lines.
+def _claims(
+    result: Json, orders: Mapping[str, float]
+) -> tuple[list[frozenset[str]], list[Json], set[str]]:
+    """Names by which each claim can be right, the entries they come from, and hidden names of right
+    lines.
 
-    A periodic effect that only lines of a wrong order name is not found: its name is struck from every claim.
+    A periodic effect that only lines of a wrong order name is not found: its name is struck from
+    every claim.
     """
     entries = list(result["claims"])
     lines = result.get("lines", [])
     periodic = frozenset(ORDERED)
     missed = {
-        n for n, order in orders.items()
+        n
+        for n, order in orders.items()
         if any(n in x["effects"] for x in lines) and not any(_order_near(x, order) for x in lines)
-    }  # fmt: skip
+    }
     claims = [frozenset(c["effects"]) - missed for c in entries]
     lined: set[str] = set()
     right_lines = []
@@ -175,18 +203,32 @@ def _claims(result: Json, orders: Mapping[str, float]) -> tuple[list[frozenset[s
         if owners:
             right_lines.append(line)
             lined |= {n for n in owners if n in line["effects"] or n == "odd_order"}
-        elif line["effects"] and not any(set(line["effects"]) <= set(c["effects"]) for c in result["claims"]):
+        elif line["effects"] and not any(
+            set(line["effects"]) <= set(c["effects"]) for c in result["claims"]
+        ):
             entries.append(line)
             claims.append(frozenset(line["effects"]) - periodic)
-    if "odd_order" in orders and right_lines:  # "kinematic error of order 3.37" is true: not a claim against us
-        kept = [(c, e) for c, e in zip(claims, entries, strict=True) if not set(e["effects"]) <= periodic]
+    if (
+        "odd_order" in orders and right_lines
+    ):  # "kinematic error of order 3.37" is true: not a claim against us
+        kept = [
+            (c, e)
+            for c, e in zip(claims, entries, strict=True)
+            if not set(e["effects"]) <= periodic
+        ]
         claims, entries = [c for c, _ in kept], [e for _, e in kept]
     return claims, entries, lined
 
 
 def _overlaps(entry: Mapping[str, Any], low: float, high: float) -> bool:
     a, b = entry.get("low"), entry.get("high")
-    return "link_position" in str(entry.get("axis")) and a is not None and b is not None and a < high and b > low
+    return (
+        "link_position" in str(entry.get("axis"))
+        and a is not None
+        and b is not None
+        and a < high
+        and b > low
+    )
 
 
 def _axis_right(kind: str, values: Mapping[str, Any], result: Json) -> bool:
@@ -197,12 +239,21 @@ def _axis_right(kind: str, values: Mapping[str, Any], result: Json) -> bool:
         return any(_overlaps(u, values["stop_begins_rad"], 1.4) for u in found)
     if kind == "odd_order":
         order = values["order_per_motor_turn"]
-        near = [u for u in found if u.get("order") is not None and abs(u["order"] - order) <= ORDER_SLACK]
+        near = [
+            u
+            for u in found
+            if u.get("order") is not None and abs(u["order"] - order) <= ORDER_SLACK
+        ]
         return bool(near) or any(_order_near(line, order) for line in result.get("lines", []))
     if kind == "link_mode":
         low, high = 0.85 * values["mode_frequency_hz"], 1.15 * values["mode_frequency_free_hz"]
-        return any(u.get("frequency_hz") is not None and low <= u["frequency_hz"] <= high for u in found)
-    return all(u.get("axis") is None and u.get("order") is None and u.get("frequency_hz") is None for u in found)
+        return any(
+            u.get("frequency_hz") is not None and low <= u["frequency_hz"] <= high for u in found
+        )
+    return all(
+        u.get("axis") is None and u.get("order") is None and u.get("frequency_hz") is None
+        for u in found
+    )
 
 
 def _outside(truth: Mapping[str, Any], result: Json) -> tuple[bool | None, bool | None]:
@@ -214,7 +265,9 @@ def _outside(truth: Mapping[str, Any], result: Json) -> tuple[bool | None, bool 
     flagged = {str(u["balance"]) for u in result["unexplained"]}
     balance = result["verdict"] == "unexplained" and bool(flagged & SEEN_IN[place])
     if kind == "odd_order" and not balance:
-        balance = any(_order_near(x, _true_orders(truth)["odd_order"]) for x in result.get("lines", []))
+        balance = any(
+            _order_near(x, _true_orders(truth)["odd_order"]) for x in result.get("lines", [])
+        )
     return balance, _axis_right(kind, truth["hidden"][kind], result)
 
 
@@ -224,12 +277,19 @@ def _ratios(step: Json) -> dict[str, float]:
 
 def _drop(places: Iterable[str], steps: Sequence[Json]) -> float | None:
     first, last = steps[0]["held_out"]["balances"], steps[-1]["held_out"]["balances"]
-    drops = [100.0 * (1.0 - last[b]["rms"] / first[b]["rms"]) for place in places for b in first if b in SEEN_IN[place] and b in last and first[b]["rms"] > 0.0]
+    drops = [
+        100.0 * (1.0 - last[b]["rms"] / first[b]["rms"])
+        for place in places
+        for b in first
+        if b in SEEN_IN[place] and b in last and first[b]["rms"] > 0.0
+    ]
     return max(drops) if drops else None
 
 
 def parameter_errors(truth: Mapping[str, Any], parameters: Mapping[str, Any]) -> dict[str, float]:
-    """Relative errors [%] of the joint's own parameters; values given on the motor side are reflected first."""
+    """Relative errors [%] of the joint's own parameters; values given on the motor side are
+    reflected first.
+    """
     ratio = abs(float(truth["gear_ratio"]))
     errors: dict[str, float] = {}
     for name, (key, power) in _PARAMETERS.items():
@@ -285,7 +345,9 @@ def score(truth: Mapping[str, Any], result: Json) -> Score:
         verdict=str(result["verdict"]),
         balance_right=balance,
         axis_right=axis,
-        drop_percent=_drop([str(p) for p in truth.get("balance", {}).values()], steps) if names else None,
+        drop_percent=_drop([str(p) for p in truth.get("balance", {}).values()], steps)
+        if names
+        else None,
         ratios=_ratios(steps[-1] if names else steps[0]),
         parameter_errors=parameter_errors(truth, steps[-1]["parameters"]),
     )

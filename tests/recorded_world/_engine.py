@@ -1,4 +1,6 @@
-"""The integrator of the recorded world: compiled once from ``_joint.c`` and kept in the temporary folder."""
+"""The integrator of the recorded world: compiled once from ``_joint.c`` and kept in the
+temporary folder.
+"""
 
 from __future__ import annotations
 
@@ -23,9 +25,10 @@ SIDE: Final = (
     *("B", "B2", "B3", "BA", "O1", "V1", "O2", "V2", "O3", "V3", "TC", "TCA", "TS", "VS", "DS"),
     *("MU", "CYC", "CYC_P", "V0", "ZS", "SIN", "COS", "KA", "BUMP", "BUMP_X", "BUMP_W", "ONE"),
 )
-"""What each side has: viscous, quadratic, cubic and even viscous; three tanh terms with their velocities; Coulomb,
-its asymmetry, Stribeck torque, velocity, exponent; load factor; cyclic friction; smoothing velocity; bristle distance;
-torques of the link position; spring; a rub at one place, in one direction where ONE is +1 or -1."""
+"""What each side has: viscous, quadratic, cubic and even viscous; three tanh terms with their
+velocities; Coulomb, its asymmetry, Stribeck torque, velocity, exponent; load factor; cyclic
+friction; smoothing velocity; bristle distance; torques of the link position; spring; a rub at one
+place, in one direction where ONE is +1 or -1."""
 COMMON: Final = (
     *(
         "STEP",
@@ -125,13 +128,15 @@ def simulate(
     start
         q, v, theta, omega at the beginning, shape (4,).
     pushes
-        Torques from outside: start [s], length [s], torque [N.m], side (0 motor, 1 link), shape (n, 4).
+        Torques from outside: start [s], length [s], torque [N.m], side (0 motor, 1 link), shape (n,
+        4).
     settle
         Time held at the first reference before the first row [s].
 
     Returns
     -------
-    Rows of drive torque [N.m], q, v, theta, omega, torque of the transmission [N.m], energy [J]: `COLUMNS`.
+    Rows of drive torque [N.m], q, v, theta, omega, torque of the transmission [N.m], energy [J]:
+    `COLUMNS`.
 
     Raises
     ------

@@ -1,9 +1,11 @@
-"""Run the tool on joints of the recorded world and print, per condition, what its answers are worth.
+"""Run the tool on joints of the recorded world and print, per condition, what its answers are
+worth.
 
 ``python -m tests.recorded_world.campaign --joints 40 --start 0 --sensors all encoders --json OUT``
 
-OUT takes one line per answer; a campaign that is started again with the same OUT goes on where it stopped. Seeds from
-100000 on are held back: nothing is tuned on them, and their tables are printed apart.
+OUT takes one line per answer; a campaign that is started again with the same OUT goes on where it
+stopped. Seeds from 100000 on are held back: nothing is tuned on them, and their tables are printed
+apart.
 """
 
 from __future__ import annotations
@@ -40,7 +42,7 @@ if TYPE_CHECKING:
 
     from tests.recorded_world.world import Case
 
-ENTRY = "workbench.cli:improve_json"
+ENTRY = "workbench.cli.main:improve_json"
 
 
 @final
@@ -109,7 +111,8 @@ def load_entry(text: str) -> Callable[[list[Path], list[Path], Path], dict[str, 
 
 @contextlib.contextmanager
 def time_limit(seconds: float) -> Iterator[None]:
-    """Raise TimeoutError after so many seconds of processor time (0: never; nor where the system has no such timer).
+    """Raise TimeoutError after so many seconds of processor time (0: never; nor where the system
+    has no such timer).
 
     Processor time, so that a busy machine refuses nothing.
     """
@@ -130,7 +133,9 @@ def time_limit(seconds: float) -> Iterator[None]:
 
 
 def run_job(job: Job) -> Answer | None:
-    """Make the case, ask the tool, score it; None where these sensors are not asked to show what is hidden."""
+    """Make the case, ask the tool, score it; None where these sensors are not asked to show
+    what is hidden.
+    """
     case = job.case()
     if not asked(case, job.sensors):
         return None
@@ -186,12 +191,17 @@ def told(answer: Answer) -> str:
     if answer.error:
         return f"{where}: {what}: REFUSED {answer.error} ({answer.seconds:.0f} s)"
     claims = f"found {','.join(answer.found) or '-'}; wrong {', '.join(answer.wrong) or '-'}"
-    rest = f"{answer.verdict}, {answer.held_out:.1f} %, ratio {answer.ratio:.1f}, {answer.seconds:.0f} s"
+    rest = (
+        f"{answer.verdict}, {answer.held_out:.1f} %, ratio {answer.ratio:.1f}, "
+        f"{answer.seconds:.0f} s"
+    )
     return f"{where}: {what}: {claims}; {rest}{'' if answer.all_right else '  <- not right'}"
 
 
 def run(jobs: list[Job], workers: int, out: Path | None, budget: float = 0.0) -> list[Answer]:
-    """Run what is not yet in ``out``; each answer is written as it comes. ``budget`` [s] stops before a new case."""
+    """Run what is not yet in ``out``; each answer is written as it comes. ``budget`` [s] stops
+    before a new case.
+    """
     answers = load(out) if out else []
     done = _done(out)
     left = [j for j in jobs if (j.seed, j.sensors) not in done]

@@ -1,8 +1,9 @@
 """Why answers fail: each failed case again without troubles, then with one trouble at a time.
 
-``python -m tests.recorded_world.causes OUT --json CAUSES`` reads the answers of a campaign. A case that fails without
-any trouble is the engine's own ("no trouble needed"); otherwise every trouble that breaks it alone is a cause, and
-where none does, it takes several together. Troubles that change nothing in a case are not run.
+``python -m tests.recorded_world.causes OUT --json CAUSES`` reads the answers of a campaign. A case
+that fails without any trouble is the engine's own ("no trouble needed"); otherwise every trouble
+that breaks it alone is a cause, and where none does, it takes several together. Troubles that
+change nothing in a case are not run.
 """
 
 from __future__ import annotations

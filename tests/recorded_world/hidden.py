@@ -1,7 +1,9 @@
-"""What can be hidden in a joint of the recorded world, sized by the joint's own friction, load and speed.
+"""What can be hidden in a joint of the recorded world, sized by the joint's own friction, load and
+speed.
 
-``size`` scales the strength of a law, never its shape. Library laws bear the key that an answer must name; laws
-outside the library have no key, and the right answer is "not in the library", or the curve itself.
+``size`` scales the strength of a law, never its shape. Library laws bear the key that an answer
+must name; laws outside the library have no key, and the right answer is "not in the library", or
+the curve itself.
 """
 
 from __future__ import annotations
@@ -33,14 +35,15 @@ class Law:
     place
         motor, link, transmission or sensor.
     sensor
-        Gains, offsets and delays of channels: ``current_offset`` [A], ``torque_gain``, ``torque_offset`` [N.m],
-        ``delay_<channel>`` [s].
+        Gains, offsets and delays of channels: ``current_offset`` [A], ``torque_gain``,
+        ``torque_offset`` [N.m], ``delay_<channel>`` [s].
     pushes
         Rows of length [s], torque [N.m], side; the moments are drawn per record.
     order
         Order of a line, per motor turn (or None).
     absent
-        Parameters of the joint without the law, where the plain joint has it (None: the plain joint).
+        Parameters of the joint without the law, where the plain joint has it (None: the plain
+        joint).
     """
 
     values: Mapping[str, float]
@@ -329,7 +332,9 @@ OF_MOTOR: Final = tuple(
 
 
 def fits(name: str, joint: Plain) -> bool:
-    """Whether a law makes sense in a joint: no second gap, no angle laws on a linear axis, gravity only where it is."""
+    """Whether a law makes sense in a joint: no second gap, no angle laws on a linear axis,
+    gravity only where it is.
+    """
     if name in ("gravity", "load_dependent_friction"):
         return joint.values["TG"] > 0.25 * joint.friction
     if name == "backlash":

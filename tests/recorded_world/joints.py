@@ -1,4 +1,6 @@
-"""Five makes of joint, drawn: what stands in their data sheets and what their motions may ask of them."""
+"""Five makes of joint, drawn: what stands in their data sheets and what their motions may ask
+of them.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,8 @@ if TYPE_CHECKING:
 @final
 @dataclass(frozen=True)
 class Make:
-    """One make of joint; ranges are low and high of a uniform draw, link-referred, SI (m and N where linear).
+    """One make of joint; ranges are low and high of a uniform draw, link-referred, SI (m and N
+    where linear).
 
     Attributes
     ----------
@@ -151,7 +154,8 @@ class Plain:
     values
         Parameters of the integrator.
     friction, load
-        Torque of friction at half speed, and the highest torque of motion and gravity: scales of what is hidden.
+        Torque of friction at half speed, and the highest torque of motion and gravity: scales of
+        what is hidden.
     zero
         Where the reading is zero, measured from upright [rad].
     """
@@ -165,7 +169,9 @@ class Plain:
 
     @property
     def gear_ratio(self) -> float:
-        """As the joint file has it: theta_motor / theta_link; 1 where the drive counts in metres of travel."""
+        """As the joint file has it: theta_motor / theta_link; 1 where the drive counts in
+        metres of travel.
+        """
         return 1.0 if self.make.linear else self.sign * self.make.ratio
 
     @property
@@ -177,8 +183,8 @@ class Plain:
 def draw(rng: Generator, make: Make, *, any_zero: bool = True, sticks: bool = True) -> Plain:
     """Draw one joint of a make.
 
-    ``any_zero`` False puts the zero upright; ``sticks`` False smooths dry friction, which two joints in five have
-    set-valued.
+    ``any_zero`` False puts the zero upright; ``sticks`` False smooths dry friction, which two
+    joints in five have set-valued.
     """
 
     def pick(pair: tuple[float, float]) -> float:

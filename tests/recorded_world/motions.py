@@ -1,4 +1,7 @@
-"""Motions as people record them. Each gives position and velocity on the fine grid, shape (rows, 2)."""
+"""Motions as people record them.
+
+Each gives position and velocity on the fine grid, shape (rows, 2).
+"""
 
 from __future__ import annotations
 
@@ -101,7 +104,9 @@ def sweeps(rng: Generator, joint: Plain, rows: int) -> FloatArray:
 
 
 def steps(rng: Generator, joint: Plain, rows: int) -> FloatArray:
-    """Steps of the set point as drives shape them: three times the usual acceleration, then a wait."""
+    """Steps of the set point as drives shape them: three times the usual acceleration, then a
+    wait.
+    """
     make = joint.make
 
     def parts(at: float) -> list[FloatArray]:
@@ -150,7 +155,9 @@ MOTIONS: Final[Mapping[str, Callable[[Generator, Plain, int], FloatArray]]] = {
 
 
 def record(rng: Generator, joint: Plain, motion: str, seconds: float, *, rests: bool) -> FloatArray:
-    """One recorded motion; ``rests`` puts a standstill before and after in three of four records."""
+    """One recorded motion; ``rests`` puts a standstill before and after in three of four
+    records.
+    """
     rows = round(seconds * ROWS_PER_SECOND)
     most = SHARE_OF_REST * seconds
     before, after = (

@@ -1,8 +1,8 @@
 """Effects planted on recordings of real axes, and how many are named.
 
-The motion stays as it was recorded; the drive is given the torque that the planted law would have asked for. Laws
-that the plain joint file lacks are to be named by ``improve``; parameters that moved are to be named by ``changed``,
-against a joint file fitted on the plain recordings.
+The motion stays as it was recorded; the drive is given the torque that the planted law would have
+asked for. Laws that the plain joint file lacks are to be named by ``improve``; parameters that
+moved are to be named by ``changed``, against a joint file fitted on the plain recordings.
 
 ``python -m tests.recorded_world.planted --rigs emps --sizes 1 0.3``
 
@@ -38,8 +38,8 @@ Table = dict[str, FloatArray]
 SHARED: Final = Path(__file__).resolve().parents[2].parent / "shared" / "measurements"
 FILES: Final = Path(__file__).resolve().parent / "rigs"
 SMOOTHING: Final = 0.02
-"""Window of the cubic that gives velocity and acceleration of a recorded motion [s]: the mass of emps then comes out
-within 2 % of the published one; 0.06 s blunts its ramps by 8 %."""
+"""Window of the cubic that gives velocity and acceleration of a recorded motion [s]: the mass of
+emps then comes out within 2 % of the published one; 0.06 s blunts its ramps by 8 %."""
 
 
 @final
@@ -58,7 +58,8 @@ class Rig:
     step
         Sampling interval [s].
     friction, inertia, speed
-        Scales of what is planted: two fifths of the drive's rms, the inertia of a plain fit, a usual speed.
+        Scales of what is planted: two fifths of the drive's rms, the inertia of a plain fit, a
+        usual speed.
     pitch
         Travel of one period of the planted ripple [rad, m].
     """
@@ -185,7 +186,9 @@ RIGS: Final[Mapping[str, Rig]] = {
 @final
 @dataclass(frozen=True)
 class Motion:
-    """A recorded motion, smoothed: position, velocity, acceleration, drive torque, each of shape (rows,)."""
+    """A recorded motion, smoothed: position, velocity, acceleration, drive torque, each of
+    shape (rows,).
+    """
 
     q: FloatArray
     v: FloatArray
@@ -303,7 +306,9 @@ def write(tables: list[Table], folder: Path, name: str) -> list[Path]:
 @final
 @dataclass(frozen=True)
 class Outcome:
-    """What was said of one planted effect: claims by set, wrong unmarked names, whether the right one is among them."""
+    """What was said of one planted effect: claims by set, wrong unmarked names, whether the
+    right one is among them.
+    """
 
     rig: str
     effect: str
@@ -332,7 +337,9 @@ def _calibrated(result: Mapping[str, Any]) -> bool:
 def judged(
     result: Mapping[str, Any], right: frozenset[str], usual: frozenset[str]
 ) -> tuple[bool, bool, tuple[str, ...]]:
-    """Whether a right name is in a set, stands alone, and which unmarked claims hold neither it nor a usual name."""
+    """Whether a right name is in a set, stands alone, and which unmarked claims hold neither it
+    nor a usual name.
+    """
     sets = _sets(result)
     found = any(names & right for names, _ in sets) or (
         "channel_delay" in right and _calibrated(result)
@@ -475,7 +482,8 @@ def table(outcomes: list[Outcome]) -> str:
         said = o.said.replace("|", " or ")
         wrong = ", ".join(o.wrong).replace("|", " or ") or "-"
         text.append(
-            f"| {o.rig} | {o.effect} | {o.size:g} | {o.task} | {marks[0]} | {marks[1]} | {wrong} | {said} |"
+            f"| {o.rig} | {o.effect} | {o.size:g} | {o.task} | {marks[0]} | {marks[1]} | {wrong} "
+            f"| {said} |"
         )
     text.append("")
     for task in ("new", "changed"):

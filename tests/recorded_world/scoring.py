@@ -17,7 +17,9 @@ SAME: Final[Mapping[str, frozenset[str]]] = {
     "stribeck": frozenset({"smooth_stribeck"}),
     "warm_up": frozenset({"thermal_friction"}),
 }
-"""Names that say the same of a hidden law: one coefficient more, another form, the law by its true cause."""
+"""Names that say the same of a hidden law: one coefficient more, another form, the law by its
+true cause.
+"""
 LEARNED: Final = "learned"
 ORDER_SLACK: Final = 0.05
 """Orders nearer than this are one line, where the answer states no wider tolerance."""
@@ -36,7 +38,8 @@ class Answer:
     found
         Hidden names that stand in a claim's set, in a line of their order, or in the calibration.
     single, right
-        Unmarked claims of one name (names true of the joint without being hidden left out), and those that are right.
+        Unmarked claims of one name (names true of the joint without being hidden left out), and
+        those that are right.
     wrong
         Unmarked claims and lines in which nothing is true, names joined by ``|``.
     marked
@@ -211,7 +214,8 @@ def _share(part: int, whole: int) -> str:
 
 
 HEADER: Final = (
-    "| {} | cases | in set % | one name right % | cases with wrong unmarked names % | with nothing hidden % "
+    "| {} | cases | in set % | one name right % | cases with wrong unmarked names % | with "
+    "nothing hidden % "
     "| verdict right % | all right % | refused | held-out % | seconds |\n"
     "|---|---|---|---|---|---|---|---|---|---|---|"
 )

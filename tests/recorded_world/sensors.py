@@ -120,8 +120,9 @@ def draw(rng: Generator, joint: Plain) -> Sensors:
 def coloured(rng: Generator, kind: str, rows: int, rate: float) -> FloatArray:
     """Noise of unit deviation, shape (rows,).
 
-    ``white``; ``ar`` with a corner at 8 Hz (pole 0.9 at 500 Hz); ``hum``: half of the power in 50 Hz and in a slip
-    of 9 to 14 Hz; ``heavy``: Student's t of three degrees; ``drift``: white with a walk of the same deviation.
+    ``white``; ``ar`` with a corner at 8 Hz (pole 0.9 at 500 Hz); ``hum``: half of the power in 50
+    Hz and in a slip of 9 to 14 Hz; ``heavy``: Student's t of three degrees; ``drift``: white with a
+    walk of the same deviation.
     """
     white = rng.standard_normal(rows)
     if kind == "ar":

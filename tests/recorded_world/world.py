@@ -1,7 +1,8 @@
 """Recordings as people bring them, of joints that nobody tuned to, with their truth.
 
-One seed is one joint: make, parameters, motion, sensors, troubles and what is hidden in it are drawn from the seed
-alone, so that the four sensor sets see the same joint. Nothing of the project is imported.
+One seed is one joint: make, parameters, motion, sensors, troubles and what is hidden in it are
+drawn from the seed alone, so that the four sensor sets see the same joint. Nothing of the project
+is imported.
 
 ``python -m tests.recorded_world.world FOLDER --seeds 3 --start 7 --sensors all`` writes cases.
 """
@@ -51,7 +52,9 @@ TROUBLES: Final = ("joint_zero", "rest", "stick", "dirt", *sensors.IDEAL)
 DIRT: Final = 0.02
 """Torque of the small unmodelled disturbances, as a share of the friction torque."""
 DIRTY: Final = 0.33
-"""Share of the joints that have them: there an answer may say that something is left unexplained."""
+"""Share of the joints that have them: there an answer may say that something is left
+unexplained.
+"""
 UNITS: Final[Mapping[str, tuple[str, str]]] = {
     "motor_current": ("A", "A"),
     "motor_position": ("rad", "m"),
@@ -80,8 +83,8 @@ class Case:
     time, measured
         Per record the time [s] and the channels (`sensors.CHANNELS`).
     strength
-        Largest share of the rms of current, torque or twist that the hidden laws make on the first record, same motion
-        and same noise [%].
+        Largest share of the rms of current, torque or twist that the hidden laws make on the first
+        record, same motion and same noise [%].
     dirty
         Whether small disturbances outside the library act beside what is hidden.
     """
@@ -119,7 +122,9 @@ def _one(rng: np.random.Generator, among: Collection[str], joint: Plain) -> str:
 
 
 def draw_names(rng: np.random.Generator, kind: str, joint: Plain) -> tuple[str, ...]:
-    """Names to hide: a pair or a triple has one in the motor, one in the transmission, one in the link's balance."""
+    """Names to hide: a pair or a triple has one in the motor, one in the transmission, one in
+    the link's balance.
+    """
     if kind == "none":
         return ()
     if kind == "single":
@@ -344,7 +349,9 @@ def truth(case: Case, given: str) -> dict[str, object]:
 
 
 def write_case(case: Case, folder: Path, given: str) -> Path:
-    """Write train.csv, test.csv, joint.toml and truth.json as seen by one sensor set; returns the folder."""
+    """Write train.csv, test.csv, joint.toml and truth.json as seen by one sensor set; returns
+    the folder.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     names = [
         n for n in sensors.SETS[given] if case.sensors.velocities or not n.endswith("_velocity")
@@ -383,7 +390,8 @@ def main(argv: list[str] | None = None) -> int:
         case = make_case(seed, without=without, seconds=options.seconds)
         folder = write_case(case, options.folder / f"{seed}-{options.sensors}", options.sensors)
         sys.stdout.write(
-            f"{folder}: {case.joint.make.name}, {case.motion}, {'+'.join(case.names) or 'nothing'}\n"
+            f"{folder}: {case.joint.make.name}, {case.motion}, "
+            f"{'+'.join(case.names) or 'nothing'}\n"
         )
     return 0
 

@@ -1,4 +1,6 @@
-"""Test FMUs of other people's making: C sources of this folder, compiled and packed with their model description."""
+"""Test FMUs of other people's making: C sources of this folder, compiled and packed with their
+model description.
+"""
 
 from __future__ import annotations
 
@@ -31,12 +33,28 @@ class Shape:
 MODELS: Final = {
     "VanDerPol": Shape("VAN_DER_POL", ("x0", "x1"), ("mu",), ("y0", "y1")),
     "Dahlquist": Shape("DAHLQUIST", ("x",), ("k",), ("y",)),
-    "Axis": Shape("AXIS", ("q", "w"), ("inertia", "viscous", "coulomb", "gravity", "idle"), ("angle", "speed"), ("torque",)),
+    "Axis": Shape(
+        "AXIS",
+        ("q", "w"),
+        ("inertia", "viscous", "coulomb", "gravity", "idle"),
+        ("angle", "speed"),
+        ("torque",),
+    ),
 }
 START: Final = {
-    "x0": 2.0, "x1": 0.0, "mu": 1.0, "x": 1.0, "k": 1.0, "q": 0.0, "w": 0.0,
-    "inertia": 2.0, "viscous": 1.0, "coulomb": 1.0, "gravity": 5.0, "idle": 1.0,
-}  # fmt: skip
+    "x0": 2.0,
+    "x1": 0.0,
+    "mu": 1.0,
+    "x": 1.0,
+    "k": 1.0,
+    "q": 0.0,
+    "w": 0.0,
+    "inertia": 2.0,
+    "viscous": 1.0,
+    "coulomb": 1.0,
+    "gravity": 5.0,
+    "idle": 1.0,
+}
 OFFSET: Final = {"states": 1, "derivatives": 11, "inputs": 21, "parameters": 31, "outputs": 41}
 
 
@@ -54,7 +72,8 @@ class Make:
     derivatives : bool
         The description promises directional derivatives.
     dependencies : bool
-        FMI 3: state the dependencies on states and inputs, as the standard has it, parameters left out.
+        FMI 3: state the dependencies on states and inputs, as the standard has it, parameters left
+        out.
     says : str, optional
         Variability of the parameters in the description, whatever the library does.
     wrong : bool
@@ -87,9 +106,19 @@ def build(name: str, folder: Path, make: Make | None = None) -> Path:
     flags = ["-shared", "-fPIC", "-O2", "-w", f"-DMODEL_{shape.macro}", f'-DGUID="{tag}"']
     flags += [*(["-DSTRICT"] if make.strict else []), *(["-DWRONG"] if make.wrong else [])]
     subprocess.run(
-        ["gcc", *flags, f"-I{HEADERS}", f"-I{HERE}", str(HERE / f"fmi{make.version}.c"), "-o", str(library), "-lm"],
-        check=True, capture_output=True,
-    )  # fmt: skip
+        [
+            "gcc",
+            *flags,
+            f"-I{HEADERS}",
+            f"-I{HERE}",
+            str(HERE / f"fmi{make.version}.c"),
+            "-o",
+            str(library),
+            "-lm",
+        ],
+        check=True,
+        capture_output=True,
+    )
     place = "linux64" if make.version == 2 else "x86_64-linux"
     text = (_two if make.version == 2 else _three)(name, tag, shape, make)
     with zipfile.ZipFile(out, "w") as archive:
@@ -99,16 +128,33 @@ def build(name: str, folder: Path, make: Make | None = None) -> Path:
     return out
 
 
-def _rows(shape: Shape, make: Make) -> list[tuple[str, int, str, str, str, float | None, int | None]]:
+def _rows(
+    shape: Shape, make: Make
+) -> list[tuple[str, int, str, str, str, float | None, int | None]]:
     """(name, value reference, causality, variability, initial, start, state of a derivative)."""
     o = OFFSET
     rows: list[tuple[str, int, str, str, str, float | None, int | None]] = []
-    rows += [(n, o["states"] + i, "local", "continuous", "exact", START[n], None) for i, n in enumerate(shape.states)]
-    rows += [(f"der({n})", o["derivatives"] + i, "local", "continuous", "calculated", None, i) for i, n in enumerate(shape.states)]
-    rows += [(n, o["inputs"] + i, "input", "continuous", "", 0.0, None) for i, n in enumerate(shape.inputs)]
+    rows += [
+        (n, o["states"] + i, "local", "continuous", "exact", START[n], None)
+        for i, n in enumerate(shape.states)
+    ]
+    rows += [
+        (f"der({n})", o["derivatives"] + i, "local", "continuous", "calculated", None, i)
+        for i, n in enumerate(shape.states)
+    ]
+    rows += [
+        (n, o["inputs"] + i, "input", "continuous", "", 0.0, None)
+        for i, n in enumerate(shape.inputs)
+    ]
     kind = make.says or ("fixed" if make.strict else "tunable")
-    rows += [(n, o["parameters"] + i, "parameter", kind, "exact", START[n], None) for i, n in enumerate(shape.parameters)]
-    rows += [(n, o["outputs"] + i, "output", "continuous", "calculated", None, None) for i, n in enumerate(shape.outputs)]
+    rows += [
+        (n, o["parameters"] + i, "parameter", kind, "exact", START[n], None)
+        for i, n in enumerate(shape.parameters)
+    ]
+    rows += [
+        (n, o["outputs"] + i, "output", "continuous", "calculated", None, None)
+        for i, n in enumerate(shape.outputs)
+    ]
     return rows
 
 
@@ -118,9 +164,13 @@ def _attributes(pairs: dict[str, str | None]) -> str:
 
 def _two(name: str, guid: str, shape: Shape, make: Make) -> str:
     promise = str(make.derivatives).lower()
-    lines = [f'<fmiModelDescription fmiVersion="2.0" modelName="{name}" guid="{guid}" numberOfEventIndicators="{make.events}">']
+    lines = [
+        f'<fmiModelDescription fmiVersion="2.0" modelName="{name}" guid="{guid}" '
+        f'numberOfEventIndicators="{make.events}">'
+    ]
     lines += [
-        f'<{k} modelIdentifier="{name}" providesDirectionalDerivative="{promise}" canHandleVariableCommunicationStepSize="true"/>'
+        f'<{k} modelIdentifier="{name}" providesDirectionalDerivative="{promise}" '
+        'canHandleVariableCommunicationStepSize="true"/>'
         if k == "CoSimulation"
         else f'<{k} modelIdentifier="{name}" providesDirectionalDerivative="{promise}"/>'
         for k in reversed(make.kinds)
@@ -132,37 +182,83 @@ def _two(name: str, guid: str, shape: Shape, make: Make) -> str:
     lines.append("<ModelVariables>")
     rows = _rows(shape, make)
     for n, vr, causality, variability, initial, start, state in rows:
-        about = _attributes({"name": n, "valueReference": str(vr), "causality": causality, "variability": variability, "initial": initial or None})
-        inner = _attributes({"start": None if start is None else repr(start), "derivative": None if state is None else str(state + 1), "unit": units.get(n)})
+        about = _attributes(
+            {
+                "name": n,
+                "valueReference": str(vr),
+                "causality": causality,
+                "variability": variability,
+                "initial": initial or None,
+            }
+        )
+        inner = _attributes(
+            {
+                "start": None if start is None else repr(start),
+                "derivative": None if state is None else str(state + 1),
+                "unit": units.get(n),
+            }
+        )
         lines.append(f"<ScalarVariable {about}><Real {inner}/></ScalarVariable>")
     index = {row[0]: i for i, row in enumerate(rows, 1)}
     outputs = "".join(f'<Unknown index="{index[n]}"/>' for n in shape.outputs)
     slopes = "".join(f'<Unknown index="{index[f"der({n})"]}"/>' for n in shape.states)
-    unknowns = "".join(f'<Unknown index="{i}"/>' for i in sorted(index[n] for n in (*shape.outputs, *(f"der({s})" for s in shape.states))))
-    lines.append(f"</ModelVariables><ModelStructure><Outputs>{outputs}</Outputs><Derivatives>{slopes}</Derivatives>")
-    lines.append(f"<InitialUnknowns>{unknowns}</InitialUnknowns></ModelStructure></fmiModelDescription>")
+    unknowns = "".join(
+        f'<Unknown index="{i}"/>'
+        for i in sorted(index[n] for n in (*shape.outputs, *(f"der({s})" for s in shape.states)))
+    )
+    lines.append(
+        f"</ModelVariables><ModelStructure><Outputs>{outputs}</Outputs><Derivatives>{slopes}"
+        "</Derivatives>"
+    )
+    lines.append(
+        f"<InitialUnknowns>{unknowns}</InitialUnknowns></ModelStructure></fmiModelDescription>"
+    )
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + "\n".join(lines)
 
 
 def _three(name: str, token: str, shape: Shape, make: Make) -> str:
     promise = str(make.derivatives).lower()
-    lines = [f'<fmiModelDescription fmiVersion="3.0" modelName="{name}" instantiationToken="{token}">']
-    lines += [f'<{k} modelIdentifier="{name}" providesDirectionalDerivatives="{promise}"/>' for k in ("ModelExchange", "CoSimulation") if k in make.kinds]
-    lines.append('<ModelVariables><Float64 name="time" valueReference="0" causality="independent" variability="continuous"/>')
+    lines = [
+        f'<fmiModelDescription fmiVersion="3.0" modelName="{name}" instantiationToken="{token}">'
+    ]
+    lines += [
+        f'<{k} modelIdentifier="{name}" providesDirectionalDerivatives="{promise}"/>'
+        for k in ("ModelExchange", "CoSimulation")
+        if k in make.kinds
+    ]
+    lines.append(
+        '<ModelVariables><Float64 name="time" valueReference="0" causality="independent" '
+        'variability="continuous"/>'
+    )
     for n, vr, causality, variability, initial, start, state in _rows(shape, make):
-        about = _attributes({
-            "name": n, "valueReference": str(vr), "causality": causality, "variability": variability, "initial": initial or None,
-            "start": None if start is None else repr(start), "derivative": None if state is None else str(OFFSET["states"] + state),
-        })  # fmt: skip
+        about = _attributes(
+            {
+                "name": n,
+                "valueReference": str(vr),
+                "causality": causality,
+                "variability": variability,
+                "initial": initial or None,
+                "start": None if start is None else repr(start),
+                "derivative": None if state is None else str(OFFSET["states"] + state),
+            }
+        )
         lines.append(f"<Float64 {about}/>")
-    own = [OFFSET["states"] + i for i in range(len(shape.states))] + [OFFSET["inputs"] + i for i in range(len(shape.inputs))]
+    own = [OFFSET["states"] + i for i in range(len(shape.states))] + [
+        OFFSET["inputs"] + i for i in range(len(shape.inputs))
+    ]
     depends = f' dependencies="{" ".join(map(str, own))}"' if make.dependencies else ""
     outputs = [OFFSET["outputs"] + i for i in range(len(shape.outputs))]
     slopes = [OFFSET["derivatives"] + i for i in range(len(shape.states))]
     structure = "".join(f'<Output valueReference="{v}"{depends}/>' for v in outputs)
-    structure += "".join(f'<ContinuousStateDerivative valueReference="{v}"{depends}/>' for v in slopes)
-    structure += "".join(f'<InitialUnknown valueReference="{v}"{depends}/>' for v in (*outputs, *slopes))
-    lines.append(f"</ModelVariables><ModelStructure>{structure}</ModelStructure></fmiModelDescription>")
+    structure += "".join(
+        f'<ContinuousStateDerivative valueReference="{v}"{depends}/>' for v in slopes
+    )
+    structure += "".join(
+        f'<InitialUnknown valueReference="{v}"{depends}/>' for v in (*outputs, *slopes)
+    )
+    lines.append(
+        f"</ModelVariables><ModelStructure>{structure}</ModelStructure></fmiModelDescription>"
+    )
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + "\n".join(lines)
 
 

@@ -1,0 +1,350 @@
+"""Residuals of the balances, from the declared physics, as numbers on prepared records."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final, final
+
+import casadi as ca
+import numpy as np
+import numpy.typing as npt
+
+from casadi_models import JointModel, Signals
+from casadi_models.affine import AffineParts
+from casadi_models.vectorised import Vectorised
+from identification.balance.memory import states_of
+from identification.balance.sensing import Sensing
+from identification.balance.weak import WeakRecord
+
+FloatArray = npt.NDArray[np.float64]
+Expression = Any
+
+_NAMES: Final = Signals.names()
+
+UNROLLED: Final = 200
+"""Steps of a memory law in one compiled stretch."""
+
+
+def residual_expressions(model: JointModel, sensing: Sensing) -> dict[str, Expression]:
+    """Symbolic residual of every balance: what drives minus what the model explains [N.m]."""
+    e = model.equations
+    motor_inertia = e.inertia.get("motor_inertia", ca.SX(0))
+    link_inertia = e.inertia.get("link_inertia", ca.SX(0))
+    motor = motor_inertia * e.motor_acceleration + e.motor_resistance
+    link = link_inertia * e.link_acceleration + e.link_resistance
+    out: dict[str, Expression] = {}
+    # in the units of the reading: a gain error must not shrink the residual with the signal
+    drive_gain = ca.jacobian(e.drive, e.signals.drive)
+    torque_gain = ca.jacobian(e.torque, e.signals.torque)
+    for balance in sensing.balances:
+        if balance == "motor":
+            out[balance] = (e.drive - e.torque * e.motor_lever - motor) / drive_gain
+        elif balance == "link":
+            out[balance] = (e.torque * e.link_lever - link) / torque_gain
+        elif balance == "transmission":
+            resist = e.motor_resistance + e.link_resistance if sensing.clamped_link else 0
+            out[balance] = (e.torque - e.transmitted - resist) / torque_gain
+        elif balance == "sum":
+            out[balance] = (
+                e.drive - motor - link + e.transmitted * (e.link_lever - e.motor_lever)
+            ) / drive_gain
+        elif balance == "deflection":
+            out[balance] = (e.drive - motor - e.transmitted * e.motor_lever) / drive_gain
+        else:
+            total: Expression = sum(e.inertia.values(), ca.SX(0))
+            resist = e.motor_resistance + e.link_resistance + e.transmitted
+            out[balance] = (e.drive - total * e.motor_acceleration - resist) / drive_gain
+    return out
+
+
+def curved_expressions(model: JointModel, sensing: Sensing) -> dict[str, Expression]:
+    """What enters the balances by its second derivative in time [N.m.s2]: the lag of a load
+    that is not recorded.
+    """
+    e = model.equations
+    lag = e.load_lag / ca.jacobian(e.drive, e.signals.drive)
+    return (
+        {b: lag if b == "axis" else ca.SX(0) for b in sensing.balances}
+        if model.lagging_load
+        else {}
+    )
+
+
+@final
+class _Part:
+    """Expressions with their Jacobian, split into what is linear in the signals and the rest.
+
+    Parameters
+    ----------
+    model : JointModel
+    expressions : mapping of str to expression
+    columns : sequence of int
+        Parameters whose Jacobian columns are wanted, by their place in the vector.
+    columns_only : bool
+        The expressions themselves are not wanted and read zero.
+    """
+
+    def __init__(
+        self,
+        model: JointModel,
+        expressions: Mapping[str, Expression],
+        columns: Sequence[int],
+        *,
+        columns_only: bool,
+    ) -> None:
+        e = model.equations
+        signals: Any = e.signals.vector()
+        parameters = e.parameters
+        stacked: list[Expression] = []
+        for r in expressions.values():
+            stacked += [
+                ca.SX(1, 1) if columns_only else r,
+                *(ca.vertsplit(ca.jacobian(r, parameters)[:, columns].T) if columns else []),
+            ]
+        out: Any = ca.vertcat(*stacked)
+        self._width = 1 + len(columns)
+        parts = AffineParts(signals, e.memory)
+        slopes = ca.SX(out.shape[0], len(_NAMES))
+        zeroed: list[Expression] = []
+        for i in range(out.shape[0]):
+            line, left = parts.split(out[i])
+            zeroed.append(left)
+            for j, slope in line.items():
+                slopes[i, j] = slope
+        self._linear = ca.Function("linear", [parameters], [ca.densify(slopes)])
+        self.needed = [i for i, part in enumerate(zeroed) if not part.is_zero()]
+        self._bent = {
+            i: [n for n, d in zip(_NAMES, ca.which_depends(zeroed[i], signals), strict=True) if d]
+            for i in self.needed
+        }
+        rest = ca.vertcat(*(zeroed[i] for i in self.needed)) if self.needed else ca.SX(0, 1)
+        self._rest = Vectorised(
+            ca.Function("rest", [signals, e.memory, parameters], [ca.densify(rest)])
+        )
+        self.remembers = bool(e.memory_terms) and ca.jacobian_sparsity(rest, e.memory).nnz() > 0
+
+    def rows(
+        self,
+        averaged: Mapping[str, FloatArray],
+        average: Callable[[FloatArray], FloatArray],
+        data: WeakRecord,
+        memory: FloatArray,
+        p: Sequence[float],
+    ) -> FloatArray:
+        """Averages (rows, expressions and columns) with the internal states given at the points."""
+        matrix = np.zeros((data.rows, len(_NAMES)))
+        for i, name in enumerate(_NAMES):
+            if name in averaged:
+                matrix[:, i] = averaged[name]
+        full: FloatArray = matrix @ np.array(self._linear(p)).T
+        if self.needed:
+            count = len(data.points["motor_position"])
+            full[:, self.needed] += average(self._rest(count, data.table(_NAMES), memory, p).T)
+        return full
+
+    def slopes(self, balances: Sequence[str], p: Sequence[float]) -> dict[str, dict[str, float]]:
+        """By balance, the signals that enter it linearly and how strongly."""
+        linear = np.array(self._linear(p))
+        return {
+            b: {
+                n: float(linear[i * self._width, j])
+                for j, n in enumerate(_NAMES)
+                if linear[i * self._width, j]
+            }
+            for i, b in enumerate(balances)
+        }
+
+    def bent(self, number: int) -> frozenset[str]:
+        """Signals that enter a balance, by its number, in another way than on a straight line."""
+        return frozenset(self._bent.get(number * self._width, ()))
+
+
+@final
+class Balances:
+    """Residuals and their Jacobian of one model with one set of channels.
+
+    Parameters
+    ----------
+    model : JointModel
+        Already adapted to the channels.
+    sensing : Sensing
+    wrt : sequence of str, optional
+        Parameters whose Jacobian columns are wanted; all by default.
+    columns_only : bool
+        The residual itself is not wanted and reads zero.
+    """
+
+    def __init__(
+        self,
+        model: JointModel,
+        sensing: Sensing,
+        wrt: Sequence[str] | None = None,
+        *,
+        columns_only: bool = False,
+    ) -> None:
+        self.model = model
+        self.sensing = sensing
+        self.names: tuple[str, ...] = model.parameter_names
+        self.wrt: tuple[str, ...] = tuple(wrt) if wrt is not None else self.names
+        expressions = residual_expressions(model, sensing)
+        columns = [self.names.index(n) for n in self.wrt]
+        self.balances = tuple(expressions)
+        curved = curved_expressions(model, sensing)
+        self._plain = _Part(model, expressions, columns, columns_only=columns_only)
+        self._curved = _Part(model, curved, columns, columns_only=columns_only) if curved else None
+        self._memory = Memory(model) if self._plain.remembers else None
+
+    def memory_values(self, data: WeakRecord, values: Mapping[str, float]) -> FloatArray:
+        """Internal states of displacement-memory effects at the points, (states, points); not
+        to be written to.
+        """
+        memory = self._memory
+        count = len(data.points["motor_position"])
+        if memory is None:
+            return np.zeros((self.model.equations.memory.shape[0], count))
+        p = np.array([float(values[n]) for n in self.names])
+        law = (self.model.structure, tuple(p[memory.depends].tolist()))
+        return states_of(data, law, lambda: memory.along(data, p))
+
+    def evaluate(
+        self, data: WeakRecord, values: Mapping[str, float], remembered: WeakRecord | None = None
+    ) -> dict[str, tuple[FloatArray, FloatArray]]:
+        """Residual (rows,) and Jacobian (rows, wrt) of every balance at the given parameter values.
+
+        `remembered` is a record with the same smoothed positions, whose internal states may be
+        known already.
+        """
+        p = [float(values[n]) for n in self.names]
+        memory = self.memory_values(remembered or data, values)
+        full = self._plain.rows(data.averaged, data.average, data, memory, p)
+        if self._curved is not None:
+            full += self._curved.rows(data.curved, data.curve, data, memory, p)
+        width = 1 + len(self.wrt)
+        return {
+            b: (full[:, i * width], full[:, i * width + 1 : (i + 1) * width])
+            for i, b in enumerate(self.balances)
+        }
+
+    def entering(self, values: Mapping[str, float]) -> dict[str, frozenset[str]]:
+        """By balance, the signals that its residual depends on at the given parameter values."""
+        p = [float(values[n]) for n in self.names]
+        return {
+            b: frozenset(self._plain.slopes(self.balances, p)[b]) | self._plain.bent(i)
+            for i, b in enumerate(self.balances)
+        }
+
+
+_KEPT: Final = 96
+"""Compiled balances that a thread keeps."""
+
+_kept = threading.local()
+
+
+def balances_of(
+    model: JointModel,
+    sensing: Sensing,
+    wrt: Sequence[str] | None = None,
+    *,
+    columns_only: bool = False,
+) -> Balances:
+    """:class:`Balances` of a model whatever its values, built once per thread and structure."""
+    key = (model.structure, sensing, None if wrt is None else tuple(wrt), columns_only)
+    cache: OrderedDict[object, Balances] = _kept.__dict__.setdefault("balances", OrderedDict())
+    if key in cache:
+        cache.move_to_end(key)
+        return cache[key]
+    made = cache[key] = Balances(model, sensing, wrt, columns_only=columns_only)
+    while len(cache) > _KEPT:
+        cache.popitem(last=False)
+    return made
+
+
+@final
+class Memory:
+    """Internal states along a record, from the step form of the memory laws.
+
+    Steps are unrolled into one SX function of :data:`UNROLLED` steps, so that the virtual machine
+    is entered once per stretch and not once per sample.
+    """
+
+    def __init__(self, model: JointModel) -> None:
+        e = model.equations
+        signals = e.signals.vector()
+        coordinates = [t[1] for t in e.memory_terms]
+        steps = ca.SX.sym("steps", len(coordinates))
+        moved: list[Expression] = []
+        for i, (term, _, z, view, values) in enumerate(e.memory_terms):
+            if term.effect.memory is not None:
+                moved.extend(term.effect.memory(z, steps[i], view, values))
+        after = ca.vertcat(*moved)
+        self.depends = sorted(
+            set(
+                ca.jacobian_sparsity(ca.vertcat(*coordinates, after), e.parameters).get_triplet()[1]
+            )
+        )
+        self._states = int(e.memory.shape[0])
+        self._used = sorted(set(ca.jacobian_sparsity(after, signals).get_triplet()[1]))
+        kept = ca.vertcat(*(signals[i] for i in self._used)) if self._used else ca.SX(0, 1)
+        one: Any = ca.Function("one", [e.memory, steps, kept, e.parameters, e.clock], [after])
+        self.coordinates = Vectorised(
+            ca.Function("where", [signals, e.parameters], [ca.densify(ca.vertcat(*coordinates))])
+        )
+        z0: Any = ca.SX.sym("z0", self._states)
+        many = ca.SX.sym("many", len(coordinates), UNROLLED)
+        aside = ca.SX.sym("aside", len(self._used), UNROLLED)
+        p = ca.SX.sym("p", e.parameters.shape[0])
+        clock = ca.SX.sym("clock")
+        state: Any = z0
+        trail: list[Any] = []
+        for k in range(UNROLLED):
+            state = one(state, many[:, k], aside[:, k], p, clock)
+            trail.append(state)
+        self._stretch = ca.Function(
+            "stretch", [z0, many, aside, p, clock], [ca.densify(ca.horzcat(*trail))]
+        )
+
+    def along(self, data: WeakRecord, p: FloatArray) -> FloatArray:
+        """States (states, points) at the points of a record; every segment begins at rest."""
+        count = len(data.points["motor_position"])
+        matrix = np.zeros((len(_NAMES), count))
+        for i, name in enumerate(_NAMES):
+            if name in data.smooth:
+                matrix[i] = data.smooth[name]
+        where = self.coordinates(count, matrix, p)
+        out = np.zeros((self._states, count))
+        for first, last in zip(data.starts[:-1], data.starts[1:], strict=True):
+            out[:, first:last] = self.follow(
+                where[:, first:last], matrix[:, first:last], p, data.grid.dt * data.grid.step
+            )
+        return out
+
+    def follow(
+        self, where: FloatArray, signals: FloatArray, p: FloatArray, step: float
+    ) -> FloatArray:
+        """States (states, points) along coordinates (coordinates, points) `step` seconds apart,
+        from rest at zero.
+        """
+        count = where.shape[1]
+        out = np.zeros((self._states, count))
+        steps = np.diff(where, axis=1, prepend=where[:, :1])
+        # CasADi's own buffers: the conversion of every stretch would cost as much as the law
+        z, trail = np.zeros((1, self._states)), np.zeros((UNROLLED, self._states))
+        many, aside = np.zeros((UNROLLED, where.shape[0])), np.zeros((UNROLLED, len(self._used)))
+        given, run = self._stretch.buffer()
+        for i, array in enumerate(
+            (z, many, aside, np.ascontiguousarray(p, dtype=np.float64), np.array([step]))
+        ):
+            given.set_arg(i, array.data)
+        given.set_res(0, trail.data)
+        for first in range(0, count, UNROLLED):
+            last = min(first + UNROLLED, count)
+            many[: last - first] = steps[:, first:last].T
+            many[last - first :] = 0.0
+            aside[: last - first] = signals[self._used, first:last].T
+            aside[last - first :] = 0.0
+            run()
+            out[:, first:last] = trail[: last - first].T
+            z[0] = trail[last - first - 1]
+        return out

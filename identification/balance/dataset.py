@@ -1,0 +1,366 @@
+"""Records prepared for the balances: kernels, blocks, scales and noise."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Final, final
+
+import numpy as np
+import numpy.typing as npt
+
+from casadi_models import JointModel, hold
+from identification.balance.calibration import unknowns_of
+from identification.balance.noise import level_of
+from identification.balance.sensing import Sensing, adapt, check_alike, sense, signals_of
+from identification.balance.stamps import evened
+from identification.balance.weak import (
+    CLAIM_KERNEL,
+    KERNEL_SAMPLES,
+    POSITION_CHAINS,
+    WeakRecord,
+    differentiated_kernel,
+    kernel,
+    prepare,
+)
+from identification.data.joint_file import Joint
+from identification.data.record import Record
+from identification.errors import InputError
+
+FloatArray = npt.NDArray[np.float64]
+
+HOLD_DELAY: Final = hold.HOLD_DELAY
+HOLD_NAME: Final = hold.HOLD_NAME
+ONE_SIDED_KERNEL: Final = 0.2
+LINK_BALANCES: Final = frozenset({"link", "sum", "axis"})
+POINTWISE_KERNELS: Final = (0.01, 0.014, 0.02, 0.03)
+STILL: Final = 3.0
+"""Pointwise speed of a side at rest, in standard deviations of its noise: 0.3 % of samples at
+rest lie above.
+"""
+VELOCITY_NOISE: Final = 2e-3
+"""Noise of a pointwise velocity, as a share of the record's speed, that is small enough."""
+
+
+@final
+@dataclass(frozen=True)
+class Dataset:
+    """Records prepared for the balances: training rows and rows the fit never sees.
+
+    Attributes
+    ----------
+    joint, sensing : what is known and what is measured
+    train, held_out : tuple of WeakRecord
+    ranges : mapping of str to float
+        99 % range of velocity [rad/s], torsion [rad], position [rad] and the duration [s]: scales
+        of shape grids.
+    noise : mapping of str to float
+        White-noise level of each measured signal.
+    orders : mapping of str to tuple of float
+        By effect, orders per motor turn at which a line carries its name: start values of its
+        shape.
+    """
+
+    joint: Joint
+    sensing: Sensing
+    train: tuple[WeakRecord, ...]
+    held_out: tuple[WeakRecord, ...]
+    ranges: Mapping[str, float]
+    noise: Mapping[str, float]
+    train_names: tuple[str, ...] = ()
+    held_out_names: tuple[str, ...] = ()
+    note: str = ""
+    orders: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        return (
+            f"Dataset({self.joint.name!r}, train: {list(self.train_names)}, held out: "
+            f"{list(self.held_out_names)}, balances: {self.sensing.balances})"
+        )
+
+    @property
+    def kernel(self) -> float:
+        """Kernel length of the balances [s]."""
+        return self.train[0].grid.length
+
+    def at_rest(self, records: Sequence[WeakRecord] | None = None) -> float:
+        """Share of the rows (of all records by default) that are at rest in some balance and
+        left out of it.
+        """
+        chosen = (*self.train, *self.held_out) if records is None else tuple(records)
+        left = sum(
+            int(
+                np.any(
+                    [w.resting(b) for b in self.sensing.balances if b not in w.masked], axis=0
+                ).sum()
+            )
+            for w in chosen
+        )
+        return left / max(sum(w.rows for w in chosen), 1)
+
+    @property
+    def blocks(self) -> int:
+        """Number of training blocks."""
+        return 1 + max(int(w.block.max(initial=-1)) for w in self.train)
+
+
+def load_dataset(
+    train: Sequence[Record],
+    held_out: Sequence[Record],
+    joint: Joint,
+    model: JointModel,
+    *,
+    kernel: float | None = None,
+    like: Sensing | None = None,
+) -> Dataset:
+    """Prepare records for the balances that their common channels allow (`like`: temperature counts
+    as in the records of a fit).
+
+    Raises
+    ------
+    InputError
+        Too short; channels that do not fit the model; a record of training and held-out data
+        without a common channel set.
+    """
+    sensing = check_alike([*train, *held_out], model)
+    if like is not None:
+        sensing = replace(
+            sensing, temperature_origin=like.temperature_origin, longest_run=like.longest_run
+        )
+    alone = seen_from_the_motor(sensing, joint)
+    length = kernel or (ONE_SIDED_KERNEL if alone else CLAIM_KERNEL)
+    prepared: list[WeakRecord] = []
+    first = 0
+    for record in (*train, *held_out):
+        made = weak_record(record, joint, sensing, length, first, curved=model.lagging_load)
+        made = replace(made, name=run_name(record))
+        if record.payload != train[0].payload:
+            made = replace(made, masked=_of_the_link(record, sensing))
+        first = max(first, 1 + int(made.block.max(initial=first - 1)))
+        prepared.append(made)
+    count = len(train)
+    for balance in sensing.balances:
+        if held_out and all(balance in made.masked for made in prepared[count:]):
+            raise InputError(
+                f"{held_out[0].name}: every held-out record has another payload than "
+                f"{train[0].name}, so none shows the {balance} balance; "
+                "give a held-out record with the same payload"
+            )
+        at_rest = [
+            not made.taking(balance).any()
+            for made in prepared[count:]
+            if balance not in made.masked
+        ]
+        if at_rest and all(at_rest):
+            raise InputError(
+                f"{held_out[0].name}: the joint stands still in every held-out record; give one "
+                "in which it moves"
+            )
+    levels = [measured_noise(r, joint, sensing) for r in train]
+    noise = {c: float(np.median([level[c] for level in levels])) for c in levels[0]}
+    return Dataset(
+        joint,
+        sensing,
+        train=tuple(prepared[:count]),
+        held_out=tuple(prepared[count:]),
+        ranges=_ranges(prepared[:count], model.clamped_link),
+        noise=noise,
+        train_names=tuple(r.name for r in train),
+        held_out_names=tuple(r.name for r in held_out),
+    )
+
+
+def run_name(record: Record) -> str:
+    """Name of a record with a mark of its samples: another run under the same name is another
+    run.
+    """
+    position = next(record[c] for c in ("link_position", "motor_position") if record.has(c))
+    return f"{record.name}:{zlib.crc32(np.ascontiguousarray(position).tobytes()):08x}"
+
+
+def _of_the_link(record: Record, sensing: Sensing) -> frozenset[str]:
+    """Balances with parameters of the link, which a record with another payload does not share."""
+    masked = frozenset(sensing.balances) & LINK_BALANCES
+    if masked == frozenset(sensing.balances):
+        raise InputError(
+            f"{record.name}: a record with another payload needs link_torque or both positions, "
+            "else every balance holds the link"
+        )
+    return masked
+
+
+def seen_from_the_motor(sensing: Sensing, joint: Joint) -> bool:
+    """True for a geared joint of which only the drive side is recorded: the load hangs on a
+    compliance nobody measures.
+    """
+    return (
+        sensing.balances == ("axis",)
+        and not sensing.both_positions
+        and abs(joint.gear_ratio) != 1.0
+    )
+
+
+def weak_record(
+    record: Record,
+    joint: Joint,
+    sensing: Sensing,
+    length: float,
+    first_block: int = 0,
+    *,
+    curved: bool = False,
+) -> WeakRecord:
+    """One record, resampled to uniform time where needed, averaged with the kernel."""
+    noise = measured_noise(record, joint, sensing)
+    record = evened(record)
+    signals, segments = signals_of(record, joint, sensing), tuple(record.segments())
+    length = max(length, KERNEL_SAMPLES * record.dt)
+    longest = length / 2 if length <= CLAIM_KERNEL else 0.06
+    made = prepare(
+        record.time,
+        signals,
+        segments,
+        length=length,
+        first_block=first_block,
+        pointwise={
+            c: pointwise_kernel(signals[c], segments, record.dt, longest, level)
+            for c, level in noise.items()
+        },
+        curved=curved,
+    )
+    made = _with_rests(made, noise)
+    if record.measured is not None and not record.measured.all():
+        made = replace(
+            made,
+            support=made.grid.correlate(
+                record.measured.astype(float),
+                differentiated_kernel(made.grid.length, made.grid.dt, 0),
+            ),
+        )
+    if made.rows < 8:
+        raise InputError(
+            f"{record.name}: {len(record)} samples in {record.duration:.3g} s are too few for a "
+            f"kernel of {length:.3g} s; give a longer record"
+        )
+    return made
+
+
+def _with_rests(made: WeakRecord, noise: Mapping[str, float]) -> WeakRecord:
+    """The record with the kernel average, for each row, of the flag "this side stands still".
+
+    A side stands still where its pointwise speed stays within its noise for at least one kernel of
+    that speed: a reversal is shorter, and is kept, because it shows friction at low speed. Laws
+    with memory follow a straight line through a rest: the noise of a position that stands still
+    would wear their state down, since they count every step, whatever its sign.
+    """
+    out: dict[str, FloatArray] = {}
+    smooth = dict(made.smooth)
+    for side in ("motor", "link"):
+        source = f"{side}_position"
+        if source not in noise:
+            continue
+        slow = np.abs(made.points[f"{side}_velocity"]) <= STILL * noise[
+            source
+        ] * made.grid.velocity_gain(source)
+        shortest = max(1, round(made.grid.pointwise[source] / (made.grid.step * made.grid.dt)))
+        still, held = np.zeros(len(slow)), made.smooth[source].copy()
+        for first, last in zip(made.starts[:-1], made.starts[1:], strict=True):
+            edges = np.flatnonzero(np.diff(np.concatenate([[False], slow[first:last], [False]])))
+            for begin, end in edges.reshape(-1, 2):
+                if end - begin >= shortest:
+                    rows = slice(first + begin, first + end)
+                    still[rows] = 1.0
+                    held[rows] = np.linspace(held[rows.start], held[rows.stop - 1], end - begin)
+        smooth[source] = held
+        out[side] = made.average(still) if still.any() else np.zeros(made.rows)
+    return replace(made, rest=out, smooth=smooth)
+
+
+def measured_noise(record: Record, joint: Joint, sensing: Sensing) -> dict[str, float]:
+    """White-noise level of each measured signal, from samples that were measured: bridges are
+    smoother than a reading.
+    """
+    signals = signals_of(record, joint, sensing)
+    return {
+        c: level_of(record, c, x, joint.gear_ratio)
+        for c, x in signals.items()
+        if c in POSITION_CHAINS
+    }
+
+
+def pointwise_kernel(
+    position: FloatArray, segments: tuple[slice, ...], dt: float, longest: float, noise: float
+) -> float:
+    """Shortest kernel whose velocity noise does not matter beside the velocities of the record [s].
+
+    A long kernel rounds off reversals, and the laws of friction at low speed then fit the rounding.
+    """
+    lag = max(1, round(POINTWISE_KERNELS[-1] / dt))
+    change = np.concatenate(
+        [np.abs(position[s][lag:] - position[s][:-lag]) for s in segments if s.stop - s.start > lag]
+        or [np.zeros(1)]
+    )
+    fast = float(np.quantile(change, 0.99)) / (lag * dt)
+    for length in POINTWISE_KERNELS:
+        if (
+            6 * dt <= length < longest
+            and noise * float(np.linalg.norm(kernel(length, dt, 1))) <= VELOCITY_NOISE * fast
+        ):
+            return length
+    return max(longest, 6 * dt)
+
+
+def _ranges(data: Sequence[WeakRecord], clamped: bool) -> dict[str, float]:
+    def span(values: FloatArray) -> float:
+        return float(np.quantile(np.abs(values), 0.99)) or 1e-12
+
+    speed = np.concatenate([w.smooth["motor_velocity"] for w in data])
+    q = np.concatenate([w.smooth["motor_position"] for w in data])
+    twist = (
+        q
+        if clamped
+        else np.concatenate([w.smooth["motor_position"] - w.smooth["link_position"] for w in data])
+    )
+    duration = sum(float(np.ptp(w.time)) for w in data)
+    return {
+        "velocity": span(speed),
+        "torsion": span(twist),
+        "position": span(q - np.median(q)),
+        "duration": duration,
+        "absolute": 1.0,
+    }
+
+
+def with_effect(model: JointModel, label: str) -> JointModel:
+    """The model with one more effect; a delay of the drive, of any length, takes the place of
+    the nuisance.
+    """
+    return (
+        model.drop(HOLD_DELAY)
+        if label == hold.DRIVE_DELAY and HOLD_DELAY in model.effects
+        else model
+    ).add(label)
+
+
+def without(model: JointModel, label: str) -> JointModel:
+    """The model without an effect; where a delay of the drive goes, the hold is a nuisance
+    again.
+    """
+    smaller = model.drop(label)
+    return smaller.add(HOLD_DELAY) if label == hold.DRIVE_DELAY else smaller
+
+
+def visible_labels(model: JointModel) -> tuple[str, ...]:
+    """Labels of the effects, without the nuisance delay of the drive."""
+    return tuple(label for label in model.effects if label != HOLD_DELAY)
+
+
+def prepared_model(joint: Joint, record: Record) -> JointModel:
+    """The joint's model in the form that the record's channels can carry."""
+    model = joint.model()
+    sensing = sense(record, model)
+    adapted = adapt(model, sensing, joint.known)
+    if sensing.has_drive and not record.has("motor_torque") and not adapted.named("delay", "drive"):
+        adapted = adapted.add(HOLD_DELAY)
+    lagging = seen_from_the_motor(sensing, joint) and sensing.has_drive
+    return replace(adapted, lagging_load=lagging, calibration=unknowns_of(adapted, sensing))

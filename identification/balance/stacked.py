@@ -1,0 +1,310 @@
+"""Residuals of the balances over several records: stacked rows, their noise floors and their
+weights.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final, final
+
+import numpy as np
+import numpy.typing as npt
+
+from casadi_models import JointModel
+from identification.balance.balances import Balances, balances_of
+from identification.balance.calibration import bare, of_run, settled, values_on
+from identification.balance.dataset import Dataset
+from identification.balance.drawn_noise import draws_of
+from identification.balance.weak import Grid, WeakRecord
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+TURN_KERNEL: Final = 0.02
+"""Longest kernel of the velocity that still follows a turn with sticking friction [s]."""
+TURN_SHARE: Final = 0.25
+"""Share of what a kernel is longer than that by which the instant of a turn may be wrong,
+either way.
+"""
+
+NORMAL_MEDIAN: Final = 0.6745
+"""Median of the absolute value of a normal variable of unit deviation."""
+WEIGHINGS: Final = 12
+"""Rounds in which the weights of the rows and their RMS are made to agree; more change nothing
+in the third digit.
+"""
+INDEPENDENT_SHARE: Final = 0.4
+"""Share of the rows that count as independent: four rows to a kernel length."""
+SURE_ERRORS: Final = 3.0
+"""Standard errors by which a residual must lie under the noise level before that level counts
+as too high.
+"""
+LEAST_MARGIN: Final = 0.5
+"""Share of a noise level that a residual may fall to by chance, however few its rows."""
+
+
+@final
+@dataclass(frozen=True)
+class Stacked:
+    """Residual and Jacobian of several records, balance by balance."""
+
+    residual: Mapping[str, FloatArray]
+    jacobian: Mapping[str, FloatArray]
+    block: IntArray
+    taking: Mapping[str, npt.NDArray[np.bool_]]
+
+    @property
+    def shown(self) -> dict[str, FloatArray]:
+        """Residuals for pictures: NaN in rows that take no part."""
+        return {b: np.where(self.taking[b], r, np.nan) for b, r in self.residual.items()}
+
+
+def stack(
+    balances: Balances,
+    records: Sequence[WeakRecord],
+    values: Mapping[str, float],
+    names: Sequence[str] | None = None,
+) -> Stacked:
+    """Evaluate the balances on records one after the other; rows that take no part are zero.
+
+    `names` are the columns of the Jacobian, by default those of the balances; a calibration unknown
+    of one run has zero in the rows of all others. A record without calibration values gets its own,
+    fitted on itself.
+    """
+    model = balances.model
+    values = settled(model, balances.sensing, records, values)
+    wanted = balances.wrt if names is None else tuple(names)
+    parts = []
+    for w in records:
+        found = balances.evaluate(w, values_on(model, w, values))
+        parts.append(
+            found
+            if names is None
+            else {b: (r, _columns(balances, w, j, wanted)) for b, (r, j) in found.items()}
+        )
+    share = [{b: w.taking(b) for b in balances.balances} for w in records]
+    return Stacked(
+        {
+            b: np.concatenate([p[b][0] * s[b] for p, s in zip(parts, share, strict=True)])
+            for b in balances.balances
+        },
+        {
+            b: np.concatenate([p[b][1] * s[b][:, None] for p, s in zip(parts, share, strict=True)])
+            for b in balances.balances
+        },
+        np.concatenate([w.block for w in records]),
+        {b: taking_part(b, records) for b in balances.balances},
+    )
+
+
+def _columns(
+    balances: Balances, record: WeakRecord, jacobian: FloatArray, names: Sequence[str]
+) -> FloatArray:
+    """Columns of the names, those of other runs zero."""
+    out = np.zeros((len(jacobian), len(names)))
+    for k, n in enumerate(names):
+        (common,) = bare([n])
+        if n in (common, of_run(common, record)):
+            out[:, k] = jacobian[:, balances.wrt.index(common)]
+    return out
+
+
+def taking_part(balance: str, records: Sequence[WeakRecord]) -> npt.NDArray[np.bool_]:
+    """Which of the stacked rows of a balance take part: neither masked nor at rest."""
+    return np.concatenate([w.taking(balance) for w in records])
+
+
+def floors(model: JointModel, data: Dataset, values: Mapping[str, float]) -> dict[str, float]:
+    """RMS that measurement noise alone would leave in each balance of the training records."""
+    rows = floor_rows(model, data, values, data.train)
+    return {b: rms(level[taking_part(b, data.train)]) for b, level in rows.items()}
+
+
+def floor_rows(
+    model: JointModel, data: Dataset, values: Mapping[str, float], records: Sequence[WeakRecord]
+) -> dict[str, FloatArray]:
+    """Standard deviation that measurement noise alone gives each row of the balances, record by
+    record.
+
+    Residual of the smoothed signals with drawn noise less that without it, at the given values:
+    every channel counts through every law that it enters. Rows in which friction may act either way
+    count less: their scatter has a weight of its own. A level above what the training records leave
+    is a contradiction (the noise of a channel reads too much): it is lowered to that.
+    """
+    values = settled(model, data.sensing, [*data.train, *records], values)
+    known = {id(w): _drawn_floors(model, data, values, w) for w in (*data.train, *records)}
+    kept = _share_that_fits(model, data, values, [known[id(w)] for w in data.train])
+    return {
+        b: np.concatenate([np.full(w.rows, kept[b] * known[id(w)][b]) for w in records])
+        if records
+        else np.empty(0)
+        for b in data.sensing.balances
+    }
+
+
+def _drawn_floors(
+    model: JointModel, data: Dataset, values: Mapping[str, float], record: WeakRecord
+) -> dict[str, float]:
+    """RMS of what drawn noise changes in each balance of one record."""
+    balances = balances_of(model, data.sensing, wrt=())
+    power = dict.fromkeys(balances.balances, 0.0)
+    either = _unsure(balances, data, values, [record])
+    drawn = draws_of(record, data.noise)
+    values = values_on(model, record, values)
+    for draw in drawn:
+        calm = balances.evaluate(draw.calm, values, remembered=record)
+        noisy = balances.evaluate(draw.noisy, values)
+        for b in power:
+            rows = record.taking(b)
+            power[b] += _sure_rms((noisy[b][0] - calm[b][0])[rows], either[b][rows]) ** 2
+    return {b: math.sqrt(p / len(drawn)) for b, p in power.items()}
+
+
+def _sure_rms(change: FloatArray, either: FloatArray) -> float:
+    """RMS in which rows that may go either way count by how sure they are, beside that RMS
+    itself: as in every fit.
+    """
+    if not len(change):
+        return 0.0
+    level = float(np.median(np.abs(change))) / NORMAL_MEDIAN
+    if level <= 0 or not np.any(either):
+        return rms(change)
+    for _ in range(WEIGHINGS):
+        weight = 1 / np.hypot(level, either)
+        level = rms(change * weight) / rms(weight)
+    return level
+
+
+def _share_that_fits(
+    model: JointModel,
+    data: Dataset,
+    values: Mapping[str, float],
+    levels: Sequence[Mapping[str, float]],
+) -> dict[str, float]:
+    """Share of the levels of noise of the training records that what these records leave
+    allows, 1 where there is no contradiction.
+    """
+    residual = stack(balances_of(model, data.sensing, wrt=()), data.train, values).residual
+    either = _unsure(balances_of(model, data.sensing, wrt=()), data, values, data.train)
+    out = dict.fromkeys(residual, 1.0)
+    for b, r in residual.items():
+        rows = taking_part(b, data.train)
+        level = np.concatenate(
+            [np.full(w.rows, found[b]) for w, found in zip(data.train, levels, strict=True)]
+        )
+        if rows.any() and level[rows].min() > 0:
+            spread = SURE_ERRORS / math.sqrt(2 * INDEPENDENT_SHARE * float(rows.sum()))
+            left = _sure_rms(r[rows] / level[rows], either[b][rows] / level[rows])
+            out[b] = min(1.0, left / max(1 - spread, LEAST_MARGIN))
+    return out
+
+
+def references(data: Dataset, records: Sequence[WeakRecord]) -> dict[str, FloatArray]:
+    """The measured torque of each balance, averaged: what the relative error refers to."""
+    names = {"link": "torque", "transmission": "torque"}
+    return {
+        b: np.concatenate([w.averaged[names.get(b, "drive")] for w in records])
+        for b in data.sensing.balances
+    }
+
+
+def _unsure(
+    balances: Balances, data: Dataset, values: Mapping[str, float], records: Sequence[WeakRecord]
+) -> dict[str, FloatArray]:
+    """Scatter of each row from where exactly friction changes its sign: it may act either way,
+    or be spread over a turn [N.m].
+    """
+    names = balances.model.named("smoothing")
+    either = _either_way(balances.model, data, values, records)
+    if not names:
+        return either
+    bare = balances_of(balances.model, data.sensing, wrt=())
+    here = stack(bare, records, values).residual
+    there = stack(bare, records, {**values, **{n: 2 * values[n] for n in names}}).residual
+    return {b: np.hypot((here[b] - there[b]) / 2, either[b]) for b in here}
+
+
+def row_weights(
+    balances: Balances,
+    data: Dataset,
+    values: Mapping[str, float],
+    sigma: Mapping[str, float] | Mapping[str, FloatArray],
+    records: Sequence[WeakRecord],
+) -> dict[str, FloatArray]:
+    """1/sigma of each row: rows that hang on where exactly friction changes its sign count less
+    (`sigma`: of a balance, or of its rows).
+    """
+    unsure = _unsure(balances, data, values, records)
+    # a row of which samples were lost averages fewer of them: its variance grows with one over what
+    # is left
+    support = np.sqrt(
+        np.concatenate([np.ones(w.rows) if w.support is None else w.support for w in records])
+    )
+    return {b: support / np.sqrt(sigma[b] ** 2 + unsure[b] ** 2) for b in unsure}
+
+
+def _either_way(
+    model: JointModel, data: Dataset, values: Mapping[str, float], records: Sequence[WeakRecord]
+) -> dict[str, FloatArray]:
+    """Friction torque that may act in either direction, at a standstill or a turn, averaged
+    like a row [N.m].
+    """
+    zero = np.zeros(sum(w.rows for w in records))
+    out = dict.fromkeys(data.sensing.balances, zero)
+    for place, balances in (
+        ("motor", ("motor", "sum", "deflection", "axis")),
+        ("link", ("link", "sum", "axis")),
+    ):
+        level = sticking_torque(model, values, place)
+        source = f"{place}_position"
+        if not level or source not in data.noise:
+            continue
+        lag = (
+            model.swinging_inertia(values) * model.load_compliance(values)
+            if model.lagging_load
+            else 0.0
+        )
+        shares = []
+        for w in records:
+            either = _either_direction(
+                w.points[f"{place}_velocity"], data.noise[source], w.grid, source
+            ).astype(float)
+            shares.append(w.average(either))
+            if lag:
+                shares[-1] = shares[-1] + lag * (np.abs(w.curving) @ either)
+        held = level * np.concatenate(shares)
+        for b in balances:
+            if b in out:
+                out[b] = np.hypot(out[b], held)
+    return out
+
+
+def sticking_torque(model: JointModel, values: Mapping[str, float], place: str) -> float:
+    """Torque that dry friction of a side may hold at a standstill, in either direction [N.m]."""
+    return float(sum(abs(values[n]) for n in model.named("static", place)))
+
+
+def _either_direction(
+    velocity: FloatArray, noise: float, grid: Grid, source: str
+) -> npt.NDArray[np.bool_]:
+    """Points at which the direction is not known: slower than the noise, or nearer to a turn
+    than its kernel tells when it was.
+    """
+    slow = np.abs(velocity) < 3 * noise * grid.velocity_gain(source)
+    turns = np.diff(np.sign(velocity), append=velocity[-1]) != 0
+    reach = max(
+        0, round(TURN_SHARE * (grid.pointwise[source] - TURN_KERNEL) / (grid.step * grid.dt))
+    )
+    near = (
+        np.convolve(turns, np.ones(2 * reach), "same") > 0
+        if reach
+        else np.zeros(len(velocity), dtype=bool)
+    )
+    return np.asarray(slow | near)
+
+
+def rms(values: FloatArray) -> float:
+    """Root mean square."""
+    return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0

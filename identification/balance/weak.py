@@ -1,0 +1,489 @@
+"""Weak form: balances averaged with a smooth kernel, so that no measured signal is differentiated.
+
+Row i of a balance is the integral of w(t - t_i) r(t) dt with the kernel w(t) = c cos^4(pi t / L).
+Terms that are linear in the signals take their derivatives on the kernel (w', w''); laws that are
+nonlinear are evaluated at the samples (velocities from a shorter kernel) and then averaged.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Final, final
+
+import numpy as np
+import numpy.typing as npt
+from numpy.lib.stride_tricks import sliding_window_view
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+POSITION_CHAINS: Final = {
+    "motor_position": ("motor_position", "motor_velocity", "motor_acceleration", "motor_jerk"),
+    "link_position": ("link_position", "link_velocity", "link_acceleration", "link_jerk"),
+    "torque": ("torque", "torque_rate"),
+    "drive": ("drive", "drive_rate"),
+}
+"""Measured signals and the signals that follow from them by derivatives."""
+
+HIGHEST_DERIVATIVE: Final = 4
+CLAIM_KERNEL: Final = 0.06
+"""Length of the balances' kernel [s]."""
+KERNEL_SAMPLES: Final = 8
+"""Samples that a kernel has at least, however slow the logger."""
+
+RESTING_SIDES: Final[Mapping[str, tuple[str, ...]]] = {
+    "motor": ("motor",),
+    "deflection": ("motor",),
+    "link": ("link",),
+    "sum": ("motor", "link"),
+    "axis": ("motor", "link"),
+}
+"""Sides whose dry friction acts in a balance. At rest it is any torque up to its limit: such a row
+is an inequality, no equation. The transmission has no friction against the ground."""
+
+LEAST_SUPPORT: Final = 0.5
+"""Share of a row's kernel that must have been measured: with less, the row is more cubic than
+record.
+"""
+REST_SHARE: Final = 0.01
+"""Share of a row's kernel that may be at rest: a choice. At 1 % the unknown friction of the rest
+weighs a hundredth of its limit in the row, which is what noise leaves of it elsewhere; the kernels
+taper, so that only rows whose edge touches a rest are near it."""
+
+
+def kernel(length: float, dt: float, order: int = 0) -> FloatArray:
+    """Samples of the cos^4 kernel or of a derivative of it, for correlation with a signal.
+
+    Parameters
+    ----------
+    length : float
+        Full width [s].
+    dt : float
+        Sample time [s].
+    order : {0, 1, 2, 3}
+        Derivative of the signal that the correlation gives.
+
+    Returns
+    -------
+    (k,) array, k odd
+        Weights that reproduce the derivative of polynomials up to `order` + 1 exactly.
+    """
+    half = max(order + 2, round(length / dt / 2))
+    t = np.arange(-half, half + 1) * dt
+    width = (2 * half + 2) * dt
+    window = np.cos(np.pi * t / width) ** 4
+    # least-squares polynomial weights under the window: exact for polynomials, the window keeps it
+    # smooth
+    degree = order + 1
+    scale = half * dt
+    basis = np.vander(t / scale, degree + 1, increasing=True)
+    weighted = basis * window[:, None]
+    coefficients = np.linalg.solve(basis.T @ weighted, np.eye(degree + 1)[order])
+    weights: FloatArray = (
+        weighted @ coefficients * float(np.prod(np.arange(1, order + 1))) / scale**order
+    )
+    return weights
+
+
+def differentiated_kernel(length: float, dt: float, order: int) -> FloatArray:
+    """Derivative of the cos^4 kernel itself, so that averages of a signal and of its derivative
+    agree.
+
+    Shapes and units as in :func:`kernel`; exact for polynomials of degree `order`.
+    """
+    half = max(order + 2, round(length / dt / 2))
+    t = np.arange(-half, half + 1) * dt
+    width = (2 * half + 2) * dt
+    phase = np.pi * t / width
+    c, s, a = np.cos(phase), np.sin(phase), np.pi / width
+    shapes = (
+        c**4,
+        4 * a * c**3 * s,
+        a**2 * (12 * c**2 * s**2 - 4 * c**4),
+        a**3 * (24 * c * s**3 - 40 * c**3 * s),
+        a**4 * (24 * s**4 - 192 * c**2 * s**2 + 40 * c**4),
+    )
+    weights = np.asarray(shapes[order], dtype=float)
+    unit = c**4 / np.sum(c**4)
+    moments = [np.sum(weights * t**k) for k in range(order)]
+    if order:
+        powers = np.vander(t, order, increasing=True)
+        gram = powers.T @ (powers * unit[:, None])
+        weights = weights - (powers * unit[:, None]) @ np.linalg.solve(gram, np.array(moments))
+    factorial = float(np.prod(np.arange(1, order + 1)))
+    weights = weights * factorial / np.sum(weights * t**order)
+    return np.asarray(weights, dtype=np.float64)
+
+
+@final
+@dataclass(frozen=True)
+class Grid:
+    """Where the rows of one record's balances stand.
+
+    Attributes
+    ----------
+    length, dt : float
+        Kernel length and sample time [s].
+    stride, step : int
+        Samples between rows; samples between the points at which nonlinear laws are evaluated.
+    segments : tuple of slice
+        Contiguous stretches that are long enough.
+    half : int
+        Samples left out at either end of a stretch.
+    pointwise : mapping of str to float
+        Kernel length of the derivatives inside nonlinear laws, by measured signal [s].
+    """
+
+    length: float
+    dt: float
+    stride: int
+    step: int
+    segments: tuple[slice, ...]
+    half: int
+    pointwise: Mapping[str, float]
+
+    def velocity_gain(self, source: str) -> float:
+        """Noise of the pointwise velocity per noise of that position [1/s]."""
+        return float(np.linalg.norm(kernel(self.pointwise[source], self.dt, 1)))
+
+    def correlate(self, values: FloatArray, weights: FloatArray) -> FloatArray:
+        """Rows of a correlation of a full-rate signal with kernel weights."""
+        return _strided(values, weights, self.segments, self.half, self.stride)
+
+    def pick(self, values: FloatArray) -> FloatArray:
+        """Full-rate values at the rows."""
+        return _strided(values, np.ones(1), self.segments, self.half, self.stride)
+
+
+def _strided(
+    values: FloatArray, weights: FloatArray, segments: tuple[slice, ...], half: int, stride: int
+) -> FloatArray:
+    own = len(weights) // 2
+    parts = []
+    for segment in segments:
+        x = values[segment]
+        rows = np.arange(half, len(x) - half, stride)
+        windows = sliding_window_view(x, len(weights))[rows - own]
+        parts.append(windows @ weights)
+    return np.concatenate(parts) if parts else np.empty(0)
+
+
+@final
+@dataclass(frozen=True)
+class WeakRecord:
+    """One record prepared for weak-form regression.
+
+    Attributes
+    ----------
+    averaged : mapping of str to (rows,) array
+        Kernel average of every signal, derivatives taken on the kernel.
+    points : mapping of str to (points,) array
+        Signals where nonlinear laws are evaluated.
+    smooth : mapping of str to (points,) array
+        The same, positions smoothed too: input of memory operators.
+    time : (rows,) array
+        Centre of each row [s].
+    block : (rows,) int array
+        Block of each row; -1 for a row that touches another block's samples.
+    starts : (segments + 1,) int array
+        First point of each segment.
+    masked : set of str
+        Balances that these rows do not take part in: those of a link with another payload.
+    curved : mapping of str to (rows,) array
+        Second derivative of the average of every signal where it was asked for.
+    rest : mapping of str to (rows,) array
+        Kernel average of "this side stands still" (0 to 1), by side: motor, link.
+    support : (rows,) array, optional
+        Share of each row's kernel that was measured and not bridged; 1 everywhere where it is None.
+    name : str
+        Tells the record from all others: its calibration unknowns go by it.
+    """
+
+    grid: Grid
+    averaged: Mapping[str, FloatArray]
+    points: Mapping[str, FloatArray]
+    smooth: Mapping[str, FloatArray]
+    time: FloatArray
+    block: IntArray
+    starts: IntArray
+    masked: frozenset[str] = frozenset()
+    curved: Mapping[str, FloatArray] = field(default_factory=dict)
+    rest: Mapping[str, FloatArray] = field(default_factory=dict)
+    support: FloatArray | None = None
+    name: str = ""
+
+    def taking(self, balance: str) -> npt.NDArray[np.bool_]:
+        """Rows that take part in a balance, shape (rows,): the one mask of every fit, error,
+        line and picture.
+        """
+        if balance in self.masked:
+            return np.zeros(self.rows, dtype=np.bool_)
+        lost = self.support < LEAST_SUPPORT if self.support is not None else False
+        return np.asarray(~(self.resting(balance) | lost))
+
+    def resting(self, balance: str) -> npt.NDArray[np.bool_]:
+        """Rows in which a side whose dry friction acts in the balance stands still, shape
+        (rows,).
+        """
+        still = np.zeros(self.rows, dtype=np.bool_)
+        for side in RESTING_SIDES.get(balance, ()):
+            if side in self.rest:
+                still |= self.rest[side] > REST_SHARE
+        return still
+
+    @cached_property
+    def stretch(self) -> IntArray:
+        """Number of the contiguous stretch of each row, shape (rows,)."""
+        grid = self.grid
+        counts = [
+            len(range(grid.half, s.stop - s.start - grid.half, grid.stride)) for s in grid.segments
+        ]
+        return np.repeat(np.arange(len(counts)), counts)
+
+    @property
+    def begins(self) -> npt.NDArray[np.bool_]:
+        """Rows that begin a stretch after another one, shape (rows,): no curve is drawn up to
+        them.
+        """
+        return np.asarray(np.diff(self.stretch, prepend=0) != 0)
+
+    def average(self, values: FloatArray) -> FloatArray:
+        """Kernel average of values at the points, one row per row.
+
+        Parameters
+        ----------
+        values : (points,) or (points, columns) array
+
+        Returns
+        -------
+        (rows,) or (rows, columns) array
+        """
+        return np.asarray(self.averaging @ values, dtype=np.float64)
+
+    def curve(self, values: FloatArray) -> FloatArray:
+        """Second derivative of the kernel average of values at the points (shapes as in
+        :meth:`average`).
+        """
+        return np.asarray(self.curving @ values, dtype=np.float64)
+
+    @cached_property
+    def averaging(self) -> Any:
+        """Sparse matrix (rows, points) of the kernel average."""
+        return self._sparse(0)
+
+    @cached_property
+    def curving(self) -> Any:
+        """Sparse matrix (rows, points) of the second derivative of the kernel average."""
+        return self._sparse(2)
+
+    def table(self, names: tuple[str, ...]) -> FloatArray:
+        """Signals at the points as rows in the order of `names`, zeros where one is not there;
+        made once, not to be written to.
+        """
+        if names not in self._tables:
+            out = np.zeros((len(names), int(self.starts[-1])))
+            for i, name in enumerate(names):
+                if name in self.points:
+                    out[i] = self.points[name]
+            self._tables[names] = out
+        return self._tables[names]
+
+    @cached_property
+    def _tables(self) -> dict[tuple[str, ...], FloatArray]:
+        return {}
+
+    def _sparse(self, order: int) -> Any:
+        from scipy.sparse import csr_array
+
+        grid = self.grid
+        half = grid.half // grid.step
+        stride = grid.stride // grid.step
+        weights = differentiated_kernel(grid.length, grid.dt * grid.step, order)
+        own = len(weights) // 2
+        centres = np.concatenate(
+            [
+                np.arange(half, last - first - half, stride) + first
+                for first, last in zip(self.starts[:-1], self.starts[1:], strict=True)
+            ]
+        )
+        columns = (centres[:, None] + np.arange(-own, own + 1)).ravel()
+        pointers = np.arange(0, len(columns) + 1, len(weights))
+        return csr_array(
+            (np.tile(weights, len(centres)), columns, pointers),
+            shape=(len(centres), int(self.starts[-1])),
+        )
+
+    @property
+    def rows(self) -> int:
+        """Number of rows of each balance."""
+        return len(self.time)
+
+
+def prepare(
+    time: FloatArray,
+    signals: Mapping[str, FloatArray],
+    segments: tuple[slice, ...],
+    *,
+    length: float = 0.06,
+    pointwise: float | Mapping[str, float] = 0.03,
+    block: float = 1.5,
+    overlap: int = 4,
+    first_block: int = 0,
+    curved: bool = False,
+) -> WeakRecord:
+    """Average a uniformly sampled record with the kernel.
+
+    Parameters
+    ----------
+    time : (n,) array
+        Uniform within each segment [s].
+    signals : mapping
+        Measured signals (keys of :data:`POSITION_CHAINS`, ``temperature``), full rate,
+        link-referred.
+    segments : tuple of slice
+        Contiguous stretches.
+    length : float
+        Kernel of the balances [s].
+    pointwise : float or mapping of str to float
+        Kernel of the derivatives inside nonlinear laws, one for all or by measured signal [s].
+    block : float
+        Length of the blocks that count as independent [s].
+    overlap : int
+        Rows per kernel length.
+    curved : bool
+        Second derivatives of the averages too.
+
+    Returns
+    -------
+    WeakRecord
+    """
+    dt = float(np.median(np.concatenate([np.diff(time[s]) for s in segments])))
+    short = (
+        dict.fromkeys(POSITION_CHAINS, pointwise)
+        if isinstance(pointwise, int | float)
+        else {**dict.fromkeys(POSITION_CHAINS, 0.03), **pointwise}
+    )
+    step = max(1, round(0.002 / dt))
+    stride = max(step, round(length / dt / overlap / step) * step)
+    half = step * (max(2, round(length / (dt * step) / 2)) + 1)
+    reach = max(half, round(length / dt / 2) + 3, round(max(short.values()) / dt / 2) + 5)
+    half = step * int(np.ceil(reach / step))
+    long_enough = tuple(s for s in segments if s.stop - s.start > 2 * half + stride)
+    grid = Grid(
+        length, dt, stride=stride, step=step, segments=long_enough, half=half, pointwise=short
+    )
+    averaged, points, smooth, bent = filtered(grid, signals, curved=curved)
+    for name, values in (("temperature", signals.get("temperature")), ("time", time)):
+        if values is not None:
+            averaged[name] = grid.correlate(values, differentiated_kernel(length, dt, 0))
+            points[name] = smooth[name] = np.concatenate(
+                [values[s][::step] for s in long_enough] or [np.empty(0)]
+            )
+    stamps = grid.pick(time)
+    numbers = np.concatenate(
+        [
+            np.full(len(range(half, s.stop - s.start - half, stride)), i)
+            for i, s in enumerate(long_enough)
+        ]
+        or [np.empty(0)]
+    )
+    blocks, inside = _blocks(stamps, numbers.astype(np.int64), block, (half - 1) * dt)
+    counts = [len(range(0, s.stop - s.start, step)) for s in long_enough]
+    return WeakRecord(
+        grid,
+        averaged,
+        points=points,
+        smooth=smooth,
+        time=stamps,
+        block=np.where(inside, blocks + first_block, -1),
+        starts=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        curved=bent,
+    )
+
+
+def filtered(
+    grid: Grid, signals: Mapping[str, FloatArray], *, curved: bool = False
+) -> tuple[
+    dict[str, FloatArray], dict[str, FloatArray], dict[str, FloatArray], dict[str, FloatArray]
+]:
+    """Measured signals and their derivatives as the rows and the nonlinear laws of a grid see them.
+
+    Parameters
+    ----------
+    grid : Grid
+    signals : mapping
+        Keys of :data:`POSITION_CHAINS`, full rate; other keys are left out.
+    curved : bool
+        Second derivatives of the averages too.
+
+    Returns
+    -------
+    averaged, points, smooth, curved
+        As in :class:`WeakRecord`.
+    """
+    averaged: dict[str, FloatArray] = {}
+    points: dict[str, FloatArray] = {}
+    smooth: dict[str, FloatArray] = {}
+    bent: dict[str, FloatArray] = {}
+    length, dt, short = grid.length, grid.dt, grid.pointwise
+    for source, chain in POSITION_CHAINS.items():
+        if source not in signals:
+            continue
+        for order, name in enumerate(chain):
+            averaged[name] = grid.correlate(
+                signals[source], differentiated_kernel(length, dt, order)
+            )
+            if curved and order + 2 <= HIGHEST_DERIVATIVE:
+                bent[name] = grid.correlate(
+                    signals[source], differentiated_kernel(length, dt, order + 2)
+                )
+            points[name], smooth[name] = _pointwise(
+                signals[source], grid.segments, short[source], dt, order, grid.step
+            )
+    return averaged, points, smooth, bent
+
+
+def _pointwise(
+    values: FloatArray, segments: tuple[slice, ...], length: float, dt: float, order: int, step: int
+) -> tuple[FloatArray, FloatArray]:
+    """Raw (order 0) or smoothed derivative at every `step`-th sample; ends by the nearest full
+    window.
+    """
+    weights = kernel(length, dt, order)
+    half = len(weights) // 2
+    raw, soft = [], []
+    for segment in segments:
+        x = values[segment]
+        inner = sliding_window_view(x, len(weights))[::1]
+        centres = np.clip(np.arange(0, len(x), step) - half, 0, len(inner) - 1)
+        filtered = inner[centres] @ weights
+        soft.append(filtered)
+        raw.append(x[::step] if order == 0 else filtered)
+    if not raw:
+        return np.empty(0), np.empty(0)
+    return np.concatenate(raw), np.concatenate(soft)
+
+
+def _blocks(
+    time: FloatArray, segment: IntArray, length: float, reach: float
+) -> tuple[IntArray, npt.NDArray[np.bool_]]:
+    """Block number of each row and whether its kernel stays inside the block."""
+    number = np.zeros(len(time), dtype=np.int64)
+    inside = np.ones(len(time), dtype=np.bool_)
+    offset = 0
+    for s in np.unique(segment):
+        here = segment == s
+        t = time[here] - time[here][0]
+        count = max(1, round((t[-1] + 1e-9) / length))
+        width = (t[-1] + 1e-9) / count if t[-1] > 0 else 1.0
+        index = np.minimum((t / width).astype(np.int64), count - 1)
+        number[here] = index + offset
+        into = t - index * width
+        keep = ((into >= min(reach, width / 8)) | (index == 0)) & (
+            (width - into >= min(reach, width / 8)) | (index == count - 1)
+        )
+        inside[here] = keep
+        offset += count
+    return number, inside

@@ -1,0 +1,1 @@
+"""Records: files read, columns and units, the joint file, the gate before every fit."""

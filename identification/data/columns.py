@@ -1,0 +1,457 @@
+"""Which column of a file is which channel: column maps, recognised headers, and a guess that is
+only ever shown.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, final
+
+from identification.data.channels import CHANNELS, channel_unit
+from identification.data.units import base_unit, check_unit, same_dimension
+from identification.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+NAMES: Final = ("time", *CHANNELS)
+_KEYS: Final = frozenset({"column", "unit", "scale", "sign", "counts_per_turn", "step"})
+_BRACKET: Final = re.compile(r"^(.*?)\s*[\[(]([^\])]*)[\])]\s*$")
+
+
+@final
+@dataclass(frozen=True)
+class Column:
+    """How one channel is made from a column: ``SI = to_si(sign * scale * raw, unit)``.
+
+    Attributes
+    ----------
+    channel : str
+        Channel name, or ``"time"``.
+    column : str
+        Name of the column in the file; empty for a time made from `step`.
+    unit : str
+        Unit of ``raw * scale``.
+    scale, sign : float
+        Factors; the sign is +1 or -1.
+    counts_per_turn : float, optional
+        Encoder counts of one turn, where the unit is ``counts``.
+    step : float, optional
+        For time only: the files has no time column, the samples are `step` apart.
+    """
+
+    channel: str
+    column: str
+    unit: str
+    scale: float = 1.0
+    sign: int = 1
+    counts_per_turn: float | None = None
+    step: float | None = None
+
+    def describe(self) -> str:
+        """Return one line for the provenance: where the channel comes from."""
+        if self.step is not None:
+            return f"{self.channel} = row number x {self.step:g} {self.unit}"
+        text = f"{self.channel} = {self.column!r}"
+        if self.channel == "run":
+            return text
+        text += f" [{self.unit}]"
+        if self.scale != 1.0:
+            text += f" x {self.scale:.10g}"
+        if self.sign == -1:
+            text += ", sign reversed"
+        if self.counts_per_turn is not None:
+            text += f", {self.counts_per_turn:g} counts per turn"
+        return text
+
+    def toml(self) -> str:
+        """Return ``channel = { column = ..., unit = ... }``."""
+        items = [f"column = {_quoted(self.column)}"]
+        if self.channel != "run":
+            items.append(f"unit = {_quoted(self.unit)}")
+        if self.scale != 1.0:
+            items.append(f"scale = {self.scale!r}")
+        if self.sign != 1:
+            items.append(f"sign = {self.sign}")
+        if self.counts_per_turn is not None:
+            items.append(f"counts_per_turn = {self.counts_per_turn!r}")
+        return f"{self.channel} = {{ {', '.join(items)} }}"
+
+
+@final
+@dataclass(frozen=True)
+class Guess:
+    """A proposed column and why."""
+
+    column: Column
+    reason: str
+
+
+def _quoted(text: str) -> str:
+    escaped = (
+        text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n").replace("\t", "\\t")
+    )
+    return f'"{escaped}"'
+
+
+def split_unit(name: str) -> tuple[str, str | None]:
+    """Split ``"speed [rpm]"`` or ``"speed (rpm)"`` into name and unit."""
+    match = _BRACKET.match(name.strip())
+    if match and match.group(1):
+        return match.group(1).strip(), match.group(2).strip() or None
+    return name.strip(), None
+
+
+def header_unit(text: str, wanted: str) -> str | None:
+    """Find the unit in the tail of a header: underscores stand for ``/`` or ``.``.
+
+    Parameters
+    ----------
+    text : str
+        For example ``"rad_s2"``.
+    wanted : str
+        The SI unit the channel has.
+
+    Returns
+    -------
+    str or None
+        The unit spelled out (``"rad/s2"``), or None where no reading has the wanted dimension.
+    """
+    parts = text.split("_")
+    if not all(parts) or len(parts) > 4:
+        return None
+    target = base_unit(wanted)
+    if wanted == "K" and parts[0] in {"C", "F"}:
+        parts[0] = f"deg{parts[0]}"
+    for marks in itertools.product("/.", repeat=len(parts) - 1):
+        unit = "".join(
+            itertools.chain.from_iterable(itertools.zip_longest(parts, marks, fillvalue=""))
+        )
+        try:
+            if same_dimension(base_unit(unit, 1.0), target):
+                return unit
+        except InputError:
+            continue
+    return None
+
+
+def channel_of(name: str) -> str | None:
+    """Return the channel a column name begins with, if any."""
+    plain = split_unit(name)[0]
+    return next(
+        (
+            c
+            for c in sorted(NAMES, key=len, reverse=True)
+            if plain == c or plain.startswith(f"{c}_")
+        ),
+        None,
+    )
+
+
+def recognise(name: str, kind: str = "rotary", unit: str | None = None) -> Column | None:
+    """Read a header that says channel and unit, ``motor_current_A`` or ``motor_current [A]``.
+
+    Parameters
+    ----------
+    name : str
+        Column name.
+    kind : {"rotary", "linear"}
+        Kind of the axis.
+    unit : str, optional
+        Unit the file itself gives for the column (a units row, an attribute).
+
+    Returns
+    -------
+    Column or None
+        None where the name is not that of a channel.
+
+    Raises
+    ------
+    InputError
+        If the name begins with a channel's name but its unit is missing, unknown or of another
+        dimension.
+    """
+    plain, bracket = split_unit(name)
+    channel = channel_of(plain)
+    if channel is None:
+        return None
+    if channel == "run":
+        return Column("run", name, "1") if plain == "run" else None
+    wanted = channel_unit(channel, kind)
+    tail = plain[len(channel) + 1 :]
+    if tail and bracket is None:
+        found = header_unit(tail, wanted)
+        if found is None:
+            raise InputError(_unfit(name, channel, tail, kind))
+        return Column(channel, name, found, counts_per_turn=None)
+    given = bracket or unit
+    if tail or given is None:
+        raise InputError(
+            f"column {name!r} does not say its unit: name it "
+            f"{channel}_{wanted.replace('/', '_').replace('.', '')} "
+            f"or give [columns] {channel} = {{ column = {_quoted(name)}, unit = "
+            f"{_quoted(wanted)} }}"
+        )
+    try:
+        check_unit(given, wanted, 1.0, channel)
+    except InputError:
+        raise InputError(_unfit(name, channel, given, kind)) from None
+    return Column(channel, name, given)
+
+
+def _unfit(name: str, channel: str, unit: str, kind: str) -> str:
+    other = "linear" if kind == "rotary" else "rotary"
+    other_unit = channel_unit(channel, other)
+    hint = (
+        f"; for a {other} axis give kind = {other!r}"
+        if header_unit(unit.replace("/", "_"), other_unit)
+        else ""
+    )
+    return (
+        f"column {name!r}: {unit!r} is not a unit of {channel} "
+        f"({channel_unit(channel, kind)}){hint}: "
+        f"correct the header or give [columns] {channel} = {{ column = {_quoted(name)}, unit = "
+        f"... }}"
+    )
+
+
+def load_map(
+    columns: Mapping[str, Any] | str | Path | None,
+) -> tuple[Mapping[str, Any], str | None]:
+    """Get the raw column map and, from a joint file, the kind of the axis.
+
+    Parameters
+    ----------
+    columns : mapping, path or None
+        ``{channel: {column, unit, scale, sign, counts_per_turn}}``, or a TOML file with a
+        ``[columns]`` table.
+
+    Returns
+    -------
+    map, kind
+        The kind is None where the file does not say it.
+    """
+    if columns is None:
+        return {}, None
+    if not isinstance(columns, (str, Path)):
+        return columns, None
+    path = Path(columns)
+    try:
+        with path.open("rb") as stream:
+            table = tomllib.load(stream)
+    except OSError as error:
+        raise InputError(
+            f"column map {path}: cannot be read ({error.strerror}): check the path"
+        ) from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"column map {path}: not valid TOML ({error}): correct it") from None
+    joint = table.get("joint")
+    kind = joint.get("kind") if isinstance(joint, dict) else None
+    found = table.get("columns")
+    if found is None:
+        found = {} if joint is not None else table
+    if not isinstance(found, dict):
+        raise InputError(
+            f"column map {path}: [columns] must be a table of channel = {{ column = ..., unit = "
+            f"... }}"
+        )
+    return found, kind if isinstance(kind, str) else None
+
+
+def parse_map(
+    raw: Mapping[str, Any], names: Sequence[str], units: Mapping[str, str], kind: str
+) -> tuple[Column, ...]:
+    """Check a column map against the columns of a file.
+
+    Parameters
+    ----------
+    raw : mapping
+        Channel to ``{column, unit, ...}`` or to the bare column name.
+    names : sequence of str
+        Columns of the file.
+    units : mapping of str to str
+        Units the file gives, by column.
+    kind : {"rotary", "linear"}
+        Kind of the axis.
+
+    Raises
+    ------
+    InputError
+        If a channel, key, column or unit is unknown, or a value is of the wrong type.
+    """
+    return tuple(_entry(channel, spec, names, units, kind) for channel, spec in raw.items())
+
+
+def _entry(
+    channel: str, spec: Any, names: Sequence[str], units: Mapping[str, str], kind: str
+) -> Column:
+    where = f"[columns] {channel}"
+    wanted = channel_unit(channel, kind)
+    table: dict[str, Any] = (
+        {"column": spec} if isinstance(spec, str) else dict(spec) if hasattr(spec, "keys") else {}
+    )
+    if not table or (unknown := set(table) - _KEYS):
+        said = f"unknown key {', '.join(sorted(unknown))}" if table else f"{spec!r} is not a table"
+        raise InputError(
+            f"{where}: {said}: write {{ column = ..., unit = ..., scale, sign, counts_per_turn }}"
+        )
+    step = _number(table, "step", where)
+    if step is not None:
+        if channel != "time" or step <= 0.0:
+            raise InputError(
+                f"{where}: step {step!r} is for time only, and positive: give the sampling step"
+            )
+        return Column(
+            "time", "", _fitting(table.get("unit", "s"), wanted, None, channel), step=step
+        )
+    column = table.get("column")
+    if not isinstance(column, str) or column not in names:
+        raise InputError(f"{where}: no column {column!r} in the file: it has {shown(names)}")
+    sign = _number(table, "sign", where)
+    if sign not in {None, 1.0, -1.0}:
+        raise InputError(f"{where}: sign is {table['sign']!r}: it is 1 or -1")
+    scale = _number(table, "scale", where)
+    if scale is not None and (scale == 0.0 or not math.isfinite(scale)):
+        raise InputError(f"{where}: scale is {scale!r}: give a finite number that is not zero")
+    counts = _number(table, "counts_per_turn", where)
+    unit = table.get("unit")
+    if unit is None:
+        own = recognise_quietly(column, kind, units.get(column))
+        unit = (
+            units.get(column)
+            or split_unit(column)[1]
+            or (own.unit if own and own.channel == channel else None)
+        )
+    if channel == "run":
+        return Column("run", column, "1")
+    if not isinstance(unit, str):
+        raise InputError(
+            f"{where}: column {column!r} has no unit: add unit = {_quoted(wanted)}, or what it "
+            "is in"
+        )
+    fitting = _fitting(unit, wanted, counts, channel)
+    return Column(
+        channel, column, fitting, 1.0 if scale is None else scale, -1 if sign == -1.0 else 1, counts
+    )
+
+
+def _fitting(unit: Any, wanted: str, counts: float | None, channel: str) -> str:
+    if not isinstance(unit, str):
+        raise InputError(
+            f"[columns] {channel}: unit {unit!r} must be text, for example {_quoted(wanted)}"
+        )
+    try:
+        check_unit(unit, wanted, counts, channel)
+    except InputError as error:
+        raise InputError(f"[columns] {error}{_other_kind(unit, wanted, channel)}") from None
+    return unit
+
+
+def _other_kind(unit: str, wanted: str, channel: str) -> str:
+    """A hint where the unit is that of the channel of the other kind of axis."""
+    other = "linear" if channel_unit(channel, "rotary") == wanted else "rotary"
+    return (
+        f"; for a {other} axis give kind = {other!r} in [joint] first"
+        if header_unit(unit.replace("/", "_"), channel_unit(channel, other))
+        else ""
+    )
+
+
+def _number(table: Mapping[str, Any], key: str, where: str) -> float | None:
+    value = table.get(key)
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise InputError(f"{where}: {key} is {value!r}: give a number")
+    return float(value)
+
+
+def recognise_quietly(name: str, kind: str, unit: str | None = None) -> Column | None:
+    """As `recognise`, with None in place of an error."""
+    try:
+        return recognise(name, kind, unit)
+    except InputError:
+        return None
+
+
+def shown(names: Iterable[str], limit: int = 20) -> str:
+    """Return names for a message, the first `limit` of them."""
+    every = list(names)
+    more = f", ... ({len(every)} in all)" if len(every) > limit else ""
+    return ", ".join(every[:limit]) + more if every else "none"
+
+
+def choose(
+    raw: Mapping[str, Any], names: Sequence[str], units: Mapping[str, str], kind: str, where: str
+) -> tuple[tuple[Column, ...], tuple[str, ...]]:
+    """Settle which columns are used: the map first, recognised headers for the other channels.
+
+    Parameters
+    ----------
+    raw, names, units, kind
+        As in `parse_map`.
+    where : str
+        The file, for messages.
+
+    Returns
+    -------
+    columns, notes
+        One `Column` a channel, time first; the notes name the columns that are not used.
+
+    Raises
+    ------
+    InputError
+        If time or every channel is missing; the message shows the guess as a TOML fragment in one
+        line.
+    """
+    from identification.data.guess import fragment
+
+    try:
+        chosen = {entry.channel: entry for entry in parse_map(raw, names, units, kind)}
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+    problems: dict[str, str] = {}
+    mapped = {entry.column for entry in chosen.values()}
+    for name in names:
+        if name in mapped:
+            continue
+        try:
+            found = recognise(name, kind, units.get(name))
+        except InputError as error:
+            problems[channel_of(name) or name] = str(error)
+            continue
+        if found is None or found.channel in raw:
+            continue
+        if found.channel in chosen:
+            both = f"{chosen[found.channel].column!r} and {name!r}"
+            raise InputError(
+                f"{where}: columns {both} are both {found.channel}: choose one in [columns]"
+            )
+        chosen[found.channel] = found
+    open_problems = [text for channel, text in problems.items() if channel not in chosen]
+    missing = "time" if "time" not in chosen else "a channel"
+    if "time" not in chosen or not set(chosen) - {"time", "run"} or (open_problems and not raw):
+        said = open_problems[0] if open_problems else f"no column is recognised as {missing}"
+        guesses = [g for g in guess_columns(names, units, kind) if g.column.channel not in chosen]
+        raise InputError(f"{where}: {said}; {fragment(guesses, names, kind)}")
+    used = {entry.column for entry in chosen.values()}
+    unused = [name for name in names if name not in used]
+    notes = (f"columns not used: {shown(unused)}",) if unused else ()
+    order = {name: place for place, name in enumerate(NAMES)}
+    return tuple(sorted(chosen.values(), key=lambda entry: order[entry.channel])), notes
+
+
+def guess_columns(
+    names: Sequence[str], units: Mapping[str, str] | None = None, kind: str = "rotary"
+) -> tuple[Guess, ...]:
+    """Propose a column map by name and unit; never applied by itself (see
+    `identification.data.guess`).
+    """
+    from identification.data.guess import guess_columns as propose
+
+    return propose(names, units or {}, kind)

@@ -1,0 +1,419 @@
+"""Joint file (TOML): what is known about a joint and its model; written back by a fit."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final, final
+
+from casadi_models import JointModel
+from casadi_models.term import INERTIAS
+from casadi_models.transmission import MODELS, build
+from identification.data.own_effects import TABLE, load_remembered, remembered
+from identification.data.units import base_unit, same_dimension
+from identification.errors import InputError
+
+_JOINT_KEYS: Final = frozenset(
+    (
+        "name",
+        "kind",
+        "gear_ratio",
+        "motor_constant",
+        "torque_per_current",
+        "torque_per_voltage",
+        "model",
+        "effects",
+        "virtual_work",
+    )
+)
+_KNOWN_KEYS: Final = ("value", "low", "high", "unit", "side", "source", "note")
+_TABLES: Final = ("joint", "known", "columns", "fitted", "calibration", "provenance", TABLE)
+
+
+@final
+@dataclass(frozen=True)
+class Known:
+    """What is known about one parameter: a fixed value, or bounds (link-referred, SI)."""
+
+    value: float | None = None
+    low: float | None = None
+    high: float | None = None
+
+
+@final
+@dataclass(frozen=True)
+class Joint:
+    """A joint file in memory.
+
+    Attributes
+    ----------
+    name, kind : str
+    gear_ratio : float
+        theta_motor / theta_link, signed.
+    torque_per_current, torque_per_voltage : float or None
+        Link-side torque per ampere or volt.
+    model_name : str
+    effects : tuple of str
+        Labels beyond the model's own.
+    known, fitted : mapping
+        By parameter name; fitted values come from a fit written back.
+    columns : mapping or None
+        Column map of the record files.
+    orders : tuple of float
+        Orders at which a line has a name beside those of the motor turn, such as meshing orders:
+        per motor turn, or per metre.
+    pitch : float or None
+        Travel of a linear axis per turn of its motor [m].
+    """
+
+    name: str = "joint"
+    kind: str = "rotary"
+    gear_ratio: float = 1.0
+    torque_per_current: float | None = None
+    torque_per_voltage: float | None = None
+    model_name: str = "hd1"
+    effects: tuple[str, ...] = ()
+    known: Mapping[str, Known] = field(default_factory=dict)
+    fitted: Mapping[str, float] = field(default_factory=dict)
+    columns: Mapping[str, Any] | None = None
+    virtual_work: bool = True
+    source: str = ""
+    orders: tuple[float, ...] = ()
+    pitch: float | None = None
+
+    def model(self) -> JointModel:
+        """The joint model with its effects (values of a fit written back included).
+
+        Raises
+        ------
+        InputError
+            An effect that is not in the library.
+        """
+        try:
+            model = replace(
+                build(self.model_name, self.gear_ratio, kind=self.kind, effects=self.effects),
+                name=self.name,
+                virtual_work=self.virtual_work,
+            )
+        except (KeyError, ValueError) as error:
+            raise InputError(f"{self.source or self.name}: {error.args[0]}") from None
+        names = set(model.parameter_names)
+        return model.with_values({k: v for k, v in self.fitted.items() if k in names})
+
+
+def load_joint(path: str | Path) -> Joint:
+    """Read a joint file.
+
+    Raises
+    ------
+    InputError
+        One line: what is wrong, where, and what to write instead.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror}); give the path of a joint file"
+        ) from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: not a text file; a joint file is TOML") from None
+    try:
+        data = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path}: not valid TOML ({error})") from None
+    return parse_joint(data, str(path))
+
+
+def parse_joint(data: Mapping[str, Any], source: str = "joint") -> Joint:
+    """A joint from the tables of a joint file (see :func:`load_joint`)."""
+    for key, value in data.items():
+        if key not in _TABLES:
+            raise InputError(
+                f"{source}: unknown table [{key}]; a joint file has [{'], ['.join(_TABLES)}]"
+            )
+        if not isinstance(value, Mapping):
+            raise InputError(f"{source}: {key} must be a table, as [{key}] on a line of its own")
+    table = data.get("joint")
+    if not isinstance(table, Mapping):
+        raise InputError(f"{source}: no [joint] table; it needs at least gear_ratio and model")
+    for key in table:
+        if key not in _JOINT_KEYS:
+            raise InputError(
+                f"{source}: [joint] has an unknown key {key!r}; known: "
+                f"{', '.join(sorted(_JOINT_KEYS))}"
+            )
+    kind = str(table.get("kind", "rotary"))
+    if kind not in ("rotary", "linear"):
+        raise InputError(f"{source}: kind = {kind!r}; use 'rotary' or 'linear'")
+    ratio = _number(table, "gear_ratio", source, 1.0)
+    if ratio is None or ratio == 0:
+        raise InputError(f"{source}: gear_ratio is 0; give theta_motor / theta_link with its sign")
+    constant = _number(table, "motor_constant", source, None)
+    per_current = _number(table, "torque_per_current", source, None)
+    if constant == 0 or per_current == 0:
+        raise InputError(
+            f"{source}: {'motor_constant' if constant == 0 else 'torque_per_current'} is 0; give "
+            "the torque per ampere"
+        )
+    if constant is not None and per_current is not None:
+        raise InputError(
+            f"{source}: motor_constant and torque_per_current are both given; keep one of them"
+        )
+    name = str(table.get("model", "hd1"))
+    if name not in MODELS:
+        raise InputError(f"{source}: model = {name!r} is not known; use one of {', '.join(MODELS)}")
+    effects = table.get("effects", [])
+    if not isinstance(effects, list) or not all(isinstance(e, str) for e in effects):
+        raise InputError(
+            f'{source}: effects must be a list of names, as effects = ["viscous", "coulomb"]'
+        )
+    joint = Joint(
+        name=str(table.get("name", Path(source).stem)),
+        kind=kind,
+        gear_ratio=ratio,
+        torque_per_current=ratio * constant if constant is not None else per_current,
+        torque_per_voltage=_number(table, "torque_per_voltage", source, None),
+        model_name=name,
+        effects=tuple(effects),
+        columns=data.get("columns"),
+        virtual_work=_flag(table, "virtual_work", source),
+        source=source,
+        fitted={k: _fitted(k, v, source) for k, v in data.get("fitted", {}).items()},
+    )
+    load_remembered(data.get(TABLE, {}), source)
+    model = joint.model()
+    table = dict(data.get("known", {}))
+    orders, pitch = (
+        _orders(table.pop("orders", []), source),
+        _pitch(table.pop("pitch", None), kind, source),
+    )
+    known = {k: _known(k, v, model, source) for k, v in table.items()}
+    for p in model.parameters:
+        if p.name in joint.fitted and not p.low - 1e-9 <= joint.fitted[p.name] <= p.high + 1e-9:
+            bounds = f"{p.low:g} to {p.high:g} {p.unit}"
+            raise InputError(
+                f"{source}: [fitted] {p.name} = {joint.fitted[p.name]:g} lies outside its "
+                f"physical bounds {bounds}; correct it or fit again"
+            )
+    return replace(joint, known=known, orders=orders, pitch=pitch)
+
+
+def _orders(entry: Any, source: str) -> tuple[float, ...]:
+    """Orders of lines that are known beforehand."""
+    if not isinstance(entry, list) or any(
+        isinstance(h, bool) or not isinstance(h, int | float) or not 0 < h < math.inf for h in entry
+    ):
+        raise InputError(
+            f"{source}: [known] orders must be a list of positive numbers, as orders = [12.0, 36.0]"
+        )
+    return tuple(float(h) for h in entry)
+
+
+def _pitch(entry: Any, kind: str, source: str) -> float | None:
+    """Travel per turn of the motor [m], from a number or a table with value and unit."""
+    if entry is None:
+        return None
+    if kind != "linear":
+        raise InputError(
+            f'{source}: [known] pitch belongs to kind = "linear"; a rotary joint has its orders '
+            "per motor turn"
+        )
+    table = entry if isinstance(entry, Mapping) else {"value": entry}
+    where = f"{source}: [known] pitch"
+    if "value" not in table or not set(table) <= {"value", "unit"}:
+        raise InputError(
+            f"{where} must be a number of metres, or a table, as pitch = {{ value = 10.0, unit = "
+            f'"mm" }}'
+        )
+    given = base_unit(str(table.get("unit", "m")))
+    if not same_dimension(given, base_unit("m")):
+        raise InputError(f"{where} has unit {table['unit']!r}; it must be one like m")
+    found = _entry_number(table, "value", where) * given.factor
+    if found <= 0:
+        raise InputError(f"{where} = {found:g} m must be positive")
+    return found
+
+
+def _number(table: Mapping[str, Any], key: str, source: str, default: float | None) -> float | None:
+    value = table.get(key, default)
+    if value is None:
+        return None
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, int | float)
+        or value != value
+        or abs(value) == float("inf")
+    ):
+        raise InputError(f"{source}: {key} = {value!r} is not a finite number")
+    return float(value)
+
+
+def _known(name: str, entry: Any, model: JointModel, source: str) -> Known:
+    parameters = {p.name: p for p in model.parameters}
+    extra = {n: p.for_kind(model.kind).unit for n, p in INERTIAS.items()}
+    if name not in parameters and name not in extra:
+        raise InputError(
+            f"{source}: [known] {name}: the model has no such parameter; it has "
+            f"{', '.join(sorted(parameters))}"
+        )
+    if isinstance(entry, int | float):
+        entry = {"value": entry}
+    if not isinstance(entry, Mapping):
+        raise InputError(
+            f"{source}: [known] {name} must be a number or a table with value, or low and high"
+        )
+    unit = parameters[name].unit if name in parameters else extra[name]
+    scale = 1.0
+    if "unit" in entry:
+        given, wanted = base_unit(str(entry["unit"])), base_unit(unit)
+        if not same_dimension(given, wanted):
+            raise InputError(
+                f"{source}: [known] {name} has unit {entry['unit']!r}; it must be one like {unit}"
+            )
+        scale = given.factor / wanted.factor
+    if entry.get("side") == "motor":
+        scale *= model.side_factor(name)
+    for key in entry:
+        if key not in _KNOWN_KEYS:
+            raise InputError(
+                f"{source}: [known] {name} has an unknown key {key!r}; known: "
+                f"{', '.join(_KNOWN_KEYS)}"
+            )
+    if entry.get("side", "link") not in ("motor", "link", "gear", "sensor", "none"):
+        raise InputError(
+            f"{source}: [known] {name} has side = {entry['side']!r}; use 'motor' or 'link'"
+        )
+    values = {
+        k: _entry_number(entry, k, f"{source}: [known] {name}") * scale
+        for k in ("value", "low", "high")
+        if k in entry
+    }
+    if not values:
+        raise InputError(f"{source}: [known] {name} has neither value nor low nor high")
+    if scale < 0:  # the link is counted against the motor shaft
+        values = {{"low": "high", "high": "low"}.get(k, k): v for k, v in values.items()}
+    if values.get("low", -math.inf) > values.get("high", math.inf):
+        raise InputError(f"{source}: [known] {name} has low above high; exchange them")
+    if "value" in values and not values.get("low", -math.inf) <= values["value"] <= values.get(
+        "high", math.inf
+    ):
+        raise InputError(
+            f"{source}: [known] {name} has a value outside its own low and high; correct one of "
+            "them"
+        )
+    if name in parameters:
+        p = parameters[name]
+        if not all(p.low <= v <= p.high for k, v in values.items() if k == "value"):
+            raise InputError(
+                f"{source}: [known] {name} = {values['value']:g} lies outside its physical "
+                f"bounds {p.low:g} to {p.high:g} {unit}"
+            )
+    return Known(**values)
+
+
+def _entry_number(entry: Mapping[str, Any], key: str, where: str) -> float:
+    value = entry[key]
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise InputError(f"{where}: {key} = {value!r} is not a finite number")
+    return float(value)
+
+
+def _fitted(name: str, entry: Any, source: str) -> float:
+    if not isinstance(entry, Mapping) or "value" not in entry:
+        raise InputError(
+            f"{source}: [fitted] {name} must be a table with value, as {name} = {{ value = 1.0 }}"
+        )
+    return _entry_number(entry, "value", f"{source}: [fitted] {name}")
+
+
+def _flag(table: Mapping[str, Any], key: str, source: str) -> bool:
+    value = table.get(key, True)
+    if not isinstance(value, bool):
+        raise InputError(f"{source}: {key} = {value!r}; use true or false")
+    return value
+
+
+def toml_text(
+    joint: Joint,
+    parameters: Mapping[str, Mapping[str, Any]] | None = None,
+    provenance: Mapping[str, str] | None = None,
+    calibration: Mapping[str, Mapping[str, Any]] | None = None,
+    outside: Sequence[str] = (),
+) -> str:
+    """The joint as the text of a joint file, with fitted values, standard errors, what the sensors
+    were off by, and provenance.
+
+    The calibration is a note: another record has its own. Labels of effects `outside` of a user's
+    FMU have their files remembered too.
+    """
+    lines = [
+        "[joint]",
+        f'name = "{_escaped(joint.name)}"',
+        f'kind = "{joint.kind}"',
+        f"gear_ratio = {joint.gear_ratio!r}",
+    ]
+    if joint.torque_per_current is not None:
+        lines.append(f"torque_per_current = {joint.torque_per_current!r}")
+    if joint.torque_per_voltage is not None:
+        lines.append(f"torque_per_voltage = {joint.torque_per_voltage!r}")
+    lines += [
+        f'model = "{joint.model_name}"',
+        "effects = [" + ", ".join(f'"{e}"' for e in joint.effects) + "]",
+    ]
+    if not joint.virtual_work:
+        lines.append("virtual_work = false")
+    lines += remembered((*joint.effects, *outside))
+    if joint.known or joint.orders or joint.pitch is not None:
+        lines += ["", "[known]"]
+        if joint.orders:
+            lines.append(f"orders = [{', '.join(repr(h) for h in joint.orders)}]")
+        if joint.pitch is not None:
+            lines.append(f"pitch = {joint.pitch!r}")
+        for name, known in joint.known.items():
+            parts = [
+                f"{k} = {getattr(known, k)!r}"
+                for k in ("value", "low", "high")
+                if getattr(known, k) is not None
+            ]
+            lines.append(f"{name} = {{ {', '.join(parts)} }}")
+    if joint.columns:
+        lines += ["", "[columns]"]
+        for channel, entry in joint.columns.items():
+            inside = (
+                ", ".join(f"{k} = {_toml(v)}" for k, v in entry.items())
+                if isinstance(entry, Mapping)
+                else None
+            )
+            lines.append(f"{channel} = {{ {inside} }}" if inside else f"{channel} = {_toml(entry)}")
+    if parameters:
+        lines += ["", "[fitted]"]
+        for name, p in parameters.items():
+            error = f", stderr = {p['stderr']:.6g}" if p.get("stderr") is not None else ""
+            lines.append(
+                f'{name} = {{ value = {p["value"]:.10g}{error}, unit = "{p["unit"]}", side = '
+                f'"{p["side"]}" }}'
+            )
+    if calibration:
+        lines += ["", "[calibration]"]
+        for name, c in calibration.items():
+            error = f", stderr = {c['stderr']:.6g}" if c.get("stderr") is not None else ""
+            lines.append(
+                f'"{_escaped(name)}" = {{ value = {c["value"]:.10g}{error}, unit = "{c["unit"]}" }}'
+            )
+    if provenance:
+        lines += ["", "[provenance]", *(f'{k} = "{_escaped(v)}"' for k, v in provenance.items())]
+    return "\n".join(lines) + "\n"
+
+
+def _escaped(text: str) -> str:
+    return text.replace("\\", "\\\\").replace('"', '\\"')
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return f'"{_escaped(value)}"' if isinstance(value, str) else repr(value)

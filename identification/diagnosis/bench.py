@@ -1,0 +1,234 @@
+"""What a session asks of a model and its records: fits, trials and what is left, behind one
+interface.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Protocol, final
+
+from casadi_models import JointModel
+from identification.balance.sensing import Sensing
+from identification.data.joint_file import Joint
+from identification.data.record import Record
+from identification.diagnosis.candidates import offered
+from identification.diagnosis.claims import Ranking, rank
+from identification.diagnosis.improvement import Step, visible_keys
+from identification.diagnosis.lines import Line, find_lines, orders_of
+from identification.diagnosis.locate import Unexplained, locate
+from identification.diagnosis.trials import Base, Trial, make_base, try_candidate
+from identification.fitting.assess import RATIO_LIMIT, VERDICT_KERNELS, BalanceError, Error, assess
+from identification.fitting.engine import Dataset, Solution, load_dataset, prepared_model, solve
+
+Progress = Callable[[str, float], None]
+
+
+class Bench(Protocol):
+    """A model with its prepared records; a joint model and a user's FMU are two."""
+
+    joint: Joint
+    data: Dataset
+
+    def start(self) -> Solution:
+        """The fit of the model that is judged."""
+
+    def fitted(
+        self, model: JointModel, start: Mapping[str, float], *, again: bool = False
+    ) -> Solution:
+        """The whole fit of a model."""
+
+    def step(self, key: str | None, label: str | None, solution: Solution) -> Step:
+        """A fitted model with its errors."""
+
+    def added(self, trial: Trial, now: Step) -> Step:
+        """The model of a step with a tried candidate, as far as it can be fitted."""
+
+    def listen(self, step: Step) -> None:
+        """Take down the orders of the lines in what a step leaves: trials of periodic effects
+        start there.
+        """
+
+    def base(self, solution: Solution) -> Base:
+        """Rows of a fitted model for the trials."""
+
+    def ranking(
+        self, base: Base, *, late: bool = False, progress: Progress | None = None
+    ) -> Ranking:
+        """The library tried on a base."""
+
+    def tried(self, solution: Solution) -> list[str]:
+        """Keys of the effects that a ranking of a fitted model tries."""
+
+    def ratios(self, step: Step) -> dict[str, BalanceError]:
+        """Residual over floor of every balance on held-out records, as the verdict counts it."""
+
+    def shown(self, step: Step) -> Step:
+        """The step with ratios that agree with the verdict, as every door shows them."""
+
+    def lines(self, step: Step) -> list[Line]:
+        """Lines in what is left."""
+
+    def places(
+        self, step: Step, error: Error, lines: Sequence[Line], limit: float
+    ) -> list[Unexplained]:
+        """Where what is left sits, for every balance over `limit` times its floor."""
+
+    def same_sign(self, trial: Trial, solution: Solution) -> bool:
+        """Whether a small effect has the same sign at half and at double kernel."""
+
+
+@final
+class JointBench:
+    """A joint model and its records.
+
+    Parameters
+    ----------
+    joint : Joint
+    data : Dataset
+        Made from `train` and `held`.
+    train, held : sequence of Record
+    like : Sensing, optional
+        Of the fit that is judged on these records: temperature counts as there.
+    """
+
+    def __init__(
+        self,
+        joint: Joint,
+        data: Dataset,
+        train: Sequence[Record],
+        held: Sequence[Record],
+        *,
+        like: Sensing | None = None,
+    ) -> None:
+        self.joint, self.data, self._like = joint, data, like
+        self._train, self._held = list(train), list(held)
+        self._solved: dict[tuple[object, ...], Solution] = {}
+        self._ratios: dict[tuple[int, bool], tuple[Solution, dict[str, BalanceError]]] = {}
+        self._kernels: dict[float, Dataset] = {round(data.kernel, 9): data}
+
+    def start(self) -> Solution:
+        """The fit of the joint's own model."""
+        return solve(prepared_model(self.joint, self._train[0]), self.data)
+
+    def fitted(
+        self, model: JointModel, start: Mapping[str, float], *, again: bool = False
+    ) -> Solution:
+        """A fit made once per model, unless `again`: a confirmed candidate is not fitted anew
+        when it is added.
+        """
+        if again:
+            return solve(model, self.data, start=start)
+        if model.structure not in self._solved:
+            self._solved[model.structure] = solve(model, self.data, start=start)
+        return self._solved[model.structure]
+
+    def step(self, key: str | None, label: str | None, solution: Solution) -> Step:
+        """A fitted model with its errors on training and held-out records."""
+        train = assess(solution.model, self.data, self.data.train, solution.values)
+        held = assess(solution.model, self.data, self.data.held_out, solution.values)
+        return Step(key, visible_keys(solution.model), train, held, solution, label)
+
+    def added(self, trial: Trial, now: Step) -> Step:
+        """The whole fit of the model with a candidate."""
+        solution = self.fitted(trial.candidate.model, {**now.solution.values, **trial.values})
+        return self.step(trial.key, trial.candidate.label, solution)
+
+    def listen(self, step: Step) -> None:
+        """Take down the orders of the lines in what a step leaves: trials of periodic effects
+        start there.
+        """
+        self.data = replace(self.data, orders=orders_of(self.lines(step), self.joint))
+
+    def base(self, solution: Solution) -> Base:
+        """See :func:`identification.diagnosis.trials.make_base`."""
+        return make_base(solution, self.data)
+
+    def ranking(
+        self, base: Base, *, late: bool = False, progress: Progress | None = None
+    ) -> Ranking:
+        """See :func:`identification.diagnosis.claims.rank`."""
+        return rank(base, late=late, progress=progress)
+
+    def tried(self, solution: Solution) -> list[str]:
+        """Keys of the effects that the records can show beside the model."""
+        return [c.effect.key for c in offered(solution.model, self.data)[0]]
+
+    def ratios(self, step: Step) -> dict[str, BalanceError]:
+        """Residual over floor, each balance at its own kernel, on held-out records."""
+        return self._judged(step.solution, held_out=True)
+
+    def shown(self, step: Step) -> Step:
+        """The step with its ratios as `judged` gives them; RMS and floor stay those of the
+        claims' kernel.
+        """
+        return replace(
+            step,
+            train=self.judged(step.solution, step.train, held_out=False),
+            held_out=self.judged(step.solution, step.held_out),
+        )
+
+    def judged(self, solution: Solution, error: Error, *, held_out: bool = True) -> Error:
+        """An error of a fitted model on these records, its ratios in agreement with the verdict.
+
+        A balance that the verdict counts as clean reads as the verdict reads it: dirt of the
+        sensors that only a slow kernel sees must not stand in a table beside "nothing is missing".
+        One with structure left reads at the kernel that shows it best.
+        """
+        ratios = {b: e.ratio for b, e in self._judged(solution, held_out=held_out).items()}
+        shown = {
+            b: r if r <= RATIO_LIMIT else max(r, error.balances[b].ratio) for b, r in ratios.items()
+        }
+        return replace(
+            error, balances={b: replace(e, ratio=shown[b]) for b, e in error.balances.items()}
+        )
+
+    def _judged(self, solution: Solution, *, held_out: bool) -> dict[str, BalanceError]:
+        mark = (id(solution), held_out)
+        if mark not in self._ratios:
+            out: dict[str, BalanceError] = {}
+            for length in sorted({VERDICT_KERNELS[b] for b in self.data.sensing.balances}):
+                data = self._at_kernel(length)
+                error = assess(
+                    solution.model, data, data.held_out if held_out else data.train, solution.values
+                )
+                out.update(
+                    {b: e for b, e in error.balances.items() if VERDICT_KERNELS[b] == length}
+                )
+            # the solution is kept with its ratios: an identity is not given to another while it
+            # lives
+            self._ratios[mark] = solution, {b: out[b] for b in self.data.sensing.balances}
+        return dict(self._ratios[mark][1])
+
+    def lines(self, step: Step) -> list[Line]:
+        """See :func:`identification.diagnosis.lines.find_lines`."""
+        return find_lines(step.solution, self.data, self._train, self._held)
+
+    def places(
+        self, step: Step, error: Error, lines: Sequence[Line], limit: float
+    ) -> list[Unexplained]:
+        """See :func:`identification.diagnosis.locate.locate`."""
+        return locate(step.solution, self.data, error, lines, limit)
+
+    def same_sign(self, trial: Trial, solution: Solution) -> bool:
+        """A minor effect must have the same sign at half and at double kernel."""
+        for factor in (0.5, 2.0):
+            data = self._at_kernel(self.data.kernel * factor)
+            other = solve(solution.model, data, start=solution.values)
+            found = try_candidate(trial.candidate, make_base(other, data))
+            if not isinstance(found, Trial):
+                return False
+            name = max(trial.candidate.amplitudes, key=lambda n: abs(trial.values[n]))
+            if trial.values[name] * found.values[name] <= 0:
+                return False
+        return True
+
+    def _at_kernel(self, length: float) -> Dataset:
+        """The same records with another kernel, prepared once."""
+        mark = round(length, 9)
+        if mark not in self._kernels:
+            model = prepared_model(self.joint, self._train[0])
+            self._kernels[mark] = load_dataset(
+                self._train, self._held, self.joint, model, kernel=length, like=self._like
+            )
+        return self._kernels[mark]

@@ -1,0 +1,315 @@
+"""From tried candidates to claims: who is significant, who cannot be told apart, what is minor."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Final, final
+
+import numpy as np
+
+from casadi_models import EFFECTS, Effect
+from identification.balance.dataset import HOLD_NAME
+from identification.diagnosis.candidates import Candidate, NotTestable, offered
+from identification.diagnosis.trials import Base, Trial, try_candidate
+
+MAJOR_DROP: Final = 10.0
+HELD_OUT_DROP: Final = 5.0
+GAIN: Final = 3.0
+FALSE_DISCOVERY: Final = 0.05
+MINOR_DROP: Final = 2.5
+MINOR_HELD_OUT: Final = 2.0
+MINOR_GAIN: Final = 100.0
+SET_P: Final = 0.05
+SET_LOST: Final = 0.15
+SET_RMS: Final = 1.5
+LARGEST_SET: Final = 4
+LATE_DROP: Final = 30.0
+"""Fall of the RMS for effects with free dynamics of their own, which fit a little of anything."""
+UNSEEN_DROP: Final = 20.0
+"""Fall of the RMS where the link is not recorded: its motion leaves structure of 10 times the
+floor in the balance.
+"""
+COMMON_DROP: Final = 4.0
+"""Fall of the RMS that is enough for an effect declared as common: hardly a joint is without it."""
+PLAIN_FIRST: Final = 0.5
+"""A plain law (Coulomb friction) goes before one that gains less than twice as much."""
+
+
+@final
+@dataclass(frozen=True)
+class Claim:
+    """A set of names for one missing effect.
+
+    Attributes
+    ----------
+    effects : tuple of str
+        Keys that the data cannot tell apart, the most likely first.
+    label : str
+        Label that was added to the model.
+    balance : str
+    held_out_drop_percent : float
+    separate_by : str or None
+        The run that would separate the names.
+    """
+
+    effects: tuple[str, ...]
+    label: str
+    balance: str
+    held_out_drop_percent: float
+    separate_by: str | None = None
+    partial: bool = False
+    contribution: float = 0.0
+
+    @property
+    def effect(self) -> Effect:
+        """The effect of the first name."""
+        return EFFECTS[self.effects[0]]
+
+    def as_json(self) -> dict[str, Any]:
+        """The shape of `improve --json`."""
+        out: dict[str, Any] = {
+            "effects": list(self.effects),
+            "balance": self.balance,
+            "held_out_drop_percent": self.held_out_drop_percent,
+            "separate_by": self.separate_by,
+        }
+        if self.partial:
+            out["partial"] = True
+        return out
+
+
+@final
+@dataclass(frozen=True)
+class Ranking:
+    """All candidates tried on one base, best first; one entry per effect."""
+
+    trials: tuple[Trial, ...]
+    significant: frozenset[str]
+    not_testable: tuple[NotTestable, ...]
+    everything: tuple[Trial, ...] = field(default=())
+
+    def __repr__(self) -> str:
+        return (
+            f"Ranking({[t.key for t in self.trials[:5]]}, {len(self.trials)} effects tried, "
+            f"{len(self.significant)} significant)"
+        )
+
+    def best(self, refused: frozenset[str] = frozenset()) -> Trial | None:
+        """Best significant trial whose label was not refused before; a visible torsion comes
+        first.
+        """
+        for t in self.everything:
+            if (
+                t.effect.stage == "structure"
+                and t.candidate.label in self.significant
+                and t.candidate.label not in refused
+            ):
+                return t
+        left = [
+            t
+            for t in self.everything
+            if t.candidate.label in self.significant and t.candidate.label not in refused
+        ]
+        plain = next((t for t in left if t.effect.stage == "plain"), None)
+        if plain is not None and plain.score >= PLAIN_FIRST * left[0].score:
+            return plain
+        return left[0] if left else None
+
+
+def rank(
+    base: Base,
+    extra: Sequence[Candidate] = (),
+    *,
+    late: bool = False,
+    progress: Callable[[str, float], None] | None = None,
+) -> Ranking:
+    """Try every candidate that the records can show on the fitted base.
+
+    Parameters
+    ----------
+    base : Base
+    extra : sequence of Candidate
+        Beside those of the library.
+    late : bool
+        The costly ones too.
+    progress : callable, optional
+        ``progress(text, share)`` before each candidate.
+    """
+    candidates, refused = offered(base.solution.model, base.data, late=late)
+    trials: list[Trial] = []
+    untestable = {n.effect: n for n in refused}
+    every = (*candidates, *extra)
+    for number, candidate in enumerate(every):
+        if progress is not None:
+            progress(
+                f"trying {candidate.effect.title.lower()} ({number + 1} of {len(every)})",
+                number / len(every),
+            )
+        found = try_candidate(candidate, base)
+        if isinstance(found, Trial):
+            trials.append(found)
+        elif isinstance(found, NotTestable):
+            untestable.setdefault(found.effect, found)
+    trials.sort(key=lambda t: -t.score)
+    seen: dict[str, Trial] = {}
+    for t in trials:
+        seen.setdefault(t.key, t)
+        untestable.pop(t.key, None)
+    kept: dict[str, Trial] = {}
+    for t in trials:
+        kept.setdefault(t.candidate.label, t)
+    unique = sorted(kept.values(), key=lambda t: -t.score)
+    passed = _discoveries(unique)
+    significant = frozenset(
+        t.candidate.label for t in unique if t.candidate.label in passed and _major(t, base)
+    )
+    order = sorted(seen.values(), key=lambda t: (t.candidate.label not in significant, -t.score))
+    return Ranking(tuple(order), significant, tuple(untestable.values()), tuple(unique))
+
+
+def nearly(ranking: Ranking, base: Base, refused: frozenset[str]) -> Trial | None:
+    """Best trial that the training blocks support and that only its linearised held-out drop
+    keeps from being significant.
+    """
+    for t in ranking.everything:
+        if t.candidate.label in ranking.significant:
+            return None
+        if t.candidate.label in refused or t.p_value > FALSE_DISCOVERY / max(
+            len(ranking.everything), 1
+        ):
+            continue
+        if not math.isnan(t.held_out_drop_percent) and _major(
+            replace(t, held_out_drop_percent=math.nan), base
+        ):
+            return t
+    return None
+
+
+def _discoveries(trials: Sequence[Trial]) -> set[str]:
+    """Benjamini-Hochberg at 5 %."""
+    ordered = sorted(trials, key=lambda t: t.p_value)
+    last = -1
+    for i, t in enumerate(ordered):
+        if t.p_value <= FALSE_DISCOVERY * (i + 1) / len(ordered):
+            last = i
+    return {t.candidate.label for t in ordered[: last + 1]}
+
+
+def _major(trial: Trial, base: Base) -> bool:
+    common = trial.effect.common
+    least = (
+        COMMON_DROP
+        if common
+        else UNSEEN_DROP
+        if base.solution.model.load_compliance(base.solution.values) > 0
+        else MAJOR_DROP
+    )
+    if trial.gain <= GAIN or trial.cv_drop_percent < least:
+        return False
+    held = trial.held_out_drop_percent
+    if not math.isnan(held) and held < (COMMON_DROP / 2 if common else HELD_OUT_DROP):
+        return False
+    if trial.effect.stage == "late":
+        return trial.cv_drop_percent >= LATE_DROP and (math.isnan(held) or held >= LATE_DROP)
+    if trial.effect.is_delay:
+        dt = base.data.train[0].grid.dt
+        hold = base.solution.values.get(HOLD_NAME, 0.0) if trial.candidate.place == "drive" else 0.0
+        return max(abs(trial.values[n] + hold) for n in trial.candidate.amplitudes) > dt / 2
+    return True
+
+
+def confusion_set(best: Trial, trials: Sequence[Trial], base: Base) -> tuple[str, ...]:
+    """Names that these records cannot tell from the best one, the best first."""
+    names = [best.key]
+    if best.effect.stage == "structure" and base.data.sensing.both_positions:
+        return (best.key,)
+    blocks = np.unique(base.block[base.block >= 0])
+    for other in trials:
+        if other.key in names or other.score <= 0 or best.key in other.effect.contains:
+            continue
+        lost = (best.score - other.score) / best.score
+        difference = best.block_score[blocks] - other.block_score[blocks]
+        spread = (
+            float(np.std(difference, ddof=1)) / math.sqrt(len(blocks))
+            if len(blocks) > 1
+            else math.inf
+        )
+        t = float(np.mean(difference)) / spread if spread > 0 else 0.0
+        alike = abs(t) < 2.0 or lost < SET_LOST
+        involved = [i for i in range(len(best.rms)) if best.rms[i] > 0]
+        ratio = max(float(other.rms[i] / best.rms[i]) for i in involved)
+        if alike and ratio <= SET_RMS and _still_helps(other, best):
+            names.append(other.key)
+    return tuple(names)
+
+
+def shortened(names: Sequence[str], ranking: Ranking) -> tuple[str, ...]:
+    """A set of names with those that are not significant themselves left out where there are
+    too many.
+    """
+    significant = {t.key for t in ranking.everything if t.candidate.label in ranking.significant}
+    kept = [n for n in names if n in significant]
+    for name in names:
+        if name not in kept and len(kept) < LARGEST_SET:
+            kept.append(name)
+    return tuple(n for n in names if n in kept)
+
+
+def _still_helps(other: Trial, best: Trial) -> bool:
+    """A name stays in the set only if it does a fair part of the work itself."""
+    return other.cv_drop_percent >= 0.5 * best.cv_drop_percent and (
+        math.isnan(other.held_out_drop_percent)
+        or other.held_out_drop_percent >= 0.5 * best.held_out_drop_percent
+    )
+
+
+def simplest(
+    best: Trial, names: Sequence[str], ranking: Ranking, refused: frozenset[str] = frozenset()
+) -> Trial:
+    """Of the names that cannot be told apart, the one with the fewest parameters."""
+    usable = ranking.significant - refused
+    alike = [t for t in ranking.trials if t.key in names and t.candidate.label in usable]
+    return min(alike or [best], key=lambda t: (len(t.values), not t.effect.common, -t.score))
+
+
+def make_claim(
+    best: Trial, ranking: Ranking, base: Base, names: tuple[str, ...] | None = None
+) -> Claim:
+    """The claim that follows from the best trial."""
+    names = names or confusion_set(best, ranking.everything, base)
+    names = (best.key, *(n for n in names if n != best.key))
+    hints = [EFFECTS[n].separate_by for n in names if EFFECTS[n].separate_by]
+    separate = hints[0] if len(names) > 1 and hints else None
+    held = best.held_out_drop_percent
+    return Claim(
+        names,
+        best.candidate.label,
+        best.balance,
+        best.cv_drop_percent if math.isnan(held) else held,
+        separate,
+        contribution=best.contribution,
+    )
+
+
+def minor_claims(ranking: Ranking, base: Base) -> list[Trial]:
+    """Small but certain candidates (to be confirmed at other kernels by the caller)."""
+    out = []
+    for t in ranking.trials:
+        if (
+            t.candidate.label in ranking.significant
+            or t.score < MINOR_GAIN
+            or t.cv_drop_percent < MINOR_DROP
+        ):
+            continue
+        if (
+            math.isnan(t.held_out_drop_percent)
+            or t.held_out_drop_percent < MINOR_HELD_OUT
+            or t.p_value > 0.01
+        ):
+            continue
+        if t.effect.is_delay or t.effect.stage == "late":
+            continue
+        out.append(t)
+    return out[:2]

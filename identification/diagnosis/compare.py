@@ -1,0 +1,202 @@
+"""Compare: how far a fitted model is from records, and where."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, final
+
+import numpy as np
+import numpy.typing as npt
+
+from identification.balance.balances import Balances
+from identification.balance.excitation import rest_note
+from identification.balance.rest import rest_check, rest_warnings
+from identification.data.check.gate import gate_warnings, gated
+from identification.data.record import Record
+from identification.diagnosis.bench import JointBench
+from identification.diagnosis.places import Place, gather, places_of
+from identification.diagnosis.session import refuse_unlike
+from identification.fitting.assess import Error, assess
+from identification.fitting.engine import load_dataset, stack
+from identification.fitting.fit import Fit
+from identification.linear.ceiling import Ceiling, ceiling
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@final
+@dataclass(frozen=True)
+class Comparison:
+    """Model against records.
+
+    Attributes
+    ----------
+    error : Error
+    places : tuple of Place
+        The most telling first.
+    worst_window : tuple of float
+        Start and end of the second with the largest residual [s].
+    whiteness : mapping of str to float
+        Autocorrelation of each residual one kernel length later.
+    linear : Ceiling or None
+        What linear models without physics explain; None where not asked for, or where the records
+        are too short.
+    at_rest : float
+        Share of the rows in which the joint stands still: left out of errors and places.
+    at_rest_beyond : tuple of str
+        What these rows leave beyond sticking friction, a sentence for each balance in which they
+        do.
+    warnings : tuple of str
+        What the check gate said about the records.
+    """
+
+    name: str
+    error: Error
+    places: tuple[Place, ...]
+    worst_window: tuple[float, float]
+    whiteness: dict[str, float]
+    linear: Ceiling | None = None
+    at_rest: float = 0.0
+    at_rest_beyond: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    def as_json(self) -> dict[str, Any]:
+        """Errors and places as data."""
+        return {
+            "record": self.name,
+            **self.error.as_json(),
+            "worst_window_s": list(self.worst_window),
+            "whiteness": self.whiteness,
+            "places": [p.as_json() for p in self.places],
+            "linear_ceiling": self.linear.as_json() if self.linear else None,
+            "at_rest_percent": 100 * self.at_rest,
+            "at_rest_beyond": list(self.at_rest_beyond),
+            "warnings": list(self.warnings),
+        }
+
+    def __str__(self) -> str:
+        ratios = ", ".join(
+            f"{b} {e.ratio:.3g} times its floor" for b, e in self.error.balances.items()
+        )
+        top = (
+            f"; fails most against {self.places[0].axis.replace('_', ' ')} "
+            f"({self.places[0].balance} balance)"
+            if self.places
+            else ""
+        )
+        linear = f"\n{self.linear}" if self.linear else ""
+        still = "".join(
+            f"\n{line}" for line in (rest_note(self.at_rest), *self.at_rest_beyond) if line
+        )
+        return (
+            f"{self.name}: fit {self.error.fit_percent:.3g} %, relative error "
+            f"{self.error.relative_error_percent:.3g} % ({ratios}){top}{still}{linear}"
+        )
+
+    def __repr__(self) -> str:
+        return (
+            f"Comparison({self.name!r}, {self.error.relative_error_percent:.3g} % relative "
+            f"error, {len(self.places)} places)"
+        )
+
+    def _repr_html_(self) -> str:
+        from identification.linear.ceiling import ceiling_html
+        from workbench.show.results import comparison_html, spaced
+
+        return comparison_html(self) + (
+            spaced(f"<div>{ceiling_html(self.linear)}</div>") if self.linear else ""
+        )
+
+
+def compare(fitted: Fit, records: Record | Sequence[Record], *, linear: bool = True) -> Comparison:
+    """Compare a fitted model with records it may never have seen.
+
+    Parameters
+    ----------
+    fitted : Fit
+    records : Record or sequence of Record
+    linear : bool
+        Fit linear models without physics too, as a ceiling (see
+        :mod:`identification.linear.ceiling`). It takes a second or two whatever the length of the
+        records.
+
+    Raises
+    ------
+    InputError
+        Records that the gate refuses, with other channels than those of the fit, or in unlike
+        units.
+    """
+    given = gated([records] if isinstance(records, Record) else list(records), fitted.joint)
+    data = load_dataset(
+        given, [], fitted.joint, fitted.model, kernel=fitted.data.kernel, like=fitted.data.sensing
+    )
+    bench = JointBench(fitted.joint, data, given, [], like=fitted.data.sensing)
+    error = bench.judged(
+        fitted.solution,
+        assess(fitted.model, data, data.train, fitted.solution.values),
+        held_out=False,
+    )
+    both = replace(fitted.data, held_out=data.train, held_out_names=data.train_names)
+    refuse_unlike(both, error.relative_error_percent)
+    stacked = stack(
+        Balances(fitted.model, data.sensing, wrt=()), data.train, fitted.solution.values
+    )
+    residual = stacked.residual
+    places = places_of(stacked.shown, gather(data))
+    time = np.concatenate([w.time for w in data.train])
+    sigma = {b: max(error.balances[b].floor, 1e-12) for b in residual}
+    power = sum((residual[b] / sigma[b]) ** 2 for b in residual)
+    counts = np.cumsum([0, *(int(w.stretch.max(initial=0)) + 1 for w in data.train)])
+    stretch = np.concatenate(
+        [w.stretch + first for w, first in zip(data.train, counts[:-1], strict=True)]
+    )
+    worst = _worst(time, np.asarray(power), stretch)
+    unseen = not any(_same(r, seen) for r in given for seen in fitted.records)
+    floor = {b: e.floor for b, e in error.balances.items()}
+    above = ceiling(fitted.data, data.train, residual, floor, unseen=unseen) if linear else None
+    return Comparison(
+        ", ".join(r.name for r in given),
+        error,
+        places=places,
+        worst_window=worst,
+        whiteness={b: _lagged(r[stacked.taking[b]]) for b, r in residual.items()},
+        linear=above,
+        at_rest=data.at_rest(),
+        at_rest_beyond=rest_warnings(
+            rest_check(fitted.model, data, data.train, fitted.solution.values),
+            "N.m" if data.joint.kind == "rotary" else "N",
+        ),
+        warnings=gate_warnings(given),
+    )
+
+
+def _same(one: Record, other: Record) -> bool:
+    """True where two records hold the same samples of the same files."""
+    if one is other:
+        return True
+    if not one.provenance.sha256 or one.provenance.sha256 != other.provenance.sha256:
+        return False
+    return len(one) == len(other) and bool(np.array_equal(one.time[[0, -1]], other.time[[0, -1]]))
+
+
+def _worst(
+    time: FloatArray, power: FloatArray, stretch: npt.NDArray[np.int64]
+) -> tuple[float, float]:
+    """Start and end of the second with the largest residual; it does not reach over a hole or
+    from one run into the next.
+    """
+    if len(time) < 2:
+        return float(time[0]), float(time[0])
+    step = float(np.median(np.diff(time)))
+    width = max(1, min(len(power), round(1.0 / max(step, 1e-9))))
+    whole = stretch[: len(power) - width + 1] == stretch[width - 1 :]
+    summed = np.convolve(power, np.ones(width), "valid")
+    k = int(np.argmax(np.where(whole, summed, -1.0) if whole.any() else summed))
+    return float(time[k]), float(time[min(k + width, len(time) - 1)])
+
+
+def _lagged(r: FloatArray, lag: int = 4) -> float:
+    x = r - r.mean()
+    power = float(x @ x)
+    return float(x[:-lag] @ x[lag:] / power) if power > 0 and len(x) > lag else 0.0

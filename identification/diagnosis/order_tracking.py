@@ -1,0 +1,448 @@
+"""Order tracking: lines of a residual that repeat with an angle or a position, over the full
+bandwidth of the samples.
+
+The samples are taken along the angle and not along time: every sample counts by the angle that it
+covers, so that rest and turns count for nothing and a line at an order stays one line at every
+speed. A line may lie above half the sampling rate, as long as nothing filters it away: the angle of
+each sample is known.
+
+A peak of the spectrum over orders is judged against its surroundings: over white noise the power at
+one order is exponentially distributed, with the mean median / ln 2 (N. Wiener, B. Fisher:
+periodogram ordinates of Gaussian noise).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Final, final
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+ALPHA: Final = 0.01
+"""Share of joints without a line on which noise may pass for one, in the scan and again on
+held-out records.
+"""
+SURROUNDINGS: Final = 32
+"""Independent orders on either side of a peak from which its background is taken: their median
+is known to a fifth.
+"""
+MEDIAN_EFFICIENCY: Final = 0.48
+"""Of the median against the mean, for the level of exponentially distributed powers: (ln 2)^2."""
+FEWEST_SURROUNDINGS: Final = 4
+"""Independent orders below a peak from which on they count as its left side."""
+NEAREST: Final = 2
+"""Independent orders next to a peak that its own main lobe covers: no background."""
+FEWEST_CYCLES: Final = 2.0
+"""Periods over the stroke from which on an order counts: what is slower is the trend over the
+position (a cubic) that is taken out.
+"""
+FREE_CYCLES: Final = 4.0
+"""Periods over the stroke from which on an order is looked for that nobody named."""
+FINEST: Final = 8
+"""Bins per period of the highest order: what a bin blurs is then under 3 %."""
+FINER: Final = 4
+"""Points of the scan per independent order: the peak between two of them is under 3 % higher."""
+OUTLIER: Final = 4.0
+"""Robust deviations at which a sample is cut: a burst in one place is no line."""
+ORDER_ERROR: Final = math.sqrt(6.0) / (2 * math.pi)
+"""Standard error of the order of a line in units of 2 pi / stroke, times the root of its power over
+the background (Cramer-Rao bound of the frequency of a sine: 0.39)."""
+NAMED_WITHIN: Final = 3.0
+"""Standard errors within which a line lies at an order to carry its name."""
+BLOCK: Final = 1.0
+"""Length of the blocks of held-out rows that count as independent [s]."""
+KNOTS: Final = 12
+"""Knots of the curve over the velocity that is taken out before the scan."""
+
+
+@final
+@dataclass(frozen=True)
+class Samples:
+    """Samples of a residual along an angle.
+
+    Attributes
+    ----------
+    angle : (n,) array
+        Motor angle [rad], or position times 2 pi [m]: an order is then a number of periods per turn
+        or per metre.
+    residual : (n,) array
+    weight : (n,) array
+        What each sample counts: the angle that it covers.
+    block : (n,) int array
+        Number of the second that the sample belongs to.
+    seen : callable
+        What the smoothing of the residual leaves of a signal at the samples.
+    """
+
+    angle: FloatArray
+    residual: FloatArray
+    weight: FloatArray
+    block: IntArray
+    seen: Callable[[FloatArray], FloatArray] = np.asarray
+
+    @property
+    def stroke(self) -> float:
+        """Angle over which the samples spread: that of samples spread evenly with the same
+        deviation, so that orders 2 pi / stroke apart are independent however long the motion dwelt
+        in the middle."""
+        if not len(self.angle) or float(self.weight.sum()) <= 0:
+            return 0.0
+        middle = float(np.average(self.angle, weights=self.weight))
+        return math.sqrt(12 * float(np.average((self.angle - middle) ** 2, weights=self.weight)))
+
+
+@final
+@dataclass(frozen=True)
+class Peak:
+    """A line in one residual.
+
+    Attributes
+    ----------
+    order : float
+    error : float
+        Standard error of the order: that of a sine in noise, or from block to block where that is
+        larger.
+    sine, cosine : float
+        Of order times angle, in the unit of the residual.
+    prominence : float
+        Power over the mean power of the background (z).
+    apart : float
+        2 pi / stroke: distance of orders that can be told apart.
+    amplitude_error : float
+        Standard error of the size: one part of it holds half the power of the background; from
+        block to block where that is larger.
+    """
+
+    order: float
+    error: float
+    sine: float
+    cosine: float
+    prominence: float
+    apart: float
+    amplitude_error: float
+
+    @property
+    def amplitude(self) -> float:
+        """Size of the line."""
+        return math.hypot(self.sine, self.cosine)
+
+    def wave(self, samples: Samples) -> FloatArray:
+        """The line as the samples show it."""
+        return samples.seen(
+            self.sine * np.sin(self.order * samples.angle)
+            + self.cosine * np.cos(self.order * samples.angle)
+        )
+
+    def at(self, order: float) -> bool:
+        """True where the line lies at an order within its error, and nearer to it than to the
+        next one that can be told apart.
+        """
+        return abs(self.order - order) <= min(NAMED_WITHIN * self.error, self.apart / 2)
+
+
+def trend(
+    angle: FloatArray,
+    velocity: FloatArray,
+    acceleration: FloatArray,
+    knots: FloatArray,
+    span: tuple[float, float],
+) -> FloatArray:
+    """Columns of what is no line: a curve over the velocity, a cubic over the position, the
+    acceleration.
+
+    Parameters
+    ----------
+    angle, velocity, acceleration : (n,) array
+    knots : (k,) array
+        Velocities at which the curve bends (see :func:`velocity_knots`).
+    span : (low, high)
+        Ends of the angle.
+
+    Returns
+    -------
+    (n, k + 4) array
+    """
+    middle, half = (span[0] + span[1]) / 2, max((span[1] - span[0]) / 2, 1e-300)
+    x = (angle - middle) / half
+    hats = [np.interp(velocity, knots, row) for row in np.eye(len(knots))]
+    size = float(np.max(np.abs(acceleration), initial=1e-300))
+    return np.column_stack([*hats, x, x**2, x**3, acceleration / size])
+
+
+def velocity_knots(velocity: FloatArray) -> FloatArray:
+    """Quantiles of the velocity, with a step of its own at zero, where friction changes its
+    sign.
+    """
+    inner = np.quantile(velocity, np.linspace(0, 1, KNOTS))
+    small = 0.01 * float(np.max(np.abs(velocity), initial=1e-300))
+    return np.unique(np.concatenate([inner[np.abs(inner) > small], [-small, small]]))
+
+
+def detrended(columns: FloatArray, samples: Samples) -> FloatArray:
+    """Coefficients of the trend by weighted least squares."""
+    root = np.sqrt(samples.weight)
+    return np.asarray(
+        np.linalg.lstsq(columns * root[:, None], samples.residual * root, rcond=None)[0],
+        dtype=np.float64,
+    )
+
+
+def clipped(samples: Samples) -> Samples:
+    """The samples with outliers cut."""
+    spread = (
+        1.4826 * float(np.median(np.abs(samples.residual[samples.weight > 0])))
+        if np.any(samples.weight > 0)
+        else 0.0
+    )
+    return replace(samples, residual=np.clip(samples.residual, -OUTLIER * spread, OUTLIER * spread))
+
+
+def spectrum(samples: Samples, highest: float) -> tuple[FloatArray, FloatArray]:
+    """Power of exp(i h angle) in the samples over orders h, from zero to `highest`.
+
+    Returns
+    -------
+    orders, power : (m,) arrays
+        :data:`FINER` or more points per independent order.
+    """
+    width = 2 * np.pi / highest / FINEST
+    bins = ((samples.angle - float(samples.angle.min())) / width).astype(np.int64)
+    size = int(bins.max()) + 1
+    summed = np.bincount(bins, weights=samples.residual * samples.weight, minlength=size)
+    length = 1 << int(math.ceil(math.log2(max(size, 2) * FINER)))
+    power = np.abs(np.fft.rfft(summed, length)) ** 2
+    orders = np.arange(len(power)) * 2 * np.pi / (length * width)
+    keep = orders <= highest
+    return np.asarray(orders[keep]), np.asarray(power[keep], dtype=np.float64)
+
+
+def background(orders: FloatArray, power: FloatArray, stroke: float, lowest: float) -> FloatArray:
+    """Mean power of the noise at every order: the larger one of the local medians to its left, to
+    its right and on both sides.
+
+    Where the noise falls with the order the median of both sides would stand under it on the left.
+    """
+    from scipy.ndimage import median_filter
+
+    step = float(orders[1] - orders[0])
+    one = 2 * np.pi / stroke / step
+    near, far = round(NEAREST * one), round(SURROUNDINGS * one)
+    first = int(np.searchsorted(orders, lowest))
+    inside = power[first:]
+    count = len(inside)
+    width = far - near
+    if count <= 2 * far:
+        middle = float(np.median(inside)) if count else 0.0
+        return np.full(len(power), middle / math.log(2))
+    medians = median_filter(inside, size=width, mode="nearest")
+    at = np.arange(count)
+    reach = (near + far) // 2
+    left = np.where(at - far >= 0, medians[np.clip(at - reach, 0, count - 1)], 0.0)
+    for k in range(near + round(FEWEST_SURROUNDINGS * one), far):
+        left[k] = np.median(inside[: k - near])
+    right = np.where(at + far < count, medians[np.clip(at + reach, 0, count - 1)], 0.0)
+    out = np.zeros(len(power))
+    out[first:] = np.maximum(left, right) / math.log(2)
+    out[:first] = out[first] if count else 0.0
+    return out
+
+
+def threshold(alpha: float, orders: float) -> float:
+    """Power over the background that noise passes with a chance of alpha in so many independent
+    orders.
+
+    -ln(alpha / orders) over a known background; the background is itself known from few orders only
+    (beta-prime distribution of the ratio of two exponential levels).
+    """
+    known = 2 * (SURROUNDINGS - NEAREST) * MEDIAN_EFFICIENCY
+    return float(known * ((max(orders, 1.0) / alpha) ** (1 / known) - 1))
+
+
+def independent_orders(lowest: float, highest: float, stroke: float) -> float:
+    """Orders between two that can be told apart over the stroke."""
+    return max((highest - lowest) * stroke / (2 * np.pi), 1.0)
+
+
+def phase_fit(order: float, samples: Samples) -> tuple[float, float]:
+    """Sine and cosine of a line at an order, by weighted least squares."""
+    root = np.sqrt(samples.weight)
+    waves = [samples.seen(f(order * samples.angle)) for f in (np.sin, np.cos)]
+    columns = np.column_stack([*waves, np.ones_like(samples.angle)])
+    found = np.linalg.lstsq(columns * root[:, None], samples.residual * root, rcond=None)[0]
+    return float(found[0]), float(found[1])
+
+
+def refined(orders: FloatArray, power: FloatArray, k: int) -> float:
+    """Peak between the points of a scan, by a parabola."""
+    if k in (0, len(power) - 1):
+        return float(orders[k])
+    a, b, c = power[k - 1], power[k], power[k + 1]
+    curve = a - 2 * b + c
+    shift = 0.5 * (a - c) / curve if curve != 0 else 0.0
+    return float(orders[k] + shift * (orders[1] - orders[0]))
+
+
+def _polished(order: float, samples: Samples, width: float) -> float:
+    """The order of the largest power near one, without the bins of the scan."""
+    from scipy.optimize import minimize_scalar
+
+    base = samples.residual * samples.weight
+
+    def negative(h: float) -> float:
+        return -float(np.abs(np.dot(base, np.exp(-1j * h * samples.angle))) ** 2)
+
+    done = minimize_scalar(
+        negative,
+        bounds=(order - width, order + width),
+        method="bounded",
+        options={"xatol": 1e-3 * width},
+    )
+    return float(done.x)
+
+
+def peaks(
+    samples: Samples,
+    highest: float,
+    named: Sequence[float] = (),
+    most: int = 4,
+    lowest: float = 0.0,
+    alpha: float = ALPHA,
+) -> list[Peak]:
+    """Lines that stand over their surroundings, the strongest first; each is taken out before the
+    next is looked for.
+
+    Parameters
+    ----------
+    samples : Samples
+        Trend taken out.
+    highest : float
+        Highest order that is looked for without a name.
+    named : sequence of float
+        Orders that are known beforehand: a smaller number to look among, so a lower threshold.
+    most : int
+        At most so many.
+    lowest : float
+        Lowest order without a name; at least :data:`FREE_CYCLES` periods over the stroke.
+    alpha : float
+        Chance of a line in noise.
+
+    Returns
+    -------
+    list of Peak
+    """
+    stroke = samples.stroke
+    if stroke <= 0:
+        return []
+    apart = 2 * np.pi / stroke
+    low = max(lowest, FREE_CYCLES * apart)
+    known = [h for h in named if h >= FEWEST_CYCLES * apart]
+    top = max([highest, *(1.1 * h + 2 * SURROUNDINGS * apart for h in known)])
+    if top <= low:
+        return []
+    anywhere = (
+        threshold(alpha, independent_orders(low, highest, stroke)) if highest > low else math.inf
+    )
+    by_name = threshold(alpha, len(known))
+    left = samples
+    out: list[Peak] = []
+    for _ in range(most):
+        orders, power = spectrum(left, top)
+        level = np.maximum(background(orders, power, stroke, FEWEST_CYCLES * apart), 1e-300)
+        ratio = power / level
+        free = np.where((orders >= low) & (orders <= highest), ratio, 0.0)
+        k = int(np.argmax(free))
+        found = None
+        if free[k] > anywhere:
+            found = _peak(refined(orders, power, k), left, float(free[k]), apart)
+        else:
+            near = [
+                (h, float(np.interp(h, orders, ratio)))
+                for h in known
+                if not any(p.at(h) for p in out)
+            ]
+            best = max(near, key=lambda x: x[1], default=(0.0, 0.0))
+            if best[1] > by_name:
+                found = _peak(best[0], left, best[1], apart)
+        if found is None:
+            break
+        out.append(found)
+        left = replace(left, residual=left.residual - found.wave(left))
+    return out
+
+
+def _peak(order: float, samples: Samples, prominence: float, apart: float) -> Peak:
+    at = _polished(order, samples, apart / 2)
+    sine, cosine = phase_fit(at, samples)
+    size = math.hypot(sine, cosine) / math.sqrt(2 * prominence)
+    found = Peak(
+        at,
+        ORDER_ERROR * apart / math.sqrt(prominence),
+        sine=sine,
+        cosine=cosine,
+        prominence=prominence,
+        apart=apart,
+        amplitude_error=size,
+    )
+    far = samples.angle - np.average(samples.angle, weights=samples.weight)
+    turned = replace(found, sine=-cosine, cosine=sine).wave(samples)
+    unit = found.wave(samples) / max(found.amplitude, 1e-300)
+    return replace(
+        found,
+        error=max(found.error, _block_error(far * turned, found, samples)),
+        amplitude_error=max(size, _block_error(unit, found, samples)),
+    )
+
+
+def _block_error(slope: FloatArray, peak: Peak, samples: Samples) -> float:
+    """Standard error of a parameter of the line from the scores of the blocks: what hangs on the
+    speed moves it more than noise.
+
+    Parameters
+    ----------
+    slope : (n,) array
+        Derivative of the line with respect to the parameter.
+    """
+    _, inverse = np.unique(samples.block, return_inverse=True)
+    scores = np.bincount(
+        inverse, weights=samples.weight * slope * (samples.residual - peak.wave(samples))
+    )
+    return float(np.linalg.norm(scores) / max(float(np.sum(samples.weight * slope**2)), 1e-300))
+
+
+def confirmed(peak: Peak, samples: Samples, candidates: int) -> bool:
+    """True where held-out samples follow the line with its phase: one-sided t of the slope over
+    blocks, alpha over the candidates.
+
+    Parameters
+    ----------
+    peak : Peak
+        From the training records.
+    samples : Samples
+        Of held-out records, trend taken out.
+    candidates : int
+        Lines that are put to this test.
+    """
+    from scipy.special import stdtrit
+
+    wave = peak.wave(samples)
+    names, inverse = np.unique(samples.block, return_inverse=True)
+    top = np.bincount(
+        inverse, weights=samples.weight * wave * samples.residual, minlength=len(names)
+    )
+    under = np.bincount(inverse, weights=samples.weight * wave**2, minlength=len(names))
+    total = float(under.sum())
+    if len(names) < 3 or total <= 0:
+        return False
+    slope = float(top.sum()) / total
+    spread = (
+        math.sqrt(float(np.sum((top - slope * under) ** 2)) * len(names) / (len(names) - 1)) / total
+    )
+    if spread == 0:
+        return slope > 0
+    return slope / spread > float(stdtrit(len(names) - 1, 1 - ALPHA / max(candidates, 1)))

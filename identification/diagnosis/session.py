@@ -1,0 +1,678 @@
+"""One session: a model and its records, and every decision about what is missing.
+
+`compare`, `diagnose` and `improve`, the page, the report and a user's FMU ask here; none of them
+decides by itself.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Final, final
+
+from casadi_models import EFFECTS
+from identification.balance.dataset import Dataset, with_effect, without
+from identification.balance.excitation import (
+    claim_limit,
+    excitation_warnings,
+    few_reversals,
+    not_identifiable,
+    unlike_units,
+)
+from identification.data.check.gate import gate_warnings, gated
+from identification.data.joint_file import Joint
+from identification.data.record import Record
+from identification.diagnosis.bench import Bench, JointBench, Progress
+from identification.diagnosis.claims import (
+    HELD_OUT_DROP,
+    LARGEST_SET,
+    Claim,
+    Ranking,
+    confusion_set,
+    make_claim,
+    minor_claims,
+    nearly,
+    shortened,
+    simplest,
+)
+from identification.diagnosis.improvement import (
+    Improvement,
+    Step,
+    held_drop,
+    judged_drop,
+    made_worse,
+)
+from identification.diagnosis.locate import Unexplained, spectral_peak
+from identification.diagnosis.outcome import refusals
+from identification.diagnosis.rival_table import is_absorbed
+from identification.diagnosis.trials import Base, Trial
+from identification.diagnosis.verdict import hardly_a_model, verdict_of, without_link
+from identification.errors import InputError
+from identification.fitting.assess import RATIO_LIMIT
+from identification.fitting.engine import Solution, load_dataset, prepared_model
+
+MAX_ADDITIONS: Final = 6
+ATTEMPTS: Final = 2 * MAX_ADDITIONS
+"""Candidates that are taken up at most, named or refused; the same however few additions are
+asked for.
+"""
+LEAST_ADDED_DROP: Final = 2.0
+"""Fall of a balance's held-out RMS that an addition must bring after its whole fit [%]."""
+EXPLAINED_SHARE: Final = 0.5
+"""Share of a balance's power over the floor below which a claim is one in part."""
+LOCATED_SHARE: Final = 50.0
+"""Share of what is left that one variable must hold before a table over it is set against the
+claims [%].
+"""
+NO_MODEL: Final = 50.0
+"""Held-out error of the start model from which records that move as far apart as degrees and
+radians are refused [%].
+"""
+SAME_WITH_ONE_LESS: Final = 5.0
+"""Rise of a balance's RMS up to which one effect does as well as two [%]."""
+SWAP_GAIN: Final = 3.0
+"""Log-likelihood by which another effect must do better than a claim to take its place [nats]."""
+NOT_NEEDED: Final = 10.0
+"""Log-likelihood of the best other effect below which a claim that is no longer significant is
+dropped [nats].
+"""
+
+
+def refuse_unlike(data: Dataset, relative_error_percent: float) -> None:
+    """Refuse records that move as far apart as degrees and radians, where the model fails on the
+    held-out ones.
+
+    Raises
+    ------
+    InputError
+        One line that names the record.
+    """
+    unlike = unlike_units(data)
+    # not (x < y): an error that is no number is no reason to go on
+    if unlike and not relative_error_percent < NO_MODEL:
+        raise InputError(unlike)
+
+
+def with_held_out(
+    train: list[Record], held_out: list[Record]
+) -> tuple[list[Record], list[Record], str]:
+    """Training and held-out records; without given ones the last 30 % of the time blocks are
+    held out.
+    """
+    if held_out:
+        return train, held_out, ""
+    pairs = [r.split(0.7) for r in train]
+    note = (
+        "no held-out records given: the last 30 % of each training record (or of its runs) is "
+        "held out"
+    )
+    return [p[0] for p in pairs], [p[1] for p in pairs], note
+
+
+@final
+@dataclass(frozen=True)
+class _Standing:
+    """Where a run stands: the accepted claims, a step for each after the start model."""
+
+    steps: tuple[Step, ...]
+    claims: tuple[Claim, ...] = ()
+
+    @property
+    def now(self) -> Step:
+        return self.steps[-1]
+
+
+@final
+class Session:
+    """Decides what is missing from a model that a bench can fit.
+
+    Parameters
+    ----------
+    bench : Bench
+    progress : callable, optional
+        ``progress(text, share)``.
+    warnings : sequence of str
+        What the check gate said about the records.
+    """
+
+    def __init__(
+        self, bench: Bench, progress: Progress | None = None, warnings: Sequence[str] = ()
+    ) -> None:
+        self.bench, self.joint = bench, bench.joint
+        self.progress: Progress = progress or (lambda text, share: None)
+        self._warnings = tuple(warnings)
+        self._refused: dict[str, str] = {}
+        self._doubted: dict[str, str] = {}
+
+    @property
+    def data(self) -> Dataset:
+        """The prepared records."""
+        return self.bench.data
+
+    @classmethod
+    def opened(
+        cls,
+        records: Sequence[Record] | Record,
+        joint: Joint,
+        held_out: Sequence[Record] | Record = (),
+        *,
+        progress: Progress | None = None,
+    ) -> Session:
+        """A session on a joint model: records through the gate, a part held out where none are
+        given.
+
+        Raises
+        ------
+        InputError
+            Unusable records or joint, in one line.
+        """
+        given = [records] if isinstance(records, Record) else list(records)
+        apart = [held_out] if isinstance(held_out, Record) else list(held_out)
+        if not given:
+            raise InputError("no training record; give at least one")
+        given, apart = gated(given, joint), gated(apart, joint)
+        train, held, note = with_held_out(given, apart)
+        model = prepared_model(joint, train[0])
+        data = replace(load_dataset(train, held, joint, model), note=note)
+        return cls(JointBench(joint, data, train, held), progress, gate_warnings([*given, *apart]))
+
+    def start(self) -> Solution:
+        """The fit of the joint's own model."""
+        self.progress("fitting the start model", 0.05)
+        return self.bench.start()
+
+    def diagnose(self, solution: Solution) -> Improvement:
+        """The first decision on a fitted model: what `run` would add first, and what is left
+        then.
+        """
+        return self._run(solution, 1, lean=True)
+
+    def run(self, solution: Solution, max_additions: int = MAX_ADDITIONS) -> Improvement:
+        """Add what is missing from a fitted model, at most `max_additions` effects."""
+        return self._run(solution, max_additions, lean=False)
+
+    def _run(self, solution: Solution, most: int, *, lean: bool) -> Improvement:
+        most = min(most, claim_limit(self.data))
+        standing = _Standing((self.bench.step(None, None, solution),))
+        start = standing.now
+        self.progress("ranking the library", 0.15)
+        why = self._unanswerable(start)
+        if why:
+            return self._without_answer(standing.steps, why)
+        self.bench.listen(start)
+        base = self.bench.base(solution)
+        first = ranking = self.bench.ranking(
+            base, progress=self._within(0.15, 0.05 if not lean else 0.45)
+        )
+        late, unnamed, aside = False, None, set[str]()
+        decided: list[Claim] = []
+        stale = False
+        for _ in range(ATTEMPTS):
+            if len(standing.claims) >= most:
+                break
+            ranking = self._confirmed(ranking, base, standing.now)
+            best = ranking.best(frozenset(self._refused) | aside)
+            may_move = not late and not self.data.sensing.one_sided
+            over = max(e.ratio for e in standing.now.held_out.balances.values()) > RATIO_LIMIT
+            if best is None and may_move and over:
+                late = True
+                ranking = self.bench.ranking(base, late=True)
+                best = ranking.best(frozenset(self._refused) | aside)
+            if best is None:
+                break
+            names = confusion_set(best, ranking.everything, base)
+            best = simplest(best, names, ranking, frozenset(self._refused) | aside)
+            claim = make_claim(best, ranking, base, shortened(names, ranking))
+            label = best.candidate.label
+            if len(claim.effects) > LARGEST_SET:
+                unnamed = unnamed or claim
+                for t in ranking.everything:
+                    if t.key in claim.effects:
+                        aside.add(t.candidate.label)
+                        size = f"is one of {len(claim.effects)} names that explain the same"
+                        self._doubted[t.candidate.label] = f"{size}: too many to be an answer"
+                continue
+            share = len(standing.claims) / max(most, 1)
+            self.progress(f"adding {best.key}", 0.2 + 0.6 * share if not lean else 0.65)
+            told = self._told_apart(claim, standing)
+            if told is not None:
+                standing = told
+                base = self.bench.base(standing.now.solution)
+                ranking = self.bench.ranking(base)
+                continue
+            after = self.bench.added(best, standing.now)
+            drop = held_drop(standing.now.held_out, after.held_out, claim.balance)
+            fall = judged_drop(standing.now.held_out, after.held_out, claim.balance)
+            asked = f"on held-out records after the whole fit ({LEAST_ADDED_DROP:g} % asked)"
+            little = (
+                f"lowers the {claim.balance} balance by {fall:.2g} % {asked}"
+                if fall < LEAST_ADDED_DROP
+                else ""
+            )
+            worse = little or made_worse(standing.now.held_out, after.held_out)
+            if worse:
+                self._refused[label] = worse
+                continue
+            accepted = replace(claim, held_out_drop_percent=drop)
+            decided.append(accepted)
+            standing = self._instead(claim, after, standing) or _Standing(
+                (*standing.steps, after), (*standing.claims, accepted)
+            )
+            if len(standing.claims) > 1:
+                standing = self._revise(standing)
+            # what comes after the last addition of a diagnosis matters only where something is left
+            stale = lean and unnamed is None and not self._over(standing.now)
+            if not stale:
+                base = self.bench.base(standing.now.solution)
+                share = len(standing.claims) / max(most, 1)
+                ranking = self.bench.ranking(base, progress=self._within(0.2 + 0.6 * share, 0.0))
+        if unnamed is not None and not any(
+            t.key in unnamed.effects and t.candidate.label in ranking.significant
+            for t in ranking.everything
+        ):
+            unnamed = None  # an addition has taken it along
+        full = len(standing.claims) >= most and not stale
+        left = ranking.best(frozenset(self._refused)) if full else None
+        stopped = None
+        if left is not None:
+            title = left.candidate.effect.title
+            stopped = (
+                f"Stopped at the limit of additions ({len(standing.claims)}): {title} "
+                "would be the next."
+            )
+        last = None if lean else (ranking, base)
+        found = self.finish(
+            first, last, standing.steps, standing.claims, following=stopped, unnamed=unnamed
+        )
+        return replace(found, decided=tuple(decided))
+
+    def finish(
+        self,
+        first: Ranking,
+        last: tuple[Ranking, Base] | None,
+        steps: Sequence[Step],
+        claims: Sequence[Claim],
+        *,
+        following: str | None = None,
+        unnamed: Claim | None = None,
+    ) -> Improvement:
+        """The result for these steps and claims: lines, minor effects, where it still fails,
+        verdict.
+
+        Parameters
+        ----------
+        first : Ranking
+            The one of the start model.
+        last : (Ranking, Base), optional
+            Those of the last step; without them no minor effect is looked for.
+        steps, claims
+            A step for the start model and one for each claim.
+        following : str, optional
+            What would be added next, and why it was not.
+        unnamed : Claim, optional
+            A set too large to be a name.
+
+        Raises
+        ------
+        InputError
+            Records in unlike units, with a start model that fails on them.
+        """
+        why = self._unanswerable(steps[0])
+        if why:
+            return self._without_answer(steps, why)
+        self.progress("looking at what is left", 0.85)
+        end = steps[-1]
+        solution = end.solution
+        ratios = self.bench.ratios(end)
+        over = any(not e.ratio <= RATIO_LIMIT for e in ratios.values())
+        lines = self.bench.lines(end) if over or last is not None else []
+        minor: tuple[Claim, ...] = ()
+        if last is not None:
+            small = [t for t in minor_claims(*last) if self.bench.same_sign(t, solution)]
+            minor = tuple(
+                Claim((t.key,), t.candidate.label, t.balance, t.held_out_drop_percent)
+                for t in small
+            )
+        where = (
+            self.bench.places(end, replace(end.held_out, balances=ratios), lines, RATIO_LIMIT)
+            if over
+            else []
+        )
+        judged = [self._partial(c, steps[0], end, where) for c in claims]
+        where = self._with_frequency(where, judged, steps)
+        verdict, reason = verdict_of(
+            judged, where, ratios, steps, following, few=few_reversals(self.data), unnamed=unnamed
+        )
+        named = {c for x in judged for c in x.effects}
+        shown = tuple(self.bench.shown(s) for s in steps)
+        return Improvement(
+            self.joint,
+            self.data,
+            steps=shown,
+            claims=tuple(judged),
+            minor=minor,
+            ranking=first,
+            lines=tuple(lines),
+            unexplained=tuple(where),
+            verdict=verdict,
+            reason=reason,
+            final_ratios=ratios,
+            not_testable=tuple(n for n in first.not_testable if n.effect not in named),
+            warnings=(
+                *hardly_a_model(steps[0]),
+                *excitation_warnings(self.data),
+                *self._about_temperature(judged),
+                *without_link(solution),
+                *self._warnings,
+            ),
+            refused=refusals(
+                first,
+                {**self._doubted, **self._refused},
+                judged,
+                self.bench.tried(steps[0].solution),
+            ),
+        )
+
+    # --- inside -----------------------------------------------------------------------------------
+
+    def _within(self, low: float, span: float) -> Progress:
+        """Progress of a part of the run."""
+        return lambda text, share: self.progress(text, low + span * share)
+
+    def _over(self, step: Step) -> bool:
+        """Whether a step leaves structure over the floor."""
+        return any(not e.ratio <= RATIO_LIMIT for e in self.bench.ratios(step).values())
+
+    def _unanswerable(self, start: Step) -> str:
+        """Why these records cannot carry the question; empty where they can.
+
+        Raises
+        ------
+        InputError
+            Records in unlike units, with a start model that fails on them.
+        """
+        refuse_unlike(self.data, start.held_out.relative_error_percent)
+        return not_identifiable(self.data)
+
+    def _without_answer(self, steps: Sequence[Step], why: str) -> Improvement:
+        """The records cannot carry the question: the steps that were made, and the reason."""
+        shown = tuple(self.bench.shown(s) for s in steps)
+        return Improvement(
+            self.joint,
+            self.data,
+            steps=shown,
+            claims=(),
+            minor=(),
+            ranking=None,
+            lines=(),
+            unexplained=(),
+            verdict="not_identifiable",
+            reason=why,
+            final_ratios=self.bench.ratios(steps[-1]),
+            not_testable=(),
+            warnings=(*excitation_warnings(self.data), *self._warnings),
+            refused=(),
+        )
+
+    def _confirmed(self, ranking: Ranking, base: Base, now: Step) -> Ranking:
+        """A candidate that fails on held-out records in its linear form only is judged by a
+        whole fit.
+        """
+        trial = nearly(ranking, base, frozenset(self._refused))
+        if trial is None:
+            return ranking
+        label = trial.candidate.label
+        drop = held_drop(now.held_out, self.bench.added(trial, now).held_out, trial.balance)
+        if drop < HELD_OUT_DROP:
+            lowered = (
+                f"lowers the {trial.balance} balance by {drop:.2g} % on held-out records "
+                "after the whole fit"
+            )
+            self._doubted[label] = f"{lowered} ({HELD_OUT_DROP:g} % asked)"
+            return ranking
+        passed = replace(trial, held_out_drop_percent=drop)
+        # what the linear form says of the others on held-out records is no more worth than what it
+        # said of this one
+        others = {
+            t.candidate.label
+            for t in ranking.everything
+            if t.balance == trial.balance and t.held_out_drop_percent < 0
+        }
+        renewed = tuple(
+            passed
+            if t.candidate.label == label
+            else replace(t, held_out_drop_percent=math.nan)
+            if t.candidate.label in others
+            else t
+            for t in ranking.everything
+        )
+        return replace(ranking, everything=renewed, significant=ranking.significant | {label})
+
+    def _told_apart(self, new: Claim, standing: _Standing) -> _Standing | None:
+        """A name of an earlier set that asks to be added beside it: where it alone does better,
+        it takes the set's place.
+        """
+        for position, claim in enumerate(standing.claims):
+            if new.effects[0] not in claim.effects[1:]:
+                continue
+            base, ranking = self._lacking(claim, standing)
+            alone = next((t for t in ranking.everything if t.candidate.label == new.label), None)
+            told = (
+                self._in_place(
+                    position, alone, make_claim(alone, ranking, base, (alone.key,)), standing
+                )
+                if alone
+                else None
+            )
+            if (
+                told is not None
+                and held_drop(standing.now.held_out, told.now.held_out, claim.balance)
+                >= LEAST_ADDED_DROP
+            ):
+                self._refused[claim.label] = (
+                    f"explains less than {EFFECTS[new.effects[0]].title} alone"
+                )
+                return told
+        return None
+
+    def _instead(self, new: Claim, after: Step, standing: _Standing) -> _Standing | None:
+        """Another name of an earlier set that alone leaves no more than that set's first name
+        with a relative of it beside it.
+        """
+        for position, claim in enumerate(standing.claims):
+            if (
+                len(claim.effects) == 1
+                or new.balance != claim.balance
+                or not set(EFFECTS[new.effects[0]].confused_with) & set(claim.effects)
+            ):
+                continue
+            base, ranking = self._lacking(claim, standing)
+            for name in claim.effects[1:]:
+                alone = next(
+                    (t for t in ranking.everything if t.key == name and t.balance == claim.balance),
+                    None,
+                )
+                told = (
+                    self._in_place(
+                        position, alone, make_claim(alone, ranking, base, (name,)), standing
+                    )
+                    if alone
+                    else None
+                )
+                if (
+                    told is not None
+                    and held_drop(after.held_out, told.now.held_out, claim.balance)
+                    >= -SAME_WITH_ONE_LESS
+                ):
+                    self._refused[claim.label] = (
+                        f"needs {EFFECTS[new.effects[0]].title} beside it to explain what "
+                        f"{EFFECTS[name].title} does alone"
+                    )
+                    return told
+        return None
+
+    def _lacking(self, claim: Claim, standing: _Standing) -> tuple[Base, Ranking]:
+        """The last model without a claim, and the library tried on it."""
+        last = standing.now.solution
+        base = self.bench.base(
+            self.bench.fitted(without(last.model, claim.label), last.values, again=True)
+        )
+        return base, self.bench.ranking(base)
+
+    def _in_place(
+        self, position: int, alone: Trial, new: Claim, standing: _Standing
+    ) -> _Standing | None:
+        """Another effect in the place of a claim; None where an earlier one does not go with it."""
+        claims = [new if i == position else c for i, c in enumerate(standing.claims)]
+        made = self._replay(claims, standing, alone.values)
+        return made if len(made.claims) == len(claims) else None
+
+    def _revise(self, standing: _Standing) -> _Standing:
+        """Judge every earlier claim given all the others: drop it, swap it, or renew its set."""
+        current = list(standing.claims)
+        last = standing.now.solution
+        for claim in standing.claims[:-1]:
+            needed = {n for c in current if c is not claim for n in c.effect.needs}
+            if claim.effect.stage == "structure" or claim.effects[0] in needed:
+                continue
+            if without(last.model, claim.label).terms == last.model.terms:
+                continue
+            base, ranking = self._lacking(claim, standing)
+            same = next((t for t in ranking.everything if t.candidate.label == claim.label), None)
+            best = ranking.best(frozenset(self._refused))
+            position = current.index(claim)
+            gone = same is None or claim.label not in ranking.significant
+            if gone and (best is None or best.score < NOT_NEEDED):
+                current.pop(position)
+                self._refused[claim.label] = (
+                    "is not needed any more once the later effects are in the model"
+                )
+                return self._replay(current, standing)
+            if (
+                best is not None
+                and best.candidate.label != claim.label
+                and (same is None or best.score > same.score + SWAP_GAIN)
+            ):
+                names = confusion_set(best, ranking.everything, base)
+                if claim.effects[0] in names:
+                    continue
+                renewed = make_claim(best, ranking, base, names)
+                self._refused[claim.label] = (
+                    f"explains less than {best.candidate.effect.title} once the later effects "
+                    "are in the model"
+                )
+                if len(renewed.effects) <= LARGEST_SET and all(
+                    c.label != renewed.label for c in current
+                ):
+                    current[position] = renewed
+                    return self._replay(current, standing)
+            if same is not None:
+                names = confusion_set(same, ranking.everything, base)
+                names = (claim.effects[0], *(n for n in names if n != claim.effects[0]))
+                current[position] = replace(
+                    claim, effects=names, separate_by=claim.separate_by if len(names) > 1 else None
+                )
+        return _Standing(standing.steps, tuple(current))
+
+    def _replay(
+        self,
+        claims: Sequence[Claim],
+        standing: _Standing,
+        new: Mapping[str, float] = MappingProxyType({}),
+    ) -> _Standing:
+        """Steps again from the start model with the revised claims (`new`: start values of a
+        label that was not in them).
+        """
+        steps = standing.steps
+        out = [steps[0]]
+        kept = []
+        for claim in claims:
+            before = out[-1]
+            try:
+                model = with_effect(before.solution.model, claim.label)
+            except ValueError:
+                continue
+            variant = next(
+                (
+                    s.solution.model.virtual_work
+                    for s in reversed(steps)
+                    if claim.label in s.solution.model.effects
+                ),
+                None,
+            )
+            if variant is not None:
+                model = replace(model, virtual_work=variant)
+            known = {k: v for s in steps for k, v in s.solution.values.items()}
+            solution = self.bench.fitted(
+                model, {**known, **new, **before.solution.values}, again=True
+            )
+            after = self.bench.step(claim.effects[0], claim.label, solution)
+            kept.append(
+                replace(
+                    claim,
+                    held_out_drop_percent=held_drop(before.held_out, after.held_out, claim.balance),
+                )
+            )
+            out.append(after)
+        return _Standing(tuple(out), tuple(kept))
+
+    def _about_temperature(self, claims: Sequence[Claim]) -> tuple[str, ...]:
+        if not any(EFFECTS[n].warms for c in claims for n in c.effects):
+            return ()
+        if self.data.sensing.has_temperature:
+            return (
+                "the values of thermal friction count from "
+                f"{self.data.sensing.temperature_origin:.4g} K, the first sample of the "
+                "first record",
+            )
+        return (
+            "no temperature was recorded: thermal friction is judged by the time since each run "
+            "started, taken as a cold start; "
+            "its values are the change over one run, not per kelvin",
+        )
+
+    def _partial(
+        self, claim: Claim, first: Step, last: Step, where: Sequence[Unexplained]
+    ) -> Claim:
+        """A claim is partial where its balance stays over the floor and it explains less than
+        half, or no more than a table over one variable.
+        """
+        left = next((u for u in where if u.balance == claim.balance), None)
+        if left is None:
+            return claim
+        before, after = (
+            first.held_out.balances[claim.balance],
+            last.held_out.balances[claim.balance],
+        )
+        over = before.rms**2 - before.floor**2
+        share = (before.rms**2 - after.rms**2) / over if over > 0 else 1.0
+        partial = share < EXPLAINED_SHARE or claim.effect.stage == "late"
+        if not partial and left.share_percent >= LOCATED_SHARE and not claim.effect.common:
+            partial = is_absorbed(claim, left, last.solution, self.data)
+        return replace(claim, partial=partial)
+
+    def _with_frequency(
+        self, where: Sequence[Unexplained], claims: Sequence[Claim], steps: Sequence[Step]
+    ) -> list[Unexplained]:
+        """What is left around a mode that is named in part only sits at the frequency that
+        stood out before the mode was added.
+        """
+        out = list(where)
+        for claim in claims:
+            before = next((a for a, b in itertools.pairwise(steps) if b.label == claim.label), None)
+            for k, u in enumerate(out):
+                nowhere = u.axis is None and u.order is None and u.frequency_hz is None
+                if (
+                    claim.partial
+                    and claim.effect.stage == "late"
+                    and u.balance == claim.balance
+                    and nowhere
+                    and before is not None
+                ):
+                    out[k] = replace(
+                        u, frequency_hz=spectral_peak(before.solution, self.data, u.balance)
+                    )
+        return out

@@ -1,0 +1,616 @@
+"""Candidates tried on a fitted base: best shape by projection, block cross-validation, held-out
+drop.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Final, final
+
+import numpy as np
+import numpy.typing as npt
+
+from casadi_models import Effect
+from identification.balance.balances import Balances, balances_of
+from identification.balance.calibration import bare, names_of_runs, settled
+from identification.balance.dataset import HOLD_NAME
+from identification.balance.weak import WeakRecord
+from identification.diagnosis.candidates import Candidate, NotTestable, shape_grid
+from identification.fitting.engine import Dataset, Solution, Stacked, row_weights, stack
+from identification.fitting.signed_fit import projected_gain, signed_fit
+from identification.fitting.start_values import bounds_of
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+FOLDS: Final = 4
+FEW_BLOCKS: Final = 32
+"""Below this many blocks up to ten folds are used, so that no fold takes a whole kind of motion
+away.
+"""
+
+COLLINEAR: Final = 2e-3
+"""Share of a candidate's columns outside the base below which it is not testable."""
+
+REFINE_SHARE: Final = 0.1
+"""Share of the residual that a candidate must explain on its grid before its shape is refined."""
+
+KERNEL_SHARE: Final = 0.4
+"""Share of rows that count as independent under white noise: four rows per kernel length."""
+
+
+@final
+@dataclass(frozen=True)
+class Base:
+    """The fitted base with its weighted rows, projected once for all candidates.
+
+    Attributes
+    ----------
+    rows : mapping of str to (rows,) slice of the stacked vector
+    residual : (n,) array, weighted
+    jacobian : (n, p) array, weighted and scaled to unit columns
+    orthonormal : (n, r) array
+    inward : (n, m) array
+        Like `jacobian`, for amplitudes that stand at a bound: a candidate may let them return from
+        it.
+    held_own : (rows, r) array
+        Orthonormal: what the calibration of the held-out records themselves takes up, each fitted
+        on itself.
+    block : (n,) int array
+    balance : (n,) int array
+    effective : mapping of str to float
+        Independent rows per balance, from the autocorrelation of the residual.
+    """
+
+    solution: Solution
+    data: Dataset
+    residual: FloatArray
+    jacobian: FloatArray
+    inward: FloatArray
+    orthonormal: FloatArray
+    block: IntArray
+    balance: IntArray
+    weight: FloatArray
+    share: FloatArray
+    held_residual: FloatArray
+    held_jacobian: FloatArray
+    held_inward: FloatArray
+    held_own: FloatArray
+    held_balance: IntArray
+    held_weight: FloatArray
+    names: tuple[str, ...]
+
+    @property
+    def parts(self) -> tuple[int, int]:
+        """Where a candidate's solution passes from free parameters to those at a bound, and
+        from these to its own amplitudes.
+        """
+        return self.jacobian.shape[1], self.jacobian.shape[1] + self.inward.shape[1]
+
+    @property
+    def balances(self) -> tuple[str, ...]:
+        """Balances in the order of their numbers."""
+        return self.data.sensing.balances
+
+    @cached_property
+    def blocks(self) -> int:
+        """Number of blocks."""
+        return int(self.block.max()) + 1
+
+    @cached_property
+    def order(self) -> IntArray:
+        """Rows that belong to a block, block after block and balance after balance."""
+        used = np.flatnonzero(self.block >= 0)
+        return np.asarray(used[np.lexsort((self.balance[used], self.block[used]))], dtype=np.int64)
+
+    @cached_property
+    def firsts(self) -> IntArray:
+        """Where each group of one block and balance begins in `order`."""
+        group = self.block[self.order] * len(self.balances) + self.balance[self.order]
+        return np.concatenate([[0], np.flatnonzero(np.diff(group)) + 1]).astype(np.int64)
+
+    @cached_property
+    def numbers(self) -> IntArray:
+        """Rows of each block and balance."""
+        count = len(self.balances)
+        where = self.block[self.order] * count + self.balance[self.order]
+        return np.bincount(where, minlength=self.blocks * count).reshape(self.blocks, count)
+
+    def grouped(self, left: FloatArray, right: FloatArray) -> FloatArray:
+        """Products of columns of `order` within each block and balance, (blocks, balances,
+        left, right).
+        """
+        out = np.zeros((self.blocks, len(self.balances), left.shape[1], right.shape[1]))
+        ends = np.append(self.firsts[1:], len(self.order))
+        at = self.order[self.firsts]
+        for first, end, b, k in zip(
+            self.firsts.tolist(),
+            ends.tolist(),
+            self.block[at].tolist(),
+            self.balance[at].tolist(),
+            strict=True,
+        ):
+            np.matmul(left[first:end].T, right[first:end], out=out[b, k])
+        return out
+
+    @cached_property
+    def plain(self) -> FloatArray:
+        """Columns of the base and its residual, in `order`."""
+        return np.column_stack([self.jacobian, self.inward, self.residual])[self.order]
+
+    @cached_property
+    def products(self) -> FloatArray:
+        """Products of these within each block and balance."""
+        return self.grouped(self.plain, self.plain)
+
+    @cached_property
+    def folds(self) -> int:
+        """Parts of the cross-validation."""
+        return FOLDS if self.blocks >= FEW_BLOCKS else max(1, min(self.blocks, 10))
+
+    @cached_property
+    def crossed(self) -> FloatArray:
+        """Sum of squares that the base leaves of each block and balance, fitted without that
+        fold; (blocks, balances).
+        """
+        p, own = self.parts
+        grams = self.products
+        total = grams.sum(axis=(0, 1))
+        out = np.zeros(grams.shape[:2])
+        for test in self.held_out_folds():
+            train = total - grams[test].sum(axis=(0, 1)) if self.folds > 1 else total
+            found = signed_fit(
+                train[:own, :own], -train[:own, -1], np.zeros(own - p), p, total[:own, :own]
+            )
+            out[test] = _quadratic(grams[test], np.append(found, 1.0))
+        return out
+
+    def held_out_folds(self) -> list[npt.NDArray[np.bool_]]:
+        """Which blocks each fold holds out."""
+        fold = np.arange(self.blocks) % self.folds
+        return [fold == k for k in range(self.folds)]
+
+
+def make_base(solution: Solution, data: Dataset) -> Base:
+    """Evaluate and project the base model on training and held-out rows."""
+    model = solution.model
+    solution = replace(
+        solution,
+        values=settled(model, data.sensing, [*data.train, *data.held_out], solution.values),
+    )
+    smoothing = model.named("smoothing")
+    free = [n for n in solution.free if n not in solution.at_bound or n in smoothing]
+    free += names_of_runs(model, data.train)
+    signs = _inward_signs(solution, data)
+    names = [*free, *signs]
+    balances = balances_of(model, data.sensing, wrt=bare(names))
+    train = stack(balances, data.train, solution.values, names)
+    r, j, block, balance = flatten(train, balances.balances)
+    weight = np.concatenate([solution.weights[b] for b in balances.balances])
+    towards = np.concatenate([np.ones(len(free)), list(signs.values())])
+    jw = j * towards * weight[:, None]
+    norms = np.linalg.norm(jw, axis=0)
+    alive = norms > 1e-12 * max(float(norms.max(initial=0.0)), 1e-300)
+    back = alive & (np.arange(len(norms)) >= len(free))
+    alive[len(free) :] = False
+    inward = jw[:, back] / norms[back]
+    jw = jw[:, alive] / norms[alive]
+    orthonormal = span_of(jw)
+    rw = r * weight
+    rw = rw - orthonormal @ (orthonormal.T @ rw)
+    shares = np.array(
+        [
+            _effective_share(rw[balance == k][train.taking[b]])
+            for k, b in enumerate(balances.balances)
+        ]
+    )
+    if data.held_out:
+        held = stack(balances, data.held_out, solution.values, names)
+        own = names_of_runs(model, data.held_out)
+        apart = flatten(
+            stack(
+                balances_of(model, data.sensing, wrt=bare(own)), data.held_out, solution.values, own
+            ),
+            balances.balances,
+        )[1]
+        hr, hj, _, hb = flatten(held, balances.balances)
+        rows = row_weights(balances, data, solution.values, solution.sigma, data.held_out)
+        held_weights = np.concatenate([rows[b] for b in balances.balances])
+        hj = hj * towards * held_weights[:, None]
+        hj, hi = hj[:, alive] / norms[alive], hj[:, back] / norms[back]
+        hr = hr * held_weights
+        ho = span_of(apart * held_weights[:, None])
+    else:
+        ho = np.empty((0, 0))
+        hr, hj, hi = np.empty(0), np.empty((0, int(alive.sum()))), np.empty((0, int(back.sum())))
+        hb, held_weights = np.empty(0, dtype=np.int64), np.empty(0)
+    return Base(
+        solution,
+        data,
+        residual=rw,
+        jacobian=jw,
+        inward=inward,
+        orthonormal=orthonormal,
+        block=block,
+        balance=balance,
+        weight=weight,
+        share=shares,
+        held_residual=hr,
+        held_jacobian=hj,
+        held_inward=hi,
+        held_own=ho,
+        held_balance=hb,
+        held_weight=held_weights,
+        names=tuple(n for n, a in zip(free, alive, strict=False) if a),
+    )
+
+
+def span_of(columns: FloatArray) -> FloatArray:
+    """Orthonormal columns that span the same space."""
+    left, singular, _ = np.linalg.svd(columns, full_matrices=False)
+    return np.asarray(
+        left[:, singular > 1e-9 * max(float(singular[0]) if len(singular) else 0.0, 1e-300)],
+        dtype=np.float64,
+    )
+
+
+def _inward_signs(solution: Solution, data: Dataset) -> dict[str, float]:
+    """Amplitudes at a bound, with the sign of the step back from it; the hold of a logged
+    command is none of them.
+    """
+    limits = bounds_of(solution.model, data.joint.known, data)
+    shapes = {p.name for p in solution.model.parameters if p.is_shape}
+    held = [
+        n for n in solution.at_bound if n in solution.free and n not in shapes and n != HOLD_NAME
+    ]
+    return {
+        n: 1.0 if solution.values[n] - limits[n][0] < limits[n][1] - solution.values[n] else -1.0
+        for n in held
+    }
+
+
+def flatten(
+    stacked: Stacked, balances: Sequence[str]
+) -> tuple[FloatArray, FloatArray, IntArray, IntArray]:
+    """Residual, Jacobian, block (-1 for rows that take no part) and balance number of all rows,
+    one balance after the other.
+    """
+    r = np.concatenate([stacked.residual[b] for b in balances])
+    j = np.concatenate([stacked.jacobian[b] for b in balances])
+    size = len(stacked.block)
+    block = np.concatenate([np.where(stacked.taking[b], stacked.block, -1) for b in balances])
+    return r, j, block, np.repeat(np.arange(len(balances)), size)
+
+
+def _effective_share(residual: FloatArray) -> float:
+    """Share of rows that count as independent (initial positive sequence of the
+    autocorrelation).
+    """
+    x = residual - residual.mean()
+    power = float(x @ x)
+    if power <= 0:
+        return 1.0
+    total = 1.0
+    for lag in range(1, min(60, len(x) - 1)):
+        rho = float(x[:-lag] @ x[lag:]) / power
+        if rho < 0.05:
+            break
+        total += 2 * rho
+    return 1.0 / total
+
+
+def columns(
+    candidate: Candidate,
+    base: Base,
+    shapes: Mapping[str, float],
+    records: Sequence[WeakRecord],
+    balances: Balances,
+) -> FloatArray:
+    """Unweighted columns of the candidate's amplitudes at amplitude zero."""
+    values = {p.name: p.start for p in candidate.model.parameters}
+    values.update(base.solution.values)
+    values.update(dict.fromkeys(candidate.amplitudes, 0.0))
+    values.update(shapes)
+    stacked = stack(balances, records, values)
+    return np.concatenate([stacked.jacobian[b] for b in balances.balances])
+
+
+@final
+@dataclass(frozen=True)
+class Trial:
+    """A candidate at its best shape, tried on blocks and on held-out records.
+
+    Attributes
+    ----------
+    values : mapping
+        Shapes and amplitude estimates.
+    balance : str
+        Balance where it helps most.
+    gain : float
+        Cross-validated log-likelihood gain [nats].
+    cv_drop_percent, held_out_drop_percent : float
+        Fall of the RMS in the affected balance.
+    p_value : float
+        Cluster-robust Wald test over blocks.
+    block_score : (blocks,) array
+        Cross-validated log-likelihood of each block against the base [nats].
+    rms : (balances,) array
+        Cross-validated RMS of each balance, in sigmas of the base.
+    outside : float
+        Largest share of a column outside the base.
+    contribution : float
+        RMS of what the effect adds to its balance [N.m].
+    score : float
+        Log-likelihood gain if only the kernel's overlap tied the rows together: order of the
+        ranking [nats].
+    """
+
+    candidate: Candidate
+    values: Mapping[str, float]
+    balance: str
+    gain: float
+    cv_drop_percent: float
+    held_out_drop_percent: float
+    p_value: float
+    block_score: FloatArray
+    rms: FloatArray
+    outside: float
+    contribution: float
+    score: float
+
+    def __repr__(self) -> str:
+        return (
+            f"Trial({self.candidate.label!r}, {self.balance} balance, "
+            f"-{self.cv_drop_percent:.3g} % on blocks, p = {self.p_value:.2g})"
+        )
+
+    @property
+    def effect(self) -> Effect:
+        """The effect tried."""
+        return self.candidate.effect
+
+    @property
+    def key(self) -> str:
+        """Key of the effect."""
+        return self.candidate.effect.key
+
+
+def try_candidate(candidate: Candidate, base: Base) -> Trial | NotTestable | None:
+    """Best shape by projection, then block cross-validation and held-out drop.
+
+    Returns
+    -------
+    Trial, NotTestable (columns inside the base), or None (no column at all, or an unphysical sign).
+    """
+    data = base.data
+    balances = balances_of(
+        candidate.model, data.sensing, wrt=candidate.amplitudes, columns_only=True
+    )
+    best: tuple[float, dict[str, float], FloatArray] | None = None
+    inside = 0.0
+    lows = np.array(
+        [{p.name: p for p in candidate.model.parameters}[n].low for n in candidate.amplitudes]
+    )
+    q = base.orthonormal
+    returning = base.inward.shape[1]
+    least = np.concatenate([np.zeros(returning), lows])
+
+    def projected(shapes: dict[str, float]) -> tuple[float, FloatArray, float] | None:
+        raw = columns(candidate, base, shapes, data.train, balances)
+        c = raw * base.weight[:, None]
+        size = np.linalg.norm(c, axis=0)
+        if not np.all(np.isfinite(c)) or size.max(initial=0.0) <= 0:
+            return None
+        c = np.column_stack([base.inward, c / np.where(size > 0, size, 1.0)])
+        outside = c - q @ (q.T @ c)
+        return (
+            projected_gain(outside, base.residual, least),
+            raw,
+            float(np.linalg.norm(outside[:, returning:], axis=0).max()),
+        )
+
+    for shapes in shape_grid(candidate, data):
+        found = projected(shapes)
+        if found is None:
+            continue
+        inside = max(inside, found[2])
+        if best is None or found[0] > best[0]:
+            best = (found[0], shapes, found[1])
+    if best is None:
+        return None
+    if inside < COLLINEAR:
+        return NotTestable(candidate.effect.key, _collinear_reason(candidate))
+    if best[0] <= 0:
+        return None
+    parameters = {p.name: p for p in candidate.model.parameters}
+    limits = {
+        n: (
+            parameters[n].grid[0] * data.ranges[parameters[n].scale] / 2,
+            parameters[n].grid[-1] * data.ranges[parameters[n].scale] * 1.25,
+        )
+        for n in candidate.shapes
+        if not parameters[n].stays_on_grid
+    }
+    if limits and best[0] > REFINE_SHARE * float(base.residual @ base.residual):
+        best = _refined(projected, best, limits)
+    return _score(
+        candidate, base, balances=balances, shapes=best[1], raw=best[2], lows=least, inside=inside
+    )
+
+
+def _refined(
+    projected: Callable[[dict[str, float]], tuple[float, FloatArray, float] | None],
+    best: tuple[float, dict[str, float], FloatArray],
+    limits: Mapping[str, tuple[float, float]],
+) -> tuple[float, dict[str, float], FloatArray]:
+    """Shape between the grid points: pattern search on a log scale."""
+    step = 0.5
+    for _ in range(5):
+        better = False
+        for name, (low, high) in limits.items():
+            for sign in (1.0, -1.0):
+                value = best[1][name] * math.exp(sign * step)
+                shapes = {**best[1], name: min(max(value, low), high)}
+                found = projected(shapes)
+                if found is not None and found[0] > best[0]:
+                    best, better = (found[0], shapes, found[1]), True
+                    break
+        if not better:
+            step /= 2.5
+    return best
+
+
+def _collinear_reason(candidate: Candidate) -> str:
+    names = ", ".join(candidate.effect.confused_with) or "what the model has already"
+    separate = (
+        f"; {candidate.effect.separate_by} would separate them"
+        if candidate.effect.separate_by
+        else ""
+    )
+    return f"on these records it cannot be told from {names}{separate}"
+
+
+def _score(
+    candidate: Candidate,
+    base: Base,
+    balances: Balances,
+    shapes: Mapping[str, float],
+    raw: FloatArray,
+    lows: FloatArray,
+    inside: float,
+) -> Trial | None:
+    p, own = base.parts
+    size = np.linalg.norm(raw * base.weight[:, None], axis=0)
+    size = np.where(size > 0, size, 1.0)
+    added = raw * base.weight[:, None] / size
+    grams = _bordered(base, added[base.order])
+    numbers = base.numbers
+    total = grams.sum(axis=(0, 1))
+    sse0, sse1 = base.crossed, np.zeros(base.crossed.shape)
+    for test in base.held_out_folds():
+        train = total - grams[test].sum(axis=(0, 1)) if base.folds > 1 else total
+        more = signed_fit(train[:-1, :-1], -train[:-1, -1], lows, p, total[:-1, :-1])
+        sse1[test] = _quadratic(grams[test], np.concatenate([more, [1.0]]))
+    delta = signed_fit(total[:-1, :-1], -total[:-1, -1], lows, p)
+    amplitude = delta[own:] / size
+    if not np.any(amplitude):
+        return None
+    per_balance0, per_balance1 = sse0.sum(axis=0), sse1.sum(axis=0)
+    rows_in = np.maximum(numbers.sum(axis=0), 1)
+    effective = rows_in * base.share
+    gains = (
+        effective / 2 * np.log(np.maximum(per_balance0, 1e-300) / np.maximum(per_balance1, 1e-300))
+    )
+    where = int(
+        np.argmax(
+            rows_in * np.log(np.maximum(per_balance0, 1e-300) / np.maximum(per_balance1, 1e-300))
+        )
+    )
+    variance = np.maximum(per_balance1 / rows_in, 1e-300)
+    block_score = ((sse0 - sse1) / (2 * variance) * base.share).sum(axis=1)
+    held = _held_out_drop(
+        candidate, base, balances=balances, shapes=shapes, delta=delta, size=size, where=where
+    )
+    drop = 100 * (1 - math.sqrt(per_balance1[where] / max(per_balance0[where], 1e-300)))
+    return Trial(
+        candidate,
+        {**shapes, **dict(zip(candidate.amplitudes, map(float, amplitude), strict=True))},
+        balance=base.balances[where],
+        gain=float(gains.sum()),
+        cv_drop_percent=drop,
+        held_out_drop_percent=held,
+        p_value=_wald(added, base, delta),
+        block_score=block_score,
+        rms=np.sqrt(per_balance1 / rows_in),
+        outside=inside,
+        contribution=float(np.sqrt(np.mean((raw[base.balance == where] @ amplitude) ** 2))),
+        score=float(
+            np.sum(
+                KERNEL_SHARE
+                * rows_in
+                / 2
+                * np.log(np.maximum(per_balance0, 1e-300) / np.maximum(per_balance1, 1e-300))
+            )
+        ),
+    )
+
+
+def _bordered(base: Base, added: FloatArray) -> FloatArray:
+    """Products within each block and balance with a candidate's columns between those of the
+    base and the residual.
+    """
+    own, more = base.parts[1], added.shape[1]
+    plain = base.products
+    across = base.grouped(added, np.column_stack([base.plain, added]))
+    out = np.empty((*plain.shape[:2], own + more + 1, own + more + 1))
+    kept = [*range(own), own + more]
+    out[:, :, np.array(kept)[:, None], kept] = plain
+    out[:, :, own:-1, kept] = across[:, :, :, : own + 1]
+    out[:, :, kept, own:-1] = across[:, :, :, : own + 1].transpose(0, 1, 3, 2)
+    out[:, :, own:-1, own:-1] = across[:, :, :, own + 1 :]
+    return out
+
+
+def _quadratic(grams: FloatArray, vector: FloatArray) -> FloatArray:
+    return np.asarray(np.maximum(np.einsum("kbij,i,j->kb", grams, vector, vector), 0.0))
+
+
+def _held_out_drop(
+    candidate: Candidate,
+    base: Base,
+    balances: Balances,
+    shapes: Mapping[str, float],
+    delta: FloatArray,
+    size: FloatArray,
+    where: int,
+) -> float:
+    """Fall of the RMS of a balance on records that the fit never saw, in percent."""
+    if not len(base.held_residual):
+        return math.nan
+    p, own = base.parts
+    raw = (
+        columns(candidate, base, shapes, base.data.held_out, balances)
+        * base.held_weight[:, None]
+        / size
+    )
+    here = base.held_balance == where
+    before = base.held_residual
+    after = (
+        before
+        + base.held_jacobian @ delta[:p]
+        + base.held_inward @ delta[p:own]
+        + raw @ delta[own:]
+    )
+    before, after = (x - base.held_own @ (base.held_own.T @ x) for x in (before, after))
+    before, after = before[here], after[here]
+    return 100 * (1 - math.sqrt(float(after @ after) / max(float(before @ before), 1e-300)))
+
+
+def _wald(added: FloatArray, base: Base, delta: FloatArray) -> float:
+    """p-value of the amplitudes, scores clustered by block."""
+    from scipy.special import fdtrc
+
+    p, own = base.parts
+    q = base.orthonormal
+    moving = base.inward[:, delta[p:own] > 0]
+    if moving.shape[1]:
+        q = np.column_stack([q, np.linalg.qr(moving - q @ (q.T @ moving))[0]])
+    active = np.flatnonzero(delta[own:])
+    blocks = int(np.count_nonzero(base.numbers.sum(axis=1)))
+    if not len(active) or blocks <= len(active) + 1:
+        return 1.0
+    c = added - q @ (q.T @ added)
+    c = c[:, active]
+    residual = (
+        base.residual + base.jacobian @ delta[:p] + base.inward @ delta[p:own] + added @ delta[own:]
+    )
+    begins = base.firsts[np.flatnonzero(np.diff(base.block[base.order[base.firsts]], prepend=-1))]
+    scores = np.add.reduceat((c * residual[:, None])[base.order], begins, axis=0)
+    inverse = np.linalg.pinv(c.T @ c, rcond=1e-10)
+    covariance = inverse @ (scores.T @ scores) @ inverse * blocks / (blocks - 1)
+    d = delta[own:][active]
+    statistic = float(d @ np.linalg.pinv(covariance, rcond=1e-12) @ d) / len(active)
+    return float(fdtrc(len(active), blocks - len(active), statistic))

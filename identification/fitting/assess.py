@@ -1,0 +1,148 @@
+"""How far a fitted model is from the measurements: errors per balance, ratio to the noise floor."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final, final
+
+import numpy as np
+import numpy.typing as npt
+
+from casadi_models import JointModel
+from identification.balance.balances import balances_of
+from identification.balance.calibration import settled
+from identification.balance.weak import WeakRecord
+from identification.fitting.engine import (
+    Dataset,
+    floor_rows,
+    references,
+    rms,
+    row_weights,
+    stack,
+    taking_part,
+)
+
+FloatArray = npt.NDArray[np.float64]
+
+VERDICT_KERNELS: Final = {
+    "motor": 0.03,
+    "link": 0.12,
+    "transmission": 0.06,
+    "sum": 0.06,
+    "deflection": 0.06,
+    "axis": 0.2,
+}
+"""Kernel at which a balance is compared with its floor: where records without a hidden effect
+read 1 [s].
+"""
+
+RATIO_LIMIT: Final = 1.5
+"""Residual over noise floor above which structure is left; joints without a hidden effect read
+0.9 to 1.4, dirty sensors included.
+"""
+
+
+@final
+@dataclass(frozen=True)
+class BalanceError:
+    """Error of one balance.
+
+    Attributes
+    ----------
+    rms : float
+        Weighted by what noise allows in each row: rows at a reversal or at standstill count less.
+    floor : float
+        What measurement noise alone would leave.
+    ratio : float
+        RMS of residual over noise, row by row: 1 where only noise is left.
+    unit : str
+    residual, weight : (rows,) array
+        Residual of each row [unit] and 1 over the scatter that noise allows it: two models are
+        compared on one common weighting.
+    """
+
+    rms: float
+    floor: float
+    ratio: float
+    unit: str
+    residual: FloatArray = field(default_factory=lambda: np.empty(0), repr=False, compare=False)
+    weight: FloatArray = field(default_factory=lambda: np.empty(0), repr=False, compare=False)
+
+    def as_json(self) -> dict[str, Any]:
+        """The shape of `improve --json`."""
+        return {"rms": self.rms, "unit": self.unit, "floor": self.floor, "ratio": self.ratio}
+
+
+@final
+@dataclass(frozen=True)
+class Error:
+    """Error of a model on a set of records.
+
+    Attributes
+    ----------
+    relative_error_percent : float
+        100 norm(residual) / norm(measured) over the balanced torques.
+    fit_percent : float
+        100 (1 - norm(residual) / norm(measured - mean)).
+    vaf_percent : float
+        100 (1 - var(residual) / var(measured)).
+    balances : mapping of str to BalanceError
+    """
+
+    relative_error_percent: float
+    fit_percent: float
+    vaf_percent: float
+    balances: Mapping[str, BalanceError]
+
+    def as_json(self) -> dict[str, Any]:
+        """The shape of `improve --json`."""
+        return {
+            "relative_error_percent": self.relative_error_percent,
+            "fit_percent": self.fit_percent,
+            "vaf_percent": self.vaf_percent,
+            "balances": {b: e.as_json() for b, e in self.balances.items()},
+        }
+
+
+def assess(
+    model: JointModel, data: Dataset, records: Sequence[WeakRecord], values: Mapping[str, float]
+) -> Error:
+    """Error of a model with the given values on prepared records."""
+    balances = balances_of(model, data.sensing, wrt=())
+    values = settled(model, data.sensing, [*data.train, *records], values)
+    whole = stack(balances, records, values).residual
+    rows = {b: taking_part(b, records) for b in balances.balances}
+    residual = {b: whole[b][rows[b]] for b in whole}
+    measured = {b: y[rows[b]] for b, y in references(data, records).items()}
+    floor = floor_rows(model, data, values, records)
+    weights = row_weights(
+        balances, data, values, {b: np.maximum(floor[b], 1e-12) for b in floor}, records
+    )
+    weights = {b: w[rows[b]] for b, w in weights.items()}
+    floor = {b: f[rows[b]] for b, f in floor.items()}
+    unit = "N.m" if model.kind == "rotary" else "N"
+    errors = {
+        b: BalanceError(
+            rms(residual[b] * weights[b]) / max(rms(weights[b]), 1e-300),
+            rms(floor[b] * weights[b]) / max(rms(weights[b]), 1e-300),
+            rms(residual[b] * weights[b]) if np.any(floor[b] > 0) else math.inf,
+            unit,
+            residual[b],
+            weights[b],
+        )
+        for b in balances.balances
+    }
+    r = np.concatenate([residual[b] for b in balances.balances])
+    y = np.concatenate([measured[b] for b in balances.balances])
+    centred = np.concatenate([measured[b] - measured[b].mean() for b in balances.balances])
+    size = float(np.linalg.norm(y)) or 1e-300
+    spread = float(np.linalg.norm(centred)) or 1e-300
+    varying = np.concatenate([residual[b] - residual[b].mean() for b in balances.balances])
+    return Error(
+        100 * float(np.linalg.norm(r)) / size,
+        100 * (1 - float(np.linalg.norm(r)) / spread),
+        100 * (1 - float(varying @ varying) / spread**2),
+        errors,
+    )

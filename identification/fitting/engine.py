@@ -1,0 +1,358 @@
+"""Weighted least squares over the balances of several records: the numbers behind fit, compare
+and diagnose.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Final, final
+
+import numpy as np
+import numpy.typing as npt
+
+from casadi_models import JointModel
+from casadi_models.term import HANGING, LOAD_COMPLIANCE
+from identification.balance.balances import Balances, balances_of
+from identification.balance.calibration import bare, is_of_run, names_of_runs
+from identification.balance.dataset import Dataset, load_dataset, prepared_model, weak_record
+from identification.balance.excitation import attenuation
+from identification.balance.stacked import (
+    Stacked,
+    floor_rows,
+    floors,
+    references,
+    rms,
+    row_weights,
+    stack,
+    taking_part,
+)
+from identification.errors import InputError
+from identification.fitting.covariance import block_errors, correlations
+from identification.fitting.start_values import bounds_of, starts
+from identification.fitting.weak_form import WeakForm
+
+__all__ = [
+    "Dataset",
+    "Solution",
+    "Stacked",
+    "floor_rows",
+    "floors",
+    "load_dataset",
+    "prepared_model",
+    "references",
+    "rms",
+    "row_weights",
+    "solve",
+    "stack",
+    "taking_part",
+    "weak_record",
+]
+FloatArray = npt.NDArray[np.float64]
+
+
+@final
+@dataclass(frozen=True)
+class Solution:
+    """A fitted model in the terms of the balances.
+
+    Attributes
+    ----------
+    model : JointModel
+        With the fitted values.
+    values, stderr : mapping
+        Every parameter; standard errors from blocks (None for fixed, nuisance or unidentifiable
+        ones).
+    free : tuple of str
+    weights : mapping of str to (rows,) array
+        1/sigma of each training row.
+    sigma : mapping of str to float
+    at_bound, unidentified : tuple of str
+    correlation : mapping
+        Largest correlation of each parameter with another one: (name, value).
+    """
+
+    model: JointModel
+    values: Mapping[str, float]
+    stderr: Mapping[str, float | None]
+    free: tuple[str, ...]
+    weights: Mapping[str, FloatArray]
+    sigma: Mapping[str, float]
+    at_bound: tuple[str, ...] = ()
+    unidentified: tuple[str, ...] = ()
+    correlation: Mapping[str, tuple[str, float]] = field(default_factory=dict)
+    iterations: int = 0
+
+    def __repr__(self) -> str:
+        return (
+            f"Solution({len(self.free)} free parameters, at bound: {list(self.at_bound)}, not "
+            f"identifiable: {list(self.unidentified)})"
+        )
+
+
+LEAST_SWING: Final = 0.05
+"""Fall of the RMS by which a link that swings unseen must show itself; else the joint is taken
+as rigid.
+"""
+HIGHEST_SWING: Final = 4.0
+"""Highest frequency of such a link in units of 1/kernel (the kernel's -3 dB point is 0.93):
+faster ones are rigid to these rows.
+"""
+
+
+def solve(
+    model: JointModel,
+    data: Dataset,
+    *,
+    iterations: int = 15,
+    start: Mapping[str, float] | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> Solution:
+    """Fit a model to the training rows by Levenberg-Marquardt steps on the weak form.
+
+    Parameters
+    ----------
+    model : JointModel
+    data : Dataset
+    iterations : int
+        At most so many in each of the two passes.
+    start : mapping of str to float, optional
+        Values to start from.
+    progress : callable, optional
+        ``progress(text, share)`` before each stage.
+
+    Raises
+    ------
+    InputError
+        A free parameter that moves no output.
+    """
+    if not model.lagging_load or LOAD_COMPLIANCE.name in data.joint.known:
+        return _fitted(model, data, iterations, start or {}, progress)
+    tied = {**(start or {}), LOAD_COMPLIANCE.name: 0.0}
+    rigid = _fitted(model, data, iterations, tied, progress, frozenset(HANGING))
+    swinging = _swings(rigid, data)
+    if swinging is None:
+        return rigid
+    found = _fitted(model, data, iterations, start or {}, progress)
+    # a start far from the scale of the torques can end in no fit at all: then the rigid fit is
+    # where to begin
+    left = [_left(model, s.values, data) for s in (found, rigid)]
+    return found if left[0] < left[1] else _fitted(model, data, iterations, swinging, progress)
+
+
+def _left(model: JointModel, values: Mapping[str, float], data: Dataset) -> float:
+    """RMS of what these values leave on the training rows of the one balance of an axis."""
+    return rms(stack(balances_of(model, data.sensing, wrt=()), data.train, values).residual["axis"])
+
+
+def _swings(rigid: Solution, data: Dataset) -> dict[str, float] | None:
+    """Values with a link that swings unseen, where it shows itself in the rows of a model that
+    was fitted as rigid; else None.
+    """
+    model = rigid.model
+    free = [*rigid.free, *HANGING]
+    free = [n for n in model.parameter_names if n in free]
+    balances = balances_of(model, data.sensing, wrt=free)
+    limits = bounds_of(model, data.joint.known, data)
+    values, _ = WeakForm(balances, data, rigid.values, tuple(free), rigid.weights).fitted(limits, 6)
+    sizes = [_left(model, v, data) for v in (rigid.values, values)]
+    lag = model.swinging_inertia(values) * values[LOAD_COMPLIANCE.name]
+    slow = lag * (2 * math.pi * HIGHEST_SWING / data.kernel) ** 2 > 1
+    return values if slow and sizes[1] < (1 - LEAST_SWING) * sizes[0] else None
+
+
+def _fitted(
+    model: JointModel,
+    data: Dataset,
+    iterations: int,
+    start: Mapping[str, float],
+    progress: Callable[[str, float], None] | None,
+    held: frozenset[str] = frozenset(),
+) -> Solution:
+    """The fit itself; the parameters `held` keep their start values."""
+    known = data.joint.known
+    values = starts(model, data)
+    values.update({k: v for k, v in start.items() if k in values})
+    fixed = {n: k.value for n, k in known.items() if k.value is not None and n in values}
+    values.update({n: v for n, v in fixed.items() if v is not None})
+    limits = bounds_of(model, known, data)
+    shapes = {p.name for p in model.parameters if p.is_shape}
+    runs = names_of_runs(model, data.train)
+    free = [
+        *(
+            n
+            for n in model.parameter_names
+            if n not in fixed and n not in held and n not in model.calibration
+        ),
+        *runs,
+    ]
+    balances = balances_of(model, data.sensing, wrt=bare(free))
+    for n in free:
+        low, high = limits[n]
+        values[n] = min(max(values[n], low), high)
+    tell = progress or (lambda text, share: None)
+    tell("start values", 0.0)
+    # first pass without shapes: linear amplitudes from any start
+    linear_only = [n for n in free if n not in shapes and not is_of_run(n)]
+    linear = WeakForm(
+        balances, data, values, tuple(linear_only), dict.fromkeys(balances.balances, 1.0)
+    )
+    _check_moves(linear)
+    values, _ = linear.fitted(limits, 3)
+    values = _best_start(balances, data, values, free, limits)
+    for number in range(2):
+        tell(("first pass", "second pass")[number], 0.2 + 0.35 * number)
+        sigma = _sigmas(model, data, values)
+        weights = row_weights(balances, data, values, sigma, data.train)
+        values, used = WeakForm(balances, data, values, tuple(free), weights).fitted(
+            limits, iterations
+        )
+    sigma = _sigmas(model, data, values)
+    weights = row_weights(balances, data, values, sigma, data.train)
+    tell("standard errors", 0.9)
+    return _with_errors(WeakForm(balances, data, values, tuple(free), weights), limits, sigma, used)
+
+
+def _sigmas(model: JointModel, data: Dataset, values: Mapping[str, float]) -> dict[str, float]:
+    """RMS of each balance on the training rows, at least its floor."""
+    residual = stack(balances_of(model, data.sensing, wrt=()), data.train, values).residual
+    floor = floors(model, data, values)
+    return {
+        b: max(rms(r[taking_part(b, data.train)]), floor[b], 1e-12) for b, r in residual.items()
+    }
+
+
+def _best_start(
+    balances: Balances,
+    data: Dataset,
+    values: dict[str, float],
+    free: Sequence[str],
+    limits: Mapping[str, tuple[float, float]],
+) -> dict[str, float]:
+    """Friction laws with a shape near zero velocity have several valleys: the best of a few
+    smoothing velocities and exponents.
+    """
+    shaped = [t for t in balances.model.terms if t.effect.several_valleys]
+    if not shaped:
+        return values
+    smooth = [n for t in shaped for n in balances.model.named("smoothing", t.place)]
+    exponents = [
+        n
+        for n in balances.model.named("exponent")
+        if any(n in t.names for t in shaped) and n in free
+    ]
+    trials = [dict(values)]
+    for share in (0.003, 0.01):
+        for power in (1.0, 2.0) if exponents else (1.0,):
+            moved = {
+                n: min(max(share * data.ranges["velocity"], limits[n][0]), limits[n][1])
+                for n in smooth
+                if n in free
+            }
+            trials.append({**values, **moved, **dict.fromkeys(exponents, power)})
+    floor = floors(balances.model, data, values)
+    sigma = {b: max(floor[b], 1e-12) for b in floor}
+    reference = trials[-1]
+    weights = row_weights(balances, data, reference, sigma, data.train)
+    bare = balances_of(balances.model, data.sensing, wrt=())
+    best: tuple[float, dict[str, float]] | None = None
+    for trial in trials:
+        fitted, _ = WeakForm(balances, data, trial, tuple(free), weights).fitted(limits, 6)
+        residual = stack(bare, data.train, fitted).residual
+        cost = sum(float(np.sum((residual[b] * weights[b]) ** 2)) for b in residual)
+        if best is None or cost < best[0]:
+            best = (cost, fitted)
+    return best[1] if best is not None else values
+
+
+def _check_moves(problem: WeakForm) -> None:
+    values = problem.values
+    jacobian = problem.stacked(np.array([values[n] for n in problem.free])).jacobian
+    dead = [
+        n
+        for i, n in enumerate(problem.free)
+        if max(float(np.abs(j[:, i]).max(initial=0.0)) for j in jacobian.values()) == 0.0
+        and values[n] != 0.0
+    ]
+    model = problem.balances.model
+    truly = [n for n in dead if n in (*model.inertias, model.stiffness_name)]
+    if truly:
+        raise InputError(
+            f"parameter {', '.join(truly)} moves no output of these records; give it a known "
+            "value or add the channel that shows it"
+        )
+
+
+def _with_errors(
+    problem: WeakForm,
+    limits: Mapping[str, tuple[float, float]],
+    sigma: Mapping[str, float],
+    used: int,
+) -> Solution:
+    """Standard errors from blocks of time and from what noise of the positions takes off; what
+    cannot be identified is said.
+    """
+    balances, data, values, free = problem.balances, problem.data, problem.values, problem.free
+    weights = {b: np.asarray(w, dtype=np.float64) for b, w in problem.weights.items()}
+    stacked = problem.stacked(np.array([values[n] for n in free]))
+    j = np.concatenate([stacked.jacobian[b] * weights[b][:, None] for b in balances.balances])
+    r = np.concatenate([stacked.residual[b] * weights[b] for b in balances.balances])
+    block = np.tile(stacked.block, len(balances.balances))
+    norms = np.linalg.norm(j, axis=0)
+    smoothing = balances.model.named("smoothing")
+    at_bound = [
+        n
+        for n in free
+        if any(
+            math.isfinite(limit) and abs(values[n] - limit) <= 1e-9 * max(abs(limit), 1e-300)
+            for limit in limits[n]
+        )
+        and n not in smoothing
+    ]
+    usable = np.array(
+        [
+            norm > 1e-12 * norms.max() and n not in at_bound
+            for n, norm in zip(free, norms, strict=True)
+        ]
+    )
+    stderr: dict[str, float | None] = dict.fromkeys(values)
+    correlation: dict[str, tuple[str, float]] = {}
+    unidentified = [
+        n
+        for n, norm in zip(free, norms, strict=True)
+        if norm <= 1e-12 * norms.max() and n not in smoothing
+    ]
+    index = np.flatnonzero(usable)
+    if len(index):
+        scaled = j[:, index] / norms[index]
+        errors = block_errors(scaled, r, block)
+        pulled = {name.replace(" ", "_"): share for name, share in attenuation(data).items()}
+        biases = np.array([pulled.get(free[i], 0.0) * values[free[i]] for i in index.tolist()])
+        size = None if errors is None else np.hypot(errors / norms[index], biases)
+        spread, corr = correlations(scaled.T @ scaled)
+        corr[:, [is_of_run(free[i]) for i in index.tolist()]] = 0.0
+        for k, i in enumerate(index.tolist()):
+            stderr[free[i]] = None if size is None else float(size[k])
+            other = int(np.argmax(np.abs(corr[k])))
+            correlation[free[i]] = (free[int(index[other])], float(corr[k, other]))
+            weak = size is not None and values[free[i]] != 0 and size[k] > abs(values[free[i]])
+            if (spread[k] > 1e4 or weak) and free[i] not in smoothing and not is_of_run(free[i]):
+                unidentified.append(free[i])
+    kept = dict(values)
+    model = balances.model
+    for n in model.calibration:
+        kept[n] = float(np.mean([kept[k] for k in free if is_of_run(k) and k.startswith(f"{n}[")]))
+    own = {n: x for n, x in kept.items() if not is_of_run(n)}
+    return Solution(
+        replace(model, values=own),
+        kept,
+        stderr=stderr,
+        free=tuple(n for n in free if not is_of_run(n)),
+        weights=weights,
+        sigma=sigma,
+        at_bound=tuple(at_bound),
+        unidentified=tuple(unidentified),
+        correlation=correlation,
+        iterations=used,
+    )

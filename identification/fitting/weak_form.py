@@ -1,0 +1,136 @@
+"""The weak form as a least-squares problem: rows of the balances against the parameters that
+move."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final, final
+
+import numpy as np
+import numpy.typing as npt
+
+from casadi_models import JointModel
+from identification.balance.balances import Balances, balances_of
+from identification.balance.dataset import Dataset
+from identification.balance.stacked import Stacked, stack
+from identification.fitting.least_squares import least_squares
+
+FloatArray = npt.NDArray[np.float64]
+
+NUMERIC_STEP: Final = 1e-2
+"""Relative step of the shapes that act through internal states: their law has kinks, which smaller
+steps would resolve."""
+ENOUGH: Final = 1e-6
+"""Relative fall of the sum of squares that ends a fit: a thousandth of a standard error over a few
+hundred rows."""
+
+
+def memory_shapes_of(model: JointModel, free: Sequence[str]) -> tuple[str, ...]:
+    """Shape parameters that act through internal states only: differentiated numerically."""
+    out = []
+    for t in model.terms:
+        if t.effect.memory is not None:
+            out += [
+                n
+                for n, p in zip(t.names, t.effect.parameters, strict=True)
+                if p.is_shape and n in free
+            ]
+    return tuple(out)
+
+
+@final
+@dataclass(frozen=True)
+class WeakForm:
+    """Rows of the balances on the training records, weighted; a
+    :class:`identification.fitting.least_squares.Problem`.
+
+    Attributes
+    ----------
+    balances : Balances
+        With a Jacobian column for every one of `free`.
+    data : Dataset
+    values : mapping of str to float
+        Of every parameter; those not free stay.
+    free : tuple of str
+        The parameters that move, in the order of the problem's vector.
+    weights : mapping of str to float or (rows,) array
+        1/sigma of each balance, or of each of its rows.
+    """
+
+    balances: Balances
+    data: Dataset
+    values: Mapping[str, float]
+    free: tuple[str, ...]
+    weights: Mapping[str, float | FloatArray]
+
+    @cached_property
+    def _bare(self) -> Balances:
+        return balances_of(self.balances.model, self.data.sensing, wrt=())
+
+    @cached_property
+    def logarithmic(self) -> npt.NDArray[np.bool_]:
+        """Which of the free parameters are scales: positive, of unknown size."""
+        known = {p.name: p for p in self.balances.model.parameters}
+        return np.array(
+            [
+                n in known
+                and known[n].is_shape
+                and known[n].scale != "absolute"
+                and self.values[n] > 0
+                for n in self.free
+            ],
+            dtype=bool,
+        )
+
+    def at(self, x: FloatArray) -> dict[str, float]:
+        """Values of every parameter."""
+        return {**self.values, **dict(zip(self.free, map(float, x), strict=True))}
+
+    def stacked(self, x: FloatArray) -> Stacked:
+        """Residual and Jacobian of every balance, unweighted, columns of `free`."""
+        values = self.at(x)
+        found = stack(self.balances, self.data.train, values, self.free)
+        jacobian = {b: np.array(j) for b, j in found.jacobian.items()}
+        for n in memory_shapes_of(self.balances.model, self.free):
+            step = NUMERIC_STEP * values[n]
+            moved = stack(self._bare, self.data.train, {**values, n: values[n] + step}).residual
+            for b in jacobian:
+                jacobian[b][:, self.free.index(n)] = (moved[b] - found.residual[b]) / step
+        return Stacked(found.residual, jacobian, found.block, found.taking)
+
+    def residual(self, x: FloatArray) -> FloatArray:
+        """Weighted rows, one balance after the other."""
+        rows = stack(self._bare, self.data.train, self.at(x)).residual
+        return np.concatenate([rows[b] * self.weights[b] for b in self.balances.balances])
+
+    def jacobian(self, x: FloatArray) -> FloatArray:
+        """Their derivative, (rows, free)."""
+        found = self.stacked(x).jacobian
+        return np.concatenate(
+            [found[b] * np.atleast_1d(self.weights[b])[:, None] for b in self.balances.balances]
+        )
+
+    def fitted(
+        self, limits: Mapping[str, tuple[float, float]], iterations: int
+    ) -> tuple[dict[str, float], int]:
+        """Values at the minimum inside the limits, and the steps it took.
+
+        Parameters
+        ----------
+        limits : mapping of str to (low, high)
+        iterations : int
+            At most so many.
+        """
+        start = [self.values[n] for n in self.free]
+        low, high = [limits[n][0] for n in self.free], [limits[n][1] for n in self.free]
+        found = least_squares(
+            self,
+            start,
+            (low, high),
+            logarithmic=self.logarithmic,
+            iterations=iterations,
+            tolerance=ENOUGH,
+        )
+        return self.at(found.x), found.iterations

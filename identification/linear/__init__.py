@@ -1,0 +1,1 @@
+"""Linear models without physics: subspace identification, black boxes, frequency responses."""

@@ -1,0 +1,3 @@
+"""The online estimator of a joint: rows while they happen, recursion, guard, faults; no FMI in
+it.
+"""

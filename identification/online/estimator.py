@@ -1,0 +1,550 @@
+"""The online estimator of a joint: balances, recursive least squares, checks, fault detection;
+no FMI in it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Final, final
+
+import numpy as np
+import numpy.typing as npt
+
+from identification.data.joint_file import Joint
+from identification.faults.detector import ABSURD
+from identification.linear.triangle import single_thread
+from identification.online.first_window import (
+    fast_recursion,
+    first_estimate,
+    least_range,
+    reversal_weights,
+)
+from identification.online.grid import Grid
+from identification.online.guard import Guard
+from identification.online.options import (
+    OnlineOptions,
+    estimated_parameters,
+    held_parameters,
+    prepared,
+    searched_parameters,
+)
+from identification.online.pulse import GAP, Pulse
+from identification.online.row_check import LEAST, RowCheck
+from identification.online.rows import RowMaker
+from identification.online.samples import Samples
+from identification.online.supervision import advance, guarded, launch
+from identification.online.two_step import make_two_step
+from identification.online.verdict import (
+    FAULT_TEXT,
+    HELD,
+    NONE,
+    implausible,
+    make_detector,
+    plant_alarm,
+    worst,
+)
+from identification.online.watch import DRIVE, Q_L, Q_M, SAMPLED, TAU, W_L, W_M, Watch
+from identification.recursive.estimator import RecursiveLeastSquares, Settings
+from identification.two_step.algorithm import OnlineSettings
+
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+
+_RESIDUAL_SECONDS: Final = 2.0
+_STRAIN: Final = OnlineSettings()
+"""When residuals ask for another search of the nonlinear parameters."""
+_ALL: Final = [True] * 6
+_NONE_FAILED: Final = (False,) * 6
+
+
+@final
+class OnlineEstimator:
+    """Estimates the linear parameters of a joint sample by sample.
+
+    Parameters
+    ----------
+    joint : Joint
+        The joint file; shapes of friction laws are held at its values.
+    dt : float
+        Sample time [s].
+    options : OnlineOptions, optional
+    detector_state : bytes, optional
+        State of a calibrated :class:`identification.faults.detector.FaultDetector` of this joint.
+
+    Attributes
+    ----------
+    names, theta, sigma
+        Estimated parameters, values and standard deviations, link-referred SI.
+    residual, floor, ratio : (balances,) array
+        Residual of the last row, floor, and root mean square of the last seconds over the floor.
+    unusable : tuple of int
+        Readings of the last sample that were no number or beyond
+        :data:`identification.faults.detector.ABSURD`; they count as missing.
+    fault, score
+        See :data:`FAULT_TEXT`; how far each reading's residuals are from their limits (1: at the
+        limit).
+    """
+
+    def __init__(
+        self,
+        joint: Joint,
+        dt: float,
+        options: OnlineOptions | None = None,
+        detector_state: bytes | None = None,
+    ) -> None:
+        self.joint, self.dt = joint, dt
+        self.options = options or OnlineOptions()
+        self.model, self.sensing = prepared(joint, self.options)
+        self.rows = RowMaker(self.model, self.sensing, dt, held_parameters(joint))
+        self.names, self.balances = self.rows.names, self.rows.balances
+        self.guard = Guard(
+            self.names, self.balances, self.rows.timing.stride * dt, self.model.inertias
+        )
+        self._plain_rows, self.two_step = self.rows, make_two_step(joint, self.rows, self.options)
+        has_link = self.options.has_link
+        self.present = (True, True, True, has_link, has_link, self.options.has_torque)
+        self._all, self._whole = list(self.present), all(self.present)
+        used: list[bool] = np.any(self.rows.uses, axis=0).tolist()
+        self._needs = [False] * 6
+        for k, reading in enumerate(SAMPLED):
+            self._needs[reading] = used[k] and self.present[reading]
+        self.samples = Samples(self.rows.timing, self._needs)
+        self.watch = Watch(dt, self.present)
+        self.grid = Grid(dt, max(GAP * self.rows.timing.length, 1.5 * dt))
+        self.pulse = Pulse(dt, self.rows.timing.length, self.present)
+        own = {p.name: (p.low, p.high) for p in self.model.parameters}
+        start = dict(zip(self.model.parameter_names, self.model.value_vector(), strict=True))
+        self.low = np.array([min(own[n][0], start[n]) for n in self.names])
+        self.high = np.array([max(own[n][1], start[n]) for n in self.names])
+        self._margin = 1.0
+        self.detector = (
+            make_detector(self.model, dt, self.options, detector_state)
+            if self.options.detect and self.is_fitted
+            else None
+        )
+        self._confirm = replace(_STRAIN, sample_time=self.rows.timing.stride * dt).samples(
+            _STRAIN.confirm_seconds
+        )
+        self._collect = max(
+            2 * len(self.names), round(self.options.warm_up / (self.rows.timing.stride * dt))
+        )
+        self._from_link = [b in ("link", "transmission") for b in self.balances]
+        self._friction = [
+            [
+                self.names.index(p.name)
+                for t in self.model.terms
+                if t.place == place and t.effect.family == "friction"
+                for p in t.parameters
+                if p.unit == "N.m" and p.name in self.names
+            ]
+            for place in ("motor", "link")
+        ]
+        self._feels = np.array(
+            [
+                [
+                    place in b or b in ("sum", "axis") or (b == "deflection" and place == "motor")
+                    for place in ("motor", "link")
+                ]
+                for b in self.balances
+            ]
+        )
+        rate = self.rows.timing.stride * dt / _RESIDUAL_SECONDS
+        self._check = RowCheck(
+            len(self.balances),
+            len(self.names),
+            self._friction,
+            self._feels,
+            rate,
+            _STRAIN.error_limit,
+        )
+        self._reference = [11 if from_link else 1 for from_link in self._from_link]
+        self.reset()
+        self._recursion(self.theta)  # its functions are made here and not inside a step
+
+    # --- life -------------------------------------------------------------------------------------
+
+    def reset(self) -> None:
+        """Before the first sample."""
+        count, n = len(self.balances), len(self.names)
+        self.rows = self._plain_rows
+        self.rows.reset()
+        self.watch.reset()
+        self.pulse.reset()
+        self.grid.reset()
+        self.guard.reset()
+        if self.two_step is not None:
+            self.two_step.reset()
+        if self.detector is not None:
+            self.detector.reset()
+        self.samples.reset()
+        self._since = self._rows = self._strained = 0
+        self._last_good = [0.0] * 6
+        self._collected: list[tuple[FloatArray, FloatArray, FloatArray]] = []
+        self.estimator: RecursiveLeastSquares | None = None
+        self._scale = np.ones(n)
+        values = dict(zip(self.model.parameter_names, self.model.value_vector(), strict=True))
+        self.theta = np.array([values[name] for name in self.names])
+        self.sigma = np.zeros(n)
+        self.residual, self.floor, self.ratio = np.zeros(count), np.zeros(count), np.zeros(count)
+        self._square, self._torque, self.level = np.zeros(count), np.zeros(count), np.zeros(count)
+        self.fault, self.score = NONE, [0.0] * 6
+        self.plant_alarm = 0
+        self.readings = [0.0] * 6
+        self.events: list[str] = []
+
+    @property
+    def warming_up(self) -> bool:
+        """True until the recursion has started."""
+        return self.estimator is None
+
+    @property
+    def is_fitted(self) -> bool:
+        """True where the joint file has a value for every estimated parameter."""
+        return all(n in self.joint.fitted for n in self.names)
+
+    @property
+    def held(self) -> bool:
+        """True while the estimate shown is one from before: the readings stand still, or what
+        they say is not believed.
+        """
+        return self.estimator is not None and (self.pulse.failed or self.guard.on_probation)
+
+    @property
+    def least(self) -> FloatArray:
+        """What counts as noise of each balance at least [N.m], (balances,)."""
+        share = self.options.floor_share * np.sqrt(self._torque)
+        found: FloatArray = np.maximum(np.maximum(self.floor, share), LEAST)
+        return found
+
+    @property
+    def made(self) -> int:
+        """Rows so far."""
+        return self._rows
+
+    @property
+    def wanted(self) -> bool:
+        """True where the residuals stay over their limit although the linear parameters follow."""
+        return self._strained >= self._confirm
+
+    def reoptimise(self) -> bool:
+        """Search the shapes as soon as there are rows enough; False where there are none."""
+        if self.two_step is None:
+            return False
+        self.two_step.ask()
+        return True
+
+    def set_fault_margin(self, factor: float) -> None:
+        """Multiply the fault detector's limits."""
+        if self.detector is not None and factor != self._margin:
+            self.detector.scale_limits(factor / self._margin)
+            self._margin = factor
+
+    def update(
+        self, time: float, readings: Sequence[float], valid: Sequence[bool], *, enable: bool = True
+    ) -> bool:
+        """Take one sample; it need not lie on the grid of the sample time.
+
+        Parameters
+        ----------
+        time : float
+            [s]
+        readings : sequence of float
+            Drive torque, motor position and velocity, link position and velocity, torque;
+            link-referred SI.
+        valid : sequence of bool
+            False for a reading that is missing.
+        enable : bool
+            False: the estimate is held.
+
+        Returns
+        -------
+        bool
+            True where a row was made.
+        """
+        values = list(map(float, readings))
+        a, b, c, d, e, f = values
+        top = ABSURD
+        self.unusable: tuple[int, ...] = ()
+        if not (
+            -top < a < top
+            and -top < b < top
+            and -top < c < top
+            and -top < d < top
+            and -top < e < top
+            and -top < f < top
+        ):
+            self.unusable = tuple(i for i, v in enumerate(values) if not -top < v < top)
+            values = [0.0 if i in self.unusable else v for i, v in enumerate(values)]
+            valid = [flag and i not in self.unusable for i, flag in enumerate(valid)]
+        made = False
+        for at, row, flags in self.grid.due(time, values, valid):
+            made |= self._sample(at, row, flags, enable=enable)
+        return made
+
+    def _sample(
+        self, time: float, values: list[float], valid: Sequence[bool], *, enable: bool
+    ) -> bool:
+        """Take a sample on the grid; True where a row was made."""
+        good = (
+            self._all if valid == _ALL else [bool(valid[i]) and self.present[i] for i in range(6)]
+        )
+        given, failed_before = good, self.pulse.failed
+        counts = self.pulse.add(time, values)
+        if failed_before and not self.pulse.failed and self.detector is not None:
+            self.detector.reset()  # its observers have followed readings that were none
+        if self.pulse.failed or self.pulse.jumped:
+            good = [False] * 6
+        looked = self.watch.add(values, good)
+        used = (
+            values
+            if good is self._all and self._whole
+            else [
+                v if g else held for v, g, held in zip(values, good, self._last_good, strict=True)
+            ]
+        )
+        self._last_good = used
+        failed = self._detect(values, good)
+        q = used
+        self.samples.add((q[Q_M], q[Q_L] if self.present[Q_L] else q[Q_M], q[TAU], q[DRIVE]))
+        self.samples.mark(
+            good if counts else [False] * 6, failed, self.watch, whole=counts and good is self._all
+        )
+        made = False
+        self._since += 1
+        if self._since >= self.rows.timing.stride:
+            self._since = 0
+            made = self._row(time, enable)
+            self._judge(given if not self.pulse.jumped else good)
+        if looked:
+            self._floors()
+        if self.two_step is not None and self.two_step.searching and enable:
+            advance(self, self.two_step)
+        return made
+
+    def _detect(self, readings: list[float], good: list[bool]) -> Sequence[bool]:
+        """Run the fault detector; readings with failed ones replaced go to `self.readings`."""
+        detector = self.detector
+        if detector is None:
+            self.readings = list(self._last_good)
+            if not good[Q_L]:
+                self.readings[Q_L], self.readings[W_L] = self._link_from_motor()
+            return _NONE_FAILED
+        row = (
+            readings
+            if good is self._all and self._whole
+            else [v if g else math.nan for v, g in zip(readings, good, strict=True)]
+        )
+        self.readings = detector.update(row)
+        return detector.replaced
+
+    def _link_from_motor(self) -> tuple[float, float]:
+        """Link position and velocity from the motor, torsion taken off."""
+        q = self._last_good
+        name = self.model.stiffness_name
+        at = self.names.index(name) if name in self.names and self.options.has_torque else -1
+        stiffness = float(self.theta[at]) if at >= 0 else 0.0
+        return (q[Q_M] - q[TAU] / stiffness if stiffness > 0 else q[Q_M]), q[W_M]
+
+    # --- rows -------------------------------------------------------------------------------------
+
+    def _row(self, time: float, enable: bool) -> bool:
+        found = self.rows.make(self.samples.window, time)
+        if found is None:
+            return False
+        y, h = found
+        self._rows += 1
+        on: BoolArray = ~np.any(self.rows.uses & self.samples.lost, axis=1)
+        shares = self._shares()
+        if self.two_step is not None:
+            self.two_step.keep(self.rows.new_points, self.rows.signals, shares, on)
+        if self.estimator is None:
+            if enable and on.all():
+                self._collected.append((y, h, shares))
+                self._torque += self.rows.signals[self._reference] ** 2
+                if len(self._collected) >= self._collect:
+                    with single_thread():
+                        self._begin()
+            return True
+        check = self._check
+        check(
+            y,
+            h,
+            self.theta,
+            shares,
+            on,
+            self.floor,
+            self.level,
+            self.rows.signals[self._reference],
+            self._square,
+            self._torque,
+            self.options.floor_share,
+        )
+        self.residual, self.ratio = check.error.copy(), check.ratio.copy()
+        self._square, self._torque = check.square.copy(), check.torque.copy()
+        if not enable:
+            return True
+        if not on.any():
+            self.theta = self._within(self.guard.blind(self.estimator))
+            return True
+        for b, use in enumerate(on.tolist()):
+            self.estimator.enable(b, use)
+        theta = self.estimator.update(check.y, check.h)
+        noise = self.estimator._ready("noise").part("fast", "noise")
+        np.maximum(noise, check.least**2, out=noise)
+        self._strained = self._strained + 1 if check.over.any() else 0
+        self.theta = self._within(
+            guarded(self, self.guard, theta, check.weighted_error, check.least, on)
+        )
+        if (
+            self.two_step is not None
+            and self.two_step.due(self._strained)
+            and not self.guard.several
+        ):
+            launch(self, self.two_step)
+        return True
+
+    def _within(self, theta: FloatArray) -> FloatArray:
+        """The estimate to show: never outside what the parameters can be."""
+        found: FloatArray = np.clip(theta, self.low, self.high)
+        return found
+
+    def _shares(self) -> FloatArray:
+        """Share of the kernel in which motor and link stand still or turn round."""
+        noise = self.watch.noise
+        return self.rows.standstill(float(noise[Q_M]), float(noise[Q_L]))
+
+    def _size(self) -> FloatArray:
+        """Size of the residuals now."""
+        found: FloatArray = np.maximum(np.maximum(self.floor, np.sqrt(self._square)), LEAST)
+        return found
+
+    def _weight_of(self, shares: FloatArray, theta: FloatArray, size: FloatArray) -> FloatArray:
+        """Weights (rows, balances) from the shares (rows, 2) and the size of the residuals
+        (balances,).
+        """
+        level = np.array(
+            [float(np.abs(theta[which]).sum()) if which else 0.0 for which in self._friction]
+        )
+        return reversal_weights(shares * level, self._feels, size)
+
+    def _begin(self) -> None:
+        """Start the recursion from the collected rows."""
+        y, h, shares = (np.array([row[i] for row in self._collected]) for i in range(3))
+        self._torque /= len(y)
+        least = np.maximum(self.options.floor_share * np.sqrt(self._torque), LEAST)
+        first, weight = first_estimate(y, h, least, partial(self._weight_of, shares))
+        least = np.maximum(least, self.rows.floor(first.tolist(), self.watch.noise[list(SAMPLED)]))
+        y, h = y * weight, h * weight[:, :, None]
+        self._scale = np.maximum(np.maximum(np.abs(first), np.abs(self.theta)), least_range(h, y))
+        self.estimator = self._recursion(self.theta)
+        started = self.estimator.begin(y, h, least, overlap=self.rows.timing.overlap)
+        if started.undetermined:
+            names = ", ".join(self.names[i] for i in started.undetermined)
+            self.events.append(f"not determined by the first window: {names}")
+        self.theta = self._within(self.estimator.theta)
+        self.sigma = self.estimator.deviation
+        self._square = np.mean((y - h @ self.theta) ** 2, axis=0)
+        self._collected = []
+        self._floors()
+        self.level = np.sqrt(self._square)
+        self.guard.start(self.estimator)
+        if self.two_step is not None and not self.two_step.known:
+            launch(self, self.two_step, first=True)
+
+    def _factory(self) -> Callable[[FloatArray, FloatArray], RecursiveLeastSquares]:
+        """(values, scale) -> recursive least squares with the present options."""
+        period = self.rows.timing.stride * self.dt
+        settings = Settings(
+            sample_time=period,
+            drift=self.options.drift,
+            alarm_drift=self.options.alarm_drift,
+            window_seconds=2.0,
+            rank_seconds=8.0,
+            inflation=self.rows.timing.overlap,
+        )
+        return partial(fast_recursion, len(self.balances), self.names, settings)
+
+    def _recursion(self, values: FloatArray) -> RecursiveLeastSquares:
+        return self._factory()(values, self._scale)
+
+    def retune(self, options: OnlineOptions) -> None:
+        """Take up other forgetting bounds and floors while running; the estimate stays."""
+        self.options = replace(
+            self.options,
+            drift=options.drift,
+            alarm_drift=options.alarm_drift,
+            floor_share=options.floor_share,
+        )
+        if self.estimator is not None:
+            fresh = self._recursion(self.theta)
+            old, new = self.estimator._ready("retune"), fresh._ready("retune")
+            new.fast[:], new.slow[:] = old.fast, old.slow
+            new.theta[:] = old.theta
+            self.estimator = fresh
+            self.guard.start(fresh)
+
+    # --- judgement --------------------------------------------------------------------------------
+
+    def _floors(self) -> None:
+        if self.estimator is None:
+            return
+        noise = self.watch.noise[list(SAMPLED)]
+        self.floor = self.rows.floor(self.theta.tolist(), noise)
+        self.sigma = self.estimator.deviation
+        self._ratios()
+
+    def _ratios(self) -> None:
+        self.ratio = np.sqrt(self._square) / self.least
+
+    def _judge(self, good: list[bool]) -> None:
+        """The most severe fault now, and the scores."""
+        detector = self.detector
+        if detector is not None:
+            self.plant_alarm, self.score = plant_alarm(detector, self.dt), detector.scores()
+        missing = [
+            not g and (self._needs[i] or (detector is not None and self.present[i]))
+            for i, g in enumerate(good)
+        ]
+        found = (
+            HELD
+            if self.pulse.failed and self.estimator is not None
+            else worst(missing, detector, self.watch)
+        )
+        if not found and self.estimator is not None and self.is_fitted:
+            found = implausible(self.names, self.theta, self.sigma, self.joint.fitted)
+        found = found or self.plant_alarm or (HELD if self.guard.on_probation else NONE)
+        if found != self.fault and found:
+            self.events.append(f"fault {found}")
+        self.fault = found
+
+    # --- state ------------------------------------------------------------------------------------
+
+    def state(self) -> bytes:
+        """Everything the estimator will use again, as bytes; of a running search what it
+        started from and how far it is.
+        """
+        from identification.online.state import state
+
+        return state(self)
+
+    def restore(self, saved: bytes) -> None:
+        """Take up a state of an estimator of the same joint and options; a running search is
+        repeated up to where it was.
+        """
+        from identification.online.state import restore
+
+        restore(self, saved)
+
+
+__all__ = [
+    "FAULT_TEXT",
+    "OnlineEstimator",
+    "OnlineOptions",
+    "estimated_parameters",
+    "held_parameters",
+    "prepared",
+    "searched_parameters",
+]

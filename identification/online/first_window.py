@@ -1,0 +1,126 @@
+"""Least squares of the first window, before the recursion starts, and weights of rows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from identification.recursive.estimator import RecursiveLeastSquares, Settings
+
+FloatArray = npt.NDArray[np.float64]
+
+
+ABSENT: Final = 1e-30
+"""Size under which a column holds nothing but rounding (a sensor that stands still from the
+first sample on).
+"""
+
+
+RIDGE: Final = 1e-5
+"""Weight of the rows theta = 0 beside columns of unit length: a direction that is 1000 times weaker
+than its columns loses one part in ten thousand, one that rounding alone shows stays at zero."""
+
+
+def least_range(h: FloatArray, y: FloatArray) -> FloatArray:
+    """Smallest prior range of each parameter: what moves the balances by a hundredth of their
+    torque.
+
+    Parameters
+    ----------
+    h : (rows, balances, parameters) array
+    y : (rows, balances) array
+    """
+    size = np.sqrt(np.mean(h**2, axis=(0, 1)))
+    level = float(np.sqrt(np.mean(y**2))) or 1.0
+    found: FloatArray = np.where(size > ABSENT, 0.01 * level / np.maximum(size, ABSENT), 1.0)
+    return found
+
+
+def least_squares(y: FloatArray, h: FloatArray, least: FloatArray) -> FloatArray:
+    """Least squares with columns of equal size and balances of equal residual; what no row shows
+    stays at zero.
+
+    Parameters
+    ----------
+    y, h
+        As in :func:`least_range`.
+    least : (balances,) array
+        Residual of each balance at least [N.m].
+    """
+    count = h.shape[2]
+    weight = 1.0 / np.maximum(np.sqrt(np.mean(y**2, axis=0)), least)
+    theta = np.zeros(count)
+    for _ in range(2):
+        rows = (h * weight[:, None]).reshape(-1, count)
+        size = np.linalg.norm(rows, axis=0)
+        shrink = np.where(size > ABSENT, 1 / np.maximum(size, ABSENT), 0.0)
+        target = (y * weight).ravel()
+        ridge = np.vstack([rows * shrink, RIDGE * np.eye(count)])
+        stacked = np.column_stack([ridge, np.concatenate([target, np.zeros(count)])])
+        triangle: FloatArray = np.asarray(np.linalg.qr(stacked, mode="r"))
+        theta = np.asarray(
+            np.linalg.solve(triangle[:count, :count], triangle[:count, count]) * shrink,
+            dtype=np.float64,
+        )
+        weight = 1.0 / np.maximum(np.sqrt(np.mean((y - h @ theta) ** 2, axis=0)), least)
+    return theta
+
+
+def first_estimate(
+    y: FloatArray,
+    h: FloatArray,
+    least: FloatArray,
+    weight_of: Callable[[FloatArray, FloatArray], FloatArray],
+) -> tuple[FloatArray, FloatArray]:
+    """Least squares of the first window with weights that follow from it.
+
+    Parameters
+    ----------
+    y, h, least
+        As in :func:`least_squares`.
+    weight_of : callable
+        (parameters, size of the residuals (balances,)) -> weights (rows, balances).
+
+    Returns
+    -------
+    parameters and weights
+    """
+    weight = np.ones_like(y)
+    for _ in range(3):
+        first = least_squares(y * weight, h * weight[:, :, None], least)
+        size = 1.5 * np.median(np.abs(y - h @ first), axis=0)
+        weight = weight_of(first, np.maximum(size, least))
+    return first, weight
+
+
+def reversal_weights(doubt: FloatArray, feels: FloatArray, size: FloatArray) -> FloatArray:
+    """Weights (rows, balances) of rows at a reversal, where friction may take any value between its
+    limits.
+
+    Parameters
+    ----------
+    doubt : (rows, 2) array
+        Share of standstill times friction, of motor and link [N.m].
+    feels : (balances, 2) array
+        True where a balance holds that side's friction.
+    size : (balances,) array
+        Size of the residuals [N.m].
+    """
+    found: FloatArray = 1.0 / np.sqrt(
+        1.0 + np.sum((doubt[:, None, :] * feels) ** 2, axis=2) / size**2
+    )
+    return found
+
+
+def fast_recursion(
+    outputs: int, names: tuple[str, ...], settings: Settings, values: FloatArray, scale: FloatArray
+) -> RecursiveLeastSquares:
+    """Recursive least squares, its step compiled where there is a compiler; the numbers are the
+    same without.
+    """
+    made = RecursiveLeastSquares(values, scale, outputs=outputs, names=names, settings=settings)
+    made.compile()
+    return made

@@ -1,0 +1,244 @@
+"""Holds the estimate through sensor failures that nothing else has told: a recursion on probation.
+
+Where the residuals leave their level at once, the recursion goes on, but the estimate shown is the
+one from before. It is taken up again as it was when the residuals come back (the failure was
+temporary). The new one is accepted when it explains the readings and the change can be one of the
+joint: it shows in one balance, and no inertia has moved with the friction of its side. A failed
+sensor shows in several balances, or scales an inertia.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, final
+
+import numpy as np
+import numpy.typing as npt
+
+from identification.recursive.estimator import RecursiveLeastSquares
+
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+
+_LIMIT: Final = 5.0
+"""Residual over its level at which a probation begins."""
+_CAP: Final = 3.0
+_MEMORY: Final = 0.25
+_AGE: Final = 1.0
+_BACK: Final = 1.0
+_ACCEPT: Final = 3.0
+"""Time constant of the residuals; age of what is gone back to; time in which residuals must be
+back, or explained [s].
+"""
+_INERTIA: Final = 0.05
+_LONG_AGO: Final = -1_000_000
+_PLAIN: Final = (
+    "on_probation",
+    "_back",
+    "_explained",
+    "_next",
+    "held_for",
+    "_fast",
+    "_new",
+    "_over",
+    "_on",
+)
+
+
+@final
+class Guard:
+    """Watches the rows of an online estimator.
+
+    Parameters
+    ----------
+    names, balances : sequence of str
+        Parameters and balances.
+    period : float
+        Time between rows [s].
+    inertias : sequence of str
+        Those of the parameters that must stay positive.
+
+    Attributes
+    ----------
+    theta : (parameters,) array
+        The estimate to show.
+    on_probation : bool
+    held_for : int
+        Rows since the probation began.
+    """
+
+    def __init__(
+        self, names: Sequence[str], balances: Sequence[str], period: float, inertias: Sequence[str]
+    ) -> None:
+        self.inertias = [i for i, n in enumerate(names) if n in inertias]
+        self._count, self._size = len(balances), len(names)
+        self._rate = min(1.0, period / _MEMORY)
+        self._age, self._wait_back, self._wait_accept = (
+            max(1, round(t / period)) for t in (_AGE, _BACK, _ACCEPT)
+        )
+        self.reset()
+
+    def reset(self) -> None:
+        """Before the recursion starts."""
+        self.on_probation = False
+        self._back = self._explained = self._next = self.held_for = 0
+        self._fast, self._new = [0.0] * self._count, [0.0] * self._count
+        self._over, self._on = [_LONG_AGO] * self._count, [True] * self._count
+        self.theta = np.zeros(self._size)
+        self._kept: list[bytes] = []
+
+    def start(self, estimator: RecursiveLeastSquares) -> None:
+        """A new recursion, trusted."""
+        self.reset()
+        self.theta = estimator.theta
+        self._kept = [estimator.state()] * 2
+
+    def step(
+        self,
+        estimator: RecursiveLeastSquares,
+        theta: FloatArray,
+        error: FloatArray,
+        level: FloatArray,
+        on: BoolArray,
+    ) -> str:
+        """Judge the recursion after a row.
+
+        Parameters
+        ----------
+        estimator : RecursiveLeastSquares
+            After its update; it may be put back.
+        theta : (parameters,) array
+            Its estimate.
+        error : (balances,) array
+            Weighted residual of the row with the estimate shown.
+        level : (balances,) array
+            Size the residuals have when all is well.
+        on : (balances,) bool array
+            Balances whose readings were all there.
+
+        Returns
+        -------
+        str
+            What happened: "", "held", "back" or "accepted".
+        """
+        flags, limits = on.tolist(), [_LIMIT * v for v in level.tolist()]
+        lost = any(was and not now for was, now in zip(self._on, flags, strict=True))
+        self._on = flags
+        over = self._follow(self._fast, error.tolist(), limits)
+        if not self.on_probation:
+            return self._calm(estimator, theta, over, lost=lost)
+        self.held_for += 1
+        self._over = [
+            self.held_for if now else then for now, then in zip(over, self._over, strict=True)
+        ]
+        self._back = 0 if True in over else self._back + 1
+        unexplained = self._follow(self._new, estimator.error.tolist(), limits, share=0.5)
+        self._explained = 0 if True in unexplained else self._explained + 1
+        if self._back >= self._wait_back:
+            self._restore(estimator)
+            self.on_probation = False
+            return "back"
+        if self._explained >= self._wait_accept and self.plausible(theta):
+            self.start(estimator)
+            return "accepted"
+        return ""
+
+    def _follow(
+        self, squares: list[float], errors: list[float], limits: list[float], share: float = 1.0
+    ) -> list[bool]:
+        """Mean squares of errors, in place; what is far over the limit is cut, not to be
+        remembered for long.
+        """
+        over = []
+        for b, (error, limit, use) in enumerate(zip(errors, limits, self._on, strict=True)):
+            most = _CAP * limit
+            cut = min(max(error, -most), most) if use else 0.0
+            squares[b] += self._rate * (cut * cut - squares[b])
+            over.append(squares[b] > (share * limit) ** 2)
+        return over
+
+    def blind(self, estimator: RecursiveLeastSquares) -> FloatArray:
+        """No balance has its readings: the estimate to show."""
+        if True in self._on and not self.on_probation:
+            self._restore(estimator)
+        self._on = [False] * self._count
+        return self.theta
+
+    def _calm(
+        self, estimator: RecursiveLeastSquares, theta: FloatArray, over: list[bool], *, lost: bool
+    ) -> str:
+        if True in over:
+            self.on_probation = True
+            self._over = [0 if now else _LONG_AGO for now in over]
+            self._new = list(self._fast)
+            self._back = self._explained = self.held_for = 0
+            self.theta = self._before(estimator)
+            return "held"
+        if lost:  # rows before a failure was noticed may hold it
+            self._restore(estimator)
+            return ""
+        self.theta = theta
+        self._next += 1
+        if self._next >= self._age:
+            self._next = 0
+            self._kept = [self._kept[-1], estimator.state()]
+        return ""
+
+    def _before(self, estimator: RecursiveLeastSquares) -> FloatArray:
+        """The estimate of the older state kept."""
+        now = estimator.state()
+        estimator.restore(self._kept[0])
+        found = estimator.theta
+        estimator.restore(now)
+        return found
+
+    def _restore(self, estimator: RecursiveLeastSquares) -> None:
+        estimator.restore(self._kept[0])
+        self.theta = estimator.theta
+        self._kept = [self._kept[0]] * 2
+        self._next = 0
+
+    @property
+    def several(self) -> bool:
+        """True on probation where more than one balance is over its limit, or was just now: a
+        sensor rather than the joint.
+        """
+        return (
+            self.on_probation
+            and sum(self.held_for - then < self._wait_accept for then in self._over) > 1
+        )
+
+    def plausible(self, theta: FloatArray) -> bool:
+        """True where the joint itself may have changed from the estimate shown to `theta`."""
+        if self.several:
+            return False
+        at = self.inertias
+        return bool(np.all(np.abs(theta[at] - self.theta[at]) <= _INERTIA * np.abs(self.theta[at])))
+
+    def figures(self) -> dict[str, float]:
+        """Limits and times [rows], for the native twin."""
+        return {
+            "LIMIT": _LIMIT,
+            "CAP": _CAP,
+            "RATE": self._rate,
+            "AGE": self._age,
+            "BACK": self._wait_back,
+            "ACCEPT": self._wait_accept,
+            "INERTIA": _INERTIA,
+        }
+
+    # --- state ------------------------------------------------------------------------------------
+
+    def state(self) -> tuple[dict[str, Any], dict[str, FloatArray], dict[str, bytes]]:
+        """Everything that changes."""
+        parts = {f"guard{i}": kept for i, kept in enumerate(self._kept)}
+        return {n: getattr(self, n) for n in _PLAIN}, {"theta": self.theta}, parts
+
+    def restore(
+        self, plain: Mapping[str, Any], arrays: Mapping[str, FloatArray], parts: Mapping[str, bytes]
+    ) -> None:
+        """Take up what :meth:`state` gave."""
+        for name in _PLAIN:
+            setattr(self, name, plain[name])
+        self.theta = arrays["theta"]
+        self._kept = [parts[f"guard{i}"] for i in range(2) if f"guard{i}" in parts]

@@ -1,0 +1,142 @@
+"""What a new row says before the recursion takes it: residuals, weights, their mean squares; one
+CasADi call.
+
+A row at a reversal counts less: there friction may take any value between its limits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Final, final
+
+import casadi as ca
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+
+LEAST: Final = 1e-12
+"""Nothing counts as smaller than this [N.m]."""
+_INTO: Final = (
+    "y",
+    "h",
+    "theta",
+    "share",
+    "on",
+    "floor",
+    "level",
+    "reference",
+    "square",
+    "torque",
+    "floor_share",
+)
+_OUT: Final = ("error", "weighted_error", "square", "torque", "least", "ratio", "over", "y", "h")
+
+
+@final
+class RowCheck:
+    """Bound to fixed memory.
+
+    Parameters
+    ----------
+    balances, parameters : int
+    friction : (2) sequence of sequence of int
+        Parameters that are friction torques, of motor and link.
+    feels : (balances, 2) bool array
+        Balances that the friction of motor and link enters.
+    rate, limit : float
+        Share by which a row moves the mean squares; residual over its level that is too large.
+
+    Attributes
+    ----------
+    error, weighted_error : (balances,) array
+        Residuals of the last row, and times their weights.
+    square, torque, least, ratio, over : (balances,) array
+        Mean squares of the weighted residuals and of the torques; what counts as noise at least
+        [N.m]; residual over that; 1 where the residual is over its limit.
+    y, h : (balances,) and (balances, parameters) array
+        The row times its weights.
+    """
+
+    def __init__(
+        self,
+        balances: int,
+        parameters: int,
+        friction: Sequence[Sequence[int]],
+        feels: npt.NDArray[np.bool_],
+        rate: float,
+        limit: float,
+    ) -> None:
+        sizes = {
+            "h": (parameters, balances),
+            "theta": (parameters, 1),
+            "share": (2, 1),
+            "floor_share": (1, 1),
+        }
+        v = {name: ca.SX.sym(name, *sizes.get(name, (balances, 1))) for name in _INTO}
+        force = [
+            v["share"][i] * sum((ca.fabs(v["theta"][j]) for j in friction[i]), ca.SX(0))
+            for i in range(2)
+        ]
+        size = ca.fmax(ca.fmax(v["floor"], ca.sqrt(v["square"])), LEAST)
+        doubt = [
+            sum((force[i] * force[i] for i in range(2) if feels[b, i]), ca.SX(0))
+            for b in range(balances)
+        ]
+        weight = ca.vertcat(
+            *(1 / ca.sqrt(1 + doubt[b] / (size[b] * size[b])) for b in range(balances))
+        )
+        error = v["y"] - v["h"].T @ v["theta"]
+        left, use = weight * error, v["on"]
+        square = ca.if_else(use, v["square"] + rate * (left * left - v["square"]), v["square"])
+        torque = ca.if_else(
+            use,
+            v["torque"] + rate / 5 * (v["reference"] * v["reference"] - v["torque"]),
+            v["torque"],
+        )
+        least = ca.fmax(ca.fmax(v["floor"], v["floor_share"] * ca.sqrt(torque)), LEAST)
+        root = ca.sqrt(square)
+        over = ca.logic_and(use, root > limit * ca.fmax(least, v["level"]))
+        out = (
+            error,
+            left,
+            square,
+            torque,
+            least,
+            root / least,
+            over,
+            weight * v["y"],
+            v["h"] * ca.repmat(weight.T, parameters, 1),
+        )
+        function = ca.Function("check", list(v.values()), [ca.densify(e) for e in out])
+        self._into = [
+            np.zeros((balances, parameters) if name == "h" else v[name].numel()) for name in _INTO
+        ]
+        found = [np.zeros((balances, parameters) if name == "h" else balances) for name in _OUT]
+        self._buffer, self._trigger = function.buffer()
+        for i, item in enumerate(self._into):
+            self._buffer.set_arg(i, item.data)
+        for i, item in enumerate(found):
+            self._buffer.set_res(i, item.data)
+        (
+            self.error,
+            self.weighted_error,
+            self.square,
+            self.torque,
+            self.least,
+            self.ratio,
+            self.over,
+            self.y,
+            self.h,
+        ) = found
+
+    def __call__(self, *given: Any) -> None:
+        """Take y, h, theta, the shares of standstill, flags, floor, level, torques, mean
+        squares and the floor's share of the torque.
+        """
+        for target, value in zip(self._into, given, strict=True):
+            target[:] = value
+        self._trigger()
+
+
+__all__ = ["LEAST", "RowCheck"]

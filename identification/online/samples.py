@@ -1,0 +1,100 @@
+"""The last samples of an online estimator, as its rows need them, and which of them cannot be
+trusted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import final
+
+import numpy as np
+import numpy.typing as npt
+
+from identification.online.rows import SOURCES
+from identification.online.timing import Timing
+from identification.online.watch import SAMPLED, Watch
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@final
+class Samples:
+    """Sampled signals in the order of :data:`identification.online.rows.SOURCES`.
+
+    Parameters
+    ----------
+    timing : Timing
+    needs : sequence of bool
+        Readings that rows need.
+    """
+
+    def __init__(self, timing: Timing, needs: Sequence[bool]) -> None:
+        self.timing, self._needs = timing, needs
+        self.reset()
+
+    def reset(self) -> None:
+        """Before the first sample."""
+        self._buffer = np.zeros((4 * self.timing.window, len(SOURCES)))
+        self._end = 0
+        self._started = self._doubt = False
+        self._lost = [0] * len(SOURCES)
+
+    @property
+    def window(self) -> FloatArray:
+        """The samples of one row, oldest first."""
+        return self._buffer[self._end - self.timing.window : self._end]
+
+    @property
+    def lost(self) -> npt.NDArray[np.bool_]:
+        """Sources of which the window holds a sample that is missing or of a failed sensor."""
+        return np.array([count > 0 for count in self._lost])
+
+    def add(self, new: tuple[float, float, float, float]) -> None:
+        """Append a sample; the first one fills the window."""
+        length = self.timing.window
+        if self._end == len(self._buffer):
+            self._buffer[:length] = self._buffer[-length:].copy()
+            self._end = length
+        if not self._started:
+            self._started = True
+            self._buffer[:length] = new
+            self._end = length
+        self._buffer[self._end] = new
+        self._end += 1
+
+    def mark(
+        self, good: Sequence[bool], failed: Sequence[bool], watch: Watch, *, whole: bool
+    ) -> None:
+        """Note which readings of the newest sample count; `whole` where all of a joint's
+        readings are there.
+        """
+        if (
+            whole
+            and not self._doubt
+            and True not in failed
+            and True not in watch.constant
+            and True not in watch.scaled
+        ):
+            return
+        lost = self._lost
+        for k, reading in enumerate(SAMPLED):
+            bad = not good[reading] and self._needs[reading]
+            if bad or failed[reading] or watch.constant[reading] or watch.scaled[reading]:
+                lost[k] = self.timing.window + self.timing.stride
+            elif lost[k]:
+                lost[k] -= 1
+        self._doubt = any(lost)
+
+    def state(self) -> tuple[list[int], FloatArray]:
+        """Everything that changes."""
+        return [self._end, int(self._started), *self._lost], self._buffer
+
+    def restore(self, plain: Sequence[int], buffer: FloatArray) -> None:
+        """Take up what :meth:`state` gave."""
+        self._end, self._started, self._lost = (
+            int(plain[0]),
+            bool(plain[1]),
+            [int(v) for v in plain[2:]],
+        )
+        self._doubt = any(self._lost)
+        self._buffer[:] = buffer

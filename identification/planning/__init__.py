@@ -1,0 +1,1 @@
+"""Trajectory selection: which motion makes which parameter identifiable (thesis 3.8)."""

@@ -1,0 +1,1 @@
+"""Multilevel coordinate search (thesis 3.7)."""

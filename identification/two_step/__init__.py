@@ -1,0 +1,3 @@
+"""Two-step identification: linear parameters by least squares, the others by a search (thesis
+3.6).
+"""

@@ -1,0 +1,439 @@
+"""C code and tables of a native estimator, read off a Python estimator that has been built for the
+same joint.
+
+Nothing is computed twice here: kernels and laws come from
+:class:`identification.online.rows.RowMaker`, the recursion from
+:mod:`identification.recursive.ud_codegen`, the observer, its gains and its limits from the fault
+detector.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import tempfile
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, final
+
+import numpy as np
+import numpy.typing as npt
+
+from identification.data.joint_file import Joint
+from identification.errors import InputError
+from identification.faults.detector import MOVED, PARITY_SENSORS, DetectorTables
+from identification.online import watch as watch_settings
+from identification.online.estimator import _RESIDUAL_SECONDS, _STRAIN, OnlineEstimator
+from identification.online.first_window import ABSENT, RIDGE
+from identification.online.grid import ON_GRID
+from identification.online.row_check import LEAST
+from identification.online.rows import _NAMES, SOURCES, RowMaker
+from identification.online.verdict import _RECENT, FAULT_TEXT, HELD, SCALED
+from identification.online.watch import DRIVE, READINGS, TAU
+from identification.recursive.prior_start import PRIOR_PASSES, UNDETERMINED
+from irj_fmu.estimator.native_expressions import cheaper
+from irj_fmu.fmi.variables import Variable
+
+FloatArray = npt.NDArray[np.float64]
+
+MAX_WARM_UP: Final = 20.0
+"""Longest first window that a native estimator has room for, where the built-in one is not
+longer [s].
+"""
+_KINDS: Final = {"real": 0, "integer": 1, "boolean": 2, "string": 3}
+
+
+@final
+@dataclass(frozen=True)
+class Code:
+    """Generated text: CasADi's functions, and sizes, tables and start values."""
+
+    model: bytes
+    config: bytes
+
+
+def generate(joint: Joint, made: OnlineEstimator, variables: Sequence[Variable], guid: str) -> Code:
+    """Write the C code of an estimator.
+
+    Parameters
+    ----------
+    joint : Joint
+    made : OnlineEstimator
+        The Python estimator, before its first sample.
+    variables : sequence of Variable
+        In the order of the value references.
+    guid : str
+    """
+    functions = _functions(made)
+    header = _Header()
+    header.define("NATIVE_GUID", f'"{guid}"')
+    _variable_tables(header, joint, made, variables)
+    _row_tables(header, made.rows)
+    _watch_tables(header, made)
+    _recursion_tables(header, made)
+    _fault_tables(header, made)
+    header.define("SZ_ARG", max(8, *(f.sz_arg() for f in functions)))
+    header.define("SZ_RES", max(8, *(f.sz_res() for f in functions)))
+    header.define("SZ_IW", max(f.sz_iw() for f in functions))
+    header.define("SZ_W", max(f.sz_w() for f in functions))
+    return Code(_model(functions), header.text())
+
+
+# --- CasADi's functions ---------------------------------------------------------------------------
+
+
+def _functions(made: OnlineEstimator) -> list[Any]:
+    import casadi as ca
+
+    engine = made._recursion(made.theta)._ready("generate")
+    found = [engine._formulas.step, engine._formulas.check, made.rows._point, made.rows._slopes]
+    if made.detector is not None:
+        found.append(made.detector.tables().function)
+    recursion = []
+    for name, function in zip(("rls_step", "rls_check"), found[:2], strict=True):
+        arguments = function.sx_in()
+        recursion.append(ca.Function(name, arguments, function.call(arguments)))
+    laws = zip(("points", "slopes", "sample_observer"), found[2:], strict=False)
+    return [*recursion, *(cheaper(function, name) for name, function in laws)]
+
+
+def _model(functions: Sequence[Any]) -> bytes:
+    import casadi as ca
+
+    generator = ca.CodeGenerator("native_model", {"with_header": False})
+    for function in functions:
+        generator.add(function)
+    with tempfile.TemporaryDirectory(prefix="irj-code-") as folder:
+        generator.generate(f"{folder}/")
+        return (Path(folder) / "native_model.c").read_bytes()
+
+
+# --- text -----------------------------------------------------------------------------------------
+
+
+def _literal(value: float) -> str:
+    number = float(value)
+    if math.isinf(number):
+        return "INFINITY" if number > 0 else "-INFINITY"
+    return repr(number)
+
+
+@final
+class _Header:
+    """Lines of native_config.h."""
+
+    def __init__(self) -> None:
+        self.lines = ["/* Sizes, tables and start values of this estimator. */"]
+
+    def define(self, name: str, value: object) -> None:
+        self.lines.append(
+            f"#define {name} {_literal(value) if isinstance(value, float) else value}"
+        )
+
+    def doubles(self, name: str, values: npt.ArrayLike) -> None:
+        """A table of doubles, nested as the array is."""
+        array = np.asarray(values, dtype=np.float64)
+        shape = "".join(f"[{max(1, size)}]" for size in array.shape)
+        self.lines.append(
+            f"static const double {name}{shape} = {_nested(array) if array.size else '{0}'};"
+        )
+
+    def whole(self, name: str, values: Iterable[int], kind: str = "int") -> None:
+        found = [str(int(value)) for value in values]
+        self.lines.append(
+            f"static const {kind} {name}[{max(1, len(found))}] = {{{', '.join(found) or '0'}}};"
+        )
+
+    def raw(self, line: str) -> None:
+        self.lines.append(line)
+
+    def text(self) -> bytes:
+        return ("\n".join(self.lines) + "\n").encode()
+
+
+def _nested(array: FloatArray) -> str:
+    if array.ndim == 1:
+        return "{" + ", ".join(map(_literal, array.tolist())) + "}"
+    return "{" + ",\n ".join(_nested(part) for part in array) + "}"
+
+
+# --- tables ---------------------------------------------------------------------------------------
+
+
+def _variable_tables(
+    header: _Header, joint: Joint, made: OnlineEstimator, variables: Sequence[Variable]
+) -> None:
+    at = {v.name: i for i, v in enumerate(variables)}
+    strings = [v.name for v in variables if v.kind == "string"]
+    header.define("N_VARIABLES", len(variables))
+    header.define("N_TEXTS", len(strings))
+    header.whole("kind", (_KINDS[v.kind] for v in variables), "unsigned char")
+    header.whole("access", map(_access, variables), "unsigned char")
+    header.doubles("start_real", [float(v.start) if v.kind == "real" else 0.0 for v in variables])
+    header.whole(
+        "start_whole", (int(v.start) if v.kind in ("integer", "boolean") else 0 for v in variables)
+    )
+    header.whole("text_of", (strings.index(v.name) if v.kind == "string" else 0 for v in variables))
+    header.define("TEXT_JOINT_FILE", strings.index("joint_file"))
+    single = {
+        "SAMPLE_TIME": "sample_time",
+        "HEALTH": "health",
+        "N_SAMPLES": "n_samples",
+        "WARM_UP": "warm_up",
+        "DETECT": "detect",
+        "DRIFT": "drift",
+        "ALARM_DRIFT": "alarm_drift",
+        "FLOOR_SHARE": "floor_share",
+        "FAULT_MARGIN": "fault_margin",
+        "RESET": "reset",
+        "ENABLE": "enable",
+        "THETA": "theta[1]",
+        "SIGMA": "sigma[1]",
+        "LINK_POSITION": "q_l_hat",
+        "FAULT": "fault",
+        "SCORE": "fault_score[1]",
+        "N_ROWS": "n_rows",
+        "ALARM": "alarm",
+        "REOPTIMISE": "reoptimise",
+        "OPTIMISE": "optimise",
+        "REQUEST": "reoptimise_request",
+    }
+    for key, name in single.items():
+        header.define(f"V_{key}", at[name])
+    header.whole("residual_at", (at[f"residual.{b}"] for b in made.balances))
+    header.whole("ratio_at", (at[f"ratio.{b}"] for b in made.balances))
+    drive = "i_m" if joint.torque_per_current is not None else "tau_m"
+    inputs = (drive, *READINGS[1:])
+    header.whole("input_at", (at[n] for n in inputs))
+    header.whole("valid_at", (at[f"valid.{n}"] for n in inputs))
+    header.raw(
+        "static const char *const input_name[] = "
+        f"{{{', '.join(chr(34) + n + chr(34) for n in inputs)}}};"
+    )
+    gear = joint.gear_ratio
+    per_unit = joint.torque_per_current if drive == "i_m" else gear
+    header.doubles("input_gain", [float(per_unit or 1.0), 1.0 / gear, 1.0 / gear, 1.0, 1.0, 1.0])
+    header.define("FAULT_TEXT", f'"{FAULT_TEXT}"')
+
+
+def _access(variable: Variable) -> int:
+    is_parameter = variable.causality == "parameter"
+    return (
+        (1 if is_parameter or variable.causality == "input" else 0)
+        + (2 if is_parameter else 0)
+        + (4 if is_parameter and variable.stated_variability == "fixed" else 0)
+    )
+
+
+def _row_tables(header: _Header, rows: RowMaker) -> None:
+    t, (count, width) = rows.timing, (len(rows.balances), rows.width)
+    centre = t.window - 1 - t.reach
+    header.define("N_THETA", len(rows.names))
+    header.define("N_BALANCES", count)
+    header.define("N_SIGNALS", len(_NAMES))
+    header.define("SOURCES", len(SOURCES))
+    header.define("WINDOW", t.window)
+    header.define("STRIDE", t.stride)
+    header.define("CENTRE", centre)
+    header.define("DELAY", float(t.delay))
+    header.define("SAMPLE_TIME", float(t.dt))
+    header.define("ROW_PERIOD", float(t.stride * t.dt))
+    new = t.stride // t.step
+    header.define("NEW_POINTS", new)
+    header.define("POINTS", 2 * t.point_half + 1)
+    header.define("ROWS_BEFORE_READY", rows.rows_before_ready)
+    header.define("N_NEEDED", len(rows.needed))
+    header.define("N_COORDINATES", rows._point.size1_in(2))
+    header.define("N_MEMORY", rows._point.size1_in(3))
+    header.whole("needed", rows.needed)
+    place = rows._place
+    header.define("PLACES", len(place))
+    header.whole("place_signal", (p[0] for p in place))
+    header.whole("place_order", (p[1] for p in place))
+    header.whole("place_source", (p[2] for p in place))
+    header.whole("source_signal", (_NAMES.index(n) for n in SOURCES))
+    header.whole("speed_signal", rows._speeds)
+    header.whole("point_at", rows._raw_at)
+    half, averaging = _support(rows.averaging, centre)
+    header.define("AVERAGE_HALF", half)
+    header.doubles("average_kernel", averaging)
+    half, smoothing = _support(
+        np.array([rows._smoothing[order, 0] for _, order, _ in place]), rows._raw_at[0]
+    )
+    for k in range(new):
+        shifted = _support(
+            np.array([rows._smoothing[order, k] for _, order, _ in place]), rows._raw_at[k]
+        )
+        if shifted[0] != half or not np.array_equal(shifted[1], smoothing):
+            raise InputError(
+                "native estimator: the kernels of the points differ; build the Python estimator "
+                "instead"
+            )
+    header.define("SMOOTH_HALF", half)
+    header.doubles("smooth_kernel", smoothing)
+    header.doubles("point_weight", rows._weights)
+    header.doubles("sharp", rows._sharp)
+    header.doubles(
+        "velocity_gain", np.broadcast_to(np.asarray(rows._velocity_gain, dtype=np.float64), (2,))
+    )
+    linear = [
+        (i, j)
+        for i, j in itertools.product(range(count * width), range(len(_NAMES)))
+        if rows.linear[i, j] != 0.0
+    ]
+    header.define("N_LINEAR", len(linear))
+    header.whole("linear_row", (i for i, _ in linear))
+    header.whole("linear_column", (j for _, j in linear))
+    header.doubles("linear_value", [rows.linear[i, j] for i, j in linear])
+    uses = ",\n ".join("{" + ", ".join(str(int(v)) for v in line) + "}" for line in rows.uses)
+    header.raw(f"static const unsigned char uses[N_BALANCES][SOURCES] = {{{uses}}};")
+    names = rows.model.parameter_names
+    header.define("N_VALUES", len(names))
+    header.doubles("fixed_value", rows.model.value_vector())
+    header.whole("theta_value", (names.index(n) for n in rows.names))
+
+
+def _support(kernels: FloatArray, centre: int) -> tuple[int, FloatArray]:
+    """Half width of the part that is not zero, about a sample, and that part of each kernel."""
+    used = np.flatnonzero(np.any(kernels != 0.0, axis=0))
+    half = int(np.max(np.abs(used - centre)))
+    return half, kernels[:, centre - half : centre + half + 1]
+
+
+def _watch_tables(header: _Header, made: OnlineEstimator) -> None:
+    header.define("WATCH", made.watch.length)
+    for name in ("MOVED", "SCALE_MOTION"):
+        header.define(name, float(getattr(watch_settings, f"_{name}")))
+    header.define("SCALE_ERROR", float(watch_settings._SCALE))
+    header.define("NOISE_MEMORY", watch_settings._MEMORY)
+    header.whole("present", made.present, "unsigned char")
+    header.whole("needs", made._needs, "unsigned char")
+    header.define("RECENT_SAMPLES", round(_RECENT / made.dt))
+    names = made.names
+    stiffness = made.model.stiffness_name
+    header.define("STIFFNESS_THETA", names.index(stiffness) if stiffness in names else -1)
+    header.define("LINK_FROM_TORSION", int(made.model.is_elastic and made.options.has_torque))
+    found = [
+        (names.index(n), made.joint.fitted[n], code)
+        for n, code in (("link_inertia", SCALED + 1 + TAU), ("motor_inertia", SCALED + 1 + DRIVE))
+        if made.is_fitted and n in names and n in made.joint.fitted
+    ]
+    header.define("N_INERTIAS", len(found))
+    header.whole("inertia_theta", (i for i, _, _ in found))
+    header.doubles("inertia_before", [v for _, v, _ in found])
+    header.whole("inertia_code", (c for _, _, c in found))
+
+
+def _recursion_tables(header: _Header, made: OnlineEstimator) -> None:
+    from identification.recursive.settings import start_state
+
+    period = made.rows.timing.stride * made.dt
+    engine = made._recursion(made.theta)._ready("generate")
+    layout, n = engine._layout, len(made.names)
+    fast, slow = start_state(layout, np.zeros(n), engine.config)
+    header.define("COLLECT", max(made._collect, round(MAX_WARM_UP / period)))
+    header.define("LEAST", LEAST)
+    header.define("ABSENT", ABSENT)
+    header.define("RIDGE", RIDGE)
+    header.define("UNDETERMINED", UNDETERMINED)
+    header.define("PRIOR_PASSES", PRIOR_PASSES)
+    header.define("OVERLAP", float(made.rows.timing.overlap))
+    header.define("RESIDUAL_RATE", period / _RESIDUAL_SECONDS)
+    for name, block, parts in (
+        ("FAST", layout.fast, ("d", "u", "theta", "noise", "error", "learned", "alarm", "due")),
+        ("SLOW", layout.slow, ()),
+        ("CONFIG", layout.config, ("scale", "theta0", "walk", "walk_alarm", "enabled", "start")),
+    ):
+        header.define(f"N_{name}", block.size)
+        for part in parts:
+            header.define(f"{name}_{part.upper()}", block[part].start)
+    header.doubles("start_fast", fast)
+    header.doubles("start_slow", slow)
+    header.doubles("start_config", engine.config)
+    header.doubles("fixed_theta", made.theta)
+    friction = [[i in where for i in range(n)] for where in made._friction]
+    feels = ", ".join("{" + ", ".join(str(int(v)) for v in line) + "}" for line in made._feels)
+    marks = ", ".join("{" + ", ".join(str(int(v)) for v in line) + "}" for line in friction)
+    header.raw(f"static const unsigned char is_friction[2][N_THETA] = {{{marks}}};")
+    header.raw(f"static const unsigned char feels[N_BALANCES][2] = {{{feels}}};")
+    header.whole("reference_signal", (11 if from_link else 1 for from_link in made._from_link))
+    for key, value in made.guard.figures().items():
+        header.define(f"GUARD_{key}", value)
+    header.whole("is_inertia", (int(i in made.guard.inertias) for i in range(n)), "unsigned char")
+    header.doubles("lowest", made.low)
+    header.doubles("highest", made.high)
+    for key, number in made.pulse.figures().items():
+        header.define(f"PULSE_{key}", number)
+    header.define("HELD_CODE", HELD)
+    header.define("ON_GRID", ON_GRID)
+    header.define("GRID_GAP", float(made.grid.gap))
+    header.define("ERROR_LIMIT", float(_STRAIN.error_limit))
+    header.define("CONFIRM_ROWS", made._confirm)
+
+
+def _fault_tables(header: _Header, made: OnlineEstimator) -> None:
+    header.define("HAS_DETECTOR", int(made.detector is not None))
+    waits = (
+        "link_wait",
+        "torque_wait",
+        "pair_wait",
+        "plant_wait",
+        "quiet_seconds",
+        "recover_seconds",
+        "settle_seconds",
+        "plant_rest_seconds",
+    )
+    keys = ("LINK", "TORQUE", "PAIR", "PLANT", "QUIET", "RECOVER", "SETTLE", "REST")
+    header.whole("parity_sensors", (sum(1 << s for s in sensors) for sensors in PARITY_SENSORS))
+    header.doubles("moved", MOVED)
+    if made.detector is None:
+        _no_fault_tables(header, keys)
+        return
+    held: DetectorTables = made.detector.tables()
+    for key, name in zip(keys, waits, strict=True):
+        header.define(f"WAIT_{key}", held.waits[name])
+    header.define("WAIT_ARM", held.waits["arm"])
+    header.define("HAS_TORQUE", int(held.has_torque))
+    header.define("N_OBSERVER", held.states)
+    header.define("N_OBSERVED", held.function.size1_out(0))
+    header.define("FAULT_RING", 1 << math.ceil(math.log2(held.lags[-1] + 2)))
+    header.define("FAULT_STIFFNESS", float(held.stiffness))
+    header.define("HALF_STEP", float(held.half))
+    header.define("MEAN_1", float(held.means[0]))
+    header.define("MEAN_2", float(held.means[1]))
+    header.define("ENERGY_DRIFT", float(held.drift))
+    header.whole("lag", held.lags)
+    header.doubles("fault_limit", held.limits)
+    header.doubles("energy_inverse", held.inverse)
+    header.doubles("energy_limit", held.energy_limits)
+    header.doubles("fault_noise", held.noise)
+    header.doubles("recover_limit", held.recover_limits)
+    header.doubles("widening", held.widening)
+    header.doubles("observer_gain", held.gains)
+    header.doubles("gate", held.gates)
+
+
+def _no_fault_tables(header: _Header, keys: Sequence[str]) -> None:
+    """The smallest tables with which the detector's code compiles, for a joint without one."""
+    for key in (*keys, "ARM"):
+        header.define(f"WAIT_{key}", 1)
+    for name, size in (("HAS_TORQUE", 0), ("N_OBSERVER", 0), ("N_OBSERVED", 32), ("FAULT_RING", 1)):
+        header.define(name, size)
+    for name in ("FAULT_STIFFNESS", "HALF_STEP", "MEAN_1", "MEAN_2", "ENERGY_DRIFT"):
+        header.define(name, 0.0)
+    header.whole("lag", [1] * 4)
+    for name, size in (
+        ("fault_limit", 19),
+        ("energy_inverse", 3),
+        ("energy_limit", 3),
+        ("fault_noise", 6),
+        ("recover_limit", 6),
+        ("gate", 5),
+    ):
+        header.doubles(name, np.zeros(size))
+    header.doubles("widening", np.zeros((6, 5)))
+    header.doubles("observer_gain", np.zeros((32, 5)))
+
+
+__all__ = ["MAX_WARM_UP", "Code", "generate"]

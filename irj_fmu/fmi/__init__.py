@@ -1,0 +1,1 @@
+"""What every FMU is made of: variables, descriptions, archives, compilers, slaves, systems."""

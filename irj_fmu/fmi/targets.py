@@ -1,0 +1,47 @@
+"""Platforms by the names of their folders in an FMU."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+from identification.errors import InputError
+from irj_fmu.fmi.compiler import TARGETS, native_target
+
+SHORT_TARGETS: Final = {
+    "linux64": ("x86_64-linux-gnu",),
+    "win64": ("x86_64-windows-gnu",),
+    "darwin64": ("x86_64-macos", "aarch64-macos"),
+    "aarch64-linux": ("aarch64-linux-gnu",),
+}
+"""Names of folders below ``binaries/`` to the targets whose libraries lie there."""
+
+
+def native_targets(target: str | Sequence[str] | None) -> tuple[str, ...]:
+    """Targets by their names, short ones included.
+
+    Raises
+    ------
+    InputError
+        A name that is neither in `irj_fmu.fmi.compiler.TARGETS` nor in :data:`SHORT_TARGETS`.
+    """
+    if target is None:
+        return (native_target(),)
+    names = (target,) if isinstance(target, str) else tuple(target)
+    found: list[str] = []
+    for name in names:
+        if name == "all":
+            found += list(TARGETS)
+        elif name in SHORT_TARGETS:
+            found += SHORT_TARGETS[name]
+        elif name in TARGETS:
+            found.append(name)
+        else:
+            raise InputError(
+                f"target {name!r} is not known; name one of "
+                f"{', '.join((*SHORT_TARGETS, *TARGETS))}, or all"
+            )
+    return tuple(dict.fromkeys(found))
+
+
+__all__ = ["SHORT_TARGETS", "native_targets"]

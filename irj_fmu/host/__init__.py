@@ -1,0 +1,1 @@
+"""Hosts: FMUs opened, connected, disturbed and run from Python."""

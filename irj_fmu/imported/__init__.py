@@ -1,0 +1,1 @@
+"""Somebody else's FMU as the model of a joint."""

@@ -1,0 +1,312 @@
+"""An effect of the library that rides outside a user's FMU as a correction of its torque input."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Final, final
+
+import numpy as np
+
+from casadi_models import JointModel
+from casadi_models.term import TOTAL_INERTIA
+from identification.errors import InputError
+from irj_fmu.host.signals import FloatArray
+from irj_fmu.imported.run import Window
+
+if TYPE_CHECKING:
+    from irj_fmu.imported.model import UserModel
+
+PREFIX: Final = "correction."
+"""Before the names of a correction's parameters, so that they never meet those of the FMU."""
+DRIVES: Final = ("motor_torque", "motor_current", "motor_voltage")
+SHAPE_RANGE: Final = 3.0
+POSITIONS: Final = ("motor_position", "link_position")
+
+
+@final
+@dataclass(frozen=True)
+class Port:
+    """Where a torque acts on an FMU, and where its position is read.
+
+    Attributes
+    ----------
+    input, output : int
+        Columns of the model's inputs and outputs.
+    torque : float
+        Link-referred torque per unit of the input.
+    position : float
+        Link-referred position per unit of the output.
+    velocity : int or None
+        Column of a velocity of the same side.
+    rate : float
+        Link-referred velocity per unit of that column.
+    """
+
+    input: int
+    output: int
+    torque: float
+    position: float
+    velocity: int | None = None
+    rate: float = 1.0
+
+
+def port_of(model: UserModel) -> Port:
+    """The torque input and the position output of a model.
+
+    Raises
+    ------
+    InputError
+        Where no drive channel or no position is mapped, or the motor constant is missing.
+    """
+    joint, name = model.joint, model.fmu.path.name
+    drive = next(
+        ((i, m) for c in DRIVES for i, m in enumerate(model.inputs) if m.channel == c), None
+    )
+    if drive is None:
+        raise InputError(
+            f"{name}: no drive channel is mapped to an input of the FMU; a correction torque "
+            f"needs one of {', '.join(DRIVES)}"
+        )
+    channel = drive[1].channel
+    per = {
+        "motor_torque": joint.gear_ratio,
+        "motor_current": joint.torque_per_current,
+        "motor_voltage": joint.torque_per_voltage or 1.0,
+    }[channel]
+    if per is None:
+        raise InputError(
+            f"{joint.source or joint.name}: motor_current needs motor_constant (Nm/A on the "
+            "motor shaft) or torque_per_current in [joint]"
+        )
+    place = next(
+        ((i, m) for c in POSITIONS for i, m in enumerate(model.outputs) if m.channel == c), None
+    )
+    if place is None:
+        raise InputError(
+            f"{name}: no position is mapped to an output of the FMU; map motor_position or "
+            "link_position"
+        )
+    motor = place[1].channel == "motor_position"
+    side = joint.gear_ratio if motor else 1.0
+    speed = next(
+        (
+            (i, m)
+            for i, m in enumerate(model.outputs)
+            if m.channel == ("motor_velocity" if motor else "link_velocity")
+        ),
+        None,
+    )
+    return Port(
+        drive[0],
+        place[0],
+        per / drive[1].scale,
+        1.0 / (side * place[1].scale),
+        speed[0] if speed else None,
+        1.0 / (side * speed[1].scale) if speed else 1.0,
+    )
+
+
+@final
+@dataclass(frozen=True)
+class Correction:
+    """Effects of the library outside an FMU.
+
+    Attributes
+    ----------
+    model : JointModel
+        Rigid, with an inertia of 1; its effects are those that are added.
+    free : tuple of str
+        Parameters of `model` that a fit may move.
+    shapes : mapping of str to float
+        Of the free ones, shape parameters and their first values.
+    """
+
+    model: JointModel
+    free: tuple[str, ...]
+    shapes: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Labels of the effects."""
+        return self.model.effects
+
+    def free_values(self) -> dict[str, float]:
+        """Values of the free parameters under their outside names."""
+        values = dict(zip(self.model.parameter_names, self.model.value_vector(), strict=True))
+        return {PREFIX + n: values[n] for n in self.free}
+
+    def bounds(self) -> dict[str, tuple[float, float]]:
+        """Bounds of the free parameters under their outside names; a shape stays near the value
+        of its trial.
+        """
+        found = {}
+        for p in self.model.parameters:
+            if p.name in self.free:
+                near = self.shapes.get(p.name)
+                low, high = (
+                    (p.low, p.high)
+                    if near is None
+                    else (max(p.low, near / SHAPE_RANGE), min(p.high, near * SHAPE_RANGE))
+                )
+                found[PREFIX + p.name] = (low, high)
+        return found
+
+    def unit(self, name: str) -> str:
+        """Unit of a parameter under its outside name."""
+        return {PREFIX + p.name: p.unit for p in self.model.parameters}[name]
+
+    def with_values(self, values: Mapping[str, float]) -> Correction:
+        """The correction with other values, by outside name; others are passed over."""
+        own = {n: float(values[PREFIX + n]) for n in self.free if PREFIX + n in values}
+        return replace(self, model=self.model.with_values(own))
+
+    def feedback(self, model: UserModel, values: Mapping[str, float]) -> CorrectionLaw:
+        """The law as something that reads outputs and adds to inputs."""
+        return CorrectionLaw(self.with_values(values).model, port_of(model), len(model.inputs))
+
+
+def correction_of(
+    model: JointModel, labels: tuple[str, ...], values: Mapping[str, float], free: tuple[str, ...]
+) -> Correction:
+    """A correction from a rigid joint model: the named effects alone, the joint's own inertia
+    and laws left to the FMU.
+    """
+    terms = tuple(t for t in model.terms if t.label in labels)
+    bare = JointModel(
+        gear_ratio=model.gear_ratio,
+        terms=terms,
+        inertias=TOTAL_INERTIA,
+        kind=model.kind,
+        load_from="gravity",
+        clamped_link=False,
+        name="correction",
+    )
+    known = set(bare.parameter_names)
+    made = bare.with_values(
+        {
+            **{k: float(v) for k, v in values.items() if k in known},
+            **dict.fromkeys(TOTAL_INERTIA, 1.0),
+        }
+    )
+    shapes = {
+        p.name: float(values[p.name])
+        for p in bare.parameters
+        if p.is_shape and p.name in free and float(values[p.name]) > 0
+    }
+    return Correction(made, free, shapes)
+
+
+@final
+class CorrectionLaw:
+    """The torque of a correction along a run (see :class:`irj_fmu.imported.run.Feedback`).
+
+    The effect resists: its torque is taken off the drive. It is read and held for a millisecond at
+    a time.
+
+    Parameters
+    ----------
+    model : JointModel
+        As in :class:`Correction`.
+    port : Port
+    inputs : int
+        Number of inputs.
+    """
+
+    def __init__(self, model: JointModel, port: Port, inputs: int) -> None:
+        import casadi as ca
+
+        from irj_fmu.plant.joint import _memory_step
+
+        functions = model.functions
+        self._held = len(functions.memory_names)
+        p = model.value_vector()
+        x, u = ca.SX.sym("x", 2 + self._held), ca.SX.sym("u", 3)
+        self._resist = Evaluator(
+            ca.Function("resist", [x, u], [ca.densify(u[0] - functions.dynamics(x, u, p)[1])])
+        )
+        self._move: Evaluator | None = None
+        if self._held:
+            before, z, h = ca.SX.sym("before", 2), ca.SX.sym("z", self._held), ca.SX.sym("h")
+            moved = _memory_step(functions)(x[:2], before, z, u, p, h)
+            self._move = Evaluator(
+                ca.Function("move", [x[:2], before, z, u, h], [ca.densify(moved)])
+            )
+        self.port = port
+        self._extra = np.zeros(inputs)
+        self.restart()
+
+    def begin(self, window: Window) -> None:
+        """Before the first sample of a window."""
+        self.restart()
+
+    def restart(self) -> None:
+        """From rest, with empty memory."""
+        self._z = np.zeros(self._held)
+        self._before = math.nan
+        self._speed = 0.0
+        self._now = math.nan
+
+    def __call__(
+        self, sample: int, time: float, inputs: FloatArray, outputs: FloatArray
+    ) -> FloatArray:
+        """What is added to the inputs from a time on."""
+        port = self.port
+        speed = None if port.velocity is None else float(outputs[port.velocity]) * port.rate
+        drive = float(inputs[port.input]) * port.torque
+        self._extra[port.input] = (
+            self.torque(time, drive, float(outputs[port.output]) * port.position, speed)
+            / port.torque
+        )
+        return self._extra
+
+    def torque(
+        self, time: float, drive: float, position: float, velocity: float | None = None
+    ) -> float:
+        """Torque to be added to the drive, link-referred [N.m].
+
+        Parameters
+        ----------
+        time : float
+            [s]
+        drive : float
+            Torque of the drive, link-referred [N.m].
+        position, velocity : float
+            Link-referred [rad, rad/s]; without a velocity the difference of positions is taken.
+        """
+        first = math.isnan(self._before)
+        step = time - self._now
+        if velocity is None:
+            velocity = 0.0 if first or step <= 0 else (position - self._before) / step
+        u = (drive, 0.0, time)
+        if self._move is not None and not first and step > 0:
+            self._z = self._move(
+                (position, velocity), (self._before, self._speed), self._z, u, (step,)
+            ).copy()
+        self._before, self._speed, self._now = position, velocity, time
+        return -float(self._resist((position, velocity, *self._z), u)[0])
+
+
+@final
+class Evaluator:
+    """A CasADi function of small dense vectors without conversions: about 2 microseconds a call."""
+
+    def __init__(self, function: Any) -> None:
+        self._function = function  # keeps the buffer alive
+        self._arguments = [np.zeros(function.numel_in(i)) for i in range(function.n_in())]
+        self._result = np.zeros(function.numel_out(0))
+        self._buffer, self._trigger = function.buffer()
+        for i, argument in enumerate(self._arguments):
+            self._buffer.set_arg(i, argument.data)
+        self._buffer.set_res(0, self._result.data)
+
+    def __call__(self, *values: Any) -> FloatArray:
+        """The result; its array is reused."""
+        for argument, value in zip(self._arguments, values, strict=True):
+            argument[:] = value
+        self._trigger()
+        return self._result
+
+
+__all__ = ["PREFIX", "Correction", "CorrectionLaw", "Port", "correction_of", "port_of"]

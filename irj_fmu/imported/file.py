@@ -1,0 +1,347 @@
+"""A joint file whose model is a user's FMU: ``[model] fmu = "axis.fmu"`` beside ``[joint]``.
+
+::
+
+    [joint]
+    name = "axis 3"
+    gear_ratio = 1.0
+    effects = ["viscous", "coulomb"]     # what the FMU holds already; a diagnosis does not propose
+    it [model] fmu = "axis3.fmu"                    # beside the joint file, or a whole path window
+    = 0.5                         # optional: simulate stretches of 0.5 s, each from its own start
+    [model.channels]                     # record channel = variable of the FMU motor_torque =
+    "torque" motor_position = { variable = "angle", scale = 57.29577951 } [model.parameters]
+    # what a fit may move inertia = { low = 0.1, high = 10.0 } viscous = {} [model.start]
+    # variable of the FMU = record channel, or a number q = "motor_position" w = "motor_velocity"
+"""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from casadi_models import JointModel
+from casadi_models.term import TOTAL_INERTIA
+from identification.data.joint_file import Joint, parse_joint, toml_text
+from identification.errors import InputError
+from irj_fmu.imported.correction import PREFIX, Correction, correction_of
+from irj_fmu.imported.model import Mapped, UserModel, load_user_model
+
+if TYPE_CHECKING:
+    from irj_fmu.imported.fit import UserFit
+
+_KEYS: Final = ("fmu", "window", "hold", "kind", "outside", "channels", "parameters", "start")
+_TABLES: Final = ("joint", "model", "columns", "fitted", "provenance")
+_ENTRY: Final = {"channels": "variable", "start": "channel"}
+
+
+def is_user_joint(path: str | Path) -> bool:
+    """True where a file is TOML with a table ``[model]``; a file that cannot be read is left to
+    others to refuse.
+    """
+    try:
+        return "model" in tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError):
+        return False
+
+
+def load_user_joint(path: str | Path) -> UserModel:
+    """Read a joint file whose model is a user's FMU.
+
+    Parameters
+    ----------
+    path : str or Path
+
+    Raises
+    ------
+    InputError
+        One line: what is wrong, where, and what to write instead.
+    """
+    path = Path(path)
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else str(error)
+        raise InputError(
+            f"{path}: cannot be read as a joint file ({why}); give the path of a TOML file"
+        ) from None
+    for key, value in data.items():
+        if key not in _TABLES:
+            raise InputError(
+                f"{path}: unknown table [{key}]; with an FMU as the model there are "
+                f"[{'], ['.join(_TABLES)}]"
+            )
+        if not isinstance(value, Mapping):
+            raise InputError(f"{path}: {key} must be a table, as [{key}] on a line of its own")
+    table = data.get("model")
+    if not isinstance(table, Mapping):
+        raise InputError(f'{path}: no [model] table; write [model] with fmu = "file.fmu"')
+    for key in table:
+        if key not in _KEYS:
+            raise InputError(
+                f"{path}: [model] has an unknown key {key!r}; known: {', '.join(_KEYS)}"
+            )
+    if "fmu" not in table:
+        raise InputError(f'{path}: [model] has no fmu; write fmu = "file.fmu"')
+    if not isinstance(table["fmu"], str) or not table["fmu"].strip():
+        raise InputError(
+            f"{path}: [model] fmu = {_shown(table['fmu'])} is not the name of an FMU; write fmu "
+            '= "file.fmu"'
+        )
+    rest = {k: v for k, v in data.items() if k in ("joint", "columns")}
+    joint = parse_joint({**rest, "joint": {**rest.get("joint", {}), "model": "hd1"}}, str(path))
+    fmu = path.parent / table["fmu"]
+    fitted = {str(k): _value(v, f"{path}: [fitted] {k}") for k, v in data.get("fitted", {}).items()}
+    channels, bounds, start = (
+        _pairs(table, "channels", path),
+        _bounds(table, path),
+        _pairs(table, "start", path),
+    )
+    window, hold = (
+        _number(table.get("window"), f"{path}: [model] window"),
+        _flag(table.get("hold", True), path),
+    )
+    try:
+        model = load_user_model(
+            fmu,
+            channels,
+            bounds,
+            start=start,
+            joint=joint,
+            window=window,
+            hold=hold,
+            kind=table.get("kind"),
+        )
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    outside = _outside(table.get("outside", []), joint, fitted, path)
+    made = replace(model, correction=outside)
+    strangers = [k for k in fitted if k not in made.values and not k.startswith(PREFIX)]
+    note = (
+        f"{path}: [fitted] {', '.join(strangers)}: [model.parameters] has no such name; the "
+        "value is left out"
+    )
+    return replace(made, notes=(*made.notes, note) if strangers else made.notes).with_values(fitted)
+
+
+def _value(entry: Any, where: str) -> float:
+    return _finite(entry.get("value") if isinstance(entry, Mapping) else entry, where)
+
+
+def _finite(value: Any, where: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise InputError(f"{where} = {value!r} is not a finite number")
+    return float(value)
+
+
+def _number(value: Any, where: str) -> float | None:
+    if value is None:
+        return None
+    found = _finite(value, where)
+    if found <= 0:
+        raise InputError(f"{where} = {found:g} must be above 0")
+    return found
+
+
+def _scale(value: Any, where: str) -> float:
+    found = _finite(value, where)
+    if found == 0:
+        raise InputError(
+            f"{where} = 0 would leave nothing of it; give variable / channel, or leave the scale "
+            "out"
+        )
+    return found
+
+
+def _shown(value: Any) -> str:
+    """A value as it stands in a joint file."""
+    return (
+        _text(value)
+        if isinstance(value, str)
+        else str(value).lower()
+        if isinstance(value, bool)
+        else repr(value)
+    )
+
+
+def _flag(value: Any, path: Path) -> bool:
+    if not isinstance(value, bool):
+        raise InputError(f"{path}: [model] hold = {value!r}; use true or false")
+    return value
+
+
+def _pairs(table: Mapping[str, Any], name: str, path: Path) -> dict[str, Any]:
+    """Entries as names, (name, scale) or numbers."""
+    found: dict[str, Any] = {}
+    for key, entry in _table(table, name, path).items():
+        where = f"{path}: [model.{name}] {key}"
+        if isinstance(entry, Mapping):
+            other = entry.get(_ENTRY[name])
+            if not isinstance(other, str) or set(entry) - {_ENTRY[name], "scale"}:
+                raise InputError(f"{where} must be a name or a table with {_ENTRY[name]} and scale")
+            found[key] = (
+                (other, _scale(entry["scale"], f"{where} scale")) if "scale" in entry else other
+            )
+        elif isinstance(entry, str) or (name == "start" and isinstance(entry, bool)):
+            found[key] = entry
+        elif name == "start" and isinstance(entry, int | float):
+            _finite(entry, where)
+            found[key] = entry
+        else:
+            raise InputError(f"{where} = {entry!r}; give the name of a {_ENTRY[name]}")
+    return found
+
+
+def _table(table: Mapping[str, Any], name: str, path: Path) -> Mapping[str, Any]:
+    found = table.get(name, {})
+    if not isinstance(found, Mapping):
+        raise InputError(
+            f"{path}: [model] {name} must be a table, as [model.{name}] on a line of its own"
+        )
+    return found
+
+
+def _bounds(table: Mapping[str, Any], path: Path) -> dict[str, tuple[float, float]]:
+    found = {}
+    for name, entry in _table(table, "parameters", path).items():
+        where = f"{path}: [model.parameters] {name}"
+        if not isinstance(entry, Mapping) or set(entry) - {"low", "high"}:
+            raise InputError(f"{where} must be a table with low and high, or {{}}")
+        low, high = (
+            _finite(entry[k], f"{where} {k}") if k in entry else v
+            for k, v in (("low", -math.inf), ("high", math.inf))
+        )
+        found[name] = (low, high)
+    return found
+
+
+def _outside(
+    labels: Any, joint: Joint, fitted: Mapping[str, float], path: Path
+) -> Correction | None:
+    """Effects outside the FMU, with their values."""
+    if not isinstance(labels, list) or not all(isinstance(e, str) for e in labels):
+        raise InputError(
+            f'{path}: [model] outside must be a list of effects, as outside = ["stribeck@motor"]'
+        )
+    return outside_correction(labels, joint, fitted, str(path)) if labels else None
+
+
+def outside_correction(
+    labels: list[str], joint: Joint, values: Mapping[str, float], source: str
+) -> Correction:
+    """A correction from labels of effects and values under outside names.
+
+    Raises
+    ------
+    InputError
+        An effect that is not in the library or cannot ride outside.
+    """
+    model = JointModel(
+        gear_ratio=joint.gear_ratio, inertias=TOTAL_INERTIA, kind=joint.kind, load_from="gravity"
+    )
+    try:
+        for label in labels:
+            model = model.add(label)
+    except (KeyError, ValueError) as error:
+        raise InputError(f"{source}: {error.args[0]}") from None
+    wrong = [t.label for t in model.terms if t.effect.family not in ("friction", "torque")]
+    if wrong:
+        raise InputError(
+            f"{source}: {', '.join(wrong)} cannot ride outside an FMU; only friction and torques "
+            "can"
+        )
+    own = dict(zip(model.parameter_names, model.value_vector(), strict=True))
+    own |= {
+        k.removeprefix(PREFIX): v
+        for k, v in values.items()
+        if k.startswith(PREFIX) and k.removeprefix(PREFIX) in own
+    }
+    free = tuple(n for t in model.terms for n in t.names)
+    return replace(correction_of(model, tuple(t.label for t in model.terms), own, free), shapes={})
+
+
+def user_joint_text(
+    model: UserModel, fit: UserFit | None = None, folder: Path | None = None
+) -> str:
+    """The model as the text of a joint file, with fitted values and standard errors.
+
+    Parameters
+    ----------
+    model : UserModel
+    fit : UserFit, optional
+        Its standard errors are written.
+    folder : Path, optional
+        Where the file goes: an FMU beside it is named without its path.
+    """
+    head = toml_text(
+        replace(model.joint, model_name="hd1", known={}, fitted={}),
+        outside=model.correction.labels if model.correction else (),
+    )
+    body = "\n".join(line for line in head.splitlines() if not line.startswith("model = "))
+    path = model.fmu.path
+    name = path.name if folder is not None and path.parent == folder.resolve() else str(path)
+    lines = [
+        "[model]",
+        f"fmu = {_text(name)}",
+        f'kind = "{model.kind}"',
+        f"hold = {str(model.hold).lower()}",
+    ]
+    if model.window is not None:
+        lines.append(f"window = {model.window!r}")
+    if model.correction is not None:
+        lines.append("outside = [" + ", ".join(f'"{e}"' for e in model.correction.labels) + "]")
+    lines += [
+        "",
+        "[model.channels]",
+        *(_mapped(m.channel, "variable", m.variable, m) for m in (*model.inputs, *model.outputs)),
+    ]
+    lines += ["", "[model.parameters]"]
+    for p in model.parameters:
+        parts = [f"{k} = {v!r}" for k, v in (("low", p.low), ("high", p.high)) if math.isfinite(v)]
+        lines.append(f"{_key(p.name)} = {{ {', '.join(parts)} }}")
+    lines += [
+        "",
+        "[model.start]",
+        *(_mapped(m.variable, "channel", m.channel, m) for m in model.starts),
+    ]
+    lines += [
+        f"{_key(k)} = {str(v).lower() if isinstance(v, bool) else repr(v)}"
+        for k, v in model.constants.items()
+    ]
+    lines += ["", "[fitted]"]
+    shown: dict[str, float] = dict(model.values)
+    if model.correction is not None:
+        every = zip(
+            model.correction.model.parameter_names,
+            model.correction.model.value_vector(),
+            strict=True,
+        )
+        shown |= {PREFIX + n: v for n, v in every if n not in TOTAL_INERTIA}
+    for key, value in shown.items():
+        error = fit.stderr.get(key) if fit is not None else None
+        lines.append(
+            f"{_key(key)} = {{ value = "
+            f"{value:.12g}{f', stderr = {error:.6g}' if error is not None else ''} }}"
+        )
+    return body + "\n\n" + "\n".join(lines) + "\n"
+
+
+def _mapped(key: str, word: str, other: str, mapped: Mapped) -> str:
+    return f"{_key(key)} = {{ {word} = {_text(other)}, scale = {mapped.scale!r} }}"
+
+
+def _text(text: str) -> str:
+    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
+    return f'"{escaped}"'
+
+
+def _key(text: str) -> str:
+    return (
+        text if text.replace("_", "").replace("-", "").isalnum() and text.isascii() else _text(text)
+    )
+
+
+__all__ = ["is_user_joint", "load_user_joint", "outside_correction", "user_joint_text"]

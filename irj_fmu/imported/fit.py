@@ -1,0 +1,407 @@
+"""Fit the parameters of a user's FMU by the error of its outputs.
+
+The outputs of the windows are a problem of the one least-squares solver; the start values of each
+window are its own unknowns.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, final
+
+import numpy as np
+
+from identification.balance.noise import noise_level
+from identification.data.record import Record
+from identification.errors import InputError
+from identification.fitting.covariance import BLOCK, block_errors, correlations, process_errors
+from identification.fitting.least_squares import least_squares, triangle_of
+from irj_fmu.host.run import FmuError
+from irj_fmu.host.signals import FloatArray
+from irj_fmu.imported.compare import UserComparison, comparison_of
+from irj_fmu.imported.exact import Exact, NotExact
+from irj_fmu.imported.model import UserModel, listed, start_values
+from irj_fmu.imported.run import Window
+from irj_fmu.imported.sensitivity import BlackBox, Simulator, scale_of
+
+if TYPE_CHECKING:
+    from irj_fmu.imported.diagnose import UserDiagnosis
+
+Progress = Callable[[str, float], None]
+_MOVED: Final = 1e-9
+"""A column smaller than this share of the output's own size moves nothing."""
+_ENOUGH: Final = 1e-5
+"""Relative fall of the sum of squares that ends a pass: every step costs a run of the FMU for
+each parameter.
+"""
+_SPREAD: Final = 1e5
+"""Standard deviation, in units of what a column alone would have, beyond which a parameter
+cannot be told from others.
+"""
+
+
+@final
+@dataclass(frozen=True)
+class UserFit:
+    """A fitted FMU.
+
+    Attributes
+    ----------
+    model : UserModel
+        With the fitted values.
+    stderr : mapping of str to float or None
+        From the spread of the scores of time blocks; None where the data do not show the parameter.
+    unmoved, at_bound : tuple of str
+        Parameters that move no output (left at their start), and those that stopped at a bound.
+    correlation : mapping
+        Largest correlation with another parameter: (name, value).
+    method : str
+        How derivatives were made, and why not exactly.
+    train : UserComparison
+    """
+
+    model: UserModel
+    stderr: Mapping[str, float | None]
+    unmoved: tuple[str, ...]
+    at_bound: tuple[str, ...]
+    correlation: Mapping[str, tuple[str, float]]
+    method: str
+    iterations: int
+    train: UserComparison
+    records: tuple[Record, ...]
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Fitted values by name."""
+        return self.model.values
+
+    @property
+    def parameters(self) -> dict[str, dict[str, Any]]:
+        """Value, standard error, unit and flags of each parameter."""
+        found = {}
+        for name, value in self.values.items():
+            own = name in self.model.fmu.variables
+            partner = self.correlation.get(name)
+            unit = (
+                (self.model.fmu.variable(name).unit or "")
+                if own
+                else self.model.correction.unit(name)
+                if self.model.correction
+                else ""
+            )
+            found[name] = {
+                "value": value,
+                "stderr": self.stderr.get(name),
+                "unit": unit,
+                "at_bound": name in self.at_bound,
+                "identifiable": name not in self.unmoved and self.stderr.get(name) is not None,
+                "of": "fmu" if own else "correction",
+                "correlation": {"with": partner[0], "value": partner[1]} if partner else None,
+            }
+        return found
+
+    def as_json(self) -> dict[str, Any]:
+        """Values, errors and flags as data."""
+        return {
+            "fmu": self.model.fmu.path.name,
+            "method": self.method,
+            "iterations": self.iterations,
+            "parameters": self.parameters,
+            "train": self.train.as_json(),
+            "notes": list(self.model.notes),
+        }
+
+    def compare(self, records: Record | Sequence[Record]) -> UserComparison:
+        """Compare with records that the fit may never have seen."""
+        return self.model.compare(records)
+
+    def diagnose(
+        self,
+        held_out: Record | Sequence[Record] = (),
+        progress: Callable[[str, float], None] | None = None,
+    ) -> UserDiagnosis:
+        """Name what is missing."""
+        return self.model.diagnose(self.records, held_out, progress)
+
+
+def fit(
+    model: UserModel,
+    records: Record | Sequence[Record],
+    *,
+    iterations: int = 25,
+    exact: bool = True,
+    progress: Progress | None = None,
+) -> UserFit:
+    """Fit the parameters of a user's FMU to records.
+
+    Parameters
+    ----------
+    model : UserModel
+    records : Record or sequence of Record
+    iterations : int
+        Gauss-Newton steps at most.
+    exact : bool
+        False: difference quotients even where exact derivatives are to be had.
+    progress : callable, optional
+        ``progress(text, share)``; how many steps are needed shows only at the end, so the share is
+        a guess.
+
+    Raises
+    ------
+    InputError
+        Unusable records, or nothing to fit.
+    FmuError
+        Where the FMU fails at the start values.
+    """
+    given = listed(records)
+    if not model.values:
+        raise InputError(f"{model.fmu.path.name}: no parameter to fit; name those that may move")
+    say = progress or (lambda _text, _share: None)
+    windows = model.windows(given)
+    say(f"taking up {model.fmu.path.name}", 0.02)
+    simulator, method = simulator_of(model, windows, exact)
+    solver = Solver(model, windows, simulator, noise_of(model, given))
+    used = solver.solve(iterations, say)
+    say("standard errors", 0.95)
+    fitted = model.with_values(solver.values)
+    stderr, correlation = solver.errors()
+    bounds = model.bounds()
+    at_bound = tuple(
+        n
+        for n in solver.names
+        if any(
+            abs(solver.values[n] - b) <= 1e-9 * max(abs(b), 1e-300)
+            for b in bounds[n]
+            if math.isfinite(b)
+        )
+    )
+    stderr = {n: None if n in at_bound else e for n, e in stderr.items()}
+    say("done", 1.0)
+    return UserFit(
+        fitted,
+        stderr,
+        unmoved=tuple(n for n in model.values if n not in solver.names),
+        at_bound=at_bound,
+        correlation=correlation,
+        method=method,
+        iterations=used,
+        train=comparison_of(fitted, given, windows, solver.predicted),
+        records=tuple(given),
+    )
+
+
+def simulator_of(
+    model: UserModel, windows: Sequence[Window], exact: bool = True
+) -> tuple[Simulator, str]:
+    """The best simulator that the FMU allows, and a sentence on it."""
+    if not exact:
+        return BlackBox(model, windows), "black box: difference quotients over whole runs"
+    try:
+        return Exact(
+            model, windows
+        ), "exact derivatives through CasADi's import, checked against difference quotients"
+    except (NotExact, FmuError) as error:
+        return BlackBox(model, windows), f"black box: {error}"
+
+
+def noise_of(model: UserModel, records: Sequence[Record]) -> FloatArray:
+    """White noise of the measured outputs, in the units of the FMU."""
+    levels = [
+        [abs(m.scale) * noise_level(r[m.channel], tuple(r.segments())) for m in model.outputs]
+        for r in records
+    ]
+    found: FloatArray = np.median(np.array(levels), axis=0)
+    return found
+
+
+@final
+class Outputs:
+    """Errors of the outputs of an FMU, window by window; a
+    :class:`identification.fitting.least_squares.LocalProblem`.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Of every parameter; those not in `names` stay.
+    names : sequence of str
+        The parameters that move.
+    sigma : (outputs,) array
+        What the errors of each output are divided by.
+    say : callable, optional
+        Called with the number of the step before its derivatives are made.
+    """
+
+    def __init__(
+        self,
+        windows: Sequence[Window],
+        simulator: Simulator,
+        values: Mapping[str, float],
+        names: Sequence[str],
+        sigma: FloatArray,
+        say: Callable[[int], None] | None = None,
+    ) -> None:
+        self.windows, self.simulator, self.values, self.names, self.sigma = (
+            windows,
+            simulator,
+            dict(values),
+            tuple(names),
+            sigma,
+        )
+        self.steps = 0
+        self._say = say
+
+    def at(self, x: FloatArray) -> dict[str, float]:
+        """Values of every parameter."""
+        return {**self.values, **dict(zip(self.names, map(float, x), strict=True))}
+
+    def costs(self, x: FloatArray, local: FloatArray) -> FloatArray:
+        """Sum of squares of each window; infinite where the FMU fails."""
+        try:
+            predicted = self.simulator.simulate(self.at(x), local)
+        except (FmuError, InputError):
+            return np.full(len(self.windows), np.inf)
+        return np.array(
+            [
+                float(np.sum(((y - w.outputs) / self.sigma) ** 2))
+                for w, y in zip(self.windows, predicted, strict=True)
+            ]
+        )
+
+    def rows(self, x: FloatArray, local: FloatArray) -> list[FloatArray]:
+        """Columns of each window (samples x outputs, k): start values, parameters, error."""
+        predicted, jacobian = self.simulator.sensitivities(self.at(x), local, self.names)
+        count, out = len(self.names), []
+        for w, y, j in zip(self.windows, predicted, jacobian, strict=True):
+            whole = (
+                np.concatenate(
+                    [j[:, :, count:], j[:, :, :count], (y - w.outputs)[:, :, None]], axis=2
+                )
+                / self.sigma[:, None]
+            )
+            out.append(whole.reshape(-1, whole.shape[2]))
+        return out
+
+    def triangles(self, x: FloatArray, local: FloatArray) -> FloatArray:
+        """Triangle of each window."""
+        self.steps += 1
+        if self._say is not None:
+            self._say(self.steps)
+        return np.array([triangle_of(rows) for rows in self.rows(x, local)])
+
+
+@final
+class Solver:
+    """The fit of an FMU: which parameters move, their values, the start values of the windows.
+
+    Attributes
+    ----------
+    values : dict
+        Of the moving parameters and of those that move no output.
+    names : list of str
+        Parameters that move an output.
+    starts : (windows, starts) array
+    predicted : list of (n, outputs) array
+    """
+
+    def __init__(
+        self,
+        model: UserModel,
+        windows: Sequence[Window],
+        simulator: Simulator,
+        noise: FloatArray,
+        frozen: bool = False,
+    ) -> None:
+        self.model, self.windows, self.simulator = model, tuple(windows), simulator
+        self.values = dict(model.values)
+        self._frozen = frozen
+        self.bounds = model.bounds()
+        self.starts = start_values(self.windows)
+        measured = np.concatenate([w.outputs for w in self.windows])
+        self.size = np.maximum(np.std(measured, axis=0), 1e-300)
+        self.noise = np.maximum(noise, 1e-9 * self.size)
+        self.sigma = self.size.copy()
+        self.predicted = simulator.simulate(self.values, self.starts)
+        self.names = self._moving()
+
+    def _moving(self) -> list[str]:
+        """Parameters that move an output here; a shape does not while its amplitude is 0."""
+        if self._frozen:
+            return []
+        names = list(self.values)
+        _, jacobian = self.simulator.sensitivities(self.values, self.starts, names)
+        moved = {
+            n: max(float(np.max(np.abs(j[:, :, i]) / self.size)) for j in jacobian)
+            for i, n in enumerate(names)
+        }
+        return [n for n in names if moved[n] * scale_of(self.values[n], self.bounds[n]) > _MOVED]
+
+    def _problem(self, say: Callable[[int], None] | None = None) -> Outputs:
+        return Outputs(self.windows, self.simulator, self.values, self.names, self.sigma, say)
+
+    def _x(self) -> FloatArray:
+        return np.array([self.values[n] for n in self.names])
+
+    def solve(self, iterations: int, say: Progress = lambda _text, _share: None) -> int:
+        """Iterate to the end; the number of steps."""
+        used = 0
+        for last in (False, True):
+            residual = np.concatenate(
+                [w.outputs - y for w, y in zip(self.windows, self.predicted, strict=True)]
+            )
+            self.sigma = np.maximum(self.noise, np.sqrt(np.mean(residual**2, axis=0)))
+            if last and len(self.names) < len(self.values):
+                self.names = self._moving()
+            before = used
+
+            def tell(step: int, before: int = before) -> None:
+                say(f"fitting, step {before + step}", 0.95 - 0.9 * 0.85 ** (before + step))
+
+            problem = self._problem(tell)
+            box = [self.bounds[n][0] for n in self.names], [self.bounds[n][1] for n in self.names]
+            left = max(1, iterations - used) if last else iterations
+            found = least_squares(
+                problem, self._x(), box, local=self.starts, iterations=left, tolerance=_ENOUGH
+            )
+            used += found.iterations
+            self.values, self.starts = problem.at(found.x), found.local
+            self.predicted = self.simulator.simulate(self.values, self.starts)
+        return used
+
+    def errors(self) -> tuple[dict[str, float | None], dict[str, tuple[str, float]]]:
+        """Standard errors from blocks of time, and correlations."""
+        n = len(self.names)
+        stderr: dict[str, float | None] = dict.fromkeys(self.values)
+        if not n:
+            return stderr, {}
+        parts, blocks, first = [], [], 0
+        for w, rows in zip(self.windows, self._problem().rows(self._x(), self.starts), strict=True):
+            starts = rows.shape[1] - n - 1
+            norms = np.linalg.norm(rows[:, :starts], axis=0)
+            q = np.linalg.qr(rows[:, :starts] / np.where(norms > 0, norms, 1.0))[0]
+            parts.append(rows[:, starts:] - q @ (q.T @ rows[:, starts:]))
+            block = first + np.floor((w.time - w.time[0]) / BLOCK + 1e-9).astype(np.int64)
+            blocks.append(np.repeat(block, w.outputs.shape[1]))
+            first = int(block[-1]) + 1
+        rows = np.concatenate(parts)
+        theta, r = rows[:, :n], rows[:, n]
+        spread, together = correlations(theta.T @ theta)
+        found = block_errors(theta, r, np.concatenate(blocks))
+        if found is None:
+            left = [
+                (w.outputs - y) / self.sigma
+                for w, y in zip(self.windows, self.predicted, strict=True)
+            ]
+            found = process_errors(theta, r, left)
+        correlation = {}
+        for i, name in enumerate(self.names):
+            error = float(found[i])
+            stderr[name] = error if spread[i] < _SPREAD and math.isfinite(error) else None
+            if n > 1:
+                other = int(np.argmax(np.abs(together[i])))
+                correlation[name] = (self.names[other], float(together[i, other]))
+        return stderr, correlation
+
+
+__all__ = ["Outputs", "Solver", "UserFit", "fit", "noise_of", "simulator_of"]

@@ -1,0 +1,510 @@
+"""A user's FMU behind one small interface: FMI 2.0 or 3.0, model exchange or co-simulation.
+
+Calls go straight to the library, so that a right-hand side costs a few microseconds; only the
+functions that are needed are looked up, so that a co-simulation FMU may lack those of model
+exchange.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import shutil
+import tempfile
+import weakref
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Literal, Self, final
+
+import numpy as np
+
+from identification.errors import InputError
+from irj_fmu.host.run import FmuError, Number, _callbacks, near_names
+from irj_fmu.host.signals import FloatArray
+
+Kind = Literal["me", "cs"]
+_REALS: Final = ("Real", "Float64")
+_WHOLE: Final = {
+    "Integer": ctypes.c_int,
+    "Enumeration": ctypes.c_int,
+    "Int32": ctypes.c_int32,
+    "Int64": ctypes.c_int64,
+}
+_P, _D, _U, _I, _B = ctypes.c_void_p, ctypes.c_double, ctypes.c_size_t, ctypes.c_int, ctypes.c_bool
+_LOG3: Final = ctypes.CFUNCTYPE(None, _P, _I, ctypes.c_char_p, ctypes.c_char_p)
+_EVENT2: Final = 48  # bytes of fmi2EventInfo: five booleans and a double, with room to spare
+_SETTLE: Final = 100
+
+
+@final
+class UserFmu:
+    """Somebody else's FMU, extracted once.
+
+    Parameters
+    ----------
+    path : Path
+        An ``.fmu`` file, or a folder it was extracted to.
+
+    Attributes
+    ----------
+    description : fmpy.model_description.ModelDescription
+    variables : dict
+        fmpy's variables by name.
+    version : int
+        2 or 3.
+    states : tuple of str
+        Continuous states, in the order in which the FMU gives them.
+
+    Raises
+    ------
+    InputError
+        Where it is not a readable FMU of FMI 2.0 or 3.0.
+    """
+
+    def __init__(self, path: Path) -> None:
+        from fmpy import extract, read_model_description
+
+        self.path = Path(path).resolve()
+        if not self.path.exists():
+            raise InputError(
+                f"{self.path}: there is no such FMU; give its path, relative to the joint file "
+                "or whole"
+            )
+        try:
+            if self.path.is_file():
+                folder = tempfile.mkdtemp(prefix="irj-user-")
+                weakref.finalize(self, shutil.rmtree, folder, True)
+                extract(str(self.path), folder)
+                self.folder = Path(folder)
+            else:
+                self.folder = self.path
+            if not (self.folder / "modelDescription.xml").is_file():
+                raise InputError("it holds no modelDescription.xml; give an .fmu file")
+            self.description: Any = read_model_description(str(self.folder))
+        except Exception as error:
+            raise InputError(
+                f"{self.path}: not a readable FMU ({' '.join(str(error).split())})"
+            ) from error
+        if str(self.description.fmiVersion)[:2] not in ("2.", "3."):
+            raise InputError(
+                f"{self.path}: FMI {self.description.fmiVersion} is not supported; export it as "
+                "FMI 2.0 or 3.0"
+            )
+        self.version = int(self.description.fmiVersion[0])
+        self.variables: dict[str, Any] = {v.name: v for v in self.description.modelVariables}
+        slopes = [d.variable for d in self.description.derivatives]
+        self.states: tuple[str, ...] = tuple(
+            v.derivative.name for v in slopes if v.derivative is not None
+        )
+
+    def kinds(self) -> tuple[Kind, ...]:
+        """What the FMU can do: model exchange first, where it has no state events."""
+        found: list[Kind] = []
+        events = self.description.numberOfEventIndicators or len(self.description.eventIndicators)
+        if self.description.modelExchange is not None and not events:
+            found.append("me")
+        if self.description.coSimulation is not None:
+            found.append("cs")
+        if not found:
+            what = (
+                "model exchange with state events only"
+                if events
+                else "neither model exchange nor co-simulation"
+            )
+            raise InputError(f"{self.path.name}: has {what}; export it for co-simulation")
+        return tuple(found)
+
+    def promises_derivatives(self) -> bool:
+        """True where model exchange is said to give directional derivatives."""
+        from xml.etree import ElementTree
+
+        found = (
+            ElementTree.parse(self.folder / "modelDescription.xml").getroot().find("ModelExchange")
+        )
+        return found is not None and any(
+            found.get(f"providesDirectionalDerivative{s}") in ("true", "1") for s in ("", "s")
+        )
+
+    def variable(self, name: str) -> Any:
+        """Return fmpy's description of a variable; an `InputError` suggests near names."""
+        if name not in self.variables:
+            raise InputError(
+                f"{self.path.name}: there is no variable {name!r}; "
+                f"{near_names(name, self.variables)}"
+            )
+        return self.variables[name]
+
+    def real(self, name: str) -> Any:
+        """The same for a scalar of type Real or Float64."""
+        found = self.variable(name)
+        if found.type not in _REALS or found.dimensions:
+            raise InputError(
+                f"{self.path.name}: variable {name!r} is no real scalar ({found.type}) and "
+                "cannot be a signal or a fitted parameter"
+            )
+        return found
+
+    def start(self, name: str) -> float:
+        """Start value of a variable; 0 where it has none."""
+        value = self.real(name).start
+        return float(value) if value is not None else 0.0
+
+
+@final
+@dataclass(frozen=True)
+class Block:
+    """Reals that are read or written by one call."""
+
+    names: tuple[str, ...]
+    references: Any
+    values: Any
+    array: FloatArray
+
+
+@final
+class UserInstance:
+    """One instance of a user's FMU, made once and reset for each run.
+
+    Parameters
+    ----------
+    fmu : UserFmu
+    kind : {"me", "cs"}
+    """
+
+    def __init__(self, fmu: UserFmu, kind: Kind) -> None:
+        part = fmu.description.modelExchange if kind == "me" else fmu.description.coSimulation
+        if part is None:
+            raise InputError(
+                f"{fmu.path.name}: this FMU has no "
+                f"{'model exchange' if kind == 'me' else 'co-simulation'}"
+            )
+        self.fmu, self.kind, self.version = fmu, kind, fmu.version
+        self.messages: list[str] = []
+        self._part = part
+        self._functions: dict[str, Any] = {}
+        self._library = self._load(part.modelIdentifier)
+        self._component = self._instantiate()
+        self._close = weakref.finalize(
+            self, _free, self._function("FreeInstance", [_P], None), self._component
+        )
+        self._used = False
+        self.size = len(fmu.states)
+        self.x: Any = (_D * max(self.size, 1))()
+        self.dx: Any = (_D * max(self.size, 1))()
+        self._x: FloatArray = np.ctypeslib.as_array(self.x)[: self.size]
+        self._dx: FloatArray = np.ctypeslib.as_array(self.dx)[: self.size]
+        self._flags = (_I * 8)()
+        self._bind()
+
+    # --- library ----------------------------------------------------------------------------------
+
+    def _load(self, identifier: str) -> Any:
+        from fmpy import platform, platform_tuple, sharedLibraryExtension
+
+        folder = self.fmu.folder / "binaries"
+        path = (
+            folder
+            / (platform if self.version == 2 else platform_tuple)
+            / f"{identifier}{sharedLibraryExtension}"
+        )
+        if not path.is_file():
+            there = (
+                ", ".join(sorted(p.name for p in folder.iterdir())) if folder.is_dir() else "none"
+            )
+            raise InputError(
+                f"{self.fmu.path.name}: holds no library for this machine ({path.parent.name}; "
+                f"it has {there}); export it for this platform"
+            )
+        try:
+            return ctypes.CDLL(str(path))
+        except OSError as error:
+            raise InputError(
+                f"{self.fmu.path.name}: its library cannot be loaded ({error})"
+            ) from error
+
+    def _function(self, name: str, arguments: list[Any], result: Any = ctypes.c_int) -> Any:
+        try:
+            found = getattr(self._library, f"fmi{self.version}{name}")
+        except AttributeError:
+            raise FmuError(
+                f"{self.fmu.path.name}: its library lacks fmi{self.version}{name}"
+            ) from None
+        found.argtypes, found.restype = arguments, result
+        return found
+
+    def _instantiate(self) -> int:
+        part, fmu, text = self._part, self.fmu, ctypes.c_char_p
+        if self.version == 2:
+            self._callbacks = _callbacks(self.messages)
+            make = self._function("Instantiate", [text, _I, text, text, _P, _I, _I], _P)
+            place = (fmu.folder / "resources").as_uri()
+            found = make(
+                b"user",
+                0 if self.kind == "me" else 1,
+                str(fmu.description.guid).encode(),
+                place.encode(),
+                ctypes.addressof(self._callbacks),
+                0,
+                0,
+            )
+        else:
+            self._callbacks = _LOG3(_note(self.messages))
+            token, place = (
+                str(fmu.description.instantiationToken).encode(),
+                f"{fmu.folder / 'resources'}/",
+            )
+            if self.kind == "me":
+                make = self._function(
+                    "InstantiateModelExchange", [text, text, text, _B, _B, _P, _LOG3], _P
+                )
+                found = make(b"user", token, place.encode(), False, False, None, self._callbacks)
+            else:
+                make = self._function(
+                    "InstantiateCoSimulation",
+                    [text, text, text, _B, _B, _B, _B, _P, _U, _P, _LOG3, _P],
+                    _P,
+                )
+                found = make(
+                    b"user",
+                    token,
+                    place.encode(),
+                    False,
+                    False,
+                    False,
+                    False,
+                    None,
+                    0,
+                    None,
+                    self._callbacks,
+                    None,
+                )
+        if not found:
+            raise FmuError(
+                f"{fmu.path.name}: cannot be instantiated as {part.modelIdentifier}{self._last()}"
+            )
+        return int(found)
+
+    def _bind(self) -> None:
+        """The calls of the inner loops, bound once."""
+        two, c = self.version == 2, self._component
+        real = "Real" if two else "Float64"
+        shape = [_P, _P, _U, _P] if two else [_P, _P, _U, _P, _U]
+        self._get, self._set = (
+            self._function(f"Get{real}", shape),
+            self._function(f"Set{real}", shape),
+        )
+        if self.kind == "me":
+            set_time = self._function("SetTime", [_P, _D])
+            set_states = self._function("SetContinuousStates", [_P, _P, _U])
+            get_slopes = self._function(
+                "GetDerivatives" if two else "GetContinuousStateDerivatives", [_P, _P, _U]
+            )
+            x, dx, n, last = self.x, self.dx, self.size, self._last
+
+            def slopes(time: float) -> None:
+                if set_time(c, time) > 1 or set_states(c, x, n) > 1 or get_slopes(c, dx, n) > 1:
+                    raise FmuError(
+                        f"{self.fmu.path.name}: refuses time, states or derivatives at t = "
+                        f"{time:g} s{last()}"
+                    )
+
+            self._slopes: Callable[[float], None] = slopes
+            needed = self._part.needsCompletedIntegratorStep
+            self._completed = (
+                self._function("CompletedIntegratorStep", [_P, _I if two else _B, _P, _P])
+                if needed
+                else None
+            )
+        elif two:
+            self._step = self._function("DoStep", [_P, _D, _D, _I])
+        else:
+            self._step = self._function("DoStep", [_P, _D, _D, _B, _P, _P, _P, _P])
+
+    def _last(self) -> str:
+        return f": {self.messages[-1]}" if self.messages else ""
+
+    def _call(self, name: str, arguments: list[Any], *values: Any) -> None:
+        found = self._functions.get(name)
+        if found is None:
+            found = self._functions[name] = self._function(name, [_P, *arguments])
+        status = found(self._component, *values)
+        if status > 1:
+            raise FmuError(
+                f"{self.fmu.path.name}: fmi{self.version}{name} failed with status "
+                f"{status}{self._last()}"
+            )
+
+    # --- values -----------------------------------------------------------------------------------
+
+    def block(self, names: Iterable[str]) -> Block:
+        """Reals to be read or written together."""
+        names = tuple(names)
+        references = (ctypes.c_uint * max(len(names), 1))(
+            *(self.fmu.real(n).valueReference for n in names)
+        )
+        values = (_D * max(len(names), 1))()
+        return Block(names, references, values, np.ctypeslib.as_array(values)[: len(names)])
+
+    def read(self, block: Block) -> FloatArray:
+        """Fill a block from the FMU; its array is returned and reused."""
+        n = len(block.names)
+        if n:
+            more = () if self.version == 2 else (n,)
+            if self._get(self._component, block.references, n, block.values, *more) > 1:
+                raise FmuError(
+                    f"{self.fmu.path.name}: refuses to give {', '.join(block.names)}{self._last()}"
+                )
+        return block.array
+
+    def write(self, block: Block) -> None:
+        """Set the FMU's variables from a block's array."""
+        n = len(block.names)
+        if n:
+            more = () if self.version == 2 else (n,)
+            if self._set(self._component, block.references, n, block.values, *more) > 1:
+                raise FmuError(
+                    f"{self.fmu.path.name}: refuses to take {', '.join(block.names)}{self._last()}"
+                )
+
+    def assign(self, values: Mapping[str, Number]) -> None:
+        """Set variables of any numeric type by name, before or during initialization."""
+        reals = self.block(n for n in values if self.fmu.variable(n).type in _REALS)
+        reals.array[:] = [float(values[n]) for n in reals.names]
+        self.write(reals)
+        for name, value in values.items():
+            variable = self.fmu.variable(name)
+            if name in reals.names:
+                continue
+            boolean = ctypes.c_bool if self.version == 3 else ctypes.c_int
+            kind = boolean if variable.type == "Boolean" else _WHOLE.get(variable.type)
+            if kind is None:
+                raise InputError(
+                    f"{self.fmu.path.name}: variable {name!r} is a {variable.type}; only real, "
+                    "integer and boolean values can be set"
+                )
+            function = f"Set{'Integer' if variable.type == 'Enumeration' and self.version == 2 else variable.type}"
+            more: tuple[Sequence[Any], Sequence[Any]] = (
+                ((), ()) if self.version == 2 else ((_U,), (1,))
+            )
+            self._call(
+                function,
+                [_P, _U, _P, *more[0]],
+                ctypes.byref(ctypes.c_uint(variable.valueReference)),
+                1,
+                ctypes.byref(kind(int(value))),
+                *more[1],
+            )
+
+    # --- a run ------------------------------------------------------------------------------------
+
+    def begin(self, time: float, values: Mapping[str, Number] | None = None) -> None:
+        """Reset where it was used, set start values and enter initialization."""
+        if self._used:
+            self._call("Reset", [])
+        self._used = True
+        self.messages.clear()
+        self.assign(values or {})
+        if self.version == 2:
+            self._call("SetupExperiment", [_I, _D, _D, _I, _D], 0, 0.0, time, 0, 0.0)
+            self._call("EnterInitializationMode", [])
+        else:
+            self._call(
+                "EnterInitializationMode", [_B, _D, _D, _B, _D], False, 0.0, time, False, 0.0
+            )
+
+    def ready(self) -> FloatArray:
+        """Leave initialization; the states of a model-exchange FMU, a copy."""
+        self._call("ExitInitializationMode", [])
+        if self.kind == "cs":
+            return np.empty(0)
+        self._settle()
+        self._call("EnterContinuousTimeMode", [])
+        self._call("GetContinuousStates", [_P, _U], self.x, self.size)
+        return self._x.copy()
+
+    def _settle(self) -> None:
+        """Event iteration; an FMU that plans time events is refused."""
+        for _ in range(_SETTLE):
+            if self.version == 2:
+                info = ctypes.create_string_buffer(_EVENT2)
+                self._call("NewDiscreteStates", [_P], info)
+                again, planned = (
+                    int.from_bytes(info.raw[4 * i : 4 * i + 4], "little") for i in (0, 4)
+                )
+            else:
+                flags, when = [_B() for _ in range(5)], _D()
+                self._call(
+                    "UpdateDiscreteStates",
+                    [_P] * 6,
+                    *(ctypes.byref(f) for f in flags),
+                    ctypes.byref(when),
+                )
+                again, planned = int(flags[0].value), int(flags[4].value)
+            if planned:
+                raise InputError(
+                    f"{self.fmu.path.name}: plans time events, which model exchange here does "
+                    "not follow; use its co-simulation"
+                )
+            if not again:
+                return
+        raise FmuError(f"{self.fmu.path.name}: its event iteration does not end")
+
+    def nominals(self) -> FloatArray:
+        """Nominal values of the states."""
+        found = (_D * max(self.size, 1))()
+        self._call("GetNominalsOfContinuousStates", [_P, _U], found, self.size)
+        return np.asarray(np.abs(np.array(found)[: self.size]), dtype=np.float64)
+
+    def slope(self, time: float, x: FloatArray) -> FloatArray:
+        """Derivatives at a time and state, with the inputs last set; a copy."""
+        self._x[:] = x
+        self._slopes(time)
+        return self._dx.copy()
+
+    def accept(self, time: float, _state: FloatArray) -> None:
+        """Tell the FMU that the integrator step to the time and state last evaluated is done."""
+        if self._completed is not None:
+            event = ctypes.addressof(self._flags)
+            if self._completed(self._component, 1, event, event + 8) > 1:
+                raise FmuError(
+                    f"{self.fmu.path.name}: refuses a completed step at t = {time:g} "
+                    f"s{self._last()}"
+                )
+
+    def do_step(self, time: float, step: float) -> None:
+        """One communication step of a co-simulation FMU."""
+        if self.version == 2:
+            status = self._step(self._component, time, step, 1)
+        else:
+            a = ctypes.addressof(self._flags)
+            status = self._step(self._component, time, step, True, a, a + 8, a + 16, a + 24)
+        if status > 1:
+            raise FmuError(
+                f"{self.fmu.path.name}: doStep failed with status {status} at t = {time:g} "
+                f"s{self._last()}"
+            )
+
+    def close(self) -> None:
+        """Free the instance."""
+        self._close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_about: object) -> None:
+        self.close()
+
+
+def _free(function: Any, component: int) -> None:
+    function(component)
+
+
+def _note(messages: list[str]) -> Callable[[Any, int, bytes, bytes], None]:
+    def note(_environment: Any, _status: int, _category: bytes, message: bytes) -> None:
+        if len(messages) < 1000:
+            messages.append(message.decode(errors="replace"))
+
+    return note
+
+
+__all__ = ["Block", "Kind", "UserFmu", "UserInstance"]

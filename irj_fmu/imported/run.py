@@ -1,0 +1,230 @@
+"""Runs of a user's FMU along measured inputs, window by window."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final, Protocol, final
+
+import numpy as np
+
+from identification.errors import InputError
+from irj_fmu.host.exchange import Stepper
+from irj_fmu.host.run import Number
+from irj_fmu.host.signals import FloatArray
+from irj_fmu.imported.library import Kind, UserFmu, UserInstance
+
+RTOL: Final = 1e-8
+ATOL: Final = 1e-10
+SAME: Final = 1e-6
+"""Largest difference of fixed steps from steps of controlled length, relative to the range of
+an output.
+"""
+SUBSTEPS: Final = (1, 2, 4, 8)
+_TRIED: Final = 2000
+HOLD: Final = 1e-3
+"""Longest time for which what is fed back holds [s]."""
+
+
+@final
+@dataclass(frozen=True)
+class Window:
+    """A stretch of a record in the units of the FMU.
+
+    Attributes
+    ----------
+    time : (n,) array
+        [s]
+    inputs : (n, inputs) array
+        What is held from each sample to the next.
+    outputs : (n, outputs) array
+        Measured.
+    start : (starts,) array
+        Start values of the variables that the measurement starts.
+    record : int
+        Number of the record.
+    """
+
+    time: FloatArray
+    inputs: FloatArray
+    outputs: FloatArray
+    start: FloatArray
+    record: int = 0
+
+
+class Feedback(Protocol):
+    """Something outside the FMU that reads its outputs and adds to its inputs."""
+
+    def begin(self, window: Window) -> None:
+        """Before the first sample of a window."""
+
+    def __call__(
+        self, sample: int, time: float, inputs: FloatArray, outputs: FloatArray
+    ) -> FloatArray:
+        """What is added to the inputs from a time on, (inputs,); called again between samples
+        that lie far apart.
+        """
+
+
+@final
+class Runner:
+    """One instance of a user's FMU that serves many runs.
+
+    Parameters
+    ----------
+    fmu : UserFmu
+    kind : {"me", "cs"}
+    inputs, outputs, starts : sequence of str
+        Variables of the columns of :class:`Window`.
+    settings : mapping
+        Values of further variables.
+
+    Attributes
+    ----------
+    substeps : int
+        Fixed Runge-Kutta steps between two samples; 0 for steps of controlled length.
+    """
+
+    def __init__(
+        self,
+        fmu: UserFmu,
+        kind: Kind,
+        *,
+        inputs: Sequence[str],
+        outputs: Sequence[str],
+        starts: Sequence[str],
+        settings: Mapping[str, Number],
+    ) -> None:
+        self.fmu, self.kind, self.starts, self.settings = fmu, kind, tuple(starts), dict(settings)
+        self.instance = UserInstance(fmu, kind)
+        self._inputs, self._outputs = self.instance.block(inputs), self.instance.block(outputs)
+        self.substeps = 0
+
+    def choose_substeps(self, window: Window, values: Mapping[str, float]) -> None:
+        """Take fixed steps where few of them agree with steps of controlled length: they cost a
+        third.
+        """
+        if self.kind != "me" or not self.instance.size:
+            return
+        short = shortened(window)
+        self.substeps = 0
+        reference = self.run(short, values)
+        for count in SUBSTEPS:
+            self.substeps = count
+            if agrees(self.run(short, values), reference):
+                return
+        self.substeps = 0
+
+    def run(
+        self,
+        window: Window,
+        values: Mapping[str, float],
+        start: FloatArray | None = None,
+        feedback: Feedback | None = None,
+    ) -> FloatArray:
+        """Outputs (n, outputs) along a window.
+
+        Parameters
+        ----------
+        window : Window
+        values : mapping
+            Parameters by name.
+        start : (starts,) array, optional
+            In place of the window's start values.
+        feedback : Feedback, optional
+
+        Raises
+        ------
+        FmuError
+            Where the FMU refuses a call.
+        InputError
+            Where an output is not finite.
+        """
+        instance, ins, outs = self.instance, self._inputs, self._outputs
+        own = dict(
+            zip(self.starts, (window.start if start is None else start).tolist(), strict=True)
+        )
+        times = window.time.tolist()
+        instance.begin(times[0], {**self.settings, **values, **own})
+        ins.array[:] = window.inputs[0]
+        instance.write(ins)
+        x = instance.ready()
+        stepper = (
+            Stepper(self.fmu.path.name, instance.nominals(), RTOL, ATOL, instance.accept)
+            if self.kind == "me"
+            else None
+        )
+        if feedback is not None:
+            feedback.begin(window)
+        table = np.empty((len(times), len(outs.names)))
+        if stepper is not None:
+            instance.slope(times[0], x)
+        last = len(times) - 1
+        for k, now in enumerate(times):
+            held = window.inputs[k]
+            ins.array[:] = held
+            instance.write(ins)
+            table[k] = instance.read(outs)
+            if k == last:
+                break
+            end = times[k + 1]
+            if feedback is None:
+                x = self._advance(stepper, now, end, x)
+                continue
+            parts = max(1, math.ceil((end - now) / HOLD - 1e-6))
+            for i in range(parts):
+                at = now + i * (end - now) / parts
+                ins.array[:] = held + feedback(k, at, held, instance.read(outs) if i else table[k])
+                instance.write(ins)
+                x = self._advance(
+                    stepper, at, now + (i + 1) * (end - now) / parts if i + 1 < parts else end, x
+                )
+        if not np.isfinite(table).all():
+            bad = outs.names[int(np.argmin(np.isfinite(table).all(axis=0)))]
+            raise InputError(
+                f"{self.fmu.path.name}: output {bad!r} is not finite; check start values and "
+                "parameters"
+            )
+        return table
+
+    def _advance(
+        self, stepper: Stepper | None, now: float, end: float, x: FloatArray
+    ) -> FloatArray:
+        """From one time to the next, inputs held: state of a model-exchange FMU."""
+        instance = self.instance
+        if stepper is None:
+            instance.do_step(now, end - now)
+            return x
+        slope = instance.slope
+        if not instance.size:
+            slope(end, x)
+            return x
+        if not self.substeps:
+            return stepper.advance(slope, now, end, x)
+        h = (end - now) / self.substeps
+        for i in range(self.substeps):
+            at = now + i * h
+            k1 = slope(at, x)
+            k2 = slope(at + h / 2, x + (h / 2) * k1)
+            k3 = slope(at + h / 2, x + (h / 2) * k2)
+            k4 = slope(at + h, x + h * k3)
+            x = x + (h / 6) * (k1 + 2 * (k2 + k3) + k4)
+        slope(end, x)
+        instance.accept(end, x)
+        return x
+
+
+def shortened(window: Window) -> Window:
+    """At most the first samples of a window, enough to try a step length on."""
+    n = slice(0, _TRIED)
+    return Window(window.time[n], window.inputs[n], window.outputs[n], window.start, window.record)
+
+
+def agrees(found: FloatArray, reference: FloatArray) -> bool:
+    """True where fixed steps follow the reference."""
+    spread = np.maximum(np.ptp(reference, axis=0), 1e-300)
+    return bool(np.all(np.abs(found - reference).max(axis=0) <= SAME * spread))
+
+
+__all__ = ["ATOL", "HOLD", "RTOL", "Feedback", "Runner", "Window", "agrees", "shortened"]

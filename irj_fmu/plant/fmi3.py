@@ -1,0 +1,216 @@
+"""Plants as FMI 3.0 model exchange, an extra beside the FMI 2.0 FMUs of
+:mod:`irj_fmu.plant.library`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+from xml.etree.ElementTree import Element, SubElement
+
+from identification.errors import InputError
+from irj_fmu.fmi.archive import content_guid, write_archive
+from irj_fmu.fmi.compiler import TARGETS, compile_library, find_compiler
+from irj_fmu.fmi.model_description import GENERATOR, to_bytes
+from irj_fmu.fmi.unit_definitions import add_unit_definitions
+from irj_fmu.fmi.variables import Variable
+from irj_fmu.plant.library import (
+    PlantSpec,
+    _check,
+    _config,
+    _generate,
+    _parameter,
+    _per_second,
+    _targets,
+)
+
+_SOURCE: Final = "plant_fmi3.c"
+_FOLDERS: Final = {
+    "x86_64-linux-gnu": "x86_64-linux",
+    "aarch64-linux-gnu": "aarch64-linux",
+    "x86_64-windows-gnu": "x86_64-windows",
+    "x86_64-macos": "x86_64-darwin",
+    "aarch64-macos": "aarch64-darwin",
+}
+
+
+def build_plant_fmi3(
+    spec: PlantSpec, out: Path, *, cc: str | None = None, target: str | Sequence[str] | None = None
+) -> Path:
+    """Build the FMI 3.0 model-exchange FMU of a plant, with directional derivatives and FMU state.
+
+    Parameters
+    ----------
+    spec : PlantSpec
+        A plant without displacement memory.
+    out, cc, target
+        As in :func:`irj_fmu.plant.library.build_plant`.
+
+    Returns
+    -------
+    Path
+        Absolute path of the FMU. The same content gives the same bytes.
+
+    Raises
+    ------
+    InputError
+        A plant with memory; no compiler; a folder that cannot be written.
+
+    Notes
+    -----
+    Outputs and derivatives state no ``dependencies``, which means that each depends on everything.
+    A list as the standard has it leaves parameters out, and importers then give wrong derivatives
+    with respect to them.
+    """
+    _check(spec)
+    if spec.memory:
+        raise InputError(
+            f"plant {spec.name}: its displacement memory moves with the steps of a "
+            "co-simulation; FMI 3.0 model exchange cannot hold it"
+        )
+    targets = _targets(target)
+    for triple in targets:
+        find_compiler(triple, cc)
+    code, limits = _generate(spec)
+    wrapper = ((Path(__file__).parents[1] / "c") / _SOURCE).read_bytes()
+    sources = {"plant_model.c": code, _SOURCE: wrapper}
+    token = content_guid(
+        {
+            **sources,
+            "description": to_bytes(_describe(spec, "")),
+            "config": _config(spec, limits, ""),
+        }
+    )
+    sources["plant_config.h"] = _config(spec, limits, token)
+    content = {f"sources/{name}": text for name, text in sources.items()}
+    content["sources/buildDescription.xml"] = to_bytes(_build_description(spec.name))
+    content["modelDescription.xml"] = to_bytes(_describe(spec, token))
+    for triple in targets:
+        library = compile_library(sources, _SOURCE, triple, cc=cc, libraries=("m",))
+        content[f"binaries/{_FOLDERS[triple]}/{spec.name}{TARGETS[triple].suffix}"] = library
+    return write_archive(out, content)
+
+
+def _build_description(name: str) -> Element:
+    root = Element("fmiBuildDescription", {"fmiVersion": "3.0"})
+    configuration = SubElement(root, "BuildConfiguration", {"modelIdentifier": name})
+    files = SubElement(configuration, "SourceFileSet", {"language": "C99"})
+    SubElement(files, "SourceFile", {"name": _SOURCE})
+    return root
+
+
+def _describe(spec: PlantSpec, token: str) -> Element:
+    root = Element(
+        "fmiModelDescription",
+        {
+            "fmiVersion": "3.0",
+            "modelName": spec.name,
+            "instantiationToken": token,
+            **({"description": spec.description} if spec.description else {}),
+            "generationTool": GENERATOR,
+            "variableNamingConvention": "structured",
+        },
+    )
+    SubElement(
+        root,
+        "ModelExchange",
+        {
+            "modelIdentifier": spec.name,
+            "canGetAndSetFMUState": "true",
+            "canSerializeFMUState": "true",
+            "providesDirectionalDerivatives": "true",
+        },
+    )
+    slopes = [Variable(f"der({v.name})", unit=_per_second(v.unit)) for v in spec.states]
+    groups = (spec.states, slopes, spec.inputs, spec.parameters, spec.outputs)
+    add_unit_definitions(
+        root, [(v.unit, v.display_unit) for group in groups for v in group] + [("s", None)]
+    )
+    categories = SubElement(root, "LogCategories")
+    SubElement(categories, "Category", {"name": "logStatusError", "description": "Errors."})
+    SubElement(
+        root,
+        "DefaultExperiment",
+        {
+            "startTime": "0.0",
+            "stopTime": "1.0",
+            "tolerance": repr(spec.tolerance),
+            "stepSize": repr(spec.default_step),
+        },
+    )
+    node = SubElement(root, "ModelVariables")
+    n = len(spec.states)
+    rows: list[tuple[Variable, dict[str, str]]] = []
+    rows += [
+        (
+            v,
+            {
+                "causality": "local",
+                "variability": "continuous",
+                "initial": "exact",
+                "start": repr(float(v.start)),
+            },
+        )
+        for v in spec.states
+    ]
+    slope = {"causality": "local", "variability": "continuous", "initial": "calculated"}
+    rows += [(v, {**slope, "derivative": str(i)}) for i, v in enumerate(slopes)]
+    rows += [
+        (v, {"causality": "input", "variability": "continuous", "start": repr(float(v.start))})
+        for v in spec.inputs
+    ]
+    rows += [
+        (
+            v,
+            {
+                "causality": "parameter",
+                "variability": _parameter(v),
+                "initial": "exact",
+                "start": repr(float(v.start)),
+            },
+        )
+        for v in spec.parameters
+    ]
+    rows += [
+        (v, {"causality": "output", "variability": "continuous", "initial": "calculated"})
+        for v in spec.outputs
+    ]
+    for reference, (variable, more) in enumerate(rows):
+        SubElement(node, "Float64", {**_attributes(variable, reference), **more})
+    time = Variable("time", "s", description="Time.")
+    SubElement(
+        node,
+        "Float64",
+        {**_attributes(time, len(rows)), "causality": "independent", "variability": "continuous"},
+    )
+    structure = SubElement(root, "ModelStructure")
+    first = len(rows) - len(spec.outputs)
+    unknowns = [("Output", first + i) for i in range(len(spec.outputs))] + [
+        ("ContinuousStateDerivative", n + i) for i in range(n)
+    ]
+    for title, reference in unknowns:
+        SubElement(structure, title, {"valueReference": str(reference)})
+    for _, reference in unknowns:
+        SubElement(structure, "InitialUnknown", {"valueReference": str(reference)})
+    return root
+
+
+def _attributes(variable: Variable, reference: int) -> dict[str, str]:
+    found: dict[str, str] = {"name": variable.name, "valueReference": str(reference)}
+    optional: Mapping[str, Any] = {
+        "description": variable.description or None,
+        "unit": variable.unit or None,
+        "displayUnit": variable.display_unit if variable.unit else None,
+        "min": variable.minimum,
+        "max": variable.maximum,
+        "nominal": variable.nominal,
+    }
+    return found | {
+        k: repr(float(v)) if isinstance(v, int | float) else str(v)
+        for k, v in optional.items()
+        if v is not None
+    }
+
+
+__all__ = ["build_plant_fmi3"]

@@ -1,0 +1,150 @@
+"""Noise floors: uneven stamps, records of several rates; standard errors from few blocks; what
+noise takes off a parameter.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from identification import Record, fit
+from identification.balance.excitation import attenuation, excitation_warnings
+from identification.balance.noise import noise_level
+from identification.diagnosis.improvement import judged_drop, made_worse
+from identification.fitting.assess import BalanceError, Error, assess
+from identification.fitting.covariance import FEWEST_BLOCKS, block_errors
+from identification.fitting.engine import load_dataset, prepared_model, rms
+from tests.identification.diagnosis.test_other_payload import FAST, JOINT, record
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.02, 0.1, 0.3])
+def test_motion_between_uneven_stamps_is_no_noise(jitter: float) -> None:
+    rng = np.random.default_rng(4)
+    stamps = np.arange(8000) * 2e-3
+    stamps = stamps + jitter * 2e-3 * rng.uniform(-1, 1, len(stamps))
+    values = 160 * np.sin(2.0 * stamps) + 1e-3 * rng.standard_normal(len(stamps))
+    whole = (slice(0, len(stamps)),)
+    assert noise_level(values, whole, stamps) == pytest.approx(1e-3, rel=0.07)
+    if jitter:
+        assert noise_level(values, whole) > 3e-3
+
+
+@pytest.mark.parametrize("factor", [1, 2, 4])
+def test_each_record_has_the_floor_of_its_own_rate(factor: int) -> None:
+    healthy = {n: record(n, seed, False, *FAST) for n, seed in (("train", 3), ("other rate", 7))}
+    train, other = healthy["train"], healthy["other rate"]
+    held = Record.from_channels(
+        other.time[::factor], {c: x[::factor] for c, x in other.channels.items()}, name="other rate"
+    )
+    model = prepared_model(JOINT, train)
+    solution = fit(JOINT, [train]).solution
+    data = load_dataset([train], [held], JOINT, model)
+    errors = assess(solution.model, data, data.held_out, solution.values).balances
+    for balance in ("link", "transmission"):
+        assert 0.8 < errors[balance].ratio < 1.2
+    single = assess(solution.model, data, data.train, solution.values).balances
+    assert errors["transmission"].floor == pytest.approx(
+        single["transmission"].floor * np.sqrt(factor), rel=0.15
+    )
+
+
+@pytest.mark.parametrize("blocks", [5, 10, 40])
+def test_twice_the_error_is_a_band_of_95_percent_with_few_blocks_too(blocks: int) -> None:
+    rng = np.random.default_rng(blocks)
+    each, parameters, kernel = 60, 6, np.ones(5) / 5
+    rows = blocks * each
+    # columns that vary slowly, as in a joint: within a block they depend on each other
+    jacobian = np.column_stack(
+        [np.sin(0.01 * (k + 1) * np.arange(rows) + k) for k in range(parameters)]
+    )
+    block = np.repeat(np.arange(blocks), each)
+    inverse = np.linalg.inv(jacobian.T @ jacobian)
+    inside = total = 0
+    for _ in range(300):
+        noise = np.convolve(rng.standard_normal(rows + 4), kernel, mode="valid")
+        found = inverse @ (jacobian.T @ noise)
+        error = block_errors(jacobian, noise - jacobian @ found, block)
+        assert error is not None
+        inside += int(np.sum(np.abs(found) < 2 * error))
+        total += parameters
+    assert 0.92 < inside / total < 0.995
+
+
+def test_too_few_blocks_give_no_error() -> None:
+    rng = np.random.default_rng(0)
+    block = np.repeat(np.arange(FEWEST_BLOCKS - 1), 20)
+    assert (
+        block_errors(rng.standard_normal((len(block), 2)), rng.standard_normal(len(block)), block)
+        is None
+    )
+
+
+def test_a_short_record_is_fitted_without_standard_errors() -> None:
+    short = record("short", 3, False, *FAST).take(slice(0, 2000))
+    found = fit(JOINT, [short])
+    assert all(found.solution.stderr[n] is None for n in ("link_inertia", "stiffness"))
+    assert found.solution.values["stiffness"] == pytest.approx(2.2e4, rel=0.05)
+
+
+def test_what_noise_takes_off_an_inertia_is_said() -> None:
+    clean = record("clean", 3, False, *FAST)
+    noisy: list[Record] = []
+    rng = np.random.default_rng(8)
+    for size in (1e-4, 4e-4):
+        noisy.append(
+            clean.with_channel(
+                "link_position", clean["link_position"] + size * rng.standard_normal(len(clean))
+            )
+        )
+    for spoilt in noisy:
+        data = load_dataset([spoilt], [], JOINT, prepared_model(JOINT, spoilt))
+        solution = fit(JOINT, [spoilt]).solution
+        found, error = solution.values["link_inertia"], solution.stderr["link_inertia"]
+        assert attenuation(data)["link inertia"] == pytest.approx(1 - found / 3.0, abs=0.04)
+        assert error is not None
+        assert abs(found - 3.0) < 3 * error
+        assert any("link inertia by about" in w for w in excitation_warnings(data))
+
+
+def test_a_direction_that_one_block_alone_tells_of_does_not_spoil_the_errors_of_the_others() -> (
+    None
+):
+    rng = np.random.default_rng(5)
+    block = np.repeat(np.arange(20), 30)
+    jacobian = rng.standard_normal((len(block), 3))
+    jacobian[:, 2] = np.where(block == 7, jacobian[:, 2] + jacobian[:, 0], 0.0)
+    noise = rng.standard_normal(len(block))
+    found = np.linalg.lstsq(jacobian, noise, rcond=None)[0]
+    together = block_errors(jacobian, noise - jacobian @ found, block)
+    without = jacobian[:, :2]
+    alone = block_errors(
+        without, noise - without @ np.linalg.lstsq(without, noise, rcond=None)[0], block
+    )
+    assert together is not None
+    assert alone is not None
+    assert together[:2] == pytest.approx(alone, rel=0.3)
+
+
+def test_an_addition_is_judged_by_what_it_leaves_and_not_by_its_floor() -> None:
+    def error(size: float, floor: float) -> Error:
+        residual = size * np.cos(np.arange(400.0))
+        weight = np.full(400, 1 / floor)
+        return Error(
+            100 * size,
+            0.0,
+            0.0,
+            {
+                "motor": BalanceError(
+                    rms(residual), floor, rms(residual) / floor, "N.m", residual, weight
+                )
+            },
+        )
+
+    assert made_worse(error(1.0, 0.5), error(0.9, 0.01)) == ""
+    assert judged_drop(error(1.0, 0.5), error(0.9, 0.01), "motor") == pytest.approx(10.0)
+    assert "motor" in made_worse(error(1.0, 0.01), error(1.3, 0.5))
+    assert made_worse(error(0.1, 1.0), error(0.1, 1.0)) == ""
+    assert made_worse(error(1.0, 0.5), error(1.05, 0.5)).startswith("the held-out error rises")

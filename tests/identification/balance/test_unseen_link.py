@@ -1,0 +1,117 @@
+"""A geared joint of which only the drive side is recorded: the link hangs on a compliance
+nobody measures.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from identification.balance.balances import Balances
+from identification.balance.dataset import load_dataset, prepared_model
+from identification.data.joint_file import Joint
+from identification.data.record import Record
+from identification.errors import InputError
+from identification.fitting.engine import solve
+from identification.fitting.fit import fit
+from identification.fitting.output_error import refine
+from tests.hidden_effect.generator import generate_case
+from workbench.cli.main import improve_json
+
+MOTOR, LINK, STIFFNESS, RATIO = 4.2, 10.8, 2.2e4, 160.0
+SWING = math.sqrt(STIFFNESS / LINK) / (2 * math.pi)
+
+
+def swinging(stiffness: float) -> Record:
+    """Drive torque and motor position of two inertias on a spring, in closed form, without
+    friction or noise.
+    """
+    t = np.arange(0.0, 20.0, 1e-3)
+    link, acceleration, snap = np.zeros_like(t), np.zeros_like(t), np.zeros_like(t)
+    for i, f in enumerate((0.21, 0.53, 0.97, 1.7, 2.9)):
+        w, size = 2 * math.pi * f, 0.3 / (1 + i) ** 2
+        link += size * np.sin(w * t + i)
+        acceleration -= size * w**2 * np.sin(w * t + i)
+        snap += size * w**4 * np.sin(w * t + i)
+    motor = link + LINK * acceleration / stiffness
+    drive = MOTOR * (acceleration + LINK * snap / stiffness) + LINK * acceleration
+    return Record.from_channels(
+        t, {"motor_torque": drive / RATIO, "motor_position": motor * RATIO}, name="swing"
+    )
+
+
+def bare_joint() -> Joint:
+    return Joint(name="bare", gear_ratio=RATIO, model_name="hd1", effects=())
+
+
+def test_the_link_is_eliminated_exactly() -> None:
+    record, joint = swinging(STIFFNESS), bare_joint()
+    model = prepared_model(joint, record)
+    data = load_dataset([record], [], joint, model)
+    values = {
+        **dict.fromkeys(model.parameter_names, 0.0),
+        "inertia": MOTOR + LINK,
+        "swinging_share": LINK / (MOTOR + LINK),
+    }
+    balances = Balances(model, data.sensing, wrt=())
+    torque = float(np.std(data.train[0].averaged["drive"]))
+    rigid = float(
+        np.std(balances.evaluate(data.train[0], {**values, "load_compliance": 0.0})["axis"][0])
+    )
+    elastic = float(
+        np.std(
+            balances.evaluate(data.train[0], {**values, "load_compliance": 1 / STIFFNESS})["axis"][
+                0
+            ]
+        )
+    )
+    assert rigid > 0.02 * torque
+    assert elastic < 1e-3 * rigid
+
+
+def test_inertias_and_compliance_are_found_from_the_motor_side() -> None:
+    record, joint = swinging(STIFFNESS), bare_joint()
+    model = prepared_model(joint, record)
+    found = solve(model, load_dataset([record], [], joint, model)).values
+    assert found["inertia"] == pytest.approx(MOTOR + LINK, rel=1e-3)
+    assert found["swinging_share"] == pytest.approx(LINK / (MOTOR + LINK), rel=0.02)
+    assert found["load_compliance"] == pytest.approx(1 / STIFFNESS, rel=0.02)
+
+
+def test_a_rigid_joint_has_no_compliance_to_find() -> None:
+    record, joint = swinging(1e12), bare_joint()
+    model = prepared_model(joint, record)
+    found = solve(model, load_dataset([record], [], joint, model)).values
+    assert found["inertia"] == pytest.approx(MOTOR + LINK, rel=1e-6)
+    assert found["load_compliance"] == 0.0
+
+
+def test_refinement_says_that_it_cannot_simulate_an_unseen_link() -> None:
+    found = fit(bare_joint(), swinging(STIFFNESS))
+    with pytest.raises(InputError, match="needs link_position where the link swings"):
+        refine(found)
+
+
+@pytest.mark.parametrize(
+    ("effect", "seed"), [("stribeck", 1000), (None, 1003), ("quadratic_drag", 1000)]
+)
+def test_friction_is_named_from_the_motor_side_alone(
+    effect: str | None, seed: int, tmp_path: Path
+) -> None:
+    generate_case(effect, seed, one_sided=True, torque_sensor=False, folder=tmp_path)
+    truth = json.loads((tmp_path / "truth.json").read_text())["link_referred"]
+    result = improve_json(
+        [tmp_path / "train.csv", tmp_path / "train2.csv"],
+        [tmp_path / "test.csv", tmp_path / "test2.csv"],
+        tmp_path / "joint.toml",
+    )
+    assert [c["effects"][0] for c in result["claims"]] == ([effect] if effect else [])
+    if effect is not None:
+        assert result["claims"][0]["held_out_drop_percent"] > 70
+    swing = math.sqrt(truth["stiffness_Nm_per_rad"] / truth["link_inertia_kg_m2"]) / (2 * math.pi)
+    said = next(w for w in result["warnings"] if "the link would swing at" in w)
+    assert float(said.split("swing at ")[1].split(" Hz")[0]) == pytest.approx(swing, rel=0.05)

@@ -1,0 +1,89 @@
+"""Kernels, noise level, vectorised evaluation: the numerics under the balances."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from casadi_models import EFFECTS, JointModel
+from casadi_models.vectorised import Vectorised
+from identification.balance.noise import noise_level
+from identification.balance.weak import differentiated_kernel, kernel, prepare
+
+
+@pytest.mark.parametrize("order", [0, 1, 2, 3])
+def test_kernel_gives_the_derivative_of_polynomials(order: int) -> None:
+    dt, length = 1e-3, 0.06
+    weights = differentiated_kernel(length, dt, order)
+    t = (np.arange(len(weights)) - len(weights) // 2) * dt
+    for power in range(order + 1):
+        expected = float(np.prod(np.arange(1, order + 1))) if power == order else 0.0
+        assert weights @ t**power == pytest.approx(
+            expected, abs=1e-7 * max(1.0, float(np.abs(weights).sum()))
+        )
+
+
+def test_average_of_a_derivative_is_the_derivative_of_the_average() -> None:
+    t = np.arange(0, 4, 1e-3)
+    q, v, a = np.sin(5 * t), 5 * np.cos(5 * t), -25 * np.sin(5 * t)
+    data = prepare(t, {"motor_position": q}, (slice(0, len(t)),))
+    plain = differentiated_kernel(0.06, 1e-3, 0)
+    assert data.averaged["motor_velocity"] == pytest.approx(data.grid.correlate(v, plain), abs=1e-6)
+    assert data.averaged["motor_acceleration"] == pytest.approx(
+        data.grid.correlate(a, plain), abs=1e-5
+    )
+    inner = slice(30, -30)
+    assert data.points["motor_velocity"][inner] == pytest.approx(v[::2][inner], abs=2e-3)
+
+
+def test_no_row_and_no_block_spans_two_segments() -> None:
+    t = np.concatenate([np.arange(0, 2, 1e-3), np.arange(10, 13, 1e-3)])
+    data = prepare(t, {"motor_position": np.sin(t)}, (slice(0, 2000), slice(2000, 5000)))
+    assert not np.any((data.time > 1.98) & (data.time < 10.02))
+    first, second = set(data.block[data.time < 5]), set(data.block[data.time > 5])
+    assert first & second <= {-1}
+
+
+def test_noise_level_of_white_and_of_quantised_noise() -> None:
+    rng = np.random.default_rng(1)
+    t = np.arange(0, 10, 1e-3)
+    smooth = np.sin(2 * t)
+    assert noise_level(
+        smooth + 0.01 * rng.standard_normal(len(t)), (slice(0, len(t)),)
+    ) == pytest.approx(0.01, rel=0.07)
+    step = 1e-3
+    quantised = np.round((smooth + 2e-3 * rng.standard_normal(len(t))) / step) * step
+    assert noise_level(quantised, (slice(0, len(t)),)) == pytest.approx(
+        np.hypot(2e-3, step / np.sqrt(12)), rel=0.1
+    )
+
+
+@pytest.mark.parametrize("key", sorted(EFFECTS))
+def test_vectorised_evaluation_equals_casadi(key: str) -> None:
+    model = (
+        JointModel(gear_ratio=-160.0).add("transmission_compliance")
+        if key != "transmission_compliance"
+        else JointModel(gear_ratio=-160.0)
+    )
+    model = model.add(key)
+    e = model.equations
+    out = ca.vertcat(
+        e.motor_resistance, e.link_resistance, e.transmitted, e.drive, e.torque, e.torsion
+    )
+    function = ca.Function("f", [e.signals.vector(), e.memory, e.parameters, e.clock], [out])
+    rng = np.random.default_rng(0)
+    points = 40
+    signals = rng.standard_normal((14, points))
+    memory = rng.uniform(-1, 1, (e.memory.shape[0], points))
+    values = np.abs(rng.standard_normal(e.parameters.shape[0])) + 0.1
+    fast = Vectorised(function)(points, signals, memory, values, np.array([1e-3]))
+    slow = np.array(function(signals, memory, values, 1e-3))
+    assert fast == pytest.approx(slow, rel=1e-12, abs=1e-12)
+
+
+def test_kernel_of_the_points_is_exact_for_polynomials() -> None:
+    for order in (0, 1):
+        weights = kernel(0.03, 1e-3, order)
+        t = (np.arange(len(weights)) - len(weights) // 2) * 1e-3
+        assert weights @ t**order == pytest.approx(1.0)

@@ -1,0 +1,59 @@
+"""Claims that a table over one variable would do as well as, lines in one place only,
+amplitudes that may leave their bound.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from identification import Improvement, improve, load_joint, read
+from identification.diagnosis.lines import EVEN, _evenness
+from tests.hidden_effect.generator import generate_case
+
+
+def improved(folder: Path) -> Improvement:
+    train, held = ([read(folder / f"{n}{i}.csv") for i in ("", "2")] for n in ("train", "test"))
+    return improve(train, load_joint(folder / "joint.toml"), held)
+
+
+def test_laws_of_the_position_that_together_imitate_a_soft_stop_are_partial(tmp_path: Path) -> None:
+    found = improved(generate_case("soft_stop", 6005, folder=tmp_path / "case"))
+    assert found.verdict == "unexplained"
+    assert found.claims
+    assert all(c.partial for c in found.claims)
+    assert "Missing:" not in found.reason
+    assert "Only part of the structure is explained by" in found.reason
+    left = next(u for u in found.unexplained if u.balance == "link")
+    assert left.axis == "link_position"
+
+
+def test_a_law_of_the_position_that_is_really_there_is_whole(tmp_path: Path) -> None:
+    found = improved(generate_case("cyclic_torque", 6, folder=tmp_path / "case"))
+    assert any("cyclic_torque" in c.effects for c in found.claims)
+    assert not any(c.partial for c in found.claims)
+
+
+def test_a_small_delay_is_found_where_damping_stands_at_zero_without_it(tmp_path: Path) -> None:
+    found = improved(
+        generate_case("channel_delay", 7000, size=0.5, dirt=True, folder=tmp_path / "case")
+    )
+    assert "structural_damping" in found.steps[0].solution.at_bound
+    assert [c.effects for c in found.claims] == [("channel_delay",)]
+    solution = found.steps[-1].solution
+    assert solution.values["torque_sensor_delay"] == pytest.approx(0.00265, rel=0.1)
+    assert "structural_damping" not in solution.at_bound
+
+
+@pytest.mark.parametrize("share", [1.0, 0.6])
+def test_a_line_goes_on_over_the_stroke_and_a_burst_does_not(share: float) -> None:
+    rng = np.random.default_rng(2)
+    angle = rng.uniform(0, 60 * np.pi, 20_000)
+    weight = np.ones(len(angle))
+    noise = 0.5 * rng.standard_normal(len(angle))
+    here = angle < share * 60 * np.pi
+    assert _evenness(3.37, angle, np.sin(3.37 * angle + 0.4) * here + noise, weight) > EVEN
+    burst = np.where(np.abs(angle - 40) < 4, 3 * np.sin(3.37 * angle), 0.0)
+    assert _evenness(3.37, angle, burst + noise, weight) < EVEN

@@ -1,0 +1,91 @@
+"""Records too poor for the question: the verdict says so and does not blame the library."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from identification import Record, fit, improve, load_joint, read
+from identification.balance.excitation import excitation_warnings
+from identification.errors import InputError
+
+DEMO = Path(str(files("workbench") / "demo"))
+SHARED = Path(__file__).resolve().parents[4] / "shared" / "hidden_effect" / "stribeck"
+
+
+def turns(record: Record) -> int:
+    """Reversals counted on the noise-free side: extrema of the motor position that stand out of
+    the noise.
+    """
+    position = record["motor_position"][::50]
+    step = np.sign(
+        np.diff(position)[np.abs(np.diff(position)) > 0.2 * np.max(np.abs(np.diff(position)))]
+    )
+    return int(np.sum(np.diff(step) != 0))
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="needs the shared recordings")
+def test_too_few_reversals_are_named_in_the_verdict() -> None:
+    joint = load_joint(DEMO / "joint.toml")
+    whole, held = read(SHARED / "train.csv"), read(SHARED / "test.csv")
+    poor = whole.take(slice(0, 4000))
+    assert turns(poor) == 1
+    found = improve([poor], joint, [held])
+    assert found.verdict == "unexplained"
+    assert found.reason.endswith(
+        "The motor reverses once only, too seldom to name friction or a law with memory: record "
+        "more reversals."
+    )
+    assert "No effect of the library" not in found.reason
+    named = improve([whole.take(slice(0, 3000))], joint, [held])
+    assert [c.effects for c in named.claims] == [("stribeck",)], (
+        "where the held-out record confirms it"
+    )
+    assert any("reverses once only" in warning for warning in named.warnings)
+    rich = improve([whole], joint, [held])
+    assert not any("reverses" in warning for warning in (*rich.warnings, rich.reason))
+
+
+def test_record_in_degrees_beside_one_in_radians_is_refused() -> None:
+    joint = load_joint(DEMO / "joint.toml")
+    train, held = read(DEMO / "train.npz"), read(DEMO / "held_out.npz")
+    moved = ("motor_position", "motor_velocity", "link_position", "link_velocity")
+    degrees = train
+    for channel in moved:
+        degrees = degrees.with_channel(channel, np.rad2deg(train[channel]))
+    with pytest.raises(
+        InputError,
+        match=r"^train moves .* are its positions in degrees\? Set their unit in \[columns\]$",
+    ):
+        improve([degrees], joint, [held])
+    assert any(
+        "degrees" in w for w in excitation_warnings(fit(joint, [degrees], held_out=[held]).data)
+    ), "and said by what only fits"
+    assert not any(
+        "degrees" in w for w in improve([train], joint, [held], max_additions=0).warnings
+    )
+
+
+def test_a_run_given_twice_under_two_names_is_refused() -> None:
+    """Twice in the fit it would count as two runs; held out too, the fit would have seen what
+    judges it.
+    """
+    joint, train, held = (
+        load_joint(DEMO / "joint.toml"),
+        read(DEMO / "train.npz"),
+        read(DEMO / "held_out.npz"),
+    )
+    copy = replace(train, name="copy")
+    for given in (([train, copy], [held]), ([train], [copy])):
+        with pytest.raises(
+            InputError,
+            match=r"^copy: holds the same samples as train; a run counts once, leave one of the "
+            r"two out$",
+        ):
+            improve(given[0], joint, given[1])
+    noisy = train.with_channel("motor_current", train["motor_current"] + 1e-9)
+    assert improve([train, replace(noisy, name="noisy")], joint, [held], max_additions=0).steps

@@ -1,0 +1,845 @@
+"""The app's server: what keeps it to one person, what it survives, and that a click gives the
+numbers of the library.
+"""
+
+from __future__ import annotations
+
+import http.client
+import io
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("starlette")
+pytest.importorskip("uvicorn")
+
+from identification.errors import InputError
+from workbench.page.demo import demo_files
+from workbench.page.records import decimated, guessed_role, thinned
+from workbench.page.security import CSP
+from workbench.page.server import _listen, create_app, with_files
+from workbench.page.session import Session, State, Store, safe_name, write_atomic
+from workbench.page.uploads import check_unpacked
+
+LIMIT = 8_000_000
+JOINT = demo_files()["joint.toml"].decode()
+
+
+class Client:
+    """A plain HTTP client: it can also send what a browser would not."""
+
+    def __init__(self, port: int) -> None:
+        self.port = port
+
+    def raw(
+        self,
+        method: str,
+        path: str,
+        body: bytes | Iterator[bytes] | None = None,
+        headers: dict[str, str] | None = None,
+    ) -> tuple[int, dict[str, str], bytes]:
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)
+        try:
+            connection.request(method, path, body, {"X-IRJ": "1", **(headers or {})})
+            answer = connection.getresponse()
+            return answer.status, {k.lower(): v for k, v in answer.getheaders()}, answer.read()
+        finally:
+            connection.close()
+
+    def get(self, path: str) -> Any:
+        status, _, body = self.raw("GET", path)
+        assert status == 200, body
+        return json.loads(body)
+
+    def post(self, path: str, data: dict[str, Any] | None = None) -> tuple[int, Any]:
+        status, headers, body = self.raw("POST", path, json.dumps(data or {}).encode())
+        return status, json.loads(body) if "json" in headers.get(
+            "content-type", ""
+        ) else body.decode()
+
+    def session(self) -> str:
+        return f"/api/session/{self.post('/api/session')[1]['id']}"
+
+    def upload(self, where: str, name: str, body: bytes) -> tuple[int, str]:
+        status, _, answer = self.raw("PUT", f"{where}/files/{name}", body)
+        return status, answer.decode()
+
+    def wait(self, where: str, limit: float = 60, *, settled: bool = True) -> dict[str, Any]:
+        end = time.monotonic() + limit
+        while time.monotonic() < end:
+            state: dict[str, Any] = self.get(where)
+            if state["job"] is None and not (
+                settled and state["steps"] and not state["steps"][-1]["settled"]
+            ):
+                return state
+            time.sleep(0.02)
+        pytest.fail("the job did not end")
+
+    def run(self, where: str, action: str, *, settled: bool = True, **body: Any) -> dict[str, Any]:
+        status, answer = self.post(f"{where}/run", {"action": action, **body})
+        assert status == 202, answer
+        return self.wait(where, settled=settled)
+
+
+class Server:
+    """A server in this process."""
+
+    def __init__(self, root: Path) -> None:
+        import uvicorn
+
+        self.listening = _listen(0)
+        self.port = int(self.listening.getsockname()[1])
+        app = create_app(root, port=self.port, max_upload=LIMIT)
+        self.server = uvicorn.Server(
+            uvicorn.Config(app, log_level="critical", ws="none", timeout_graceful_shutdown=1)
+        )
+        self.thread = threading.Thread(
+            target=self.server.run, kwargs={"sockets": [self.listening]}, daemon=True
+        )
+        self.thread.start()
+        self.client = Client(self.port)
+
+    def stop(self) -> None:
+        self.server.should_exit = True
+        self.thread.join(10)
+        self.listening.close()
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("sessions")
+
+
+@pytest.fixture(scope="module")
+def client(root: Path) -> Iterator[Client]:
+    server = Server(root)
+    yield server.client
+    server.stop()
+
+
+@pytest.fixture(scope="module")
+def fitted(client: Client) -> str:
+    """A session with the demo, fitted and diagnosed."""
+    where = client.session()
+    assert client.post(f"{where}/demo")[0] == 200
+    client.run(where, "fit")
+    client.run(where, "diagnose")
+    return where
+
+
+# --- security -------------------------------------------------------------------------------------
+
+
+def test_only_the_loopback_interface_is_bound() -> None:
+    listening = _listen(0)
+    try:
+        assert listening.getsockname()[0] == "127.0.0.1"
+        others = {
+            i[4][0] for i in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)
+        } - {"127.0.0.1", "127.0.1.1"}
+        for address in others:
+            with (
+                pytest.raises(OSError),
+                socket.create_connection((str(address), listening.getsockname()[1]), timeout=1),
+            ):
+                pass
+    finally:
+        listening.close()
+
+
+def test_a_taken_port_is_said() -> None:
+    listening = _listen(0)
+    try:
+        with pytest.raises(InputError, match="is taken; give another with --port"):
+            _listen(listening.getsockname()[1])
+    finally:
+        listening.close()
+
+
+@pytest.mark.parametrize(
+    "host", ["evil.example", "127.0.0.1", "127.0.0.1:1", "127.0.0.1.evil.example:8765", ""]
+)
+def test_another_host_name_is_refused(client: Client, host: str) -> None:
+    """DNS rebinding: the browser would send the attacker's name."""
+    assert client.raw("GET", "/", headers={"Host": host})[0] == 400
+    assert client.raw("GET", "/", headers={"Host": f"localhost:{client.port}"})[0] == 200
+
+
+@pytest.mark.parametrize(
+    "origin", ["http://evil.example", "null", "https://127.0.0.1:{port}", "http://127.0.0.1:1"]
+)
+def test_another_origin_is_refused(client: Client, origin: str) -> None:
+    for method, path in (("GET", "/api/config"), ("POST", "/api/session")):
+        assert (
+            client.raw(method, path, b"{}", {"Origin": origin.format(port=client.port)})[0] == 403
+        )
+    assert (
+        client.raw("POST", "/api/session", b"{}", {"Origin": f"http://127.0.0.1:{client.port}"})[0]
+        == 200
+    )
+    assert client.raw("GET", "/", headers={"Sec-Fetch-Site": "cross-site"})[0] == 403
+
+
+def test_a_form_of_another_site_changes_nothing(client: Client) -> None:
+    connection = http.client.HTTPConnection("127.0.0.1", client.port, timeout=10)
+    connection.request(
+        "POST", "/api/session", b"", {"Content-Type": "application/x-www-form-urlencoded"}
+    )
+    assert connection.getresponse().status == 403
+    connection.close()
+
+
+@pytest.mark.parametrize("path", ["/", "/app.js", "/api/config", "/nothing", "/api/session/x"])
+def test_every_answer_carries_the_policy(client: Client, path: str) -> None:
+    headers = client.raw("GET", path)[1]
+    assert headers["content-security-policy"] == CSP
+    assert headers["x-content-type-options"] == "nosniff"
+    scripts = next(p for p in CSP.split("; ") if p.startswith("script-src"))
+    assert scripts == "script-src 'self'"
+    assert "unsafe" not in CSP
+
+
+def test_the_page_has_nothing_inline_and_no_network() -> None:
+    web = Path(__file__).parents[2] / "workbench" / "web"
+    page = (web / "index.html").read_text(encoding="utf-8")
+    assert not re.search(r"<script(?![^>]*src=)|\sstyle=|\son\w+=|<style", page)
+    for file in web.iterdir():
+        text = file.read_text(encoding="utf-8")
+        assert not re.search(r"""https?://(?!www\.w3\.org/2000/svg)""", text), file.name
+        assert "innerHTML" not in text, file.name
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/../app.py",
+        "/..%2fapp.py",
+        "/%2e%2e/app.py",
+        "/web/app.js",
+        "/assets/report.js",
+        "/api/session/..%2f..%2fetc",
+        "/api/session/../../etc/passwd",
+        "{where}/files/..%2f..%2fstate.json",
+        "{where}/view/..%2fstate.json",
+        "{where}/view/state.json",
+        "{where}/state.json",
+    ],
+)
+def test_no_path_outside_is_readable(client: Client, fitted: str, path: str) -> None:
+    status, _, body = client.raw("GET", path.format(where=fitted))
+    assert status in (404, 405), body[:200]
+
+
+def test_a_state_file_cannot_point_out_of_its_folder(tmp_path: Path) -> None:
+    session = Store(tmp_path).create()
+    (tmp_path / "secret.csv").write_text("time_s,motor_position_rad\n0,1\n")
+    state = session.load().as_json()
+    state["files"] = [{"id": "a", "name": "x.csv", "stored": "../../secret.csv"}]
+    write_atomic(session.folder / "state.json", json.dumps(state).encode())
+    with pytest.raises(InputError, match="leaves the session folder"):
+        session.path_of(session.load().files[0])
+
+
+def test_session_identifiers_cannot_be_guessed_or_listed(client: Client, root: Path) -> None:
+    first, second = client.session(), client.session()
+    assert first != second
+    assert len(first.rsplit("/", 1)[1]) == 32
+    assert client.raw("GET", "/api/session")[0] == 405
+    assert client.raw("GET", "/api/session/" + "0" * 32)[0] == 404
+    assert all(folder.stat().st_mode & 0o077 == 0 for folder in root.glob("*/files"))
+
+
+@pytest.mark.parametrize(
+    ("given", "safe"),
+    [
+        ("../../etc/passwd", "passwd"),
+        ("..\\x.csv", "x.csv"),
+        (".hidden", "hidden"),
+        ("", "record"),
+        ("a\x00b.csv", "a_b.csv"),
+        ("ü.csv", "_.csv"),
+    ],
+)
+def test_names_of_uploads_are_made_safe(given: str, safe: str) -> None:
+    assert safe_name(given) == safe
+
+
+# --- uploads --------------------------------------------------------------------------------------
+
+
+def test_an_oversized_upload_is_refused_before_it_is_read(client: Client) -> None:
+    where = client.session()
+    connection = http.client.HTTPConnection("127.0.0.1", client.port, timeout=10)
+    connection.putrequest("PUT", f"{where}/files/big.csv")
+    connection.putheader("X-IRJ", "1")
+    connection.putheader("Content-Length", str(2 << 30))
+    connection.endheaders()
+    answer = connection.getresponse()
+    assert answer.status == 413
+    assert b"2,147 MB is over the limit of 8 MB" in answer.read()
+    connection.close()
+
+
+def test_a_stream_without_a_length_is_cut_at_the_limit(client: Client, root: Path) -> None:
+    where = client.session()
+
+    def endless() -> Iterator[bytes]:
+        for _ in range(200):
+            yield b"x" * 100_000
+
+    try:
+        status, _, body = client.raw("PUT", f"{where}/files/big.csv", endless())
+        assert status == 413, body
+    except (BrokenPipeError, ConnectionResetError):
+        pass
+    folder = root / where.rsplit("/", 1)[1] / "files"
+    time.sleep(0.2)
+    assert list(folder.iterdir()) == []
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc").exists(), reason="memory is read from /proc")
+def test_two_gigabytes_are_streamed_and_cut_at_the_limit(tmp_path: Path) -> None:
+    """Sent without a length: the server cannot know before it has the limit; its memory stays
+    flat, its disk is clean after.
+    """
+    code = (
+        "from pathlib import Path\nfrom workbench.page.server import serve\nserve([], 0, "
+        f"False, root=Path({str(tmp_path)!r}))"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    process = subprocess.Popen(
+        [sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    try:
+        client = Client(int(process.stdout.readline().strip().rstrip("/").rsplit(":", 1)[1]))
+        for _ in range(100):
+            try:
+                where = client.session()
+                break
+            except OSError:
+                time.sleep(0.1)
+        sent: list[int] = []
+
+        def chunks() -> Iterator[bytes]:
+            block = b"0.001,1.0,2.0\n" * 75_000
+            while sum(sent) < 2 << 30:
+                sent.append(len(block))
+                yield block
+
+        try:
+            status, _, body = client.raw("PUT", f"{where}/files/big.csv", chunks())
+            assert status == 413
+            assert b"over the limit of 1,074 MB" in body
+        except (BrokenPipeError, ConnectionResetError):
+            pass
+        assert (1 << 30) <= sum(sent) < 1.1 * (1 << 30)
+        peak = int(
+            next(
+                line.split()[1]
+                for line in Path(f"/proc/{process.pid}/status").read_text().splitlines()
+                if line.startswith("VmHWM")
+            )
+        )
+        assert peak < 300_000, f"{peak} kB"
+        time.sleep(0.3)
+        assert list((tmp_path / where.rsplit("/", 1)[1] / "files").iterdir()) == []
+        assert client.get(where)["files"] == []
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+
+
+def test_a_zip_bomb_is_not_unpacked(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
+    """256 MB of zeros in 0.3 MB, against a limit of 64 MB; the limit itself is 2 GB."""
+    monkeypatch.setattr("workbench.page.uploads.MAX_UNPACKED", 64_000_000)
+    out = io.BytesIO()
+    with (
+        zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive,
+        archive.open("time_s.npy", "w", force_zip64=True) as member,
+    ):
+        for _ in range(16):
+            member.write(bytes(1 << 24))
+    where = client.session()
+    assert client.upload(where, "bomb.npz", out.getvalue())[0] == 200
+    entry = client.get(where)["files"][0]
+    assert entry["status"] == "refused"
+    assert "unpacks to more than 64 MB" in entry["message"]
+    assert entry["guess"] == []
+
+
+def test_a_mat_bomb_is_counted_not_kept(tmp_path: Path) -> None:
+    import zlib
+
+    squeezed = zlib.compress(bytes(1 << 26), 9)
+    header = b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM"
+    file = tmp_path / "bomb.mat"
+    file.write_bytes(
+        header + (15).to_bytes(4, "little") + len(squeezed).to_bytes(4, "little") + squeezed
+    )
+    with pytest.raises(InputError, match="unpacks to more than"):
+        check_unpacked(file, "bomb.mat", limit=1 << 25)
+    check_unpacked(file, "bomb.mat", limit=1 << 27)
+
+
+@pytest.mark.parametrize(
+    ("name", "body", "says"),
+    [
+        (
+            "text.mat",
+            b"time_s,motor_position_rad\n0,1\n1,2\n",
+            "is not a MAT file, whatever its name says",
+        ),
+        ("empty.csv", b"", "is empty"),
+        ("broken.npz", b"PK\x03\x04 and nothing", "is not a readable NPZ archive"),
+        ("noise.csv", bytes(range(256)) * 20, "noise"),
+        ("one.csv", b"time_s,motor_position_rad\n0,1\n", "one"),
+    ],
+)
+def test_a_file_that_cannot_be_used_gets_one_sentence(
+    client: Client, name: str, body: bytes, says: str
+) -> None:
+    where = client.session()
+    assert client.upload(where, name, body)[0] == 200
+    entry = client.get(where)["files"][0]
+    assert entry["status"] == "refused"
+    assert says in entry["message"]
+    assert "\n" not in entry["message"]
+    assert str(Path.home()) not in entry["message"]
+    assert "/tmp" not in entry["message"]
+
+
+def test_a_joint_file_that_is_wrong_is_refused_and_leaves_the_old_one(client: Client) -> None:
+    where = client.session()
+    assert client.upload(where, "joint.toml", JOINT.encode())[0] == 200
+    status, text = client.upload(where, "joint.toml", b"[joint]\ngear_ratio = 0\n")
+    assert status == 422
+    assert "gear_ratio is 0" in text
+    assert client.upload(where, "joint.toml", b"\xff\xfe\x00")[0] == 422
+    assert client.get(where)["joint_text"] == JOINT
+
+
+def test_a_guess_of_columns_is_shown_and_not_applied(client: Client) -> None:
+    where = client.session()
+    t = np.arange(400) * 0.01
+    table = np.column_stack([t, np.sin(t), np.cos(t)])
+    out = io.StringIO()
+    np.savetxt(out, table, delimiter=",", header="t_s,q_rad,iq_A", comments="")
+    client.upload(where, "bench.csv", out.getvalue().encode())
+    entry = client.get(where)["files"][0]
+    assert entry["status"] == "columns"
+    assert {g["column"]: g["channel"] for g in entry["guess"]} == {
+        "t_s": "time",
+        "q_rad": "motor_position",
+        "iq_A": "motor_current",
+    }
+    columns = {g["channel"]: {"column": g["column"], "unit": g["unit"]} for g in entry["guess"]}
+    columns["motor_position"]["sign"] = -1
+    assert client.post(f"{where}/file/{entry['id']}", {"columns": columns})[1]["status"] == "ready"
+    series = client.get(
+        f"{where}/view/series?file={entry['id']}&channels=motor_position&points=1000"
+    )
+    np.testing.assert_allclose(series["series"][0]["values"], -np.sin(t), atol=1e-6)
+
+
+# --- the loop -------------------------------------------------------------------------------------
+
+
+def test_a_click_gives_the_numbers_of_the_library(
+    client: Client, fitted: str, tmp_path: Path
+) -> None:
+    from identification import fit, load_joint, read
+
+    for name, content in demo_files().items():
+        (tmp_path / name).write_bytes(content)
+    train, held, joint = (
+        [read(tmp_path / "train.npz")],
+        [read(tmp_path / "held_out.npz")],
+        load_joint(tmp_path / "joint.toml"),
+    )
+    start = fit(joint, train, held_out=held)
+    better = fit(start.model.add("stribeck@motor"), train, joint=joint, held_out=held)
+    state = client.get(fitted)
+    assert state["diagnosis"]["claim"]["effects"] == ["stribeck"]
+    state = client.run(fitted, "add", label="stribeck@motor")
+    errors = [s["held_out"]["relative_error_percent"] for s in state["steps"]]
+    assert start.held_out is not None
+    assert better.held_out is not None
+    assert errors == pytest.approx(
+        [start.held_out.relative_error_percent, better.held_out.relative_error_percent], rel=2e-3
+    )
+    assert errors[1] < 0.5 * errors[0]
+    undone = client.run(fitted, "undo")
+    assert [s["label"] for s in undone["steps"]] == [None]
+    redone = client.run(fitted, "redo")
+    assert redone["steps"] == state["steps"]
+    removed = client.run(fitted, "remove", label="stribeck@motor")
+    assert removed["steps"][-1]["held_out"]["relative_error_percent"] == pytest.approx(
+        errors[0], rel=5e-3
+    )
+    client.run(fitted, "undo")
+
+
+def test_copied_code_gives_the_same_errors(client: Client, fitted: str, tmp_path: Path) -> None:
+    state = client.get(fitted)
+    for name, content in demo_files().items():
+        (tmp_path / name).write_bytes(content)
+    (tmp_path / "session.py").write_text(client.get(f"{fitted}/view/code")["code"])
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    done = subprocess.run(
+        [sys.executable, "session.py"],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    said = [float(line.split()[-1]) for line in done.stdout.splitlines()]
+    assert said == pytest.approx(
+        [s["held_out"]["relative_error_percent"] for s in state["steps"]], rel=2e-3
+    )
+    assert (tmp_path / "fitted.toml").exists()
+
+
+def test_the_worst_window_and_the_places_come_with_the_comparison(
+    client: Client, fitted: str
+) -> None:
+    found = client.get(f"{fitted}/view/compare")
+    shares = [max(p["share_percent"], 0.0) for p in found["places"]]
+    assert shares == sorted(shares, reverse=True)
+    low, high = found["worst"]["low"], found["worst"]["high"]
+    assert 1.5 < high - low < 2.5
+    whole = client.get(f"{fitted}/view/balance?balance=motor&points=60")
+    close = client.get(f"{fitted}/view/balance?balance=motor&points=600&from={low}&to={high}")
+    assert not whole["full"]
+    assert close["full"]
+    measured, model, residual = (np.array(s["values"]) for s in close["series"])
+    np.testing.assert_allclose(measured - model, residual, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "query",
+    [
+        "balance=none",
+        "balance=motor&points=x",
+        "balance=motor&from=2&to=1",
+        "balance=motor&from=nan&to=1",
+    ],
+)
+def test_a_wrong_question_gets_a_sentence(client: Client, fitted: str, query: str) -> None:
+    status, _, body = client.raw("GET", f"{fitted}/view/balance?{query}")
+    assert status == 422, body
+    assert b"\n" not in body
+
+
+def test_what_cannot_be_done_is_said(client: Client) -> None:
+    where = client.session()
+    state = client.run(where, "fit")
+    assert "no record to fit" in state["error"] or "no joint yet" in state["error"]
+    assert client.post(f"{where}/run", {"action": "nonsense"})[0] == 422
+    assert client.post(f"{where}/run", {"action": "add"})[0] == 422
+    assert client.raw("POST", f"{where}/run", b"[1]")[0] == 422
+    assert client.raw("POST", f"{where}/run", b"{")[0] == 422
+    assert client.raw("POST", f"{where}/joint", b"x" * (2 << 20))[0] == 413
+
+
+# --- robustness -----------------------------------------------------------------------------------
+
+
+def test_fifty_quick_clicks_do_the_work_once(client: Client) -> None:
+    where = client.session()
+    client.post(f"{where}/demo")
+    client.wait(where)
+    answers: list[int] = []
+
+    def click() -> None:
+        answers.append(client.post(f"{where}/run", {"action": "fit"})[0])
+
+    threads = [threading.Thread(target=click) for _ in range(50)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    state = client.wait(where)
+    assert set(answers) <= {202, 409}
+    assert 202 in answers
+    assert len(state["steps"]) == 1
+    assert state["error"] is None
+
+
+def test_two_sessions_do_not_disturb_each_other(client: Client) -> None:
+    first, second = client.session(), client.session()
+    for where in (first, second):
+        client.post(f"{where}/demo")
+    for where in (first, second):
+        assert client.post(f"{where}/run", {"action": "fit"})[0] == 202
+    states = [client.wait(where) for where in (first, second)]
+    assert states[0]["steps"][0]["held_out"] == states[1]["steps"][0]["held_out"]
+    client.run(first, "add", label="cubic_viscous@motor")
+    assert len(client.get(first)["steps"]) == 2
+    assert len(client.get(second)["steps"]) == 1
+
+
+def test_a_job_can_be_cancelled_and_changes_nothing(client: Client, fitted: str) -> None:
+    before = client.get(fitted)
+    assert client.post(f"{fitted}/run", {"action": "diagnose"})[0] == 202
+    time.sleep(0.3)
+    status, text = client.post(f"{fitted}/run", {"action": "fit"})
+    assert status == 409
+    assert "wait for it or cancel it" in text
+    assert client.raw("DELETE", f"{fitted}/file/{before['files'][0]['id']}")[0] == 409
+    client.post(f"{fitted}/cancel")
+    after = client.wait(fitted)
+    assert "cancelled" in after["error"]
+    assert after["steps"] == before["steps"]
+    again = client.run(fitted, "diagnose")
+    assert again["error"] is None
+    assert again["diagnosis"]["ranking"]
+
+
+def test_progress_comes_as_events_and_a_closed_tab_stops_nothing(client: Client) -> None:
+    where = client.session()
+    client.post(f"{where}/demo")
+    connection = http.client.HTTPConnection("127.0.0.1", client.port, timeout=30)
+    connection.request("GET", f"{where}/events")
+    stream = connection.getresponse()
+    assert stream.getheader("content-type", "").startswith("text/event-stream")
+
+    def event() -> dict[str, Any]:
+        while not (line := stream.readline()).startswith(b"data: "):
+            pass
+        found: dict[str, Any] = json.loads(line[6:])
+        return found
+
+    first = event()
+    assert first["job"] is None
+    client.post(f"{where}/run", {"action": "fit"})
+    assert event()["job"]["action"] == "fit"
+    connection.close()
+    assert len(client.wait(where)["steps"]) == 1
+
+
+def test_a_changed_record_takes_the_fit_back(client: Client) -> None:
+    where = client.session()
+    client.post(f"{where}/demo")
+    state = client.run(where, "fit")
+    held = next(f for f in state["files"] if f["role"] == "held_out")
+    client.post(f"{where}/file/{held['id']}", {"role": "train"})
+    state = client.get(where)
+    assert state["steps"] == []
+    state = client.run(where, "fit")
+    assert "held out" in state["note"]
+    assert client.raw("DELETE", f"{where}/file/{held['id']}")[0] == 200
+    assert len(client.get(where)["files"]) == 1
+
+
+def test_a_restart_finds_everything(tmp_path: Path) -> None:
+    server = Server(tmp_path)
+    where = server.client.session()
+    server.client.post(f"{where}/demo")
+    server.client.run(where, "fit")
+    server.client.run(where, "diagnose")
+    before = server.client.run(where, "add", label="stribeck@motor")
+    value = server.client.get(f"{where}/view/parameters")["motor_stribeck_extra"]["value"]
+    server.stop()
+    server = Server(tmp_path)
+    try:
+        after = server.client.get(where)
+        assert after["steps"] == before["steps"]
+        assert server.client.get(f"{where}/view/parameters")["motor_stribeck_extra"][
+            "value"
+        ] == pytest.approx(value, rel=1e-3)
+        assert len(server.client.run(where, "undo")["steps"]) == 1
+    finally:
+        server.stop()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="kill -9")
+def test_a_killed_server_loses_nothing(tmp_path: Path) -> None:
+    code = (
+        "from pathlib import Path\nfrom workbench.page.server import serve\nserve([], 0, "
+        f"False, root=Path({str(tmp_path)!r}))"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+
+    def started() -> tuple[subprocess.Popen[str], Client]:
+        process = subprocess.Popen(
+            [sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, text=True
+        )
+        assert process.stdout is not None
+        address = process.stdout.readline().strip()
+        match = re.fullmatch(r"http://127\.0\.0\.1:(\d+)/", address)
+        assert match, address
+        return process, Client(int(match.group(1)))
+
+    def ready(client: Client) -> None:
+        for _ in range(100):
+            try:
+                client.get("/api/config")
+                return
+            except OSError:
+                time.sleep(0.1)
+
+    process, client = started()
+    try:
+        ready(client)
+        where = client.session()
+        client.post(f"{where}/demo")
+        before = client.run(where, "fit")
+        client.post(f"{where}/run", {"action": "diagnose"})
+        time.sleep(0.3)
+    finally:
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        assert process.stdout is not None
+        process.stdout.close()
+    process, client = started()
+    try:
+        ready(client)
+        after = client.get(where)
+        assert after["job"] is None
+        assert after["steps"] == before["steps"]
+        assert client.run(where, "diagnose")["diagnosis"]["claim"]["effects"] == ["stribeck"]
+    finally:
+        process.kill()
+        process.wait()
+        assert process.stdout is not None
+        process.stdout.close()
+
+
+def test_files_of_the_command_line_are_in_the_session(tmp_path: Path) -> None:
+    for name, content in demo_files().items():
+        (tmp_path / name).write_bytes(content)
+    identifier = with_files(tmp_path / "sessions", [tmp_path / name for name in demo_files()])
+    state = Session(tmp_path / "sessions" / identifier).load()
+    found = [(f.name, f.role, f.status) for f in state.files]
+    assert found == [("train.npz", "train", "ready"), ("held_out.npz", "held_out", "ready")]
+    assert state.joint_text == JOINT
+    with pytest.raises(InputError, match="there is no such file"):
+        with_files(tmp_path / "sessions", ["missing.csv"])
+
+
+# --- parts ----------------------------------------------------------------------------------------
+
+
+def test_a_crash_in_the_middle_of_writing_keeps_the_old_state(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session = Store(tmp_path).create()
+    old = session.save(State(joint_text="old"))
+
+    def crash(descriptor: int) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr(os, "fsync", crash)
+    with pytest.raises(OSError, match="disk full"):
+        session.save(State(joint_text="new"))
+    assert session.load() == old
+    assert [p.name for p in session.folder.iterdir() if p.is_file()] == ["state.json"]
+
+
+def test_a_state_of_a_newer_version_is_read(tmp_path: Path) -> None:
+    session = Store(tmp_path).create()
+    data = session.load().as_json() | {
+        "new_key": 1,
+        "files": [{"id": "a", "name": "b", "stored": "c", "new": 2}],
+    }
+    write_atomic(session.folder / "state.json", json.dumps(data).encode())
+    assert session.load().files[0].name == "b"
+    write_atomic(session.folder / "state.json", b"{")
+    with pytest.raises(InputError, match="cannot be read"):
+        session.load()
+
+
+def test_decimation_loses_no_spike_and_zooms_to_every_sample() -> None:
+    rng = np.random.default_rng(1)
+    time_ = np.arange(100_000) * 1e-3
+    values = rng.normal(size=100_000)
+    values[54_321], values[777] = 40.0, -50.0
+    stamps, (drawn,), full = decimated(time_, [values], 500)
+    assert not full
+    assert len(stamps) == len(drawn) == 1000
+    assert drawn.max() == 40.0
+    assert drawn.min() == -50.0
+    assert (np.diff(stamps) > 0).all()
+    assert abs(stamps[int(np.argmax(drawn))] - 54.321) < 0.4
+    stamps, (drawn,), full = decimated(time_, [values], 500, (54.2995, 54.3505))
+    assert full
+    assert stamps[0] == time_[54_299]
+    assert stamps[-1] == time_[54_351]
+    np.testing.assert_array_equal(drawn, values[54_299 : 54_299 + len(drawn)])
+
+
+def test_decimation_keeps_the_order_of_a_slope() -> None:
+    time_ = np.arange(10_000) * 1e-3
+    for slope in (1.0, -1.0):
+        drawn = decimated(time_, [slope * time_], 100)[1][0]
+        assert (np.diff(slope * drawn) > 0).all()
+
+
+def test_thinning_spreads_windows_over_the_record() -> None:
+    from identification.data.record import Record
+
+    t = np.arange(500_000) * 1e-3
+    record = Record.from_channels(t, {"motor_position": np.sin(t)})
+    thin = thinned(record, 60.0)
+    assert thin.duration == pytest.approx(60.0, rel=0.02)
+    assert len(thin.segments()) == 10
+    assert thin.time[0] < 50 < 450 < thin.time[-1]
+    assert thinned(thin, 60.0) is thin
+
+
+@pytest.mark.parametrize(
+    ("name", "role"),
+    [
+        ("test.csv", "held_out"),
+        ("Validation2.mat", "held_out"),
+        ("train.csv", "train"),
+        ("run7.npz", "train"),
+    ],
+)
+def test_roles_are_guessed_from_names(name: str, role: str) -> None:
+    assert guessed_role(name)[0] == role
+
+
+def test_the_demo_is_that_of_the_command_line() -> None:
+    folder = Path(__file__).parents[2] / "workbench" / "demo"
+    assert {
+        name: (folder / name).read_bytes() for name in ("joint.toml", "train.npz", "held_out.npz")
+    } == demo_files()
+
+
+def test_an_upload_is_answered_with_state_and_first_plot(client: Client) -> None:
+    """So that the page draws a long record without another question."""
+    where = client.session()
+    content = demo_files()["train.npz"]
+    status, answer = client.upload(where, "a.npz?points=300", content)
+    made = json.loads(answer)
+    assert status == 200
+    assert made["state"]["files"][0]["id"] == made["id"]
+    assert "stored" not in made["state"]["files"][0]
+    assert made["plot"] == client.get(
+        f"{where}/view/series?file={made['id']}&points=300&channels="
+        f"{made['plot']['series'][0]['name']}"
+    )
+    assert made["state"]["revision"] == client.get(where)["revision"]
+    assert json.loads(client.upload(where, "b.npz", content)[1])["plot"] is None
+    unknown = json.loads(client.upload(where, "c.csv?points=300", b"a,b\n1,2\n3,4\n5,6\n")[1])
+    assert unknown["plot"] is None
+    assert unknown["state"]["files"][-1]["status"] == "columns"

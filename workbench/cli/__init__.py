@@ -1,0 +1,1 @@
+"""The command line `irj`: one module a family of verbs."""

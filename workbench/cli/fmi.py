@@ -1,0 +1,131 @@
+"""export, cosim, batch: the doors to FMI, C and CasADi; arguments go through to the modules
+that do the work.
+"""
+
+from __future__ import annotations
+
+import importlib
+import tempfile
+from argparse import Namespace
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from identification.errors import InputError
+from irj_fmu.command_line import OneLineParser, check_output, keep_inputs, replace_files
+from workbench.cli.files import open_joint, write_json
+
+CODE_KINDS: Final = ("c", "casadi")
+TAKES: Final = ("--joint", "--out", "--cc", "--target", "--sample-time", "--json")
+"""Options that take one word."""
+FUNCTIONS: Final = ("dynamics", "regressor", "jacobian", "energy")
+
+
+def run_export(arguments: Namespace) -> int:
+    """`irj export [KIND] --joint J`: FMUs by irj_fmu.build, `c` and `casadi` here; `plant`
+    without a kind.
+    """
+    from irj_fmu.build import KINDS, main
+    from irj_fmu.imported.export import KINDS as OF_FMU
+
+    every = (*KINDS, *CODE_KINDS, *OF_FMU)
+    kind, rest = _kind(list(arguments.rest), every)
+    if kind in CODE_KINDS:
+        return _export_code([kind, *rest])
+    if kind in OF_FMU and kind not in KINDS:
+        for i, word in enumerate(rest):
+            if word == "--joint" and i + 1 < len(rest):
+                open_joint(rest[i + 1])  # a file that cannot be read says so itself
+        raise InputError(
+            f"export {kind}: goes with a joint file whose model is an FMU; give one with --joint "
+            "(docs/user-fmu.md), or export plant"
+        )
+    if kind is not None and kind not in KINDS:
+        raise InputError(
+            f"export: {kind!r} cannot be built; choose one of {', '.join((*KINDS, *CODE_KINDS))}"
+        )
+    asks = not kind and {"-h", "--help"} & set(rest)
+    return int(main(rest if asks else [kind or "plant", *rest], prog="irj export"))
+
+
+def _kind(rest: list[str], known: Sequence[str]) -> tuple[str | None, list[str]]:
+    """What is to be built, which may stand behind options, and the other words."""
+    if rest and not rest[0].startswith("-"):
+        return rest[0], rest[1:]
+    for i, word in enumerate(rest):
+        takes = i > 0 and rest[i - 1] in TAKES
+        if word in known and not takes:
+            return word, [*rest[:i], *rest[i + 1 :]]
+    return None, rest
+
+
+def _export_code(rest: Sequence[str]) -> int:
+    parser = OneLineParser(
+        prog=f"irj export {rest[0]}",
+        description="Dynamics, regressor, Jacobian and energy of a joint as code.",
+    )
+    parser.add_argument("kind", choices=CODE_KINDS)
+    parser.add_argument("--joint", required=True)
+    parser.add_argument("--out", default="dist", help="folder of the results (default: dist)")
+    parser.add_argument("--json", metavar="FILE")
+    given = parser.parse_args(rest)
+    if given.json is not None:
+        check_output(given.json, [given.joint])
+    files = export_code(given.kind, given.joint, Path(given.out))
+    for path in files:
+        print(path)
+    write_json(given.json, {"built": [str(p) for p in files]})
+    return 0
+
+
+def export_code(kind: str, joint_path: str, folder: Path) -> list[Path]:
+    """Write the joint's functions as C source (``c``) or as CasADi files (``casadi``, loaded by
+    ``casadi.Function.load``).
+
+    Arguments are those of :class:`casadi_models.functions.JointFunctions`; the parameter vector is
+    written beside them as ``parameters.json`` with names, units and values.
+    """
+    import casadi as ca
+
+    model = open_joint(joint_path).model()
+    functions = [getattr(model, name) for name in FUNCTIONS]
+    values = [
+        {"name": p.name, "value": v, "unit": p.unit, "side": p.side}
+        for p, v in zip(model.parameters, model.value_vector(), strict=True)
+    ]
+    with tempfile.TemporaryDirectory() as temporary:
+        if kind == "c":
+            code = ca.CodeGenerator("joint.c", {"with_header": True})
+            for function in functions:
+                code.add(function)
+            code.generate(temporary + "/")
+        else:
+            for name, function in zip(FUNCTIONS, functions, strict=True):
+                function.save(str(Path(temporary) / f"{name}.casadi"))
+        write_json(Path(temporary) / "parameters.json", values)
+        made = {path.name: path.read_bytes() for path in sorted(Path(temporary).iterdir())}
+    keep_inputs([folder / name for name in made], [joint_path])
+    return replace_files(folder, made)
+
+
+def run_cosim(arguments: Namespace) -> int:
+    """`irj cosim`."""
+    return _passed("cosim", arguments)
+
+
+def run_batch(arguments: Namespace) -> int:
+    """`irj batch`."""
+    return _passed("batch", arguments)
+
+
+def _passed(verb: str, arguments: Namespace) -> int:
+    name = f"irj_fmu.{verb}"
+    try:
+        module = importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        missing = error.name or name
+        raise InputError(
+            f"{verb} needs the module {missing}, which is not in this installation; from Python, "
+            "irj_fmu.batch.fleet.run_fleet does the work"
+        ) from None
+    return int(module.main(arguments.rest))

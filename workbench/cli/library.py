@@ -1,0 +1,66 @@
+"""effects, add: the effect library."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from dataclasses import replace
+
+from casadi_models import EFFECTS
+from identification.data.joint_file import toml_text
+from identification.errors import InputError
+from workbench.cli.files import open_joint, write_json, write_text
+
+
+def run_effects(arguments: Namespace) -> int:
+    """`irj effects [KEY]`."""
+    if arguments.key and arguments.key not in EFFECTS:
+        raise InputError(f"no effect {arguments.key!r} in the library; `irj effects` lists it")
+    chosen = [EFFECTS[arguments.key]] if arguments.key else list(EFFECTS.values())
+    data = [
+        {
+            "key": e.key,
+            "title": e.title,
+            "acts_on": list(e.acts_on),
+            "absence": e.absence,
+            "excitation": e.excitation,
+            "confused_with": list(e.confused_with),
+            "needs": list(e.needs),
+            "separate_by": e.separate_by,
+            "source": e.source,
+            "parameters": [
+                {"name": p.name, "unit": p.unit, "meaning": p.meaning, "shape": p.is_shape}
+                for p in e.parameters
+            ],
+        }
+        for e in chosen
+    ]
+    for effect in chosen:
+        print(f"{effect.key:<28} {effect.title} ({', '.join(effect.acts_on)})")
+        if arguments.key:
+            print(
+                f"  how its absence looks: {effect.absence}\n  what shows it: "
+                f"{effect.excitation}\n  source: {effect.source}"
+            )
+            for p in effect.parameters:
+                print(f"  {p.name} [{p.unit}]: {p.meaning}")
+            if effect.confused_with:
+                print(
+                    f"  confused with: {', '.join(effect.confused_with)}; separate by "
+                    f"{effect.separate_by or 'another run'}"
+                )
+    write_json(arguments.json, data)
+    return 0
+
+
+def run_add(arguments: Namespace) -> int:
+    """`irj add KEY --joint J -o J2`."""
+    joint = open_joint(arguments.joint)
+    try:
+        model = joint.model().add(arguments.key)
+    except (KeyError, ValueError) as error:
+        raise InputError(f"{arguments.joint}: {error.args[0]}") from None
+    larger = replace(joint, effects=(*joint.effects, arguments.key))
+    write_text(arguments.output, toml_text(larger))
+    print(f"{arguments.output}: {', '.join(model.effects)}")
+    write_json(arguments.json, {"effects": list(model.effects), "file": arguments.output})
+    return 0

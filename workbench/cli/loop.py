@@ -1,0 +1,313 @@
+"""demo, fit, compare, diagnose, improve, report: the main job."""
+
+from __future__ import annotations
+
+import sys
+from argparse import Namespace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from importlib.resources import as_file, files
+from typing import Any
+
+from identification.data.check.gate import gate_warnings
+from identification.data.joint_file import Joint, toml_text
+from identification.data.record import Record
+from identification.diagnosis.compare import compare
+from identification.diagnosis.diagnose import diagnose
+from identification.diagnosis.improve import Improvement, improve
+from identification.diagnosis.locate import Unexplained
+from identification.fitting.fit import Fit, fit
+from workbench.cli.files import (
+    alike,
+    distinct,
+    open_joint,
+    open_records,
+    progress_bar,
+    write_json,
+    write_text,
+)
+
+
+def improve_files(
+    train: Sequence[str],
+    held_out: Sequence[str],
+    joint_path: str,
+    *,
+    other_payload: Sequence[str] = (),
+    max_additions: int = 6,
+) -> tuple[dict[str, Any], Improvement, list[Record]]:
+    """The loop on files: its JSON, the result and the records."""
+    distinct(training=train, other_payload=other_payload, held_out=held_out)
+    joint = open_joint(joint_path)
+    records, _ = _training(train, other_payload, joint)
+    held, _ = open_records(held_out, joint)
+    alike([*train, *other_payload, *held_out], [*records, *held], joint)
+    found = improve(records, joint, held, max_additions=max_additions, progress=progress_bar)
+    progress_bar("done", 1.0)
+    _print_warnings(found.warnings, [*records, *held])
+    return found.as_json(), found, [*records, *held]
+
+
+def _print_warnings(warnings: Sequence[str], records: Sequence[Record]) -> None:
+    """Warnings on stderr, without those that were printed when the records were opened."""
+    said = gate_warnings(records)
+    for text in warnings:
+        if text not in said:
+            print(f"irj: {text}", file=sys.stderr)
+
+
+def _training(
+    paths: Sequence[str], other_payload: Sequence[str], joint: Joint
+) -> tuple[list[Record], list[str]]:
+    """Training records, those with another payload marked, and the warnings."""
+    records, warnings = open_records(paths, joint)
+    marked, more = open_records(other_payload, joint)
+    return [*records, *(replace(r, payload="other") for r in marked)], [*warnings, *more]
+
+
+def run_improve(arguments: Namespace) -> int:
+    """`irj improve`."""
+    data, found, records = improve_files(
+        arguments.records,
+        arguments.held_out,
+        arguments.joint,
+        other_payload=arguments.other_payload,
+        max_additions=arguments.max_steps,
+    )
+    _print_improvement(found)
+    _write_improvement(found, records, arguments.report, arguments.output, arguments.command)
+    _write_picture(found, arguments.picture)
+    write_json(arguments.json, data)
+    return 0
+
+
+def run_report(arguments: Namespace) -> int:
+    """`irj report`."""
+    data, found, records = improve_files(
+        arguments.records,
+        arguments.held_out,
+        arguments.joint,
+        other_payload=arguments.other_payload,
+    )
+    print(found.reason)
+    _write_improvement(found, records, arguments.output, None, arguments.command)
+    write_json(arguments.json, data)
+    return 0
+
+
+def run_demo(arguments: Namespace) -> int:
+    """`irj demo`."""
+    with as_file(files("workbench") / "demo") as folder:
+        names = {n: str(folder / n) for n in ("joint.toml", "train.npz", "held_out.npz")}
+        print(
+            "A simulated harmonic-drive joint with one effect that its model lacks; the answer "
+            "is not in these files."
+        )
+        data, found, records = improve_files(
+            [names["train.npz"]], [names["held_out.npz"]], names["joint.toml"]
+        )
+    _print_improvement(found)
+    _write_improvement(found, records, arguments.report, None, arguments.command)
+    _write_picture(found, arguments.picture)
+    write_json(arguments.json, data)
+    return 0
+
+
+def _write_improvement(
+    found: Improvement,
+    records: Sequence[Record],
+    report: str | None,
+    output: str | None,
+    command: str,
+) -> None:
+    if report:
+        from workbench.show.report import write_report
+
+        print(f"report: {write_report(found, report, records=records, command=command)}")
+    if output:
+        write_text(output, found.to_joint_file())
+        print(f"joint file: {output}")
+
+
+def _write_picture(found: Improvement, path: str | None) -> None:
+    if path:
+        from workbench.show.picture import improvement_picture
+
+        write_text(path, improvement_picture(found))
+        print(f"picture: {path}")
+
+
+def _print_improvement(found: Improvement) -> None:
+    if found.data.note:
+        print(f"note: {found.data.note}")
+    print(f"{'step':<32} {'train %':>8} {'held-out %':>10}   residual over noise floor")
+    for step in found.steps:
+        ratios = "  ".join(f"{b} {e.ratio:.3g}" for b, e in step.held_out.balances.items())
+        name = f"+ {step.added}" if step.added else "start model"
+        print(
+            f"{name:<32} {step.train.relative_error_percent:8.3f} "
+            f"{step.held_out.relative_error_percent:10.3f}   {ratios}"
+        )
+    for claim in found.claims:
+        names = (
+            claim.effects[0] if len(claim.effects) == 1 else "{" + ", ".join(claim.effects) + "}"
+        )
+        said, rest = (
+            ("in part", "; structure is left that is not in the library")
+            if claim.partial
+            else ("missing", "")
+        )
+        print(
+            f"{said}: {names}, {claim.balance} balance, held-out RMS falls by "
+            f"{claim.held_out_drop_percent:.1f} %{rest}"
+        )
+        if claim.separate_by:
+            print(
+                f"  these cannot be told apart on these records; {claim.separate_by} would "
+                "separate them"
+            )
+    for claim in found.minor:
+        print(
+            f"minor, small but certain: {', '.join(claim.effects)} ({claim.balance} balance, "
+            f"{claim.held_out_drop_percent:.1f} %)"
+        )
+    for line in found.lines:
+        named = f", {' or '.join(line.effects)}" if line.effects else ", function of position"
+        print(
+            f"line: order {line.order:.3f} +- {line.tolerance:.3f} per {line.per}, "
+            f"{line.amplitude:.3g} {line.unit} ({line.balance}{named})"
+        )
+    print_places(found.unexplained)
+    for c in found.calibration:
+        if c.stderr is not None and abs(c.value) > 2 * c.stderr:
+            name = found.data.train_names[c.run]
+            print(
+                f"calibration found: {c.what} of {c.sensor} in {name} {c.value:.4g} +- "
+                f"{2 * c.stderr:.2g} {c.unit} (taken off, no physics)"
+            )
+    if found.not_testable:
+        print(
+            f"not testable with these records ({len(found.not_testable)}): "
+            f"{', '.join(n.effect for n in found.not_testable)}"
+        )
+    print(found.reason)
+
+
+def print_places(places: Sequence[Unexplained]) -> None:
+    """Where structure is left that no effect explains."""
+    for place in places:
+        where = "no measured variable"
+        if place.axis and place.low is not None and place.high is not None:
+            where = f"{place.axis} from {place.low:.3g} to {place.high:.3g} {place.unit}"
+        extra = (
+            f", order {place.order:.2f}"
+            if place.order
+            else (f", near {place.frequency_hz:.1f} Hz" if place.frequency_hz else "")
+        )
+        print(
+            f"unexplained: {place.balance} balance, depends on {where} "
+            f"({place.share_percent:.0f} % of it){extra}"
+        )
+
+
+def run_fit(arguments: Namespace) -> int:
+    """`irj fit`."""
+    distinct(training=arguments.records, other_payload=arguments.other_payload)
+    joint = open_joint(arguments.joint)
+    records, warnings = _training(arguments.records, arguments.other_payload, joint)
+    alike([*arguments.records, *arguments.other_payload], records, joint)
+    fitted = fit(joint, records)
+    if arguments.refine:
+        fitted = _refined(fitted)
+    print(
+        f"relative error {fitted.train.relative_error_percent:.3f} %, fit "
+        f"{fitted.train.fit_percent:.2f} %"
+    )
+    _print_parameters(fitted.parameters)
+    if arguments.output:
+        write_text(arguments.output, fitted.to_joint_file())
+    write_json(arguments.json, {**fitted.as_json(), "warnings": warnings})
+    return 0
+
+
+def _refined(fitted: Fit) -> Fit:
+    """The fit refined by the error of its simulated outputs, and what that gained."""
+    from identification.fitting.output_error import refine
+
+    found = refine(fitted)
+    falls = ", ".join(f"{n} {found.before[n]:.3g} -> {found.after[n]:.3g}" for n in found.before)
+    print(f"output error in {found.windows} windows, RMS: {falls}")
+    return found.fit
+
+
+def _print_parameters(parameters: Mapping[str, Mapping[str, Any]]) -> None:
+    print("  value +- standard error, in brackets the side it is referred to")
+    for name, p in parameters.items():
+        if p["nuisance"]:
+            continue
+        error = f" +- {p['stderr']:.2g}" if p["stderr"] is not None else ""
+        flags = "".join(
+            [" at its bound" * bool(p["at_bound"]), " not identifiable" * (not p["identifiable"])]
+        )
+        print(f"  {name:<28} {p['value']:.6g}{error} {p['unit']} ({p['side']} side){flags}")
+
+
+def run_compare(arguments: Namespace) -> int:
+    """`irj compare`."""
+    joint = open_joint(arguments.joint)
+    records, _ = open_records(arguments.records, joint)
+    basis = open_records(arguments.fit_records, joint)[0] if arguments.fit_records else records
+    alike(arguments.records, records, joint)
+    alike(
+        [*(arguments.fit_records or arguments.records), *arguments.records],
+        [*basis, *records],
+        joint,
+        once=False,
+    )
+    comparison = compare(fit(joint, basis), records, linear=not arguments.no_linear)
+    print(comparison)
+    for place in comparison.places[:5]:
+        print(
+            f"  {place.balance} balance against {place.title}: explains "
+            f"{max(place.share_percent, 0):.0f} % of what is left there"
+        )
+    write_json(arguments.json, comparison.as_json())
+    return 0
+
+
+def run_diagnose(arguments: Namespace) -> int:
+    """`irj diagnose`."""
+    distinct(
+        training=arguments.records,
+        other_payload=arguments.other_payload,
+        held_out=arguments.held_out,
+    )
+    joint = open_joint(arguments.joint)
+    records, _ = _training(arguments.records, arguments.other_payload, joint)
+    held, _ = open_records(arguments.held_out, joint)
+    alike(
+        [*arguments.records, *arguments.other_payload, *arguments.held_out],
+        [*records, *held],
+        joint,
+    )
+    found = diagnose(fit(joint, records), held, progress=progress_bar)
+    progress_bar("done", 1.0)
+    _print_warnings(found.warnings, [*records, *held])
+    if found.data.note:
+        print(f"note: {found.data.note}")
+    print(found)
+    print_places(found.unexplained)
+    for item in found.ranking.not_testable:
+        print(f"not testable: {item.effect}: {item.why}")
+    for key in arguments.why:
+        print(found.why(key))
+    if arguments.output and found.claims:
+        write_text(
+            arguments.output,
+            toml_text(replace(joint, effects=(*joint.effects, found.claims[0].label))),
+        )
+        print(f"joint file with {found.claims[0].label}: {arguments.output}")
+    elif arguments.output:
+        print(f"nothing is named: {arguments.output} is not written")
+    write_json(arguments.json, found.as_json())
+    return 0

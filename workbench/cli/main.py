@@ -1,0 +1,435 @@
+"""The command line `irj`: thin doors on the Python calls of the same names."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import importlib
+import io
+import os
+import shlex
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from types import FrameType
+from typing import Any, TextIO, cast, final
+
+from identification import __version__
+from identification.errors import InputError
+from irj_fmu.command_line import STOPPED, OneLineParser, fail, stopped, system_refusal, terminable
+from workbench.cli.files import check_outputs
+from workbench.cli.user_fmu import module_of
+
+
+def _count(text: str) -> int:
+    """A number of additions: 0 or more."""
+    try:
+        value = int(text)
+    except ValueError:
+        value = -1
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"takes a whole number from 0 up, not {text!r}")
+    return value
+
+
+def _port(text: str) -> int:
+    """A port: 0 for any that is free."""
+    try:
+        value = int(text)
+    except ValueError:
+        value = -1
+    if not 0 <= value <= 65535:
+        raise argparse.ArgumentTypeError(f"takes a port from 0 to 65535, not {text!r}")
+    return value
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = OneLineParser(
+        prog="irj", description="Tells which physics a geared joint's model is missing."
+    )
+    parser.add_argument("--version", action="version", version=f"irj {__version__}")
+    parser.add_argument(
+        "--effects",
+        metavar="FILE.py",
+        action="append",
+        default=[],
+        help="register your own effects from a Python file",
+    )
+    verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
+
+    def verb(
+        name: str, module: str, text: str, *, records: bool = False, joint: bool = False
+    ) -> argparse.ArgumentParser:
+        sub = verbs.add_parser(name, help=text, description=text)
+        sub.set_defaults(module=module)
+        sub.add_argument(
+            "--effects",
+            dest="own_effects",
+            metavar="FILE.py",
+            action="append",
+            default=[],
+            help=argparse.SUPPRESS,
+        )
+        sub.add_argument("--json", metavar="FILE", help="write the result as JSON")
+        if records:
+            sub.add_argument("records", nargs="+", metavar="REC", help="record files")
+        if joint:
+            sub.add_argument("--joint", metavar="J", required=True, help="joint file (TOML)")
+        return sub
+
+    def other_payload(sub: argparse.ArgumentParser) -> None:
+        text = (
+            "training records of the same joint with another payload: they share motor and "
+            "transmission, not the link"
+        )
+        sub.add_argument(
+            "--other-payload", nargs="+", action="extend", metavar="REC", default=[], help=text
+        )
+
+    demo = verb(
+        "demo", "loop", "the main job on embedded data: a simulated joint with a hidden effect"
+    )
+    demo.add_argument(
+        "--report",
+        default="irj-demo.html",
+        metavar="FILE",
+        help="where the report goes (default irj-demo.html)",
+    )
+    demo.add_argument(
+        "--picture", metavar="FILE.svg", help="draw the falling error and the place of the residual"
+    )
+    checked = verb("check", "records", "check records before a fit", records=True)
+    checked.add_argument("--joint", metavar="J", help="joint file: column map and gear ratio")
+    resampled = verb(
+        "resample", "records", "put a record with late stamps or lost samples on an even grid"
+    )
+    resampled.add_argument("records", nargs=1, metavar="FILE", help="record file")
+    resampled.add_argument("--joint", metavar="J", help="joint file: column map")
+    resampled.add_argument(
+        "-o", "--output", metavar="OUT", required=True, help="record file to write, .csv or .npz"
+    )
+    fitted = verb("fit", "loop", "fit the joint's model", records=True, joint=True)
+    other_payload(fitted)
+    fitted.add_argument(
+        "--refine",
+        action="store_true",
+        help="refine by the error of the simulated outputs (slower, less bias by noise)",
+    )
+    fitted.add_argument("-o", "--output", metavar="FILE", help="write the fitted joint file")
+    compared = verb(
+        "compare",
+        "loop",
+        "how far the model is from the records, and where",
+        records=True,
+        joint=True,
+    )
+    compared.add_argument(
+        "--fit",
+        dest="fit_records",
+        nargs="+",
+        action="extend",
+        metavar="REC",
+        default=[],
+        help="fit to these records and compare with REC",
+    )
+    compared.add_argument(
+        "--no-linear",
+        action="store_true",
+        help="leave out what linear models without physics would explain",
+    )
+    diagnosed = verb("diagnose", "loop", "rank what is missing", records=True, joint=True)
+    other_payload(diagnosed)
+    diagnosed.add_argument(
+        "--held-out",
+        nargs="+",
+        action="extend",
+        metavar="REC",
+        default=[],
+        help="records the fit must not see",
+    )
+    diagnosed.add_argument(
+        "--why",
+        metavar="KEY",
+        nargs="+",
+        action="extend",
+        default=[],
+        help="say why this effect is named, or why it is not",
+    )
+    diagnosed.add_argument(
+        "-o", "--output", metavar="FILE", help="write the joint file with the first claim added"
+    )
+    improved = verb(
+        "improve",
+        "loop",
+        "name what is missing, add it, watch the error fall",
+        records=True,
+        joint=True,
+    )
+    other_payload(improved)
+    improved.add_argument(
+        "--held-out",
+        nargs="+",
+        action="extend",
+        metavar="REC",
+        default=[],
+        help="records the fit must not see",
+    )
+    improved.add_argument("--report", metavar="FILE", help="write the HTML report")
+    improved.add_argument(
+        "--picture", metavar="FILE.svg", help="draw the falling error and the place of the residual"
+    )
+    improved.add_argument("-o", "--output", metavar="FILE", help="write the improved joint file")
+    improved.add_argument(
+        "--max-steps", type=_count, default=6, metavar="N", help="most effects to add (default 6)"
+    )
+    report = verb(
+        "report", "loop", "the improve loop, written as one HTML file", records=True, joint=True
+    )
+    other_payload(report)
+    report.add_argument(
+        "--held-out",
+        nargs="+",
+        action="extend",
+        metavar="REC",
+        default=[],
+        help="records the fit must not see",
+    )
+    report.add_argument(
+        "-o", "--output", metavar="FILE", default="irj-report.html", help="the HTML file"
+    )
+    listed = verb("effects", "library", "list the effect library, or one effect")
+    listed.add_argument("key", nargs="?", help="key of one effect")
+    added = verb("add", "library", "add an effect to a joint file")
+    added.add_argument("key", help="effect key, or key@place")
+    added.add_argument("--joint", metavar="J", required=True)
+    added.add_argument("-o", "--output", metavar="FILE", required=True)
+    simulated = verb("simulate", "virtual", "simulate the joint with its sensors", joint=True)
+    simulated.add_argument(
+        "--hide",
+        metavar="KEY",
+        action="append",
+        default=[],
+        help="add this effect without saying so in the record",
+    )
+    simulated.add_argument(
+        "-o", "--output", metavar="FILE", default="simulated.csv", help="record file, .csv or .npz"
+    )
+    simulated.add_argument("--truth", metavar="FILE", help="write the true parameters as JSON")
+    simulated.add_argument(
+        "--set",
+        metavar="NAME=VALUE",
+        action="append",
+        default=[],
+        help="true value of a parameter, link-referred SI",
+    )
+    simulated.add_argument("--seconds", type=float, default=24.0)
+    simulated.add_argument(
+        "--rate", type=float, default=500.0, help="samples per second (default 500)"
+    )
+    simulated.add_argument("--seed", type=int, default=0)
+    simulated.add_argument("--motion", choices=("multisine", "triangle"), default="multisine")
+    tracked = verb(
+        "track",
+        "online",
+        "replay the online estimator with sensor-fault detection",
+        records=True,
+        joint=True,
+    )
+    tracked.add_argument(
+        "--healthy",
+        nargs="+",
+        action="extend",
+        metavar="REC",
+        default=[],
+        help="records of the healthy joint: limits of the fault detector",
+    )
+    tracked.add_argument(
+        "--fail-on-fault", action="store_true", help="exit with 1 where a fault is found"
+    )
+    tracked.add_argument("--report", metavar="FILE", help="write the HTML report")
+    tracked.add_argument(
+        "--inject",
+        metavar="SENSOR:KIND:START[:SIZE[:END]]",
+        action="append",
+        default=[],
+        help="put a fault into the readings to see what is found, as link_position:stuck:9",
+    )
+    planned = verb(
+        "plan", "online", "select a motion that makes the parameters identifiable", joint=True
+    )
+    planned.add_argument(
+        "-o",
+        "--output",
+        metavar="FILE",
+        default="trajectory.csv",
+        help="the motion as CSV (default trajectory.csv)",
+    )
+    planned.add_argument(
+        "--max-position",
+        type=float,
+        metavar="DEG",
+        default=85.0,
+        help="half of the link's workspace [deg]",
+    )
+    planned.add_argument(
+        "--max-speed", type=float, metavar="DEG_S", default=60.0, help="link speed [deg/s]"
+    )
+    planned.add_argument(
+        "--max-torque",
+        type=float,
+        metavar="NM",
+        default=float("inf"),
+        help="drive torque on the link side [Nm]",
+    )
+    for name, text in (
+        ("export", "export as FMU, C or CasADi function"),
+        ("cosim", "co-simulate plant and estimator FMU"),
+        ("batch", "many runs of a study"),
+    ):
+        verbs.add_parser(name, help=text, add_help=False).set_defaults(module="fmi", own_effects=[])
+    app = verb("app", "page", "the page in your browser")
+    app.add_argument("files", nargs="*", metavar="FILES")
+    app.add_argument("--port", type=_port, default=0)
+    app.add_argument("--no-browser", action="store_true")
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run `irj`; returns the exit code: 0 done, 1 a check failed, 2 unusable input, 130
+    interrupted.
+    """
+    given = list(sys.argv[1:] if argv is None else argv)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(
+            errors="backslashreplace"
+        )  # a terminal that lacks a sign must not cost the results
+    parser = _parser()
+    arguments, rest = parser.parse_known_args(given)
+    arguments.rest = rest
+    if arguments.module == "fmi":
+        arguments.rest, arguments.own_effects = _taken(rest)
+    if rest and arguments.module != "fmi":
+        parser.error(f"unrecognized arguments: {' '.join(rest)}")
+    arguments.command = shlex.join(["irj", *given])
+    STOPPED.clear()
+    with _watched_interrupt(), _patient_output():
+        try:
+            return _run(arguments)
+        except InputError as error:
+            return fail(str(error))
+        except OSError as error:
+            return fail(system_refusal(error))
+        except MemoryError as error:
+            return fail(f"not enough memory ({error}); give shorter or fewer records")
+        except KeyboardInterrupt:
+            STOPPED.append(signal.SIGINT)
+            return stopped()
+        except Exception:
+            if STOPPED:  # compiled code may turn an interrupt into an error of its own
+                return stopped()
+            raise
+        finally:
+            STOPPED.clear()
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    check_outputs(arguments)
+    _register([*arguments.effects, *arguments.own_effects])
+    module = importlib.import_module(f"workbench.cli.{module_of(arguments)}")
+    work = getattr(module, f"run_{arguments.verb}")
+    if arguments.module == "page":  # the server heeds signals itself
+        return int(work(arguments))
+    with terminable():
+        return int(work(arguments))
+
+
+@final
+class _Patient:
+    """Standard output whose reader may leave: what is still printed is dropped, and the work
+    goes on to its end.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        """Write, or drop where nobody reads any more."""
+        return self._tried(lambda: self._stream.write(text)) or len(text)
+
+    def flush(self) -> None:
+        """Flush, or drop where nobody reads any more."""
+        self._tried(self._stream.flush)
+
+    def _tried(self, call: Callable[[], int | None]) -> int | None:
+        try:
+            return call()
+        except BrokenPipeError:  # the reader of our output has seen enough
+            os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
+            return None
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+@contextlib.contextmanager
+def _patient_output() -> Iterator[None]:
+    patient = _Patient(sys.stdout)
+    with contextlib.redirect_stdout(cast(TextIO, patient)):
+        try:
+            yield
+        finally:
+            patient.flush()
+
+
+@contextlib.contextmanager
+def _watched_interrupt() -> Iterator[None]:
+    """Note that the user interrupts; the interrupt itself is raised as ever."""
+    if (
+        threading.current_thread() is not threading.main_thread()
+        or signal.getsignal(signal.SIGINT) is not signal.default_int_handler
+    ):
+        yield
+        return
+
+    def note(number: int, frame: FrameType | None) -> None:
+        STOPPED.append(number)
+        signal.default_int_handler(number, frame)
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _register(files: Sequence[str]) -> None:
+    from identification.data.own_effects import register
+
+    for name in files:
+        register(name)
+
+
+def _taken(rest: list[str]) -> tuple[list[str], list[str]]:
+    """Words that go through to another parser without ``--effects``, and the files that it
+    names.
+    """
+    parser = OneLineParser(prog="irj", add_help=False, allow_abbrev=False)
+    parser.add_argument("--effects", action="append", default=[])
+    found, others = parser.parse_known_args(rest)
+    return others, found.effects
+
+
+def improve_json(
+    train: Sequence[str | Path], held_out: Sequence[str | Path], joint: str | Path
+) -> dict[str, Any]:
+    """The loop on files, as the data of `improve --json`."""
+    from workbench.cli.loop import improve_files
+
+    found, _, _ = improve_files([str(p) for p in train], [str(p) for p in held_out], str(joint))
+    return found
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,555 @@
+"""track, plan: the online estimator replayed on records, and the motion that makes the
+parameters identifiable.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from argparse import Namespace
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, final
+
+import numpy as np
+import numpy.typing as npt
+
+from identification.errors import InputError
+from irj_fmu.command_line import counted
+from irj_fmu.estimator.healthy import online_readings
+from workbench.cli.files import (
+    named,
+    needed,
+    open_joint,
+    open_records,
+    progress_bar,
+    write_bytes,
+    write_json,
+)
+
+if TYPE_CHECKING:
+    from identification.data.joint_file import Joint
+    from identification.data.record import Record
+    from identification.faults.detector import Fault
+    from identification.online.estimator import OnlineEstimator
+    from identification.planning.trajectories import Excitation, Selection
+
+FloatArray = npt.NDArray[np.float64]
+
+POINTS: Final = 400
+"""Points of the parameters' course kept per record."""
+AFTERMATH: Final = 2.0
+"""Seconds after a failure in which the look at the last second of readings still sees it."""
+UNESTIMATED: Final = (
+    "the parameters were not estimated: the first window needs some seconds in "
+    "which every reading is good"
+)
+READINGS: Final = (
+    "motor current",
+    "motor position",
+    "motor velocity",
+    "link position",
+    "link velocity",
+    "torque",
+)
+
+
+@final
+@dataclass(frozen=True)
+class Replay:
+    """What the online estimator made of one record.
+
+    Attributes
+    ----------
+    record : Record
+        At even steps.
+    estimator : OnlineEstimator
+        After the last sample.
+    time, values, sigmas, ratios
+        Course of the estimate at some hundred points: (m,) [s], (m, parameters) twice, (m,
+        balances).
+    events : tuple of dict
+        ``time``, ``fault``, ``text``.
+    healthy, readings, used : (n, 6) array
+        As recorded; with the faults tried on purpose, NaN where there is none; with failed ones
+        replaced. Link-referred SI.
+    failed : (n, 6) bool array
+        Where a reading is replaced.
+    tried : tuple of Fault
+    calibrated : bool
+        The detector's limits come from healthy records.
+    """
+
+    record: Record
+    estimator: OnlineEstimator
+    time: FloatArray
+    values: FloatArray
+    sigmas: FloatArray
+    ratios: FloatArray
+    events: tuple[dict[str, Any], ...]
+    healthy: FloatArray
+    readings: FloatArray
+    used: FloatArray
+    failed: npt.NDArray[np.bool_]
+    tried: tuple[Fault, ...] = ()
+    calibrated: bool = False
+
+    def spans(self, reading: int | None = None) -> list[tuple[float, float]]:
+        """Times [s] from which to which a reading is replaced; any reading where none is named."""
+        failed = self.failed.any(axis=1) if reading is None else self.failed[:, reading]
+        edges = np.flatnonzero(np.diff(failed.astype(np.int8), prepend=0, append=0))
+        time = self.record.time
+        return [
+            (float(time[a]), float(time[min(b, len(time) - 1)]))
+            for a, b in edges.reshape(-1, 2).tolist()
+        ]
+
+    def as_json(self) -> dict[str, Any]:
+        """Data of `track --json`."""
+        estimator = self.estimator
+        units = {p.name: p for p in estimator.model.parameters}
+        return {
+            "record": self.record.name,
+            "time": self.time.tolist(),
+            "detector": estimator.detector is not None,
+            "calibrated": self.calibrated,
+            "events": list(self.events),
+            "replaced": [
+                {"reading": name, "from": a, "to": b}
+                for i, name in enumerate(READINGS)
+                for a, b in self.spans(i)
+            ],
+            "ratio": dict(zip(estimator.balances, self.ratios[-1].tolist(), strict=True))
+            if len(self.time)
+            else {},
+            "parameters": {
+                name: {
+                    "value": float(self.values[-1, i]),
+                    "sigma": float(self.sigmas[-1, i]),
+                    "unit": units[name].unit,
+                    "side": units[name].side,
+                    "history": self.values[:, i].tolist(),
+                    "sigma_history": self.sigmas[:, i].tolist(),
+                }
+                for i, name in enumerate(estimator.names)
+                if len(self.time)
+            },
+        }
+
+
+def run_track(arguments: Namespace) -> int:
+    """`irj track`: 1 where ``--fail-on-fault`` was given and a fault was found."""
+    joint = open_joint(arguments.joint)
+    tried = [parse_fault(text) for text in getattr(arguments, "inject", None) or []]
+    records, warnings = _open_doubtful(arguments.records, joint)
+    healthy, more = open_records(arguments.healthy, joint)
+    state = limits(
+        joint,
+        records[0],
+        [r.renamed(path) for r, path in zip(healthy, arguments.healthy, strict=True)],
+    )
+    found = []
+    for path, record in zip(arguments.records, records, strict=True):
+        try:
+            found.append(replay(record, joint, state, tried))
+        except InputError as error:
+            raise named(error, path, record) from None
+    results = [made.as_json() for made in found]
+    for result in results:
+        _print_track(result)
+    write_json(arguments.json, {"records": results, "warnings": [*warnings, *more]})
+    page = getattr(arguments, "report", None)
+    if page:
+        from workbench.show.track_report import track_page
+
+        write_bytes(
+            page,
+            track_page(
+                found, joint, command=getattr(arguments, "command", None), notes=[*warnings, *more]
+            ).encode(),
+        )
+        print(f"{page}: report written")
+    return 1 if arguments.fail_on_fault and any(r["events"] for r in results) else 0
+
+
+def _open_doubtful(paths: Sequence[str], joint: Joint) -> tuple[list[Record], list[str]]:
+    """Records in SI of which only the head must be sane: what a sensor does later is for the
+    estimator to find.
+
+    Raises
+    ------
+    InputError
+        The first seconds cannot be used, or the record cannot be sampled evenly; the line starts
+        with the path.
+    """
+    from identification.data.check.checks import check, gate, repair
+    from identification.data.read import read
+    from identification.online.estimator import OnlineOptions
+
+    records, warnings = [], []
+    for path in paths:
+        record = read(path, columns=joint.columns, kind=joint.kind)
+        given = (joint.gear_ratio, needed(record, joint), joint.torque_per_current)
+        try:
+            head = record.time - record.time[0] <= OnlineOptions().warm_up
+            gate(
+                record if head.all() else record.take(head, "the first window of the estimator"),
+                *given,
+            )
+            findings = check(record, *given)
+            record = repair(record)
+            record.resampled()
+        except InputError as error:
+            raise named(error, path, record) from None
+        warnings += [
+            f"{path}: {f.message.removeprefix(record.name + ': ')}"
+            for f in findings
+            if f.severity != "ok"
+        ]
+        records.append(record)
+    for text in warnings:
+        sys.stderr.write(f"irj: {text}\n")
+    return records, warnings
+
+
+def parse_fault(text: str) -> Fault:
+    """A fault to try, as ``SENSOR:KIND:START[:SIZE[:END]]``; size in the unit of the reading, times
+    in s.
+
+    Raises
+    ------
+    InputError
+        One line that says how to write it.
+    """
+    from identification.faults.detector import KINDS, SENSORS, Fault
+
+    parts = text.split(":")
+    how = (
+        f"write SENSOR:KIND:START[:SIZE[:END]], SENSOR one of {', '.join(SENSORS)}, KIND one "
+        f"of {', '.join(KINDS)}, as link_position:stuck:9"
+    )
+    try:
+        sensor, kind, *numbers = parts
+        start, size, end = (*map(float, numbers), *(0.0, math.inf)[max(len(numbers) - 1, 0) :])
+    except ValueError:
+        raise InputError(f"--inject {text!r}: {how}") from None
+    if len(numbers) < 2 and kind not in ("stuck", "zero", "dropout"):
+        raise InputError(f"--inject {text!r}: {kind} needs a size; {how}")
+    try:
+        return Fault(sensor, kind, start, size, end)  # type: ignore[arg-type]
+    except InputError as error:
+        raise InputError(f"--inject {text!r}: {error}") from None
+
+
+def limits(joint: Joint, record: Record, healthy: Sequence[Record]) -> bytes | None:
+    """State of a fault detector with limits from healthy records; None without records.
+
+    Raises
+    ------
+    InputError
+        The joint is rigid or not fitted; a record has another sample time or lacks a channel.
+    """
+    if not healthy:
+        return None
+    from identification.online.estimator import OnlineOptions
+    from irj_fmu.estimator.healthy import detector_state
+
+    options = OnlineOptions(
+        has_link=record.has("link_position"), has_torque=record.has("link_torque")
+    )
+    for other in healthy:
+        if other.dt > 1.01 * record.dt:
+            raise InputError(
+                f"{other.name}: sampled every {other.dt:.4g} s, {record.name} every "
+                f"{record.dt:.4g} s; --healthy takes that rate or finer"
+            )
+        for channel in ("link_position", "link_torque"):
+            if record.has(channel) and not other.has(channel):
+                raise InputError(
+                    f"{other.name}: no {channel}, which {record.name} has; --healthy takes "
+                    "records with the same channels"
+                )
+    return detector_state(joint, options, healthy, record.resampled().dt)
+
+
+def track(record: Record, joint: Joint, detector_state: bytes | None = None) -> dict[str, Any]:
+    """Replay a record through the online estimator, sample by sample (see :func:`replay`).
+
+    Returns
+    -------
+    dict
+        ``record``, ``time``, ``parameters`` (name to value, sigma, unit, side, history), ``ratio``
+        (balance to residual over floor), ``events``, ``detector`` (whether faults were looked for).
+    """
+    return replay(record, joint, detector_state).as_json()
+
+
+def replay(
+    record: Record, joint: Joint, detector_state: bytes | None = None, tried: Sequence[Fault] = ()
+) -> Replay:
+    """Replay a record through the online estimator, sample by sample.
+
+    Parameters
+    ----------
+    record : Record
+        Resampled to its median step; every stretch starts the estimator anew.
+    joint : Joint
+        With fitted values the sensor-fault detector runs too.
+    detector_state : bytes, optional
+        Of a detector calibrated with healthy records.
+    tried : sequence of Fault
+        Faults put into the readings; their times count from the first sample.
+
+    Raises
+    ------
+    InputError
+        The record is too short for the first window, or a fault begins after its end.
+    """
+    from identification.online.estimator import OnlineEstimator, OnlineOptions
+
+    even = record.resampled()
+    for asked in tried:
+        if not 0 <= asked.start < even.duration:
+            raise InputError(
+                f"{record.name}: a fault at {asked.start:g} s is asked for, the record is "
+                f"{even.duration:.4g} s long"
+            )
+    options = OnlineOptions(
+        has_link=record.has("link_position"), has_torque=record.has("link_torque")
+    )
+    estimator = OnlineEstimator(joint, even.dt, options, detector_state)
+    table, there = online_readings(even, joint)
+    healthy = np.array(table)
+    readings = np.array(online_readings(even, joint, tried)[0]) if tried else healthy
+    valid = (np.isfinite(readings) & np.array(there)).tolist()
+    rows = np.nan_to_num(readings).tolist()
+    used, failed = readings.copy(), np.zeros(readings.shape, dtype=bool)
+    every = max(1, len(even) // POINTS)
+    course: list[tuple[float, FloatArray, FloatArray, FloatArray]] = []
+    events: list[dict[str, Any]] = []
+    fault, detector = 0, estimator.detector
+    for part in even.segments():
+        estimator.reset()
+        before: tuple[bool, ...] = (False,) * len(READINGS)
+        quiet = [-math.inf] * len(READINGS)
+        for k in range(part.start, part.stop):
+            now = float(even.time[k])
+            estimator.update(now, rows[k], valid[k])
+            codes = []
+            if detector is not None:
+                replaced = detector.replaced
+                used[k], failed[k] = estimator.readings, replaced
+                if replaced != before:
+                    codes = [
+                        i + (1 if valid[k][i] else 11)
+                        for i in range(len(READINGS))
+                        if replaced[i] and not before[i]
+                    ]
+                    quiet = [
+                        now + AFTERMATH if r or b else q
+                        for r, b, q in zip(replaced, before, quiet, strict=True)
+                    ]
+                    before = replaced
+            if estimator.fault != fault:
+                fault = estimator.fault
+                # a reading that is replaced has been reported when that began
+                known = fault not in (7, 8, 9) and (
+                    before[fault % 10 - 1] or now < quiet[fault % 10 - 1]
+                )
+                codes += [fault] if fault and not known else []
+            events += [{"time": now, "fault": code, "text": fault_text(code)} for code in codes]
+            if (k + 1) % every == 0 and not estimator.warming_up:
+                course.append(
+                    (now, estimator.theta.copy(), estimator.sigma.copy(), estimator.ratio.copy())
+                )
+        progress_bar(f"tracking {record.name}", part.stop / len(even))
+    if not course and not events:
+        longest = max(part.stop - part.start for part in even.segments()) * even.dt
+        where = (
+            "are too short"
+            if len(even.segments()) == 1
+            else f"in {len(even.segments())} pieces, the longest of {longest:.3g} s, are too short"
+        )
+        raise InputError(
+            f"{record.name}: {even.duration:.3g} s {where} for the first window of "
+            f"{options.warm_up:g} s; give a longer record"
+        )
+    widths = ((), (len(estimator.names),), (len(estimator.names),), (len(estimator.balances),))
+    time, values, sigmas, ratios = (
+        np.array([row[i] for row in course]).reshape(-1, *w) for i, w in enumerate(widths)
+    )
+    return Replay(
+        even,
+        estimator,
+        time=time,
+        values=values,
+        sigmas=sigmas,
+        ratios=ratios,
+        events=tuple(events),
+        healthy=healthy,
+        readings=readings,
+        used=used,
+        failed=failed,
+        tried=tuple(tried),
+        calibrated=estimator.detector is not None and detector_state is not None,
+    )
+
+
+def fault_text(code: int) -> str:
+    """What a fault code means, in words."""
+    if code == 7:
+        return "motor current sensor failed or motor friction changed"
+    if code == 8:
+        return "the joint changed, the sensors agree with each other"
+    if code == 9:
+        return (
+            "the readings cannot be those of the joint, or stand still while it moves; the "
+            "estimate is held"
+        )
+    kind, sensor = divmod(code, 10)
+    what = (
+        "sensor failed",
+        "reading missing",
+        "reading constant while the joint moves",
+        "reading of wrong scale",
+    )[kind]
+    return f"{READINGS[sensor - 1]}: {what}"
+
+
+def _print_track(result: dict[str, Any]) -> None:
+    if result["parameters"]:
+        print(f"{result['record']}: {counted(len(result['parameters']), 'parameter')} followed")
+        print(
+            "  last value +- standard deviation, in brackets the side it is referred to, and the "
+            "first value"
+        )
+    else:
+        print(f"{result['record']}: {UNESTIMATED}")
+    for name, p in result["parameters"].items():
+        print(
+            f"  {name:<28} {p['value']:.6g} +- {p['sigma']:.2g} {p['unit']} ({p['side']} side), "
+            f"first {p['history'][0]:.6g}"
+        )
+    if result["ratio"]:
+        print(
+            "  residual over floor: "
+            + ", ".join(f"{b} {r:.3g}" for b, r in result["ratio"].items())
+        )
+    if not result["detector"]:
+        print(
+            "  sensor faults were not looked for: that needs an elastic joint file with fitted "
+            "values (`irj fit -o`)"
+        )
+    for event in result["events"]:
+        print(f"  {event['time']:.3f} s: {event['text']}")
+    for span in result["replaced"]:
+        print(f"  {span['reading']} replaced from {span['from']:.3f} s to {span['to']:.3f} s")
+    if result["detector"] and not result["calibrated"]:
+        print(
+            "  limits of the fault detector are guesses: give records of the healthy joint with "
+            "--healthy"
+        )
+    if result["detector"] and not result["events"]:
+        print("  no sensor fault")
+
+
+def run_plan(arguments: Namespace) -> int:
+    """`irj plan`."""
+    from identification.data.typical import true_values
+    from identification.planning.trajectories import (
+        Experiment,
+        Limits,
+        select,
+        sinusoidal_grid,
+        triangular_grid,
+    )
+
+    joint = open_joint(arguments.joint)
+    model = joint.model()
+    if not model.is_elastic:
+        raise InputError(
+            f'{arguments.joint}: plan simulates an elastic joint; set model = "hd3" (a rigid '
+            "model is excited by any motion that reverses)"
+        )
+    for option in ("max_position", "max_speed", "max_torque"):
+        if not getattr(arguments, option) > 0:
+            raise InputError(
+                f"--{option.replace('_', '-')} {getattr(arguments, option):g}: give a limit above 0"
+            )
+    model = model.with_values(true_values(model, joint))
+    limits = Limits(
+        math.radians(arguments.max_position),
+        math.radians(arguments.max_speed),
+        arguments.max_torque,
+    )
+    motions = [
+        *triangular_grid(limit=min(math.radians(arguments.max_position) * 0.95, math.radians(80))),
+        *sinusoidal_grid(),
+    ]
+    experiment = Experiment(model, stride=20)
+    tried = []
+    for k, motion in enumerate(motions):
+        progress_bar(f"trying {motion.family}", k / len(motions))
+        tried.append(experiment.evaluate(motion, limits=limits))
+    progress_bar("done", 1.0)
+    allowed = [t for t in tried if not t.broken]
+    if not allowed:
+        broken = ", ".join(sorted({b for t in tried for b in t.broken}))
+        raise InputError(
+            f"{arguments.joint}: no motion keeps the limits ({broken}); widen --max-position, "
+            "--max-speed or --max-torque"
+        )
+    chosen = select(experiment, [t.motion for t in allowed], limits=limits)
+    _write_motion(arguments.output, chosen.best)
+    _print_plan(arguments.output, chosen, len(tried) - len(allowed), bool(joint.fitted))
+    best = chosen.best
+    data = {
+        "family": best.motion.family,
+        "parameters": dict(best.motion.parameters),
+        "relative_deviation": dict(best.relative_deviation),
+        "condition": best.condition,
+        "tried": len(tried),
+        "file": arguments.output,
+        "by_effect": best.by_effect(model),
+    }
+    write_json(arguments.json, data)
+    return 0
+
+
+def _write_motion(path: str, best: Excitation) -> None:
+    import io
+
+    from identification.planning.trajectories import COLUMNS
+
+    text = io.StringIO()
+    rows = np.column_stack([best.motion.time, best.motion.table])
+    np.savetxt(text, rows, delimiter=",", header=",".join(COLUMNS), comments="", fmt="%.9g")
+    write_bytes(path, text.getvalue().encode())
+
+
+def _print_plan(path: str, chosen: Selection, refused: int, fitted: bool) -> None:
+    best = chosen.best
+    values = ", ".join(_shown(k, v) for k, v in best.motion.parameters.items())
+    print(
+        f"{path}: {best.motion.family} motion, {values}; best of {len(chosen.tried)}"
+        + (f", {refused} break the limits" if refused else "")
+    )
+    if not fitted:
+        print(
+            "  the joint file has no fitted values: typical ones were taken, so read the figures "
+            "as orders of magnitude"
+        )
+    print("  standard deviation to expect, in percent of the value:")
+    for name, deviation in best.relative_deviation.items():
+        shown = (
+            f"{100 * deviation:.3g} %"
+            if math.isfinite(deviation)
+            else "cannot be identified by this motion"
+        )
+        print(f"    {name:<28} {shown}")
+
+
+def _shown(name: str, value: float) -> str:
+    if name in ("hold", "period", "rendezvous", "reversal"):
+        return f"{name} {value:.3g} s"
+    return f"{name} {math.degrees(value):.3g} deg" + ("/s" if name == "speed" else "")

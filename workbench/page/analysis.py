@@ -1,0 +1,471 @@
+"""The loop in memory: records prepared once, then each click adds or removes an effect and fits
+again.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Final, final
+
+import numpy as np
+import numpy.typing as npt
+
+from casadi_models import EFFECTS, JointModel
+from identification.balance.balances import Balances
+from identification.balance.dataset import with_effect, without
+from identification.data.check.gate import gate_warnings, gated
+from identification.data.joint_file import Joint
+from identification.data.record import Record
+from identification.diagnosis.bench import JointBench
+from identification.diagnosis.diagnose import Diagnosis
+from identification.diagnosis.improve import HOLD_DELAY, ranked_json
+from identification.diagnosis.outcome import key_of
+from identification.diagnosis.places import Rows, gather, places_of
+from identification.diagnosis.session import Session, with_held_out
+from identification.diagnosis.trials import Trial
+from identification.errors import InputError
+from identification.fitting.assess import Error, assess
+from identification.fitting.engine import (
+    Dataset,
+    Solution,
+    load_dataset,
+    prepared_model,
+    references,
+    solve,
+    stack,
+)
+from identification.fitting.fit import joint_text
+from identification.fitting.parameters import parameter_table
+from workbench.page.first import first_look
+from workbench.page.records import thinned
+from workbench.page.session import StepEntry
+from workbench.show.results import headline
+
+FloatArray = npt.NDArray[np.float64]
+Progress = Callable[[str, float], None]
+
+QUICK_TRAIN: Final = 60.0
+QUICK_HELD_OUT: Final = 30.0
+"""Seconds of record that a click fits and judges at once; longer records are taken in windows
+[s].
+"""
+USUAL_RATE: Final = 1000.0
+"""Records of fewer samples than the seconds above have at this rate are short, however long
+they last [1/s].
+"""
+
+
+def clean(value: Any) -> Any:
+    """Data for JSON: NaN and infinity become None, arrays become lists."""
+    if isinstance(value, Mapping):
+        return {str(k): clean(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple, frozenset, set)):
+        return [clean(v) for v in value]
+    if isinstance(value, np.ndarray):
+        return clean(value.tolist())
+    if isinstance(value, (float, np.floating)):
+        return float(value) if math.isfinite(value) else None
+    return value.item() if isinstance(value, np.generic) else value
+
+
+@final
+class Analysis:
+    """Records and joint of a session, prepared; holds the current solution and the tried
+    candidates.
+
+    Parameters
+    ----------
+    joint : Joint
+    train, held_out : sequence of Record
+        Without held-out records the last part of each training record is held out.
+
+    Raises
+    ------
+    InputError
+        Records that do not carry the model.
+    """
+
+    def __init__(self, joint: Joint, train: Sequence[Record], held_out: Sequence[Record]) -> None:
+        if not train:
+            raise InputError("no record to fit: load one, or set the role of one to fit")
+        self.joint = joint
+        whole, held, self.note = with_held_out(gated(train, joint), gated(held_out, joint))
+        self.records = (*whole, *held)
+        self._train, self._held = whole, held
+        quick_train, quick_held = _share(whole, QUICK_TRAIN), _share(held, QUICK_HELD_OUT)
+        self._quick = quick_train, quick_held
+        self.whole = quick_train is whole and quick_held is held
+        if not self.whole:
+            seconds = sum(r.duration for r in (*quick_train, *quick_held))
+            total = sum(r.duration for r in self.records)
+            part = (
+                f"fitted and judged on {seconds:.0f} s of the {total:.0f} s of record, in "
+                "windows spread over it; Confirm takes every sample"
+            )
+            self.note = f"{self.note}; {part}" if self.note else part
+        self.start_model = prepared_model(joint, whole[0])
+        self.data = load_dataset(quick_train, quick_held, joint, self.start_model)
+        self.bench = JointBench(joint, self.data, quick_train, quick_held)
+        self.solution: Solution | None = None
+        self.trials: dict[str, Trial] = {}
+        self._rows: Rows | None = None
+        self._solved: dict[str, Solution] = {}
+        self._prepared: dict[str, tuple[Solution, Solution, StepEntry]] = {}
+
+    @property
+    def split(self) -> tuple[list[Record], list[Record]]:
+        """Records of the fit and held-out records, every sample of them."""
+        return self._train, self._held
+
+    @property
+    def quick(self) -> tuple[list[Record], list[Record]]:
+        """Records of the fit and held-out records as the clicks take them: windows of long ones."""
+        return self._quick
+
+    # --- models -----------------------------------------------------------------------------------
+
+    def model_of(self, effects: Sequence[str], virtual_work: bool) -> JointModel:
+        """The model with these labels, in the form that the records carry."""
+        labels = tuple(label for label in effects if label != HOLD_DELAY)
+        return prepared_model(
+            replace(self.joint, model_name="hd1", effects=labels, virtual_work=virtual_work),
+            self._train[0],
+        )
+
+    def restore(self, step: StepEntry) -> None:
+        """Make the solution of a step of the ledger current again."""
+        known = self._solved.get(_mark(step))
+        if known is None:
+            model = self.model_of(step.effects, step.virtual_work)
+            known = solve(model, self.data, start=step.values, iterations=1)
+            self._solved[_mark(step)] = known
+        self.solution, self.trials = known, {}
+
+    # --- verbs ------------------------------------------------------------------------------------
+
+    def fit_start(self, progress: Progress | None = None) -> StepEntry:
+        """Fit the start model."""
+        began = time.perf_counter()
+        self.solution = solve(self.start_model, self.data, progress=progress)
+        self.trials = {}
+        return self._entry("start", None, self.data, began)
+
+    def add(self, label: str, hint: Mapping[str, Any] | None = None) -> StepEntry:
+        """Add an effect: the whole fit where it was made ahead, else a first look that `settle`
+        follows.
+
+        Parameters
+        ----------
+        label : str
+            Label of a candidate, or key of an effect.
+        hint : mapping, optional
+            Start values and form from a diagnosis: ``{"values", "virtual_work"}``.
+
+        Raises
+        ------
+        InputError
+            The effect is in the model already, or cannot be there.
+        """
+        began = time.perf_counter()
+        now = self._current()
+        ready = self._prepared.get(label)
+        if ready is not None and ready[0] is now:
+            self.solution, self.trials = ready[1], {}
+            return replace(ready[2], seconds=round(time.perf_counter() - began, 3))
+        model, start = self._with(label, hint)
+        return self._looked("add", label, model, start, began)
+
+    def prepare(self, label: str, hint: Mapping[str, Any] | None = None) -> None:
+        """Fit a candidate ahead of the click, so that `add` has it at once."""
+        began, now = time.perf_counter(), self._current()
+        model, start = self._with(label, hint)
+        made = solve(model, self.data, start=start)
+        entry = self._entry("add", label, self.data, began, made)
+        self._prepared = {
+            **{k: v for k, v in self._prepared.items() if v[0] is now},
+            label: (now, made, entry),
+        }
+
+    def settle(self, step: StepEntry) -> StepEntry:
+        """The whole fit of a step that was only looked at."""
+        began, now = time.perf_counter(), self._current()
+        made = solve(now.model, self.data, start=now.values)
+        entry = self._entry(step.action, step.label, self.data, began, made)
+        self.solution = made
+        return replace(entry, names=step.names, separate_by=step.separate_by)
+
+    def remove(self, label: str) -> StepEntry:
+        """Take an effect out of the model: a first look, as `add`."""
+        began = time.perf_counter()
+        now = self._current()
+        try:
+            model = without(now.model, label)
+        except (KeyError, ValueError) as error:
+            raise InputError(f"{label}: {error.args[0]}") from None
+        return self._looked("remove", label, model, now.values, began)
+
+    def _with(
+        self, label: str, hint: Mapping[str, Any] | None
+    ) -> tuple[JointModel, dict[str, float]]:
+        """The model with an effect, and the values to start from."""
+        now = self._current()
+        trial = self.trials.get(label)
+        values = {**now.values, **(trial.values if trial else (hint or {}).get("values", {}))}
+        try:
+            model = trial.candidate.model if trial else with_effect(now.model, label)
+        except (KeyError, ValueError) as error:
+            raise InputError(f"{label}: {error.args[0]}") from None
+        if not trial and hint and "virtual_work" in hint:
+            model = replace(model, virtual_work=bool(hint["virtual_work"]))
+        return model, values
+
+    def _looked(
+        self, action: str, label: str, model: JointModel, start: Mapping[str, float], began: float
+    ) -> StepEntry:
+        made = first_look(model, self.data, self._current(), start)
+        entry = self._entry(action, label, self.data, began, made, whole=False)
+        self.solution, self.trials = made, {}
+        return entry
+
+    def diagnose(self, progress: Progress) -> dict[str, Any]:
+        """What is missing from the current model: the first decision of the loop, as every door
+        gives it.
+
+        Raises
+        ------
+        InputError
+            Records in unlike units.
+        """
+        now = self._current()
+        session = Session(self.bench, progress, gate_warnings(self.records))
+        found = Diagnosis(session.diagnose(now))
+        ranking, claim = found.ranking, None
+        if found.claims:
+            claim = found.claims[0].as_json() | {"label": found.claims[0].label}
+        self.trials = {t.candidate.label: t for t in ranking.everything}
+        rows = []
+        for trial in ranking.trials:
+            e = trial.candidate.effect
+            rows.append(
+                ranked_json(trial, trial.candidate.label in ranking.significant)
+                | {
+                    "label": trial.candidate.label,
+                    "values": dict(trial.values),
+                    "virtual_work": trial.candidate.model.virtual_work,
+                    "absence": e.absence,
+                    "excitation": e.excitation,
+                    "source": e.source,
+                    "separate_by": e.separate_by,
+                    "family": e.family,
+                    "contribution": trial.contribution,
+                    "score": trial.score,
+                }
+            )
+        unit = "N" if self.joint.kind == "linear" else "N.m"
+        story = found.as_json()
+        out: dict[str, Any] = clean(
+            {
+                **{
+                    key: story[key]
+                    for key in (
+                        "outcome",
+                        "verdict",
+                        "reason",
+                        "refused",
+                        "unexplained",
+                        "floor_ratio",
+                        "warnings",
+                    )
+                },
+                "headline": headline(story),
+                "ranking": rows,
+                "claim": claim,
+                "unit": unit,
+                "not_testable": [
+                    {"effect": n.effect, "title": EFFECTS[n.effect].title, "why": n.why}
+                    for n in ranking.not_testable
+                ],
+            }
+        )
+        return out
+
+    def confirm(self, step: StepEntry, progress: Progress) -> StepEntry:
+        """Fit the current model to every sample, and judge it on every held-out sample."""
+        began = time.perf_counter()
+        progress("preparing every sample", 0.1)
+        data = load_dataset(self._train, self._held, self.joint, self.start_model)
+        progress("fitting every sample", 0.4)
+        now = self._current()
+        self.solution = solve(
+            now.model,
+            data,
+            start=now.values,
+            iterations=4,
+            progress=lambda text, share: progress(
+                f"fitting every sample, {text}", 0.4 + 0.5 * share
+            ),
+        )
+        made = self._entry(step.action, step.label, data, began)
+        self.restore(made)
+        return replace(made, exact=True)
+
+    # --- views ------------------------------------------------------------------------------------
+
+    def compare(self) -> dict[str, Any]:
+        """Error, and places with the most telling first, on the held-out records."""
+        now = self._current()
+        rows = self._gathered()
+        residual = self._residuals()
+        found = places_of(residual, rows)
+        error = self.bench.judged(now, assess(now.model, self.data, self.data.held_out, now.values))
+        out: dict[str, Any] = clean(
+            {
+                "error": error.as_json(),
+                "places": [p.as_json() for p in found],
+                "worst": self._worst(residual, error, rows),
+                "records": list(self.data.held_out_names),
+                "note": self.note,
+            }
+        )
+        return out
+
+    def balance_series(self, balance: str) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Time, measured torque and what the model explains of it, on the held-out records.
+
+        Raises
+        ------
+        InputError
+            The records have no such balance.
+        """
+        residual = self._residuals()
+        if balance not in residual:
+            raise InputError(
+                f"no {balance} balance in these records; they have {', '.join(residual)}"
+            )
+        # a curve breaks where a new stretch begins
+        breaks = np.concatenate([np.where(w.begins, np.nan, 0.0) for w in self.data.held_out])
+        measured = references(self.data, self.data.held_out)[balance] + breaks
+        return self._gathered().axes["time"].values, measured, measured - residual[balance]
+
+    def parameters(self) -> dict[str, Any]:
+        """Table of the parameters of the current model."""
+        table = parameter_table(self._current(), self.data)
+        limits = {p.name: (p.low, p.high) for p in self._current().model.parameters}
+        out: dict[str, Any] = clean(
+            {
+                n: {
+                    **row,
+                    "low": limits.get(n, (None, None))[0],
+                    "high": limits.get(n, (None, None))[1],
+                }
+                for n, row in table.items()
+            }
+        )
+        return out
+
+    def to_joint_file(self) -> str:
+        """The fitted joint as the text of a joint file."""
+        now = self._current()
+        own = set(self.start_model.effects) - set(self.joint.effects)
+        kept = (
+            self.joint if own <= set(now.model.effects) else replace(self.joint, model_name="hd1")
+        )
+        return joint_text(kept, now, self.data)
+
+    # --- inside -----------------------------------------------------------------------------------
+
+    def _current(self) -> Solution:
+        if self.solution is None:
+            raise InputError("no fit yet: press Fit first")
+        return self.solution
+
+    def _gathered(self) -> Rows:
+        if self._rows is None:
+            self._rows = gather(self.data, self.data.held_out)
+        return self._rows
+
+    def _residuals(self) -> dict[str, FloatArray]:
+        now = self._current()
+        return dict(
+            stack(
+                Balances(now.model, self.data.sensing, wrt=()), self.data.held_out, now.values
+            ).residual
+        )
+
+    def _worst(
+        self, residual: Mapping[str, FloatArray], error: Error, rows: Rows
+    ) -> dict[str, Any]:
+        """The two seconds in which the residual stands highest over its floor."""
+        stamps = rows.axes["time"].values
+        power = sum((r / max(error.balances[b].floor, 1e-12)) ** 2 for b, r in residual.items())
+        step = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1.0
+        width = max(1, min(len(stamps), round(2.0 / step)))
+        k = int(np.argmax(np.convolve(np.asarray(power), np.ones(width), "valid")))
+        where = {
+            b: float(np.sum(r[k : k + width] ** 2)) / max(error.balances[b].floor, 1e-12) ** 2
+            for b, r in residual.items()
+        }
+        return {
+            "low": float(stamps[k]),
+            "high": float(stamps[min(k + width, len(stamps) - 1)]),
+            "balance": max(where, key=lambda b: where[b]),
+        }
+
+    def _entry(
+        self,
+        action: str,
+        label: str | None,
+        data: Dataset,
+        began: float,
+        made: Solution | None = None,
+        *,
+        whole: bool = True,
+    ) -> StepEntry:
+        """A step of the ledger; without `whole` a first look, judged on the held-out records
+        only.
+        """
+        now = made or self._current()
+        bench = (
+            self.bench
+            if data is self.data
+            else JointBench(self.joint, data, self._train, self._held)
+        )
+        train: dict[str, Any] = {}
+        if whole:
+            seen = assess(now.model, data, data.train, now.values)
+            train = clean(bench.judged(now, seen, held_out=False).as_json())
+        held = bench.judged(now, assess(now.model, data, data.held_out, now.values))
+        key = key_of(label) if label else None
+        entry = StepEntry(
+            action,
+            tuple(now.model.effects),
+            values={k: float(v) for k, v in now.values.items()},
+            train=train,
+            held_out=clean(held.as_json()),
+            key=key,
+            label=label,
+            title=EFFECTS[key].title if key is not None and key in EFFECTS else None,
+            virtual_work=now.model.virtual_work,
+            exact=self.whole,
+            seconds=round(time.perf_counter() - began, 3),
+            settled=whole,
+        )
+        if data is self.data:
+            self._solved[_mark(entry)] = now
+        return entry
+
+
+def _mark(step: StepEntry) -> str:
+    """What tells one fitted model from another."""
+    return repr((step.effects, step.virtual_work, sorted(step.values.items())))
+
+
+def _share(records: list[Record], seconds: float) -> list[Record]:
+    """Records thinned to `seconds` in all; the same list where they are short enough."""
+    total = sum(r.duration for r in records)
+    if total <= 1.5 * seconds or sum(map(len, records)) <= 1.5 * seconds * USUAL_RATE:
+        return records
+    return [thinned(r, seconds * r.duration / total) for r in records]

@@ -1,0 +1,225 @@
+"""What comes into a session: records, the joint, the demo."""
+
+from __future__ import annotations
+
+import json
+import math
+import secrets
+import tomllib
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+from casadi_models.transmission import MODELS
+from identification.data.joint_file import Joint, parse_joint, toml_text
+from identification.errors import InputError
+from workbench.page.live import Live
+from workbench.page.records import guessed_role
+from workbench.page.session import FileEntry, State
+
+LARGEST_JOINT: Final = 1 << 20
+NUMBERS: Final = ("gear_ratio", "motor_constant", "torque_per_current", "torque_per_voltage")
+
+
+def add_upload(live: Live, name: str, stored: str, size: int) -> dict[str, Any]:
+    """Take a file that is in the session folder: a joint file by its ending, else a record."""
+    path = live.session.files / stored
+    if name.lower().endswith(".toml"):
+        if size > LARGEST_JOINT:
+            raise InputError(
+                f"{name}: is too long for a joint file; give records as CSV, MAT or NPZ"
+            )
+        try:
+            text = path.read_text(encoding="utf-8-sig")
+        except UnicodeDecodeError:
+            raise InputError(f"{name}: not a text file; a joint file is TOML") from None
+        path.unlink()
+        return set_joint(live, {"text": text, "source": name})
+    role, reason = guessed_role(name)
+    entry = live.examine(
+        FileEntry(secrets.token_hex(6), name, stored, role, reason, size), soon=True
+    )
+    live.change_input(lambda s: replace(s, files=(*s.files, entry)))
+    live.check_soon(entry)
+    return {"id": entry.id, "status": entry.status, "message": entry.message}
+
+
+def put_upload(live: Live, identifier: str, body: Mapping[str, Any]) -> dict[str, Any]:
+    """Change the role or the column map of a record.
+
+    Raises
+    ------
+    InputError
+        Unknown record, role or map.
+    """
+    entry = _entry(live.state, identifier)
+    if "role" in body:
+        if body["role"] not in ("train", "held_out"):
+            raise InputError("role is 'train' or 'held_out'")
+        entry = replace(entry, role=body["role"], role_reason="chosen by hand")
+    if "columns" in body:
+        columns = _columns(body["columns"])
+        everywhere = [
+            f
+            for f in live.state.files
+            if f.id == identifier
+            or (body.get("all") and f.status == "columns" and set(_used(columns)) <= set(f.names))
+        ]
+        made = {
+            f.id: live.examine(replace(entry if f.id == identifier else f, columns=columns))
+            for f in everywhere
+        }
+        live.change_input(lambda s: replace(s, files=tuple(made.get(f.id, f) for f in s.files)))
+        entry = made[identifier]
+    else:
+        live.change_input(
+            lambda s: replace(s, files=tuple(entry if f.id == identifier else f for f in s.files))
+        )
+    return {"id": entry.id, "status": entry.status, "message": entry.message}
+
+
+def drop_upload(live: Live, identifier: str) -> None:
+    """Take a record out of the session and off the disk."""
+    entry = _entry(live.state, identifier)
+    live.change_input(lambda s: replace(s, files=tuple(f for f in s.files if f.id != identifier)))
+    live.session.path_of(entry).unlink(missing_ok=True)
+
+
+def _entry(state: State, identifier: str) -> FileEntry:
+    entry = next((f for f in state.files if f.id == identifier), None)
+    if entry is None:
+        raise InputError("no such record in this session")
+    return entry
+
+
+def _columns(given: Any) -> dict[str, Any]:
+    if not isinstance(given, Mapping) or not given:
+        raise InputError("columns: choose a column for time and for at least one channel")
+    out: dict[str, Any] = {}
+    for channel, spec in given.items():
+        if not isinstance(spec, Mapping):
+            raise InputError(f"columns: {channel} must be a table")
+        entry = {k: spec[k] for k in ("column", "unit") if spec.get(k)}
+        for key in ("scale", "counts_per_turn"):
+            if spec.get(key) not in (None, "", 1, 1.0):
+                entry[key] = _number(spec[key], f"{channel}: {key}")
+        if spec.get("sign") == -1:
+            entry["sign"] = -1
+        out[str(channel)] = entry
+    return out
+
+
+def _used(columns: Mapping[str, Any]) -> list[str]:
+    return [str(c.get("column")) for c in columns.values()]
+
+
+def _number(value: Any, what: str) -> float:
+    try:
+        found = float(value)
+    except (TypeError, ValueError):
+        raise InputError(f"{what} is {value!r}; give a number") from None
+    if not math.isfinite(found):
+        raise InputError(f"{what} is {value!r}; give a finite number")
+    return found
+
+
+def set_joint(live: Live, body: Mapping[str, Any]) -> dict[str, Any]:
+    """Set the joint from a joint file's text, or from the fields of the form.
+
+    Raises
+    ------
+    InputError
+        What is wrong with it; the joint before it is kept.
+    """
+    source = str(body.get("source", "joint"))
+    if "text" in body:
+        text = str(body["text"])
+    else:
+        text = toml_text(_from_form(body, _previous(live.state.joint_text)))
+    try:
+        parse_joint(tomllib.loads(text), source)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{source}: not valid TOML ({error})") from None
+    changed = live.change_input(lambda s: replace(s, joint_text=text, joint_source=source))
+    made = {f.id: live.examine(f) for f in changed.files}
+    live.change(lambda s: replace(s, files=tuple(made.get(f.id, f) for f in s.files)))
+    return {"ok": True, "files": [{"id": f.id, "status": f.status} for f in live.state.files]}
+
+
+def _previous(text: str) -> dict[str, Any]:
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError:
+        return {}
+
+
+def _from_form(body: Mapping[str, Any], previous: Mapping[str, Any]) -> Joint:
+    """The form's fields as a joint; [known] and [columns] of the joint before are kept."""
+    kind = body.get("kind", "rotary")
+    model = body.get("model", "hd1")
+    effects = body.get("effects", [])
+    if model not in MODELS:
+        raise InputError(f"model = {model!r} is not known; use one of {', '.join(MODELS)}")
+    if not isinstance(effects, list):
+        raise InputError("effects must be a list of names")
+    table: dict[str, Any] = {
+        "name": str(body.get("name") or "joint"),
+        "kind": kind,
+        "model": model,
+        "effects": [str(e) for e in effects],
+    }
+    for key in NUMBERS:
+        if body.get(key) not in (None, ""):
+            table[key] = _number(body[key], key)
+    if table.get("gear_ratio") is None:
+        raise InputError(
+            "gear_ratio is empty; give theta_motor / theta_link with its sign (1 where "
+            "everything is measured on one side)"
+        )
+    whole = {"joint": table}
+    for part in ("known", "columns"):
+        if previous.get(part):
+            whole[part] = previous[part]
+    try:
+        return parse_joint(whole, "joint")
+    except InputError as error:
+        if "[known]" in str(error):
+            whole.pop("known", None)
+            return parse_joint(whole, "joint")
+        raise
+
+
+def joint_form(text: str) -> dict[str, Any]:
+    """The fields of the form for a joint file."""
+    data = _previous(text)
+    table = dict(data.get("joint", {}))
+    table["known"] = data.get("known", {})
+    table["columns"] = data.get("columns", {})
+    return dict(json.loads(json.dumps(table, default=str)))
+
+
+def start_demo(live: Live) -> dict[str, Any]:
+    """Put the demo into the session: simulated records of a joint with a hidden effect.
+
+    Raises
+    ------
+    InputError
+        The session is not empty.
+    """
+    from workbench.page.demo import demo_files
+
+    if live.state.files:
+        raise InputError("the session has records already; start a new one for the demo")
+    for name, content in demo_files().items():
+        stored = f"{secrets.token_hex(4)}-{name}"
+        (live.session.files / stored).write_bytes(content)
+        add_upload(live, name, stored, len(content))
+    return {"ok": True}
+
+
+def folder_of(live: Live) -> Path:
+    """Folder for what is made for a download."""
+    made = live.session.folder / "exports"
+    made.mkdir(exist_ok=True, mode=0o700)
+    return made

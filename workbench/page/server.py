@@ -1,0 +1,422 @@
+"""The workbench in a browser: Starlette on the loopback interface, the page in ``web/``, state
+in a folder.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import importlib
+import json
+import os
+import secrets
+import socket
+import threading
+from collections import OrderedDict
+from collections.abc import AsyncIterator, Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, final
+
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import (
+    FileResponse,
+    JSONResponse,
+    PlainTextResponse,
+    Response,
+    StreamingResponse,
+)
+from starlette.routing import Route
+
+from identification.errors import InputError
+from workbench.page import verbs as app_verbs
+from workbench.page.input import add_upload, drop_upload, put_upload, set_joint, start_demo
+from workbench.page.live import BusyError, Live
+from workbench.page.security import Guard, loopback_hosts
+from workbench.page.session import Store, safe_name
+from workbench.page.uploads import MAX_UPLOAD, TooLargeError, refuse_size, stream_to
+from workbench.page.views import VIEWS, first_plot
+
+IN_MEMORY: Final = 4
+"""Sessions kept in memory; older ones are read from their folder again."""
+MAX_BODY: Final = 1 << 20
+HEARTBEAT: Final = 15.0
+WEB: Final = Path(__file__).parents[1] / "web"
+ASSETS: Final = Path(__file__).parents[1] / "assets"
+PAGE: Final = {
+    "/": (WEB / "index.html", "text/html; charset=utf-8"),
+    "/app.css": (WEB / "app.css", "text/css; charset=utf-8"),
+    "/app.js": (WEB / "app.js", "text/javascript; charset=utf-8"),
+    "/views.js": (WEB / "views.js", "text/javascript; charset=utf-8"),
+    "/more.js": (WEB / "more.js", "text/javascript; charset=utf-8"),
+    "/preview.js": (WEB / "preview.js", "text/javascript; charset=utf-8"),
+    "/plots.js": (WEB / "plots.js", "text/javascript; charset=utf-8"),
+    "/uPlot.js": (ASSETS / "uPlot.iife.min.js", "text/javascript; charset=utf-8"),
+    "/uPlot.css": (ASSETS / "uPlot.min.css", "text/css; charset=utf-8"),
+}
+"""Every file the page is made of; nothing else on the disk has an address."""
+
+
+@final
+@dataclass
+class Service:
+    """The sessions of one server."""
+
+    store: Store
+    max_upload: int
+    lives: OrderedDict[str, Live]
+    lock: threading.Lock
+
+    def live(self, identifier: str) -> Live:
+        """A session by its identifier.
+
+        Raises
+        ------
+        KeyError
+        """
+        with self.lock:
+            if identifier not in self.lives:
+                self.lives[identifier] = Live(self.store.open(identifier))
+            self.lives.move_to_end(identifier)
+            spare = [
+                k
+                for k, live in self.lives.items()
+                if k != identifier and not live.job and not live.listeners and live.worker.idle
+            ]
+            for old in spare[: max(0, len(self.lives) - IN_MEMORY)]:
+                del self.lives[old]
+            return self.lives[identifier]
+
+
+Handler = Callable[[Request, Live], Any]
+
+
+def _with_session(service: Service, handler: Handler) -> Callable[[Request], Any]:
+    """Find the session; turn what went wrong into one sentence."""
+
+    async def answer(request: Request) -> Response:
+        try:
+            live = await run_in_threadpool(service.live, request.path_params["sid"])
+            result: Response = await handler(request, live)
+            return result
+        except KeyError:
+            return PlainTextResponse("no such session; start a new one", 404)
+        except TooLargeError as error:
+            return PlainTextResponse(str(error), 413, headers={"connection": "close"})
+        except BusyError as error:
+            return PlainTextResponse(str(error), 409)
+        except InputError as error:
+            return PlainTextResponse(str(error), 422)
+        except ClientDisconnect:
+            return PlainTextResponse("closed", 499)
+
+    return answer
+
+
+async def _body(request: Request) -> dict[str, Any]:
+    raw = b""
+    async for chunk in request.stream():
+        raw += chunk
+        if len(raw) > MAX_BODY:
+            raise TooLargeError("the request is too long")
+    try:
+        data = json.loads(raw or b"{}")
+    except ValueError:
+        raise InputError("the request is not JSON") from None
+    if not isinstance(data, dict):
+        raise InputError("the request is not a JSON object")
+    return data
+
+
+def _json(data: Any) -> Response:
+    return JSONResponse(data, headers={"cache-control": "no-store"})
+
+
+def _public(live: Live) -> dict[str, Any]:
+    """The state as the page gets it: without values of parameters and names on the disk."""
+    state = live.whole()
+    for step in state["steps"] + state["undone"]:
+        step.pop("values")
+    for entry in state["files"]:
+        entry.pop("stored")
+    return state
+
+
+async def _state(request: Request, live: Live) -> Response:
+    return _json(await run_in_threadpool(_public, live))
+
+
+async def _events(request: Request, live: Live) -> Response:
+    loop = asyncio.get_running_loop()
+    queue: asyncio.Queue[dict[str, Any]] = asyncio.Queue()
+
+    def listener(snapshot: dict[str, Any]) -> None:
+        if not loop.is_closed():
+            loop.call_soon_threadsafe(queue.put_nowait, snapshot)
+
+    async def stream() -> AsyncIterator[str]:
+        live.listeners.add(listener)
+        try:
+            yield f"data: {json.dumps(live.snapshot())}\n\n"
+            while True:
+                try:
+                    snapshot = await asyncio.wait_for(queue.get(), HEARTBEAT)
+                except TimeoutError:
+                    yield ": still here\n\n"
+                    continue
+                while not queue.empty():
+                    snapshot = queue.get_nowait()
+                yield f"data: {json.dumps(snapshot)}\n\n"
+        finally:
+            live.listeners.discard(listener)
+
+    return StreamingResponse(
+        stream(), media_type="text/event-stream", headers={"cache-control": "no-store"}
+    )
+
+
+async def _upload(request: Request, live: Live, limit: int) -> Response:
+    name = safe_name(request.path_params["name"])
+    announced = int(request.headers.get("content-length", "0") or 0)
+    refuse_size(name, announced, limit, live.session.files)
+    stored = f"{secrets.token_hex(4)}-{name}"
+    path = live.session.files / stored
+    size = await stream_to(path, request.stream(), limit)
+
+    def taken() -> Response:
+        """The record is in the session; with the state and, where the page names its width, the
+        first plot: that saves it two questions.
+        """
+        made = add_upload(live, name, stored, size)
+        plot = (
+            first_plot(live, str(made.get("id", "")), request.query_params)
+            if "points" in request.query_params
+            else None
+        )
+        return _json({**made, "plot": plot, "state": _public(live)})
+
+    try:
+        return await run_in_threadpool(taken)
+    except InputError:
+        path.unlink(missing_ok=True)
+        raise
+
+
+async def _change_file(request: Request, live: Live) -> Response:
+    body = await _body(request)
+    return _json(await run_in_threadpool(put_upload, live, request.path_params["fid"], body))
+
+
+async def _delete_file(request: Request, live: Live) -> Response:
+    await run_in_threadpool(drop_upload, live, request.path_params["fid"])
+    return _json({})
+
+
+async def _joint(request: Request, live: Live) -> Response:
+    body = await _body(request)
+    return _json(await run_in_threadpool(set_joint, live, body))
+
+
+async def _demo(request: Request, live: Live) -> Response:
+    return _json(await run_in_threadpool(start_demo, live))
+
+
+async def _run(request: Request, live: Live) -> Response:
+    body = await _body(request)
+    app_verbs.run(live, str(body.get("action", "")), body)
+    return JSONResponse(live.snapshot(), 202)
+
+
+async def _cancel(request: Request, live: Live) -> Response:
+    return _json({"cancelled": live.cancel()})
+
+
+async def _view(request: Request, live: Live) -> Response:
+    view = VIEWS.get(request.path_params["view"])
+    if view is None:
+        return PlainTextResponse("no such view", 404)
+    made = await run_in_threadpool(view, live, dict(request.query_params))
+    return made if isinstance(made, Response) else _json(made)
+
+
+def create_app(
+    root: Path,
+    *,
+    port: int = 8765,
+    max_upload: int = MAX_UPLOAD,
+    hosts: frozenset[str] | None = None,
+) -> Guard:
+    """The application.
+
+    Parameters
+    ----------
+    root : Path
+        Folder of the sessions.
+    port : int
+        Port it is served on: part of the Host header that is accepted.
+    max_upload : int
+        Largest upload in bytes.
+    hosts : set of str, optional
+        Host headers in place of the loopback names.
+    """
+    service = Service(Store(root), max_upload, OrderedDict(), threading.Lock())
+
+    async def page(request: Request) -> Response:
+        path, kind = PAGE[request.url.path]
+        return FileResponse(path, media_type=kind, headers={"cache-control": "no-cache"})
+
+    async def new(request: Request) -> Response:
+        made = await run_in_threadpool(service.store.create)
+        return _json({"id": made.id})
+
+    async def config(request: Request) -> Response:
+        return _json(
+            await run_in_threadpool(VIEWS["config"], None, {"max_upload": service.max_upload})
+        )
+
+    def at(path: str, handler: Handler, *methods: str) -> Route:
+        return Route(
+            "/api/session/{sid}" + path,
+            _with_session(service, handler),
+            methods=list(methods) or ["GET"],
+        )
+
+    async def upload(request: Request, live: Live) -> Response:
+        return await _upload(request, live, service.max_upload)
+
+    routes = [
+        *(Route(path, page) for path in PAGE),
+        Route("/api/config", config),
+        Route("/api/session", new, methods=["POST"]),
+        at("", _state),
+        at("/events", _events),
+        at("/files/{name}", upload, "PUT"),
+        at("/file/{fid}", _change_file, "POST"),
+        at("/file/{fid}", _delete_file, "DELETE"),
+        at("/joint", _joint, "POST"),
+        at("/demo", _demo, "POST"),
+        at("/run", _run, "POST"),
+        at("/cancel", _cancel, "POST"),
+        at("/view/{view}", _view),
+    ]
+    return Guard(Starlette(routes=routes), hosts or loopback_hosts(port))
+
+
+def default_root() -> Path:
+    """Where sessions are kept: ``$IRJ_SESSIONS``, else the user's data folder."""
+    given = os.environ.get("IRJ_SESSIONS")
+    if given:
+        return Path(given)
+    base = (
+        os.environ.get("XDG_DATA_HOME")
+        or os.environ.get("LOCALAPPDATA")
+        or str(Path.home() / ".local" / "share")
+    )
+    return Path(base) / "irj" / "sessions"
+
+
+def with_files(root: Path, files: Sequence[str | Path]) -> str:
+    """A new session with files from the command line (copied); its identifier.
+
+    Raises
+    ------
+    InputError
+        A file that does not exist.
+    """
+    import shutil
+
+    store = Store(root)
+    for file in files:
+        if not Path(file).is_file():
+            raise InputError(f"{file}: there is no such file; check the path")
+    session = store.create()
+    live = Live(session)
+    for file in sorted(map(Path, files), key=lambda f: f.suffix != ".toml"):
+        name = safe_name(file.name)
+        stored = f"{secrets.token_hex(4)}-{name}"
+        shutil.copyfile(file, session.files / stored)
+        add_upload(live, name, stored, file.stat().st_size)
+    return session.id
+
+
+def serve(
+    files: Sequence[str | Path] = (),
+    port: int = 0,
+    open_browser: bool = True,
+    *,
+    root: Path | None = None,
+    say: Callable[[str], None] | None = None,
+) -> None:
+    """Serve the app on 127.0.0.1 until it is interrupted; prints its address on one line.
+
+    Parameters
+    ----------
+    files : sequence of path
+        Records and a joint file to start with.
+    port : int
+        0: the first free one from 8765.
+    open_browser : bool
+    root : Path, optional
+        Folder of the sessions (`default_root`).
+    say : callable, optional
+        Gets the line with the address in place of standard output.
+
+    Raises
+    ------
+    InputError
+        The port is taken; a file cannot be used.
+    """
+    import sys
+    import webbrowser
+
+    import uvicorn
+
+    folder = root or default_root()
+    listening = _listen(port)
+    port = int(listening.getsockname()[1])
+    tail = f"#session={with_files(folder, files)}" if files else ""
+    address = f"http://127.0.0.1:{port}/{tail}"
+    if say is not None:
+        say(address)
+    else:
+        sys.stdout.write(address + "\n")
+        sys.stdout.flush()
+    config = uvicorn.Config(
+        create_app(folder, port=port),
+        log_level="warning",
+        access_log=False,
+        server_header=False,
+        timeout_graceful_shutdown=1,
+        ws="none",
+    )
+    threading.Thread(target=_warm_up, daemon=True, name="warm up").start()
+    if open_browser:
+        threading.Timer(0.5, webbrowser.open, (address,)).start()
+    uvicorn.Server(config).run(sockets=[listening])
+
+
+def _warm_up() -> None:
+    """Import what the first upload would wait for."""
+    for name in ("numpy.ma", "numpy.fft", "identification.data.guess", "scipy.sparse"):
+        importlib.import_module(name)
+
+
+def _listen(port: int) -> socket.socket:
+    """A listening socket on the loopback interface, and on no other."""
+    for candidate in [port] if port else [*range(8765, 8775), 0]:
+        listening = socket.socket(
+            socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP
+        )  # with the protocol: else asyncio leaves Nagle's delay on
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            listening.bind(("127.0.0.1", candidate))
+            listening.listen(64)
+        except OSError:
+            listening.close()
+            continue
+        return listening
+    raise InputError(f"port {port} of 127.0.0.1 is taken; give another with --port")
+
+
+__all__ = ["create_app", "default_root", "serve"]

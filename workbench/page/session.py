@@ -1,0 +1,266 @@
+"""The state of the app: one folder per session, written so that a killed server loses nothing.
+
+A session folder holds ``state.json`` (written to a new file that then replaces the old one),
+``files/`` with the uploads as they came, and nothing else that is needed: everything in memory is
+made from these again.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import secrets
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final, final
+
+from identification.errors import InputError
+
+VERSION: Final = 1
+_ID: Final = re.compile(r"^[0-9a-f]{32}$")
+_UNSAFE: Final = re.compile(r"[^A-Za-z0-9._ -]+")
+
+
+def write_atomic(path: Path, content: bytes) -> None:
+    """Write a file so that a reader, or a crash, sees the old content or the new one, never a
+    part.
+    """
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+    try:
+        with temporary.open("wb") as stream:
+            stream.write(content)
+            stream.flush()
+            os.fsync(stream.fileno())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def safe_name(name: str) -> str:
+    """The name of an upload as a file name: no folder, no leading dot, at most 100 characters."""
+    last = name.replace("\\", "/").rsplit("/", 1)[-1]
+    kept = _UNSAFE.sub("_", last).strip(" .")
+    stem, dot, tail = kept.rpartition(".")
+    if len(kept) > 100:
+        kept = f"{stem[: 99 - len(tail)]}{dot}{tail}" if len(tail) < 20 else kept[:100]
+    return kept or "record"
+
+
+@final
+@dataclass(frozen=True)
+class FileEntry:
+    """One uploaded record.
+
+    Attributes
+    ----------
+    id, name, stored : str
+        Identifier, name as uploaded, name in the session folder.
+    role : {"train", "held_out"}
+    role_reason : str
+        Why it has this role, as the page says it.
+    status : {"ready", "checking", "columns", "refused"}
+        ``checking``: can be looked at, the check gate runs; ``columns``: the column map must be
+        confirmed first.
+    message : str
+    columns : mapping or None
+        Column map that the user confirmed.
+    names, guess : what the file holds and which map is proposed.
+    findings, summary : result of the check gate; size, channels and where they come from.
+    """
+
+    id: str
+    name: str
+    stored: str
+    role: str = "train"
+    role_reason: str = ""
+    size: int = 0
+    status: str = "ready"
+    message: str = ""
+    columns: Mapping[str, Any] | None = None
+    names: tuple[str, ...] = ()
+    guess: tuple[Mapping[str, Any], ...] = ()
+    findings: tuple[Mapping[str, Any], ...] = ()
+    summary: Mapping[str, Any] = field(default_factory=dict)
+
+
+@final
+@dataclass(frozen=True)
+class StepEntry:
+    """One step of the ledger: the model after it, with its values and errors.
+
+    Attributes
+    ----------
+    action : {"start", "add", "remove"}
+    key, label, title : str or None
+        The effect that was added or removed.
+    effects : tuple of str
+        Labels in the model.
+    names, separate_by
+        What the diagnosis could not tell apart when it was added, and the run that would.
+    exact : bool
+        False while the values come from a part of the samples.
+    settled : bool
+        False while the values are those of the first look, before the whole fit.
+    """
+
+    action: str
+    effects: tuple[str, ...]
+    values: Mapping[str, float]
+    train: Mapping[str, Any]
+    held_out: Mapping[str, Any]
+    key: str | None = None
+    label: str | None = None
+    title: str | None = None
+    virtual_work: bool = True
+    exact: bool = True
+    seconds: float = 0.0
+    names: tuple[str, ...] = ()
+    separate_by: str | None = None
+    settled: bool = True
+
+
+@final
+@dataclass(frozen=True)
+class State:
+    """Everything a session knows.
+
+    Attributes
+    ----------
+    revision : int
+        Counts up with every change; a page with an older one asks again.
+    joint_text : str
+        The joint file, empty until there is one.
+    steps, undone : tuple of StepEntry
+        The ledger, and what undo took off it.
+    diagnosis, improvement : mapping or None
+        The ranking that belongs to the last step; the result of the whole loop.
+    left_open : mapping
+        What the last diagnosis, whatever was added since, could not test, and its warnings about
+        the records.
+    """
+
+    revision: int = 0
+    created: float = 0.0
+    files: tuple[FileEntry, ...] = ()
+    joint_text: str = ""
+    joint_source: str = ""
+    steps: tuple[StepEntry, ...] = ()
+    undone: tuple[StepEntry, ...] = ()
+    diagnosis: Mapping[str, Any] | None = None
+    improvement: Mapping[str, Any] | None = None
+    note: str = ""
+    left_open: Mapping[str, Any] = field(default_factory=dict)
+
+    def without_fit(self) -> State:
+        """The state before any fit: after a change of records or of the joint."""
+        return replace(
+            self, steps=(), undone=(), diagnosis=None, improvement=None, note="", left_open={}
+        )
+
+    def as_json(self) -> dict[str, Any]:
+        """As written to ``state.json`` and sent to the page."""
+        return {"version": VERSION, **asdict(self)}
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> State:
+        """Read `as_json` back; keys of a newer version are left out."""
+        known = set(cls.__dataclass_fields__)
+        kept = {k: v for k, v in data.items() if k in known}
+        kept["files"] = tuple(_made(FileEntry, f) for f in kept.get("files", ()))
+        kept["steps"] = tuple(_made(StepEntry, s) for s in kept.get("steps", ()))
+        kept["undone"] = tuple(_made(StepEntry, s) for s in kept.get("undone", ()))
+        return cls(**kept)
+
+
+def _made(kind: type[Any], data: Mapping[str, Any]) -> Any:
+    known = set(kind.__dataclass_fields__)
+    return kind(
+        **{k: tuple(v) if isinstance(v, list) else v for k, v in data.items() if k in known}
+    )
+
+
+@final
+class Session:
+    """A session folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.id = folder.name
+
+    @property
+    def files(self) -> Path:
+        """Folder of the uploads."""
+        return self.folder / "files"
+
+    def path_of(self, entry: FileEntry) -> Path:
+        """Path of an upload.
+
+        Raises
+        ------
+        InputError
+            A state file that names a path outside the session folder.
+        """
+        path = (self.files / entry.stored).resolve()
+        if path.parent != self.files.resolve():
+            raise InputError(
+                f"{entry.name}: its path leaves the session folder; upload the file again"
+            )
+        return path
+
+    def load(self) -> State:
+        """The state on disk.
+
+        Raises
+        ------
+        InputError
+            A state file that cannot be read.
+        """
+        path = self.folder / "state.json"
+        try:
+            data = json.loads(path.read_text(encoding="utf-8"))
+            return State.from_json(data)
+        except (OSError, ValueError, TypeError) as error:
+            raise InputError(
+                f"{path}: the session cannot be read ({error}); start a new one"
+            ) from None
+
+    def save(self, state: State) -> State:
+        """Write the state with its revision counted up; returns what was written."""
+        newer = replace(state, revision=state.revision + 1)
+        write_atomic(
+            self.folder / "state.json", json.dumps(newer.as_json(), allow_nan=False).encode()
+        )
+        return newer
+
+
+@final
+class Store:
+    """All session folders under one root, which only its owner may read."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        root.mkdir(parents=True, exist_ok=True, mode=0o700)
+
+    def create(self) -> Session:
+        """A new, empty session with an identifier that cannot be guessed."""
+        folder = self.root / secrets.token_hex(16)
+        (folder / "files").mkdir(parents=True, mode=0o700)
+        session = Session(folder)
+        session.save(State(created=time.time()))
+        return session
+
+    def open(self, identifier: str) -> Session:
+        """An existing session.
+
+        Raises
+        ------
+        KeyError
+            No session of that name.
+        """
+        folder = self.root / identifier
+        if not _ID.match(identifier) or not (folder / "state.json").is_file():
+            raise KeyError(identifier)
+        return Session(folder)

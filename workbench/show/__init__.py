@@ -1,0 +1,1 @@
+"""Results as people see them: charts, pictures, tables, the report."""

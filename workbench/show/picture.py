@@ -1,0 +1,60 @@
+"""An improvement in one picture: the falling error beside the residual in its most telling
+place.
+"""
+
+from __future__ import annotations
+
+from identification.diagnosis.improve import Improvement
+from identification.errors import InputError
+from workbench.show.pictures import (
+    AFTER,
+    BEFORE,
+    HEIGHT,
+    INK,
+    WIDTH,
+    place_picture,
+    staircase_picture,
+)
+from workbench.show.plots import report_plots
+from workbench.show.results import floor_percent
+
+_HEAD = 26
+
+
+def improvement_picture(improvement: Improvement) -> str:
+    """A self-contained SVG: held-out error after each step; mean residual before and after, with 95
+    % bands.
+
+    Raises
+    ------
+    InputError
+        Nothing was fitted, so there is nothing to draw.
+    """
+    plots = report_plots(improvement)
+    if plots is None or not plots.places:
+        raise InputError("no picture: nothing was fitted")
+    result = improvement.as_json()
+    values = [float(s["held_out"]["relative_error_percent"]) for s in result["steps"]]
+    labels = ["start", *(f"+ {key}" for key in result["added"])]
+    stairs = staircase_picture(values, floor_percent(result["steps"][-1]["held_out"]), labels)
+    before, after = plots.places[0]
+    telling = place_picture(before, after)
+    legend = _word(WIDTH + 54, BEFORE, "◆ start model") + (
+        _word(WIDTH + 154, AFTER, "■ with the additions") if after is not None else ""
+    )
+    title = _word(54, INK, "error on records the fit never saw")
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {2 * WIDTH} {HEIGHT + _HEAD}" '
+        f'width="{2 * WIDTH}" height="{HEIGHT + _HEAD}" '
+        'font-family="system-ui, sans-serif"><rect width="100%" height="100%" '
+        f'fill="#ffffff"/>{title}{legend}'
+        f'<g transform="translate(0 {_HEAD})">{stairs}</g><g transform="translate({WIDTH} '
+        f'{_HEAD})">{telling}</g></svg>\n'
+    )
+
+
+def _word(x: float, colour: str, text: str, anchor: str = "start") -> str:
+    return (
+        f'<text x="{x:g}" y="18" font-size="12" fill="{colour}" '
+        f'text-anchor="{anchor}">{text}</text>'
+    )
