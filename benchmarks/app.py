@@ -58,15 +58,15 @@ LIMITS = {
 
 def record(samples: int) -> Path:
     """A closed-loop record of a joint like the demo's, as NPZ."""
-    from casadi_models.transmission import build
+    from casadi_models import JointModel
     from identification.planning.follow import Controller, Follower
 
     path = Path(tempfile.gettempdir()) / f"irj-bench-{samples}.npz"
     if path.exists():
         return path
-    model = build("hd3", GEAR_RATIO, effects=("viscous", "coulomb", "gravity", HIDDEN)).with_values(
-        dict(VALUES)
-    )
+    model = JointModel.by_name(
+        "hd3", GEAR_RATIO, effects=("viscous", "coulomb", "gravity", HIDDEN)
+    ).with_values(dict(VALUES))
     t = np.arange(samples) * DT
     f, a, phase = (
         np.array([0.11, 0.29, 0.63]),
@@ -249,7 +249,10 @@ def clicks(page: Any) -> dict[str, Any]:
         if label:
             page.select_option("#add-label", label)
         mark = page.evaluate("() => app.state.revision")
-        shown = "() => document.querySelector('#headline').dataset.text.startsWith(digits(app.state.steps.at(-1).held_out.relative_error_percent))"
+        shown = (
+            "() => document.querySelector('#headline').dataset.text.startsWith("
+            "digits(app.state.steps.at(-1).held_out.relative_error_percent))"
+        )
 
         def seen(mark: int = mark, shown: str = shown) -> None:
             page.wait_for_function(

@@ -47,7 +47,8 @@ V = VALUES
 class PythonPlant(TableSlave):
     variables = (
         Variable("i_m", "A", 0.0, causality="input"),
-        *(Variable(n, causality="output") for n in ("motor_position", "motor_velocity", "link_position", "link_velocity", "link_torque")),
+        *(Variable(n, causality="output") for n in (
+            "motor_position", "motor_velocity", "link_position", "link_velocity", "link_torque")),
     )
 
     def __init__(self, **kwargs: Any) -> None:
@@ -59,10 +60,13 @@ class PythonPlant(TableSlave):
         d = q - link
         torque = V["stiffness"] * d + V["cubic_stiffness"] * d * d * d
         decay = math.exp(-abs(w) / V["motor_smooth_stribeck_velocity"])
-        motor = V["motor_added_spring"] * q + (V["motor_viscous"] + V["motor_smooth_stribeck"] * decay) * w
+        damping = V["motor_viscous"] + V["motor_smooth_stribeck"] * decay
+        motor = V["motor_added_spring"] * q + damping * w
         motor += V["motor_coulomb"] * math.tanh(w / V["motor_smoothing_velocity"])
-        load = V["link_viscous"] * rate + (V["link_cyclic_torque_sine"] - V["gravity_torque"]) * math.sin(link)
-        return (w, (drive - torque - motor) / V["motor_inertia"], rate, (torque - load) / V["link_inertia"])
+        sine = V["link_cyclic_torque_sine"] - V["gravity_torque"]
+        load = V["link_viscous"] * rate + sine * math.sin(link)
+        up, out = (drive - torque - motor) / V["motor_inertia"], (torque - load) / V["link_inertia"]
+        return (w, up, rate, out)
 
     def process(self, time: float, step: float, inputs: Mapping[str, Value]) -> Mapping[str, Value]:
         drive, x, h = V["torque_per_current"] * float(inputs["i_m"]), self.x, step / 2
@@ -71,9 +75,11 @@ class PythonPlant(TableSlave):
             k2 = self.slope(tuple(a + h / 2 * b for a, b in zip(x, k1)), drive)
             k3 = self.slope(tuple(a + h / 2 * b for a, b in zip(x, k2)), drive)
             k4 = self.slope(tuple(a + h * b for a, b in zip(x, k3)), drive)
-            x = tuple(a + h / 6 * (b + 2 * c + 2 * d + e) for a, b, c, d, e in zip(x, k1, k2, k3, k4))
+            x = tuple(
+                a + h / 6 * (b + 2 * c + 2 * d + e) for a, b, c, d, e in zip(x, k1, k2, k3, k4))
         self.x = x
-        return {"motor_position": x[0], "motor_velocity": x[1], "link_position": x[2], "link_velocity": x[3],
+        return {"motor_position": x[0], "motor_velocity": x[1],
+                "link_position": x[2], "link_velocity": x[3],
                 "link_torque": V["stiffness"] * (x[0] - x[2])}
 '''
 

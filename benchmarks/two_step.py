@@ -19,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import casadi as ca
 
-from casadi_models.transmission import build
+from casadi_models import JointModel
 from identification.planning.follow import Follower
 from identification.two_step.algorithm import (
     JOINT_CHANNELS,
@@ -161,7 +161,7 @@ def variant_record(
     """Motion of a simulated joint; torques of the TS model: linear +30 % from 16 s, nonlinear
     +20 % from 27 s.
     """
-    plant = build("irj2b", -160.0, effects=("structural_damping",)).with_values(
+    plant = JointModel.by_name("irj2b", -160.0, effects=("structural_damping",)).with_values(
         {
             "motor_inertia": 4.447,
             "link_inertia": 10.277,

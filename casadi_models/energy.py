@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import casadi as ca
 import numpy as np
 
-from .equations import Equations
+from .equations import Equations, Solvable
 from .signals import Expression, LocalSignals
 from .term import Term
-
-if TYPE_CHECKING:
-    from .joint import JointModel
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 _PANELS: Final = 8
 
 
-def total_energy(model: JointModel) -> Expression:
+def total_energy(model: Solvable) -> Expression:
     """Energy [J] as an expression of the signals and parameters of ``model.true_equations``.
 
     Counted: both inertias with what inertia effects without states add, springs of the transmission
@@ -36,7 +33,7 @@ def total_energy(model: JointModel) -> Expression:
     return total
 
 
-def _stored(model: JointModel, term: Term, e: Equations) -> Expression:
+def _stored(model: Solvable, term: Term, e: Equations) -> Expression:
     """Energy that one term stores."""
     effect, s = term.effect, e.signals
     if effect.states or effect.dissipative:
@@ -54,12 +51,12 @@ def _stored(model: JointModel, term: Term, e: Equations) -> Expression:
     return ca.SX(0)
 
 
-def _values(model: JointModel, term: Term) -> Any:
+def _values(model: Solvable, term: Term) -> Any:
     symbols = ca.vertsplit(model.true_equations.parameters)
     return term.bound(dict(zip(model.parameter_names, symbols, strict=True)))
 
 
-def _slope(model: JointModel, term: Term, signal: str) -> Expression:
+def _slope(model: Solvable, term: Term, signal: str) -> Expression:
     """Slope of a law against one signal: the inertia or the compliance that it adds."""
     symbol = ca.SX.sym(signal)
     changed: dict[str, Expression] = {signal: symbol}
@@ -67,7 +64,7 @@ def _slope(model: JointModel, term: Term, signal: str) -> Expression:
     return ca.jacobian(term.effect.law(still, _values(model, term)), symbol)
 
 
-def _potential(model: JointModel, term: Term, upto: Expression) -> Expression:
+def _potential(model: Solvable, term: Term, upto: Expression) -> Expression:
     """Integral of the law of a term along its own coordinate from 0 to `upto`."""
     values = _values(model, term)
     if term.effect.potential is not None:
@@ -82,7 +79,7 @@ def _potential(model: JointModel, term: Term, upto: Expression) -> Expression:
     return total * upto
 
 
-def _still(model: JointModel, at: Expression) -> LocalSignals:
+def _still(model: Solvable, at: Expression) -> LocalSignals:
     """A joint at rest in one position (or torsion)."""
     nothing = ca.SX(0)
     return LocalSignals(

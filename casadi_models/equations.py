@@ -10,15 +10,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Final, final
+from typing import Any, Final, Protocol, final
 
 import casadi as ca
 
+from .parameter import Parameter
 from .signals import Expression, LocalSignals, Signals
 from .term import Term
-
-if TYPE_CHECKING:
-    from .joint import JointModel
 
 MemoryTerm = tuple[Term, Expression, tuple[Expression, ...], LocalSignals, SimpleNamespace]
 """Term with states: (term, driving coordinate, states, what the law sees, its parameters)."""
@@ -35,6 +33,32 @@ _RATES: Final = {
 }
 _MOTOR_CHAIN: Final = ("motor_position", "motor_velocity", "motor_acceleration", "motor_jerk")
 _LINK_CHAIN: Final = ("link_position", "link_velocity", "link_acceleration", "link_jerk")
+
+
+class Structure(Protocol):
+    """What the equations need to know of a joint model (see `casadi_models.joint.JointModel`)."""
+
+    @property
+    def gear_ratio(self) -> float: ...
+    @property
+    def terms(self) -> tuple[Term, ...]: ...
+    @property
+    def inertias(self) -> tuple[str, ...]: ...
+    @property
+    def virtual_work(self) -> bool: ...
+    @property
+    def load_from(self) -> str: ...
+    @property
+    def clamped_link(self) -> bool: ...
+    @property
+    def lagging_load(self) -> bool: ...
+    @property
+    def is_elastic(self) -> bool: ...
+    @property
+    def parameters(self) -> tuple[Parameter, ...]: ...
+    @property
+    def parameter_names(self) -> tuple[str, ...]: ...
+    def swinging_inertia(self, values: Mapping[str, Any]) -> Any: ...
 
 
 @final
@@ -92,6 +116,20 @@ class Equations:
     memory_terms: tuple[MemoryTerm, ...]
 
 
+class Solvable(Structure, Protocol):
+    """A joint model with its equations: what energy and CasADi functions are made from."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def equations(self) -> Equations: ...
+    @property
+    def true_equations(self) -> Equations: ...
+    @property
+    def linear_parameters(self) -> tuple[str, ...]: ...
+    def value_vector(self) -> list[float]: ...
+
+
 @final
 @dataclass(frozen=True)
 class Symbols:
@@ -103,7 +141,7 @@ class Symbols:
     clock: Expression
 
     @staticmethod
-    def of(model: JointModel) -> Symbols:
+    def of(model: Structure) -> Symbols:
         """Fresh symbols for a model."""
         return Symbols(
             Signals.symbols(),
@@ -138,7 +176,7 @@ class _View:
 class _Builder:
     """Laws of one model on its symbols."""
 
-    model: JointModel
+    model: Structure
     symbols: Symbols
 
     def torsion_rate(self, view: _View) -> Expression:
@@ -225,7 +263,7 @@ class _Builder:
         return 1 - ca.jacobian(error, raw.motor_position), 1 + ca.jacobian(error, raw.link_position)
 
 
-def bare_twist(model: JointModel, s: Signals) -> Expression:
+def bare_twist(model: Structure, s: Signals) -> Expression:
     """Motor side minus link side; the position itself where the link is clamped."""
     return s.motor_position if model.clamped_link else s.motor_position - s.link_position
 
@@ -241,12 +279,12 @@ def time_derivative(expression: Expression, signals: Signals) -> Expression:
     return total
 
 
-def build_equations(model: JointModel, symbols: Symbols, *, sensors: bool) -> Equations:
+def build_equations(model: Structure, symbols: Symbols, *, sensors: bool) -> Equations:
     """Equations of a joint on given symbols.
 
     Parameters
     ----------
-    model : JointModel
+    model : Structure
     symbols : Symbols
     sensors : bool
         True: the signals are readings, corrected by the sensor effects of the model. False: the
@@ -304,7 +342,7 @@ def build_equations(model: JointModel, symbols: Symbols, *, sensors: bool) -> Eq
     )
 
 
-def inverse_dynamics(model: JointModel) -> Expression:
+def inverse_dynamics(model: Solvable) -> Expression:
     """Right-hand sides of the equations of motion, (drive, 0): what a regressor reproduces."""
     e = model.equations
     if model.is_elastic:
@@ -324,7 +362,7 @@ def inverse_dynamics(model: JointModel) -> Expression:
     return inertia * e.motor_acceleration + resistance - (e.drive - e.signals.drive)
 
 
-def linear_set(model: JointModel) -> tuple[str, ...]:
+def linear_set(model: Solvable) -> tuple[str, ...]:
     """Greedy largest independent set of the graph whose edges are non-zero mutual Hessian
     entries.
     """

@@ -12,10 +12,14 @@ import numpy as np
 import numpy.typing as npt
 
 from .energy import total_energy
-from .equations import Equations
-from .joint import MEMORY_STEP, JointModel, inverse_dynamics
+from .equations import Equations, Solvable, inverse_dynamics
 from .signals import Expression
 from .solve import affine_solution, carried_torque, rigid_solution
+
+MEMORY_STEP: Final = 1e-6
+"""Time over which a memory without a rate of its own is differentiated to its continuous form
+[s].
+"""
 
 INPUTS: Final = ("drive", "temperature", "time")
 """Inputs of the dynamics: n Km I [N.m], temperature [K], time [s]."""
@@ -34,7 +38,7 @@ class JointFunctions:
     :attr:`outputs` only.
     """
 
-    def __init__(self, model: JointModel) -> None:
+    def __init__(self, model: Solvable) -> None:
         self._model = model
         self._equations: Equations = model.true_equations
         mechanical = ("motor_position", "motor_velocity", "link_position", "link_velocity")

@@ -27,6 +27,7 @@ from .equations import (
     linear_set,
     time_derivative,
 )
+from .functions import MEMORY_STEP, JointFunctions
 from .parameter import Parameter, Role
 from .sides import side_factor
 from .term import (
@@ -39,13 +40,9 @@ from .term import (
     Term,
     smoothing,
 )
+from .transmission import MODELS, STARTS, signed_ratio
 
 __all__ = ["MEMORY_STEP", "Equations", "JointModel", "Term", "inverse_dynamics", "time_derivative"]
-
-MEMORY_STEP: Final = 1e-6
-"""Time over which a memory without a rate of its own is differentiated to its continuous form
-[s].
-"""
 
 _FRICTION_SIDES: Final = ("motor", "link")
 SHOWN: Final = 22
@@ -118,15 +115,63 @@ class JointModel:
         return "\n".join(lines)
 
     @staticmethod
-    def harmonic_drive(
-        number: int, *, gear_ratio: float = -160.0, configuration: str | int = "IRJ"
+    def by_name(
+        name: str, gear_ratio: float, *, kind: str = "rotary", effects: tuple[str, ...] = ()
     ) -> JointModel:
-        """Harmonic-drive model 1 to 4 of the thesis (see
-        :func:`casadi_models.transmission.harmonic_drive`).
-        """
-        from .transmission import harmonic_drive
+        """A model by name (:data:`casadi_models.transmission.MODELS`), with further effects.
 
-        return harmonic_drive(number, gear_ratio=gear_ratio, configuration=configuration)
+        Parameters
+        ----------
+        name : str
+            ``hd1`` to ``hd4``, ``irj1a``, ``irj1b``, ``irj2a``, ``irj2b``, ``irj_ts``.
+        gear_ratio : float
+            theta_motor / theta_link, signed.
+        kind : {"rotary", "linear"}
+        effects : tuple of str
+            Labels as in :meth:`add`; one that the model has already is passed over.
+
+        Raises
+        ------
+        KeyError
+            Unknown model.
+        """
+        model = JointModel(gear_ratio=gear_ratio, kind=kind)
+        if name not in MODELS:
+            raise KeyError(f"unknown model {name!r}; known: {', '.join(MODELS)}")
+        for label in (*MODELS[name], *effects):
+            key = label.partition("#")[0]
+            there = model.has(key) or model.has_form_of(key)
+            if label in model.effects or ("@" not in label and "#" not in label and there):
+                continue
+            model = model.add(label)
+        known = set(model.parameter_names)
+        return model.with_values({n: v for n, v in STARTS.get(name, {}).items() if n in known})
+
+    @staticmethod
+    def harmonic_drive(
+        number: int | str, *, gear_ratio: float = -160.0, configuration: str | int = "IRJ"
+    ) -> JointModel:
+        """Harmonic-drive model 1 to 4 of the thesis (section 2.4 to 2.6).
+
+        Model 1 is ideal; 2 adds losses; 3 adds stiffness and structural damping; 4 adds the
+        kinematic error at 1, 2 and 4 per turn of the wave generator. Friction beyond model 2 is
+        added by name.
+
+        Parameters
+        ----------
+        number : int or str
+            1 to 4, or ``"hd1"`` to ``"hd4"`` as the joint files call them.
+        gear_ratio : float
+            The reduction; with configuration IRJ its sign is kept.
+        configuration : {"1", "2", "IRJ"}
+            Gives the sense of rotation.
+        """
+        name = number if isinstance(number, str) else f"hd{number}"
+        if name not in ("hd1", "hd2", "hd3", "hd4"):
+            raise ValueError(f"harmonic-drive model {number}: use 1, 2, 3 or 4")
+        if str(configuration) != "IRJ":
+            gear_ratio = signed_ratio(configuration, abs(gear_ratio))
+        return JointModel.by_name(name, gear_ratio)
 
     # --- composition ------------------------------------------------------------------------------
 
@@ -354,8 +399,6 @@ class JointModel:
     @cached_property
     def functions(self) -> Any:
         """CasADi functions of the joint (see :mod:`casadi_models.functions`)."""
-        from .functions import JointFunctions
-
         return JointFunctions(self)
 
     @property

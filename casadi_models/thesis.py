@@ -21,7 +21,6 @@ from typing import Final, Literal, final
 from .joint import JointModel
 from .parameter import Side
 from .quantities import UnitError, side_power
-from .transmission import build
 
 Variant = Literal["coupled", "y1", "y2"]
 
@@ -233,7 +232,7 @@ def numbers(*tables: Mapping[str, Value]) -> dict[str, float]:
 
 
 def _model(name: str, *tables: Mapping[str, Value]) -> JointModel:
-    model = build(name, GEAR_RATIO)
+    model = JointModel.by_name(name, GEAR_RATIO)
     known = set(model.parameter_names)
     return model.with_values({n: v for n, v in numbers(TABLE_4_1, *tables).items() if n in known})
 

@@ -14,8 +14,6 @@ from __future__ import annotations
 
 from typing import Final
 
-from .joint import JointModel
-
 CONFIGURATIONS: Final = ("1", "2", "IRJ")
 
 MODELS: Final[dict[str, tuple[str, ...]]] = {
@@ -58,11 +56,14 @@ MODELS: Final[dict[str, tuple[str, ...]]] = {
 ladder of 4.3.2.
 """
 
-ORDERS: Final = {
-    "kinematic_error_order": 1.0,
-    "kinematic_error_order_2": 2.0,
-    "kinematic_error_order_3": 4.0,
+STARTS: Final[dict[str, dict[str, float]]] = {
+    "hd4": {
+        "kinematic_error_order": 1.0,
+        "kinematic_error_order_2": 2.0,
+        "kinematic_error_order_3": 4.0,
+    }
 }
+"""Values that a model has by its name: the orders of (2.48)."""
 
 
 def signed_ratio(configuration: str | int, reduction: float) -> float:
@@ -89,44 +90,3 @@ def port_torques(torque_wg: float, reduction: float) -> tuple[float, float]:
     losses.
     """
     return (reduction + 1) * torque_wg, reduction * torque_wg
-
-
-def build(
-    name: str, gear_ratio: float, *, kind: str = "rotary", effects: tuple[str, ...] = ()
-) -> JointModel:
-    """A joint model by name, with further effects.
-
-    Raises
-    ------
-    KeyError
-        Unknown model.
-    """
-    model = JointModel(gear_ratio=gear_ratio, kind=kind)
-    if name not in MODELS:
-        raise KeyError(f"unknown model {name!r}; known: {', '.join(MODELS)}")
-    for label in (*MODELS[name], *effects):
-        key = label.partition("#")[0]
-        if label in model.effects or (
-            "@" not in label and "#" not in label and (model.has(key) or model.has_form_of(key))
-        ):
-            continue
-        model = model.add(label)
-    known = set(model.parameter_names)
-    return model.with_values({n: v for n, v in ORDERS.items() if n in known and name == "hd4"})
-
-
-def harmonic_drive(
-    number: int, *, gear_ratio: float = -160.0, configuration: str | int = "IRJ"
-) -> JointModel:
-    """Model 1 to 4; `gear_ratio` gives the reduction, `configuration` the sense (IRJ keeps the sign
-    given).
-
-    Model 1 is ideal; 2 adds losses; 3 adds stiffness and structural damping; 4 adds the kinematic
-    error at 1, 2 and 4 per turn of the wave generator. Friction beyond model 2 is added by name.
-    """
-    if number not in (1, 2, 3, 4):
-        raise ValueError(f"harmonic-drive model {number}: use 1, 2, 3 or 4")
-    ratio = (
-        gear_ratio if str(configuration) == "IRJ" else signed_ratio(configuration, abs(gear_ratio))
-    )
-    return build(f"hd{number}", ratio)

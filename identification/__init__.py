@@ -20,6 +20,7 @@ from identification.errors import InputError
 from identification.fitting.fit import Fit
 from identification.fitting.fit import fit as fit
 from identification.search.mcs import mcs as mcs
+from identification.version import VERSION
 
 if TYPE_CHECKING:
     from identification.faults.detector import FaultDetector
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from identification.recursive.estimator import RecursiveLeastSquares
     from identification.two_step.algorithm import TwoStep
 
-__version__ = "0.1.0"
+__version__ = VERSION
 
 _LATE = {
     "moesp": "linear.subspace",

@@ -42,7 +42,8 @@ from fmpy import read_model_description, simulate_fmu
 import numpy as np
 path, step, count = sys.argv[1], float(sys.argv[2]), int(sys.argv[3])
 names = [v.name for v in read_model_description(path).modelVariables if v.causality == "output"]
-found = simulate_fmu(path, stop_time=step * count, output_interval=step, step_size=step, output=names,
+found = simulate_fmu(path, stop_time=step * count, output_interval=step, step_size=step,
+                     output=names,
                      fmi_type="CoSimulation")
 if len(found) != count + 1:
     sys.exit(f"{len(found)} of {count + 1} steps")

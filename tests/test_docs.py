@@ -80,7 +80,8 @@ def test_figures_of_the_guide_are_what_fit_compare_and_diagnose_print() -> None:
     assert values["motor_viscous"] == pytest.approx(float(viscous), rel=0.03)
     compared = run("compare", held_out, "--fit", train, "--joint", joint)
     times, share = re.findall(
-        r"fails: (\S+) times the noise floor .* and (\d+) % of what is left depends on the velocity",
+        r"fails: (\S+) times the noise floor .* "
+        r"and (\d+) % of what is left depends on the velocity",
         guide,
     )[0]
     assert float(re.findall(r"motor (\S+) times its floor", compared)[0]) == pytest.approx(

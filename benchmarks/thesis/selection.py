@@ -13,7 +13,6 @@ from benchmarks.thesis.draw import Curve, Map, Panel, picture
 from benchmarks.thesis.page import Figure, Row, Section, Table, shown
 from benchmarks.thesis.record import DT, FloatArray
 from casadi_models import JointModel, thesis
-from casadi_models.transmission import build
 from identification.planning.trajectories import (
     PERIODS,
     SPEEDS,
@@ -32,7 +31,7 @@ HOLD: Final = 0.5
 @cache
 def joint() -> JointModel:
     """Catalogue stiffness (table 4.1), friction of table 4.3, the columns of (3.54)."""
-    model = build(
+    model = JointModel.by_name(
         "irj2b",
         thesis.GEAR_RATIO,
         effects=(

@@ -4,140 +4,22 @@ only ever shown.
 
 from __future__ import annotations
 
-import itertools
 import math
-import re
 import tomllib
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, final
+from typing import TYPE_CHECKING, Any, Final
 
 from identification.data.channels import CHANNELS, channel_unit
-from identification.data.units import base_unit, check_unit, same_dimension
+from identification.data.column import Column, header_unit, quoted, shown, split_unit
+from identification.data.guess import fragment, guess_columns
+from identification.data.units import check_unit
 from identification.errors import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
 NAMES: Final = ("time", *CHANNELS)
 _KEYS: Final = frozenset({"column", "unit", "scale", "sign", "counts_per_turn", "step"})
-_BRACKET: Final = re.compile(r"^(.*?)\s*[\[(]([^\])]*)[\])]\s*$")
-
-
-@final
-@dataclass(frozen=True)
-class Column:
-    """How one channel is made from a column: ``SI = to_si(sign * scale * raw, unit)``.
-
-    Attributes
-    ----------
-    channel : str
-        Channel name, or ``"time"``.
-    column : str
-        Name of the column in the file; empty for a time made from `step`.
-    unit : str
-        Unit of ``raw * scale``.
-    scale, sign : float
-        Factors; the sign is +1 or -1.
-    counts_per_turn : float, optional
-        Encoder counts of one turn, where the unit is ``counts``.
-    step : float, optional
-        For time only: the files has no time column, the samples are `step` apart.
-    """
-
-    channel: str
-    column: str
-    unit: str
-    scale: float = 1.0
-    sign: int = 1
-    counts_per_turn: float | None = None
-    step: float | None = None
-
-    def describe(self) -> str:
-        """Return one line for the provenance: where the channel comes from."""
-        if self.step is not None:
-            return f"{self.channel} = row number x {self.step:g} {self.unit}"
-        text = f"{self.channel} = {self.column!r}"
-        if self.channel == "run":
-            return text
-        text += f" [{self.unit}]"
-        if self.scale != 1.0:
-            text += f" x {self.scale:.10g}"
-        if self.sign == -1:
-            text += ", sign reversed"
-        if self.counts_per_turn is not None:
-            text += f", {self.counts_per_turn:g} counts per turn"
-        return text
-
-    def toml(self) -> str:
-        """Return ``channel = { column = ..., unit = ... }``."""
-        items = [f"column = {_quoted(self.column)}"]
-        if self.channel != "run":
-            items.append(f"unit = {_quoted(self.unit)}")
-        if self.scale != 1.0:
-            items.append(f"scale = {self.scale!r}")
-        if self.sign != 1:
-            items.append(f"sign = {self.sign}")
-        if self.counts_per_turn is not None:
-            items.append(f"counts_per_turn = {self.counts_per_turn!r}")
-        return f"{self.channel} = {{ {', '.join(items)} }}"
-
-
-@final
-@dataclass(frozen=True)
-class Guess:
-    """A proposed column and why."""
-
-    column: Column
-    reason: str
-
-
-def _quoted(text: str) -> str:
-    escaped = (
-        text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n").replace("\t", "\\t")
-    )
-    return f'"{escaped}"'
-
-
-def split_unit(name: str) -> tuple[str, str | None]:
-    """Split ``"speed [rpm]"`` or ``"speed (rpm)"`` into name and unit."""
-    match = _BRACKET.match(name.strip())
-    if match and match.group(1):
-        return match.group(1).strip(), match.group(2).strip() or None
-    return name.strip(), None
-
-
-def header_unit(text: str, wanted: str) -> str | None:
-    """Find the unit in the tail of a header: underscores stand for ``/`` or ``.``.
-
-    Parameters
-    ----------
-    text : str
-        For example ``"rad_s2"``.
-    wanted : str
-        The SI unit the channel has.
-
-    Returns
-    -------
-    str or None
-        The unit spelled out (``"rad/s2"``), or None where no reading has the wanted dimension.
-    """
-    parts = text.split("_")
-    if not all(parts) or len(parts) > 4:
-        return None
-    target = base_unit(wanted)
-    if wanted == "K" and parts[0] in {"C", "F"}:
-        parts[0] = f"deg{parts[0]}"
-    for marks in itertools.product("/.", repeat=len(parts) - 1):
-        unit = "".join(
-            itertools.chain.from_iterable(itertools.zip_longest(parts, marks, fillvalue=""))
-        )
-        try:
-            if same_dimension(base_unit(unit, 1.0), target):
-                return unit
-        except InputError:
-            continue
-    return None
 
 
 def channel_of(name: str) -> str | None:
@@ -194,8 +76,8 @@ def recognise(name: str, kind: str = "rotary", unit: str | None = None) -> Colum
         raise InputError(
             f"column {name!r} does not say its unit: name it "
             f"{channel}_{wanted.replace('/', '_').replace('.', '')} "
-            f"or give [columns] {channel} = {{ column = {_quoted(name)}, unit = "
-            f"{_quoted(wanted)} }}"
+            f"or give [columns] {channel} = {{ column = {quoted(name)}, unit = "
+            f"{quoted(wanted)} }}"
         )
     try:
         check_unit(given, wanted, 1.0, channel)
@@ -215,7 +97,7 @@ def _unfit(name: str, channel: str, unit: str, kind: str) -> str:
     return (
         f"column {name!r}: {unit!r} is not a unit of {channel} "
         f"({channel_unit(channel, kind)}){hint}: "
-        f"correct the header or give [columns] {channel} = {{ column = {_quoted(name)}, unit = "
+        f"correct the header or give [columns] {channel} = {{ column = {quoted(name)}, unit = "
         f"... }}"
     )
 
@@ -331,8 +213,7 @@ def _entry(
         return Column("run", column, "1")
     if not isinstance(unit, str):
         raise InputError(
-            f"{where}: column {column!r} has no unit: add unit = {_quoted(wanted)}, or what it "
-            "is in"
+            f"{where}: column {column!r} has no unit: add unit = {quoted(wanted)}, or what it is in"
         )
     fitting = _fitting(unit, wanted, counts, channel)
     return Column(
@@ -343,7 +224,7 @@ def _entry(
 def _fitting(unit: Any, wanted: str, counts: float | None, channel: str) -> str:
     if not isinstance(unit, str):
         raise InputError(
-            f"[columns] {channel}: unit {unit!r} must be text, for example {_quoted(wanted)}"
+            f"[columns] {channel}: unit {unit!r} must be text, for example {quoted(wanted)}"
         )
     try:
         check_unit(unit, wanted, counts, channel)
@@ -379,13 +260,6 @@ def recognise_quietly(name: str, kind: str, unit: str | None = None) -> Column |
         return None
 
 
-def shown(names: Iterable[str], limit: int = 20) -> str:
-    """Return names for a message, the first `limit` of them."""
-    every = list(names)
-    more = f", ... ({len(every)} in all)" if len(every) > limit else ""
-    return ", ".join(every[:limit]) + more if every else "none"
-
-
 def choose(
     raw: Mapping[str, Any], names: Sequence[str], units: Mapping[str, str], kind: str, where: str
 ) -> tuple[tuple[Column, ...], tuple[str, ...]]:
@@ -409,8 +283,6 @@ def choose(
         If time or every channel is missing; the message shows the guess as a TOML fragment in one
         line.
     """
-    from identification.data.guess import fragment
-
     try:
         chosen = {entry.channel: entry for entry in parse_map(raw, names, units, kind)}
     except InputError as error:
@@ -444,14 +316,3 @@ def choose(
     notes = (f"columns not used: {shown(unused)}",) if unused else ()
     order = {name: place for place, name in enumerate(NAMES)}
     return tuple(sorted(chosen.values(), key=lambda entry: order[entry.channel])), notes
-
-
-def guess_columns(
-    names: Sequence[str], units: Mapping[str, str] | None = None, kind: str = "rotary"
-) -> tuple[Guess, ...]:
-    """Propose a column map by name and unit; never applied by itself (see
-    `identification.data.guess`).
-    """
-    from identification.data.guess import guess_columns as propose
-
-    return propose(names, units or {}, kind)

@@ -8,7 +8,7 @@ import re
 from typing import TYPE_CHECKING, Final
 
 from identification.data.channels import CHANNELS, channel_unit
-from identification.data.columns import Column, Guess, header_unit, shown, split_unit
+from identification.data.column import Column, Guess, header_unit, shown, split_unit
 from identification.data.units import base_unit, same_dimension
 from identification.errors import InputError
 

@@ -11,7 +11,7 @@ from typing import Any, Final, final
 
 from casadi_models import JointModel
 from casadi_models.term import INERTIAS
-from casadi_models.transmission import MODELS, build
+from casadi_models.transmission import MODELS
 from identification.data.own_effects import TABLE, load_remembered, remembered
 from identification.data.units import base_unit, same_dimension
 from identification.errors import InputError
@@ -94,7 +94,9 @@ class Joint:
         """
         try:
             model = replace(
-                build(self.model_name, self.gear_ratio, kind=self.kind, effects=self.effects),
+                JointModel.by_name(
+                    self.model_name, self.gear_ratio, kind=self.kind, effects=self.effects
+                ),
                 name=self.name,
                 virtual_work=self.virtual_work,
             )

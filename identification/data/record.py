@@ -4,7 +4,6 @@ from.
 
 from __future__ import annotations
 
-import html
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, final
@@ -14,6 +13,7 @@ import numpy.typing as npt
 
 from identification.data.channels import CHANNELS, KINDS, channel_unit
 from identification.errors import InputError
+from identification.representation import html_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -469,21 +469,8 @@ class Record:
             > 0.5
         )
 
-    def _repr_html_(self) -> str:
-        from identification.data.formats import pretty_unit, value_range
-        from workbench.show.results import spaced
-
-        rows = "".join(
-            f"<tr><td>{key}</td><td>{pretty_unit(self.unit(key))}</td><td>{value_range(values)}"
-            "</td></tr>"
-            for key, values in self.channels.items()
-        )
-        size = f"{len(self)} samples, {self.duration:.6g} s, {len(self.segments())} segment(s)"
-        return spaced(
-            f"<table><caption>{html.escape(self.name)}: "
-            f"{size}</caption><tr><th>channel</th><th>unit</th><th>range</th></tr>{rows}"
-            "</table>"
-        )
+    def _repr_html_(self) -> str | None:
+        return html_of(self)
 
     def __repr__(self) -> str:
         return (

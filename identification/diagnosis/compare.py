@@ -21,6 +21,7 @@ from identification.fitting.assess import Error, assess
 from identification.fitting.engine import load_dataset, stack
 from identification.fitting.fit import Fit
 from identification.linear.ceiling import Ceiling, ceiling
+from identification.representation import html_of
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -100,13 +101,8 @@ class Comparison:
             f"error, {len(self.places)} places)"
         )
 
-    def _repr_html_(self) -> str:
-        from identification.linear.ceiling import ceiling_html
-        from workbench.show.results import comparison_html, spaced
-
-        return comparison_html(self) + (
-            spaced(f"<div>{ceiling_html(self.linear)}</div>") if self.linear else ""
-        )
+    def _repr_html_(self) -> str | None:
+        return html_of(self)
 
 
 def compare(fitted: Fit, records: Record | Sequence[Record], *, linear: bool = True) -> Comparison:

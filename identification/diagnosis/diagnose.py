@@ -16,6 +16,7 @@ from identification.diagnosis.outcome import Refusal
 from identification.diagnosis.session import Session
 from identification.fitting.assess import BalanceError
 from identification.fitting.fit import Fit
+from identification.representation import html_of
 
 SHOWN: Final = 5
 """Rows of the ranking that are printed."""
@@ -142,10 +143,8 @@ class Diagnosis:
             "candidates tried)"
         )
 
-    def _repr_html_(self) -> str:
-        from workbench.show.results import diagnosis_html
-
-        return diagnosis_html(self)
+    def _repr_html_(self) -> str | None:
+        return html_of(self)
 
 
 def diagnose(

@@ -21,7 +21,9 @@ from identification.diagnosis.outcome import Refusal, outcome_of, why_not
 from identification.diagnosis.trials import Trial
 from identification.fitting.assess import BalanceError, Error
 from identification.fitting.engine import Solution
+from identification.fitting.joint_text import joint_text
 from identification.fitting.parameters import parameter_table
+from identification.representation import html_of
 
 SPOILT_RISE: Final = 1.2
 """Rise of a balance's RMS by which an addition spoils it."""
@@ -144,8 +146,6 @@ class Improvement:
 
     def to_joint_file(self) -> str:
         """The joint with all that was added, as the text of a joint file."""
-        from identification.fitting.fit import joint_text
-
         return joint_text(self.joint, self.steps[-1].solution, self.data)
 
     def __str__(self) -> str:
@@ -173,10 +173,8 @@ class Improvement:
     def __repr__(self) -> str:
         return f"Improvement({self.verdict}, added: {list(self.added)}, {len(self.steps)} steps)"
 
-    def _repr_html_(self) -> str:
-        from workbench.show.results import improvement_html
-
-        return improvement_html(self)
+    def _repr_html_(self) -> str | None:
+        return html_of(self)
 
     def as_json(self) -> dict[str, Any]:
         """The loop as data; held to improve.schema.json by a test."""

@@ -96,7 +96,9 @@ __declspec(dllexport)
 #else
 __attribute__((visibility("default")))
 #endif
-void fault_sample(const double **arg, double **res, long long int *iw, double *w) { watched(arg, res, iw, w, 0); }
+void fault_sample(const double **arg, double **res, long long int *iw, double *w) {
+    watched(arg, res, iw, w, 0);
+}
 """
 
 
@@ -375,6 +377,7 @@ class Residuals:
 
     @limits.setter
     def limits(self, values: Sequence[float]) -> None:
+        """Limit of each residual."""
         self._weights[_LIMITS] = values
 
     @property
@@ -385,6 +388,7 @@ class Residuals:
 
     @inverse.setter
     def inverse(self, values: Sequence[float]) -> None:
+        """One over the mean square of each residual that is summed up as energy."""
         self._weights[_INVERSE] = values
 
     @property
@@ -395,6 +399,7 @@ class Residuals:
 
     @energy_limits.setter
     def energy_limits(self, values: Sequence[float]) -> None:
+        """Limit of the CUSUM of each energy."""
         self._weights[_MOST] = values
 
     def numbers(self, k: int) -> list[float]:

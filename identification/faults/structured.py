@@ -9,7 +9,15 @@ from typing import Final, final
 import numpy as np
 import numpy.typing as npt
 
-from identification.faults.calibrate import calibrate, default_limits, default_recovery
+from identification.errors import InputError
+from identification.faults.calibrate import (
+    WITHOUT_SECONDS,
+    default_limits,
+    default_recovery,
+    energy_peak,
+    floors,
+    last_rows,
+)
 from identification.faults.core import (
     ABSURD,
     LINK_POSITION,
@@ -20,10 +28,10 @@ from identification.faults.core import (
     TORQUE,
     ObserverCore,
 )
-from identification.faults.fresh_start import begin_anew, take_back
 from identification.faults.residuals import (
     BIT_NAMES,
     COUNT,
+    ENERGY_RESIDUALS,
     LINK,
     LINK_JUMP,
     LINK_PARITY,
@@ -44,6 +52,14 @@ _PLACES: Final = [
     tuple(i for i, bit in enumerate(_BITS) if bits & bit) for bits in range(1 << len(_BITS))
 ]
 """Places of the bits that are set, for each set of bits."""
+LARGEST: Final = 1e6
+"""A reading beyond this is no place to start an estimate from."""
+OTHERS: Final = (
+    (MOTOR_POSITION, LINK_POSITION),
+    (LINK_POSITION, MOTOR_POSITION),
+    (MOTOR_VELOCITY, LINK_VELOCITY),
+    (LINK_VELOCITY, MOTOR_VELOCITY),
+)
 MOVED: Final = (20.0, 2e-3, 2e-2, 2e-3, 2e-2, 10.0)
 """A sensor is taken back only after its estimate has moved by this much, so that a stuck one is
 not taken back.
@@ -115,10 +131,81 @@ class StructuredRule:
         ]
 
     def calibrate(self, pieces: Sequence[FloatArray]) -> None:
-        """Limits, noise of r1 and recovery limits from healthy readings, tables (n, 6) that
-        need not follow each other.
+        """Limits, noise of r1 and recovery limits from healthy readings, tables (n, 6) that need
+        not follow each other.
         """
-        calibrate(self, pieces)
+        core, settings, res = self.core, self.settings, self.residuals
+        if not all(np.isfinite(p).all() for p in pieces):
+            raise InputError("calibrate: the readings hold NaN or infinity; give a healthy record")
+        pieces = [p for p in pieces if len(p) >= 2 * self.arm] or list(pieces[:1])
+        count = sum(map(len, pieces))
+        if count < 4 * self.arm:
+            raise InputError(
+                f"calibrate: {count} samples; give at least {4 * self.arm} healthy ones"
+            )
+        seen = self.watch(pieces)
+        if core.has_torque:
+            core.tune(max(float(np.sqrt(np.mean(seen[:, 16] ** 2))), float(core.noise[TORQUE])))
+            seen = self.watch(pieces)
+        low = floors(core, settings)
+        top = np.max(np.abs(seen[:, :COUNT]), axis=0)
+        res.limits = [max(f, settings.margin * float(t)) for f, t in zip(low, top, strict=True)]
+        res.inverse = [
+            1.0 / max(float(np.mean(seen[:, at] ** 2)), (low[at] / 8.0) ** 2)
+            for at in ENERGY_RESIDUALS
+        ]
+        peaks = [
+            energy_peak(seen[:, at], inverse, settings.energy_drift)
+            for at, inverse in zip(ENERGY_RESIDUALS, res.inverse, strict=True)
+        ]
+        res.energy_limits = [max(60.0, settings.energy_margin * peak) for peak in peaks]
+        longest = max(round(WITHOUT_SECONDS / core.dt), 2 * self.arm)
+        for sensor in range(6):
+            if sensor != TORQUE or core.has_torque:
+                self._without(sensor, last_rows(pieces, longest))
+        self.reset()
+
+    def watch(self, pieces: Sequence[FloatArray], without: int | None = None) -> FloatArray:
+        """Values of all residuals over healthy readings after the start-up of each piece, and one
+        column more.
+
+        With a sensor left out, the last column is how far its reading lies from the estimate.
+        """
+        res = self.residuals
+        kept = (res.limits, res.inverse, res.energy_limits)
+        res.limits, res.inverse = [math.inf] * COUNT, [0.0] * len(res.inverse)
+        self.calibrating = True
+        seen = []
+        for readings in pieces:
+            self.reset()
+            if without is not None:
+                self.failed[without] = True
+                self.exchange([without])
+            out = np.zeros((len(readings), COUNT + 1))
+            for k, row in enumerate(readings):
+                used = self.update(row.tolist())
+                out[k, :COUNT] = res.values
+                if without is not None:
+                    out[k, COUNT] = used[without] - row[without]
+            seen.append(out[self.arm :])
+        self.calibrating = False
+        res.limits, res.inverse, res.energy_limits = kept
+        return np.concatenate(seen)
+
+    def _without(self, sensor: int, pieces: Sequence[FloatArray]) -> None:
+        """What healthy readings give while one of them is replaced: recovery limit, and wider
+        residual limits.
+        """
+        seen = np.max(np.abs(self.watch(pieces, sensor)), axis=0)
+        limits, margin = self.residuals.limits, self.settings.margin
+        self.recover_limits[sensor] = max(
+            margin * float(seen[COUNT]), 6.0 * float(self.core.noise[sensor])
+        )
+        for i in range(5):
+            rows = range(4 * i, 4 * i + 4) if i < 4 else range(16, COUNT)
+            self.widening[sensor][i] = max(
+                1.0, *(margin * float(seen[j]) / limits[j] for j in rows)
+            )
 
     # --- one sample -------------------------------------------------------------------------------
 
@@ -143,7 +230,7 @@ class StructuredRule:
             self.core.start(np.array(reading))
         a, b, c, d, e, f, over, locked, total = self.residuals.step(k, reading)
         if total - total != 0.0:  # NaN or infinity
-            return begin_anew(self, reading)
+            return self.begin_anew(reading)
         if k == self.gate_until:
             self.core.open_gates(False)
             self.gate_until = -1
@@ -182,6 +269,7 @@ class StructuredRule:
             self.open_gates()
 
     def open_gates(self) -> None:
+        """Let the observer take readings however far they lie."""
         self.core.open_gates(True)
         self.gate_until = self.k + self.waits["settle_seconds"]
         self.cut = 0
@@ -197,7 +285,7 @@ class StructuredRule:
         for i in gone:
             self.good[i] = 0
         if True in self.lost:
-            take_back(self, reading, gone)
+            self.take_back(reading, gone)
         return [0.0 if i in gone else v for i, v in enumerate(reading)]
 
     # --- isolation --------------------------------------------------------------------------------
@@ -336,6 +424,7 @@ class StructuredRule:
         return tuple(name for bit, name in BIT_NAMES.items() if self.latched & bit)
 
     def close(self) -> None:
+        """Forget the suspicion that was open."""
         self.latched, self.opened = 0, -1
 
     # --- replacement and recovery -----------------------------------------------------------------
@@ -470,3 +559,57 @@ class StructuredRule:
         if self.gate_until >= 0:
             self.core.open_gates(True)
         self.core.state[:] = state
+
+    # --- fresh starts -----------------------------------------------------------------------------
+
+    def begin_anew(self, reading: list[float]) -> list[float]:
+        """Absurd readings have driven the estimate out of all bounds: start it and the residuals
+        again.
+        """
+        usable = [value if -LARGEST < value < LARGEST else 0.0 for value in reading]
+        self._start(usable)
+        self.open_gates()
+        self.close()
+        return [
+            u if failed else r for u, r, failed in zip(usable, reading, self.failed, strict=True)
+        ]
+
+    def take_back(self, reading: list[float], gone: Sequence[int]) -> None:
+        """Use readings again that were missing, where no position is in use.
+
+        Without a position the estimate drifts and can judge none. A reading that was missing is as
+        good as at the first sample once it is there, so the estimate starts anew from it. Sensors
+        that failed otherwise stay out.
+        """
+        failed, lost = self.failed, self.lost
+        here = any(lost[s] and s not in gone for s in (MOTOR_POSITION, LINK_POSITION))
+        if not (here and failed[MOTOR_POSITION] and failed[LINK_POSITION]):
+            self.there = 0
+            return
+        self.there += 1
+        if self.there < self.waits["settle_seconds"]:
+            return
+        back = [s for s in range(6) if lost[s] and s not in gone]
+        for s in back:
+            failed[s] = lost[s] = False
+        start = [value if -LARGEST < value < LARGEST else 0.0 for value in reading]
+        usable = [0.0 if failed[s] else start[s] for s in range(6)]
+        for own, other in OTHERS:
+            if failed[own]:
+                start[own] = usable[other]
+        self._start(start)
+        self.events.append(
+            FaultEvent(self.k, self.k, Verdict.RECOVERED, tuple(SENSORS[s] for s in back), ())
+        )
+        self.there = 0
+        self.exchange(back)
+
+    def _start(self, reading: list[float]) -> None:
+        """Observer at the readings, residuals without a past; their scales stay."""
+        residuals = self.residuals
+        self.core.start(np.array(reading))
+        scale = residuals.scale.copy()
+        residuals.clear()
+        residuals.scale[:] = scale
+        for parity in range(len(PARITY_SENSORS)):
+            residuals.invalidate(parity, self.k + 1 + self.waits["settle_seconds"])

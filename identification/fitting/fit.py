@@ -7,15 +7,16 @@ from dataclasses import dataclass, replace
 from typing import Any, Final, final
 
 from casadi_models import JointModel
-from identification.balance.calibration import Found, calibration_found
-from identification.balance.dataset import HOLD_DELAY, visible_labels
+from identification.balance.dataset import visible_labels
 from identification.data.check.gate import gated
-from identification.data.joint_file import Joint, toml_text
+from identification.data.joint_file import Joint
 from identification.data.record import Record
 from identification.errors import InputError
 from identification.fitting.assess import Error, assess
 from identification.fitting.engine import Dataset, Solution, load_dataset, prepared_model, solve
+from identification.fitting.joint_text import calibration_of, joint_text
 from identification.fitting.parameters import parameter_table
+from identification.representation import html_of
 
 SHOWN: Final = 20
 """Parameters that `print` shows: the whole text stays under 25 lines."""
@@ -97,31 +98,8 @@ class Fit:
             f"{self.train.relative_error_percent:.3g} % relative error)"
         )
 
-    def _repr_html_(self) -> str:
-        from workbench.show.results import fit_html
-
-        return fit_html(self)
-
-
-def joint_text(joint: Joint, solution: Solution, data: Dataset) -> str:
-    """A joint file with fitted values, standard errors and provenance."""
-    labels = tuple(label for label in solution.model.effects if label != HOLD_DELAY)
-    fitted = {n: p for n, p in parameter_table(solution, data).items() if n in solution.values}
-    whole = replace(joint, effects=labels, virtual_work=solution.model.virtual_work)
-    from identification import __version__
-
-    calibration = {
-        f"{c.what} of {c.sensor} in {data.train_names[c.run]}": c.as_json()
-        for c in calibration_of(solution, data)
-    }
-    return toml_text(
-        whole, fitted, {"records": ", ".join(data.train_names), "version": __version__}, calibration
-    )
-
-
-def calibration_of(solution: Solution, data: Dataset) -> tuple[Found, ...]:
-    """What the sensors of the training records are off by, as found in a fit."""
-    return calibration_found(solution.model, data.train, solution.values, solution.stderr)
+    def _repr_html_(self) -> str | None:
+        return html_of(self)
 
 
 def as_joint(model: JointModel | Joint, joint: Joint | None = None) -> Joint:

@@ -40,6 +40,7 @@ from identification.linear.spectra import (
     measure,
     stretches,
 )
+from identification.representation import html_of
 
 if TYPE_CHECKING:
     import control
@@ -72,10 +73,8 @@ class Bode:
     responses: tuple[Response, ...]
     notes: tuple[str, ...]
 
-    def _repr_html_(self) -> str:
-        from workbench.show.bode import bode_html
-
-        return bode_html(self)
+    def _repr_html_(self) -> str | None:
+        return html_of(self)
 
 
 def bode(fitted: Fit, records: Record | Sequence[Record] | None = None) -> Bode | None:

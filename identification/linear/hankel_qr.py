@@ -191,15 +191,17 @@ class HankelQR:
 
         The other's open record counts as closed.
         """
-        if self._settings() != other._settings() or not np.array_equal(self.weights, other.weights):
+        theirs = other.state()
+        alike = np.array_equal(self.state()["settings"], theirs["settings"])
+        if not alike or not np.array_equal(self.weights, other.weights):
             raise InputError(
                 "accumulators with other channels, block rows, method or weights cannot be "
                 "merged: make them alike"
             )
-        self._triangle.add(other._triangle.factor())
+        self._triangle.add(theirs["triangle"])
         self.rows += other.rows
-        np.minimum(self._low, other._low, out=self._low)
-        np.maximum(self._high, other._high, out=self._high)
+        np.minimum(self._low, theirs["range"][0], out=self._low)
+        np.maximum(self._high, theirs["range"][1], out=self._high)
 
     def state(self) -> dict[str, FloatArray]:
         """Return everything needed to go on later, as arrays (for `numpy.savez`)."""

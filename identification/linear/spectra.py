@@ -136,15 +136,18 @@ class Stretch:
 
     @property
     def across(self) -> Pair:
+        """Motor to link position: the response of the transmission."""
         return Pair(self.motor, self.link, None, self.dt, 2)
 
     @property
     def through(self) -> Pair:
+        """Drive to motor position, with the reference as instrument in closed loop."""
         drive = np.zeros_like(self.motor) if self.drive is None else self.drive
         return Pair(drive, self.motor, self.reference, self.dt, 1)
 
 
 def stretches(records: Sequence[Record], joint: Joint, sensing: Sensing) -> list[Stretch]:
+    """Contiguous stretches of the records."""
     if sensing.clamped_link:
         return []
     out: list[Stretch] = []

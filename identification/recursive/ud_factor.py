@@ -24,10 +24,12 @@ def where(condition: SX, value: SX) -> SX:
 
 
 def select(condition: SX, yes: SX, no: SX) -> SX:
+    """One of two expressions by a condition."""
     return where(condition, yes) + where(ca.logic_not(condition), no)
 
 
 def every(conditions: list[SX]) -> SX:
+    """True where all conditions hold."""
     result = conditions[0]
     for condition in conditions[1:]:
         result = ca.logic_and(result, condition)
@@ -35,6 +37,7 @@ def every(conditions: list[SX]) -> SX:
 
 
 def total(terms: list[SX]) -> SX:
+    """Sum of the terms, 0 without any."""
     result = ca.SX(0)
     for term in terms:
         result = result + term
@@ -61,6 +64,7 @@ class Parts:
         return found
 
     def joined(self) -> SX:
+        """All parts stacked to one column."""
         return ca.vertcat(*(item for part in self.values.values() for item in part))
 
 
@@ -73,6 +77,7 @@ class Factor:
         self.u = {(i, j): u[j * (j - 1) // 2 + i] for j in range(self.n) for i in range(j)}
 
     def packed(self) -> list[SX]:
+        """Entries of U over its diagonal, column by column."""
         return [self.u[i, j] for j in range(self.n) for i in range(j)]
 
     def transposed_times(self, vector: list[SX]) -> list[SX]:

@@ -14,67 +14,24 @@ from concurrent.futures import (
     ProcessPoolExecutor,
     wait,
 )
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, final
 
 import numpy as np
 
 from identification.errors import InputError
+from irj_fmu.batch.case import Batch
 from irj_fmu.batch.store import Store
 from irj_fmu.batch.worker import FIGURES, Chunk, Done, empty, enter, run_chunk
 from irj_fmu.host.run import Fmu, FmuError, Number
-from irj_fmu.host.signals import FloatArray, Table
+from irj_fmu.host.signals import FloatArray
 
 Progress = Callable[[int, int], None]
 MOST: Final = 250_000_000
 """Samples times variables of one run."""
 _PATIENCE: Final = 5
 """Cases that may kill their process one after another before the FMU is given up."""
-
-
-@final
-@dataclass(frozen=True)
-class Batch:
-    """Many co-simulations of one FMU.
-
-    Parameters
-    ----------
-    fmu : Path
-        The FMU.
-    cases : sequence of mapping
-        Start values by variable name, one mapping per run.
-    record : sequence of str
-        Variables to record.
-    inputs : mapping
-        Input name to samples, the same for all cases.
-    step, stop : float
-        Communication step and length in s.
-    chunk : int
-        Runs that one worker takes at a time; also what is run again after an interruption.
-    every : int
-        Keep every n-th sample, beginning with the first; the figures see all.
-    measured : mapping
-        Recorded variable to the signal it is compared with.
-    """
-
-    fmu: Path
-    cases: Sequence[Mapping[str, Number | str]]
-    record: Sequence[str]
-    inputs: Mapping[str, Table] = field(default_factory=dict)
-    step: float = 1e-3
-    stop: float = 1.0
-    chunk: int = 20
-    every: int = 1
-    measured: Mapping[str, Table] = field(default_factory=dict)
-
-    @property
-    def time(self) -> FloatArray:
-        """Times of the samples that are kept."""
-        times: FloatArray = (
-            self.step * np.arange(round(self.stop / self.step) + 1, dtype=np.float64)[:: self.every]
-        )
-        return times
 
 
 @final
@@ -388,9 +345,11 @@ class _Run:
         found, errors = empty(chunk), {}
         for i, case in enumerate(chunk.cases):
             kept: list[Done] = []
-            died = self._alone(
-                replace(chunk, cases=(case,)), lambda _, done, kept=kept: kept.append(done)
-            )  # type: ignore[misc]
+
+            def keep(_: Chunk, done: Done, kept: list[Done] = kept) -> None:
+                kept.append(done)
+
+            died = self._alone(replace(chunk, cases=(case,)), keep)
             if died:
                 errors[i] = died
                 self.deaths += 1

@@ -239,8 +239,7 @@ def _main(arguments: argparse.Namespace) -> int:
         count = len(study.models) * max(1, len(study.files)) * len(study.cases)
         sys.stdout.write(
             f"study {study.name}: {' x '.join(sizes)}, "
-            f"{counted(count, 'run')}"
-            f"{' where each record is one stretch' if study.files else ''}\n"
+            f"{counted(count, 'run')}{' where each record is one stretch' if study.files else ''}\n"
         )
         return 0
     bar = _Bar()

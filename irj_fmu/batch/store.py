@@ -12,15 +12,13 @@ import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self, final
+from typing import Any, Self, final
 
 import numpy as np
 
 from identification.errors import InputError
+from irj_fmu.batch.case import Batch
 from irj_fmu.batch.worker import FIGURES, Chunk, Done
-
-if TYPE_CHECKING:
-    from irj_fmu.batch.fleet import Batch
 
 _NOTE = "batch.sha256"
 

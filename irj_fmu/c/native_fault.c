@@ -274,7 +274,7 @@ static void begin_anew(Fault *f, const double reading[SENSORS], double used[SENS
     close_suspicion(f);
 }
 
-/* Use readings again that were missing, where no position is in use; identification.faults.fresh_start. */
+/* Use readings again that were missing, where no position is in use; StructuredRule.take_back. */
 static void take_back(Fault *f, const double reading[SENSORS], int gone) {
     static const int others[4][2] = {{Q_M, Q_L}, {Q_L, Q_M}, {W_M, W_L}, {W_L, W_M}};
     const int here = (f->lost[Q_M] && !(gone & 1 << Q_M)) || (f->lost[Q_L] && !(gone & 1 << Q_L));

@@ -253,8 +253,10 @@ def _start_script(
     tail = f"""
 
 def _start() -> type:
-    add_site_packages({json.dumps(list(needed))}, {json.dumps(list(recorded))}, {json.dumps(version)})
-    return load_class({json.dumps(prefix)}, Path(__file__).resolve().parent / "bundle", {json.dumps(spec.module)},
+    add_site_packages(
+        {json.dumps(list(needed))}, {json.dumps(list(recorded))}, {json.dumps(version)})
+    folder = Path(__file__).resolve().parent / "bundle"
+    return load_class({json.dumps(prefix)}, folder, {json.dumps(spec.module)},
                       {json.dumps(spec.class_name)})
 
 
@@ -271,7 +273,8 @@ folder, out, script, name, guid, identifier = sys.argv[1:]
 sys.path.insert(0, folder)
 made = getattr(importlib.import_module(script), name)(instance_name="description", resources=folder)
 base = next(kind for kind in type(made).__mro__ if kind.__name__ == "TableSlave")
-to_bytes = importlib.import_module(base.__module__.rpartition(".")[0] + ".model_description").to_bytes
+home = base.__module__.rpartition(".")[0]
+to_bytes = importlib.import_module(home + ".model_description").to_bytes
 pathlib.Path(out).write_bytes(to_bytes(made.to_xml({"guid": guid, "identifier": identifier})))
 """
 

@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, final
+from typing import Any, final
 
 import numpy as np
 
 from identification.errors import InputError
+from irj_fmu.host.fmu import Block, Instance, Wiring
 from irj_fmu.host.signals import FloatArray, Signal, Table
-
-if TYPE_CHECKING:
-    from irj_fmu.host.run import Block, Instance, Wiring
 
 
 @final

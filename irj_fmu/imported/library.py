@@ -19,7 +19,7 @@ from typing import Any, Final, Literal, Self, final
 import numpy as np
 
 from identification.errors import InputError
-from irj_fmu.host.run import FmuError, Number, _callbacks, near_names
+from irj_fmu.host.fmu import FmuError, Number, callbacks, near_names
 from irj_fmu.host.signals import FloatArray
 
 Kind = Literal["me", "cs"]
@@ -235,7 +235,7 @@ class UserInstance:
     def _instantiate(self) -> int:
         part, fmu, text = self._part, self.fmu, ctypes.c_char_p
         if self.version == 2:
-            self._callbacks = _callbacks(self.messages)
+            self.callbacks = callbacks(self.messages)
             make = self._function("Instantiate", [text, _I, text, text, _P, _I, _I], _P)
             place = (fmu.folder / "resources").as_uri()
             found = make(
@@ -243,12 +243,12 @@ class UserInstance:
                 0 if self.kind == "me" else 1,
                 str(fmu.description.guid).encode(),
                 place.encode(),
-                ctypes.addressof(self._callbacks),
+                ctypes.addressof(self.callbacks),
                 0,
                 0,
             )
         else:
-            self._callbacks = _LOG3(_note(self.messages))
+            self.callbacks = _LOG3(_note(self.messages))
             token, place = (
                 str(fmu.description.instantiationToken).encode(),
                 f"{fmu.folder / 'resources'}/",
@@ -257,7 +257,7 @@ class UserInstance:
                 make = self._function(
                     "InstantiateModelExchange", [text, text, text, _B, _B, _P, _LOG3], _P
                 )
-                found = make(b"user", token, place.encode(), False, False, None, self._callbacks)
+                found = make(b"user", token, place.encode(), False, False, None, self.callbacks)
             else:
                 make = self._function(
                     "InstantiateCoSimulation",
@@ -275,7 +275,7 @@ class UserInstance:
                     None,
                     0,
                     None,
-                    self._callbacks,
+                    self.callbacks,
                     None,
                 )
         if not found:
@@ -382,7 +382,8 @@ class UserInstance:
                     f"{self.fmu.path.name}: variable {name!r} is a {variable.type}; only real, "
                     "integer and boolean values can be set"
                 )
-            function = f"Set{'Integer' if variable.type == 'Enumeration' and self.version == 2 else variable.type}"
+            whole = variable.type == "Enumeration" and self.version == 2
+            function = f"Set{'Integer' if whole else variable.type}"
             more: tuple[Sequence[Any], Sequence[Any]] = (
                 ((), ()) if self.version == 2 else ((_U,), (1,))
             )

@@ -34,10 +34,10 @@ def pair_variables(model: UserModel) -> tuple[Variable, ...]:
                     m.variable,
                     _unit(model, m.variable),
                     model.fmu.start(m.variable),
-                    causality=causality,
+                    causality=causality,  # type: ignore[arg-type]
                     description=text,
                 )
-            )  # type: ignore[arg-type]
+            )
     for name, value in [(p.name, p.value) for p in model.parameters] + [
         (m.variable, model.fmu.start(m.variable)) for m in model.starts
     ]:

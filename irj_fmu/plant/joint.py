@@ -368,7 +368,7 @@ class _Builder:
         x, u, every, z = arguments
         before = ca.SX.sym("x_prev", x.shape[0])
         duration = x[-1] - before[-1]
-        moved = _memory_step(f)(x[:size], before[:size], z, model_input, p, duration)
+        moved = f.memory_step(x[:size], before[:size], z, model_input, p, duration)
         kept = ca.if_else(duration > 0, moved, z)
         return ca.Function("z", [x, z, u, every, before], [ca.densify(kept)])
 
@@ -411,16 +411,3 @@ def _used_inputs(functions: JointFunctions) -> tuple[bool, bool, bool]:
     both = ca.vertcat(functions.dynamics(x, u, p), functions.outputs(x, u, p))
     used = set(ca.jacobian_sparsity(both, u).get_triplet()[1])
     return 0 in used, 1 in used, 2 in used
-
-
-def _memory_step(functions: JointFunctions) -> Any:
-    """(x, x before, z, u, p, duration) -> z after the step, from the step form of the declared
-    memory.
-    """
-    x, z, u, p = functions._symbols
-    where = ca.Function("where", [x, z, u, p], [ca.vertcat(*functions._memory_coordinates)])
-    before, duration = ca.SX.sym("before", x.shape[0]), ca.SX.sym("duration")
-    steps = ca.vertsplit(where(x, z, u, p) - where(before, z, u, p))
-    return ca.Function(
-        "moved", [x, before, z, u, p, duration], [functions._moved_memory(steps, duration)]
-    )

@@ -11,8 +11,6 @@ import pytest
 from casadi_models import JointModel, Signals
 from casadi_models.transmission import (
     MODELS,
-    build,
-    harmonic_drive,
     port_angles,
     port_torques,
     signed_ratio,
@@ -58,7 +56,7 @@ def test_ports_keep_power_and_torque() -> None:
 @pytest.mark.parametrize("configuration", ["1", "2", "IRJ"])
 @pytest.mark.parametrize("number", [1, 2, 3, 4])
 def test_every_model_in_every_configuration(number: int, configuration: str) -> None:
-    model = harmonic_drive(number, configuration=configuration)
+    model = JointModel.harmonic_drive(number, configuration=configuration)
     assert model.gear_ratio == (N + 1 if configuration == "1" else -N)
     assert model.is_elastic == (number >= 3)
     values = {"motor_inertia": 4.447, "link_inertia": 10.277} | (
@@ -83,7 +81,7 @@ def test_each_model_contains_what_the_step_adds() -> None:
     ]
     assert orders == [1.0, 2.0, 4.0]
     with pytest.raises(ValueError, match="1, 2, 3 or 4"):
-        harmonic_drive(5)
+        JointModel.harmonic_drive(5)
 
 
 def test_model_2_loses_power_as_equation_2_36_says() -> None:
@@ -106,7 +104,7 @@ def test_model_2_loses_power_as_equation_2_36_says() -> None:
 
 @pytest.mark.parametrize("name", sorted(MODELS))
 def test_ladder_by_name(name: str) -> None:
-    model = build(name, -N)
+    model = JointModel.by_name(name, -N)
     keys = {label.partition("#")[0].partition("@")[0] for label in MODELS[name]}
     assert keys == {t.effect.key for t in model.terms}
     assert np.isfinite(model.value_vector()).all()
@@ -115,20 +113,20 @@ def test_ladder_by_name(name: str) -> None:
 
 
 def test_ladder_grows() -> None:
-    sets = {n: set(build(n, -N).effects) for n in MODELS}
+    sets = {n: set(JointModel.by_name(n, -N).effects) for n in MODELS}
     assert sets["irj1a"] < sets["irj1b"] < sets["irj2b"]
     assert sets["irj2a"] < sets["irj2b"]
     assert sets["hd3"] < sets["hd4"]
-    assert not build("irj1b", -N).is_elastic
-    assert build("irj2a", -N).is_elastic
+    assert not JointModel.by_name("irj1b", -N).is_elastic
+    assert JointModel.by_name("irj2a", -N).is_elastic
 
 
 def test_build_adds_further_effects_once() -> None:
-    model = build("hd3", -N, effects=("viscous", "stribeck", "transmission_compliance"))
+    model = JointModel.by_name("hd3", -N, effects=("viscous", "stribeck", "transmission_compliance"))
     assert model.effects.count("transmission_compliance") == 1
     assert {"viscous@motor", "viscous@link", "stribeck@motor"} <= set(model.effects)
     with pytest.raises(KeyError, match="unknown model"):
-        build("hd9", -N)
+        JointModel.by_name("hd9", -N)
 
 
 def test_model_4_exact_and_approximate() -> None:

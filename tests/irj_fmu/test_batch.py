@@ -457,10 +457,12 @@ BAD = {
     HEAD + MODEL + "[random]\ncount = 5\n": "[random.parameters]",
     HEAD
     + MODEL
-    + "[random]\ncount = -5\n[random.parameters]\nstiffness = { low = 1, high = 2 }\n": "not a whole number",
+    + "[random]\ncount = -5\n"
+    + "[random.parameters]\nstiffness = { low = 1, high = 2 }\n": "not a whole number",
     HEAD
     + MODEL
-    + "[random]\ncount = 5\n[random.parameters]\nstiffness = { low = 1, mean = 2 }\n": "give one of",
+    + "[random]\ncount = 5\n"
+    + "[random.parameters]\nstiffness = { low = 1, mean = 2 }\n": "give one of",
     HEAD + MODEL + '[inputs]\ni_m = "motor_current"\n': "no [records]",
     HEAD + MODEL + "[inputs]\nnothing = 1.0\n": "no model has such an input",
     HEAD + MODEL + "[inputs]\ni_m = { time = [1, 0], value = [1, 2] }\n": "must increase",

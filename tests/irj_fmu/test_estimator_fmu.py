@@ -337,7 +337,8 @@ for k in range(8500):
         one.call("setReal", [one.variable(n).valueReference for n in names], table[k].tolist())
         one.call("doStep", k * 1e-3, 1e-3)
 for one in opened:
-    print(*(repr(one.call("getReal", [v.valueReference])[0]) for n, v in one.fmu.variables.items() if n.startswith("theta[")))
+    theta = [v for n, v in one.fmu.variables.items() if n.startswith("theta[")]
+    print(*(repr(one.call("getReal", [v.valueReference])[0]) for v in theta))
 """
 
 

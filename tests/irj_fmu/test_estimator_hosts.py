@@ -300,7 +300,8 @@ execution.add_observer(observer)
 execution.add_manipulator(manipulator)
 rows = []
 for row in np.load(table):
-    manipulator.slave_real_values(slave_index=index, variable_references=inputs, values=row.tolist())
+    manipulator.slave_real_values(
+        slave_index=index, variable_references=inputs, values=row.tolist())
     assert execution.step()
     rows.append(observer.last_real_values(index, outputs))
 np.save(out, np.array(rows))

@@ -379,7 +379,9 @@ opened = [Instance(Fmu(path), name="x") for path in sys.argv[3:]]
 for one in opened:
     one.begin(0.0); one.ready()
 inputs = ("i_m", "q_m", "w_m", "q_l", "w_l", "tau_l")
-blocks = [(one.blocks(inputs)[0], one.blocks([n for n in one.fmu.variables if n.startswith("theta[")])[0]) for one in opened]
+def theta(one):
+    return [n for n in one.fmu.variables if n.startswith("theta[")]
+blocks = [(one.blocks(inputs)[0], one.blocks(theta(one))[0]) for one in opened]
 for k, row in enumerate(table.tolist()):
     for one, (write, _) in zip(opened, blocks):
         write.values[:] = row

@@ -371,6 +371,26 @@ def test_the_keyboard_alone_reaches_the_falling_error(served: Served, browser: B
     assert browser.error() < 0.5 * start
 
 
+def test_a_key_pressed_while_work_runs_or_a_view_is_drawn_anew_is_not_lost(
+    served: Served, browser: Browser
+) -> None:
+    page = browser.page
+    page.goto(served.address)
+    page.wait_for_selector("#demo")
+    page.click("#demo")
+    page.wait_for_selector("#fit", timeout=60_000)
+    browser.idle("load")
+    page.focus("#fit")
+    page.evaluate("app.sent = true; surround(); render(false)")  # as while an answer is awaited
+    page.wait_for_timeout(200)
+    assert page.evaluate("document.activeElement.id") == "fit"
+    page.keyboard.press("Enter")
+    assert page.evaluate("Boolean(app.waiting)")
+    page.evaluate("app.sent = false; adopt(app.state)")
+    browser.idle("compare")
+    assert browser.error() > 0
+
+
 # --- the views beside the loop --------------------------------------------------------------------
 
 

@@ -308,7 +308,8 @@ from casadi_models import effect, signed
 
 @effect("test_seal", title="drag of the seal", family="friction", acts_on=("motor",),
         parameters=(signed("seal_drag", "N.m", "torque of the seal"),),
-        absence="a step at zero velocity", excitation="reversals", source="this test", candidate=False)
+        absence="a step at zero velocity", excitation="reversals", source="this test",
+        candidate=False)
 def seal(s, p):
     return p.seal_drag * s.direction
 """

@@ -309,7 +309,8 @@ def test_export_with_records_that_cannot_serve(
         (("app", "--port", "70000", "--no-browser"), "takes a port from 0 to 65535"),
         (
             ("fit", "train.npz", "thin.npz", "--joint", "joint.toml"),
-            "thin.npz: has no link_torque, which train.npz has; give records with the same channels",
+            "thin.npz: has no link_torque, which train.npz has; "
+            "give records with the same channels",
         ),
         (
             ("compare", "train.npz", "--fit", "thin.npz", "--joint", "joint.toml"),

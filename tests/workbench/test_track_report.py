@@ -37,7 +37,8 @@ kind = "rotary"
 gear_ratio = -160.0
 torque_per_current = -8.848
 model = "hd3"
-effects = ["transmission_compliance", "structural_damping", "viscous@motor", "viscous@link", "coulomb@motor", "coulomb@link", "gravity", "stribeck@motor"]
+effects = ["transmission_compliance", "structural_damping", "viscous@motor", "viscous@link",
+  "coulomb@motor", "coulomb@link", "gravity", "stribeck@motor"]
 [fitted]
 motor_inertia = { value = 4.4488, unit = "kg.m2", side = "link" }
 link_inertia = { value = 10.2715, unit = "kg.m2", side = "link" }

@@ -110,22 +110,21 @@ def export_code(kind: str, joint_path: str, folder: Path) -> list[Path]:
 
 def run_cosim(arguments: Namespace) -> int:
     """`irj cosim`."""
-    return _passed("cosim", arguments)
+    return _passed("irj_fmu.cosim", arguments)
 
 
 def run_batch(arguments: Namespace) -> int:
     """`irj batch`."""
-    return _passed("batch", arguments)
+    return _passed("irj_fmu.batch.run", arguments)
 
 
-def _passed(verb: str, arguments: Namespace) -> int:
-    name = f"irj_fmu.{verb}"
+def _passed(name: str, arguments: Namespace) -> int:
     try:
         module = importlib.import_module(name)
     except ModuleNotFoundError as error:
         missing = error.name or name
         raise InputError(
-            f"{verb} needs the module {missing}, which is not in this installation; from Python, "
+            f"{arguments.verb} needs the module {missing}, which is not in this installation; from Python, "
             "irj_fmu.batch.fleet.run_fleet does the work"
         ) from None
     return int(module.main(arguments.rest))

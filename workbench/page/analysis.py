@@ -37,7 +37,7 @@ from identification.fitting.engine import (
     solve,
     stack,
 )
-from identification.fitting.fit import joint_text
+from identification.fitting.joint_text import joint_text
 from identification.fitting.parameters import parameter_table
 from workbench.page.first import first_look
 from workbench.page.records import thinned

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from identification.data.check.gate import inspected, stamped
-from identification.data.columns import guess_columns
+from identification.data.guess import guess_columns
 from identification.data.joint_file import Joint
 from identification.data.read import open_table, read
 from identification.data.record import Record

@@ -16,8 +16,8 @@ from identification.diagnosis.lines import Line
 from identification.diagnosis.locate import AXIS_R2, Unexplained
 from identification.diagnosis.places import AXIS_TITLES, Place
 from identification.fitting.assess import VERDICT_KERNELS
-from identification.linear.ceiling import ceiling_html
 from workbench.show.bode import bode_html
+from workbench.show.ceiling import ceiling_html
 from workbench.show.pictures import place_picture
 from workbench.show.plots import Overlay, ReportPlots, StepPlace
 from workbench.show.results import BALANCES, table, text, title_of

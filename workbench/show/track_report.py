@@ -85,8 +85,8 @@ def _verdict(replays: Sequence[Replay], notes: Sequence[str]) -> str:
     listed = f"<ul>{''.join(f'<li>{i}</li>' for i in items)}</ul>" if items else ""
     return (
         f'<section class="verdict {kind}" '
-        f'aria-label="Verdict"><h2>{sentence}</h2>{listed}'
-        f"{''.join(f'<p>{h}</p>' for h in hints)}</section>"
+        f'aria-label="Verdict"><h2>{sentence}</h2>{listed}{"".join(f"<p>{h}</p>" for h in hints)}'
+        "</section>"
     )
 
 

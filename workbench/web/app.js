@@ -52,7 +52,7 @@ function clearError() { $("error").hidden = true; }
 async function act(work) {
   if (app.sent) return;
   app.sent = true; clearError(); surround();
-  try { await work(); } catch (error) { fail(error); } finally { app.sent = false; surround(); }
+  try { await work(); } catch (error) { fail(error); } finally { app.sent = false; surround(); goOn(); }
 }
 
 /* Start long work; `then` is the view to open when it came to its end. */
@@ -61,6 +61,23 @@ function run(action, body, then) {
     app.then = then ? { view: then, steps: app.state.steps.length, revision: app.state.revision } : null;
     try { await post("/run", { action, ...body }); } catch (error) { app.then = null; throw error; }
   });
+}
+
+/* A control works from the moment it is shown: what is asked for while other work runs is done when that has ended. A second click on the control whose work runs is no second request. */
+function whenIdle(key, work) {
+  return (event) => {
+    if (!busy()) { app.acting = key; return work(event); }
+    if (app.acting !== key) app.waiting = { key, work };
+    surround();
+  };
+}
+function goOn() {
+  if (busy()) return;
+  app.acting = null;
+  const next = app.waiting;
+  if (!next) return;
+  app.waiting = null; app.acting = next.key;
+  next.work();
 }
 
 function busy() { return Boolean(app.sent || app.upload || (app.state && app.state.job)); }
@@ -79,6 +96,7 @@ function adopt(state) {
   if (state.error) fail(new Error(state.error));
   surround();
   if (changed) render(false);
+  goOn();
 }
 
 function listen() {
@@ -118,10 +136,10 @@ function surround() {
   const job = app.upload || state.job;
   $("job").hidden = !job;
   if (job) {
-    $("job-text").textContent = job.text + " …"; $("cancel").disabled = Boolean(job.cancelled);
+    $("job-text").textContent = job.text + (app.waiting ? " …, then what you asked for" : " …"); $("cancel").disabled = Boolean(job.cancelled);
     if (job.share > 0) $("job-bar").value = job.share; else $("job-bar").removeAttribute("value");
   }
-  document.querySelectorAll("[data-work]").forEach((b) => { b.disabled = busy() || b.dataset.off === "1"; });
+  document.querySelectorAll("[data-work]").forEach((b) => { if (busy()) b.setAttribute("aria-disabled", "true"); else b.removeAttribute("aria-disabled"); }); /* not "disabled", which would take the focus and the key with it */
 }
 
 function open(view) {
@@ -133,15 +151,19 @@ function open(view) {
   render(true);
 }
 
-/* Draw the view again; the focus stays on the control with the same id. */
+/* Where the focus is: by id, else by its place among the elements of its kind. */
+function placeOf(node, main) { return { id: node.id, tag: node.tagName, place: [...main.querySelectorAll(node.tagName)].indexOf(node) }; }
+
+/* Draw the view again; the focus stays on the same control. */
 function render(moved) {
-  const focused = document.activeElement && document.activeElement.id, where = moved ? 0 : scrollY;
+  const where = moved ? 0 : scrollY;
   app.plots.forEach((p) => p.destroy());
   app.plots = [];
   const main = $("main");
   const token = (app.token = (app.token || 0) + 1);
   Promise.resolve(views[app.view](app.state)).then((nodes) => {
     if (token !== app.token) return;
+    const focused = main.contains(document.activeElement) ? placeOf(document.activeElement, main) : null; /* now, not when the drawing began */
     main.replaceChildren(...[nodes].flat(3).filter(Boolean));
     main.dataset.view = app.view; main.dataset.revision = app.state.revision;
     document.title = `${VIEWS.find((v) => v[0] === app.view)[1]} – Joint workbench`;
@@ -149,7 +171,7 @@ function render(moved) {
     (app.after || []).forEach((f) => f());
     app.after = [];
     if (moved) main.focus({ preventScroll: true });
-    else if (focused && $(focused)) $(focused).focus({ preventScroll: true });
+    else if (focused) { const same = focused.id ? $(focused.id) : main.querySelectorAll(focused.tag)[focused.place]; if (same) same.focus({ preventScroll: true }); }
     scrollTo(0, where);
   }).catch(fail);
 }
@@ -216,7 +238,7 @@ async function boot() {
   $("theme").addEventListener("click", () => { const next = document.documentElement.dataset.theme === "dark" ? "light" : "dark"; remembered("irj-theme", next); theme(next); render(false); });
   $("undo").addEventListener("click", () => run("undo"));
   $("redo").addEventListener("click", () => run("redo"));
-  $("cancel").addEventListener("click", () => (app.sending ? app.sending.abort() : post("/cancel").catch(fail)));
+  $("cancel").addEventListener("click", () => { app.waiting = null; if (app.sending) app.sending.abort(); else post("/cancel").catch(fail); });
   $("fresh").addEventListener("click", () => act(fresh));
   $("error-close").addEventListener("click", clearError);
   addEventListener("dragover", (e) => { e.preventDefault(); document.querySelectorAll(".drop").forEach((d) => d.classList.add("over")); });

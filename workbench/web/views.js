@@ -1,7 +1,7 @@
 "use strict";
 /* One function per view: from the state to the nodes of the main region. */
 const later = (f) => { (app.after = app.after || []).push(f); };
-const button = (text, onclick, { kind = "", id, off, work = true, label } = {}) => h("button", { type: "button", class: kind, id, onclick, "aria-label": label, "data-work": work ? "1" : null, "data-off": off ? "1" : null, disabled: Boolean(off) }, text);
+const button = (text, onclick, { kind = "", id, off, work = true, label } = {}) => h("button", { type: "button", class: kind, id, onclick: work ? whenIdle(id || label || text, onclick) : onclick, "aria-label": label, "data-work": work ? "1" : null, "data-off": off ? "1" : null, disabled: Boolean(off) }, text);
 const sentence = (text, end = ".") => text.charAt(0).toUpperCase() + text.slice(1) + (text.endsWith(end) ? "" : end);
 const plural = (n, one, many) => `${n.toLocaleString("en")} ${n === 1 ? one : many || one + "s"}`;
 const effectTitle = (label) => { const e = app.config.effects.find((x) => x.key === label.split(/[@#]/)[0]); const p = label.includes("@") ? ` (${label.split("@")[1].replace(/_/g, " ")})` : ""; return (e ? e.title : label) + p; };

@@ -11,7 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from identification.data.check.gate import passed
-from identification.data.columns import Column, choose, load_map
+from identification.data.column import Column
+from identification.data.columns import choose, load_map
 from identification.data.read._formats import open_table
 from identification.data.record import Provenance, Record, channel_unit
 from identification.data.units import to_si

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from identification.data.columns import guess_columns, recognise
+from identification.data.columns import recognise
+from identification.data.guess import guess_columns
 from identification.data.read import read
 from identification.data.record import Record
 from identification.errors import InputError

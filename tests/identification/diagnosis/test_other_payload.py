@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from casadi_models.transmission import build
+from casadi_models import JointModel
 from identification import Joint, Record, improve, read
 from identification.data.joint_file import Known, load_joint
 from identification.errors import InputError
@@ -52,7 +52,9 @@ def follower(loaded: bool) -> Follower:
     the inertia.
     """
     values = TRUE if loaded else {**TRUE, "gravity_torque": 0.0, "link_inertia": 3.0}
-    model = build("hd3", RATIO, effects=("viscous", "coulomb", "gravity")).with_values(values)
+    model = JointModel.by_name("hd3", RATIO, effects=("viscous", "coulomb", "gravity")).with_values(
+        values
+    )
     return Follower(model, DT, controller=Controller(25.0, 0.9), substeps=8)
 
 

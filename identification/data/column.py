@@ -1,0 +1,138 @@
+"""One column of a file as one channel: unit, scale, sign; and a guess of it with its reason."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Final, final
+
+from identification.data.units import base_unit, same_dimension
+from identification.errors import InputError
+
+_BRACKET: Final = re.compile(r"^(.*?)\s*[\[(]([^\])]*)[\])]\s*$")
+
+
+@final
+@dataclass(frozen=True)
+class Column:
+    """How one channel is made from a column: ``SI = to_si(sign * scale * raw, unit)``.
+
+    Attributes
+    ----------
+    channel : str
+        Channel name, or ``"time"``.
+    column : str
+        Name of the column in the file; empty for a time made from `step`.
+    unit : str
+        Unit of ``raw * scale``.
+    scale, sign : float
+        Factors; the sign is +1 or -1.
+    counts_per_turn : float, optional
+        Encoder counts of one turn, where the unit is ``counts``.
+    step : float, optional
+        For time only: the files has no time column, the samples are `step` apart.
+    """
+
+    channel: str
+    column: str
+    unit: str
+    scale: float = 1.0
+    sign: int = 1
+    counts_per_turn: float | None = None
+    step: float | None = None
+
+    def describe(self) -> str:
+        """Return one line for the provenance: where the channel comes from."""
+        if self.step is not None:
+            return f"{self.channel} = row number x {self.step:g} {self.unit}"
+        text = f"{self.channel} = {self.column!r}"
+        if self.channel == "run":
+            return text
+        text += f" [{self.unit}]"
+        if self.scale != 1.0:
+            text += f" x {self.scale:.10g}"
+        if self.sign == -1:
+            text += ", sign reversed"
+        if self.counts_per_turn is not None:
+            text += f", {self.counts_per_turn:g} counts per turn"
+        return text
+
+    def toml(self) -> str:
+        """Return ``channel = { column = ..., unit = ... }``."""
+        items = [f"column = {quoted(self.column)}"]
+        if self.channel != "run":
+            items.append(f"unit = {quoted(self.unit)}")
+        if self.scale != 1.0:
+            items.append(f"scale = {self.scale!r}")
+        if self.sign != 1:
+            items.append(f"sign = {self.sign}")
+        if self.counts_per_turn is not None:
+            items.append(f"counts_per_turn = {self.counts_per_turn!r}")
+        return f"{self.channel} = {{ {', '.join(items)} }}"
+
+
+@final
+@dataclass(frozen=True)
+class Guess:
+    """A proposed column and why."""
+
+    column: Column
+    reason: str
+
+
+def quoted(text: str) -> str:
+    """Text as a TOML string."""
+    escaped = (
+        text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n").replace("\t", "\\t")
+    )
+    return f'"{escaped}"'
+
+
+def split_unit(name: str) -> tuple[str, str | None]:
+    """Split ``"speed [rpm]"`` or ``"speed (rpm)"`` into name and unit."""
+    match = _BRACKET.match(name.strip())
+    if match and match.group(1):
+        return match.group(1).strip(), match.group(2).strip() or None
+    return name.strip(), None
+
+
+def header_unit(text: str, wanted: str) -> str | None:
+    """Find the unit in the tail of a header: underscores stand for ``/`` or ``.``.
+
+    Parameters
+    ----------
+    text : str
+        For example ``"rad_s2"``.
+    wanted : str
+        The SI unit the channel has.
+
+    Returns
+    -------
+    str or None
+        The unit spelled out (``"rad/s2"``), or None where no reading has the wanted dimension.
+    """
+    parts = text.split("_")
+    if not all(parts) or len(parts) > 4:
+        return None
+    target = base_unit(wanted)
+    if wanted == "K" and parts[0] in {"C", "F"}:
+        parts[0] = f"deg{parts[0]}"
+    for marks in itertools.product("/.", repeat=len(parts) - 1):
+        unit = "".join(
+            itertools.chain.from_iterable(itertools.zip_longest(parts, marks, fillvalue=""))
+        )
+        try:
+            if same_dimension(base_unit(unit, 1.0), target):
+                return unit
+        except InputError:
+            continue
+    return None
+
+
+def shown(names: Iterable[str], limit: int = 20) -> str:
+    """Return names for a message, the first `limit` of them."""
+    every = list(names)
+    more = f", ... ({len(every)} in all)" if len(every) > limit else ""
+    return ", ".join(every[:limit]) + more if every else "none"

@@ -1,0 +1,31 @@
+"""A fitted joint as the text of a joint file, with standard errors and provenance."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from identification.balance.calibration import Found, calibration_found
+from identification.balance.dataset import HOLD_DELAY, Dataset
+from identification.data.joint_file import Joint, toml_text
+from identification.fitting.engine import Solution
+from identification.fitting.parameters import parameter_table
+from identification.version import VERSION
+
+
+def calibration_of(solution: Solution, data: Dataset) -> tuple[Found, ...]:
+    """What the sensors of the training records are off by, as found in a fit."""
+    return calibration_found(solution.model, data.train, solution.values, solution.stderr)
+
+
+def joint_text(joint: Joint, solution: Solution, data: Dataset) -> str:
+    """A joint file with fitted values, standard errors and provenance."""
+    labels = tuple(label for label in solution.model.effects if label != HOLD_DELAY)
+    fitted = {n: p for n, p in parameter_table(solution, data).items() if n in solution.values}
+    whole = replace(joint, effects=labels, virtual_work=solution.model.virtual_work)
+    calibration = {
+        f"{c.what} of {c.sensor} in {data.train_names[c.run]}": c.as_json()
+        for c in calibration_of(solution, data)
+    }
+    return toml_text(
+        whole, fitted, {"records": ", ".join(data.train_names), "version": VERSION}, calibration
+    )
