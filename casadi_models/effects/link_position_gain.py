@@ -16,7 +16,7 @@ from ..signals import Expression, LocalSignals, gain_error
         signed(
             "link_position_gain",
             "1",
-            "relative error: link reading = (1 + error) motor reading / gear_ratio, without torsion",
+            "relative error: link reading = (1 + error) motor reading / gear_ratio, no torsion",
             typical=0.002,
         ),
     ),

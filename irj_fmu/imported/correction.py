@@ -217,8 +217,6 @@ class CorrectionLaw:
     def __init__(self, model: JointModel, port: Port, inputs: int) -> None:
         import casadi as ca
 
-        from irj_fmu.plant.joint import _memory_step
-
         functions = model.functions
         self._held = len(functions.memory_names)
         p = model.value_vector()
@@ -229,7 +227,7 @@ class CorrectionLaw:
         self._move: Evaluator | None = None
         if self._held:
             before, z, h = ca.SX.sym("before", 2), ca.SX.sym("z", self._held), ca.SX.sym("h")
-            moved = _memory_step(functions)(x[:2], before, z, u, p, h)
+            moved = functions.memory_step(x[:2], before, z, u, p, h)
             self._move = Evaluator(
                 ca.Function("move", [x[:2], before, z, u, h], [ca.densify(moved)])
             )

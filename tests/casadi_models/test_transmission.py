@@ -122,7 +122,8 @@ def test_ladder_grows() -> None:
 
 
 def test_build_adds_further_effects_once() -> None:
-    model = JointModel.by_name("hd3", -N, effects=("viscous", "stribeck", "transmission_compliance"))
+    effects = ("viscous", "stribeck", "transmission_compliance")
+    model = JointModel.by_name("hd3", -N, effects=effects)
     assert model.effects.count("transmission_compliance") == 1
     assert {"viscous@motor", "viscous@link", "stribeck@motor"} <= set(model.effects)
     with pytest.raises(KeyError, match="unknown model"):

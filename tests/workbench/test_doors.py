@@ -44,12 +44,24 @@ from casadi_models import effect, shape, signed
 
 def declared(key, law):
     effect(key, title=key, family="friction", acts_on=("motor",), parameters=(
-        signed(key, "N.m", "size"), shape(key + "_velocity", "rad/s", "where it bends", (0.05, 0.2, 0.6), "velocity", start=0.1, low=1e-6, high=100.0)),
+        signed(key, "N.m", "size"),
+        shape(key + "_velocity", "rad/s", "where it bends", (0.05, 0.2, 0.6), "velocity",
+              start=0.1, low=1e-6, high=100.0)),
         absence="friction is left", excitation="slow and fast motion", source="a test")(law)
 
-declared("own_gauss", lambda s, p: p.own_gauss * ca.tanh(20 * s.velocity / p.own_gauss_velocity) * ca.exp(-(s.velocity / p.own_gauss_velocity) ** 2))
-declared("own_knee", lambda s, p: p.own_knee * s.velocity / ca.sqrt(1 + (s.velocity / p.own_knee_velocity) ** 2))
-declared("own_slope", lambda s, p: p.own_slope * s.velocity * ca.exp(-ca.fabs(s.velocity) / p.own_slope_velocity))
+def gauss(s, p):
+    x = s.velocity / p.own_gauss_velocity
+    return p.own_gauss * ca.tanh(20 * x) * ca.exp(-x**2)
+
+def knee(s, p):
+    return p.own_knee * s.velocity / ca.sqrt(1 + (s.velocity / p.own_knee_velocity) ** 2)
+
+def slope(s, p):
+    return p.own_slope * s.velocity * ca.exp(-ca.fabs(s.velocity) / p.own_slope_velocity)
+
+declared("own_gauss", gauss)
+declared("own_knee", knee)
+declared("own_slope", slope)
 """
 
 

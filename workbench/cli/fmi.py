@@ -124,7 +124,8 @@ def _passed(name: str, arguments: Namespace) -> int:
     except ModuleNotFoundError as error:
         missing = error.name or name
         raise InputError(
-            f"{arguments.verb} needs the module {missing}, which is not in this installation; from Python, "
+            f"{arguments.verb} needs the module {missing}, which is not in this installation; "
+            "from Python, "
             "irj_fmu.batch.fleet.run_fleet does the work"
         ) from None
     return int(module.main(arguments.rest))

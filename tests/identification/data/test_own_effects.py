@@ -30,9 +30,11 @@ from casadi_models import amplitude, effect, shape
 
 @effect("rubbing_seal", title="rubbing shaft seal", family="friction", acts_on=("motor", "link"),
         parameters=(amplitude("seal_torque", "N.m", "torque where it rubs most", typical=9.0),
-                    shape("seal_width", "rad", "half the angle over which it rubs", (0.1, 0.2, 0.4), "position",
+                    shape("seal_width", "rad", "half the angle over which it rubs",
+                          (0.1, 0.2, 0.4), "position",
                           start=0.2, low=0.01, high=3.0, typical=0.15)),
-        absence="friction in one sector", excitation="a slow turn in both directions", source="this test",
+        absence="friction in one sector", excitation="a slow turn in both directions",
+        source="this test",
         dissipative=True, needs=("coulomb",), confused_with=("cyclic_friction",),
         separate_by="a run through less than the sector")
 def rubbing_seal(s, p):
