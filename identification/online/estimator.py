@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from identification.data.joint_file import Joint
+from identification.errors import InputError
 from identification.faults.detector import ABSURD
 from identification.linear.triangle import single_thread
 from identification.online.first_window import (
@@ -35,8 +36,8 @@ from identification.online.pulse import GAP, Pulse
 from identification.online.row_check import LEAST, RowCheck
 from identification.online.rows import RowMaker
 from identification.online.samples import Samples
-from identification.online.supervision import advance, guarded, launch
-from identification.online.two_step import make_two_step
+from identification.online.state_bytes import pack, unpack
+from identification.online.two_step import Reoptimiser, make_two_step
 from identification.online.verdict import (
     FAULT_TEXT,
     HELD,
@@ -58,6 +59,44 @@ _STRAIN: Final = OnlineSettings()
 """When residuals ask for another search of the nonlinear parameters."""
 _ALL: Final = [True] * 6
 _NONE_FAILED: Final = (False,) * 6
+
+
+_PLAIN: Final = (
+    "_since",
+    "_rows",
+    "_strained",
+    "_last_good",
+    "fault",
+    "score",
+    "readings",
+    "plant_alarm",
+    "events",
+)
+_ARRAYS: Final = (
+    "level",
+    "theta",
+    "sigma",
+    "residual",
+    "floor",
+    "ratio",
+    "_square",
+    "_torque",
+    "_scale",
+)
+"""What changes from sample to sample, besides samples, rows, watch, recursion, detector and
+search.
+"""
+_PREFIX: Final = "two_step."
+_GUARD: Final = "guard."
+
+
+def _own(arrays: dict[str, FloatArray], prefix: str) -> dict[str, FloatArray]:
+    """Arrays of a part, by their own names."""
+    return {
+        name.removeprefix(prefix): values
+        for name, values in arrays.items()
+        if name.startswith(prefix)
+    }
 
 
 @final
@@ -321,7 +360,7 @@ class OnlineEstimator:
         if looked:
             self._floors()
         if self.two_step is not None and self.two_step.searching and enable:
-            advance(self, self.two_step)
+            self._advance(self.two_step)
         return made
 
     def _detect(self, readings: list[float], good: list[bool]) -> Sequence[bool]:
@@ -396,14 +435,14 @@ class OnlineEstimator:
         np.maximum(noise, check.least**2, out=noise)
         self._strained = self._strained + 1 if check.over.any() else 0
         self.theta = self._within(
-            guarded(self, self.guard, theta, check.weighted_error, check.least, on)
+            self._guarded(self.guard, theta, check.weighted_error, check.least, on)
         )
         if (
             self.two_step is not None
             and self.two_step.due(self._strained)
             and not self.guard.several
         ):
-            launch(self, self.two_step)
+            self._launch(self.two_step)
         return True
 
     def _within(self, theta: FloatArray) -> FloatArray:
@@ -452,7 +491,7 @@ class OnlineEstimator:
         self.level = np.sqrt(self._square)
         self.guard.start(self.estimator)
         if self.two_step is not None and not self.two_step.known:
-            launch(self, self.two_step, first=True)
+            self._launch(self.two_step, first=True)
 
     def _factory(self) -> Callable[[FloatArray, FloatArray], RecursiveLeastSquares]:
         """(values, scale) -> recursive least squares with the present options."""
@@ -526,17 +565,123 @@ class OnlineEstimator:
         """Everything the estimator will use again, as bytes; of a running search what it
         started from and how far it is.
         """
-        from identification.online.state import state
-
-        return state(self)
+        plain = {name: getattr(self, name) for name in _PLAIN}
+        arrays = {name: getattr(self, name) for name in _ARRAYS} | {"watch": self.watch.numbers()}
+        plain["samples"], arrays["samples"] = self.samples.state()
+        if self._collected:
+            arrays |= {
+                key: np.array([row[i] for row in self._collected])
+                for i, key in enumerate(("y", "h", "shares"))
+            }
+        arrays.update({f"row{i}": values for i, values in enumerate(self.rows.numbers())})
+        if self.two_step is not None:
+            plain["two_step"], more = self.two_step.state()
+            arrays |= {_PREFIX + name: values for name, values in more.items()}
+        parts = {} if self.estimator is None else {"rls": self.estimator.state()}
+        plain["guard"], more, kept = self.guard.state()
+        arrays |= {_GUARD + name: values for name, values in more.items()} | {
+            "pulse": np.array(self.pulse.numbers()),
+            "grid": np.array(self.grid.numbers()),
+        }
+        parts |= kept
+        if self.detector is not None:
+            parts["detector"] = self.detector.state()
+        return pack(plain, arrays, parts)
 
     def restore(self, saved: bytes) -> None:
         """Take up a state of an estimator of the same joint and options; a running search is
         repeated up to where it was.
-        """
-        from identification.online.state import restore
 
-        restore(self, saved)
+        Raises
+        ------
+        InputError
+            The bytes are damaged, or of another joint, sample time or options.
+        """
+        plain, arrays, parts = unpack(saved)
+        fits = (
+            arrays["theta"].shape == self.theta.shape
+            and arrays["samples"].shape == self.samples.state()[1].shape
+        )
+        if not fits or ("two_step" in plain) != (self.two_step is not None):
+            raise InputError(
+                "restore: the state is of another joint, sample time or options; give one of this "
+                "estimator"
+            )
+        for name in (*_PLAIN, *_ARRAYS):
+            setattr(self, name, plain[name] if name in plain else arrays[name])
+        self.watch.load(arrays["watch"])
+        self.samples.restore(plain["samples"], arrays["samples"])
+        self._collected = (
+            list(zip(arrays["y"], arrays["h"], arrays["shares"], strict=True))
+            if "y" in arrays
+            else []
+        )
+        self.rows = self._plain_rows
+        if self.two_step is not None:
+            self.two_step.restore(plain["two_step"], _own(arrays, _PREFIX), self._factory())
+            if self.two_step.active:
+                self.rows = self.two_step.rows
+        self.rows.load([arrays[f"row{i}"] for i in range(len(self.rows.numbers()))])
+        self.estimator = self._recursion(self.theta) if "rls" in parts else None
+        if self.estimator is not None:
+            self.estimator.restore(parts["rls"])
+        self.guard.restore(plain["guard"], _own(arrays, _GUARD), parts)
+        self.pulse.load(arrays["pulse"].tolist())
+        self.grid.load(arrays["grid"].tolist())
+        if self.detector is not None and "detector" in parts:
+            self.detector.restore(parts["detector"])
+
+    # --- supervision of the recursion -------------------------------------------------------------
+
+    def _guarded(
+        self,
+        guard: Guard,
+        theta: FloatArray,
+        error: FloatArray,
+        least: FloatArray,
+        on: BoolArray,
+    ) -> FloatArray:
+        """The estimate to show after a row; a recursion that follows a failed sensor is held."""
+        if self.estimator is None:
+            return self.theta
+        told = guard.step(self.estimator, theta, error, np.maximum(least, self.level), on)
+        if told:
+            self.events.append(f"estimate {told}")
+        if told == "back":
+            self._square[:], self._strained = self.level**2, 0
+            if self.two_step is not None:
+                self.two_step.forget(guard.held_for)
+        return guard.theta
+
+    def _launch(self, two: Reoptimiser, *, first: bool = False) -> None:
+        """Begin a search for the shapes on the rows kept."""
+        window = two.window()
+        weight = self._weight_of(window.shares, self.theta, self._size()) * window.on
+        two.launch(weight, self.theta, self.level, self.least, self._factory(), first=first)
+        self.events.append(str(two.mode))
+
+    def _advance(self, two: Reoptimiser) -> None:
+        """Do the portions of a sample, and take up what the search has found."""
+        found, guard = two.advance(), self.guard
+        if found is None:
+            return
+        self.events.append(found.text)
+        self._strained = 0
+        if found.eta is None:
+            return
+        trusted = (
+            found.good and found.estimator is not None and guard.plausible(found.estimator.theta)
+        )
+        if guard.on_probation and not trusted:
+            return
+        self.rows = two.reshaped(found.eta, found.deviation, self.rows)
+        if found.estimator is not None:
+            self.estimator, self._scale = found.estimator, found.scale
+            self.theta, self.sigma = found.estimator.theta, found.estimator.deviation
+            self._square, self.level = found.level**2, found.level
+        if self.estimator is not None:
+            guard.start(self.estimator)
+        self._floors()
 
 
 __all__ = [

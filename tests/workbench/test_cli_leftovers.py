@@ -587,7 +587,8 @@ def test_numbers_and_their_nouns() -> None:
 def test_a_track_without_an_estimate_does_not_count_to_zero(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    from workbench.cli.online import UNESTIMATED, _print_track
+    from workbench.cli.online import _print_track
+    from workbench.show.replayed import UNESTIMATED
 
     result = {
         "record": "run",

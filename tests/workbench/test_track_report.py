@@ -18,14 +18,12 @@ from identification.data.read import read
 from identification.data.record import Record
 from identification.errors import InputError
 from workbench.cli.online import (
-    READINGS,
-    UNESTIMATED,
-    Replay,
     limits,
     parse_fault,
     replay,
     run_track,
 )
+from workbench.show.replayed import READINGS, UNESTIMATED, Replay
 from workbench.show.track_pictures import signal_picture, timeline_picture
 from workbench.show.track_report import track_page
 

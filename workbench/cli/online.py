@@ -8,8 +8,7 @@ import math
 import sys
 from argparse import Namespace
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -26,115 +25,18 @@ from workbench.cli.files import (
     write_bytes,
     write_json,
 )
+from workbench.show.replayed import AFTERMATH, READINGS, UNESTIMATED, Replay
 
 if TYPE_CHECKING:
     from identification.data.joint_file import Joint
     from identification.data.record import Record
     from identification.faults.detector import Fault
-    from identification.online.estimator import OnlineEstimator
     from identification.planning.trajectories import Excitation, Selection
 
 FloatArray = npt.NDArray[np.float64]
 
 POINTS: Final = 400
 """Points of the parameters' course kept per record."""
-AFTERMATH: Final = 2.0
-"""Seconds after a failure in which the look at the last second of readings still sees it."""
-UNESTIMATED: Final = (
-    "the parameters were not estimated: the first window needs some seconds in "
-    "which every reading is good"
-)
-READINGS: Final = (
-    "motor current",
-    "motor position",
-    "motor velocity",
-    "link position",
-    "link velocity",
-    "torque",
-)
-
-
-@final
-@dataclass(frozen=True)
-class Replay:
-    """What the online estimator made of one record.
-
-    Attributes
-    ----------
-    record : Record
-        At even steps.
-    estimator : OnlineEstimator
-        After the last sample.
-    time, values, sigmas, ratios
-        Course of the estimate at some hundred points: (m,) [s], (m, parameters) twice, (m,
-        balances).
-    events : tuple of dict
-        ``time``, ``fault``, ``text``.
-    healthy, readings, used : (n, 6) array
-        As recorded; with the faults tried on purpose, NaN where there is none; with failed ones
-        replaced. Link-referred SI.
-    failed : (n, 6) bool array
-        Where a reading is replaced.
-    tried : tuple of Fault
-    calibrated : bool
-        The detector's limits come from healthy records.
-    """
-
-    record: Record
-    estimator: OnlineEstimator
-    time: FloatArray
-    values: FloatArray
-    sigmas: FloatArray
-    ratios: FloatArray
-    events: tuple[dict[str, Any], ...]
-    healthy: FloatArray
-    readings: FloatArray
-    used: FloatArray
-    failed: npt.NDArray[np.bool_]
-    tried: tuple[Fault, ...] = ()
-    calibrated: bool = False
-
-    def spans(self, reading: int | None = None) -> list[tuple[float, float]]:
-        """Times [s] from which to which a reading is replaced; any reading where none is named."""
-        failed = self.failed.any(axis=1) if reading is None else self.failed[:, reading]
-        edges = np.flatnonzero(np.diff(failed.astype(np.int8), prepend=0, append=0))
-        time = self.record.time
-        return [
-            (float(time[a]), float(time[min(b, len(time) - 1)]))
-            for a, b in edges.reshape(-1, 2).tolist()
-        ]
-
-    def as_json(self) -> dict[str, Any]:
-        """Data of `track --json`."""
-        estimator = self.estimator
-        units = {p.name: p for p in estimator.model.parameters}
-        return {
-            "record": self.record.name,
-            "time": self.time.tolist(),
-            "detector": estimator.detector is not None,
-            "calibrated": self.calibrated,
-            "events": list(self.events),
-            "replaced": [
-                {"reading": name, "from": a, "to": b}
-                for i, name in enumerate(READINGS)
-                for a, b in self.spans(i)
-            ],
-            "ratio": dict(zip(estimator.balances, self.ratios[-1].tolist(), strict=True))
-            if len(self.time)
-            else {},
-            "parameters": {
-                name: {
-                    "value": float(self.values[-1, i]),
-                    "sigma": float(self.sigmas[-1, i]),
-                    "unit": units[name].unit,
-                    "side": units[name].side,
-                    "history": self.values[:, i].tolist(),
-                    "sigma_history": self.sigmas[:, i].tolist(),
-                }
-                for i, name in enumerate(estimator.names)
-                if len(self.time)
-            },
-        }
 
 
 def run_track(arguments: Namespace) -> int:

@@ -15,7 +15,7 @@ import numpy as np
 
 from identification.data.formats import number, pretty_unit, with_error, words
 from identification.faults.detector import SENSORS
-from workbench.cli.online import READINGS, UNESTIMATED, Replay
+from workbench.show.replayed import READINGS, UNESTIMATED, Replay
 from workbench.show.report import asset, versions
 from workbench.show.results import BALANCES, table, text
 from workbench.show.track_pictures import (
