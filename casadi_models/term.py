@@ -152,11 +152,11 @@ CALIBRATION: Final = {
             Parameter(
                 "link_encoder_zero",
                 "rad",
-                0.0,
-                -math.inf,
-                math.inf,
-                "reading of the link encoder, less that of the motor encoder, without twist",
-                "sensor",
+                start=0.0,
+                low=-math.inf,
+                high=math.inf,
+                meaning="reading of the link encoder, less that of the motor encoder, without twist",
+                side="sensor",
             ),
         ),
     )

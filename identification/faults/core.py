@@ -134,14 +134,16 @@ class ObserverCore:
         link = rates[3] + link_gain * (carried - estimate[4])
         following = ca.vertcat(step(after[:size], after[size:], drive), after[size:])
         out = ca.vertcat(
-            following,
-            drive + (1 - used[0]) * after[size],
-            filled,
-            innovation,
-            motor,
-            link,
-            sprung,
-            estimate,
+            *(
+                following,
+                drive + (1 - used[0]) * after[size],
+                filled,
+                innovation,
+                motor,
+                link,
+                sprung,
+                estimate,
+            ),
         )
         return step, ca.Function("sample", [x, y, used, gain, gate], [ca.densify(out)])
 

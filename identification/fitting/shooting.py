@@ -236,7 +236,7 @@ class Shooting:
         )
         self.states = 4 if model.is_elastic else 2
         self._names = model.parameter_names
-        self._data = data
+        self.data = data
         rows = [OUTPUT_ROWS[c] for c in data.channels]
         samples = data.count * data.length
         self._plain = WindowRun(_sample(model, None, rows, data.dt, substeps), data.length, samples)
@@ -244,30 +244,25 @@ class Shooting:
             _sample(model, self.free, rows, data.dt, substeps), data.length, samples
         )
 
-    @property
-    def data(self) -> Windows:
-        """The windows."""
-        return self._data
-
     def every(self, stride: int) -> Shooting:
         """The same simulation over one window in `stride`."""
         out = copy(self)
-        out._data = self._data.every(stride)
+        out.data = self.data.every(stride)
         return out
 
     def errors(self, values: Mapping[str, float], x0: FloatArray) -> FloatArray:
         """Simulated less measured outputs, (windows, channels, length); not finite where the
         simulation diverges.
         """
-        found = self._plain(x0, self._data.inputs.T, self._vector(values))
-        out: FloatArray = found.transpose(0, 2, 1) - self._data.measured
+        found = self._plain(x0, self.data.inputs.T, self._vector(values))
+        out: FloatArray = found.transpose(0, 2, 1) - self.data.measured
         return out
 
     def columns(self, values: Mapping[str, float], x0: FloatArray) -> FloatArray:
         """Slopes along initial states and free parameters, and the errors, (windows, columns +
         1, channels, length).
         """
-        data, channels, wide = self._data, len(self._data.channels), self.states + len(self.free)
+        data, channels, wide = self.data, len(self.data.channels), self.states + len(self.free)
         start = np.zeros((data.count, self.states * (1 + wide)))
         start[:, : self.states] = x0
         for i in range(self.states):

@@ -147,10 +147,10 @@ class OnlineEstimator:
         self.present = (True, True, True, has_link, has_link, self.options.has_torque)
         self._all, self._whole = list(self.present), all(self.present)
         used: list[bool] = np.any(self.rows.uses, axis=0).tolist()
-        self._needs = [False] * 6
+        self.needs = [False] * 6
         for k, reading in enumerate(SAMPLED):
-            self._needs[reading] = used[k] and self.present[reading]
-        self.samples = Samples(self.rows.timing, self._needs)
+            self.needs[reading] = used[k] and self.present[reading]
+        self.samples = Samples(self.rows.timing, self.needs)
         self.watch = Watch(dt, self.present)
         self.grid = Grid(dt, max(GAP * self.rows.timing.length, 1.5 * dt))
         self.pulse = Pulse(dt, self.rows.timing.length, self.present)
@@ -164,14 +164,14 @@ class OnlineEstimator:
             if self.options.detect and self.is_fitted
             else None
         )
-        self._confirm = replace(_STRAIN, sample_time=self.rows.timing.stride * dt).samples(
+        self.confirm = replace(_STRAIN, sample_time=self.rows.timing.stride * dt).samples(
             _STRAIN.confirm_seconds
         )
-        self._collect = max(
+        self.collect = max(
             2 * len(self.names), round(self.options.warm_up / (self.rows.timing.stride * dt))
         )
-        self._from_link = [b in ("link", "transmission") for b in self.balances]
-        self._friction = [
+        self.from_link = [b in ("link", "transmission") for b in self.balances]
+        self.friction = [
             [
                 self.names.index(p.name)
                 for t in self.model.terms
@@ -181,7 +181,7 @@ class OnlineEstimator:
             ]
             for place in ("motor", "link")
         ]
-        self._feels = np.array(
+        self.feels = np.array(
             [
                 [
                     place in b or b in ("sum", "axis") or (b == "deflection" and place == "motor")
@@ -194,14 +194,14 @@ class OnlineEstimator:
         self._check = RowCheck(
             len(self.balances),
             len(self.names),
-            self._friction,
-            self._feels,
+            self.friction,
+            self.feels,
             rate,
             _STRAIN.error_limit,
         )
-        self._reference = [11 if from_link else 1 for from_link in self._from_link]
+        self._reference = [11 if from_link else 1 for from_link in self.from_link]
         self.reset()
-        self._recursion(self.theta)  # its functions are made here and not inside a step
+        self.recursion(self.theta)  # its functions are made here and not inside a step
 
     # --- life -------------------------------------------------------------------------------------
 
@@ -266,7 +266,7 @@ class OnlineEstimator:
     @property
     def wanted(self) -> bool:
         """True where the residuals stay over their limit although the linear parameters follow."""
-        return self._strained >= self._confirm
+        return self._strained >= self.confirm
 
     def reoptimise(self) -> bool:
         """Search the shapes as soon as there are rows enough; False where there are none."""
@@ -403,23 +403,25 @@ class OnlineEstimator:
             if enable and on.all():
                 self._collected.append((y, h, shares))
                 self._torque += self.rows.signals[self._reference] ** 2
-                if len(self._collected) >= self._collect:
+                if len(self._collected) >= self.collect:
                     with single_thread():
                         self._begin()
             return True
         check = self._check
         check(
-            y,
-            h,
-            self.theta,
-            shares,
-            on,
-            self.floor,
-            self.level,
-            self.rows.signals[self._reference],
-            self._square,
-            self._torque,
-            self.options.floor_share,
+            *(
+                y,
+                h,
+                self.theta,
+                shares,
+                on,
+                self.floor,
+                self.level,
+                self.rows.signals[self._reference],
+                self._square,
+                self._torque,
+                self.options.floor_share,
+            ),
         )
         self.residual, self.ratio = check.error.copy(), check.ratio.copy()
         self._square, self._torque = check.square.copy(), check.torque.copy()
@@ -431,7 +433,7 @@ class OnlineEstimator:
         for b, use in enumerate(on.tolist()):
             self.estimator.enable(b, use)
         theta = self.estimator.update(check.y, check.h)
-        noise = self.estimator._ready("noise").part("fast", "noise")
+        noise = self.estimator.engine_for("noise").part("fast", "noise")
         np.maximum(noise, check.least**2, out=noise)
         self._strained = self._strained + 1 if check.over.any() else 0
         self.theta = self._within(
@@ -465,9 +467,9 @@ class OnlineEstimator:
         (balances,).
         """
         level = np.array(
-            [float(np.abs(theta[which]).sum()) if which else 0.0 for which in self._friction]
+            [float(np.abs(theta[which]).sum()) if which else 0.0 for which in self.friction]
         )
-        return reversal_weights(shares * level, self._feels, size)
+        return reversal_weights(shares * level, self.feels, size)
 
     def _begin(self) -> None:
         """Start the recursion from the collected rows."""
@@ -478,7 +480,7 @@ class OnlineEstimator:
         least = np.maximum(least, self.rows.floor(first.tolist(), self.watch.noise[list(SAMPLED)]))
         y, h = y * weight, h * weight[:, :, None]
         self._scale = np.maximum(np.maximum(np.abs(first), np.abs(self.theta)), least_range(h, y))
-        self.estimator = self._recursion(self.theta)
+        self.estimator = self.recursion(self.theta)
         started = self.estimator.begin(y, h, least, overlap=self.rows.timing.overlap)
         if started.undetermined:
             names = ", ".join(self.names[i] for i in started.undetermined)
@@ -506,7 +508,8 @@ class OnlineEstimator:
         )
         return partial(fast_recursion, len(self.balances), self.names, settings)
 
-    def _recursion(self, values: FloatArray) -> RecursiveLeastSquares:
+    def recursion(self, values: FloatArray) -> RecursiveLeastSquares:
+        """A fresh recursion that begins at the given values, shape (parameters,)."""
         return self._factory()(values, self._scale)
 
     def retune(self, options: OnlineOptions) -> None:
@@ -518,8 +521,8 @@ class OnlineEstimator:
             floor_share=options.floor_share,
         )
         if self.estimator is not None:
-            fresh = self._recursion(self.theta)
-            old, new = self.estimator._ready("retune"), fresh._ready("retune")
+            fresh = self.recursion(self.theta)
+            old, new = self.estimator.engine_for("retune"), fresh.engine_for("retune")
             new.fast[:], new.slow[:] = old.fast, old.slow
             new.theta[:] = old.theta
             self.estimator = fresh
@@ -544,7 +547,7 @@ class OnlineEstimator:
         if detector is not None:
             self.plant_alarm, self.score = plant_alarm(detector, self.dt), detector.scores()
         missing = [
-            not g and (self._needs[i] or (detector is not None and self.present[i]))
+            not g and (self.needs[i] or (detector is not None and self.present[i]))
             for i, g in enumerate(good)
         ]
         found = (
@@ -622,7 +625,7 @@ class OnlineEstimator:
             if self.two_step.active:
                 self.rows = self.two_step.rows
         self.rows.load([arrays[f"row{i}"] for i in range(len(self.rows.numbers()))])
-        self.estimator = self._recursion(self.theta) if "rls" in parts else None
+        self.estimator = self.recursion(self.theta) if "rls" in parts else None
         if self.estimator is not None:
             self.estimator.restore(parts["rls"])
         self.guard.restore(plain["guard"], _own(arrays, _GUARD), parts)

@@ -110,7 +110,7 @@ class RowMaker:
         self._split(ca.vertcat(*stacked), signals, e.memory, fixed)
         self.uses = self._dependence(ca.vertcat(*expressions.values()), signals)
         self._kernels()
-        self._slopes = self._slope_function(expressions, signals, p)
+        self.slopes = self._slope_function(expressions, signals, p)
         self.reset()
 
     def _value(self, name: str) -> float:
@@ -159,7 +159,7 @@ class RowMaker:
                 self.needed.append(i)
                 rest.append(left)
         self.laws = ca.vertcat(*rest) if rest else ca.SX(0, 1)
-        self._point = self._point_function(self.laws, signals, memory, fixed)
+        self.point = self._point_function(self.laws, signals, memory, fixed)
 
     def _point_function(self, rest: Any, signals: Any, memory: Any, fixed: Any) -> Any:
         """(signals, smooth signals, coordinates before, memory before) -> laws, coordinates,
@@ -215,7 +215,7 @@ class RowMaker:
         centre = size - 1 - t.reach
         self.averaging = np.zeros((self._orders, size))
         new = t.stride // t.step
-        self._smoothing = np.zeros((self._orders, new, size))
+        self.smoothing = np.zeros((self._orders, new, size))
         for order in range(self._orders):
             w = differentiated_kernel(t.length, t.dt, order)
             own = len(w) // 2
@@ -224,39 +224,39 @@ class RowMaker:
             own = len(w) // 2
             for k in range(new):
                 at = centre + (t.point_half - (new - 1 - k)) * t.step
-                self._smoothing[order, k, at - own : at + own + 1] = w
-        self._raw_at = [centre + (t.point_half - (new - 1 - k)) * t.step for k in range(new)]
-        self._weights = differentiated_kernel(t.length, t.dt * t.step, 0)
-        self._place: list[tuple[int, int, int]] = [
+                self.smoothing[order, k, at - own : at + own + 1] = w
+        self.raw_at = [centre + (t.point_half - (new - 1 - k)) * t.step for k in range(new)]
+        self.weights = differentiated_kernel(t.length, t.dt * t.step, 0)
+        self.place: list[tuple[int, int, int]] = [
             (_NAMES.index(name), order, k)
             for k, source in enumerate(SOURCES)
             for order, name in enumerate(POSITION_CHAINS[source])
         ]
-        columns = np.array(self._place).T
+        columns = np.array(self.place).T
         self._index, self._flat = columns[0], columns[1] * len(SOURCES) + columns[2]
         points = np.arange(new)[:, None]
         self._to = (points * len(_NAMES) + columns[0]).ravel()
         self._from = ((columns[1] * new + points) * len(SOURCES) + columns[2]).ravel()
-        sampled = [i for i, (_, order, _) in enumerate(self._place) if order == 0]
+        sampled = [i for i, (_, order, _) in enumerate(self.place) if order == 0]
         self._raw_to = (points * len(_NAMES) + columns[0][sampled]).ravel()
         self._raw_from = (
-            np.array(self._raw_at)[:, None] * len(SOURCES) + columns[2][sampled]
+            np.array(self.raw_at)[:, None] * len(SOURCES) + columns[2][sampled]
         ).ravel()
-        self._speeds = [_NAMES.index("motor_velocity"), _NAMES.index("link_velocity")]
+        self.speeds = [_NAMES.index("motor_velocity"), _NAMES.index("link_velocity")]
         self._sharpen()
-        self._velocity_gain = float(np.linalg.norm(kernel(t.pointwise, t.dt, 1)))
+        self.velocity_gain = float(np.linalg.norm(kernel(t.pointwise, t.dt, 1)))
         self._middle = centre
-        self._flat_smoothing = self._smoothing.reshape(-1, size)
+        self._flat_smoothing = self.smoothing.reshape(-1, size)
         self._smooth_sum, self._average_sum = (
             np.where(np.arange(len(table)) < plain, table.sum(axis=1), 0.0)[:, None]
             for table, plain in ((self._flat_smoothing, new), (self.averaging, 1))
         )
-        self._still = _standstill(self._weights)
+        self._still = _standstill(self.weights)
 
     def _sharpen(self) -> None:
         """Velocities below which a side counts as standing still."""
         smooth = dict(zip(self.model.parameter_names, self.model.value_vector(), strict=True))
-        self._sharp = [
+        self.sharp = [
             2 * min(sum(smooth[n] for n in self.model.named("smoothing", side)), SHARP)
             for side in ("motor", "link")
         ]
@@ -273,9 +273,9 @@ class RowMaker:
         """Before the first sample."""
         t = self.timing
         length = 2 * t.point_half + 1
-        self._ring, self._speed = np.zeros((length, len(self.needed))), np.zeros((length, 2))
+        self._ring, self.speed = np.zeros((length, len(self.needed))), np.zeros((length, 2))
         new = t.stride // t.step
-        count, states = self._point.size1_in(2), self._point.size1_in(3)
+        count, states = self.point.size1_in(2), self.point.size1_in(3)
         self._in: list[FloatArray] = [
             np.zeros((new, len(_NAMES))),
             np.zeros((new, len(_NAMES))),
@@ -288,7 +288,7 @@ class RowMaker:
             np.zeros(count),
             np.zeros(states),
         ]
-        buffer, self._trigger = self._point.buffer()
+        buffer, self._trigger = self.point.buffer()
         for i, item in enumerate([*self._in, *([self.shape_values] if self.shapes else [])]):
             buffer.set_arg(i, memoryview(item))  # type: ignore[arg-type, unused-ignore]
         for i, item in enumerate(self._out):
@@ -296,7 +296,7 @@ class RowMaker:
         self._buffer = buffer
         self._slow, self._share = np.zeros(2), np.zeros(2)
         still, self._find_still = self._still.buffer()
-        for i, item in enumerate((self._speed, self._slow)):
+        for i, item in enumerate((self.speed, self._slow)):
             still.set_arg(i, memoryview(item))  # type: ignore[arg-type, unused-ignore]
         still.set_res(0, memoryview(self._share))  # type: ignore[arg-type, unused-ignore]
         self._still_buffer = still
@@ -335,8 +335,8 @@ class RowMaker:
             new = len(raw)
             self._ring[:-new] = self._ring[new:].copy()
             self._ring[-new:] = out
-            self._speed[:-new] = self._speed[new:].copy()
-            self._speed[-new:] = raw[:, self._speeds]
+            self.speed[:-new] = self.speed[new:].copy()
+            self.speed[-new:] = raw[:, self.speeds]
         self.made += 1
         averaged = self.averaging @ apart
         averaged += self._average_sum * middle
@@ -344,7 +344,7 @@ class RowMaker:
         self.signals[0] = time - self.timing.delay
         full = self.linear @ self.signals
         if self.needed:
-            full[self.needed] += self._weights @ self._ring
+            full[self.needed] += self.weights @ self._ring
         if self.made <= self.rows_before_ready:
             return None
         table = full.reshape(len(self.balances), self.width)
@@ -378,7 +378,7 @@ class RowMaker:
             Signals at the last points, newest last; those that the kernel holds are enough.
         """
         self.made, self.signals = other.made, other.signals.copy()
-        self._speed[:] = other._speed
+        self.speed[:] = other.speed
         raw = self._in[0]
         new = len(raw)
         for at in range(len(points) % new, len(points), new):
@@ -393,7 +393,7 @@ class RowMaker:
         """
         if not self.needed:
             return np.zeros(2)
-        gain, sharp = self._velocity_gain, self._sharp
+        gain, sharp = self.velocity_gain, self.sharp
         self._slow[:] = max(3 * motor_noise * gain, sharp[0]), max(3 * link_noise * gain, sharp[1])
         self._find_still()
         return self._share.copy()
@@ -420,7 +420,7 @@ class RowMaker:
             float(estimated.get(n, v))
             for n, v in zip(self.model.parameter_names, self.model.value_vector(), strict=True)
         ]
-        slopes = np.array(self._slopes(self.signals, self._in[3], values))
+        slopes = np.array(self.slopes(self.signals, self._in[3], values))
         variance = np.zeros(len(self.balances))
         for k, source in enumerate(SOURCES):
             combined = np.zeros((len(self.balances), self.averaging.shape[1]))
@@ -437,7 +437,7 @@ class RowMaker:
         """Everything that changes."""
         return [
             self._ring,
-            self._speed,
+            self.speed,
             self._in[2],
             self._in[3],
             self._in[4],

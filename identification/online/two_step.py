@@ -206,7 +206,7 @@ class Reoptimiser:
         if self.job is None:
             return
         work = partial(
-            search, self.job, self.balances, self.rows.model, self.settings, _TUNING, recursion
+            search, *(self.job, self.balances, self.rows.model, self.settings, _TUNING, recursion)
         )
         self._task = PortionedTask(work, free=False)
 

@@ -112,7 +112,7 @@ class ShapedBalances:
         self._linear_of, self._linear = rows.linear_of, rows.linear.copy()
         self._linear_moves = bool(rows.linear_of.jac_sparsity(0, 0).nnz())
         self._width, self._count = rows.width, len(rows.balances)
-        self._weights = rows._weights.copy()
+        self._weights = rows.weights.copy()
         self._new = rows.timing.stride // rows.timing.step
         self.lead, self.overlap = rows.rows_before_ready, rows.timing.overlap
         signals = rows.model.equations.signals.vector()

@@ -22,8 +22,8 @@ SAMPLED: Final = (Q_M, Q_L, TAU, DRIVE)
 """Readings behind :data:`identification.online.rows.SOURCES`."""
 _MOVED: Final = 1e-3
 _SCALE_MOTION: Final = 2e-2
-_SCALE: Final = 0.2
-_MEMORY: Final = 30
+SCALE: Final = 0.2
+MEMORY: Final = 30
 
 
 @final
@@ -94,7 +94,7 @@ class Watch:
             if spread[i] > 0 or moves:
                 self.constant[i] = bool(spread[i] == 0)
             if spread[i] > 0:
-                self.looks[i] = min(self.looks[i] + 1, _MEMORY)
+                self.looks[i] = min(self.looks[i] + 1, MEMORY)
                 level = noise_level(self.rows[:, i], whole)
                 self.noise[i] = np.sqrt(
                     self.noise[i] ** 2 + (level**2 - self.noise[i] ** 2) / self.looks[i]
@@ -109,10 +109,10 @@ class Watch:
                 change = np.diff(self.rows[:, position])
                 travelled = 0.5 * self.dt * (self.rows[1:, velocity] + self.rows[:-1, velocity])
                 own[position] = _slope(np.cumsum(travelled), np.cumsum(change))
-                self.scaled[velocity] = abs(own[position] - 1.0) > _SCALE
+                self.scaled[velocity] = abs(own[position] - 1.0) > SCALE
         if good[Q_M] and good[Q_L] and max(spread[Q_M], spread[Q_L]) > _SCALE_MOTION:
-            wrong = abs(_slope(self.rows[:, Q_L], self.rows[:, Q_M]) - 1.0) > _SCALE
-            off_m, off_l = (abs(own.get(i, 1.0) - 1.0) > _SCALE for i in (Q_M, Q_L))
+            wrong = abs(_slope(self.rows[:, Q_L], self.rows[:, Q_M]) - 1.0) > SCALE
+            off_m, off_l = (abs(own.get(i, 1.0) - 1.0) > SCALE for i in (Q_M, Q_L))
             self.scaled[Q_L] = wrong and off_l and not off_m
             self.scaled[Q_M] = wrong and not self.scaled[Q_L]
             if wrong:

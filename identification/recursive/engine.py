@@ -107,8 +107,8 @@ class Engine:
     ) -> None:
         n = theta0.size
         self.freeze, self.walking = settings.freeze, walk is not None or method == "random_walk"
-        self._formulas = formulas(n, outputs, method, self.freeze, self.walking)
-        layout = self._layout = self._formulas.layout
+        self.formulas = formulas(n, outputs, method, self.freeze, self.walking)
+        layout = self.layout = self.formulas.layout
         self.config = fill_config(
             layout, method, theta0=theta0, scale=scale, settings=settings, walk=walk, noise=noise
         )
@@ -120,12 +120,12 @@ class Engine:
         out = [self.theta, self._error, self._status]
         rows = self.h.reshape(-1)
         self._step = _trigger(
-            self._formulas.step,
+            self.formulas.step,
             [self.fast, flags, self.config, self.y, rows],
             [self._fast_next, *out],
         )
         self._check = _trigger(
-            self._formulas.check,
+            self.formulas.check,
             [self._fast_next, self.slow, self.config],
             [self.fast, self._slow_next],
         )
@@ -136,7 +136,7 @@ class Engine:
 
     def start(self, theta: FloatArray, covariance: FloatArray | None) -> None:
         """Before the first sample: theta and its covariance (None: P0), user units."""
-        layout, scale = self._layout, self.part("config", "scale")
+        layout, scale = self.layout, self.part("config", "scale")
         self.fast[:], self.slow[:] = start_state(layout, theta, self.config)
         self.theta[:] = theta
         if covariance is None:
@@ -151,12 +151,12 @@ class Engine:
     def part(self, block: str, name: str) -> FloatArray:
         """View of a named part of "fast", "slow" or "config"."""
         memory: FloatArray = {"fast": self.fast, "slow": self.slow, "config": self.config}[block]
-        where: slice = getattr(self._layout, block)[name]
+        where: slice = getattr(self.layout, block)[name]
         return memory[where]
 
     def covariance(self) -> FloatArray:
         """P in scaled parameters."""
-        n = self._layout.n
+        n = self.layout.n
         unit = np.eye(n)
         packed = iter(self.part("fast", "u"))
         for j in range(n):
@@ -191,7 +191,7 @@ class Engine:
         """Load the compiled step, building it where needed; without a compiler all stays
         interpreted.
         """
-        self._native, note = _library(self._formulas)
+        self._native, note = _library(self.formulas)
         if self._native is None:
             return RunOutcome.NO_COMPILER, note
         memory = (

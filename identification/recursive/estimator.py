@@ -197,7 +197,7 @@ class RecursiveLeastSquares:
         """Build and load the compiled step now: `update` then costs a third. The numbers stay
         the same bit by bit.
         """
-        return self._ready("compile").compile()[0]
+        return self.engine_for("compile").compile()[0]
 
     def startup(self, Y: npt.ArrayLike, H: npt.ArrayLike, *, limit: float = 1e-9) -> Startup:
         """Start values from a window of samples by SVD, (3.47) to (3.49).
@@ -256,13 +256,13 @@ class RecursiveLeastSquares:
 
     def reset(self) -> None:
         """Back to theta0, P0 and zero counters; enabled outputs, held parameters and R2 stay."""
-        self._ready("reset").start(self._theta0, None)
+        self.engine_for("reset").start(self._theta0, None)
 
     # What a supervisor switches
 
     def enable(self, output: int, on: bool = True) -> None:
         """Use (or leave out) an output; values of an output left out are not looked at."""
-        engine = self._ready("enable")
+        engine = self.engine_for("enable")
         if not 0 <= output < engine.y.size:
             raise InputError(
                 f"enable: there is no output {output}; outputs are 0 to {engine.y.size - 1}"
@@ -271,20 +271,22 @@ class RecursiveLeastSquares:
 
     def hold(self, parameters: Iterable[int | str]) -> None:
         """Freeze parameters, by name or position, until `release`."""
-        self._ready("hold").part("config", "free")[positions(self._names, parameters, "hold")] = 0.0
+        self.engine_for("hold").part("config", "free")[
+            positions(self._names, parameters, "hold")
+        ] = 0.0
 
     def release(self, parameters: Iterable[int | str] | None = None) -> None:
         """Let held parameters move again; None: all of them."""
         where = range(self._theta0.size) if parameters is None else parameters
-        self._ready("release").part("config", "free")[positions(self._names, where, "release")] = (
-            1.0
-        )
+        self.engine_for("release").part("config", "free")[
+            positions(self._names, where, "release")
+        ] = 1.0
 
     def set_measurement_covariance(self, R2: npt.ArrayLike | None) -> None:
         """New R2 from now on (raised when a sensor is suspected); None: estimate it from the
         innovations.
         """
-        engine = self._ready("set_measurement_covariance")
+        engine = self.engine_for("set_measurement_covariance")
         if R2 is None:
             engine.part("config", "noise_known")[:] = 0.0
             return
@@ -299,16 +301,18 @@ class RecursiveLeastSquares:
         """Everything the estimator will ever use again, as bytes; `restore` brings it back bit
         by bit.
         """
-        engine = self._ready("state")
+        engine = self.engine_for("state")
         body = engine.fast.tobytes() + engine.slow.tobytes() + engine.config.tobytes()
         head = _HEADER.pack(
-            _MAGIC,
-            self._theta0.size,
-            engine.y.size,
-            METHODS.index(self._method),
-            int(engine.freeze),
-            int(engine.walking),
-            zlib.crc32(body),
+            *(
+                _MAGIC,
+                self._theta0.size,
+                engine.y.size,
+                METHODS.index(self._method),
+                int(engine.freeze),
+                int(engine.walking),
+                zlib.crc32(body),
+            ),
         )
         return head + body
 
@@ -400,12 +404,12 @@ class RecursiveLeastSquares:
     @property
     def error(self) -> FloatArray:
         """A priori error of the last sample, shape (outputs,); zero where it was skipped."""
-        return self._ready("error").part("fast", "error").copy()
+        return self.engine_for("error").part("fast", "error").copy()
 
     @property
     def measurement_covariance(self) -> FloatArray:
         """R2 in use, given or estimated, shape (outputs,)."""
-        engine = self._ready("measurement_covariance")
+        engine = self.engine_for("measurement_covariance")
         return np.where(
             engine.part("config", "noise_known") > 0,
             engine.part("config", "noise_given"),
@@ -445,7 +449,7 @@ class RecursiveLeastSquares:
     @property
     def excited(self) -> BoolArray:
         """Which parameters move: neither held nor without excitation, shape (parameters,)."""
-        engine = self._ready("excited")
+        engine = self.engine_for("excited")
         found: BoolArray = (engine.part("slow", "excited") > 0) & (
             engine.part("config", "free") > 0
         )
@@ -454,7 +458,7 @@ class RecursiveLeastSquares:
     @property
     def live(self) -> BoolArray:
         """Which outputs still carry at least half of their parameters, shape (outputs,)."""
-        found: BoolArray = self._ready("live").part("slow", "live") > 0
+        found: BoolArray = self.engine_for("live").part("slow", "live") > 0
         return found
 
     # Inside
@@ -462,7 +466,14 @@ class RecursiveLeastSquares:
     def _number(self, name: str) -> float:
         return 0.0 if self._engine is None else float(self._engine.part("fast", name)[0])
 
-    def _ready(self, asked: str) -> Engine:
+    def engine_for(self, asked: str) -> Engine:
+        """The memory of the recursion; `asked` names the call that needs it.
+
+        Raises
+        ------
+        InputError
+            Before the number of outputs is known.
+        """
         if self._engine is None:
             raise InputError(
                 f"{asked}: the number of outputs is not known yet; pass outputs= or give a "

@@ -86,8 +86,8 @@ def generate(joint: Joint, made: OnlineEstimator, variables: Sequence[Variable],
 def _functions(made: OnlineEstimator) -> list[Any]:
     import casadi as ca
 
-    engine = made._recursion(made.theta)._ready("generate")
-    found = [engine._formulas.step, engine._formulas.check, made.rows._point, made.rows._slopes]
+    engine = made.recursion(made.theta).engine_for("generate")
+    found = [engine.formulas.step, engine.formulas.check, made.rows.point, made.rows.slopes]
     if made.detector is not None:
         found.append(made.detector.tables().function)
     recursion = []
@@ -244,26 +244,26 @@ def _row_tables(header: _Header, rows: RowMaker) -> None:
     header.define("POINTS", 2 * t.point_half + 1)
     header.define("ROWS_BEFORE_READY", rows.rows_before_ready)
     header.define("N_NEEDED", len(rows.needed))
-    header.define("N_COORDINATES", rows._point.size1_in(2))
-    header.define("N_MEMORY", rows._point.size1_in(3))
+    header.define("N_COORDINATES", rows.point.size1_in(2))
+    header.define("N_MEMORY", rows.point.size1_in(3))
     header.whole("needed", rows.needed)
-    place = rows._place
+    place = rows.place
     header.define("PLACES", len(place))
     header.whole("place_signal", (p[0] for p in place))
     header.whole("place_order", (p[1] for p in place))
     header.whole("place_source", (p[2] for p in place))
     header.whole("source_signal", (_NAMES.index(n) for n in SOURCES))
-    header.whole("speed_signal", rows._speeds)
-    header.whole("point_at", rows._raw_at)
+    header.whole("speed_signal", rows.speeds)
+    header.whole("point_at", rows.raw_at)
     half, averaging = _support(rows.averaging, centre)
     header.define("AVERAGE_HALF", half)
     header.doubles("average_kernel", averaging)
     half, smoothing = _support(
-        np.array([rows._smoothing[order, 0] for _, order, _ in place]), rows._raw_at[0]
+        np.array([rows.smoothing[order, 0] for _, order, _ in place]), rows.raw_at[0]
     )
     for k in range(new):
         shifted = _support(
-            np.array([rows._smoothing[order, k] for _, order, _ in place]), rows._raw_at[k]
+            np.array([rows.smoothing[order, k] for _, order, _ in place]), rows.raw_at[k]
         )
         if shifted[0] != half or not np.array_equal(shifted[1], smoothing):
             raise InputError(
@@ -272,10 +272,10 @@ def _row_tables(header: _Header, rows: RowMaker) -> None:
             )
     header.define("SMOOTH_HALF", half)
     header.doubles("smooth_kernel", smoothing)
-    header.doubles("point_weight", rows._weights)
-    header.doubles("sharp", rows._sharp)
+    header.doubles("point_weight", rows.weights)
+    header.doubles("sharp", rows.sharp)
     header.doubles(
-        "velocity_gain", np.broadcast_to(np.asarray(rows._velocity_gain, dtype=np.float64), (2,))
+        "velocity_gain", np.broadcast_to(np.asarray(rows.velocity_gain, dtype=np.float64), (2,))
     )
     linear = [
         (i, j)
@@ -305,10 +305,10 @@ def _watch_tables(header: _Header, made: OnlineEstimator) -> None:
     header.define("WATCH", made.watch.length)
     for name in ("MOVED", "SCALE_MOTION"):
         header.define(name, float(getattr(watch_settings, f"_{name}")))
-    header.define("SCALE_ERROR", float(watch_settings._SCALE))
-    header.define("NOISE_MEMORY", watch_settings._MEMORY)
+    header.define("SCALE_ERROR", float(watch_settings.SCALE))
+    header.define("NOISE_MEMORY", watch_settings.MEMORY)
     header.whole("present", made.present, "unsigned char")
-    header.whole("needs", made._needs, "unsigned char")
+    header.whole("needs", made.needs, "unsigned char")
     header.define("RECENT_SAMPLES", round(_RECENT / made.dt))
     names = made.names
     stiffness = made.model.stiffness_name
@@ -329,10 +329,10 @@ def _recursion_tables(header: _Header, made: OnlineEstimator) -> None:
     from identification.recursive.settings import start_state
 
     period = made.rows.timing.stride * made.dt
-    engine = made._recursion(made.theta)._ready("generate")
-    layout, n = engine._layout, len(made.names)
+    engine = made.recursion(made.theta).engine_for("generate")
+    layout, n = engine.layout, len(made.names)
     fast, slow = start_state(layout, np.zeros(n), engine.config)
-    header.define("COLLECT", max(made._collect, round(MAX_WARM_UP / period)))
+    header.define("COLLECT", max(made.collect, round(MAX_WARM_UP / period)))
     header.define("LEAST", LEAST)
     header.define("ABSENT", ABSENT)
     header.define("RIDGE", RIDGE)
@@ -352,12 +352,12 @@ def _recursion_tables(header: _Header, made: OnlineEstimator) -> None:
     header.doubles("start_slow", slow)
     header.doubles("start_config", engine.config)
     header.doubles("fixed_theta", made.theta)
-    friction = [[i in where for i in range(n)] for where in made._friction]
-    feels = ", ".join("{" + ", ".join(str(int(v)) for v in line) + "}" for line in made._feels)
+    friction = [[i in where for i in range(n)] for where in made.friction]
+    feels = ", ".join("{" + ", ".join(str(int(v)) for v in line) + "}" for line in made.feels)
     marks = ", ".join("{" + ", ".join(str(int(v)) for v in line) + "}" for line in friction)
     header.raw(f"static const unsigned char is_friction[2][N_THETA] = {{{marks}}};")
     header.raw(f"static const unsigned char feels[N_BALANCES][2] = {{{feels}}};")
-    header.whole("reference_signal", (11 if from_link else 1 for from_link in made._from_link))
+    header.whole("reference_signal", (11 if from_link else 1 for from_link in made.from_link))
     for key, value in made.guard.figures().items():
         header.define(f"GUARD_{key}", value)
     header.whole("is_inertia", (int(i in made.guard.inertias) for i in range(n)), "unsigned char")
@@ -369,7 +369,7 @@ def _recursion_tables(header: _Header, made: OnlineEstimator) -> None:
     header.define("ON_GRID", ON_GRID)
     header.define("GRID_GAP", float(made.grid.gap))
     header.define("ERROR_LIMIT", float(_STRAIN.error_limit))
-    header.define("CONFIRM_ROWS", made._confirm)
+    header.define("CONFIRM_ROWS", made.confirm)
 
 
 def _fault_tables(header: _Header, made: OnlineEstimator) -> None:

@@ -239,13 +239,15 @@ class UserInstance:
             make = self._function("Instantiate", [text, _I, text, text, _P, _I, _I], _P)
             place = (fmu.folder / "resources").as_uri()
             found = make(
-                b"user",
-                0 if self.kind == "me" else 1,
-                str(fmu.description.guid).encode(),
-                place.encode(),
-                ctypes.addressof(self.callbacks),
-                0,
-                0,
+                *(
+                    b"user",
+                    0 if self.kind == "me" else 1,
+                    str(fmu.description.guid).encode(),
+                    place.encode(),
+                    ctypes.addressof(self.callbacks),
+                    0,
+                    0,
+                ),
             )
         else:
             self.callbacks = _LOG3(_note(self.messages))
@@ -257,7 +259,7 @@ class UserInstance:
                 make = self._function(
                     "InstantiateModelExchange", [text, text, text, _B, _B, _P, _LOG3], _P
                 )
-                found = make(b"user", token, place.encode(), False, False, None, self.callbacks)
+                found = make(*(b"user", token, place.encode(), False, False, None, self.callbacks))
             else:
                 make = self._function(
                     "InstantiateCoSimulation",
@@ -265,18 +267,20 @@ class UserInstance:
                     _P,
                 )
                 found = make(
-                    b"user",
-                    token,
-                    place.encode(),
-                    False,
-                    False,
-                    False,
-                    False,
-                    None,
-                    0,
-                    None,
-                    self.callbacks,
-                    None,
+                    *(
+                        b"user",
+                        token,
+                        place.encode(),
+                        False,
+                        False,
+                        False,
+                        False,
+                        None,
+                        0,
+                        None,
+                        self.callbacks,
+                        None,
+                    ),
                 )
         if not found:
             raise FmuError(
@@ -406,11 +410,11 @@ class UserInstance:
         self.messages.clear()
         self.assign(values or {})
         if self.version == 2:
-            self._call("SetupExperiment", [_I, _D, _D, _I, _D], 0, 0.0, time, 0, 0.0)
+            self._call("SetupExperiment", [_I, _D, _D, _I, _D], *(0, 0.0, time, 0, 0.0))
             self._call("EnterInitializationMode", [])
         else:
             self._call(
-                "EnterInitializationMode", [_B, _D, _D, _B, _D], False, 0.0, time, False, 0.0
+                "EnterInitializationMode", [_B, _D, _D, _B, _D], *(False, 0.0, time, False, 0.0)
             )
 
     def ready(self) -> FloatArray:
@@ -478,7 +482,7 @@ class UserInstance:
             status = self._step(self._component, time, step, 1)
         else:
             a = ctypes.addressof(self._flags)
-            status = self._step(self._component, time, step, True, a, a + 8, a + 16, a + 24)
+            status = self._step(*(self._component, time, step, True, a, a + 8, a + 16, a + 24))
         if status > 1:
             raise FmuError(
                 f"{self.fmu.path.name}: doStep failed with status {status} at t = {time:g} "

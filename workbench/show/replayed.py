@@ -1,4 +1,4 @@
-"""What the online estimator made of a record, sample by sample: what the report of a replay shows."""
+"""What the online estimator made of a record: what the report of a replay shows."""
 
 from __future__ import annotations
 
