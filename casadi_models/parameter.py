@@ -16,7 +16,7 @@ Role = Literal[
     "inertia",
     "stiffness",
     "stiffening",
-    "gravity",
+    "weight",
     "static",
     "delay",
     "smoothing",

@@ -155,7 +155,7 @@ CALIBRATION: Final = {
                 start=0.0,
                 low=-math.inf,
                 high=math.inf,
-                meaning="reading of the link encoder, less that of the motor encoder, without twist",
+                meaning="reading of the link encoder less that of the motor encoder, without twist",
                 side="sensor",
             ),
         ),

@@ -105,7 +105,8 @@ def joint_with(label: str) -> Joint:
     typical size.
     """
     base = reference_joint("hd3")
-    base = replace(base, effects=tuple(e for e in base.effects if "stribeck" not in e))
+    common = tuple(e for e in base.effects if EFFECTS[e.partition("@")[0]].common)
+    base = replace(base, effects=common)
     base = replace(
         base, fitted={n: v for n, v in base.fitted.items() if n in base.model().parameter_names}
     )

@@ -24,7 +24,7 @@ def _stored(s: LocalSignals, p: SimpleNamespace) -> Expression:
             "N.m",
             "sine part of the gravity torque: all of it where the link stands or hangs at zero; "
             "positive: upright",
-            role="gravity",
+            role="weight",
             typical=105.18,
         ),
         signed(

@@ -106,7 +106,7 @@ class Follower:
             inertia * tuned.bandwidth**2,
             2 * tuned.damping * inertia * tuned.bandwidth,
             inertia,
-            sum(start[n] for n in model.named("gravity")),
+            sum(start[n] for n in model.named("weight")),
         ]
 
     def run(

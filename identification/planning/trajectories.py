@@ -172,7 +172,7 @@ class Experiment:
         chosen = (
             tuple(parameters)
             if parameters is not None
-            else tuple(n for n in linear if n not in (*model.inertias, *model.named("gravity")))
+            else tuple(n for n in linear if n not in (*model.inertias, *model.named("weight")))
         )
         chosen = tuple(n for n in chosen if not (reduced and n in model.named("stiffening")))
         unknown = [n for n in chosen if n not in linear]

@@ -284,7 +284,7 @@ class _Builder:
             start = dict(zip(self.model.parameter_names, self.model.value_vector(), strict=True))
             inertia = sum(start[n] for n in self.model.inertias)
             damping = 2 * _DAMPING * inertia * BANDWIDTH
-            weight = sum(start[n] for n in self.model.named("gravity"))
+            weight = sum(start[n] for n in self.model.named("weight"))
             unit = self._unit
             stiff = self._parameter(
                 "controller.stiffness",
