@@ -279,6 +279,7 @@ class Registry(Mapping[str, Effect]):
         self._effects: dict[str, Effect] = {}
         self._loaded: dict[Path, EffectFile] = {}
         self._former: dict[str, str] = {}
+        self._typed: dict[str, EffectFile] = {}
 
     def __getitem__(self, key: str) -> Effect:
         try:
@@ -306,6 +307,27 @@ class Registry(Mapping[str, Effect]):
     def is_former(self, key: str) -> bool:
         """True for the key of an effect that is part of another one now."""
         return key in self._former
+
+    def hold(self, effect: Effect, code: bytes) -> None:
+        """Register an effect that was typed as text; it takes the place of one typed before under
+        the same key.
+
+        Parameters
+        ----------
+        effect : Effect
+        code : bytes
+            Python source that declares it, for where the text is not at hand.
+        """
+        if effect.key in self._effects and effect.key not in self._typed:
+            raise ValueError(f"effect {effect.key!r} is in the library already; choose another key")
+        self._effects[effect.key] = effect
+        digest = hashlib.sha256(code).hexdigest()
+        self._typed[effect.key] = EffectFile(Path(f"{effect.key}.py"), digest, (effect.key,), code)
+
+    @property
+    def typed(self) -> tuple[EffectFile, ...]:
+        """The effects that were typed as text, each as a file that declares it."""
+        return tuple(self._typed.values())
 
     @property
     def files(self) -> tuple[EffectFile, ...]:

@@ -122,6 +122,10 @@ class Solvable(Structure, Protocol):
     @property
     def name(self) -> str: ...
     @property
+    def kind(self) -> str: ...
+    @property
+    def symbols(self) -> Symbols: ...
+    @property
     def equations(self) -> Equations: ...
     @property
     def true_equations(self) -> Equations: ...
@@ -342,6 +346,68 @@ def build_equations(model: Structure, symbols: Symbols, *, sensors: bool) -> Equ
     )
 
 
+@final
+@dataclass(frozen=True)
+class PlacedLaw:
+    """One term's law on the model's symbols, with the torsion and its rate left as symbols.
+
+    Attributes
+    ----------
+    term : Term
+    law : expression
+    states : tuple of expression
+        Its internal states.
+    moved : tuple of expression
+        The states after the driving coordinate has moved by `step` in the time `clock`.
+    step : expression
+        Symbol of that step.
+    """
+
+    term: Term
+    law: Expression
+    states: tuple[Expression, ...]
+    moved: tuple[Expression, ...]
+    step: Expression
+
+
+def placed_laws(
+    model: Structure, symbols: Symbols, torsion: Expression, torsion_rate: Expression
+) -> tuple[PlacedLaw, ...]:
+    """Every law of a model in its place, on true signals.
+
+    Parameters
+    ----------
+    model : Structure
+    symbols : Symbols
+    torsion, torsion_rate : symbols
+        Stand for the twist of the transmission and its rate in the laws outside ``torsion``.
+    """
+    builder, s = _Builder(model, symbols), symbols.signals
+    zero = _zero()
+    outside = _View(s, torsion, zero, zero, zero)
+    load = s.torque if model.load_from == "torque" else builder.gravity(outside)
+    views = {
+        "drive": _View(s, zero, zero, s.drive, s.drive_rate),
+        "torsion": _View(s, bare_twist(model, s), s.torque, zero, zero),
+        "motor_position_sensor": _View(s, zero, zero, s.motor_position, s.motor_velocity),
+        "link_position_sensor": _View(s, zero, zero, s.link_position, s.link_velocity),
+        "torque_sensor": _View(s, zero, zero, s.torque, s.torque_rate),
+    }
+    found = []
+    for term in model.terms:
+        view = views.get(term.place, replace(outside, load=load))
+        local = builder.local(term, view)
+        if term.place not in views:
+            local = replace(local, torsion_rate=torsion_rate)
+        if term.place == "transmission":
+            local = replace(local, velocity=torsion_rate)
+        values, step = term.bound(symbols.parameters), ca.SX.sym("step")
+        memory = term.effect.memory
+        moved = () if memory is None else memory(local.memory, step, local, values)
+        found.append(PlacedLaw(term, term.effect.law(local, values), local.memory, moved, step))
+    return tuple(found)
+
+
 def inverse_dynamics(model: Solvable) -> Expression:
     """Right-hand sides of the equations of motion, (drive, 0): what a regressor reproduces."""
     e = model.equations
@@ -363,22 +429,34 @@ def inverse_dynamics(model: Solvable) -> Expression:
 
 
 def linear_set(model: Solvable) -> tuple[str, ...]:
-    """Greedy largest independent set of the graph whose edges are non-zero mutual Hessian
-    entries.
+    """Largest set of parameters that enter the equations of motion jointly linearly."""
+    chosen = jointly_linear(ca.vertcat(inverse_dynamics(model)), model.equations.parameters)
+    return tuple(model.parameter_names[i] for i in chosen)
+
+
+def jointly_linear(rows: Expression, p: Expression) -> tuple[int, ...]:
+    """Greedy largest independent set of the graph whose edges are non-zero mutual Hessian entries.
+
+    Parameters
+    ----------
+    rows : column of expressions
+    p : column of symbols
+
+    Returns
+    -------
+    tuple of int
+        Places in `p`, rising; parameters that no row depends on are not among them.
     """
-    p = model.equations.parameters
-    right = inverse_dynamics(model)
-    names = model.parameter_names
-    edges: dict[int, set[int]] = {i: set() for i in range(len(names))}
-    for row in ca.vertsplit(ca.vertcat(right)):
+    edges: dict[int, set[int]] = {i: set() for i in range(p.numel())}
+    for row in ca.vertsplit(rows):
         sparsity = ca.hessian(row, p)[0].sparsity()
         for i, j in zip(*sparsity.get_triplet(), strict=True):
             edges[i].add(j)
-    present = set(ca.jacobian(right, p).sparsity().get_triplet()[1])
+    present = set(ca.jacobian(rows, p).sparsity().get_triplet()[1])
     chosen = {i for i in edges if i in present and i not in edges[i]}
     while True:
         degree = {i: len(edges[i] & chosen) for i in chosen}
         worst = max(degree, key=lambda i: (degree[i], i), default=None)
         if worst is None or degree[worst] == 0:
-            return tuple(names[i] for i in sorted(chosen))
+            return tuple(sorted(chosen))
         chosen.discard(worst)

@@ -29,6 +29,7 @@ from .equations import (
 )
 from .functions import MEMORY_STEP, JointFunctions
 from .parameter import Parameter, Role
+from .shown import shown
 from .sides import side_factor
 from .term import (
     CALIBRATION,
@@ -380,16 +381,21 @@ class JointModel:
         """The symbolic joint on readings: what the sensors add is taken off (built once per
         model).
         """
-        return build_equations(self, self._symbols, sensors=True)
+        return build_equations(self, self.symbols, sensors=True)
 
     @cached_property
     def true_equations(self) -> Equations:
         """The symbolic joint on true signals, on the same symbols: what a simulation integrates."""
-        return build_equations(self, self._symbols, sensors=False)
+        return build_equations(self, self.symbols, sensors=False)
 
     @cached_property
-    def _symbols(self) -> Symbols:
+    def symbols(self) -> Symbols:
+        """The symbols that all forms of the equations share."""
         return Symbols.of(self)
+
+    def _repr_latex_(self) -> str:
+        """The equations and values in a notebook (see :mod:`casadi_models.shown`)."""
+        return shown(self, "latex")
 
     @cached_property
     def linear_parameters(self) -> tuple[str, ...]:

@@ -12,7 +12,9 @@ from typing import Any, Final, final
 from casadi_models import JointModel
 from casadi_models.term import INERTIAS
 from casadi_models.transmission import MODELS
+from casadi_models.typed_law import TypedLaw
 from identification.data.own_effects import TABLE, load_remembered, remembered
+from identification.data.typed_laws import LAWS, hold_laws, law_lines, read_laws
 from identification.data.units import base_unit, same_dimension
 from identification.errors import InputError
 
@@ -30,7 +32,7 @@ _JOINT_KEYS: Final = frozenset(
     )
 )
 _KNOWN_KEYS: Final = ("value", "low", "high", "unit", "side", "source", "note")
-_TABLES: Final = ("joint", "known", "columns", "fitted", "calibration", "provenance", TABLE)
+_TABLES: Final = ("joint", "known", "columns", "fitted", "calibration", "provenance", TABLE, LAWS)
 
 
 @final
@@ -60,6 +62,8 @@ class Joint:
         Labels beyond the model's own.
     known, fitted : mapping
         By parameter name; fitted values come from a fit written back.
+    errors : mapping
+        Standard errors of fitted values, where the file has them.
     columns : mapping or None
         Column map of the record files.
     orders : tuple of float
@@ -67,6 +71,8 @@ class Joint:
         per motor turn, or per metre.
     pitch : float or None
         Travel of a linear axis per turn of its motor [m].
+    laws : mapping of str to TypedLaw
+        Laws typed as text, by the key of their effect.
     """
 
     name: str = "joint"
@@ -78,11 +84,13 @@ class Joint:
     effects: tuple[str, ...] = ()
     known: Mapping[str, Known] = field(default_factory=dict)
     fitted: Mapping[str, float] = field(default_factory=dict)
+    errors: Mapping[str, float] = field(default_factory=dict)
     columns: Mapping[str, Any] | None = None
     virtual_work: bool = True
     source: str = ""
     orders: tuple[float, ...] = ()
     pitch: float | None = None
+    laws: Mapping[str, TypedLaw] = field(default_factory=dict)
 
     def model(self) -> JointModel:
         """The joint model with its effects (values of a fit written back included).
@@ -92,6 +100,9 @@ class Joint:
         InputError
             An effect that is not in the library.
         """
+        hold_laws(
+            self.laws, self.source or self.name
+        )  # another joint's law may have had the key since
         try:
             model = replace(
                 JointModel.by_name(
@@ -185,6 +196,12 @@ def parse_joint(data: Mapping[str, Any], source: str = "joint") -> Joint:
         virtual_work=_flag(table, "virtual_work", source),
         source=source,
         fitted={k: _fitted(k, v, source) for k, v in data.get("fitted", {}).items()},
+        errors={
+            k: _entry_number(v, "stderr", f"{source}: [fitted] {k}")
+            for k, v in data.get("fitted", {}).items()
+            if "stderr" in v
+        },
+        laws=read_laws(data.get(LAWS, {}), kind, source),
     )
     load_remembered(data.get(TABLE, {}), source)
     model = joint.model()
@@ -368,6 +385,7 @@ def toml_text(
     ]
     if not joint.virtual_work:
         lines.append("virtual_work = false")
+    lines += law_lines(joint.laws)
     lines += remembered((*joint.effects, *outside))
     if joint.known or joint.orders or joint.pitch is not None:
         lines += ["", "[known]"]

@@ -28,15 +28,21 @@ _LARGEST: Final = 1 << 20
 
 
 def files_of(labels: Iterable[str]) -> tuple[EffectFile, ...]:
-    """The users' files from which these effects come, each once."""
-    keys = {label.partition("#")[0].partition("@")[0] for label in labels}
-    return tuple(f for f in EFFECTS.files if keys & set(f.keys))
+    """The users' files from which these effects come, each once; a typed law is a file of its
+    own.
+    """
+    keys = _keys(labels)
+    return tuple(f for f in (*EFFECTS.files, *EFFECTS.typed) if keys & set(f.keys))
+
+
+def _keys(labels: Iterable[str]) -> set[str]:
+    return {label.partition("#")[0].partition("@")[0] for label in labels}
 
 
 def remembered(labels: Iterable[str]) -> list[str]:
     """The lines of a joint file that name the files of these effects."""
-    lines = []
-    for found in files_of(labels):
+    lines, used = [], _keys(labels)
+    for found in (f for f in EFFECTS.files if used & set(f.keys)):
         keys = ", ".join(f'"{key}"' for key in found.keys)
         lines.append(
             f'"{_escaped(str(found.path))}" = {{ sha256 = "{found.sha256}", keys = [{keys}] }}'

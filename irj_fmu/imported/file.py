@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Any, Final
 from casadi_models import JointModel
 from casadi_models.term import TOTAL_INERTIA
 from identification.data.joint_file import Joint, parse_joint, toml_text
+from identification.data.typed_laws import LAWS
 from identification.errors import InputError
 from irj_fmu.imported.correction import PREFIX, Correction, correction_of
 from irj_fmu.imported.model import Mapped, UserModel, load_user_model
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     from irj_fmu.imported.fit import UserFit
 
 _KEYS: Final = ("fmu", "window", "hold", "kind", "outside", "channels", "parameters", "start")
-_TABLES: Final = ("joint", "model", "columns", "fitted", "provenance")
+_TABLES: Final = ("joint", "model", "columns", "fitted", "provenance", LAWS)
 _ENTRY: Final = {"channels": "variable", "start": "channel"}
 
 
@@ -91,7 +92,7 @@ def load_user_joint(path: str | Path) -> UserModel:
             f"{path}: [model] fmu = {_shown(table['fmu'])} is not the name of an FMU; write fmu "
             '= "file.fmu"'
         )
-    rest = {k: v for k, v in data.items() if k in ("joint", "columns")}
+    rest = {k: v for k, v in data.items() if k in ("joint", "columns", LAWS)}
     joint = parse_joint({**rest, "joint": {**rest.get("joint", {}), "model": "hd1"}}, str(path))
     fmu = path.parent / table["fmu"]
     fitted = {str(k): _value(v, f"{path}: [fitted] {k}") for k, v in data.get("fitted", {}).items()}

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from casadi_models import EFFECTS
 from identification.data.joint_file import Joint
 from identification.data.record import Record
 from identification.diagnosis.improve import RATIO_LIMIT
@@ -544,6 +545,41 @@ def test_commands_with_an_fmu_as_the_model(
     assert (tmp_path / "user_axis_pair.fmu").is_file()
     with pytest.raises(InputError, match="irj track"):
         irj("track", train, "--joint", final)
+
+
+def test_a_typed_law_rides_outside_an_fmu(folder: Path, dragged: Record, tmp_path: Path) -> None:
+    """The drag typed as text is fitted like the library's."""
+    joint, larger, final = (tmp_path / f"{n}.toml" for n in ("user", "larger", "final"))
+    joint.write_text(FILE.format(fmu=fmu(folder, "Axis", Make(2, CS))))
+    part = dragged.window(0, 3)
+    np.savez(
+        tmp_path / "r.npz",
+        **{
+            "time_s": part.time,
+            "motor_position_rad": part["motor_position"],
+            "motor_torque_N.m": part["motor_torque"],
+        },
+    )
+    words = (
+        "--law",
+        "c*v*abs(v)",
+        "--on",
+        "motor",
+        "--parameter",
+        "c=-1e3..1e3 N.m.s2/rad2",
+        "--key",
+        "typed_drag",
+    )
+    try:
+        assert irj("add", *words, "--joint", str(joint), "-o", str(larger)) == 0
+        assert load_user_joint(larger).joint.laws["typed_drag"].text == "c*v*abs(v)"
+        assert irj("fit", str(tmp_path / "r.npz"), "--joint", str(larger), "-o", str(final)) == 0
+        assert load_user_joint(final).values[f"{PREFIX}typed_drag_c"] == pytest.approx(
+            DRAG, rel=0.05
+        )
+    finally:
+        EFFECTS._effects.pop("typed_drag", None)
+        EFFECTS._typed.clear()
 
 
 def test_an_fmu_that_fails_is_unusable_input(folder: Path, plain: Record, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ that do the work.
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import tempfile
 from argparse import Namespace
@@ -62,7 +63,8 @@ def _kind(rest: list[str], known: Sequence[str]) -> tuple[str | None, list[str]]
 def _export_code(rest: Sequence[str]) -> int:
     parser = OneLineParser(
         prog=f"irj export {rest[0]}",
-        description="Dynamics, regressor, Jacobian and energy of a joint as code.",
+        description="Dynamics, regressor, Jacobian, energy and friction compensation of a joint "
+        "as code.",
     )
     parser.add_argument("kind", choices=CODE_KINDS)
     parser.add_argument("--joint", required=True)
@@ -87,8 +89,12 @@ def export_code(kind: str, joint_path: str, folder: Path) -> list[Path]:
     """
     import casadi as ca
 
+    from casadi_models.compensation import friction_compensation
+
     model = open_joint(joint_path).model()
     functions = [getattr(model, name) for name in FUNCTIONS]
+    with contextlib.suppress(ValueError):  # a joint without friction has none to compensate
+        functions.append(friction_compensation(model))
     values = [
         {"name": p.name, "value": v, "unit": p.unit, "side": p.side}
         for p, v in zip(model.parameters, model.value_vector(), strict=True)
@@ -100,8 +106,8 @@ def export_code(kind: str, joint_path: str, folder: Path) -> list[Path]:
                 code.add(function)
             code.generate(temporary + "/")
         else:
-            for name, function in zip(FUNCTIONS, functions, strict=True):
-                function.save(str(Path(temporary) / f"{name}.casadi"))
+            for function in functions:
+                function.save(str(Path(temporary) / f"{function.name()}.casadi"))
         write_json(Path(temporary) / "parameters.json", values)
         made = {path.name: path.read_bytes() for path in sorted(Path(temporary).iterdir())}
     keep_inputs([folder / name for name in made], [joint_path])

@@ -6,7 +6,8 @@ from argparse import Namespace
 from dataclasses import replace
 
 from casadi_models import EFFECTS
-from identification.data.joint_file import toml_text
+from casadi_models.typed_law import LawError, TypedLaw, derived_key, register
+from identification.data.joint_file import Joint, toml_text
 from identification.errors import InputError
 from workbench.cli.files import open_joint, write_json, write_text
 
@@ -53,14 +54,40 @@ def run_effects(arguments: Namespace) -> int:
 
 
 def run_add(arguments: Namespace) -> int:
-    """`irj add KEY --joint J -o J2`."""
+    """`irj add KEY --joint J -o J2`, or a law typed in one line with `--law`."""
     joint = open_joint(arguments.joint)
+    key = arguments.key
+    if key is None or arguments.law is not None:
+        joint, key = with_law(joint, arguments)
+    elif arguments.on or arguments.parameter or arguments.named:
+        raise InputError("add: --on, --parameter and --key describe a law; give it with --law")
     try:
-        model = joint.model().add(arguments.key)
+        model = joint.model().add(key)
     except (KeyError, ValueError) as error:
         raise InputError(f"{arguments.joint}: {error.args[0]}") from None
-    larger = replace(joint, effects=(*joint.effects, arguments.key))
+    larger = replace(joint, effects=(*joint.effects, key))
     write_text(arguments.output, toml_text(larger))
     print(f"{arguments.output}: {', '.join(model.effects)}")
     write_json(arguments.json, {"effects": list(model.effects), "file": arguments.output})
     return 0
+
+
+def with_law(joint: Joint, arguments: Namespace) -> tuple[Joint, str]:
+    """The joint with a typed law among its laws, and the label of its effect."""
+    if arguments.law is None:
+        raise InputError(
+            "add: give the key of an effect, or a law with --law (`irj effects` lists the library)"
+        )
+    if arguments.key is not None and arguments.named is not None:
+        raise InputError(
+            f"add: the law has two keys, {arguments.key} and {arguments.named}; give one"
+        )
+    places = tuple(p.strip() for words in arguments.on for p in words.split(","))
+    parameters = tuple(arguments.parameter)
+    key = arguments.named or arguments.key or derived_key(arguments.law, places, parameters)
+    law = TypedLaw(key, arguments.law, places, parameters, joint.kind)
+    try:
+        register(law)
+    except LawError as error:
+        raise InputError(f"--law: {error}") from None
+    return replace(joint, laws={**joint.laws, key: law}), key

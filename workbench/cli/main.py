@@ -202,9 +202,53 @@ def _parser() -> argparse.ArgumentParser:
     listed = verb("effects", "library", "list the effect library, or one effect")
     listed.add_argument("key", nargs="?", help="key of one effect")
     added = verb("add", "library", "add an effect to a joint file")
-    added.add_argument("key", help="effect key, or key@place")
+    added.add_argument("key", nargs="?", help="effect key, or key@place")
+    added.add_argument(
+        "--law",
+        metavar="TEXT",
+        help='a law of your own, as "c*tanh(v/b)"; write --law="-c*v" where it starts with a minus',
+    )
+    added.add_argument(
+        "--on",
+        metavar="PLACE",
+        action="append",
+        default=[],
+        help="where the law acts: motor, link, transmission...",
+    )
+    added.add_argument(
+        "--parameter",
+        metavar="NAME=LOW..HIGH UNIT",
+        action="append",
+        default=[],
+        help='a parameter of the law, as "b=0.01..1 rad/s"',
+    )
+    added.add_argument(
+        "--key", dest="named", metavar="KEY", help="key of the law (default: one derived from it)"
+    )
     added.add_argument("--joint", metavar="J", required=True)
     added.add_argument("-o", "--output", metavar="FILE", required=True)
+    displayed = verb(
+        "show",
+        "show",
+        "write down the equations of a joint with values, standard errors and units",
+        joint=True,
+    )
+    displayed.add_argument(
+        "--format", choices=("text", "latex", "sympy"), default="text", help="default text"
+    )
+    displayed.add_argument(
+        "--compensation",
+        action="store_true",
+        help="the friction torque alone, as a table over velocity",
+    )
+    displayed.add_argument(
+        "--max-speed",
+        type=float,
+        default=60.0,
+        metavar="DEG_S",
+        help="fastest speed of the table [deg/s; m/s on a linear axis]",
+    )
+    displayed.add_argument("-o", "--output", metavar="FILE", help="write to a file")
     simulated = verb("simulate", "virtual", "simulate the joint with its sensors", joint=True)
     simulated.add_argument(
         "--hide",

@@ -18,6 +18,7 @@ from identification.data.record import Record
 from identification.errors import InputError
 from irj_fmu.command_line import OneLineParser, check_output, keep_inputs
 from workbench.cli.files import distinct, open_records, progress_bar, write_json, write_text
+from workbench.cli.library import with_law
 from workbench.cli.records import checked
 
 if TYPE_CHECKING:
@@ -230,8 +231,11 @@ def run_add(arguments: Namespace) -> int:
     from irj_fmu.imported.file import load_user_joint, outside_correction, user_joint_text
 
     model = load_user_joint(arguments.joint)
-    before = model.correction
-    labels = [*(before.labels if before else ()), arguments.key]
+    key, before = arguments.key, model.correction
+    if key is None or arguments.law is not None:
+        joint, key = with_law(model.joint, arguments)
+        model = replace(model, joint=joint)
+    labels = [*(before.labels if before else ()), key]
     values = (
         {}
         if before is None

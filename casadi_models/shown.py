@@ -1,0 +1,361 @@
+"""The equations of a joint for a reader: balances, laws, values, as text, LaTeX or sympy code.
+
+Each equation is a sum of parts, one per effect, taken from the model's own CasADi expressions
+(:func:`casadi_models.equations.placed_laws`) and written by :mod:`casadi_models.written`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, Final, final
+
+import casadi as ca
+
+from .equations import PlacedLaw, Solvable, bare_twist, placed_laws, time_derivative
+from .quantities import linear_unit
+from .signals import SIGNAL_UNITS, Expression, Signals
+from .written import Language, identifier, latex_name, written
+
+LATEX_SIGNALS: Final[Mapping[str, str]] = {
+    "time": "t",
+    "drive": "T_d",
+    "drive_rate": r"\dot T_d",
+    "motor_position": "q_m",
+    "motor_velocity": r"\dot q_m",
+    "motor_acceleration": r"\ddot q_m",
+    "motor_jerk": r"\dddot q_m",
+    "link_position": "q_l",
+    "link_velocity": r"\dot q_l",
+    "link_acceleration": r"\ddot q_l",
+    "link_jerk": r"\dddot q_l",
+    "torque": "T",
+    "torque_rate": r"\dot T",
+    "temperature": r"\vartheta",
+    "torsion": r"\delta",
+    "torsion_rate": r"\dot\delta",
+    "motor_lever": r"\lambda_m",
+    "link_lever": r"\lambda_l",
+    "torque_reading": "T_r",
+    "motor_position_reading": "q_{m,r}",
+    "link_position_reading": "q_{l,r}",
+    "step": r"\Delta",
+    "clock": "h",
+}
+_SENSED: Final[Mapping[str, str]] = {
+    "motor_position_sensor": "motor_position",
+    "link_position_sensor": "link_position",
+    "torque_sensor": "torque",
+}
+_WIDTH: Final = 60
+"""Column at which the text says which effect a part is."""
+
+
+@final
+@dataclass(frozen=True)
+class ShownEquation:
+    """``left = sum of parts``.
+
+    Attributes
+    ----------
+    key, title : str
+        Identifier and heading.
+    left : expression
+        A symbol or a sum of few.
+    parts : tuple of (str, expression)
+        What each part comes from, and the part.
+    unit : str
+    """
+
+    key: str
+    title: str
+    left: Expression
+    parts: tuple[tuple[str, Expression], ...]
+    unit: str
+
+    @property
+    def right(self) -> Expression:
+        """Sum of the parts."""
+        total: Expression = ca.SX(0)
+        for _, part in self.parts:
+            total = total + part
+        return total
+
+
+def shown_equations(model: Solvable) -> tuple[ShownEquation, ...]:
+    """The equations of a joint, on the symbols of ``model.true_equations``.
+
+    The symbols ``torsion`` and ``torsion_rate`` stand for what two of the equations define;
+    ``motor_torque`` for the drive with what its effects add; ``_reading`` marks what a sensor
+    shows.
+    """
+    symbols = model.symbols
+    torsion, rate = ca.SX.sym("torsion"), ca.SX.sym("torsion_rate")
+    laws = placed_laws(model, symbols, torsion, rate)
+    found = _mechanics(model, laws, torsion, rate)
+    found += _sensors(laws, symbols.signals)
+    found += _memories(laws)
+    return tuple(_converted(e, model.kind) for e in found)
+
+
+def _of(
+    laws: Sequence[PlacedLaw], place: str, factor: float = 1.0
+) -> tuple[tuple[str, Expression], ...]:
+    return tuple(
+        (x.term.label, x.law if factor == 1.0 else factor * x.law)
+        for x in laws
+        if x.term.place == place
+    )
+
+
+def _mechanics(
+    model: Solvable, laws: Sequence[PlacedLaw], torsion: Expression, rate: Expression
+) -> list[ShownEquation]:
+    """Balances of motor, link and transmission."""
+    e, s = model.true_equations, model.symbols.signals
+    found = []
+    total, driving = s.drive, _of(laws, "drive")
+    if driving:
+        total = ca.SX.sym("motor_torque")
+        found.append(
+            ShownEquation(
+                "drive", "torque of the motor", total, (("drive", s.drive), *driving), "N.m"
+            )
+        )
+    if not model.is_elastic:
+        inertia: Expression = sum(e.inertia.values())
+        parts = (
+            ("inertia", inertia * s.motor_acceleration),
+            *_of(laws, "motor"),
+            *_of(laws, "link"),
+        )
+        found.append(
+            ShownEquation(
+                "joint",
+                "balance of the rigid joint (link_position = motor_position)",
+                total,
+                parts,
+                "N.m",
+            )
+        )
+        if "link_inertia" in e.inertia:
+            carried = (
+                ("inertia", e.inertia["link_inertia"] * s.link_acceleration),
+                *_of(laws, "link"),
+            )
+            found.append(ShownEquation("link", "torque into the link", s.torque, carried, "N.m"))
+        return found
+    motor = (("inertia", e.inertia["motor_inertia"] * s.motor_acceleration), *_of(laws, "motor"))
+    motor_lever, link_lever = _lever("motor", e.motor_lever), _lever("link", e.link_lever)
+    passed = ("transmitted", s.torque * motor_lever)
+    found.append(ShownEquation("motor", "motor balance", total, (*motor, passed), "N.m"))
+    gear = _of(laws, "transmission")
+    found.append(ShownEquation("transmission", "torque of the transmission", s.torque, gear, "N.m"))
+    errors = _of(laws, "torsion", -1.0)
+    twist = (("positions", bare_twist(model, s)), *errors)
+    found.append(ShownEquation("torsion", "torsion", torsion, twist, "rad"))
+    turned = e.torsion if model.virtual_work else bare_twist(model, s)
+    found.append(
+        ShownEquation(
+            "torsion_rate",
+            "rate of the torsion",
+            rate,
+            (("velocities", time_derivative(turned, s)),),
+            "rad/s",
+        )
+    )
+    link = (("inertia", e.inertia["link_inertia"] * s.link_acceleration), *_of(laws, "link"))
+    found.append(ShownEquation("link", "link balance", s.torque * link_lever, link, "N.m"))
+    for lever, value in ((motor_lever, e.motor_lever), (link_lever, e.link_lever)):
+        if not lever.is_constant():
+            title = "share of the torque that a side feels through the kinematic error"
+            found.append(ShownEquation(lever.name(), title, lever, (("virtual work", value),), "1"))
+    return found
+
+
+def _lever(side: str, value: Expression) -> Expression:
+    """A symbol for a lever that is no number."""
+    return value if value.is_constant() else ca.SX.sym(f"{side}_lever")
+
+
+def _sensors(laws: Sequence[PlacedLaw], signals: Signals) -> list[ShownEquation]:
+    """True values from readings; the laws see the reading where the balances see the true value."""
+    found = []
+    for place, channel in _SENSED.items():
+        own = _of(laws, place)
+        if own:
+            true, reading = getattr(signals, channel), ca.SX.sym(f"{channel}_reading")
+            parts = zip(
+                (n for n, _ in own),
+                ca.substitute([x for _, x in own], [true], [reading]),
+                strict=True,
+            )
+            title = f"{channel.replace('_', ' ')} from its reading"
+            found.append(
+                ShownEquation(
+                    f"{channel}_from_reading",
+                    title,
+                    true,
+                    (("reading", reading), *parts),
+                    SIGNAL_UNITS[channel],
+                )
+            )
+    return found
+
+
+def _memories(laws: Sequence[PlacedLaw]) -> list[ShownEquation]:
+    """States after their coordinate has moved by ``step``."""
+    found = []
+    for x in laws:
+        for i, after in enumerate(x.moved):
+            name = f"{identifier(x.term.label)}_{i}"
+            title = (
+                f"{x.term.label}: its state {i} after the position (of a transmission: the "
+                "torsion) has moved by step"
+            )
+            found.append(
+                ShownEquation(
+                    f"{name}_next", title, ca.SX.sym(f"{name}_next"), ((x.term.label, after),), "1"
+                )
+            )
+    return found
+
+
+def _converted(e: ShownEquation, kind: str) -> ShownEquation:
+    return (
+        e
+        if kind == "rotary"
+        else ShownEquation(e.key, e.title, e.left, e.parts, linear_unit(e.unit))
+    )
+
+
+# --- as text, LaTeX, sympy ------------------------------------------------------------------------
+
+
+def shown(
+    model: Solvable,
+    language: Language = "text",
+    errors: Mapping[str, float] = MappingProxyType({}),
+) -> str:
+    """The joint's equations and values.
+
+    Parameters
+    ----------
+    model : Solvable
+    language : {"text", "latex", "sympy"}
+    errors : mapping
+        Standard errors of the values, by parameter name.
+    """
+    equations = shown_equations(model)
+    if language == "latex":
+        return _latex(equations, values_of(model, errors))
+    return (
+        _sympy(equations, model, errors) if language == "sympy" else _text(equations, model, errors)
+    )
+
+
+def values_of(model: Solvable, errors: Mapping[str, float]) -> list[dict[str, Any]]:
+    """Name, value, standard error (None where there is none), unit, side and meaning of every
+    parameter.
+    """
+    return [
+        {
+            "name": p.name,
+            "value": v,
+            "stderr": errors.get(p.name),
+            "unit": p.unit,
+            "side": p.side,
+            "meaning": p.meaning,
+        }
+        for p, v in zip(model.parameters, model.value_vector(), strict=True)
+    ]
+
+
+def _text(equations: Sequence[ShownEquation], model: Solvable, errors: Mapping[str, float]) -> str:
+    lines = [
+        f"{model.name}: gear ratio {model.gear_ratio:g}; all quantities are referred to the "
+        "link, in SI units"
+    ]
+    for e in equations:
+        lines += ["", f"{e.title} [{e.unit}]", f"  {written(e.left)} ="]
+        for i, (source, part) in enumerate(e.parts):
+            body = written(part)
+            minus = i > 0 and body.startswith("-") and " + " not in body and " - " not in body
+            head = "-" if minus else "+" if i else " "
+            body = body[1:] if minus else body
+            lines.append(f"    {head} {body}".ljust(_WIDTH) + f"  # {source}")
+    lines += ["", "values +- standard error"]
+    for v in values_of(model, errors):
+        error = f" +- {v['stderr']:.2g}" if v["stderr"] is not None else ""
+        lines.append(
+            f"  {v['name']} = {v['value']:.6g}{error} {v['unit']}".ljust(_WIDTH)
+            + f"  # {v['meaning']}"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def _latex(equations: Sequence[ShownEquation], values: Sequence[Mapping[str, Any]]) -> str:
+    rows = []
+    for e in equations:
+        left = written(e.left, "latex", LATEX_SIGNALS)
+        for i, (_, part) in enumerate(e.parts):
+            body = written(part, "latex", LATEX_SIGNALS)
+            join = f"{left} &= " if i == 0 else "&\\quad " if body.startswith("-") else "&\\quad + "
+            rows.append(f"  {join}{body}")
+    table = [
+        rf"  {latex_name(v['name'])} &= {_latex_number(v['value'])}"
+        + (rf" \pm {_latex_number(v['stderr'], 2)}" if v["stderr"] is not None else "")
+        + (rf"\;{_latex_unit(v['unit'])}" if v["unit"] != "1" else "")
+        for v in values
+    ]
+    blocks = [
+        r"\begin{aligned}" + "\n" + " \\\\\n".join(part) + "\n" + r"\end{aligned}"
+        for part in (rows, table)
+    ]
+    return "\n".join(f"\\[\n{block}\n\\]" for block in blocks) + "\n"
+
+
+def _latex_number(value: float, digits: int = 6) -> str:
+    head, found, power = f"{value:.{digits}g}".partition("e")
+    return rf"{head} \cdot 10^{{{int(power)}}}" if found else head.replace("inf", r"\infty")
+
+
+def _latex_unit(unit: str) -> str:
+    return r"\mathrm{" + re.sub(r"(\d+)", r"^{\1}", unit).replace(".", r"\,") + "}"
+
+
+def _sympy(equations: Sequence[ShownEquation], model: Solvable, errors: Mapping[str, float]) -> str:
+    """Python code that defines the symbols, one ``Eq`` for each equation, ``values`` and
+    ``errors``.
+    """
+    names: dict[str, None] = {}
+    for e in equations:
+        for x in ca.symvar(ca.vertcat(e.left, *(part for _, part in e.parts))):
+            names[identifier(x.name())] = None
+    names.update(dict.fromkeys(model.parameter_names))
+    lines = [
+        f"# {model.name!r}: gear ratio {model.gear_ratio!r}; link-referred, SI units",
+        "from sympy import *",
+        "",
+    ]
+    lines += [f'{n} = Symbol("{n}", real=True)' for n in names]
+    lines.append("equations = {}")
+    for e in equations:
+        right = " + ".join(f"({written(part, 'sympy')})" for _, part in e.parts)
+        lines += [
+            f"# {e.title} [{e.unit}]",
+            f'equations["{e.key}"] = Eq('
+            f"{written(e.left, 'sympy')}, {right or '0'}, evaluate=False)",
+        ]
+    lines.append("values = {")
+    for v in values_of(model, errors):
+        lines.append(f"    {v['name']}: {v['value']!r},  # {v['unit']}")
+    lines += [
+        "}",
+        "errors = {",
+        *(f"    {n}: {v!r}," for n, v in errors.items() if n in names),
+        "}",
+    ]
+    return "\n".join(lines) + "\n"
