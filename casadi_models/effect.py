@@ -15,11 +15,12 @@ from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
-from typing import Final, Literal, final
+from typing import Any, Final, Literal, final, get_args
 
 import casadi as ca
 
 from .parameter import Parameter, Side
+from .quantities import UnitError, side_power
 from .signals import Expression, LocalSignals
 
 Place = Literal[
@@ -224,16 +225,67 @@ class Effect:
     @cached_property
     def reads(self) -> frozenset[str]:
         """Names of the signals (of :class:`LocalSignals`) that the law uses."""
-        symbols = {f.name: ca.SX.sym(f.name) for f in fields(LocalSignals) if f.name != "memory"}
-        states = tuple(ca.SX.sym(f"z{i}") for i in range(self.states))
-        values = SimpleNamespace(**{p.name: ca.SX.sym(p.name) for p in self.parameters})
-        found = ca.SX(self.law(LocalSignals(memory=states, **symbols), values))
-        return frozenset(n for n, x in symbols.items() if ca.depends_on(found, x))
+        local, values = self._symbols()
+        found = ca.SX(self.law(local, values))
+        names = (f.name for f in fields(LocalSignals) if f.name != "memory")
+        return frozenset(n for n in names if ca.depends_on(found, getattr(local, n)))
 
     @property
     def warms(self) -> bool:
         """True for a law of the temperature."""
         return "temperature" in self.reads
+
+    def check(self) -> None:
+        """Try the declaration symbolically: what is only found out in the middle of a fit is said
+        here.
+
+        Raises
+        ------
+        ValueError
+            A place, family or stage that does not exist; a unit that is not known; a law, memory or
+            rate that returns anything but scalar expressions.
+        """
+        where = f"effect {self.key!r}"
+        for word, found, known in (
+            *(("place", place, get_args(Place)) for place in self.acts_on),
+            ("family", self.family, get_args(Family)),
+            ("stage", self.stage, get_args(Stage)),
+        ):
+            if found not in known:
+                raise ValueError(f"{where}: no {word} {found!r}; use one of {', '.join(known)}")
+        if not isinstance(self.acts_on, tuple) or not self.acts_on:
+            raise ValueError(f"{where}: acts_on must be a tuple of places, as ('motor',)")
+        for p in self.parameters:
+            try:
+                side_power(p.unit)
+            except UnitError as error:
+                raise ValueError(f"{where}: parameter {p.name!r}: {error}") from None
+        local, values = self._symbols()
+        _scalar(self.law(local, values), f"{where}: its law")
+        if self.potential is not None:
+            _scalar(self.potential(local, values), f"{where}: its potential")
+        if self.memory is not None:
+            self._check_states(
+                "memory", self.memory(local.memory, ca.SX.sym("step"), local, values)
+            )
+        if self.rate is not None:
+            self._check_states("rate", self.rate(local.memory, local, values))
+
+    def _check_states(self, name: str, found: object) -> None:
+        where = f"effect {self.key!r}: its {name}"
+        if not isinstance(found, tuple | list) or len(found) != self.states:
+            raise ValueError(
+                f"{where} must return a tuple of {self.states} expression(s), one a state"
+            )
+        for entry in found:
+            _scalar(entry, where)
+
+    def _symbols(self) -> tuple[LocalSignals, SimpleNamespace]:
+        """Free symbols for all that a law may use."""
+        symbols = {f.name: ca.SX.sym(f.name) for f in fields(LocalSignals) if f.name != "memory"}
+        states = tuple(ca.SX.sym(f"z{i}") for i in range(self.states))
+        values = SimpleNamespace(**{p.name: ca.SX.sym(p.name) for p in self.parameters})
+        return LocalSignals(memory=states, **symbols), values
 
     @property
     def amplitudes(self) -> tuple[Parameter, ...]:
@@ -362,6 +414,8 @@ class Registry(Mapping[str, Effect]):
         try:
             exec(compile(code, str(path), "exec"), module.__dict__)
             self._check_references(set(self._effects) - before, path)
+            for key in sorted(set(self._effects) - before):
+                self._effects[key].check()
         except BaseException:
             self._effects = kept
             raise
@@ -383,6 +437,22 @@ class Registry(Mapping[str, Effect]):
                     raise ValueError(
                         f"{path}: effect {key!r} names {other!r}, which is not in the library"
                     )
+
+
+def _scalar(found: Any, what: str) -> None:
+    """Refuse anything but one expression or number."""
+    if found is None:
+        raise ValueError(
+            f"{what} returns None; it must return an expression (is a `return` missing?)"
+        )
+    try:
+        shape = ca.SX(found).shape
+    except Exception:  # CasADi raises several kinds for what is no expression
+        raise ValueError(
+            f"{what} returns {type(found).__name__}, not an expression of CasADi"
+        ) from None
+    if shape != (1, 1):
+        raise ValueError(f"{what} returns {shape[0]} x {shape[1]} values; it must return one")
 
 
 def _only_python(path: Path) -> None:

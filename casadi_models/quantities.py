@@ -280,6 +280,10 @@ def named(name: str, counts_per_turn: float | None = None) -> BaseUnit:
 _TOKEN: Final = re.compile(r"g0(?!\d)|[A-Za-zµμ°%Ω]+|[-+]?\d+|\*\*|[\^.*·⋅/()]|\S")
 _WHOLE: Final = re.compile(r"[-+]?\d+")
 Factors = tuple[tuple[str, int], ...]
+_LONGEST: Final = 64
+"""Characters of a unit at most; the longest in use, ``N.m.s2/(rad.A)`` and its like, have 20."""
+_HIGHEST: Final = 12
+"""Largest power that is read; the highest that occurs in a law is 5 (rad5)."""
 
 
 class _Parser:
@@ -329,7 +333,10 @@ class _Parser:
                 raise UnitError("a power must be a whole number")
         if self.peek() and _WHOLE.fullmatch(self.peek()):
             power = int(self.take())
-        return tuple((name, power * own) for name, own in inner)
+        found = tuple((name, power * own) for name, own in inner)
+        if any(abs(own) > _HIGHEST for _, own in found):
+            raise UnitError(f"no power may be over {_HIGHEST}")
+        return found
 
 
 @lru_cache(maxsize=1024)
@@ -348,6 +355,8 @@ def factors(unit: str, *, lenient: bool = False) -> Factors:
     UnitError
         A text that is no unit.
     """
+    if len(unit) > _LONGEST:
+        raise UnitError(f"longer than {_LONGEST} characters")
     parser = _Parser(unit, lenient=lenient)
     found = parser.product()
     if parser.peek():
@@ -390,7 +399,10 @@ def base_unit(
         result = _PLAIN
         for name, power in factors(text, lenient=lenient):
             result = result.times(named(name, counts_per_turn).power(power))
+        if not 0.0 < abs(result.factor) < math.inf:
+            raise UnitError("its factor to SI is no number that a computer can hold")
     except UnitError as error:
+        text = text if len(text) <= _LONGEST else text[:_LONGEST] + "..."
         detail = "" if str(error) == f"unit {text!r} is not known" else f" ({error})"
         raise UnitError(
             f"unit {text!r} is not understood{detail}: write it like N.m/rad, rad/s, mA, kg.m2"

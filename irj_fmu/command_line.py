@@ -10,6 +10,7 @@ import json
 import math
 import os
 import secrets
+import shlex
 import signal
 import sys
 import tempfile
@@ -19,8 +20,11 @@ from pathlib import Path
 from types import FrameType
 from typing import IO, Any, Final, NoReturn, final
 
+from identification.crash import internal_error
 from identification.errors import InputError
 
+CRASHED: Final = 3
+"""Exit code after an error of the program itself: no answer, neither yes nor no."""
 INTERRUPTED: Final = 130
 """Exit code after Ctrl-C."""
 STOPPED: Final[list[int]] = []
@@ -89,6 +93,23 @@ def fail(text: str) -> int:
     return 2
 
 
+def crashed(error: BaseException, doing: str) -> int:
+    """Say that the program itself failed and where the trace is kept; the exit code for that.
+
+    Parameters
+    ----------
+    error : BaseException
+        What came up; after a signal it is the signal that counts.
+    doing : str
+        The command, for the file with the trace.
+    """
+    end_bar()
+    if STOPPED:  # compiled code may turn an interrupt into an error of its own
+        return stopped()
+    sys.stderr.write(one_line(internal_error(error, doing)) + "\n")
+    return CRASHED
+
+
 def stopped() -> int:
     """Say that the user interrupted; the exit code of a shell for the signal."""
     end_bar()
@@ -108,10 +129,21 @@ def run_alone(main: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
     except KeyboardInterrupt:
         STOPPED.append(signal.SIGINT)
         return stopped()
+    except InputError as error:
+        return fail(str(error))
     except OSError as error:
         return fail(system_refusal(error))
+    except MemoryError as error:
+        return fail(no_memory(error))
+    except Exception as error:
+        return crashed(error, shlex.join([Path(sys.argv[0]).name, *argv]))
     finally:
         STOPPED.clear()
+
+
+def no_memory(error: MemoryError) -> str:
+    """What is said where the memory does not suffice."""
+    return f"not enough memory ({error}); give shorter or fewer records"
 
 
 def system_refusal(error: OSError) -> str:
@@ -295,17 +327,20 @@ def finite(data: Any) -> Any:
 
 
 __all__ = [
+    "CRASHED",
     "INTERRUPTED",
     "STOPPED",
     "OneLineParser",
     "check_output",
     "checkpoint",
     "counted",
+    "crashed",
     "end_bar",
     "fail",
     "finite",
     "is_special",
     "keep_inputs",
+    "no_memory",
     "one_line",
     "progress_bar",
     "replace_file",

@@ -13,9 +13,9 @@ if (
 
 @pytest.fixture(autouse=True, scope="session")
 def _allowed_effects(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """What tests allow to run is noted in a file of their own."""
+    """What tests allow to run, and the traces of what fails, are kept in a folder of their own."""
     with pytest.MonkeyPatch.context() as patched:
-        patched.setenv(
-            "IRJ_ALLOWED_EFFECTS", str(tmp_path_factory.mktemp("state") / "allowed-effects.txt")
-        )
+        state = tmp_path_factory.mktemp("state")
+        patched.setenv("IRJ_ALLOWED_EFFECTS", str(state / "allowed-effects.txt"))
+        patched.setenv("IRJ_CRASHES", str(state / "crashes"))
         yield

@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final, final
 
+from identification.data.plain_text import toml_string
 from identification.data.units import base_unit, same_dimension
 from identification.errors import InputError
 
@@ -61,9 +62,9 @@ class Column:
 
     def toml(self) -> str:
         """Return ``channel = { column = ..., unit = ... }``."""
-        items = [f"column = {quoted(self.column)}"]
+        items = [f"column = {toml_string(self.column)}"]
         if self.channel != "run":
-            items.append(f"unit = {quoted(self.unit)}")
+            items.append(f"unit = {toml_string(self.unit)}")
         if self.scale != 1.0:
             items.append(f"scale = {self.scale!r}")
         if self.sign != 1:
@@ -80,14 +81,6 @@ class Guess:
 
     column: Column
     reason: str
-
-
-def quoted(text: str) -> str:
-    """Text as a TOML string."""
-    escaped = (
-        text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n").replace("\t", "\\t")
-    )
-    return f'"{escaped}"'
 
 
 def split_unit(name: str) -> tuple[str, str | None]:

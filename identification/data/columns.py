@@ -5,13 +5,13 @@ only ever shown.
 from __future__ import annotations
 
 import math
-import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from identification.data.channels import CHANNELS, channel_unit
-from identification.data.column import Column, header_unit, quoted, shown, split_unit
+from identification.data.column import Column, header_unit, shown, split_unit
 from identification.data.guess import fragment, guess_columns
+from identification.data.plain_text import from_toml, toml_string
 from identification.data.units import check_unit
 from identification.errors import InputError
 
@@ -76,8 +76,8 @@ def recognise(name: str, kind: str = "rotary", unit: str | None = None) -> Colum
         raise InputError(
             f"column {name!r} does not say its unit: name it "
             f"{channel}_{wanted.replace('/', '_').replace('.', '')} "
-            f"or give [columns] {channel} = {{ column = {quoted(name)}, unit = "
-            f"{quoted(wanted)} }}"
+            f"or give [columns] {channel} = {{ column = {toml_string(name)}, unit = "
+            f"{toml_string(wanted)} }}"
         )
     try:
         check_unit(given, wanted, 1.0, channel)
@@ -97,8 +97,8 @@ def _unfit(name: str, channel: str, unit: str, kind: str) -> str:
     return (
         f"column {name!r}: {unit!r} is not a unit of {channel} "
         f"({channel_unit(channel, kind)}){hint}: "
-        f"correct the header or give [columns] {channel} = {{ column = {quoted(name)}, unit = "
-        f"... }}"
+        f"correct the header or give [columns] {channel} = {{ column = {toml_string(name)}, unit "
+        f"= ... }}"
     )
 
 
@@ -124,14 +124,14 @@ def load_map(
         return columns, None
     path = Path(columns)
     try:
-        with path.open("rb") as stream:
-            table = tomllib.load(stream)
+        text = path.read_text(encoding="utf-8-sig")
     except OSError as error:
         raise InputError(
             f"column map {path}: cannot be read ({error.strerror}): check the path"
         ) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError as error:
         raise InputError(f"column map {path}: not valid TOML ({error}): correct it") from None
+    table = from_toml(text, f"column map {path}")
     joint = table.get("joint")
     kind = joint.get("kind") if isinstance(joint, dict) else None
     found = table.get("columns")
@@ -213,7 +213,8 @@ def _entry(
         return Column("run", column, "1")
     if not isinstance(unit, str):
         raise InputError(
-            f"{where}: column {column!r} has no unit: add unit = {quoted(wanted)}, or what it is in"
+            f"{where}: column {column!r} has no unit: add unit = {toml_string(wanted)}, or what "
+            "it is in"
         )
     fitting = _fitting(unit, wanted, counts, channel)
     return Column(
@@ -224,7 +225,7 @@ def _entry(
 def _fitting(unit: Any, wanted: str, counts: float | None, channel: str) -> str:
     if not isinstance(unit, str):
         raise InputError(
-            f"[columns] {channel}: unit {unit!r} must be text, for example {quoted(wanted)}"
+            f"[columns] {channel}: unit {unit!r} must be text, for example {toml_string(wanted)}"
         )
     try:
         check_unit(unit, wanted, counts, channel)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,6 +13,7 @@ from casadi_models.term import INERTIAS
 from casadi_models.transmission import MODELS
 from casadi_models.typed_law import TypedLaw
 from identification.data.own_effects import TABLE, load_remembered, remembered
+from identification.data.plain_text import from_toml, toml_key, toml_string, toml_value
 from identification.data.typed_laws import LAWS, hold_laws, law_lines, read_laws
 from identification.data.units import base_unit, same_dimension
 from identification.errors import InputError
@@ -134,11 +134,7 @@ def load_joint(path: str | Path) -> Joint:
         ) from None
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file; a joint file is TOML") from None
-    try:
-        data = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: not valid TOML ({error})") from None
-    return parse_joint(data, str(path))
+    return parse_joint(from_toml(text, str(path)), str(path))
 
 
 def parse_joint(data: Mapping[str, Any], source: str = "joint") -> Joint:
@@ -183,6 +179,11 @@ def parse_joint(data: Mapping[str, Any], source: str = "joint") -> Joint:
     if not isinstance(effects, list) or not all(isinstance(e, str) for e in effects):
         raise InputError(
             f'{source}: effects must be a list of names, as effects = ["viscous", "coulomb"]'
+        )
+    if constant is not None and not 0 < abs(ratio * constant) < math.inf:
+        raise InputError(
+            f"{source}: gear_ratio times motor_constant is {ratio * constant:g}; correct one of "
+            "them"
         )
     joint = Joint(
         name=str(table.get("name", Path(source).stem)),
@@ -252,8 +253,8 @@ def _pitch(entry: Any, kind: str, source: str) -> float | None:
     if not same_dimension(given, base_unit("m")):
         raise InputError(f"{where} has unit {table['unit']!r}; it must be one like m")
     found = _entry_number(table, "value", where) * given.factor
-    if found <= 0:
-        raise InputError(f"{where} = {found:g} m must be positive")
+    if not 0 < found < math.inf:
+        raise InputError(f"{where} = {found:g} m must be positive and finite")
     return found
 
 
@@ -313,6 +314,11 @@ def _known(name: str, entry: Any, model: JointModel, source: str) -> Known:
     }
     if not values:
         raise InputError(f"{source}: [known] {name} has neither value nor low nor high")
+    if not all(map(math.isfinite, values.values())):
+        raise InputError(
+            f"{source}: [known] {name} is no finite number once it is in {unit} on the link "
+            "side; correct value, unit or side"
+        )
     if scale < 0:  # the link is counted against the motor shaft
         values = {{"low": "high", "high": "low"}.get(k, k): v for k, v in values.items()}
     if values.get("low", -math.inf) > values.get("high", math.inf):
@@ -371,7 +377,7 @@ def toml_text(
     """
     lines = [
         "[joint]",
-        f'name = "{_escaped(joint.name)}"',
+        f"name = {toml_string(joint.name)}",
         f'kind = "{joint.kind}"',
         f"gear_ratio = {joint.gear_ratio!r}",
     ]
@@ -379,10 +385,7 @@ def toml_text(
         lines.append(f"torque_per_current = {joint.torque_per_current!r}")
     if joint.torque_per_voltage is not None:
         lines.append(f"torque_per_voltage = {joint.torque_per_voltage!r}")
-    lines += [
-        f'model = "{joint.model_name}"',
-        "effects = [" + ", ".join(f'"{e}"' for e in joint.effects) + "]",
-    ]
+    lines += [f'model = "{joint.model_name}"', f"effects = {toml_value(joint.effects)}"]
     if not joint.virtual_work:
         lines.append("virtual_work = false")
     lines += law_lines(joint.laws)
@@ -403,12 +406,7 @@ def toml_text(
     if joint.columns:
         lines += ["", "[columns]"]
         for channel, entry in joint.columns.items():
-            inside = (
-                ", ".join(f"{k} = {_toml(v)}" for k, v in entry.items())
-                if isinstance(entry, Mapping)
-                else None
-            )
-            lines.append(f"{channel} = {{ {inside} }}" if inside else f"{channel} = {_toml(entry)}")
+            lines.append(f"{toml_key(channel)} = {toml_value(entry)}")
     if parameters:
         lines += ["", "[fitted]"]
         for name, p in parameters.items():
@@ -422,18 +420,16 @@ def toml_text(
         for name, c in calibration.items():
             error = f", stderr = {c['stderr']:.6g}" if c.get("stderr") is not None else ""
             lines.append(
-                f'"{_escaped(name)}" = {{ value = {c["value"]:.10g}{error}, unit = "{c["unit"]}" }}'
+                f'{toml_string(name)} = {{ value = {c["value"]:.10g}{error}, unit = "{c["unit"]}" }}'
             )
     if provenance:
-        lines += ["", "[provenance]", *(f'{k} = "{_escaped(v)}"' for k, v in provenance.items())]
-    return "\n".join(lines) + "\n"
-
-
-def _escaped(text: str) -> str:
-    return text.replace("\\", "\\\\").replace('"', '\\"')
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    return f'"{_escaped(value)}"' if isinstance(value, str) else repr(value)
+        lines += [
+            "",
+            "[provenance]",
+            *(f"{toml_key(k)} = {toml_string(v)}" for k, v in provenance.items()),
+        ]
+    text = "\n".join(lines) + "\n"
+    from_toml(
+        text, f"{joint.source or joint.name}, as it would be written"
+    )  # it may replace the file it came from
+    return text

@@ -11,12 +11,14 @@ from __future__ import annotations
 
 import hashlib
 import os
+import warnings
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
 from casadi_models import EFFECTS
 from casadi_models.effect import EffectFile
+from identification.data.plain_text import toml_string, toml_value
 from identification.errors import InputError
 
 TABLE: Final = "own_effects"
@@ -43,10 +45,8 @@ def remembered(labels: Iterable[str]) -> list[str]:
     """The lines of a joint file that name the files of these effects."""
     lines, used = [], _keys(labels)
     for found in (f for f in EFFECTS.files if used & set(f.keys)):
-        keys = ", ".join(f'"{key}"' for key in found.keys)
-        lines.append(
-            f'"{_escaped(str(found.path))}" = {{ sha256 = "{found.sha256}", keys = [{keys}] }}'
-        )
+        entry = {"sha256": found.sha256, "keys": found.keys}
+        lines.append(f"{toml_string(str(found.path))} = {toml_value(entry)}")
     return ["", f"[{TABLE}]", *lines] if lines else []
 
 
@@ -149,8 +149,15 @@ def _content(path: Path) -> bytes:
 
 def _loaded(path: Path, content: bytes) -> EffectFile:
     try:
-        return EFFECTS.load_code(path, content)
-    except Exception as error:  # a user's file may fail in any way
+        with warnings.catch_warnings():
+            warnings.simplefilter(
+                "ignore"
+            )  # Python's own remarks on the text; what matters is an error
+            return EFFECTS.load_code(path, content)
+    except (
+        Exception,
+        SystemExit,
+    ) as error:  # a user's file may fail in any way, or end the program
         raise InputError(
             f"{path}: cannot be used as effects ({type(error).__name__}: {error})"
         ) from None
@@ -197,10 +204,6 @@ def _remember(sha256: str) -> None:
             stream.write(sha256 + "\n")
     except OSError:
         return
-
-
-def _escaped(text: str) -> str:
-    return text.replace("\\", "\\\\").replace('"', '\\"')
 
 
 __all__ = ["STORE", "TABLE", "files_of", "load_remembered", "register", "remembered"]

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, final
 
+from identification.data.plain_text import from_toml
 from identification.errors import InputError
 from irj_fmu.batch.checks import Value, flag, known, names, number, table, value
 from irj_fmu.batch.sampling import cases_of
@@ -122,15 +122,14 @@ def load_study(path: str | Path) -> Study:
     """
     path = Path(path)
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        text = path.read_text(encoding="utf-8-sig")
     except OSError as error:
         raise InputError(
             f"{path}: cannot be read ({error.strerror}); give the path of a study file"
         ) from None
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file; a study file is TOML") from None
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: not valid TOML ({error})") from None
+    data = from_toml(text, str(path))
     where = str(path)
     known(data, _TABLES, where)
     study = table(data, "study", where)

@@ -17,7 +17,6 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -26,6 +25,7 @@ from typing import TYPE_CHECKING, Any, Final
 from casadi_models import JointModel
 from casadi_models.term import TOTAL_INERTIA
 from identification.data.joint_file import Joint, parse_joint, toml_text
+from identification.data.plain_text import from_toml, toml_key, toml_string, toml_value
 from identification.data.typed_laws import LAWS
 from identification.errors import InputError
 from irj_fmu.imported.correction import PREFIX, Correction, correction_of
@@ -44,8 +44,8 @@ def is_user_joint(path: str | Path) -> bool:
     others to refuse.
     """
     try:
-        return "model" in tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError):
+        return "model" in from_toml(Path(path).read_text(encoding="utf-8-sig"), str(path))
+    except (OSError, ValueError):
         return False
 
 
@@ -63,12 +63,13 @@ def load_user_joint(path: str | Path) -> UserModel:
     """
     path = Path(path)
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else str(error)
         raise InputError(
             f"{path}: cannot be read as a joint file ({why}); give the path of a TOML file"
         ) from None
+    data = from_toml(text, str(path))
     for key, value in data.items():
         if key not in _TABLES:
             raise InputError(
@@ -159,13 +160,7 @@ def _scale(value: Any, where: str) -> float:
 
 def _shown(value: Any) -> str:
     """A value as it stands in a joint file."""
-    return (
-        _text(value)
-        if isinstance(value, str)
-        else str(value).lower()
-        if isinstance(value, bool)
-        else repr(value)
-    )
+    return toml_value(value)
 
 
 def _flag(value: Any, path: Path) -> bool:
@@ -286,7 +281,7 @@ def user_joint_text(
     name = path.name if folder is not None and path.parent == folder.resolve() else str(path)
     lines = [
         "[model]",
-        f"fmu = {_text(name)}",
+        f"fmu = {toml_string(name)}",
         f'kind = "{model.kind}"',
         f"hold = {str(model.hold).lower()}",
     ]
@@ -302,16 +297,13 @@ def user_joint_text(
     lines += ["", "[model.parameters]"]
     for p in model.parameters:
         parts = [f"{k} = {v!r}" for k, v in (("low", p.low), ("high", p.high)) if math.isfinite(v)]
-        lines.append(f"{_key(p.name)} = {{ {', '.join(parts)} }}")
+        lines.append(f"{toml_key(p.name)} = {{ {', '.join(parts)} }}")
     lines += [
         "",
         "[model.start]",
         *(_mapped(m.variable, "channel", m.channel, m) for m in model.starts),
     ]
-    lines += [
-        f"{_key(k)} = {str(v).lower() if isinstance(v, bool) else repr(v)}"
-        for k, v in model.constants.items()
-    ]
+    lines += [f"{toml_key(k)} = {toml_value(v)}" for k, v in model.constants.items()]
     lines += ["", "[fitted]"]
     shown: dict[str, float] = dict(model.values)
     if model.correction is not None:
@@ -324,25 +316,14 @@ def user_joint_text(
     for key, value in shown.items():
         error = fit.stderr.get(key) if fit is not None else None
         lines.append(
-            f"{_key(key)} = {{ value = "
+            f"{toml_key(key)} = {{ value = "
             f"{value:.12g}{f', stderr = {error:.6g}' if error is not None else ''} }}"
         )
     return body + "\n\n" + "\n".join(lines) + "\n"
 
 
 def _mapped(key: str, word: str, other: str, mapped: Mapped) -> str:
-    return f"{_key(key)} = {{ {word} = {_text(other)}, scale = {mapped.scale!r} }}"
-
-
-def _text(text: str) -> str:
-    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
-    return f'"{escaped}"'
-
-
-def _key(text: str) -> str:
-    return (
-        text if text.replace("_", "").replace("-", "").isalnum() and text.isascii() else _text(text)
-    )
+    return f"{toml_key(key)} = {{ {word} = {toml_string(other)}, scale = {mapped.scale!r} }}"
 
 
 __all__ = ["is_user_joint", "load_user_joint", "outside_correction", "user_joint_text"]

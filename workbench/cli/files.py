@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import sys
-import tomllib
 from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Final
 from identification.balance.sensing import check_alike
 from identification.data.check.gate import needed, passed
 from identification.data.joint_file import Joint, load_joint
+from identification.data.plain_text import from_toml
 from identification.data.read import read
 from identification.data.record import Record
 from identification.errors import InputError
@@ -106,7 +106,7 @@ def check_outputs(arguments: Namespace) -> None:
 def _fmu_of(joint: object) -> list[str]:
     """The FMU that a joint file names as its model."""
     try:
-        table = tomllib.loads(Path(str(joint)).read_text(encoding="utf-8-sig"))
+        table = from_toml(Path(str(joint)).read_text(encoding="utf-8-sig"), str(joint))
         return [str(Path(str(joint)).parent / str(table["model"]["fmu"]))]
     except (OSError, ValueError, KeyError, TypeError):
         return []

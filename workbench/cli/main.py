@@ -18,7 +18,16 @@ from typing import Any, TextIO, cast, final
 
 from identification import __version__
 from identification.errors import InputError
-from irj_fmu.command_line import STOPPED, OneLineParser, fail, stopped, system_refusal, terminable
+from irj_fmu.command_line import (
+    STOPPED,
+    OneLineParser,
+    crashed,
+    fail,
+    no_memory,
+    stopped,
+    system_refusal,
+    terminable,
+)
 from workbench.cli.files import check_outputs
 from workbench.cli.user_fmu import module_of
 
@@ -341,8 +350,8 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run `irj`; returns the exit code: 0 done, 1 a check failed, 2 unusable input, 130
-    interrupted.
+    """Run `irj`; returns the exit code: 0 done, 1 a check failed, 2 unusable input, 3 an
+    internal error, 130 interrupted.
     """
     given = list(sys.argv[1:] if argv is None else argv)
     if isinstance(sys.stdout, io.TextIOWrapper):
@@ -366,14 +375,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         except OSError as error:
             return fail(system_refusal(error))
         except MemoryError as error:
-            return fail(f"not enough memory ({error}); give shorter or fewer records")
+            return fail(no_memory(error))
         except KeyboardInterrupt:
             STOPPED.append(signal.SIGINT)
             return stopped()
-        except Exception:
-            if STOPPED:  # compiled code may turn an interrupt into an error of its own
-                return stopped()
-            raise
+        except Exception as error:
+            return crashed(error, arguments.command)
         finally:
             STOPPED.clear()
 

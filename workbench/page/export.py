@@ -35,8 +35,7 @@ def session_code(state: State) -> str:
         "from identification.diagnosis.improve import with_held_out",
         "from identification.data.joint_file import parse_joint",
         "",
-        f'joint = parse_joint(tomllib.loads("""\n{state.joint_text.strip()}\n""".replace("\\r", '
-        '"")))',
+        f"joint = parse_joint(tomllib.loads({_literal(state.joint_text)}))",
         "",
     ]
     for role in ("train", "held_out"):
@@ -64,6 +63,14 @@ def session_code(state: State) -> str:
         "    stream.write(fitted.to_joint_file())",
     ]
     return "\n".join(lines) + "\n"
+
+
+def _literal(text: str) -> str:
+    """A text as Python: readable where it can stand between triple quotes, which a joint file
+    must not be able to end.
+    """
+    plain = text.strip().replace("\r", "")
+    return repr(plain) if '"""' in plain or "\\" in plain else f'"""\n{plain}\n"""'
 
 
 def _step_lines(

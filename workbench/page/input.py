@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import secrets
-import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any, Final
 
 from casadi_models.transmission import MODELS
 from identification.data.joint_file import Joint, parse_joint, toml_text
+from identification.data.plain_text import from_toml
 from identification.errors import InputError
 from workbench.page.live import Live
 from workbench.page.records import guessed_role
@@ -137,10 +137,7 @@ def set_joint(live: Live, body: Mapping[str, Any]) -> dict[str, Any]:
         text = str(body["text"])
     else:
         text = toml_text(_from_form(body, _previous(live.state.joint_text)))
-    try:
-        parse_joint(tomllib.loads(text), source)
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{source}: not valid TOML ({error})") from None
+    parse_joint(from_toml(text, source), source)
     changed = live.change_input(lambda s: replace(s, joint_text=text, joint_source=source))
     made = {f.id: live.examine(f) for f in changed.files}
     live.change(lambda s: replace(s, files=tuple(made.get(f.id, f) for f in s.files)))
@@ -149,8 +146,8 @@ def set_joint(live: Live, body: Mapping[str, Any]) -> dict[str, Any]:
 
 def _previous(text: str) -> dict[str, Any]:
     try:
-        return tomllib.loads(text)
-    except tomllib.TOMLDecodeError:
+        return from_toml(text, "joint")
+    except InputError:
         return {}
 
 

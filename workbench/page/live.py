@@ -8,7 +8,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final, final
 
+from identification.crash import internal_error
 from identification.data.joint_file import Joint, parse_joint
+from identification.data.plain_text import from_toml
 from identification.data.record import Record
 from identification.errors import InputError
 from workbench.page.analysis import Analysis, Progress
@@ -141,18 +143,12 @@ class Live:
         InputError
             None yet, or not a valid one.
         """
-        import tomllib
-
         if not self.state.joint_text:
             raise InputError(
                 "no joint yet: fill in gear ratio, motor constant and model on the Model page"
             )
-        try:
-            return parse_joint(
-                tomllib.loads(self.state.joint_text), self.state.joint_source or "joint"
-            )
-        except tomllib.TOMLDecodeError as error:
-            raise InputError(f"the joint file is not valid TOML ({error})") from None
+        source = self.state.joint_source or "joint"
+        return parse_joint(from_toml(self.state.joint_text, source), source)
 
     # --- records and analysis ---------------------------------------------------------------------
 
@@ -206,13 +202,12 @@ class Live:
         except (
             Exception
         ) as problem:  # a record that cannot be checked must not be used, nor wait for ever
-            _LOG.exception("checking %s failed", entry.name)
-            made = replace(
-                entry,
-                status="refused",
-                message=f"{entry.name}: cannot be checked ({type(problem).__name__}: {problem}); "
-                "export it again",
+            said = (
+                f"{entry.name}: cannot be checked, "
+                f"{internal_error(problem, f'page: checking {entry.name}')}"
             )
+            _LOG.error(said)
+            made = replace(entry, status="refused", message=said)
         self.change(
             lambda s: replace(
                 s,
@@ -328,11 +323,11 @@ class Live:
             Exception
         ) as problem:  # the page must get a sentence for whatever goes wrong in a fit
             if not job.cancelled:  # foreign code turns the request to stop into errors of its own
-                _LOG.exception("job %s failed", job.action)
-            error = (
-                f"{job.action} failed ({type(problem).__name__}: {problem}); the state "
-                "before it is kept"
-            )
+                error = (
+                    f"{job.action}: {internal_error(problem, f'page: {job.action}')}; the "
+                    "state before it is kept"
+                )
+                _LOG.error(error)
         if job.cancelled:
             job.change, error = None, f"{job.action}: cancelled; nothing was changed"
         done = job.change is not None

@@ -7,6 +7,7 @@ from __future__ import annotations
 import asyncio
 import importlib
 import json
+import logging
 import os
 import secrets
 import socket
@@ -29,7 +30,10 @@ from starlette.responses import (
 )
 from starlette.routing import Route
 
+from identification.crash import internal_error
+from identification.data.plain_text import from_json
 from identification.errors import InputError
+from irj_fmu.command_line import system_refusal
 from workbench.page import verbs as app_verbs
 from workbench.page.input import add_upload, drop_upload, put_upload, set_joint, start_demo
 from workbench.page.live import BusyError, Live
@@ -89,6 +93,7 @@ class Service:
             return self.lives[identifier]
 
 
+_LOG = logging.getLogger(__name__)
 Handler = Callable[[Request, Live], Any]
 
 
@@ -110,6 +115,12 @@ def _with_session(service: Service, handler: Handler) -> Callable[[Request], Any
             return PlainTextResponse(str(error), 422)
         except ClientDisconnect:
             return PlainTextResponse("closed", 499)
+        except OSError as error:
+            return PlainTextResponse(system_refusal(error), 507)
+        except Exception as error:
+            said = internal_error(error, f"page: {request.method} {request.url.path}")
+            _LOG.error(said)
+            return PlainTextResponse(said, 500)
 
     return answer
 
@@ -120,10 +131,7 @@ async def _body(request: Request) -> dict[str, Any]:
         raw += chunk
         if len(raw) > MAX_BODY:
             raise TooLargeError("the request is too long")
-    try:
-        data = json.loads(raw or b"{}")
-    except ValueError:
-        raise InputError("the request is not JSON") from None
+    data = from_json(raw or b"{}", "the request")
     if not isinstance(data, dict):
         raise InputError("the request is not a JSON object")
     return data
@@ -198,7 +206,7 @@ async def _upload(request: Request, live: Live, limit: int) -> Response:
 
     try:
         return await run_in_threadpool(taken)
-    except InputError:
+    except Exception:
         path.unlink(missing_ok=True)
         raise
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import shutil
 import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, final
@@ -14,6 +15,7 @@ from identification.data.check.gate import passed
 from identification.data.column import Column
 from identification.data.columns import choose, load_map
 from identification.data.read._formats import open_table
+from identification.data.read._source import from_pipe, is_pipe, renamed
 from identification.data.record import Provenance, Record, channel_unit
 from identification.data.units import to_si
 from identification.errors import InputError
@@ -74,8 +76,22 @@ def read(
     raw, said = load_map(columns)
     axis = kind or said or "rotary"
     channel_unit("time", axis)
-    with _Digest(file) as digest:
-        table = open_table(file)
+    name = name or file.stem
+    if not is_pipe(file):
+        record = _read(file, file, raw, axis, name)
+    else:
+        copy = from_pipe(file)
+        try:
+            record = renamed(lambda: _read(file, copy, raw, axis, name), copy, file)
+        finally:
+            shutil.rmtree(copy.parent, ignore_errors=True)
+    return record if joint is None else passed(record, joint)[0]
+
+
+def _read(file: Path, place: Path, raw: Mapping[str, Any], axis: str, name: str) -> Record:
+    """Read the file that lies at a place."""
+    with _Digest(place) as digest:
+        table = open_table(place)
         chosen, notes = choose(raw, table.names, table.units, axis, str(file))
         time, channels, run_notes = _load(table, chosen, axis, file)
     provenance = Provenance(
@@ -85,10 +101,7 @@ def read(
         columns=tuple(entry.describe() for entry in chosen),
         notes=table.notes + notes + run_notes,
     )
-    record = Record.from_channels(
-        time, channels, name=name or file.stem, kind=axis, provenance=provenance
-    )
-    return record if joint is None else passed(record, joint)[0]
+    return Record.from_channels(time, channels, name=name, kind=axis, provenance=provenance)
 
 
 def _load(

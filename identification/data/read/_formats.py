@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Final
 
+from identification.data.read._child import FORMATS, open_in_child
+from identification.data.read._source import opened_packed
 from identification.errors import InputError
 
 if TYPE_CHECKING:
@@ -97,7 +99,12 @@ def open_table(path: Path) -> Table:
     InputError
         If there is no such file, it is empty, of no known format, or a package for it is missing.
     """
-    module, function = _OPENERS[_format(path)]
+    form = _format(path)
+    if form == "text" and (table := opened_packed(path, open_table)) is not None:
+        return table
+    module, function = _OPENERS[form]
+    if form in FORMATS:
+        return open_in_child(path, form, module, function)
     opener: Callable[[Path], Table] = getattr(
         importlib.import_module(f"identification.data.read.{module}"), function
     )

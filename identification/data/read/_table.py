@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final, final
 
 import numpy as np
@@ -114,6 +114,48 @@ def from_arrays(
         return {name: columns[name] for name in (*numeric, *text)}
 
     return Table(reader, tuple(columns), load, units or {}, notes)
+
+
+Layout = tuple[tuple[int, ...], np.dtype[Any]]
+"""Shape and type of an array that is still in its file."""
+
+
+def on_demand(
+    reader: str,
+    layouts: Mapping[str, Layout],
+    fetch: Callable[[Sequence[str]], Mapping[str, npt.NDArray[Any]]],
+    where: str,
+    units: Mapping[str, str] | None = None,
+) -> Table:
+    """Make a table of arrays that stay in their file until a column of them is asked for.
+
+    Parameters
+    ----------
+    reader, where : str
+        Name of the format; the file, for messages.
+    layouts : mapping of str to (shape, dtype)
+        The arrays of the file.
+    fetch : callable
+        Takes names of arrays and reads them; what it gives must have the layouts said.
+    units : mapping of str to str, optional
+
+    Raises
+    ------
+    InputError
+        If there is no numeric vector.
+    """
+    stand_ins = {
+        name: np.broadcast_to(np.zeros((), kind), shape) for name, (shape, kind) in layouts.items()
+    }
+    outline = from_arrays(reader, stand_ins, where, units)
+
+    def load(numeric: Sequence[str], text: Sequence[str]) -> Mapping[str, npt.NDArray[Any]]:
+        wanted = list(dict.fromkeys((*numeric, *text)))
+        arrays = list(dict.fromkeys(n if n in layouts else n.rpartition("[")[0] for n in wanted))
+        columns = vectors(fetch(arrays), where)
+        return {name: columns[name] for name in wanted}
+
+    return replace(outline, load=load)
 
 
 @final

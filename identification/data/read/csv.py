@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv as _csv
 import re
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, final
@@ -44,6 +45,11 @@ class _Layout:
     skip: int
     notes: tuple[str, ...]
 
+    @property
+    def wide(self) -> bool:
+        """Whether a character takes two bytes."""
+        return self.encoding.startswith("utf-16")
+
     def open(self) -> TextIO:
         return self.path.open(encoding=self.encoding, errors="replace", newline="")
 
@@ -79,6 +85,9 @@ def _decode(path: Path) -> tuple[str, list[str], bool]:
     if head.startswith((b"\xff\xfe", b"\xfe\xff")):
         encoding = "utf-16"
         head = head[: len(head) // 2 * 2]
+    elif wide := _wide(head):
+        encoding = wide
+        head = head[: len(head) // 2 * 2]
     elif b"\x00" in head:
         raise InputError(
             f"{path}: is not a text file nor a known binary format: export CSV, MAT, NPZ, HDF5 "
@@ -97,9 +106,25 @@ def _decode(path: Path) -> tuple[str, list[str], bool]:
     return encoding, text.splitlines(), whole
 
 
+def _wide(head: bytes) -> str | None:
+    """UTF-16 without a mark: of text in a table nearly every other byte is 0, of a binary file
+    hardly.
+    """
+    for encoding, high, low in (
+        ("utf-16-le", head[1::2], head[::2]),
+        ("utf-16-be", head[::2], head[1::2]),
+    ):
+        if len(head) > 2 and high.count(0) > 0.9 * len(high) and low.count(0) == 0:
+            return encoding
+    return None
+
+
 def _delimiter(line: str) -> str | None:
     for mark in (";", "\t", ",", "|"):
         if mark in line:
+            spaced = line.split() if mark == "," else []
+            if len(spaced) > 1 and all(_numeric(cell, True) for cell in spaced):
+                return None  # decimal commas, and spaces between the columns
             return mark
     return None
 
@@ -151,7 +176,7 @@ def _layout(path: Path) -> _Layout:
         )
     number, line = body[first]
     cells = _cells(line, delimiter)
-    comma = delimiter != "," and any(_COMMA_NUMBER.match(cell) for cell in cells)
+    comma = delimiter != "," and _decimal_comma(lines[number:], delimiter, path)
     names, units, used = _header([text for _, text in body[:first]], delimiter, len(cells), path)
     notes: list[str] = []
     if not names:
@@ -171,6 +196,34 @@ def _layout(path: Path) -> _Layout:
         skip=number,
         notes=tuple(notes),
     )
+
+
+def _decimal_comma(lines: Sequence[str], delimiter: str | None, path: Path) -> bool:
+    """Whether numbers are written 1,5: judged by all rows of the file's head, for the first ones
+    may be whole numbers.
+
+    Raises
+    ------
+    InputError
+        Commas and points: one of them must part thousands, and nothing says which.
+    """
+    found = [
+        cell
+        for line in lines
+        if "," in line
+        for cell in _cells(line, delimiter)
+        if _COMMA_NUMBER.match(cell)
+    ]
+    if not found:
+        return False
+    for line in lines:
+        for cell in _cells(line, delimiter) if "." in line else ():
+            if "." in cell and _NUMBER.match(cell):
+                raise InputError(
+                    f"{path}: has both decimal commas ({found[0].strip()}) and decimal points "
+                    f"({cell.strip()}): write one of them"
+                )
+    return True
 
 
 def _header(
@@ -193,7 +246,7 @@ def _header(
             "agree"
         )
     names = [name.strip() for name in names[:width]]
-    doubled = sorted({name for name in names if name and names.count(name) > 1})
+    doubled = sorted(name for name, count in Counter(names).items() if name and count > 1)
     if doubled:
         raise InputError(
             f"{path}: column name {doubled[0]!r} stands more than once in the header: rename one"
@@ -241,7 +294,7 @@ def _fast(layout: _Layout, places: Sequence[int]) -> list[FloatColumn] | None:
     if not places:
         return []
     packed = layout.path.suffix.lower() in {".gz", ".bz2", ".xz"}
-    plain = layout.encoding != "utf-16" and not layout.comma and not packed
+    plain = not layout.wide and not layout.comma and not packed
     whole = list(places) == list(range(len(layout.names)))
     try:
         if not whole and not _regular(layout):
@@ -265,8 +318,10 @@ def _fast(layout: _Layout, places: Sequence[int]) -> list[FloatColumn] | None:
 
 def _regular(layout: _Layout) -> bool:
     """Whether every line has the same number of delimiters, so that no row has shifted cells."""
-    if layout.delimiter is None or layout.encoding == "utf-16":
+    if layout.delimiter is None:
         return True
+    if layout.wide:
+        return False  # the rows are read one by one
     mark = ord(layout.delimiter)
     with layout.path.open("rb") as stream:
         for _ in range(layout.skip):
@@ -331,6 +386,10 @@ def _slow(layout: _Layout, places: Sequence[int]) -> list[FloatColumn]:
 def _number(cell: str, layout: _Layout, number: int, place: int) -> float:
     text = cell.strip()
     try:
+        if (
+            "_" in text or not text.isascii()
+        ):  # Python takes 1_000 and the digits of other scripts, a table means something else
+            raise ValueError(text)
         return float(text.replace(",", ".") if layout.comma else text)
     except ValueError:
         if text.lower() in _MISSING:
@@ -347,7 +406,7 @@ def _number(cell: str, layout: _Layout, number: int, place: int) -> float:
 
 
 def _text(layout: _Layout, place: int) -> npt.NDArray[Any]:
-    if layout.encoding != "utf-16" and _regular(layout):
+    if not layout.wide and _regular(layout):
         try:
             return np.loadtxt(
                 str(layout.path),

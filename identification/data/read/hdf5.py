@@ -5,11 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
-from identification.data.read._table import Table, from_arrays, missing_package
+from identification.data.read._table import Layout, Table, missing_package, on_demand
 from identification.errors import InputError
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
 
@@ -26,7 +28,7 @@ def open_hdf5(path: Path) -> Table:
         import h5py
     except ImportError:
         raise missing_package("h5py", "hdf5", "HDF5 and MAT 7.3 files", str(path)) from None
-    arrays: dict[str, Any] = {}
+    layouts: dict[str, Layout] = {}
     units: dict[str, str] = {}
 
     def visit(name: str, item: Any) -> None:
@@ -36,10 +38,13 @@ def open_hdf5(path: Path) -> Table:
             or item.dtype.kind not in "fiubOS"
         ):
             return
-        if item.attrs.get("MATLAB_class") in {b"char", b"cell", b"logical"} or item.ndim > 2:
+        if (
+            item.attrs.get("MATLAB_class") in {b"char", b"cell", b"logical"}
+            or item.shape is None
+            or item.ndim > 2
+        ):
             return
-        value = item.asstr()[()] if h5py.check_string_dtype(item.dtype) else item[()]
-        arrays[name] = np.asarray(value)
+        layouts[name] = item.shape, item.dtype
         for key in ("unit", "units", "Unit", "Units"):
             text = item.attrs.get(key)
             if text is not None:
@@ -48,8 +53,22 @@ def open_hdf5(path: Path) -> Table:
     try:
         with h5py.File(path, "r") as file:
             file.visititems(visit)
+    except MemoryError:
+        raise
     except Exception as error:  # h5py raises errors of many kinds on a damaged file
         raise InputError(
             f"{path}: is not a readable HDF5 file ({type(error).__name__}): save it again"
         ) from None
-    return from_arrays("HDF5", arrays, str(path), units)
+
+    def fetch(names: Sequence[str]) -> Mapping[str, npt.NDArray[Any]]:
+        try:
+            with h5py.File(path, "r") as file:
+                return {name: np.asarray(file[name][()]) for name in names}
+        except MemoryError:
+            raise
+        except Exception as error:  # as above
+            raise InputError(
+                f"{path}: is damaged ({type(error).__name__}): save it again"
+            ) from None
+
+    return on_demand("HDF5", layouts, fetch, str(path), units)

@@ -26,6 +26,8 @@ def open_mat(path: Path) -> Table:
 
     try:
         content = loadmat(str(path), struct_as_record=False, squeeze_me=True)
+    except MemoryError:
+        raise
     except Exception as error:  # scipy raises whatever its parser meets in a damaged file
         raise InputError(
             f"{path}: is not a readable MAT file ({type(error).__name__}): save it again"

@@ -38,7 +38,7 @@ def open_mcap(path: Path) -> Table:
                     collector.odd_topics.add(f"{channel.topic} ({channel.message_encoding})")
                     continue
                 collector.add(channel.topic, message.log_time * 1e-9, decode(message.data))
-    except InputError:
+    except (InputError, MemoryError):
         raise
     except (
         Exception

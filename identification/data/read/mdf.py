@@ -34,6 +34,8 @@ def open_mdf(path: Path) -> Table:
     try:
         with asammdf.MDF(path) as file:
             places, units = _channels(file)
+    except MemoryError:
+        raise
     except Exception as error:  # asammdf raises whatever its parser meets in a damaged file
         raise InputError(
             f"{path}: is not a readable MDF file ({type(error).__name__}): save it again"
@@ -72,6 +74,8 @@ def _signals(
                     np.asarray(signal.timestamps, dtype=np.float64),
                     np.asarray(signal.samples),
                 )
+    except MemoryError:
+        raise
     except Exception as error:  # asammdf raises whatever its parser meets in a damaged file
         raise InputError(f"{path}: is damaged ({type(error).__name__}): save it again") from None
     return found

@@ -31,15 +31,19 @@ def open_parquet(path: Path) -> Table:
         raise missing_package("pyarrow", "parquet", "Parquet files", str(path)) from None
     try:
         schema = pq.read_schema(path)
-    except (pa.ArrowException, OSError) as error:
+    except MemoryError:
+        raise
+    except (pa.ArrowException, OSError, ValueError) as error:
         raise InputError(
             f"{path}: is not a readable Parquet file ({_line(error)}): save it again"
         ) from None
 
     def load(numeric: Sequence[str], text: Sequence[str]) -> Mapping[str, npt.NDArray[Any]]:
         try:
-            table = pq.read_table(path, columns=[*numeric, *text])
-        except (pa.ArrowException, OSError) as error:
+            table = pq.read_table(path, columns=[*numeric, *text], use_threads=False)
+        except MemoryError:
+            raise
+        except (pa.ArrowException, OSError, ValueError) as error:
             raise InputError(f"{path}: is damaged ({_line(error)}): save it again") from None
         result = {name: _array(table.column(name), path, name) for name in numeric}
         result.update(
@@ -66,7 +70,7 @@ def open_parquet(path: Path) -> Table:
     for field in schema:
         for key in (b"unit", b"units"):
             if field.metadata and key in field.metadata:
-                units[field.name] = field.metadata[key].decode()
+                units[field.name] = field.metadata[key].decode("utf-8", "replace")
         if pa.types.is_timestamp(field.type) or pa.types.is_duration(field.type):
             units[field.name] = "s"
     return Table("Parquet", tuple(schema.names), load, units)

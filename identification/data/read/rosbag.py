@@ -42,6 +42,8 @@ def open_rosbag(path: Path) -> Table:
                 collector.add(
                     connection.topic, stamp * 1e-9, reader.deserialize(raw, connection.msgtype)
                 )
+    except MemoryError:
+        raise
     except Exception as error:  # rosbags raises its own and its parsers' errors on a damaged bag
         detail = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(
