@@ -422,10 +422,16 @@ def inverse_dynamics(model: Solvable) -> Expression:
             + e.link_resistance
             - e.transmitted * e.link_lever
         )
+        link = link - e.signals.coupling_torque
         return ca.vertcat(motor - (e.drive - e.signals.drive), link)
     inertia = sum(e.inertia.values())
     resistance = e.motor_resistance + e.link_resistance
-    return inertia * e.motor_acceleration + resistance - (e.drive - e.signals.drive)
+    return (
+        inertia * e.motor_acceleration
+        + resistance
+        - (e.drive - e.signals.drive)
+        - e.signals.coupling_torque
+    )
 
 
 def linear_set(model: Solvable) -> tuple[str, ...]:

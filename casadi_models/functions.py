@@ -25,7 +25,10 @@ INPUTS: Final = ("drive", "temperature", "time")
 """Inputs of the dynamics: n Km I [N.m], temperature [K], time [s]."""
 
 FloatArray = npt.NDArray[np.float64]
-_GONE: Final = ("drive_rate", "torque_rate", "motor_jerk", "link_jerk")
+_GONE: Final = ("drive_rate", "torque_rate", "motor_jerk", "link_jerk", "coupling_torque")
+"""Signals that are no input: rates, and the torque on the link from elsewhere, which a
+simulated joint does not feel.
+"""
 
 
 @final

@@ -26,6 +26,7 @@ SIGNAL_UNITS: Final = {
     "torque": "N.m",
     "torque_rate": "N.m/s",
     "temperature": "K",
+    "coupling_torque": "N.m",
 }
 
 
@@ -35,7 +36,9 @@ class Signals:
     """Signals of the joint at one instant (symbols, numbers or arrays alike).
 
     Motor quantities are divided by the gear ratio (link-referred); `drive` is the motor torque
-    times the gear ratio, n Km I; `torque` is what the gear puts into the link.
+    times the gear ratio, n Km I; `torque` is what the gear puts into the link; `coupling_torque` is
+    what acts on the link from elsewhere (other axes, a rigid-body model of the arm), positive where
+    it drives the link.
     """
 
     time: Expression
@@ -52,6 +55,7 @@ class Signals:
     torque: Expression
     torque_rate: Expression
     temperature: Expression
+    coupling_torque: Expression
 
     @staticmethod
     def names() -> tuple[str, ...]:

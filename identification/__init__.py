@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 from identification.data.joint_file import Joint, load_joint
 from identification.data.read import read as read
 from identification.data.record import Record
+from identification.diagnosis.changed import Changes
+from identification.diagnosis.changed import changed as changed
 from identification.diagnosis.compare import Comparison
 from identification.diagnosis.compare import compare as compare
 from identification.diagnosis.diagnose import Diagnosis
@@ -38,6 +40,7 @@ _LATE = {
 }
 
 __all__ = [
+    "Changes",
     "Comparison",
     "Diagnosis",
     "FaultDetector",
@@ -48,6 +51,7 @@ __all__ = [
     "Record",
     "RecursiveLeastSquares",
     "TwoStep",
+    "changed",
     "compare",
     "diagnose",
     "fit",

@@ -38,24 +38,25 @@ def residual_expressions(model: JointModel, sensing: Sensing) -> dict[str, Expre
     # in the units of the reading: a gain error must not shrink the residual with the signal
     drive_gain = ca.jacobian(e.drive, e.signals.drive)
     torque_gain = ca.jacobian(e.torque, e.signals.torque)
+    coupling = e.signals.coupling_torque
     for balance in sensing.balances:
         if balance == "motor":
             out[balance] = (e.drive - e.torque * e.motor_lever - motor) / drive_gain
         elif balance == "link":
-            out[balance] = (e.torque * e.link_lever - link) / torque_gain
+            out[balance] = (e.torque * e.link_lever + coupling - link) / torque_gain
         elif balance == "transmission":
             resist = e.motor_resistance + e.link_resistance if sensing.clamped_link else 0
             out[balance] = (e.torque - e.transmitted - resist) / torque_gain
         elif balance == "sum":
             out[balance] = (
-                e.drive - motor - link + e.transmitted * (e.link_lever - e.motor_lever)
+                e.drive + coupling - motor - link + e.transmitted * (e.link_lever - e.motor_lever)
             ) / drive_gain
         elif balance == "deflection":
             out[balance] = (e.drive - motor - e.transmitted * e.motor_lever) / drive_gain
         else:
             total: Expression = sum(e.inertia.values(), ca.SX(0))
             resist = e.motor_resistance + e.link_resistance + e.transmitted
-            out[balance] = (e.drive - total * e.motor_acceleration - resist) / drive_gain
+            out[balance] = (e.drive + coupling - total * e.motor_acceleration - resist) / drive_gain
     return out
 
 

@@ -10,7 +10,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import numpy.typing as npt
 
-from casadi_models import JointModel
+from casadi_models import EFFECTS, JointModel
 from casadi_models.term import SIDE_INERTIAS, TOTAL_INERTIA
 from identification.data.joint_file import Joint
 from identification.data.record import Record
@@ -46,6 +46,8 @@ class Sensing:
         What the temperature of every record is counted from: the first sample of the first one.
     longest_run : float
         Of all records [s]: scale of the warm-up that stands in for a temperature.
+    has_coupling : bool
+        A torque on the link from elsewhere is known.
     """
 
     balances: tuple[str, ...]
@@ -57,6 +59,7 @@ class Sensing:
     moving: str = "motor_position"
     temperature_origin: float = 0.0
     longest_run: float = 0.0
+    has_coupling: bool = False
 
     @property
     def one_sided(self) -> bool:
@@ -66,6 +69,12 @@ class Sensing:
 
 TEMPERATURE_CHANGE: Final = 2.0
 """Change of the temperature over the records that is worth the name [K]."""
+TWIST: Final = next(
+    e.key
+    for e in EFFECTS.values()
+    if e.stage == "structure" and any(p.role == "stiffness" for p in e.parameters)
+)
+"""Effect by which a transmission twists at all."""
 DRIVES: Final = ("motor_torque", "motor_current", "motor_voltage")
 
 
@@ -111,6 +120,7 @@ def _sensed(record: Record, elastic: bool) -> Sensing:
         "has_drive": drive,
         "has_temperature": temperature,
         "both_positions": motor and link,
+        "has_coupling": record.has("coupling_torque"),
     }
     moving = "motor_position" if motor else "link_position"
     if not drive and not (motor and link):
@@ -186,7 +196,10 @@ def check_alike(
             found.append(sense(record, model))
         except InputError as error:
             raise InputError(f"{label}: {str(error).removeprefix(record.name + ': ')}") from None
-        if found[-1].balances != found[0].balances:
+        if (
+            found[-1].balances != found[0].balances
+            or found[-1].has_coupling != found[0].has_coupling
+        ):
             raise InputError(
                 f"{label}: {_difference(record, records[0], called[0])}; give records with the "
                 "same channels"
@@ -227,7 +240,7 @@ def _difference(record: Record, first: Record, label: str) -> str:
         return (
             f"has a {what}, which {label} has not" if here else f"has no {what}, which {label} has"
         )
-    for channel in ("link_torque", "motor_position", "link_position"):
+    for channel in ("link_torque", "motor_position", "link_position", "coupling_torque"):
         if record.has(channel) != first.has(channel):
             return (
                 f"has {channel}, which {label} has not"
@@ -257,7 +270,8 @@ def adapt(
     gravity without a torque sensor.
     """
     if sensing.clamped_link:
-        model = replace(model, inertias=())
+        # torque against twist shows the transmission, whatever else the model has or has not
+        model = replace(model if model.is_elastic else model.add(TWIST), inertias=())
     elif sensing.balances == ("axis",) and not set(SIDE_INERTIAS) & set(known or ()):
         model = replace(model, inertias=TOTAL_INERTIA)
     if sensing.one_sided:
@@ -313,6 +327,8 @@ def signals_of(record: Record, joint: Joint, sensing: Sensing) -> dict[str, Floa
         out["link_position"] = np.asarray(link if link is not None else one)
     if sensing.has_torque:
         out["torque"] = np.asarray(record["link_torque"])
+    if sensing.has_coupling:
+        out["coupling_torque"] = np.asarray(record["coupling_torque"])
     out["temperature"] = (
         record["temperature"] - sensing.temperature_origin
         if sensing.has_temperature

@@ -24,6 +24,7 @@ POSITION_CHAINS: Final = {
     "link_position": ("link_position", "link_velocity", "link_acceleration", "link_jerk"),
     "torque": ("torque", "torque_rate"),
     "drive": ("drive", "drive_rate"),
+    "coupling_torque": ("coupling_torque",),
 }
 """Measured signals and the signals that follow from them by derivatives."""
 

@@ -22,6 +22,7 @@ _UNITS: Final[Mapping[str, tuple[str, str]]] = {
     "link_velocity": ("rad/s", "m/s"),
     "link_acceleration": ("rad/s2", "m/s2"),
     "link_torque": ("N.m", "N"),
+    "coupling_torque": ("N.m", "N"),
     "temperature": ("K", "K"),
     "reference_position": ("rad", "m"),
     "run": ("1", "1"),

@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final, final
 
+from identification.data.formula import Formula
 from identification.data.plain_text import toml_string
 from identification.data.units import base_unit, same_dimension
 from identification.errors import InputError
@@ -34,6 +35,8 @@ class Column:
         Encoder counts of one turn, where the unit is ``counts``.
     step : float, optional
         For time only: the files has no time column, the samples are `step` apart.
+    formula : Formula, optional
+        In place of a column: what is made of several.
     """
 
     channel: str
@@ -43,12 +46,24 @@ class Column:
     sign: int = 1
     counts_per_turn: float | None = None
     step: float | None = None
+    formula: Formula | None = None
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Columns of the file that the channel is made of."""
+        if self.formula is not None:
+            return self.formula.columns
+        return () if self.step is not None else (self.column,)
 
     def describe(self) -> str:
         """Return one line for the provenance: where the channel comes from."""
         if self.step is not None:
             return f"{self.channel} = row number x {self.step:g} {self.unit}"
-        text = f"{self.channel} = {self.column!r}"
+        text = (
+            f"{self.channel} = {self.column!r}"
+            if self.formula is None
+            else f"{self.channel} = {self.formula.text}"
+        )
         if self.channel == "run":
             return text
         text += f" [{self.unit}]"
@@ -62,7 +77,11 @@ class Column:
 
     def toml(self) -> str:
         """Return ``channel = { column = ..., unit = ... }``."""
-        items = [f"column = {toml_string(self.column)}"]
+        items = [
+            f"column = {toml_string(self.column)}"
+            if self.formula is None
+            else f"formula = {toml_string(self.formula.text)}"
+        ]
         if self.channel != "run":
             items.append(f"unit = {toml_string(self.unit)}")
         if self.scale != 1.0:

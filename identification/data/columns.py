@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from identification.data.channels import CHANNELS, channel_unit
 from identification.data.column import Column, header_unit, shown, split_unit
+from identification.data.formula import Formula, parse_formula
 from identification.data.guess import fragment, guess_columns
 from identification.data.plain_text import from_toml, toml_string
 from identification.data.units import check_unit
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
 NAMES: Final = ("time", *CHANNELS)
-_KEYS: Final = frozenset({"column", "unit", "scale", "sign", "counts_per_turn", "step"})
+_KEYS: Final = frozenset({"column", "formula", "unit", "scale", "sign", "counts_per_turn", "step"})
 
 
 def channel_of(name: str) -> str | None:
@@ -180,7 +181,8 @@ def _entry(
     if not table or (unknown := set(table) - _KEYS):
         said = f"unknown key {', '.join(sorted(unknown))}" if table else f"{spec!r} is not a table"
         raise InputError(
-            f"{where}: {said}: write {{ column = ..., unit = ..., scale, sign, counts_per_turn }}"
+            f"{where}: {said}: write {{ column = ... or formula = ..., unit = ..., scale, sign, "
+            f"counts_per_turn }}"
         )
     step = _number(table, "step", where)
     if step is not None:
@@ -191,8 +193,9 @@ def _entry(
         return Column(
             "time", "", _fitting(table.get("unit", "s"), wanted, None, channel), step=step
         )
-    column = table.get("column")
-    if not isinstance(column, str) or column not in names:
+    formula = _formula(table, names, channel, where)
+    column = table.get("column") if formula is None else ""
+    if not isinstance(column, str) or (formula is None and column not in names):
         raise InputError(f"{where}: no column {column!r} in the file: it has {shown(names)}")
     sign = _number(table, "sign", where)
     if sign not in {None, 1.0, -1.0}:
@@ -202,7 +205,7 @@ def _entry(
         raise InputError(f"{where}: scale is {scale!r}: give a finite number that is not zero")
     counts = _number(table, "counts_per_turn", where)
     unit = table.get("unit")
-    if unit is None:
+    if unit is None and formula is None:
         own = recognise_quietly(column, kind, units.get(column))
         unit = (
             units.get(column)
@@ -212,14 +215,37 @@ def _entry(
     if channel == "run":
         return Column("run", column, "1")
     if not isinstance(unit, str):
+        said = f"column {column!r}" if formula is None else f"formula {formula.text!r}"
         raise InputError(
-            f"{where}: column {column!r} has no unit: add unit = {toml_string(wanted)}, or what "
-            "it is in"
+            f"{where}: {said} has no unit: add unit = {toml_string(wanted)}, or what it is in"
         )
     fitting = _fitting(unit, wanted, counts, channel)
     return Column(
-        channel, column, fitting, 1.0 if scale is None else scale, -1 if sign == -1.0 else 1, counts
+        channel,
+        column,
+        fitting,
+        1.0 if scale is None else scale,
+        -1 if sign == -1.0 else 1,
+        counts,
+        formula=formula,
     )
+
+
+def _formula(
+    table: Mapping[str, Any], names: Sequence[str], channel: str, where: str
+) -> Formula | None:
+    """The formula of an entry, None where it names a column."""
+    text = table.get("formula")
+    if text is None:
+        return None
+    if "column" in table or not isinstance(text, str):
+        raise InputError(f'{where}: give either column = "..." or formula = "...", each a text')
+    if channel == "run":
+        raise InputError(f"{where}: runs are told by a column, not by a formula")
+    try:
+        return parse_formula(text, tuple(names))
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
 
 
 def _fitting(unit: Any, wanted: str, counts: float | None, channel: str) -> str:
@@ -289,7 +315,9 @@ def choose(
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
     problems: dict[str, str] = {}
-    mapped = {entry.column for entry in chosen.values()}
+    mapped = {
+        entry.column for entry in chosen.values() if entry.formula is None
+    }  # a column of a formula may be a channel too
     for name in names:
         if name in mapped:
             continue
@@ -312,7 +340,7 @@ def choose(
         said = open_problems[0] if open_problems else f"no column is recognised as {missing}"
         guesses = [g for g in guess_columns(names, units, kind) if g.column.channel not in chosen]
         raise InputError(f"{where}: {said}; {fragment(guesses, names, kind)}")
-    used = {entry.column for entry in chosen.values()}
+    used = {name for entry in chosen.values() for name in entry.sources}
     unused = [name for name in names if name not in used]
     notes = (f"columns not used: {shown(unused)}",) if unused else ()
     order = {name: place for place, name in enumerate(NAMES)}

@@ -420,7 +420,8 @@ def toml_text(
         for name, c in calibration.items():
             error = f", stderr = {c['stderr']:.6g}" if c.get("stderr") is not None else ""
             lines.append(
-                f'{toml_string(name)} = {{ value = {c["value"]:.10g}{error}, unit = "{c["unit"]}" }}'
+                f"{toml_string(name)} = {{ value = {c['value']:.10g}{error}, "
+                f'unit = "{c["unit"]}" }}'
             )
     if provenance:
         lines += [

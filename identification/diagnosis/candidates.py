@@ -121,7 +121,9 @@ def offered(
         ]
         if one_sided and "motor" in places and "link" in places:
             places.remove("link")
-        if one_sided and not sensing.both_positions:
+        if sensing.clamped_link:  # the twist is what is recorded; its error cannot be told from it
+            places = [p for p in places if p != "torsion"]
+        elif one_sided and not sensing.both_positions:
             kept = ("transmission",) if direct and effect.of_displacement else ()
             places = [p for p in places if p in kept or p not in ("transmission", "torsion")]
         if effect.angular and data.joint.kind == "linear":

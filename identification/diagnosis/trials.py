@@ -203,7 +203,7 @@ def make_base(solution: Solution, data: Dataset) -> Base:
     rw = rw - orthonormal @ (orthonormal.T @ rw)
     shares = np.array(
         [
-            _effective_share(rw[balance == k][train.taking[b]])
+            effective_share(rw[balance == k][train.taking[b]])
             for k, b in enumerate(balances.balances)
         ]
     )
@@ -285,7 +285,7 @@ def flatten(
     return r, j, block, np.repeat(np.arange(len(balances)), size)
 
 
-def _effective_share(residual: FloatArray) -> float:
+def effective_share(residual: FloatArray) -> float:
     """Share of rows that count as independent (initial positive sequence of the
     autocorrelation).
     """

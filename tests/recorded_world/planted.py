@@ -450,12 +450,11 @@ def _changed(rig: Rig, effects: list[str], sizes: list[float], folder: Path) -> 
             why = last.partition(" (choose")[0]
             outcomes.append(_refused(rig, effect, size, "changed", why))
             continue
-        names = [
-            str(c["parameter"]) for c in json.loads(out.read_text(encoding="utf-8"))["changed"]
-        ]
-        wrong = tuple(n for n in names if n not in right)
-        good = bool(set(names) & right)
-        said = ", ".join(names) or "nothing changed"
+        moved = json.loads(out.read_text(encoding="utf-8"))["changed"]
+        sets = [(str(c["parameter"]), *map(str, c.get("tied_with", ()))) for c in moved]
+        wrong = tuple("|".join(names) for names in sets if not set(names) & right)
+        good = any(set(names) & right for names in sets)
+        said = ", ".join("|".join(names) for names in sets) or "nothing changed"
         outcomes.append(
             Outcome(
                 rig=rig.name,
@@ -463,7 +462,7 @@ def _changed(rig: Rig, effects: list[str], sizes: list[float], folder: Path) -> 
                 size=size,
                 task="changed",
                 right=good,
-                alone=good and not wrong,
+                alone=good and all(set(names) <= right for names in sets),
                 wrong=wrong,
                 said=said,
             )

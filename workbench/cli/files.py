@@ -90,6 +90,7 @@ def check_outputs(arguments: Namespace) -> None:
     ]
     joint = getattr(arguments, "joint", None)
     inputs += _fmu_of(joint)
+    inputs += [arguments.reference] if getattr(arguments, "reference", None) else []
     named: dict[str, str] = {}
     for option in OUTPUTS:
         path = getattr(arguments, option, None)

@@ -17,6 +17,7 @@ from identification.diagnosis.diagnose import diagnose
 from identification.diagnosis.improve import Improvement, improve
 from identification.diagnosis.locate import Unexplained
 from identification.fitting.fit import Fit, fit
+from workbench.cli.changed import compared
 from workbench.cli.files import (
     alike,
     distinct,
@@ -35,17 +36,29 @@ def improve_files(
     *,
     other_payload: Sequence[str] = (),
     max_additions: int = 6,
+    reference: str | None = None,
 ) -> tuple[dict[str, Any], Improvement, list[Record]]:
-    """The loop on files: its JSON, the result and the records."""
+    """The loop on files: its JSON, the result and the records; with a `reference`, first what
+    changed since.
+    """
     distinct(training=train, other_payload=other_payload, held_out=held_out)
     joint = open_joint(joint_path)
     records, _ = _training(train, other_payload, joint)
     held, _ = open_records(held_out, joint)
     alike([*train, *other_payload, *held_out], [*records, *held], joint)
+    since = (
+        compared(open_joint(reference), [r for r in records if r.payload != "other"])
+        if reference
+        else None
+    )
+    if since is not None:  # what has moved is not known any more
+        gone = {n for c in since.changes for n in (c.parameter, *c.tied)}
+        joint = replace(joint, known={n: k for n, k in joint.known.items() if n not in gone})
     found = improve(records, joint, held, max_additions=max_additions, progress=progress_bar)
     progress_bar("done", 1.0)
     _print_warnings(found.warnings, [*records, *held])
-    return found.as_json(), found, [*records, *held]
+    data = found.as_json() if since is None else {**found.as_json(), "changed": since.as_json()}
+    return data, found, [*records, *held]
 
 
 def _print_warnings(warnings: Sequence[str], records: Sequence[Record]) -> None:
@@ -73,6 +86,7 @@ def run_improve(arguments: Namespace) -> int:
         arguments.joint,
         other_payload=arguments.other_payload,
         max_additions=arguments.max_steps,
+        reference=arguments.reference,
     )
     _print_improvement(found)
     _write_improvement(found, records, arguments.report, arguments.output, arguments.command)

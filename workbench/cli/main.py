@@ -193,6 +193,14 @@ def _parser() -> argparse.ArgumentParser:
     improved.add_argument(
         "--max-steps", type=_count, default=6, metavar="N", help="most effects to add (default 6)"
     )
+    improved.add_argument(
+        "--reference",
+        metavar="REFERENCE",
+        help="fitted joint file: first say what changed since, before any new effect is looked for",
+    )
+    moved = verb("changed", "changed", "which parameters of a fitted joint moved, by how much")
+    moved.add_argument("reference", metavar="REFERENCE", help="joint file written by a fit")
+    moved.add_argument("records", nargs="+", metavar="REC", help="record files")
     report = verb(
         "report", "loop", "the improve loop, written as one HTML file", records=True, joint=True
     )

@@ -107,7 +107,7 @@ def _read(file: Path, place: Path, raw: Mapping[str, Any], axis: str, name: str)
 def _load(
     table: Table, chosen: tuple[Column, ...], kind: str, file: Path
 ) -> tuple[npt.NDArray[np.float64], dict[str, npt.NDArray[np.float64]], tuple[str, ...]]:
-    numeric = [entry.column for entry in chosen if entry.channel != "run" and entry.step is None]
+    numeric = [name for entry in chosen if entry.channel != "run" for name in entry.sources]
     text = [entry.column for entry in chosen if entry.channel == "run"]
     loaded = table.load(list(dict.fromkeys(numeric)), text)
     channels: dict[str, npt.NDArray[np.float64]] = {}
@@ -118,6 +118,12 @@ def _load(
             channels[entry.channel] = to_si(entry.step * np.arange(count), entry.unit, "time")
         elif entry.channel == "run":
             channels["run"], notes = _runs(loaded[entry.column])
+        elif entry.formula is not None:
+            try:
+                made = entry.formula.values(loaded)
+            except InputError as error:
+                raise InputError(f"{file}: {error}") from None
+            channels[entry.channel] = _si(made, entry, kind, file)
         else:
             channels[entry.channel] = _si(loaded[entry.column], entry, kind, file)
     time = channels.pop("time")

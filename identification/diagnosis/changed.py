@@ -1,0 +1,887 @@
+"""What changed: which parameters of a fitted joint moved, by how much, and with what certainty.
+
+The structure of the reference is fitted to new records with the reference's own values and standard
+errors as what is known beforehand.  A parameter is let go only where that lowers the error on
+blocks of time that its fit did not see, so that the fewest changes that explain the records are
+named.  Rates of false discovery after Benjamini and Hochberg (1995).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Final, final
+
+import numpy as np
+import numpy.typing as npt
+
+from casadi_models import EFFECTS, JointModel
+from casadi_models.term import LINK_INERTIA, TOTAL_INERTIA
+from identification.balance.balances import balances_of
+from identification.balance.dataset import HOLD_NAME, Dataset, load_dataset, prepared_model
+from identification.data.joint_file import Joint
+from identification.data.prepare import STANDARD_GRAVITY
+from identification.data.record import Record
+from identification.diagnosis.candidates import observable
+from identification.diagnosis.claims import FALSE_DISCOVERY, GAIN, LARGEST_SET
+from identification.diagnosis.trials import effective_share
+from identification.errors import InputError
+from identification.fitting.assess import Error, assess
+from identification.fitting.covariance import FEWEST_BLOCKS, RANK, errors_of_blocks
+from identification.fitting.engine import Solution, solve, stack
+from identification.fitting.start_values import bounds_of
+from identification.fitting.weak_form import WeakForm
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+Progress = Callable[[str, float], None]
+
+LEAST_FALL: Final = 1.0
+"""Fall of the RMS of some balance on blocks that the fit did not see that a change must bring [%]:
+under it the records can be explained as well without the change, whatever its standard error
+says."""
+CERTAIN: Final = 2.0
+"""Standard errors of the mean difference between blocks up to which two explanations do equally
+well: a 95 % band.
+"""
+TIED: Final = 0.15
+"""Share of the gain that another name for a change may lose and still stand beside it: what the
+sets of `improve` allow.
+"""
+LEAST_SHARE: Final = 0.5
+"""Share of the gain below which a name does not stand beside another one, however much blocks
+differ: it misses half of it.
+"""
+FOLDS: Final = 8
+"""Parts of the blocks that are left out in turn: each leaves most of the motion in the fit."""
+HELD: Final = 1e-6
+"""Standard error of a reference value that was held, as a share of its size: known as far as a
+file's figures go.
+"""
+STEPS: Final = 12
+"""Steps of one refit at most: it starts next to its end."""
+
+
+@final
+@dataclass(frozen=True)
+class Change:
+    """One parameter that moved.
+
+    Attributes
+    ----------
+    parameter, unit : str
+    before, after : float
+        Value of the reference, and on the new records [unit].
+    stderr : float
+        Standard error of the difference: of the new value, of the reference's, and of what ties it
+        to the others.
+    q : float
+        Rate of false discovery at which this change is just named.
+    tied : tuple of str
+        Other parameters that explain the records as well in its place.
+    drop_percent : float
+        Rise of the RMS of the balance it shows in most, on blocks not seen, if this change were
+        left out, in % of that RMS.
+    """
+
+    parameter: str
+    before: float
+    after: float
+    stderr: float
+    unit: str
+    q: float
+    tied: tuple[str, ...] = ()
+    drop_percent: float = 0.0
+
+    def as_json(self) -> dict[str, Any]:
+        """The shape of `changed --json`."""
+        return {
+            "parameter": self.parameter,
+            "from": self.before,
+            "to": self.after,
+            "stderr": self.stderr,
+            "unit": self.unit,
+            "q": self.q,
+            "tied_with": list(self.tied),
+            "drop_percent": self.drop_percent,
+        }
+
+
+@final
+@dataclass(frozen=True)
+class Payload:
+    """A load that was added (or taken off, negative).
+
+    Attributes
+    ----------
+    mass, stderr : float
+        [kg]
+    distance, distance_stderr : float or None
+        Of its centre from the axis of rotation [m]; None on a linear axis.
+    """
+
+    mass: float
+    stderr: float
+    distance: float | None
+    distance_stderr: float | None
+
+    def as_json(self) -> dict[str, Any]:
+        """The shape of `changed --json`."""
+        return {
+            "mass": self.mass,
+            "stderr": self.stderr,
+            "distance": self.distance,
+            "distance_stderr": self.distance_stderr,
+        }
+
+
+@final
+@dataclass(frozen=True)
+class Changes:
+    """What moved between a reference and new records.
+
+    Attributes
+    ----------
+    joint : Joint
+        The reference.
+    model : JointModel
+        With the values that hold on the new records.
+    changes : tuple of Change
+        The largest gain first.
+    payload : Payload or None
+    unchanged, untestable : tuple of str
+        Parameters of the reference that stayed, and those that the new records do not show.
+    before, after : Error
+        Of the reference, and after the changes, on the new records.
+    refitted : Error
+        With every parameter fitted anew: what no change of a parameter can explain.
+    minor : tuple of Change
+        A shift that is certain, but smaller than the model's own error: another motion may do as
+        much to a model that is not exact.
+    """
+
+    joint: Joint
+    model: JointModel
+    changes: tuple[Change, ...]
+    payload: Payload | None
+    unchanged: tuple[str, ...]
+    untestable: tuple[str, ...]
+    before: Error
+    after: Error
+    refitted: Error
+    records: tuple[str, ...] = ()
+    payload_note: str = ""
+    minor: tuple[Change, ...] = ()
+
+    @property
+    def unexplained(self) -> tuple[str, ...]:
+        """Balances in which more than noise is left with every parameter fitted anew: something
+        that is no parameter.
+        """
+        return tuple(b for b, e in self.refitted.balances.items() if e.ratio > NOISE_RATIO)
+
+    def as_json(self) -> dict[str, Any]:
+        """The shape of `changed --json`."""
+        return {
+            "changed": [c.as_json() for c in self.changes],
+            "payload": self.payload.as_json() if self.payload else None,
+            "minor": [c.as_json() for c in self.minor],
+            "unchanged": list(self.unchanged),
+            "untestable": list(self.untestable),
+            "records": list(self.records),
+            "before": self.before.as_json(),
+            "after": self.after.as_json(),
+            "refitted": self.refitted.as_json(),
+            "unexplained": list(self.unexplained),
+            "payload_note": self.payload_note,
+        }
+
+    def __str__(self) -> str:
+        return "\n".join(self._lines())
+
+    def _lines(self) -> Iterable[str]:
+        for word, group in (("changed", self.changes), ("small but certain", self.minor)):
+            for c in group:
+                share = f" ({100 * (c.after / c.before - 1):+.1f} %)" if c.before else ""
+                yield (
+                    f"{word}: {c.parameter} {c.before:.6g} -> {c.after:.6g} +- {c.stderr:.2g} "
+                    f"{c.unit}{share}, q = {c.q:.2g}"
+                )
+                if c.tied:
+                    yield f"  or {' or '.join(c.tied)}: these cannot be told apart on these records"
+        if not self.changes:
+            yield (
+                "nothing changed: no parameter moved by more than its band and the error of "
+                "the model itself"
+            )
+        if self.payload is not None:
+            at = (
+                f" at {self.payload.distance:.3g} +- {self.payload.distance_stderr:.2g} m"
+                if self.payload.distance is not None
+                else ""
+            )
+            yield f"payload: {self.payload.mass:.3g} +- {self.payload.stderr:.2g} kg{at}"
+        elif self.payload_note:
+            yield f"payload: {self.payload_note}"
+        if self.untestable:
+            yield f"not shown by these records: {', '.join(self.untestable)}"
+        yield (
+            f"relative error {self.before.relative_error_percent:.2f} % with the reference, "
+            f"{self.after.relative_error_percent:.2f} % after the changes"
+        )
+        for b in self.unexplained:
+            e = self.after.balances[b]
+            yield (
+                f"not explained by any parameter: {b} balance, {e.rms:.3g} {e.unit} left, "
+                f"{e.ratio:.2g} times its noise; see irj improve"
+            )
+
+
+NOISE_RATIO: Final = 1.5
+"""Residual over noise from which more than noise is left: the limit of `improve`."""
+
+
+def changed(
+    reference: Joint, records: Record | Sequence[Record], *, progress: Progress | None = None
+) -> Changes:
+    """Name the parameters of a fitted joint that moved.
+
+    Parameters
+    ----------
+    reference : Joint
+        A joint file written by a fit, with its values and standard errors.
+    records : Record or sequence of Record
+        New records, with the channels of those of the fit.
+    progress : callable, optional
+        ``progress(text, share)``.
+
+    Returns
+    -------
+    Changes
+
+    Raises
+    ------
+    InputError
+        No fitted values; a parameter of these records that the reference has no value of; records
+        too short.
+
+    Examples
+    --------
+    >>> print(changed(load_joint("healthy.toml"), read("today.csv")))   # doctest: +SKIP
+    """
+    given = [records] if isinstance(records, Record) else list(records)
+    tell = progress or (lambda text, share: None)
+    search = _prepared(reference, given, tell)
+    moved = search.chosen(tell)
+    tell("sizes and bands", 0.9)
+    return _result(search, moved, tuple(r.name for r in given))
+
+
+def _prepared(reference: Joint, records: Sequence[Record], tell: Progress) -> _Search:
+    """The structure of the reference on the new records, with the calibration of its sensors as
+    what may have changed too.
+    """
+    where = reference.source or reference.name
+    if not reference.fitted:
+        raise InputError(
+            f"{where}: has no [fitted] values to compare with; write it with irj fit REC... "
+            f"--joint {where} -o FILE"
+        )
+    if not records:
+        raise InputError("no record to compare with the reference; give at least one")
+    plain = prepared_model(replace(reference, known={}), records[0])
+    lacking = [n for n in plain.parameter_names if n not in reference.fitted and n != HOLD_NAME]
+    if lacking:
+        raise InputError(
+            f"{where}: has no fitted value of {', '.join(lacking)}, which these records ask for; "
+            "fit the reference on records with the same channels"
+        )
+    free = replace(reference, known={})
+    plain = plain.with_values(
+        {n: reference.fitted[n] for n in plain.parameter_names if n in reference.fitted}
+    )
+    data = load_dataset(records, [], free, plain)
+    if data.blocks < FEWEST_BLOCKS:
+        raise InputError(
+            f"{records[0].name}: too short to tell a change from chance; give at least "
+            f"{1.5 * FEWEST_BLOCKS:g} s of motion"
+        )
+    tell("refitting the reference", 0.1)
+    refit = solve(plain, data, start=dict(plain.values))
+    model = plain
+    for label in _calibrations(plain, data):
+        model = model.add(label)
+    values = {**{p.name: p.start for p in model.parameters}, **plain.values}
+    values.update({n: refit.values[n] for n in _nuisances(plain)})
+    names = tuple(model.parameter_names)
+    balances = balances_of(model, data.sensing, wrt=names)
+    error = assess(refit.model, data, data.train, refit.values)
+    weights, inexact, shares = _shared(refit, data, error)
+    form = WeakForm(balances, data, values, names, weights)
+    return _Search(
+        reference,
+        model,
+        data=data,
+        refit=refit,
+        form=form,
+        spread=_prior(reference, model, values),
+        inexact=inexact,
+        shares=shares,
+        refitted=error,
+    )
+
+
+def _calibrations(model: JointModel, data: Dataset) -> list[str]:
+    """Gain and offset of the drive and of the torque sensor, which the file holds as figures
+    and not as parameters of the model.
+    """
+    out = []
+    for effect in EFFECTS.values():
+        if effect.family != "sensor" or effect.shapes or effect.is_delay or not effect.candidate:
+            continue
+        out += [
+            effect.key
+            for place in effect.acts_on
+            if len(effect.acts_on) == 1
+            and observable(place, data.sensing)
+            and not model.has(effect.key)
+        ]
+    return out
+
+
+def _shared(
+    refit: Solution, data: Dataset, error: Error
+) -> tuple[dict[str, FloatArray], FloatArray, FloatArray]:
+    """Weights of the refit, each row counted as the share of an independent one, and what it leaves
+    over noise.
+
+    Returns
+    -------
+    weights : dict of (rows,) array
+    inexact : (balances,) array
+        Sum of squares that is left over the noise with every parameter fitted anew: the model's own
+        error.
+    shares : (balances,) array
+    """
+    balances = balances_of(refit.model, data.sensing, wrt=())
+    stacked = stack(balances, data.train, refit.values)
+    weights, inexact, shares = {}, [], []
+    for b in balances.balances:
+        rows = (stacked.residual[b] * refit.weights[b])[stacked.taking[b]]
+        shares.append(effective_share(rows) if len(rows) else 1.0)
+        weights[b] = np.asarray(refit.weights[b] * math.sqrt(shares[-1]), dtype=np.float64)
+        ratio = error.balances[b].ratio
+        inexact.append(shares[-1] * float(rows @ rows) * max(0.0, 1 - 1 / max(ratio, 1.0) ** 2))
+    return weights, np.array(inexact), np.array(shares)
+
+
+def _nuisances(model: JointModel) -> tuple[str, ...]:
+    """What says nothing of the joint: it is taken as the refit has it."""
+    return tuple(n for n in model.parameter_names if n in (*model.named("smoothing"), HOLD_NAME))
+
+
+def _prior(reference: Joint, model: JointModel, values: dict[str, float]) -> FloatArray:
+    """Standard error of each reference value; that of a nuisance is not asked for."""
+    nuisances = _nuisances(model)
+    out = []
+    for p in model.parameters:
+        size = reference.errors.get(p.name, 0.0)
+        out.append(
+            math.nan if p.name in nuisances else max(size, HELD * max(abs(values[p.name]), HELD))
+        )
+    return np.array(out)
+
+
+@final
+@dataclass(frozen=True)
+class _Search:
+    """Rows of the new records and what the reference says beforehand.
+
+    Attributes
+    ----------
+    form : WeakForm
+        Every parameter in the order of the model, weighted so that its rows count as independent.
+    spread : (p,) array
+        Standard error of each reference value; not a number for a nuisance.
+    inexact : (balances,) array
+        Squares that the model leaves over the noise with every parameter fitted anew.
+    shares : (balances,) array
+        Share of the rows that count as independent.
+    refitted : Error
+        Of that fit.
+    """
+
+    reference: Joint
+    model: JointModel
+    data: Dataset
+    refit: Solution
+    form: WeakForm
+    spread: FloatArray
+    inexact: FloatArray
+    shares: FloatArray
+    refitted: Error
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.form.free
+
+    @cached_property
+    def start(self) -> FloatArray:
+        """Values of the reference, (p,)."""
+        return np.array([self.form.values[n] for n in self.names])
+
+    @cached_property
+    def _limits(self) -> dict[str, tuple[float, float]]:
+        """Bounds, wide enough for the reference itself."""
+        limits = bounds_of(self.model, {}, self.data)
+        return {
+            n: (min(limits[n][0], v), max(limits[n][1], v))
+            for n, v in zip(self.names, self.start.tolist(), strict=True)
+        }
+
+    @cached_property
+    def shown(self) -> npt.NDArray[np.bool_]:
+        """Parameters that move the rows and that the reference knows, (p,)."""
+        size = np.linalg.norm(self.form.jacobian(self.start), axis=0)
+        return np.asarray((size > 1e-9 * size.max()) & np.isfinite(self.spread))
+
+    def free(self, moved: Sequence[int]) -> list[int]:
+        """Places of what is fitted when the parameters of `moved` are let go."""
+        return sorted(moved)
+
+    def fitted(self, moved: Sequence[int], start: FloatArray) -> _Point:
+        """The refit with the parameters of `moved` let go; all others stay at the reference."""
+        free = self.free(moved)
+        x = np.where(np.isin(np.arange(len(start)), free), start, self.start)
+        if free:
+            names = tuple(self.names[i] for i in free)
+            form = replace(self.form, values=self.form.at(x), free=names)
+            values, _ = form.fitted(self._limits, STEPS)
+            x = np.array([values[n] for n in self.names])
+        return _Point.at(self, x, tuple(moved))
+
+    def groups(self) -> list[tuple[int, ...]]:
+        """What may be let go in one step: each parameter, and inertia with gravity, which a
+        payload changes together.
+        """
+        out: list[tuple[int, ...]] = [(int(i),) for i in np.flatnonzero(self.shown)]
+        together = tuple(i for i in (*self.inertia, *self.gravity) if self.shown[i])
+        return [*out, together] if len(together) > 1 else out
+
+    @property
+    def inertia(self) -> tuple[int, ...]:
+        """Place of the inertia that a payload adds to."""
+        return tuple(i for i, n in enumerate(self.names) if n in (LINK_INERTIA, *TOTAL_INERTIA))
+
+    @property
+    def gravity(self) -> tuple[int, ...]:
+        """Places of the gravity torques."""
+        named = self.model.named("weight")
+        return tuple(i for i, n in enumerate(self.names) if n in named)
+
+    def trials(self, point: _Point) -> dict[tuple[int, ...], _Gain]:
+        """What each group that is still held would bring, with its rate of false discovery
+        among all of them.
+        """
+        groups = [g for g in self.groups() if not set(g) <= set(point.moved)]
+        gains = [point.gain(g) for g in groups]
+        rates = discovery_rates([g.p_value for g in gains])
+        return {g: replace(gain, q=q) for g, gain, q in zip(groups, gains, rates, strict=True)}
+
+    def chosen(self, tell: Progress) -> _Point:
+        """Forward selection of what moved, each addition followed by leaving out what it made
+        needless.
+        """
+        point = self.fitted((), self.start)
+        refused: set[tuple[int, ...]] = set()
+        for number in range(2 * len(self.names)):
+            tell("looking for what changed", 0.2 + 0.6 * min(1.0, number / 8))
+            worth = {g: t for g, t in self.trials(point).items() if t.worth and g not in refused}
+            if not worth:
+                break
+            group = max(worth, key=lambda g: worth[g].nats)
+            bigger = self._without_needless(
+                self.fitted(tuple(sorted({*point.moved, *group})), point.x)
+            )
+            if bigger.score > point.score:
+                point = bigger
+            else:
+                refused.add(group)
+        return point
+
+    def _without_needless(self, point: _Point) -> _Point:
+        """The fit without those changes that the others make needless, one after the other."""
+        while len(point.moved) > 1:
+            smaller = {
+                i: self.fitted(tuple(j for j in point.moved if j != i), point.x)
+                for i in point.moved
+            }
+            needless = [
+                s for i, s in smaller.items() if not (self.shown[i] and self.trials(s)[(i,)].worth)
+            ]
+            if not needless:
+                return point
+            point = max(needless, key=lambda s: s.score)
+        return point
+
+
+@final
+@dataclass(frozen=True)
+class _Gain:
+    """What letting one or more parameters go brings on blocks that the fit did not see.
+
+    Attributes
+    ----------
+    nats : float
+        Log-likelihood over all balances.
+    block : (blocks,) array
+        The same by block, on common variances.
+    fall_percent : float
+        Largest fall of a balance's RMS.
+    beyond : bool
+        True where it takes more out of a balance than the model's own error leaves in it.
+    p_value, q : float
+        Chance of a change of this size, the smallest of the parameters'; rate of false discovery
+        among all that were tried.
+    """
+
+    nats: float
+    block: FloatArray
+    fall_percent: float
+    beyond: bool
+    p_value: float
+    q: float = 1.0
+
+    @property
+    def worth(self) -> bool:
+        """True where the records ask for it."""
+        return self.beyond and self.certain
+
+    @property
+    def certain(self) -> bool:
+        """True where chance is no explanation."""
+        return self.nats > GAIN and self.fall_percent >= LEAST_FALL and self.q <= FALSE_DISCOVERY
+
+
+@final
+@dataclass(frozen=True)
+class _Point:
+    """A refit with its normal equations by block and balance.
+
+    Attributes
+    ----------
+    x : (p,) array
+    moved : tuple of int
+        Places of the parameters that are let go.
+    grams : (blocks, balances, p + 1, p + 1) array
+        Products of the columns and, last, the residual.
+    rows : (balances,) array
+        Rows of each balance.
+    """
+
+    search: _Search
+    x: FloatArray
+    moved: tuple[int, ...]
+    grams: FloatArray
+    rows: FloatArray
+
+    @classmethod
+    def at(cls, search: _Search, x: FloatArray, moved: tuple[int, ...]) -> _Point:
+        """The point with its normal equations."""
+        form = search.form
+        stacked = form.stacked(x)
+        count = int(stacked.block.max()) + 1
+        names = form.balances.balances
+        grams = np.zeros((count, len(names), len(x) + 1, len(x) + 1))
+        rows = np.zeros(len(names))
+        for k, b in enumerate(names):
+            used = stacked.taking[b] & (stacked.block >= 0)
+            full = (
+                np.column_stack([stacked.jacobian[b], stacked.residual[b]])
+                * np.asarray(form.weights[b])[:, None]
+            )
+            for block in range(count):
+                part = full[used & (stacked.block == block)]
+                grams[block, k] = part.T @ part
+            rows[k] = float(np.sum(used))
+        return cls(search, x, moved, grams, rows)
+
+    @property
+    def away(self) -> FloatArray:
+        """How far each parameter is from the reference, (p,)."""
+        return self.x - self.search.start
+
+    @staticmethod
+    def _step(total: FloatArray, free: Sequence[int]) -> FloatArray:
+        """Step to the minimum of rows with these normal equations, the others held; (p,)."""
+        step = np.zeros(len(total) - 1)
+        if len(free):
+            step[list(free)] = -_inverse(total[np.ix_(free, free)]) @ total[list(free), -1]
+        return step
+
+    def squares(self, moved: Sequence[int]) -> FloatArray:
+        """Sum of squares of each block and balance under the step that the other folds give,
+        (blocks, balances).
+        """
+        free = self.search.free(moved)
+        total = self.grams.sum(axis=(0, 1))
+        count = len(self.grams)
+        folds = min(FOLDS, count)
+        out = np.zeros(self.grams.shape[:2])
+        for k in range(folds):
+            test = np.arange(count) % folds == k
+            whole = np.append(self._step(total - self.grams[test].sum(axis=(0, 1)), free), 1.0)
+            out[test] = np.einsum("i,bkij,j->bk", whole, self.grams[test], whole)
+        return out
+
+    @cached_property
+    def own(self) -> FloatArray:
+        """Sum of squares of each block and balance, not seen by the fit."""
+        return self.squares(self.moved)
+
+    @property
+    def score(self) -> float:
+        """Log-likelihood on blocks not seen [nats], rows counted as independent ones."""
+        return -float(np.sum(self._counts / 2 * np.log(np.maximum(self.own.sum(axis=0), 1e-300))))
+
+    @property
+    def _counts(self) -> FloatArray:
+        """Independent rows of each balance."""
+        return np.asarray(self.rows * self.search.shares)
+
+    def gain(self, group: Sequence[int]) -> _Gain:
+        """What letting a group go brings."""
+        moved = tuple(sorted({*self.moved, *group}))
+        after = self.squares(moved)
+        before, left = self.own.sum(axis=0), np.maximum(after.sum(axis=0), 1e-300)
+        counts = self._counts
+        variance = left / np.maximum(counts, 1.0)
+        block = ((self.own - after) / (2 * variance)).sum(axis=1)
+        nats = float(np.sum(counts / 2 * np.log(np.maximum(before, 1e-300) / left)))
+        fall = 100 * (1 - float(np.sqrt(np.min(left / np.maximum(before, 1e-300)))))
+        errors, sizes = self.errors(moved), self.sizes(moved)
+        new = [i for i in group if i not in self.moved]
+        p = min(_two_sided(sizes[i] / errors[i]) for i in new) if new else 1.0
+        beyond = bool(np.any(before - after.sum(axis=0) > self.search.inexact))
+        return _Gain(nats, block, fall, beyond, p)
+
+    def sizes(self, moved: Sequence[int]) -> FloatArray:
+        """Change of each parameter with those of `moved` let go, (p,)."""
+        return self.away + self._step(self.grams.sum(axis=(0, 1)), self.search.free(moved))
+
+    def free_errors(self, moved: Sequence[int], turned: FloatArray | None = None) -> FloatArray:
+        """Standard errors of the changes of all that is free, in their order (see
+        :meth:`_Search.free`).
+
+        Three parts: the scatter between blocks; the standard error of the reference value; and
+        those of the values that are held, as far as an error there would have moved this one.  In
+        other coordinates, x = `turned` @ new, where these are given.
+        """
+        free = self.search.free(moved)
+        if not free:
+            return np.zeros(0)
+        held = [
+            i for i in range(len(self.x)) if i not in free and np.isfinite(self.search.spread[i])
+        ]
+        total = self.grams.sum(axis=(0, 1))
+        step = self._step(total, free)
+        grams = self.grams.sum(axis=1)
+        scores = (grams[:, :-1, -1] + grams[:, :-1, :-1] @ step)[:, free]
+        grams = grams[:, :-1, :-1]
+        pulled = (
+            -_inverse(total[np.ix_(free, free)])
+            @ total[np.ix_(free, held)]
+            * self.search.spread[held]
+        )
+        own = np.where(np.isin(free, moved), self.search.spread[free], 0.0)
+        grams = grams[:, free][:, :, free]
+        if turned is not None:
+            back = np.linalg.inv(turned)
+            grams, scores = np.einsum("ia,bij,jc->bac", turned, grams, turned), scores @ turned
+            pulled = back @ pulled
+            own = np.sqrt((back**2) @ own**2)
+        blocks = errors_of_blocks(grams, scores)
+        found = np.zeros(len(free)) if blocks is None else blocks
+        return np.asarray(np.sqrt(found**2 + own**2 + np.sum(pulled**2, axis=1)))
+
+    def errors(self, moved: Sequence[int]) -> FloatArray:
+        """Standard errors of the changes by place, (p,); infinite for what is held."""
+        out = np.full(len(self.x), np.inf)
+        out[self.search.free(moved)] = self.free_errors(moved)
+        return out
+
+
+def _inverse(gram: FloatArray) -> FloatArray:
+    """Inverse of normal equations, columns scaled alike; directions that are rounding stay."""
+    size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    return np.asarray(
+        np.linalg.pinv(gram / np.outer(size, size), rcond=RANK, hermitian=True)
+        / np.outer(size, size),
+        dtype=np.float64,
+    )
+
+
+def _two_sided(z: float) -> float:
+    """Chance of so many standard errors either way."""
+    return math.erfc(abs(z) / math.sqrt(2.0))
+
+
+def discovery_rates(p_values: Sequence[float]) -> list[float]:
+    """Benjamini-Hochberg rates of false discovery (q) of p-values, in their order."""
+    order = np.argsort(p_values)
+    out = np.ones(len(p_values))
+    least = 1.0
+    for rank in range(len(order), 0, -1):
+        place = order[rank - 1]
+        least = min(least, p_values[place] * len(order) / rank)
+        out[place] = least
+    return [float(q) for q in out]
+
+
+def _result(search: _Search, point: _Point, records: tuple[str, ...]) -> Changes:
+    """Sizes, bands, rates, sets and the payload of a selection."""
+    names, parameters = search.names, {p.name: p for p in search.model.parameters}
+    tested = [int(i) for i in np.flatnonzero(search.shown)]
+    errors = point.errors(point.moved)
+    p_values = []
+    for i in tested:
+        moved = tuple(sorted({*point.moved, i}))
+        here = (
+            (errors, point.away) if i in point.moved else (point.errors(moved), point.sizes(moved))
+        )
+        p_values.append(_two_sided(here[1][i] / here[0][i]))
+    rates = dict(zip(tested, discovery_rates(p_values), strict=True))
+    found = []
+    for i in point.moved:
+        less = search.fitted(tuple(j for j in point.moved if j != i), point.x)
+        gain = less.gain((i,))
+        found.append(
+            (
+                gain.nats,
+                Change(
+                    names[i],
+                    float(search.start[i]),
+                    after=float(point.x[i]),
+                    stderr=float(errors[i]),
+                    unit=parameters[names[i]].unit,
+                    q=rates[i],
+                    tied=_tied(search, less, i, gain),
+                    drop_percent=gain.fall_percent,
+                ),
+            )
+        )
+    changes = tuple(c for _, c in sorted(found, key=lambda f: -f[0]))
+    values = dict(zip(names, map(float, point.x), strict=True))
+    payload, note = _payload(search, point)
+    data = search.data
+    model = search.model.with_values(values)
+    still = {names[i] for i in tested} - {names[i] for i in point.moved}
+    reference = [
+        n
+        for n in names
+        if n in search.reference.fitted and n != HOLD_NAME and parameters[n].role != "smoothing"
+    ]
+    return Changes(
+        search.reference,
+        model,
+        changes=changes,
+        payload=payload,
+        unchanged=tuple(n for n in reference if n in still),
+        untestable=tuple(n for n in reference if not search.shown[names.index(n)]),
+        before=assess(
+            search.model, data, data.train, dict(zip(names, map(float, search.start), strict=True))
+        ),
+        after=assess(model, data, data.train, values),
+        refitted=search.refitted,
+        records=records,
+        payload_note=note,
+        minor=_minor(search, point, rates),
+    )
+
+
+def _minor(search: _Search, point: _Point, rates: Mapping[int, float]) -> tuple[Change, ...]:
+    """What would be let go next if it were larger than the model's own error."""
+    trials = [(t, g[0]) for g, t in search.trials(point).items() if len(g) == 1 and t.certain]
+    if not trials:
+        return ()
+    gain, i = max(trials, key=lambda t: t[0].nats)
+    moved = (*point.moved, i)
+    unit = search.model.parameters[i].unit
+    after = float(search.start[i] + point.sizes(moved)[i])
+    tied = _tied(search, point, i, gain)
+    return (
+        Change(
+            search.names[i],
+            float(search.start[i]),
+            after=after,
+            stderr=float(point.errors(moved)[i]),
+            unit=unit,
+            q=rates[i],
+            tied=tied,
+            drop_percent=gain.fall_percent,
+        ),
+    )
+
+
+def _tied(search: _Search, less: _Point, i: int, gain: _Gain) -> tuple[str, ...]:
+    """Parameters that explain the records as well as this one in its place."""
+    out = []
+    for j in map(int, np.flatnonzero(search.shown)):
+        if j == i or j in less.moved:
+            continue
+        other = less.gain((j,))
+        difference = gain.block - other.block
+        spread = float(np.std(difference, ddof=1)) * math.sqrt(len(difference))
+        lost = float(difference.sum())
+        near = other.nats >= (1 - TIED) * gain.nats
+        if near or (lost <= CERTAIN * spread and other.nats >= LEAST_SHARE * gain.nats):
+            out.append((other.nats, search.names[j]))
+    return tuple(n for _, n in sorted(out, reverse=True)[: LARGEST_SET - 1])
+
+
+def _payload(search: _Search, point: _Point) -> tuple[Payload | None, str]:
+    """Mass and distance from the changes of inertia and of gravity torque: dJ = m r^2, dT = m g
+    r.
+    """
+    inertia = [i for i in search.inertia if i in point.moved]
+    gravity = [i for i in search.gravity if i in point.moved]
+    errors = point.errors(point.moved)
+    if search.model.kind == "linear":
+        return (
+            (Payload(float(point.away[inertia[0]]), float(errors[inertia[0]]), None, None), "")
+            if inertia
+            else (None, "")
+        )
+    if not gravity:
+        return None, ""
+    torque = float(np.linalg.norm(point.away[gravity]))
+    moment = torque / STANDARD_GRAVITY
+    if not inertia:
+        return (
+            None,
+            f"mass times distance changed by {moment:.3g} kg.m; the change of inertia is too "
+            "small to tell them apart",
+        )
+    added = float(point.away[inertia[0]])
+    mass, distance = moment**2 / added, added / moment
+    slopes = np.zeros((2, len(point.x)))
+    along = point.away[gravity] / torque
+    slopes[0, inertia[0]], slopes[1, inertia[0]] = -mass / added, 1 / moment
+    slopes[0, gravity] = 2 * moment / added / STANDARD_GRAVITY * along
+    slopes[1, gravity] = -distance / torque * along
+    spread = [_functional_error(point, row, inertia[0]) for row in slopes]
+    return Payload(mass, spread[0], abs(distance), spread[1]), ""
+
+
+def _functional_error(point: _Point, slopes: FloatArray, place: int) -> float:
+    """Standard error of a linear function of the changes: the same covariance in coordinates of
+    which it is one.
+    """
+    free = point.search.free(point.moved)
+    turned = np.eye(len(free))
+    own = free.index(place)
+    turned[own] = -slopes[free] / slopes[place]
+    turned[own, own] = 1 / slopes[place]
+    return float(point.free_errors(point.moved, turned)[own])
