@@ -22,6 +22,7 @@ import casadi as ca
 from .parameter import Parameter, Side
 from .quantities import UnitError, side_power
 from .signals import Expression, LocalSignals
+from .table import Table
 
 Place = Literal[
     "motor",
@@ -167,6 +168,8 @@ class Effect:
     candidate : bool
         False for another form of an effect of the library: used when it is named, not proposed by a
         diagnosis.
+    table : Table or None
+        Variable and parameters of a law that is a table and no formula.
     source : str
         Equation or paper.
     """
@@ -203,6 +206,7 @@ class Effect:
     shapes_reversal: bool = False
     everywhere: bool = False
     pairs: tuple[tuple[str, str, str], ...] = ()
+    table: Table | None = None
 
     def __post_init__(self) -> None:
         if (self.memory is None) != (self.states == 0):
@@ -496,6 +500,7 @@ def effect(
     shapes_reversal: bool = False,
     everywhere: bool = False,
     pairs: tuple[tuple[str, str, str], ...] = (),
+    table: Table | None = None,
 ) -> Callable[[Law], Law]:
     """Declare and register the decorated law as an effect (see :class:`Effect` for the
     arguments).
@@ -536,6 +541,7 @@ def effect(
                 everywhere=everywhere,
                 pairs=pairs,
                 formerly=formerly,
+                table=table,
             )
         )
         return law

@@ -23,6 +23,7 @@ Role = Literal[
     "compliance",
     "exponent",
     "order",
+    "range",
 ]
 Typical = float | Mapping[str, float] | None
 """A usual size, or one for each place, or none."""
@@ -59,7 +60,8 @@ class Parameter:
         positive), ``static`` (friction torque that holds a joint at rest, in either direction),
         ``delay`` (time by which a channel is late), ``smoothing`` (velocity over which friction
         changes its sign, a nuisance), ``compliance`` (between motor and a link that is not
-        recorded), ``exponent`` and ``order`` (shapes that are taken from their grid as they stand).
+        recorded), ``exponent`` and ``order`` (shapes that are taken from their grid as they stand),
+        ``range`` (where a table begins and ends: a fit leaves it as it stands).
     typical : float, mapping of place to float, or None
         A usual size, link-referred: what `irj simulate` takes where the joint file gives no value.
     """

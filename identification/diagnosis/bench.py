@@ -15,6 +15,7 @@ from identification.data.record import Record
 from identification.diagnosis.candidates import offered
 from identification.diagnosis.claims import Ranking, rank
 from identification.diagnosis.improvement import Step, visible_keys
+from identification.diagnosis.learned import LearnedClaim, learned_claims
 from identification.diagnosis.lines import Line, find_lines, orders_of
 from identification.diagnosis.locate import Unexplained, locate
 from identification.diagnosis.trials import Base, Trial, make_base, try_candidate
@@ -73,6 +74,9 @@ class Bench(Protocol):
         self, step: Step, error: Error, lines: Sequence[Line], limit: float
     ) -> list[Unexplained]:
         """Where what is left sits, for every balance over `limit` times its floor."""
+
+    def learned(self, step: Step, error: Error) -> tuple[LearnedClaim, ...]:
+        """Curves over one variable of what is left in the balances over their floor."""
 
     def same_sign(self, trial: Trial, solution: Solution) -> bool:
         """Whether a small effect has the same sign at half and at double kernel."""
@@ -209,6 +213,10 @@ class JointBench:
     ) -> list[Unexplained]:
         """See :func:`identification.diagnosis.locate.locate`."""
         return locate(step.solution, self.data, error, lines, limit)
+
+    def learned(self, step: Step, error: Error) -> tuple[LearnedClaim, ...]:
+        """See :func:`identification.diagnosis.learned.learned_claims`."""
+        return learned_claims(step.solution, self.data, error, RATIO_LIMIT)
 
     def same_sign(self, trial: Trial, solution: Solution) -> bool:
         """A minor effect must have the same sign at half and at double kernel."""

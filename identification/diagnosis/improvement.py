@@ -15,6 +15,7 @@ from identification.balance.dataset import HOLD_DELAY, Dataset, visible_labels
 from identification.data.joint_file import Joint
 from identification.diagnosis.candidates import NotTestable
 from identification.diagnosis.claims import Claim, Ranking
+from identification.diagnosis.learned import LearnedClaim, with_curves
 from identification.diagnosis.lines import Line
 from identification.diagnosis.locate import Unexplained
 from identification.diagnosis.outcome import Refusal, outcome_of, why_not
@@ -91,6 +92,8 @@ class Improvement:
     decided : tuple of Claim
         The claims as they were decided, one after the other; `claims` are what later ones left of
         them.
+    learned : tuple of LearnedClaim
+        Where the verdict is ``unexplained``: curves over one variable of what is left.
     """
 
     joint: Joint
@@ -108,6 +111,7 @@ class Improvement:
     warnings: tuple[str, ...] = ()
     refused: tuple[Refusal, ...] = ()
     decided: tuple[Claim, ...] = ()
+    learned: tuple[LearnedClaim, ...] = ()
 
     @property
     def outcome(self) -> str:
@@ -145,8 +149,10 @@ class Improvement:
         return self.steps[-1].solution.model
 
     def to_joint_file(self) -> str:
-        """The joint with all that was added, as the text of a joint file."""
-        return joint_text(self.joint, self.steps[-1].solution, self.data)
+        """The joint with all that was added, learned curves included, as the text of a joint
+        file.
+        """
+        return joint_text(self.joint, with_curves(self.steps[-1].solution, self.learned), self.data)
 
     def __str__(self) -> str:
         lines = [self.reason]
@@ -188,7 +194,10 @@ class Improvement:
             },
             "steps": [s.as_json(self.data) for s in self.steps],
             "added": list(self.added),
-            "claims": [c.as_json() for c in self.claims],
+            "claims": [
+                *(c.as_json() for c in self.claims),
+                *(c.as_json() for c in self.learned),
+            ],
             "minor": [c.as_json() for c in self.minor],
             "lines": [line.as_json() for line in self.lines],
             "ranking": [

@@ -336,11 +336,9 @@ class Session:
                 Claim((t.key,), t.candidate.label, t.balance, t.held_out_drop_percent)
                 for t in small
             )
-        where = (
-            self.bench.places(end, replace(end.held_out, balances=ratios), lines, RATIO_LIMIT)
-            if over
-            else []
-        )
+        error = replace(end.held_out, balances=ratios)
+        where = self.bench.places(end, error, lines, RATIO_LIMIT) if over else []
+        learned = self.bench.learned(end, error) if over and last is not None else ()
         judged = [self._partial(c, steps[0], end, where) for c in claims]
         where = self._with_frequency(where, judged, steps)
         verdict, reason = verdict_of(
@@ -374,6 +372,7 @@ class Session:
                 judged,
                 self.bench.tried(steps[0].solution),
             ),
+            learned=learned,
         )
 
     # --- inside -----------------------------------------------------------------------------------

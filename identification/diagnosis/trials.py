@@ -63,6 +63,10 @@ class Base:
     balance : (n,) int array
     effective : mapping of str to float
         Independent rows per balance, from the autocorrelation of the residual.
+    names : tuple of str
+        Parameters of the columns of `jacobian`.
+    norms : (p,) array
+        What these columns were divided by.
     """
 
     solution: Solution
@@ -82,6 +86,7 @@ class Base:
     held_balance: IntArray
     held_weight: FloatArray
     names: tuple[str, ...]
+    norms: FloatArray
 
     @property
     def parts(self) -> tuple[int, int]:
@@ -245,6 +250,7 @@ def make_base(solution: Solution, data: Dataset) -> Base:
         held_balance=hb,
         held_weight=held_weights,
         names=tuple(n for n, a in zip(free, alive, strict=False) if a),
+        norms=norms[alive],
     )
 
 

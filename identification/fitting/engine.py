@@ -179,12 +179,9 @@ def _fitted(
     limits = bounds_of(model, known, data)
     shapes = {p.name for p in model.parameters if p.is_shape}
     runs = names_of_runs(model, data.train)
+    apart = {*fixed, *held, *model.calibration, *model.named("range")}
     free = [
-        *(
-            n
-            for n in model.parameter_names
-            if n not in fixed and n not in held and n not in model.calibration
-        ),
+        *(n for n in model.parameter_names if n not in apart),
         *runs,
     ]
     balances = balances_of(model, data.sensing, wrt=bare(free))

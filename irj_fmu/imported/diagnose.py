@@ -20,6 +20,7 @@ from identification.diagnosis.candidates import Candidate, NotTestable, offered
 from identification.diagnosis.claims import Claim, Ranking, rank
 from identification.diagnosis.diagnose import Diagnosis
 from identification.diagnosis.improvement import Step, visible_keys
+from identification.diagnosis.learned import LearnedClaim
 from identification.diagnosis.lines import Line
 from identification.diagnosis.locate import Unexplained, locate
 from identification.diagnosis.session import Session, with_held_out
@@ -306,6 +307,10 @@ class FmuBench:
             for b, e in error.balances.items()
             if not e.ratio <= limit
         ]
+
+    def learned(self, step: Step, error: Error) -> tuple[LearnedClaim, ...]:
+        """None: a curve cannot ride outside an FMU yet."""
+        return ()
 
     def same_sign(self, trial: Trial, solution: Solution) -> bool:
         """No minor effects are looked for."""

@@ -275,8 +275,18 @@ def test_effect_moves_something(key: str, place: str, elastic: bool) -> None:
         shown = ca.depends_on(slope, e.signals.drive_rate)
         assert shown
         return
-    for name in amplitudes:
-        assert np.abs(slopes[:, present.parameter_names.index(name)]).max() > 0, name
+    still = [
+        n for n in amplitudes if np.abs(slopes[:, present.parameter_names.index(n)]).max() == 0
+    ]
+    if (
+        effect.table is not None
+        # a control value of a table acts near its own knots: three reach the end of a range, four
+        # any
+        # other place
+    ):
+        assert len(still) <= len(amplitudes) - 3
+        return
+    assert still == []
 
 
 # --- declarations ---------------------------------------------------------------------------------

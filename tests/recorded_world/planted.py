@@ -324,6 +324,7 @@ def _sets(result: Mapping[str, Any]) -> list[tuple[frozenset[str], bool]]:
     claims = [
         (frozenset(str(e).partition("@")[0] for e in c["effects"]), bool(c.get("partial")))
         for c in result["claims"]
+        if "curve" not in c
     ]
     return claims + [(frozenset(map(str, x["effects"])), False) for x in result.get("lines", [])]
 

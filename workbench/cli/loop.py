@@ -192,6 +192,8 @@ def _print_improvement(found: Improvement) -> None:
             f"{line.amplitude:.3g} {line.unit} ({line.balance}{named})"
         )
     print_places(found.unexplained)
+    for learned in found.learned:
+        print(f"learned: {learned.sentence}")
     for c in found.calibration:
         if c.stderr is not None and abs(c.value) > 2 * c.stderr:
             name = found.data.train_names[c.run]

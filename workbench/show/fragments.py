@@ -318,6 +318,14 @@ def unexplained_html(improvement: Improvement) -> str:
         return "<p>Nothing: every balance is at its noise.</p>"
     linear = improvement.joint.kind == "linear"
     items = "".join(f"<li>{unexplained_sentence(u, linear)}</li>" for u in improvement.unexplained)
+    curves = "".join(
+        f"<article><p>{text(c.sentence)}</p>{place_picture(c.place, None, 'torque')}</article>"
+        for c in improvement.learned
+    )
+    if curves:
+        items += (
+            f"</ul><h3>The curve in the place of a name</h3><div class='grid'>{curves}</div><ul>"
+        )
     return (
         f"<ul>{items}</ul><p class='note'>This is not in the library. Look at the place named "
         "above; an effect of your own takes about ten lines of Python.</p>"

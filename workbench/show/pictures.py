@@ -143,7 +143,7 @@ def _curve(b: Branch, frame: Frame, kind: str, colour: str) -> str:
     return "".join(out)
 
 
-def place_picture(before: Place, after: Place | None = None) -> str:
+def place_picture(before: Place, after: Place | None = None, quantity: str = "residual") -> str:
     """Mean residual against one signal before (diamonds) and after (squares) an addition, with 95 %
     bands.
 
@@ -152,6 +152,8 @@ def place_picture(before: Place, after: Place | None = None) -> str:
     before : Place
     after : Place, optional
         With the same bins.
+    quantity : str
+        What is drawn, where it is no residual.
 
     Returns
     -------
@@ -172,7 +174,7 @@ def place_picture(before: Place, after: Place | None = None) -> str:
     body = _axes(
         frame,
         f"{before.title} [{pretty_unit(before.unit)}]",
-        f"residual [{pretty_unit(before.residual_unit)}]",
+        f"{quantity} [{pretty_unit(before.residual_unit)}]",
     )
     zero = frame.up(0.0)
     body += (
@@ -182,7 +184,7 @@ def place_picture(before: Place, after: Place | None = None) -> str:
     body += "".join(_curve(b, frame, "before", BEFORE) for b in before.branches)
     if after is not None:
         body += "".join(_curve(b, frame, "after", AFTER) for b in after.branches)
-    return _svg(_place_label(before, after), body)
+    return _svg(_place_label(before, after, quantity), body)
 
 
 def _kept_bands(b: Branch) -> tuple[np.ndarray[tuple[int], np.dtype[np.float64]], ...]:
@@ -195,10 +197,10 @@ def _largest(place: Place) -> float:
     return max((float(np.max(np.abs(b.mean), initial=0.0)) for b in place.branches), default=0.0)
 
 
-def _place_label(before: Place, after: Place | None) -> str:
+def _place_label(before: Place, after: Place | None, quantity: str) -> str:
     unit = before.residual_unit
     text = (
-        f"Mean residual of the {before.balance} balance against {before.title}: largest "
+        f"Mean {quantity} of the {before.balance} balance against {before.title}: largest "
         f"{number(_largest(before), 3)} {unit}"
     )
     return text + (

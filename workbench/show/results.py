@@ -106,7 +106,7 @@ def verdict_html(result: Mapping[str, Any], level: int = 2) -> str:
 
 def headline(result: Mapping[str, Any]) -> str:
     """The verdict of an `improve --json` result in a few words."""
-    if result["verdict"] == "unexplained" and result["claims"]:
+    if result["verdict"] == "unexplained" and any("curve" not in c for c in result["claims"]):
         return "Found a part of what is missing; something is left"
     return HEADLINES.get(result["verdict"], words(result["verdict"]))
 
@@ -177,6 +177,8 @@ def claims_html(result: Mapping[str, Any]) -> str:
             f"{names}: lowers the error of the {text(claim['balance'])} balance by "
             f"{percent(claim['held_out_drop_percent'])} on held-out records."
         )
+        if "curve" in claim:
+            line = f"{names}: {text(claim['sentence'])}"
         if len(claim["effects"]) > 1:
             how = text(claim["separate_by"] or "a run that moves differently")
             line += f" These records cannot tell these names apart; what would: {how}."

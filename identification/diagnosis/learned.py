@@ -1,0 +1,341 @@
+"""Names held against the curve of their own variable, and the curve as the answer where no name
+does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final, final
+
+import numpy as np
+import numpy.typing as npt
+
+from casadi_models import EFFECTS, JointModel
+from identification.balance.dataset import Dataset, without
+from identification.balance.stacked import sticking_torque
+from identification.diagnosis.candidates import Candidate
+from identification.diagnosis.claims import Claim
+from identification.diagnosis.curve import Curve, Gain, find_curves, gain
+from identification.diagnosis.places import AXIS_TITLES, Branch, Place
+from identification.diagnosis.trials import Base, make_base
+from identification.fitting.assess import Error
+from identification.fitting.covariance import block_errors
+from identification.fitting.engine import Solution, solve
+
+FloatArray = npt.NDArray[np.float64]
+
+EQUIVALENT: Final = 0.01
+"""Share of what a curve explains that a name may miss: true names miss .6 % at most, the best wrong
+name on a law outside the library 18 % in the median and 5 % in one of twenty."""
+ONE_SIDED: Final = 1.645
+"""The normal distribution's one-sided bound of 95 %."""
+LEAST_ERROR: Final = 3.0
+"""Fewest independent rows' worth of squares by which a missed share is uncertain."""
+OVERLAP: Final = 2.5
+"""Rows that count as one: four of them overlap in a kernel that tapers."""
+ALIKE: Final = 0.05
+"""Share missed up to which a law is still said to be like the name."""
+OUTSIDE: Final = 2.0
+"""Standard errors by which a parameter must want to pass its bound."""
+
+
+# --- a curve as a claim ---------------------------------------------------------------------------
+
+
+@final
+@dataclass(frozen=True)
+class LearnedClaim:
+    """A missing torque without a name: a function of a variable, this one.
+
+    Attributes
+    ----------
+    curve : Curve
+    held_out_drop_percent : float
+        Fall of the balance's RMS, on held-out rows that move steadily, by all curves of the
+        balance.
+    """
+
+    curve: Curve
+    held_out_drop_percent: float
+
+    @property
+    def balance(self) -> str:
+        """The balance in which it is missing."""
+        return self.curve.balance
+
+    @property
+    def place(self) -> Place:
+        """The whole curve with its band, as a picture shows it."""
+        c = self.curve
+        branch = Branch("both", c.x, c.y, c.low, c.high, np.zeros(len(c.x), dtype=np.int64))
+        title = AXIS_TITLES.get(c.axis, c.axis.replace("_", " "))
+        half = np.maximum((c.high - c.low) / 2, 1e-300)
+        return Place(
+            c.balance,
+            c.axis,
+            title=title,
+            unit=c.unit,
+            residual_unit=c.y_unit,
+            edges=c.x,
+            branches=(branch,),
+            share_percent=100 * c.gain.fall,
+            strength=float(np.max(np.abs(c.y) / half)),
+        )
+
+    @property
+    def sentence(self) -> str:
+        """What a reader is told."""
+        variable = self.curve.axis.replace("_", " ")
+        sign = ", with the sign of the direction of motion" if self.curve.by_direction else ""
+        low, high = self.curve.x[0], self.curve.x[-1]
+        return (
+            f"What is missing in the {self.balance} balance is a function of {variable}{sign}, "
+            "known from "
+            f"{low:.3g} to {high:.3g} {self.curve.unit}; no name of the library is as good "
+            f"({self.curve.label})."
+        )
+
+    def as_json(self) -> dict[str, Any]:
+        """The shape of a claim in `improve --json`."""
+        drop = self.held_out_drop_percent
+        return {
+            "effects": ["learned"],
+            "balance": self.balance,
+            "label": self.curve.label,
+            "held_out_drop_percent": drop if np.isfinite(drop) else 100 * self.curve.gain.fall,
+            "separate_by": None,
+            "curve": self.curve.as_json(),
+            "sentence": self.sentence,
+        }
+
+
+def learned_claims(
+    solution: Solution, data: Dataset, error: Error, threshold: float
+) -> tuple[LearnedClaim, ...]:
+    """The curves of every balance that stays over its floor.
+
+    Parameters
+    ----------
+    solution : Solution
+        The last model.
+    data : Dataset
+    error : Error
+        Its error on held-out records.
+    threshold : float
+        Ratio to the floor up to which a balance counts as explained.
+    """
+    failing = [b for b in data.sensing.balances if error.balances[b].ratio > threshold]
+    if not failing:
+        return ()
+    base = make_base(solution, data)
+    out: list[LearnedClaim] = []
+    for balance in failing:
+        found = find_curves(base, balance)
+        drop = found.held_out_drop_percent
+        seen = {c.curve.label for c in out}  # a side that two balances show is told once
+        out += [LearnedClaim(c, drop) for c in found.curves if c.label not in seen]
+    return tuple(out)
+
+
+def with_curves(solution: Solution, learned: Sequence[LearnedClaim]) -> Solution:
+    """A fit with the learned curves in its model, at the values of their penalised fit.
+
+    The parameters beside them are those of that fit too: only the sum of both is identifiable.
+    """
+    model, values = solution.model, dict(solution.values)
+    for claim in learned:
+        model = model.add(claim.curve.label)
+        values |= _inside(model, claim.curve.beside) | dict(claim.curve.values)
+    for p in model.parameters:
+        values.setdefault(p.name, p.start)
+    if not learned:
+        return solution
+    return replace(
+        solution,
+        model=model.with_values(values),
+        values=values,
+        stderr=dict.fromkeys(values),
+        correlation={},
+        unidentified=(),
+    )
+
+
+def _inside(model: JointModel, values: Mapping[str, float]) -> dict[str, float]:
+    """Values within the physical bounds of their parameters."""
+    limits = {p.name: (p.low, p.high) for p in model.parameters}
+    return {n: min(max(v, limits[n][0]), limits[n][1]) for n, v in values.items() if n in limits}
+
+
+# --- a name against the curve of its own variable -------------------------------------------------
+
+
+@final
+@dataclass(frozen=True)
+class Equivalence:
+    """How much of what a curve over its own variable explains a name misses.
+
+    Attributes
+    ----------
+    share_missed, stderr : float
+        Share of the explained squares.
+    sentence : str
+        "NAME"; "like NAME, which explains 97 %"; or that it is not the name.
+    """
+
+    share_missed: float
+    stderr: float
+    sentence: str
+
+    @property
+    def is_name(self) -> bool:
+        """True where the name is shown to be as good as the curve."""
+        return self.share_missed + ONE_SIDED * self.stderr < EQUIVALENT
+
+    def as_json(self) -> dict[str, Any]:
+        """As data."""
+        return {"share_missed": self.share_missed, "stderr": self.stderr, "sentence": self.sentence}
+
+
+def equivalence(claim: Claim, solution: Solution, data: Dataset) -> Equivalence | None:
+    """The name of a claim against the best curve over the variables that its law reads.
+
+    A test that merely fails to reject a name has no power: the share that the name misses, with its
+    error, must be shown to be small.
+
+    Parameters
+    ----------
+    claim : Claim
+        One whose effect is in the model.
+    solution : Solution
+        Fit of the model with it.
+    data : Dataset
+
+    Returns
+    -------
+    Equivalence or None
+        None where the effect cannot be taken out alone, or no curve has its variable.
+    """
+    model = without(solution.model, claim.label)
+    if model.terms == solution.model.terms:
+        return None
+    named = make_base(solution, data)
+    less = solve(model, data, start=solution.values)
+    # the same rows with the same weights, so that the squares compare
+    bare = make_base(replace(less, weights=solution.weights, sigma=solution.sigma), data)
+    place = next(t.place for t in solution.model.terms if t.label == claim.label)
+    reads = EFFECTS[claim.effects[0]].reads
+
+    def own(candidate: Candidate) -> bool:
+        table = candidate.effect.table
+        if table is None or candidate.place != place:
+            return False
+        return table.over in reads and table.odd == ("direction" in reads or table.of_speed)
+
+    before = find_curves(bare, claim.balance, lambda c: False).before
+    beside = find_curves(named, claim.balance, own, most=1, certain=False)
+    if not beside.curves:
+        return None
+    return _missed(
+        before,
+        beside.before,
+        beside.after,
+        EFFECTS[claim.effects[0]].title,
+        _rows(named, claim.balance),
+    )
+
+
+def _rows(base: Base, balance: str) -> int:
+    where = base.balances.index(balance)
+    return int(np.count_nonzero((base.block >= 0) & (base.balance == where)))
+
+
+def _missed(
+    before: FloatArray, name: FloatArray, curve: FloatArray, title: str, rows: int
+) -> Equivalence:
+    """From cross-validated squares of the blocks: of the base, with the name, and with the
+    curve beside it.
+    """
+    explained = max(float(before.sum() - min(curve.sum(), name.sum())), 1e-300)
+    share = max(float(name.sum() - curve.sum()), 0.0) / explained
+    found: Gain = gain(name, curve)
+    least = LEAST_ERROR * float(name.sum()) / (rows / OVERLAP) / explained
+    stderr = max(share / found.t if found.t > 0 else 0.0, least)
+    explains = f"{100 * max(1 - share, 0.0):.3g} %"
+    sentence = f"like {title}, which explains {explains}"
+    if share + ONE_SIDED * stderr < EQUIVALENT:
+        sentence = title
+    elif share > ALIKE:
+        sentence = (
+            f"not {title}, which explains {explains} of what a curve over its own variable does"
+        )
+    return Equivalence(share, stderr, sentence)
+
+
+# --- what forbids "complete" ----------------------------------------------------------------------
+
+
+def artefacts(solution: Solution, data: Dataset, curves: Sequence[Curve] = ()) -> tuple[str, ...]:
+    """Reasons why the parameters of a model cannot be those of its laws: any of them forbids
+    ``complete``.
+
+    Parameters
+    ----------
+    solution : Solution
+    data : Dataset
+    curves : sequence of Curve
+        From :func:`identification.diagnosis.curve.find_curves` on the same model.
+
+    Returns
+    -------
+    tuple of str
+        An amplitude that its bound holds back by more than `OUTSIDE` errors; dry friction that lies
+        outside the band of a curve over velocity at zero speed. A bare sign does not tell: the fit
+        without the true law gives a positive Coulomb torque where there is none.
+    """
+    return (*_held_back(solution, data), *_no_dry_friction(solution, curves))
+
+
+def _held_back(solution: Solution, data: Dataset) -> list[str]:
+    base = make_base(solution, data)
+    count = base.inward.shape[1]
+    if not count:
+        return []
+    both = np.column_stack([base.jacobian, base.inward])
+    errors = block_errors(both, base.residual, base.block)
+    if errors is None:
+        return []
+    step = np.linalg.lstsq(both, -base.residual, rcond=None)[0]
+    held = [n for n in solution.at_bound if n in solution.free and not _is_shape(solution, n)]
+    out = []
+    for name, d, e in zip(held, step[-count:], errors[-count:], strict=False):
+        if d < -OUTSIDE * e:
+            out.append(
+                f"{name} stands at its bound ({solution.values[name]:.3g}) and would pass it by "
+                f"{-d / e:.2g} standard errors: "
+                "another law does its work"
+            )
+    return out
+
+
+def _is_shape(solution: Solution, name: str) -> bool:
+    return any(p.name == name and p.is_shape for p in solution.model.parameters)
+
+
+def _no_dry_friction(solution: Solution, curves: Sequence[Curve]) -> list[str]:
+    out = []
+    for c in curves:
+        table = EFFECTS[c.label.partition("@")[0]].table
+        place = c.label.partition("@")[2]
+        if table is None or not (table.of_speed and table.odd):
+            continue
+        torque = sticking_torque(solution.model, solution.values, place)
+        slope = (c.y[1] - c.y[0]) / (c.x[1] - c.x[0])
+        low, high = c.low[0] - slope * c.x[0], c.high[0] - slope * c.x[0]
+        if torque and not low <= torque <= high:
+            out.append(
+                f"the dry friction of the {place} side, {torque:.3g} {c.y_unit}, is an artefact: "
+                "the curve over velocity "
+                f"starts between {low:.3g} and {high:.3g} {c.y_unit}"
+            )
+    return out

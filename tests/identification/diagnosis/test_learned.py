@@ -1,0 +1,163 @@
+"""A name is held against the curve of its own variable; where none does, the curve is the
+answer and an effect like any other.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from smooth_laws import LAWS, Law, Run, nothing, run
+
+from identification.data.joint_file import load_joint
+from identification.diagnosis.claims import Claim
+from identification.diagnosis.improve import RATIO_LIMIT
+from identification.diagnosis.learned import (
+    Equivalence,
+    artefacts,
+    equivalence,
+    learned_claims,
+    with_curves,
+)
+from identification.fitting.assess import assess
+from workbench.cli.main import main
+
+NAMES: dict[str, Law] = {
+    "stribeck": lambda q, v: 8 * np.exp(-((v / 0.1) ** 2)) * np.sign(v),
+    "quadratic_drag": lambda q, v: 3 * v * np.abs(v),
+    "added_spring": lambda q, v: 10 * q,
+}
+WRONG = {"quadratic_drag": "tanh", "added_spring": "bump", "cubic_viscous": "root"}
+
+
+def held_against(key: str, law: Law, seed: int) -> Equivalence:
+    found = run(seed, law, ("viscous", "coulomb", f"{key}@motor"))
+    answer = equivalence(Claim((key,), f"{key}@motor", "axis", 0.0), found.solution, found.data)
+    assert answer is not None
+    return answer
+
+
+@pytest.mark.parametrize("key", NAMES)
+def test_a_true_name_misses_nothing(key: str) -> None:
+    answer = held_against(key, NAMES[key], 31)
+    assert answer.is_name
+    assert "like" not in answer.sentence
+    assert answer.share_missed < 0.006
+
+
+@pytest.mark.parametrize("key", WRONG)
+def test_a_wrong_name_misses_more_than_it_may(key: str) -> None:
+    answer = held_against(key, LAWS[WRONG[key]][1], 32)
+    assert not answer.is_name
+    assert answer.share_missed > 0.05
+    assert answer.sentence.startswith(("not ", "like "))
+    assert set(answer.as_json()) == {"share_missed", "stderr", "sentence"}
+
+
+@pytest.fixture(scope="module")
+def snag() -> Run:
+    return run(33, LAWS["snag"][1])
+
+
+def test_dry_friction_outside_the_curve_is_an_artefact() -> None:
+    """tanh(v/0.15) beside Coulomb friction: the fit without it puts half of it into Coulomb
+    friction.
+    """
+    found = run(34, LAWS["tanh"][1])
+    reasons = artefacts(found.solution, found.data, found.found.curves)
+    assert len(reasons) == 1
+    assert "artefact" in reasons[0]
+
+
+def test_an_amplitude_held_at_its_bound_is_told() -> None:
+    found = run(35, LAWS["tanh"][1], ("viscous", "coulomb", "stribeck@motor"))
+    assert any("stands at its bound" in r for r in artefacts(found.solution, found.data))
+
+
+@pytest.mark.parametrize("seed", [36, 37])
+def test_nothing_forbids_complete_where_the_model_is_right(seed: int) -> None:
+    found = run(seed, nothing)
+    assert artefacts(found.solution, found.data, found.found.curves) == ()
+
+
+def test_where_a_balance_fails_the_curve_is_a_claim(snag: Run) -> None:
+    error = assess(snag.solution.model, snag.data, snag.data.held_out, snag.solution.values)
+    (claim,) = learned_claims(snag.solution, snag.data, error, RATIO_LIMIT)
+    shown = json.loads(json.dumps(claim.as_json(), allow_nan=False))
+    assert shown["effects"] == ["learned"]
+    assert shown["balance"] == "axis"
+    curve = shown["curve"]
+    assert (curve["axis"], curve["unit"], curve["y_unit"]) == ("motor_position", "rad", "N.m")
+    assert len(curve["x"]) == len(curve["y"]) == len(curve["low"]) == len(curve["high"])
+    assert np.all(np.array(curve["low"]) <= curve["y"])
+    assert abs(curve["x"][int(np.argmax(curve["y"]))] + 0.2) < 0.05
+    fine = {b: 10 * e.ratio for b, e in error.balances.items()}
+    assert learned_claims(snag.solution, snag.data, error, max(fine.values())) == ()
+
+
+def test_it_goes_into_the_model_at_the_values_of_its_fit(snag: Run) -> None:
+    before = assess(snag.solution.model, snag.data, snag.data.held_out, snag.solution.values)
+    solution = with_curves(
+        snag.solution, learned_claims(snag.solution, snag.data, before, RATIO_LIMIT)
+    )
+    after = assess(solution.model, snag.data, snag.data.held_out, solution.values)
+    assert after.balances["axis"].ratio < 0.2 * before.balances["axis"].ratio
+    assert after.balances["axis"].ratio < 1.3
+
+
+def test_improve_writes_a_joint_file_that_every_door_takes(
+    snag: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    names = []
+    for name, record in zip(("train", "held"), snag.records, strict=True):
+        names.append(str(tmp_path / f"{name}.csv"))
+        columns = np.column_stack([record.time, record["motor_torque"], record["motor_position"]])
+        np.savetxt(
+            names[-1],
+            columns,
+            delimiter=",",
+            header="time_s,motor_torque_Nm,motor_position_rad",
+            comments="",
+            fmt="%.9g",
+        )
+    joint, better, report = (
+        str(tmp_path / n) for n in ("joint.toml", "better.toml", "report.html")
+    )
+    Path(joint).write_text(
+        '[joint]\ngear_ratio = 1.0\nmodel = "hd1"\neffects = ["viscous@motor", "coulomb@motor"]\n'
+    )
+    command = [
+        "improve",
+        names[0],
+        "--held-out",
+        names[1],
+        "--joint",
+        joint,
+        "--json",
+        str(tmp_path / "out.json"),
+    ]
+    assert main([*command, "-o", better, "--report", report]) == 0
+    result = json.loads((tmp_path / "out.json").read_text())
+    assert result["verdict"] == "unexplained"
+    assert [c["effects"] for c in result["claims"]] == [["learned"]]
+    assert "The curve in the place of a name" in Path(report).read_text()
+    label = "learned_position_friction@motor"
+    assert label in load_joint(better).effects
+    assert f"({label})" in capsys.readouterr().out
+    assert main(["fit", names[0], "--joint", better, "--json", str(tmp_path / "fit.json")]) == 0
+    fitted = json.loads((tmp_path / "fit.json").read_text())["parameters"]
+    half = load_joint(better).fitted["motor_learned_position_friction_half_range"]
+    assert fitted["motor_learned_position_friction_half_range"]["value"] == pytest.approx(half), (
+        "the range of a table stays"
+    )
+    assert (
+        main(["simulate", "--joint", better, "--seconds", "2", "-o", str(tmp_path / "again.csv")])
+        == 0
+    )
+    assert main(["export", "casadi", "--joint", better, "--out", str(tmp_path / "code")]) == 0
+    assert any(
+        "learned" in p["name"]
+        for p in json.loads((tmp_path / "code" / "parameters.json").read_text())
+    )
