@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.irj_fmu.test_user_fmu import FILE, axis
+from tests.irj_fmu.imported.test_user_fmu import FILE, axis
 
 from irj_fmu.imported.file import load_user_joint
 from irj_fmu.imported.fit import fit
