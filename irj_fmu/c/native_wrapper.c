@@ -72,6 +72,7 @@ fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String guid, f
 }
 
 fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean has_tolerance, fmi2Real tolerance, fmi2Real start, fmi2Boolean has_stop, fmi2Real stop) {
+    LIVING("fmi2SetupExperiment");
     Twin *m = c;
     (void)has_tolerance; (void)tolerance; (void)has_stop; (void)stop;
     if (m->s.phase != INSTANTIATED) return fail(m, "setupExperiment: only before initialization");
@@ -80,6 +81,7 @@ fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean has_tolerance, fmi2R
 }
 
 fmi2Status fmi2ExitInitializationMode(fmi2Component c) {
+    LIVING("fmi2ExitInitializationMode");
     Twin *m = c;
     if (m->s.phase != INITIALIZING) return fail(m, "exitInitializationMode: called out of order");
     m->s.phase = STEPPING;
@@ -88,6 +90,7 @@ fmi2Status fmi2ExitInitializationMode(fmi2Component c) {
 }
 
 fmi2Status fmi2Reset(fmi2Component c) {
+    LIVING("fmi2Reset");
     Twin *m = c;
     restart(&m->s);
     memset(m->told, 0, sizeof m->told);
@@ -110,6 +113,8 @@ static int may_set(Twin *m, fmi2ValueReference v) { /* 0: the value stays, and t
 }
 
 fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference vr[], size_t n, fmi2Real value[]) {
+    LIVING("fmi2GetReal");
+    GIVEN(n == 0 || (vr && value), "getReal");
     Twin *m = c;
     size_t i;
     for (i = 0; i < n; i++) {
@@ -120,6 +125,8 @@ fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference vr[], size_t n,
 }
 
 fmi2Status fmi2SetReal(fmi2Component c, const fmi2ValueReference vr[], size_t n, const fmi2Real value[]) {
+    LIVING("fmi2SetReal");
+    GIVEN(n == 0 || (vr && value), "setReal");
     Twin *m = c;
     size_t i;
     for (i = 0; i < n; i++) {
@@ -133,6 +140,8 @@ fmi2Status fmi2SetReal(fmi2Component c, const fmi2ValueReference vr[], size_t n,
 
 #define WHOLE(type, wanted) \
     fmi2Status fmi2Get##type(fmi2Component c, const fmi2ValueReference vr[], size_t n, fmi2##type value[]) { \
+        LIVING("fmi2Get" #type); \
+        GIVEN(n == 0 || (vr && value), "get" #type); \
         Twin *m = c; \
         size_t i; \
         for (i = 0; i < n; i++) { \
@@ -142,6 +151,8 @@ fmi2Status fmi2SetReal(fmi2Component c, const fmi2ValueReference vr[], size_t n,
         return fmi2OK; \
     } \
     fmi2Status fmi2Set##type(fmi2Component c, const fmi2ValueReference vr[], size_t n, const fmi2##type value[]) { \
+        LIVING("fmi2Set" #type); \
+        GIVEN(n == 0 || (vr && value), "set" #type); \
         Twin *m = c; \
         size_t i; \
         for (i = 0; i < n; i++) { \
@@ -157,6 +168,8 @@ WHOLE(Integer, INTEGER)
 WHOLE(Boolean, BOOLEAN)
 
 fmi2Status fmi2GetString(fmi2Component c, const fmi2ValueReference vr[], size_t n, fmi2String value[]) {
+    LIVING("fmi2GetString");
+    GIVEN(n == 0 || (vr && value), "getString");
     Twin *m = c;
     size_t i;
     for (i = 0; i < n; i++) {
@@ -167,6 +180,8 @@ fmi2Status fmi2GetString(fmi2Component c, const fmi2ValueReference vr[], size_t 
 }
 
 fmi2Status fmi2SetString(fmi2Component c, const fmi2ValueReference vr[], size_t n, const fmi2String value[]) {
+    LIVING("fmi2SetString");
+    GIVEN(n == 0 || (vr && value), "setString");
     Twin *m = c;
     size_t i;
     for (i = 0; i < n; i++) {
@@ -183,6 +198,7 @@ fmi2Status fmi2SetString(fmi2Component c, const fmi2ValueReference vr[], size_t 
 
 fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2ValueReference unknown[], size_t n_unknown,
                                         const fmi2ValueReference known[], size_t n_known, const fmi2Real seed[], fmi2Real out[]) {
+    LIVING("fmi2GetDirectionalDerivative");
     (void)unknown; (void)n_unknown; (void)known; (void)n_known; (void)seed; (void)out;
     return fail(c, "getDirectionalDerivative: not provided");
 }
@@ -190,6 +206,7 @@ fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2ValueReferenc
 /* ---- co-simulation ------------------------------------------------------------------------------------------------ */
 
 fmi2Status fmi2DoStep(fmi2Component c, fmi2Real t, fmi2Real length, fmi2Boolean no_rollback) {
+    LIVING("fmi2DoStep");
     Twin *m = c;
     (void)no_rollback;
     if (m->s.phase != STEPPING) return fail(m, "doStep: called out of order");
@@ -198,6 +215,7 @@ fmi2Status fmi2DoStep(fmi2Component c, fmi2Real t, fmi2Real length, fmi2Boolean 
 }
 
 fmi2Status fmi2SetRealInputDerivatives(fmi2Component c, const fmi2ValueReference vr[], size_t n, const fmi2Integer order[], const fmi2Real value[]) {
+    LIVING("fmi2SetRealInputDerivatives");
     (void)vr; (void)order; (void)value;
     return n ? fail(c, "setRealInputDerivatives: not provided") : fmi2OK;
 }

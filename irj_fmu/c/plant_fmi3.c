@@ -9,6 +9,7 @@
 #include <string.h>
 
 #include "fmi3Functions.h"
+#include "living.c"
 #include "plant_config.h"
 
 #define CASADI_SYMBOL_EXPORT static
@@ -40,6 +41,9 @@ typedef struct {
 
 typedef const fmi3ValueReference *References;
 typedef int (*Generated)(const casadi_real **, casadi_real **, casadi_int *, casadi_real *, int);
+
+#define LIVING(call) do { if (!is_alive(&instances, c)) { tell_stranger(call); return fmi3Error; } } while (0)
+#define GIVEN(condition, call) do { if (!(condition)) return fail(c, "%s: a pointer is NULL", call); } while (0)
 
 static fmi3Status fail(Plant *m, const char *format, ...) {
     char text[256];
@@ -90,23 +94,37 @@ fmi3Instance fmi3InstantiateModelExchange(fmi3String name, fmi3String token, fmi
         return NULL;
     }
     restart(&m->s);
-    return m;
+    if (born(&instances, m)) return m;
+    free(m);
+    return NULL;
 }
 
 fmi3Instance fmi3InstantiateCoSimulation(fmi3String name, fmi3String token, fmi3String resources, fmi3Boolean visible, fmi3Boolean logging,
                                          fmi3Boolean events, fmi3Boolean early, const fmi3ValueReference required[], size_t n,
                                          fmi3InstanceEnvironment environment, fmi3LogMessageCallback log, fmi3IntermediateUpdateCallback update) {
+    if (log) log(environment, fmi3Error, "logStatusError", "instantiate: this FMU is for model exchange");
     return NULL;
 }
 
 fmi3Instance fmi3InstantiateScheduledExecution(fmi3String name, fmi3String token, fmi3String resources, fmi3Boolean visible, fmi3Boolean logging,
                                                fmi3InstanceEnvironment environment, fmi3LogMessageCallback log, fmi3ClockUpdateCallback clock,
                                                fmi3LockPreemptionCallback lock, fmi3UnlockPreemptionCallback unlock) {
+    if (log) log(environment, fmi3Error, "logStatusError", "instantiate: this FMU is for model exchange");
     return NULL;
 }
 
-void fmi3FreeInstance(fmi3Instance c) { free(c); }
-fmi3Status fmi3SetDebugLogging(fmi3Instance c, fmi3Boolean on, size_t n, const fmi3String categories[]) { return fmi3OK; }
+void fmi3FreeInstance(fmi3Instance c) {
+    if (!c) return;
+    if (dies(&instances, c)) free(c);
+    else tell_stranger("fmi3FreeInstance");
+}
+fmi3Status fmi3SetDebugLogging(fmi3Instance c, fmi3Boolean on, size_t n, const fmi3String categories[]) { LIVING("fmi3SetDebugLogging"); return fmi3OK; }
+
+/* between initialization and termination */
+#define EXCHANGING(call) do { \
+    LIVING(call); \
+    if (((Plant *)c)->s.phase != EVENTS && ((Plant *)c)->s.phase != CONTINUOUS) return fail(c, "%s: called out of order", call); \
+} while (0)
 
 static fmi3Status change(Plant *m, Phase from, Phase to, const char *name) {
     if (m->s.phase != from) return fail(m, "%s: called out of order", name);
@@ -115,14 +133,16 @@ static fmi3Status change(Plant *m, Phase from, Phase to, const char *name) {
 }
 
 fmi3Status fmi3EnterInitializationMode(fmi3Instance c, fmi3Boolean has_tolerance, fmi3Float64 tolerance, fmi3Float64 start, fmi3Boolean has_stop, fmi3Float64 stop) {
+    LIVING("fmi3EnterInitializationMode");
     ((Plant *)c)->s.t = start;
     return change(c, INSTANTIATED, INITIALIZING, "enterInitializationMode");
 }
-fmi3Status fmi3ExitInitializationMode(fmi3Instance c) { return change(c, INITIALIZING, EVENTS, "exitInitializationMode"); }
-fmi3Status fmi3EnterEventMode(fmi3Instance c) { ((Plant *)c)->s.phase = EVENTS; return fmi3OK; }
-fmi3Status fmi3EnterContinuousTimeMode(fmi3Instance c) { ((Plant *)c)->s.phase = CONTINUOUS; return fmi3OK; }
-fmi3Status fmi3Terminate(fmi3Instance c) { ((Plant *)c)->s.phase = TERMINATED; return fmi3OK; }
+fmi3Status fmi3ExitInitializationMode(fmi3Instance c) { LIVING("fmi3ExitInitializationMode"); return change(c, INITIALIZING, EVENTS, "exitInitializationMode"); }
+fmi3Status fmi3EnterEventMode(fmi3Instance c) { EXCHANGING("fmi3EnterEventMode"); ((Plant *)c)->s.phase = EVENTS; return fmi3OK; }
+fmi3Status fmi3EnterContinuousTimeMode(fmi3Instance c) { EXCHANGING("fmi3EnterContinuousTimeMode"); ((Plant *)c)->s.phase = CONTINUOUS; return fmi3OK; }
+fmi3Status fmi3Terminate(fmi3Instance c) { EXCHANGING("fmi3Terminate"); ((Plant *)c)->s.phase = TERMINATED; return fmi3OK; }
 fmi3Status fmi3Reset(fmi3Instance c) {
+    LIVING("fmi3Reset");
     restart(&((Plant *)c)->s);
     ((Plant *)c)->fresh = 0;
     return fmi3OK;
@@ -131,6 +151,8 @@ fmi3Status fmi3Reset(fmi3Instance c) {
 /* ---- variables ------------------------------------------------------------ */
 
 fmi3Status fmi3SetFloat64(fmi3Instance c, References vr, size_t n, const fmi3Float64 value[], size_t length) {
+    LIVING("fmi3SetFloat64");
+    GIVEN(n == 0 || (vr && value), "setFloat64");
     Plant *m = c;
     size_t i;
     if (length != n) return fail(m, "setFloat64: all variables are scalars");
@@ -146,6 +168,8 @@ fmi3Status fmi3SetFloat64(fmi3Instance c, References vr, size_t n, const fmi3Flo
 }
 
 fmi3Status fmi3GetFloat64(fmi3Instance c, References vr, size_t n, fmi3Float64 value[], size_t length) {
+    LIVING("fmi3GetFloat64");
+    GIVEN(n == 0 || (vr && value), "getFloat64");
     Plant *m = c;
     size_t i;
     if (length != n) return fail(m, "getFloat64: all variables are scalars");
@@ -164,9 +188,11 @@ fmi3Status fmi3GetFloat64(fmi3Instance c, References vr, size_t n, fmi3Float64 v
 
 #define NO_VARIABLES(name) \
     fmi3Status fmi3Get##name(fmi3Instance c, References vr, size_t n, fmi3##name value[], size_t length) { \
+        LIVING("fmi3Get" #name); \
         return n ? fail(c, "get" #name ": all variables are Float64") : fmi3OK; \
     } \
     fmi3Status fmi3Set##name(fmi3Instance c, References vr, size_t n, const fmi3##name value[], size_t length) { \
+        LIVING("fmi3Set" #name); \
         return n ? fail(c, "set" #name ": all variables are Float64") : fmi3OK; \
     }
 NO_VARIABLES(Float32)
@@ -180,7 +206,7 @@ NO_VARIABLES(Int64)
 NO_VARIABLES(UInt64)
 NO_VARIABLES(Boolean)
 NO_VARIABLES(String)
-#define REFUSE(text) { return fail(c, text); }
+#define REFUSE(text) { LIVING(__func__); return fail(c, text); }
 fmi3Status fmi3GetBinary(fmi3Instance c, References vr, size_t n, size_t sizes[], fmi3Binary v[], size_t k) REFUSE("there are no binary variables")
 fmi3Status fmi3SetBinary(fmi3Instance c, References vr, size_t n, const size_t sizes[], const fmi3Binary v[], size_t k) REFUSE("there are no binary variables")
 fmi3Status fmi3GetClock(fmi3Instance c, References vr, size_t n, fmi3Clock v[]) REFUSE("there are no clocks")
@@ -188,6 +214,8 @@ fmi3Status fmi3SetClock(fmi3Instance c, References vr, size_t n, const fmi3Clock
 
 fmi3Status fmi3GetDirectionalDerivative(fmi3Instance c, References unknown, size_t n, References known, size_t k, const fmi3Float64 seed[], size_t seeds,
                                         fmi3Float64 out[], size_t outs) {
+    LIVING("fmi3GetDirectionalDerivative");
+    GIVEN((n == 0 || (unknown && out)) && (k == 0 || (known && seed)), "getDirectionalDerivative");
     Plant *m = c;
     double sx[DIM(NX)] = {0}, su[DIM(NU)] = {0}, sp[DIM(NP)] = {0}, dy[DIM(NY)], ddx[DIM(NX)];
     size_t i;
@@ -220,31 +248,54 @@ fmi3Status fmi3GetVariableDependencies(fmi3Instance c, fmi3ValueReference v, siz
 
 /* ---- FMU state ------------------------------------------------------------ */
 
+static State *new_state(void) {
+    State *made = malloc(sizeof *made);
+    if (made && born(&states, made)) return made;
+    free(made);
+    return NULL;
+}
+
 fmi3Status fmi3GetFMUState(fmi3Instance c, fmi3FMUState *state) {
-    if (!*state) *state = malloc(sizeof(State));
-    if (!*state) return fail(c, "getFMUState: out of memory");
+    LIVING("fmi3GetFMUState");
+    GIVEN(state, "getFMUState");
+    if (!is_alive(&states, *state) && !(*state = new_state())) return fail(c, "getFMUState: out of memory");
     memcpy(*state, &((Plant *)c)->s, sizeof(State));
     return fmi3OK;
 }
 fmi3Status fmi3SetFMUState(fmi3Instance c, fmi3FMUState state) {
+    LIVING("fmi3SetFMUState");
+    if (!is_alive(&states, state)) return fail(c, "setFMUState: this is no state of this FMU, or it was freed");
     memcpy(&((Plant *)c)->s, state, sizeof(State));
     ((Plant *)c)->fresh = 0;
     return fmi3OK;
 }
 fmi3Status fmi3FreeFMUState(fmi3Instance c, fmi3FMUState *state) {
-    if (state) { free(*state); *state = NULL; }
+    LIVING("fmi3FreeFMUState");
+    if (!state || !*state) return fmi3OK;
+    if (!dies(&states, *state)) return fail(c, "freeFMUState: this is no state of this FMU, or it was freed");
+    free(*state);
+    *state = NULL;
     return fmi3OK;
 }
-fmi3Status fmi3SerializedFMUStateSize(fmi3Instance c, fmi3FMUState state, size_t *size) { *size = sizeof(State); return fmi3OK; }
+fmi3Status fmi3SerializedFMUStateSize(fmi3Instance c, fmi3FMUState state, size_t *size) { LIVING("fmi3SerializedFMUStateSize"); 
+    if (!is_alive(&states, state)) return fail(c, "serializedFMUStateSize: this is no state of this FMU, or it was freed");
+    GIVEN(size, "serializedFMUStateSize");
+    *size = sizeof(State);
+    return fmi3OK;
+}
 fmi3Status fmi3SerializeFMUState(fmi3Instance c, fmi3FMUState state, fmi3Byte bytes[], size_t size) {
+    LIVING("fmi3SerializeFMUState");
+    if (!is_alive(&states, state)) return fail(c, "serializeFMUState: this is no state of this FMU, or it was freed");
+    GIVEN(bytes, "serializeFMUState");
     if (size < sizeof(State)) return fail(c, "serializeFMUState: %lu bytes are too few", (unsigned long)size);
     memcpy(bytes, state, sizeof(State));
     return fmi3OK;
 }
 fmi3Status fmi3DeserializeFMUState(fmi3Instance c, const fmi3Byte bytes[], size_t size, fmi3FMUState *state) {
+    LIVING("fmi3DeserializeFMUState");
+    GIVEN(bytes && state, "deserializeFMUState");
     if (size != sizeof(State) || memcmp(bytes, PLANT_GUID, strlen(PLANT_GUID)) != 0) return fail(c, "deserializeFMUState: these bytes are not a state of this FMU");
-    if (!*state) *state = malloc(sizeof(State));
-    if (!*state) return fail(c, "deserializeFMUState: out of memory");
+    if (!is_alive(&states, *state) && !(*state = new_state())) return fail(c, "deserializeFMUState: out of memory");
     memcpy(*state, bytes, sizeof(State));
     return fmi3OK;
 }
@@ -252,45 +303,57 @@ fmi3Status fmi3DeserializeFMUState(fmi3Instance c, const fmi3Byte bytes[], size_
 /* ---- model exchange ------------------------------------------------------- */
 
 fmi3Status fmi3UpdateDiscreteStates(fmi3Instance c, fmi3Boolean *again, fmi3Boolean *stop, fmi3Boolean *nominals, fmi3Boolean *values, fmi3Boolean *planned, fmi3Float64 *next) {
+    EXCHANGING("fmi3UpdateDiscreteStates");
+    GIVEN(again && stop && nominals && values && planned && next, "updateDiscreteStates");
     *again = *stop = *nominals = *values = *planned = fmi3False;
     *next = 0;
     return fmi3OK;
 }
-fmi3Status fmi3EvaluateDiscreteStates(fmi3Instance c) { return fmi3OK; }
+fmi3Status fmi3EvaluateDiscreteStates(fmi3Instance c) { EXCHANGING("fmi3EvaluateDiscreteStates"); return fmi3OK; }
 fmi3Status fmi3CompletedIntegratorStep(fmi3Instance c, fmi3Boolean no_rollback, fmi3Boolean *event, fmi3Boolean *stop) {
+    EXCHANGING("fmi3CompletedIntegratorStep");
+    GIVEN(event && stop, "completedIntegratorStep");
     *event = *stop = fmi3False;
     return fmi3OK;
 }
-fmi3Status fmi3SetTime(fmi3Instance c, fmi3Float64 t) { ((Plant *)c)->s.t = t; return fmi3OK; }
+fmi3Status fmi3SetTime(fmi3Instance c, fmi3Float64 t) { LIVING("fmi3SetTime"); ((Plant *)c)->s.t = t; return fmi3OK; }
 
 static fmi3Status check_length(Plant *m, size_t n) { return n == NX ? fmi3OK : fail(m, "the plant has %d states, not %lu", NX, (unsigned long)n); }
 
 fmi3Status fmi3SetContinuousStates(fmi3Instance c, const fmi3Float64 x[], size_t n) {
+    EXCHANGING("fmi3SetContinuousStates");
     Plant *m = c;
     if (check_length(m, n) != fmi3OK) return fmi3Error;
+    GIVEN(n == 0 || x, "states");
     memcpy(m->s.x, x, n * sizeof *x);
     m->fresh = 0;
     return fmi3OK;
 }
 fmi3Status fmi3GetContinuousStates(fmi3Instance c, fmi3Float64 x[], size_t n) {
+    LIVING("fmi3GetContinuousStates");
     if (check_length(c, n) != fmi3OK) return fmi3Error;
+    GIVEN(n == 0 || x, "states");
     memcpy(x, ((Plant *)c)->s.x, n * sizeof *x);
     return fmi3OK;
 }
 fmi3Status fmi3GetContinuousStateDerivatives(fmi3Instance c, fmi3Float64 dx[], size_t n) {
+    LIVING("fmi3GetContinuousStateDerivatives");
     if (check_length(c, n) != fmi3OK) return fmi3Error;
+    GIVEN(n == 0 || dx, "states");
     refresh(c);
     memcpy(dx, ((Plant *)c)->dx, n * sizeof *dx);
     return fmi3OK;
 }
 fmi3Status fmi3GetNominalsOfContinuousStates(fmi3Instance c, fmi3Float64 x[], size_t n) {
+    LIVING("fmi3GetNominalsOfContinuousStates");
     if (check_length(c, n) != fmi3OK) return fmi3Error;
+    GIVEN(n == 0 || x, "states");
     memcpy(x, nominal_x, n * sizeof *x);
     return fmi3OK;
 }
-fmi3Status fmi3GetEventIndicators(fmi3Instance c, fmi3Float64 z[], size_t n) { return n ? fail(c, "the plant has no event indicators") : fmi3OK; }
-fmi3Status fmi3GetNumberOfEventIndicators(fmi3Instance c, size_t *n) { *n = 0; return fmi3OK; }
-fmi3Status fmi3GetNumberOfContinuousStates(fmi3Instance c, size_t *n) { *n = NX; return fmi3OK; }
+fmi3Status fmi3GetEventIndicators(fmi3Instance c, fmi3Float64 z[], size_t n) { LIVING("fmi3GetEventIndicators"); return n ? fail(c, "the plant has no event indicators") : fmi3OK; }
+fmi3Status fmi3GetNumberOfEventIndicators(fmi3Instance c, size_t *n) { LIVING("fmi3GetNumberOfEventIndicators"); GIVEN(n, "getNumberOfEventIndicators"); *n = 0; return fmi3OK; }
+fmi3Status fmi3GetNumberOfContinuousStates(fmi3Instance c, size_t *n) { LIVING("fmi3GetNumberOfContinuousStates"); GIVEN(n, "getNumberOfContinuousStates"); *n = NX; return fmi3OK; }
 
 /* ---- what other interfaces would need ------------------------------------- */
 

@@ -90,8 +90,9 @@ fmi2Component fmi2Instantiate(fmi2String name, fmi2Type kind, fmi2String guid, f
     Plant *m = instance(name, functions, logging);
     (void)resources; (void)visible;
     if (!m) return NULL;
-    if (!guid || strcmp(guid, PLANT_GUID) != 0 || (kind == fmi2ModelExchange && NZ > 0)) {
-        fail(m, "instantiate: %s", kind == fmi2ModelExchange && NZ > 0 ? "this plant has memory and runs in co-simulation only"
+    if (!guid || strcmp(guid, PLANT_GUID) != 0 || (kind != fmi2ModelExchange && kind != fmi2CoSimulation) || (kind == fmi2ModelExchange && NZ > 0)) {
+        fail(m, "instantiate: %s", kind != fmi2ModelExchange && kind != fmi2CoSimulation ? "the type is neither model exchange nor co-simulation"
+                                   : kind == fmi2ModelExchange && NZ > 0 ? "this plant has memory and runs in co-simulation only"
                                                                        : "the GUID is not that of this library");
         fmi2FreeInstance(m);
         return NULL;
@@ -102,6 +103,7 @@ fmi2Component fmi2Instantiate(fmi2String name, fmi2Type kind, fmi2String guid, f
 }
 
 fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean has_tolerance, fmi2Real tolerance, fmi2Real start, fmi2Boolean has_stop, fmi2Real stop) {
+    LIVING("fmi2SetupExperiment");
     Plant *m = c;
     (void)has_stop; (void)stop;
     if (m->s.phase != INSTANTIATED) return fail(m, "setupExperiment: only before initialization");
@@ -112,6 +114,7 @@ fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean has_tolerance, fmi2R
 }
 
 fmi2Status fmi2ExitInitializationMode(fmi2Component c) {
+    LIVING("fmi2ExitInitializationMode");
     Plant *m = c;
     if (m->s.phase != INITIALIZING) return fail(m, "exitInitializationMode: called out of order");
     m->s.phase = m->s.kind == fmi2ModelExchange ? EVENTS : STEPPING;
@@ -119,6 +122,7 @@ fmi2Status fmi2ExitInitializationMode(fmi2Component c) {
 }
 
 fmi2Status fmi2Reset(fmi2Component c) {
+    LIVING("fmi2Reset");
     restart(&((Plant *)c)->s);
     stale(c);
     return fmi2OK;
@@ -136,6 +140,8 @@ static double *setting(Plant *m, fmi2ValueReference vr) { /* NULL: may not be se
 }
 
 fmi2Status fmi2SetReal(fmi2Component c, const fmi2ValueReference vr[], size_t n, const fmi2Real value[]) {
+    LIVING("fmi2SetReal");
+    GIVEN(n == 0 || (vr && value), "setReal");
     Plant *m = c;
     size_t i;
     for (i = 0; i < n; i++) {
@@ -148,6 +154,8 @@ fmi2Status fmi2SetReal(fmi2Component c, const fmi2ValueReference vr[], size_t n,
 }
 
 fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference vr[], size_t n, fmi2Real value[]) {
+    LIVING("fmi2GetReal");
+    GIVEN(n == 0 || (vr && value), "getReal");
     Plant *m = c;
     size_t i;
     for (i = 0; i < n; i++) {
@@ -165,6 +173,7 @@ fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference vr[], size_t n,
 
 #define NO_VARIABLES(function, type) \
     fmi2Status function(fmi2Component c, const fmi2ValueReference vr[], size_t n, type value[]) { \
+        LIVING(#function); \
         (void)vr; (void)value; \
         return n ? fail(c, #function ": all variables are Real") : fmi2OK; \
     }
@@ -177,6 +186,8 @@ NO_VARIABLES(fmi2SetString, const fmi2String)
 
 fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2ValueReference unknown[], size_t n_unknown,
                                         const fmi2ValueReference known[], size_t n_known, const fmi2Real seed[], fmi2Real out[]) {
+    LIVING("fmi2GetDirectionalDerivative");
+    GIVEN((n_unknown == 0 || (unknown && out)) && (n_known == 0 || (known && seed)), "getDirectionalDerivative");
     Plant *m = c;
     double sx[DIM(NX)] = {0}, su[DIM(NU)] = {0}, sp[DIM(NP)] = {0}, dy[DIM(NY)] = {0}, ddx[DIM(NX)] = {0};
     int need_f = 0, need_y = 0;
@@ -208,6 +219,7 @@ fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2ValueReferenc
 /* ---- co-simulation --------------------------------------------------------- */
 
 fmi2Status fmi2DoStep(fmi2Component c, fmi2Real t, fmi2Real length, fmi2Boolean no_rollback) {
+    LIVING("fmi2DoStep");
     Plant *m = c;
     State *s = &m->s;
     fmi2Status status;
@@ -229,6 +241,8 @@ fmi2Status fmi2DoStep(fmi2Component c, fmi2Real t, fmi2Real length, fmi2Boolean 
 }
 
 fmi2Status fmi2SetRealInputDerivatives(fmi2Component c, const fmi2ValueReference vr[], size_t n, const fmi2Integer order[], const fmi2Real value[]) {
+    LIVING("fmi2SetRealInputDerivatives");
+    GIVEN(n == 0 || (vr && order && value), "setRealInputDerivatives");
     Plant *m = c;
     size_t i;
     for (i = 0; i < n; i++) {
@@ -242,18 +256,31 @@ fmi2Status fmi2SetRealInputDerivatives(fmi2Component c, const fmi2ValueReference
 
 
 fmi2Status fmi2GetRealStatus(fmi2Component c, const fmi2StatusKind kind, fmi2Real *value) {
+    LIVING("fmi2GetRealStatus");
     if (kind != fmi2LastSuccessfulTime) return fail(c, "getRealStatus: only the last successful time is known");
+    GIVEN(value, "getRealStatus");
     *value = ((Plant *)c)->s.t;
     return fmi2OK;
 }
 
 /* ---- model exchange --------------------------------------------------------- */
 
-fmi2Status fmi2EnterEventMode(fmi2Component c) { ((Plant *)c)->s.phase = EVENTS; return fmi2OK; }
-fmi2Status fmi2EnterContinuousTimeMode(fmi2Component c) { ((Plant *)c)->s.phase = CONTINUOUS; return fmi2OK; }
+/* between initialization and termination, of an instance that was made for it */
+#define EXCHANGING(call) do { \
+    LIVING(call); \
+    if (((Plant *)c)->s.phase != EVENTS && ((Plant *)c)->s.phase != CONTINUOUS) return fail(c, "%s: called out of order", call); \
+} while (0)
+#define FOR_EXCHANGE(call) do { \
+    LIVING(call); \
+    if (((Plant *)c)->s.kind != fmi2ModelExchange) return fail(c, "%s: this instance is for co-simulation", call); \
+} while (0)
+
+fmi2Status fmi2EnterEventMode(fmi2Component c) { EXCHANGING("fmi2EnterEventMode"); ((Plant *)c)->s.phase = EVENTS; return fmi2OK; }
+fmi2Status fmi2EnterContinuousTimeMode(fmi2Component c) { EXCHANGING("fmi2EnterContinuousTimeMode"); ((Plant *)c)->s.phase = CONTINUOUS; return fmi2OK; }
 
 fmi2Status fmi2NewDiscreteStates(fmi2Component c, fmi2EventInfo *info) {
-    (void)c;
+    EXCHANGING("fmi2NewDiscreteStates");
+    GIVEN(info, "newDiscreteStates");
     info->newDiscreteStatesNeeded = fmi2False;
     info->terminateSimulation = fmi2False;
     info->nominalsOfContinuousStatesChanged = fmi2False;
@@ -264,47 +291,58 @@ fmi2Status fmi2NewDiscreteStates(fmi2Component c, fmi2EventInfo *info) {
 }
 
 fmi2Status fmi2CompletedIntegratorStep(fmi2Component c, fmi2Boolean no_rollback, fmi2Boolean *enter_event_mode, fmi2Boolean *terminate) {
-    (void)c; (void)no_rollback;
+    EXCHANGING("fmi2CompletedIntegratorStep");
+    (void)no_rollback;
+    GIVEN(enter_event_mode && terminate, "completedIntegratorStep");
     *enter_event_mode = *terminate = fmi2False;
     return fmi2OK;
 }
 
-fmi2Status fmi2SetTime(fmi2Component c, fmi2Real t) { ((Plant *)c)->s.t = t; return fmi2OK; }
+fmi2Status fmi2SetTime(fmi2Component c, fmi2Real t) { FOR_EXCHANGE("fmi2SetTime"); ((Plant *)c)->s.t = t; return fmi2OK; }
 
 static fmi2Status check_length(Plant *m, size_t n) {
     return n == NX ? fmi2OK : fail(m, "the plant has %d states, not %lu", NX, (unsigned long)n);
 }
 
 fmi2Status fmi2SetContinuousStates(fmi2Component c, const fmi2Real x[], size_t n) {
+    EXCHANGING("fmi2SetContinuousStates");
     Plant *m = c;
     if (check_length(m, n) != fmi2OK) return fmi2Error;
+    GIVEN(n == 0 || x, "states");
     memcpy(m->s.x, x, n * sizeof *x);
     stale(m);
     return fmi2OK;
 }
 
 fmi2Status fmi2GetContinuousStates(fmi2Component c, fmi2Real x[], size_t n) {
+    FOR_EXCHANGE("fmi2GetContinuousStates");
     Plant *m = c;
     if (check_length(m, n) != fmi2OK) return fmi2Error;
+    GIVEN(n == 0 || x, "states");
     memcpy(x, m->s.x, n * sizeof *x);
     return fmi2OK;
 }
 
 fmi2Status fmi2GetDerivatives(fmi2Component c, fmi2Real dx[], size_t n) {
+    FOR_EXCHANGE("fmi2GetDerivatives");
     Plant *m = c;
     if (check_length(m, n) != fmi2OK) return fmi2Error;
+    GIVEN(n == 0 || dx, "states");
     refresh_f(m);
     memcpy(dx, m->dx, n * sizeof *dx);
     return fmi2OK;
 }
 
 fmi2Status fmi2GetNominalsOfContinuousStates(fmi2Component c, fmi2Real x[], size_t n) {
+    FOR_EXCHANGE("fmi2GetNominalsOfContinuousStates");
     if (check_length(c, n) != fmi2OK) return fmi2Error;
+    GIVEN(n == 0 || x, "states");
     memcpy(x, nominal_x, n * sizeof *x);
     return fmi2OK;
 }
 
 fmi2Status fmi2GetEventIndicators(fmi2Component c, fmi2Real indicators[], size_t n) {
+    FOR_EXCHANGE("fmi2GetEventIndicators");
     (void)indicators;
     return n ? fail(c, "the plant has no event indicators") : fmi2OK;
 }

@@ -36,6 +36,7 @@ _MAIN: Final = "native_wrapper.c"
 _SOURCES: Final = (
     _MAIN,
     "fmi2_common.c",
+    "living.c",
     "native_state.h",
     "native_rows.c",
     "native_watch.c",

@@ -16,10 +16,13 @@ import importlib
 import importlib.abc
 import importlib.machinery
 import importlib.util
+import json
 import os
+import shutil
 import site
+import subprocess
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from types import CodeType, ModuleType
 
@@ -150,19 +153,87 @@ def load_class(prefix: str, root: Path, module: str, name: str) -> type:
     return found
 
 
-def add_site_packages(modules: Iterable[str], recorded: Iterable[str], version: str) -> None:
+_ASK = (
+    "import json, sys; print(json.dumps([list(sys.version_info[:2]), [p for p in sys.path if "
+    "p.endswith('-packages')]]))"
+)
+_PATIENCE = 60.0
+"""Time an interpreter has to say where its packages are [s]; one that starts from a slow disk
+needs seconds.
+"""
+
+
+def add_site_packages(modules: Sequence[str], resources: Path) -> None:
     """Add package folders where one of the modules is missing.
 
-    ``IRJ_SITE_PACKAGES`` (separated like PATH) comes first, then the recorded folders where this
-    Python is of the recorded version.
+    ``IRJ_SITE_PACKAGES`` (separated like PATH) comes first, then the packages of the interpreters
+    that ``IRJ_PYTHON``, the file ``python.txt`` beside this one, and PATH name, where they are of
+    this version of Python.
+
+    Raises
+    ------
+    ImportError
+        One line that says what is missing and what to set.
     """
-    named = [
-        folder for folder in os.environ.get("IRJ_SITE_PACKAGES", "").split(os.pathsep) if folder
-    ]
-    same = version == f"{sys.version_info.major}.{sys.version_info.minor}"
-    for folder in (*named, *(recorded if same else ())):
-        if all(importlib.util.find_spec(name) is not None for name in modules):
+    for folders in _places(resources):
+        if not missing_of(modules):
             return
-        if Path(folder).is_dir():
+        for folder in filter(os.path.isdir, folders):
             site.addsitedir(folder)
-            importlib.invalidate_caches()
+        importlib.invalidate_caches()
+    missing = missing_of(modules)
+    if missing:
+        version = f"{sys.version_info.major}.{sys.version_info.minor}"
+        raise ImportError(
+            f"No module named {', '.join(map(repr, missing))} for this Python {version}; set "
+            "IRJ_PYTHON to the path of a "
+            f"Python {version} that has it, or write that path into resources/python.txt of this "
+            "FMU"
+        )
+
+
+def missing_of(modules: Iterable[str]) -> list[str]:
+    """The modules that cannot be found."""
+    return [name for name in modules if importlib.util.find_spec(name) is None]
+
+
+def _places(resources: Path) -> Iterator[list[str]]:
+    """Package folders of one place after the other; an interpreter is asked only when its turn
+    comes.
+    """
+    yield []
+    yield [folder for folder in os.environ.get("IRJ_SITE_PACKAGES", "").split(os.pathsep) if folder]
+    note = resources / "python.txt"
+    named = [
+        os.environ.get("IRJ_PYTHON", ""),
+        note.read_text(encoding="utf-8-sig").strip() if note.is_file() else "",
+    ]
+    on_path = [
+        shutil.which(name)
+        for name in (
+            "python3",
+            "python",
+            f"python{sys.version_info.major}.{sys.version_info.minor}",
+        )
+    ]
+    for python in dict.fromkeys(filter(None, (*named, *on_path))):
+        yield packages_of(python)
+
+
+def packages_of(python: str) -> list[str]:
+    """Package folders of an interpreter of this version; none where it is another, or does not
+    answer.
+    """
+    try:
+        done = subprocess.run(
+            [python, "-P", "-c", _ASK],
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=_PATIENCE,
+            check=False,
+        )
+        version, folders = json.loads(done.stdout)
+    except (OSError, ValueError, subprocess.SubprocessError):
+        return []
+    return [str(folder) for folder in folders] if version == list(sys.version_info[:2]) else []

@@ -11,12 +11,12 @@ import json
 import re
 import subprocess
 import sys
-import sysconfig
 import tempfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import final
+from xml.etree import ElementTree
 
 from casadi_models.effect import EffectFile
 from identification.errors import InputError
@@ -57,10 +57,7 @@ class SlaveSpec:
         ``self.resources``.
     effects : tuple of EffectFile
         Users' own effects that the model uses: they join the library of the bundled packages.
-    record_paths : bool
-        Note this machine's libpython and site-packages in the FMU, so that a host without Python
-        runs it here. Elsewhere the environment variables IRJ_LIBPYTHON and IRJ_SITE_PACKAGES say
-        where they are.
+        Elsewhere the environment variables IRJ_LIBPYTHON and IRJ_SITE_PACKAGES say where they are.
     """
 
     identifier: str
@@ -68,7 +65,6 @@ class SlaveSpec:
     class_name: str
     packages: tuple[Path, ...]
     files: Mapping[str, Path] = field(default_factory=dict)
-    record_paths: bool = True
     effects: tuple[EffectFile, ...] = ()
 
 
@@ -133,7 +129,7 @@ def package_slave(
         except InputError as error:
             note = _NO_SHIM.format(reason=str(error).split(":")[0])
         else:
-            library = _compile_shim(spec, cc)
+            library = _compile_shim(spec, content["modelDescription.xml"], _third_party(bundle), cc)
     else:
         note = _NO_SHIM.format(reason="left out on request")
     for name, code in inner.items():
@@ -203,14 +199,17 @@ def _bundle(spec: SlaveSpec) -> dict[str, bytes]:
 
 
 def _third_party(bundle: Mapping[str, bytes]) -> list[str]:
-    """Return the top-level modules that the bundle imports and neither holds nor finds in the
+    """Return the modules that the bundle imports when it starts and neither holds nor finds in the
     standard library.
+
+    What a function imports when it is called, such as the reader of a file format, may be missing
+    where the FMU runs.
     """
     names: set[str] = set()
     for name, text in bundle.items():
         if not name.endswith(".py") or name.startswith("pythonfmu/"):
             continue
-        for node in ast.walk(ast.parse(text)):
+        for node in ast.parse(text).body:
             if isinstance(node, ast.Import):
                 names |= {item.name.partition(".")[0] for item in node.names}
             elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
@@ -220,15 +219,13 @@ def _third_party(bundle: Mapping[str, bytes]) -> list[str]:
 
 
 def _resources(spec: SlaveSpec, bundle: Mapping[str, bytes]) -> dict[str, bytes]:
-    paths = sysconfig.get_paths()
-    recorded = sorted({paths["purelib"], paths["platlib"]}) if spec.record_paths else []
     digest = hashlib.sha256()
     for name in sorted(bundle):
         digest.update(f"{name}\0{len(bundle[name])}\0".encode() + bundle[name])
-    digest.update(f"{spec.module}:{spec.class_name}:{recorded}".encode())
+    digest.update(f"{spec.module}:{spec.class_name}".encode())
     mark = digest.hexdigest()[:16]
     script = f"{spec.identifier}_{mark}"
-    start = _start_script(spec, f"_fmu_{mark}", _third_party(bundle), recorded)
+    start = _start_script(spec, f"_fmu_{mark}", _third_party(bundle))
     resources = {f"bundle/{name}": code for name, code in bundle.items()}
     resources[f"{script}.py"] = start.encode()
     resources["slavemodule.txt"] = script.encode()
@@ -239,9 +236,7 @@ def _resources(spec: SlaveSpec, bundle: Mapping[str, bytes]) -> dict[str, bytes]
     return resources
 
 
-def _start_script(
-    spec: SlaveSpec, prefix: str, needed: Iterable[str], recorded: Iterable[str]
-) -> str:
+def _start_script(spec: SlaveSpec, prefix: str, needed: Iterable[str]) -> str:
     """Return the text of the script pythonfmu's library runs: the loader and a tail that names the
     class.
 
@@ -249,12 +244,10 @@ def _start_script(
     those, and gives back one reference to the module's dictionary too many at each instantiation;
     the last line makes up for it.
     """
-    version = f"{sys.version_info.major}.{sys.version_info.minor}"
     tail = f"""
 
 def _start() -> type:
-    add_site_packages(
-        {json.dumps(list(needed))}, {json.dumps(list(recorded))}, {json.dumps(version)})
+    add_site_packages({json.dumps(list(needed))}, Path(__file__).resolve().parent)
     folder = Path(__file__).resolve().parent / "bundle"
     return load_class({json.dumps(prefix)}, folder, {json.dumps(spec.module)},
                       {json.dumps(spec.class_name)})
@@ -312,32 +305,48 @@ def _describe(spec: SlaveSpec, resources: Mapping[str, bytes], guid: str) -> byt
         )
         if done.returncode != 0 or not out.is_file():
             lines = done.stderr.strip().splitlines() or ["no message"]
+            why, missing, _ = lines[-1].partition("; set IRJ_PYTHON")
+            cure = "; install it, or add it to `packages`" if missing else ""
             raise InputError(
-                f"slave {spec.module}.{spec.class_name} does not start from its bundle: {lines[-1]}"
+                f"slave {spec.module}.{spec.class_name} does not start from its bundle: {why}{cure}"
             )
         return out.read_bytes()
 
 
-def _libpython_candidates(spec: SlaveSpec) -> list[str]:
+def _libpython_candidates() -> list[str]:
+    """Names that the loader of the host looks for; none of them is a path of this machine."""
     current = f"libpython{sys.version_info.major}.{sys.version_info.minor}.so.1.0"
-    candidates: list[str] = []
-    folder, name = sysconfig.get_config_var("LIBDIR"), sysconfig.get_config_var("INSTSONAME")
-    if spec.record_paths and folder and name and (Path(folder) / name).is_file():
-        candidates.append(str(Path(folder) / name))
-    others = [f"libpython3.{minor}.so.1.0" for minor in (13, 12, 11)]
-    return [*candidates, *dict.fromkeys([current, *others])]
+    return list(dict.fromkeys([current, *(f"libpython3.{minor}.so.1.0" for minor in (13, 12, 11))]))
 
 
-def _compile_shim(spec: SlaveSpec, cc: str | None) -> bytes:
-    quoted = ", ".join(json.dumps(path, ensure_ascii=False) for path in _libpython_candidates(spec))
-    config = (
-        f"#define INNER_LIBRARY {json.dumps(_inner_name(spec))}\n#define "
-        f"LIBPYTHON_CANDIDATES {quoted}\n"
-    )
-    sources = {
-        "slave_shim.c": (_HERE.parent / "c" / "slave_shim.c").read_bytes(),
-        "shim_config.h": config.encode(),
+def _kinds(description: ElementTree.Element) -> str:
+    """The first letter of the type of each value reference; a blank where there is none."""
+    letters = {"Real": "R", "Integer": "I", "Enumeration": "I", "Boolean": "B", "String": "S"}
+    found = {
+        int(v.attrib["valueReference"]): letters[t.tag]
+        for v in description.iter("ScalarVariable")
+        for t in v
+        if t.tag in letters
     }
+    return "".join(found.get(i, " ") for i in range(max(found, default=-1) + 1))
+
+
+def _compile_shim(
+    spec: SlaveSpec, description: bytes, needed: Iterable[str], cc: str | None
+) -> bytes:
+    root = ElementTree.fromstring(description)
+    quoted = ", ".join(json.dumps(path, ensure_ascii=False) for path in _libpython_candidates())
+    defined = {
+        "INNER_LIBRARY": json.dumps(_inner_name(spec)),
+        "GUID": json.dumps(root.attrib["guid"]),
+        "KINDS": json.dumps(_kinds(root)),
+        "MODULES": json.dumps(" ".join(needed)),
+        "LIBPYTHON_CANDIDATES": quoted,
+    }
+    config = "".join(f"#define {name} {text}\n" for name, text in defined.items())
+    sources = {
+        name: (_HERE.parent / "c" / name).read_bytes() for name in ("slave_shim.c", "living.c")
+    } | {"shim_config.h": config.encode()}
     return compile_library(
         sources, "slave_shim.c", _SHIM_TARGET, cc=cc, libraries=("dl", "pthread")
     )

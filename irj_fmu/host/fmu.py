@@ -5,13 +5,16 @@ from __future__ import annotations
 import ctypes
 import shutil
 import tempfile
-from collections.abc import Collection, Mapping, Sequence
+import weakref
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self, final
 
 from identification.errors import InputError
+from irj_fmu.host.last_free import freer
 from irj_fmu.host.signals import Fault, Signal
 
 Number = float | int | bool
@@ -181,7 +184,10 @@ class Instance:
                 f"{name} ({fmu.path.name}): its library cannot be loaded here, {error}"
             ) from error
         self.call("instantiate", callbacks=self.callbacks, loggingOn=log)
-        self._open = True
+        free = partial(self.raw.fmi2FreeInstance, self.raw.component)
+        self._close = weakref.finalize(
+            self, _closed, freer(self.raw.dll, free), self.raw.freeLibrary
+        )
 
     def call(self, function: str, *args: Any, **kwargs: Any) -> Any:
         """Call a method of fmpy's instance; its failures become `FmuError` with the FMU's last
@@ -279,9 +285,7 @@ class Instance:
 
     def close(self) -> None:
         """Free the instance."""
-        if self._open:
-            self._open = False
-            self.raw.freeInstance()
+        self._close()
 
     def __enter__(self) -> Self:
         return self
@@ -316,6 +320,12 @@ def callbacks(messages: list[str]) -> Any:
     made.allocateMemory = fmi2CallbackAllocateMemoryTYPE(calloc)
     made.freeMemory = fmi2CallbackFreeMemoryTYPE(free)
     return made
+
+
+def _closed(free: Callable[[], None], unload: Callable[[], None]) -> None:
+    """Free an instance, then fmpy's hold on its library."""
+    free()
+    unload()
 
 
 @final

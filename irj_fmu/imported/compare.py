@@ -2,100 +2,22 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, final
-
-import numpy as np
+from collections.abc import Sequence
 
 from identification.data.record import Record
-from irj_fmu.host.signals import FloatArray
-from irj_fmu.imported.run import Window
-
-if TYPE_CHECKING:
-    from irj_fmu.imported.model import UserModel
+from irj_fmu.imported.fit import Solver, UserFit, simulator_of
+from irj_fmu.imported.model import UserModel, listed
+from irj_fmu.imported.outputs import UserComparison, comparison_of, noise_of
 
 
-@final
-@dataclass(frozen=True)
-class OutputError:
-    """Error of one output.
-
-    Attributes
-    ----------
-    rms, floor : float
-        Of measured less simulated, and what white noise of the channel alone would leave, in
-        `unit`.
-    fit_percent : float
-        100 (1 - norm(residual) / norm(measured - mean)).
-    whiteness : float
-        Autocorrelation of the residual one sample later.
-    """
-
-    channel: str
-    variable: str
-    unit: str
-    rms: float
-    floor: float
-    fit_percent: float
-    relative_error_percent: float
-    whiteness: float
-
-    @property
-    def ratio(self) -> float:
-        """Error over floor: 1 where only noise is left."""
-        return self.rms / self.floor if self.floor > 0 else math.inf
-
-
-@final
-@dataclass(frozen=True)
-class UserComparison:
-    """A user's FMU against records.
-
-    Attributes
-    ----------
-    outputs : mapping of str to OutputError
-        By channel.
-    worst_window : tuple of float
-        Start and end of the second with the largest error, time stamps of its record [s].
-    time : tuple of (n,) array
-        Of each window [s].
-    measured, simulated : tuple of (n, outputs) array
-        Of each window, in the units of the FMU.
-    """
-
-    name: str
-    outputs: Mapping[str, OutputError]
-    worst_window: tuple[float, float]
-    time: tuple[FloatArray, ...]
-    measured: tuple[FloatArray, ...]
-    simulated: tuple[FloatArray, ...]
-
-    def as_json(self) -> dict[str, Any]:
-        """Errors as data."""
-        return {
-            "record": self.name,
-            "worst_window_s": list(self.worst_window),
-            "outputs": {c: {**e.__dict__, "ratio": e.ratio} for c, e in self.outputs.items()},
-        }
-
-    def __str__(self) -> str:
-        parts = [
-            f"{c} fit {e.fit_percent:.4g} %, error {e.rms:.3g} {e.unit}, {e.ratio:.3g} times its "
-            "floor"
-            for c, e in self.outputs.items()
-        ]
-        return f"{self.name}: {'; '.join(parts)}"
-
-
-def compare(model: UserModel, records: Record | Sequence[Record]) -> UserComparison:
+def compare(model: UserModel | UserFit, records: Record | Sequence[Record]) -> UserComparison:
     """Compare a user's FMU with records; start values that come from channels are estimated,
     parameters are not.
 
     Parameters
     ----------
-    model : UserModel
+    model : UserModel or UserFit
+        A fit is compared at its fitted values.
     records : Record or sequence of Record
 
     Raises
@@ -105,9 +27,7 @@ def compare(model: UserModel, records: Record | Sequence[Record]) -> UserCompari
     FmuError
         Where the FMU refuses a call.
     """
-    from irj_fmu.imported.fit import Solver, noise_of, simulator_of
-    from irj_fmu.imported.model import listed
-
+    model = model.model if isinstance(model, UserFit) else model
     given = listed(records)
     windows = model.windows(given)
     simulator, _ = simulator_of(model, windows)
@@ -117,60 +37,4 @@ def compare(model: UserModel, records: Record | Sequence[Record]) -> UserCompari
     return comparison_of(model, given, windows, solver.predicted)
 
 
-def comparison_of(
-    model: UserModel,
-    records: Sequence[Record],
-    windows: Sequence[Window],
-    predicted: Sequence[FloatArray],
-) -> UserComparison:
-    """The comparison of simulated windows."""
-    from irj_fmu.imported.fit import noise_of
-
-    floors = noise_of(model, records)
-    measured = np.concatenate([w.outputs for w in windows])
-    residual = measured - np.concatenate(list(predicted))
-    found = {}
-    for i, m in enumerate(model.outputs):
-        y, r = measured[:, i], residual[:, i]
-        spread = float(np.linalg.norm(y - y.mean())) or 1e-300
-        size = float(np.linalg.norm(y)) or 1e-300
-        centred = r - r.mean()
-        power = float(centred @ centred)
-        found[m.channel] = OutputError(
-            m.channel,
-            m.variable,
-            unit=model.fmu.variable(m.variable).unit or "",
-            rms=float(np.sqrt(np.mean(r**2))),
-            floor=float(floors[i]),
-            fit_percent=100 * (1 - float(np.linalg.norm(r)) / spread),
-            relative_error_percent=100 * float(np.linalg.norm(r)) / size,
-            whiteness=float(centred[:-1] @ centred[1:]) / power if power > 0 else 0.0,
-        )
-    return UserComparison(
-        ", ".join(r.name for r in records),
-        found,
-        _worst(windows, residual),
-        tuple(w.time for w in windows),
-        tuple(w.outputs for w in windows),
-        tuple(predicted),
-    )
-
-
-def _worst(windows: Sequence[Window], residual: FloatArray) -> tuple[float, float]:
-    """The second with the largest error."""
-    scale = np.maximum(np.sqrt(np.mean(residual**2, axis=0)), 1e-300)
-    power = np.sum((residual / scale) ** 2, axis=1)
-    best, place, first = -1.0, (0.0, 0.0), 0
-    for w in windows:
-        n = len(w.time)
-        own = power[first : first + n]
-        first += n
-        width = max(1, min(n, round(1.0 / max(float(np.median(np.diff(w.time))), 1e-9))))
-        sums = np.convolve(own, np.ones(width), "valid")
-        k = int(np.argmax(sums))
-        if sums[k] > best:
-            best, place = float(sums[k]), (float(w.time[k]), float(w.time[k + width - 1]))
-    return place
-
-
-__all__ = ["OutputError", "UserComparison", "compare", "comparison_of"]
+__all__ = ["compare"]

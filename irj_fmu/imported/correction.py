@@ -5,24 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Final, final
+from typing import Any, Final, final
 
 import numpy as np
 
 from casadi_models import JointModel
 from casadi_models.term import TOTAL_INERTIA
-from identification.errors import InputError
 from irj_fmu.host.signals import FloatArray
 from irj_fmu.imported.run import Window
 
-if TYPE_CHECKING:
-    from irj_fmu.imported.model import UserModel
-
 PREFIX: Final = "correction."
 """Before the names of a correction's parameters, so that they never meet those of the FMU."""
-DRIVES: Final = ("motor_torque", "motor_current", "motor_voltage")
 SHAPE_RANGE: Final = 3.0
-POSITIONS: Final = ("motor_position", "link_position")
 
 
 @final
@@ -50,62 +44,6 @@ class Port:
     position: float
     velocity: int | None = None
     rate: float = 1.0
-
-
-def port_of(model: UserModel) -> Port:
-    """The torque input and the position output of a model.
-
-    Raises
-    ------
-    InputError
-        Where no drive channel or no position is mapped, or the motor constant is missing.
-    """
-    joint, name = model.joint, model.fmu.path.name
-    drive = next(
-        ((i, m) for c in DRIVES for i, m in enumerate(model.inputs) if m.channel == c), None
-    )
-    if drive is None:
-        raise InputError(
-            f"{name}: no drive channel is mapped to an input of the FMU; a correction torque "
-            f"needs one of {', '.join(DRIVES)}"
-        )
-    channel = drive[1].channel
-    per = {
-        "motor_torque": joint.gear_ratio,
-        "motor_current": joint.torque_per_current,
-        "motor_voltage": joint.torque_per_voltage or 1.0,
-    }[channel]
-    if per is None:
-        raise InputError(
-            f"{joint.source or joint.name}: motor_current needs motor_constant (Nm/A on the "
-            "motor shaft) or torque_per_current in [joint]"
-        )
-    place = next(
-        ((i, m) for c in POSITIONS for i, m in enumerate(model.outputs) if m.channel == c), None
-    )
-    if place is None:
-        raise InputError(
-            f"{name}: no position is mapped to an output of the FMU; map motor_position or "
-            "link_position"
-        )
-    motor = place[1].channel == "motor_position"
-    side = joint.gear_ratio if motor else 1.0
-    speed = next(
-        (
-            (i, m)
-            for i, m in enumerate(model.outputs)
-            if m.channel == ("motor_velocity" if motor else "link_velocity")
-        ),
-        None,
-    )
-    return Port(
-        drive[0],
-        place[0],
-        per / drive[1].scale,
-        1.0 / (side * place[1].scale),
-        speed[0] if speed else None,
-        1.0 / (side * speed[1].scale) if speed else 1.0,
-    )
 
 
 @final
@@ -161,10 +99,6 @@ class Correction:
         """The correction with other values, by outside name; others are passed over."""
         own = {n: float(values[PREFIX + n]) for n in self.free if PREFIX + n in values}
         return replace(self, model=self.model.with_values(own))
-
-    def feedback(self, model: UserModel, values: Mapping[str, float]) -> CorrectionLaw:
-        """The law as something that reads outputs and adds to inputs."""
-        return CorrectionLaw(self.with_values(values).model, port_of(model), len(model.inputs))
 
 
 def correction_of(
@@ -307,4 +241,4 @@ class Evaluator:
         return self._result
 
 
-__all__ = ["PREFIX", "Correction", "CorrectionLaw", "Port", "correction_of", "port_of"]
+__all__ = ["PREFIX", "Correction", "CorrectionLaw", "Port", "correction_of"]

@@ -13,10 +13,10 @@ from identification.data.own_effects import files_of
 from identification.errors import InputError
 from irj_fmu.fmi.package import SlaveSpec, package_slave
 from irj_fmu.fmi.ssp import System, write_ssp
-from irj_fmu.imported.correction import port_of
 from irj_fmu.imported.file import user_joint_text
 from irj_fmu.imported.library import UserFmu
 from irj_fmu.imported.model import UserModel
+from irj_fmu.imported.port import port_of
 from irj_fmu.imported.slave import PAIR_FILE
 from irj_fmu.plant.joint import identifier
 

@@ -9,25 +9,21 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, final
+from typing import Any, Final, final
 
 import numpy as np
 
-from identification.balance.noise import noise_level
 from identification.data.record import Record
 from identification.errors import InputError
 from identification.fitting.covariance import BLOCK, block_errors, correlations, process_errors
 from identification.fitting.least_squares import least_squares, triangle_of
 from irj_fmu.host.run import FmuError
 from irj_fmu.host.signals import FloatArray
-from irj_fmu.imported.compare import UserComparison, comparison_of
 from irj_fmu.imported.exact import Exact, NotExact
 from irj_fmu.imported.model import UserModel, listed, start_values
+from irj_fmu.imported.outputs import UserComparison, comparison_of, noise_of
 from irj_fmu.imported.run import Window
 from irj_fmu.imported.sensitivity import BlackBox, Simulator, scale_of
-
-if TYPE_CHECKING:
-    from irj_fmu.imported.diagnose import UserDiagnosis
 
 Progress = Callable[[str, float], None]
 _MOVED: Final = 1e-9
@@ -113,18 +109,6 @@ class UserFit:
             "notes": list(self.model.notes),
         }
 
-    def compare(self, records: Record | Sequence[Record]) -> UserComparison:
-        """Compare with records that the fit may never have seen."""
-        return self.model.compare(records)
-
-    def diagnose(
-        self,
-        held_out: Record | Sequence[Record] = (),
-        progress: Callable[[str, float], None] | None = None,
-    ) -> UserDiagnosis:
-        """Name what is missing."""
-        return self.model.diagnose(self.records, held_out, progress)
-
 
 def fit(
     model: UserModel,
@@ -204,16 +188,6 @@ def simulator_of(
         ), "exact derivatives through CasADi's import, checked against difference quotients"
     except (NotExact, FmuError) as error:
         return BlackBox(model, windows), f"black box: {error}"
-
-
-def noise_of(model: UserModel, records: Sequence[Record]) -> FloatArray:
-    """White noise of the measured outputs, in the units of the FMU."""
-    levels = [
-        [abs(m.scale) * noise_level(r[m.channel], tuple(r.segments())) for m in model.outputs]
-        for r in records
-    ]
-    found: FloatArray = np.median(np.array(levels), axis=0)
-    return found
 
 
 @final
@@ -404,4 +378,4 @@ class Solver:
         return stderr, correlation
 
 
-__all__ = ["Outputs", "Solver", "UserFit", "fit", "noise_of", "simulator_of"]
+__all__ = ["Outputs", "Solver", "UserFit", "fit", "simulator_of"]

@@ -13,6 +13,7 @@ import tempfile
 import weakref
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, Literal, Self, final
 
@@ -20,6 +21,7 @@ import numpy as np
 
 from identification.errors import InputError
 from irj_fmu.host.fmu import FmuError, Number, callbacks, near_names
+from irj_fmu.host.last_free import freer
 from irj_fmu.host.signals import FloatArray
 
 Kind = Literal["me", "cs"]
@@ -184,9 +186,8 @@ class UserInstance:
         self._functions: dict[str, Any] = {}
         self._library = self._load(part.modelIdentifier)
         self._component = self._instantiate()
-        self._close = weakref.finalize(
-            self, _free, self._function("FreeInstance", [_P], None), self._component
-        )
+        free = self._function("FreeInstance", [_P], None)
+        self._close = weakref.finalize(self, freer(self._library, partial(free, self._component)))
         self._used = False
         self.size = len(fmu.states)
         self.x: Any = (_D * max(self.size, 1))()
@@ -235,20 +236,16 @@ class UserInstance:
     def _instantiate(self) -> int:
         part, fmu, text = self._part, self.fmu, ctypes.c_char_p
         if self.version == 2:
-            self.callbacks = callbacks(self.messages)
+            self._callbacks = callbacks(self.messages)
             make = self._function("Instantiate", [text, _I, text, text, _P, _I, _I], _P)
             place = (fmu.folder / "resources").as_uri()
-            found = make(
-                *(
-                    b"user",
-                    0 if self.kind == "me" else 1,
-                    str(fmu.description.guid).encode(),
-                    place.encode(),
-                    ctypes.addressof(self.callbacks),
-                    0,
-                    0,
-                ),
+            given: tuple[Any, ...] = (
+                b"user",
+                0 if self.kind == "me" else 1,
+                str(fmu.description.guid).encode(),
+                place.encode(),
             )
+            given = (*given, ctypes.addressof(self._callbacks), 0, 0)
         else:
             self.callbacks = _LOG3(_note(self.messages))
             token, place = (
@@ -259,29 +256,28 @@ class UserInstance:
                 make = self._function(
                     "InstantiateModelExchange", [text, text, text, _B, _B, _P, _LOG3], _P
                 )
-                found = make(*(b"user", token, place.encode(), False, False, None, self.callbacks))
+                given = (b"user", token, place.encode(), False, False, None, self._callbacks)
             else:
                 make = self._function(
                     "InstantiateCoSimulation",
                     [text, text, text, _B, _B, _B, _B, _P, _U, _P, _LOG3, _P],
                     _P,
                 )
-                found = make(
-                    *(
-                        b"user",
-                        token,
-                        place.encode(),
-                        False,
-                        False,
-                        False,
-                        False,
-                        None,
-                        0,
-                        None,
-                        self.callbacks,
-                        None,
-                    ),
+                given = (
+                    b"user",
+                    token,
+                    place.encode(),
+                    False,
+                    False,
+                    False,
+                    False,
+                    None,
+                    0,
+                    None,
+                    self._callbacks,
+                    None,
                 )
+        found = make(*given)
         if not found:
             raise FmuError(
                 f"{fmu.path.name}: cannot be instantiated as {part.modelIdentifier}{self._last()}"
@@ -391,14 +387,13 @@ class UserInstance:
             more: tuple[Sequence[Any], Sequence[Any]] = (
                 ((), ()) if self.version == 2 else ((_U,), (1,))
             )
-            self._call(
-                function,
-                [_P, _U, _P, *more[0]],
+            taken = (
                 ctypes.byref(ctypes.c_uint(variable.valueReference)),
                 1,
                 ctypes.byref(kind(int(value))),
                 *more[1],
             )
+            self._call(function, [_P, _U, _P, *more[0]], *taken)
 
     # --- a run ------------------------------------------------------------------------------------
 
@@ -498,10 +493,6 @@ class UserInstance:
 
     def __exit__(self, *_about: object) -> None:
         self.close()
-
-
-def _free(function: Any, component: int) -> None:
-    function(component)
 
 
 def _note(messages: list[str]) -> Callable[[Any, int, bytes, bytes], None]:

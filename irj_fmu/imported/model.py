@@ -5,10 +5,10 @@ to be fitted.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, final
+from typing import Any, Final, final
 
 import numpy as np
 
@@ -19,14 +19,9 @@ from identification.data.units import base_unit, same_dimension
 from identification.errors import InputError
 from irj_fmu.host.run import Number
 from irj_fmu.host.signals import FloatArray
+from irj_fmu.imported.correction import Correction
 from irj_fmu.imported.library import Kind, UserFmu
 from irj_fmu.imported.run import Runner, Window
-
-if TYPE_CHECKING:
-    from irj_fmu.imported.compare import UserComparison
-    from irj_fmu.imported.correction import Correction
-    from irj_fmu.imported.diagnose import UserDiagnosis
-    from irj_fmu.imported.fit import UserFit
 
 DRIVES: Final = ("motor_current", "motor_torque", "motor_voltage")
 _SLOPE_OF: Final = {"motor_velocity": "motor_position", "link_velocity": "link_position"}
@@ -180,31 +175,6 @@ class UserModel:
             settings=self.constants,
         )
 
-    # --- the three verbs --------------------------------------------------------------------------
-
-    def fit(self, records: Record | Sequence[Record], **options: Any) -> UserFit:
-        """Fit the parameters; see :func:`irj_fmu.imported.fit.fit`."""
-        from irj_fmu.imported.fit import fit
-
-        return fit(self, records, **options)
-
-    def compare(self, records: Record | Sequence[Record]) -> UserComparison:
-        """Compare with records; see :func:`irj_fmu.imported.compare.compare`."""
-        from irj_fmu.imported.compare import compare
-
-        return compare(self, records)
-
-    def diagnose(
-        self,
-        records: Record | Sequence[Record],
-        held_out: Record | Sequence[Record] = (),
-        progress: Callable[[str, float], None] | None = None,
-    ) -> UserDiagnosis:
-        """Name what is missing; see :func:`irj_fmu.imported.diagnose.diagnose`."""
-        from irj_fmu.imported.diagnose import diagnose
-
-        return diagnose(self, records, held_out, progress=progress)
-
 
 def listed(records: Record | Sequence[Record]) -> list[Record]:
     """One record or several as a list."""
@@ -272,7 +242,7 @@ def load_user_model(
     --------
     >>> model = load_user_model("axis.fmu", {"motor_torque": "tau", "motor_position": "phi"},
     ["inertia"])  # doctest: +SKIP
-    >>> fitted = model.fit(read("run.csv"))
+    >>> fitted = fit(model, read("run.csv"))
     # doctest: +SKIP
     """
     fmu = UserFmu(Path(path))
@@ -295,15 +265,14 @@ def load_user_model(
     return UserModel(
         fmu,
         joint,
-        inputs=inputs,
-        outputs=outputs,
-        parameters=_parameters(fmu, parameters),
-        starts=starts,
+        inputs,
+        outputs,
+        _parameters(fmu, parameters),
+        starts,
         constants=constants,
         window=window,
         hold=hold,
         kind=kind or ways[0],
-        correction=None,
         notes=tuple(notes),
     )
 

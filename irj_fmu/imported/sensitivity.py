@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final, Protocol, final
 import numpy as np
 
 from irj_fmu.host.signals import FloatArray
+from irj_fmu.imported.port import feedback_of
 from irj_fmu.imported.run import Runner, Window
 
 if TYPE_CHECKING:
@@ -58,11 +59,7 @@ class BlackBox:
         ]
 
     def _feedback(self, values: Mapping[str, float]) -> Feedback | None:
-        return (
-            None
-            if self.model.correction is None
-            else self.model.correction.feedback(self.model, values)
-        )
+        return feedback_of(self.model, values)
 
     def sensitivities(
         self, values: Mapping[str, float], starts: FloatArray, names: Sequence[str]

@@ -13,9 +13,10 @@ from irj_fmu.fmi.slave_base import Health, TableSlave
 from irj_fmu.fmi.unit_definitions import base_unit as fmi_unit
 from irj_fmu.fmi.variables import Value, Variable
 from irj_fmu.host.run import FmuError
-from irj_fmu.imported.correction import PREFIX, CorrectionLaw, port_of
+from irj_fmu.imported.correction import PREFIX, CorrectionLaw
 from irj_fmu.imported.file import load_user_joint
 from irj_fmu.imported.model import UserModel
+from irj_fmu.imported.port import feedback_of, port_of
 
 PAIR_FILE: Final = "pair.toml"
 _STATE: Final = {"canGetAndSetFMUstate": "false", "canSerializeFMUstate": "false"}
@@ -127,11 +128,10 @@ class Pair(TableSlave):
         )
         if self._stepper is not None:
             instance.slope(start, self._x)
-        self._law: CorrectionLaw | None = None
-        if model.correction is not None:
-            self._law = model.correction.feedback(
-                model, {k: float(v) for k, v in parameters.items() if k.startswith(PREFIX)}
-            )
+        self._law = feedback_of(
+            model, {k: float(v) for k, v in parameters.items() if k.startswith(PREFIX)}
+        )
+        if self._law is not None:
             self._law.restart()
         self._time = start
         self._publish()
@@ -206,9 +206,10 @@ class Outside(TableSlave):
 
     def configure(self, parameters: Mapping[str, Value]) -> None:
         """Make the law with the parameters."""
-        if self._model.correction is not None:
-            values = {k: float(v) for k, v in parameters.items() if k.startswith(PREFIX)}
-            self._law = self._model.correction.feedback(self._model, values)
+        self._law = feedback_of(
+            self._model, {k: float(v) for k, v in parameters.items() if k.startswith(PREFIX)}
+        )
+        if self._law is not None:
             self._law.restart()
 
     def process(self, time: float, step: float, inputs: Mapping[str, Value]) -> Mapping[str, Value]:

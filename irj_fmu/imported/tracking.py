@@ -20,7 +20,8 @@ from identification.balance.weak import kernel
 from identification.data.record import Record
 from identification.errors import InputError
 from irj_fmu.host.signals import FloatArray
-from irj_fmu.imported.correction import CorrectionLaw, Port, port_of
+from irj_fmu.imported.correction import CorrectionLaw, Port
+from irj_fmu.imported.port import feedback_of, port_of
 from irj_fmu.imported.run import Runner, Window
 
 if TYPE_CHECKING:
@@ -151,11 +152,7 @@ def balanced_records(
     own = {p.name: p.value for p in model.parameters} | {
         k: v for k, v in (values or {}).items() if k in {p.name for p in model.parameters}
     }
-    law = (
-        model.correction.feedback(model, {**model.values, **(values or {})})
-        if model.correction is not None
-        else None
-    )
+    law = feedback_of(model, {**model.values, **(values or {})})
     runner = whole.runner()
     found = []
     for number, record in enumerate(records):

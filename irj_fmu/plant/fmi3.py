@@ -73,8 +73,10 @@ def build_plant_fmi3(
     for triple in targets:
         find_compiler(triple, cc)
     code, limits = _generate(spec)
-    wrapper = ((Path(__file__).parents[1] / "c") / _SOURCE).read_bytes()
-    sources = {"plant_model.c": code, _SOURCE: wrapper}
+    folder = Path(__file__).parents[1] / "c"
+    sources = {"plant_model.c": code} | {
+        name: (folder / name).read_bytes() for name in (_SOURCE, "living.c")
+    }
     token = content_guid(
         {
             **sources,

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 DEFAULT_TOLERANCE = 1e-9
 _C = Path(__file__).parents[1] / "c"
-_SOURCES = ("plant_wrapper.c", "fmi2_common.c", "plant_integrator.c")
+_SOURCES = ("plant_wrapper.c", "fmi2_common.c", "living.c", "plant_integrator.c")
 _GROUPS = ("states", "inputs", "parameters", "outputs", "memory")
 
 

@@ -454,7 +454,7 @@ def test_fifty_cycles_in_c(c_host: Path, rigid: Path, tmp_path: Path) -> None:
     done = subprocess.run(
         command(c_host, rigid, tmp_path, 50, steps),
         cwd="/",
-        env={"PATH": os.defpath, "LC_ALL": "C"},
+        env={"PATH": os.defpath, "LC_ALL": "C", "IRJ_PYTHON": sys.executable},
         capture_output=True,
         text=True,
         check=False,
@@ -492,7 +492,11 @@ def test_another_python_on_the_path_does_not_matter(
     run = command(c_host, elastic, tmp_path, 1, 20)
     outputs = []
     for path in paths:
-        environment = {"PATH": path.format(other=other), "LC_ALL": "C"}
+        environment = {
+            "PATH": path.format(other=other),
+            "LC_ALL": "C",
+            "IRJ_PYTHON": sys.executable,
+        }
         done = subprocess.run(
             run, cwd="/", env=environment, capture_output=True, text=True, check=False
         )

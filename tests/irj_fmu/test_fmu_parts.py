@@ -121,12 +121,10 @@ def test_site_packages_are_added_where_a_module_is_missing(
 ) -> None:
     monkeypatch.setattr(sys, "path", list(sys.path))
     (tmp_path / "only_there_irj.py").write_text("")
-    version = f"{sys.version_info.major}.{sys.version_info.minor}"
-    add_site_packages(["json"], [str(tmp_path)], version)
-    add_site_packages(["only_there_irj"], [str(tmp_path)], "2.7")
-    assert str(tmp_path) not in sys.path
     monkeypatch.setenv("IRJ_SITE_PACKAGES", str(tmp_path))
-    add_site_packages(["only_there_irj"], [], version)
+    add_site_packages(["json"], tmp_path)
+    assert str(tmp_path) not in sys.path
+    add_site_packages(["only_there_irj"], tmp_path)
     assert str(tmp_path) in sys.path
 
 

@@ -88,9 +88,9 @@ def run_improve(arguments: Namespace) -> int:
         max_additions=arguments.max_steps,
         reference=arguments.reference,
     )
-    _print_improvement(found)
+    print_improvement(found)
     _write_improvement(found, records, arguments.report, arguments.output, arguments.command)
-    _write_picture(found, arguments.picture)
+    write_picture(found, arguments.picture)
     write_json(arguments.json, data)
     return 0
 
@@ -120,9 +120,9 @@ def run_demo(arguments: Namespace) -> int:
         data, found, records = improve_files(
             [names["train.npz"]], [names["held_out.npz"]], names["joint.toml"]
         )
-    _print_improvement(found)
+    print_improvement(found)
     _write_improvement(found, records, arguments.report, None, arguments.command)
-    _write_picture(found, arguments.picture)
+    write_picture(found, arguments.picture)
     write_json(arguments.json, data)
     return 0
 
@@ -143,7 +143,8 @@ def _write_improvement(
         print(f"joint file: {output}")
 
 
-def _write_picture(found: Improvement, path: str | None) -> None:
+def write_picture(found: Improvement, path: str | None) -> None:
+    """Draw the falling error, where a file is wanted."""
     if path:
         from workbench.show.picture import improvement_picture
 
@@ -151,7 +152,8 @@ def _write_picture(found: Improvement, path: str | None) -> None:
         print(f"picture: {path}")
 
 
-def _print_improvement(found: Improvement) -> None:
+def print_improvement(found: Improvement) -> None:
+    """Steps, claims, what is left and the verdict, for a reader."""
     if found.data.note:
         print(f"note: {found.data.note}")
     print(f"{'step':<32} {'train %':>8} {'held-out %':>10}   residual over noise floor")

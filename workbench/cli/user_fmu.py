@@ -1,5 +1,5 @@
-"""check, fit, compare, diagnose, add and export where the joint file's model is a user's FMU
-(``[model] fmu = "..."``).
+"""check, fit, compare, diagnose, improve, report, add and export where the joint file's model
+is a user's FMU (``[model] fmu = "..."``).
 """
 
 from __future__ import annotations
@@ -22,11 +22,12 @@ from workbench.cli.library import with_law
 from workbench.cli.records import checked
 
 if TYPE_CHECKING:
-    from irj_fmu.imported.compare import UserComparison
     from irj_fmu.imported.diagnose import UserDiagnosis
+    from irj_fmu.imported.improve import UserImprovement
     from irj_fmu.imported.model import UserModel
+    from irj_fmu.imported.outputs import UserComparison
 
-VERBS: Final = ("check", "fit", "compare", "diagnose", "add", "export")
+VERBS: Final = ("check", "fit", "compare", "diagnose", "improve", "report", "add", "export")
 
 
 def module_of(arguments: Namespace) -> str:
@@ -141,9 +142,10 @@ def run_check(arguments: Namespace) -> int:
 def run_fit(arguments: Namespace) -> int:
     """`irj fit REC --joint J` with an FMU as the model."""
     from irj_fmu.imported.file import user_joint_text
+    from irj_fmu.imported.fit import fit
 
     model, records, warnings = _open(arguments)
-    fitted = model.fit(records, progress=progress_bar)
+    fitted = fit(model, records, progress=progress_bar)
     print(fitted.method)
     _print_outputs(fitted.train)
     _print_parameters(fitted.parameters)
@@ -168,10 +170,13 @@ def run_compare(arguments: Namespace) -> int:
     """`irj compare REC --joint J` with an FMU as the model: as it is, or fitted to other
     records first.
     """
+    from irj_fmu.imported.compare import compare
+    from irj_fmu.imported.fit import fit
+
     model, records, warnings = _open(arguments)
     if arguments.fit_records:
-        model = model.fit(_records(arguments.fit_records, model)[0], progress=progress_bar).model
-    found = model.compare(records)
+        model = fit(model, _records(arguments.fit_records, model)[0], progress=progress_bar).model
+    found = compare(model, records)
     _print_outputs(found)
     print(f"  fails most from {found.worst_window[0]:.4g} s to {found.worst_window[1]:.4g} s")
     write_json(arguments.json, {**found.as_json(), "warnings": warnings})
@@ -181,12 +186,15 @@ def run_compare(arguments: Namespace) -> int:
 @_one_line
 def run_diagnose(arguments: Namespace) -> int:
     """`irj diagnose REC --joint J` with an FMU as the model."""
+    from irj_fmu.imported.diagnose import diagnose
+    from irj_fmu.imported.fit import fit
+
     distinct(training=arguments.records, held_out=arguments.held_out)
     model, records, _ = _open(arguments)
     held, _ = _records(arguments.held_out, model)
     if model.parameters:
-        model = model.fit(records, progress=progress_bar).model
-    found = model.diagnose(records, held, progress=progress_bar)
+        model = fit(model, records, progress=progress_bar).model
+    found = diagnose(model, records, held, progress=progress_bar)
     said = gate_warnings([*records, *held])
     for text in found.diagnosis.warnings:
         if text not in said:
@@ -205,6 +213,62 @@ def run_diagnose(arguments: Namespace) -> int:
         _offer(found, arguments)
     for key in arguments.why:
         print(found.diagnosis.why(key))
+    write_json(arguments.json, found.as_json())
+    return 0
+
+
+def _improved(arguments: Namespace, report: str | None, most: int) -> UserImprovement:
+    """The loop on files, its report written where one is wanted."""
+    from irj_fmu.imported.improve import improve
+
+    distinct(training=arguments.records, held_out=arguments.held_out)
+    model, records, _ = _open(arguments)
+    held, _ = _records(arguments.held_out, model)
+    found = improve(model, records, held, max_additions=most, progress=progress_bar)
+    said = gate_warnings([*records, *held])
+    for text in found.found.warnings:
+        if text not in said:
+            print(f"irj: {text}", file=sys.stderr)
+    if report:
+        from workbench.show.report import write_report
+
+        print(
+            f"report: {write_report(found.found, report, records=[*records, *held], command=arguments.command)}"
+        )
+    return found
+
+
+@_one_line
+def run_improve(arguments: Namespace) -> int:
+    """`irj improve REC --joint J` with an FMU as the model: effects are added outside it."""
+    from irj_fmu.imported.file import user_joint_text
+    from workbench.cli.loop import print_improvement, write_picture
+
+    found = _improved(arguments, arguments.report, arguments.max_steps)
+    print("balance at the drive:")
+    print_improvement(found.found)
+    print("outputs on held-out data:")
+    for step, outputs in zip(found.found.steps, found.outputs, strict=True):
+        print(f"{'+ ' + step.added if step.added else 'start model'}")
+        _print_outputs(outputs)
+    if arguments.output:
+        write_text(
+            arguments.output,
+            user_joint_text(found.model, folder=Path(arguments.output).resolve().parent),
+        )
+        print(f"joint file: {arguments.output}")
+    write_picture(found.found, arguments.picture)
+    write_json(arguments.json, found.as_json())
+    return 0
+
+
+@_one_line
+def run_report(arguments: Namespace) -> int:
+    """`irj report REC --joint J` with an FMU as the model."""
+    from identification.diagnosis.session import MAX_ADDITIONS
+
+    found = _improved(arguments, arguments.output, MAX_ADDITIONS)
+    print(found.found.reason)
     write_json(arguments.json, found.as_json())
     return 0
 
@@ -334,4 +398,6 @@ __all__ = [
     "run_diagnose",
     "run_export",
     "run_fit",
+    "run_improve",
+    "run_report",
 ]

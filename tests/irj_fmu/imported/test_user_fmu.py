@@ -23,7 +23,9 @@ from identification.errors import InputError
 from irj_fmu.host.exchange import Stepper
 from irj_fmu.host.run import Fmu, FmuError, Instance, Wiring, simulate_cs
 from irj_fmu.host.signals import Table
+from irj_fmu.imported.compare import compare
 from irj_fmu.imported.correction import PREFIX
+from irj_fmu.imported.diagnose import diagnose
 from irj_fmu.imported.exact import Imported, NotExact, patched_copy
 from irj_fmu.imported.export import export_pair, export_system
 from irj_fmu.imported.file import (
@@ -32,8 +34,10 @@ from irj_fmu.imported.file import (
     outside_correction,
     user_joint_text,
 )
+from irj_fmu.imported.fit import fit
 from irj_fmu.imported.library import UserFmu, UserInstance
 from irj_fmu.imported.model import UserModel, load_user_model
+from irj_fmu.imported.port import feedback_of
 from tests.user_fmus.make import MODELS, Make, build, check
 
 FloatArray = npt.NDArray[np.float64]
@@ -169,13 +173,13 @@ def test_parameters_of_strict_fmus_are_recovered_through_the_black_box(
         {"motor_position": "y0", "motor_velocity": "y1"},
         {"mu": (0.1, 5.0)},
     )
-    found = model.fit(van_der_pol(2.3))
+    found = fit(model, van_der_pol(2.3))
     assert found.method.startswith("black box")
     assert found.values["mu"] == pytest.approx(2.3, rel=1e-4)
     assert abs(found.values["mu"] - 2.3) < 5 * (found.stderr["mu"] or 0.0)
     assert all(0.9 < e.ratio < 1.1 for e in found.train.outputs.values())
     model = load_user_model(fmu(folder, "Dahlquist", make), {"motor_position": "y"}, ["k"])
-    decayed = model.fit(dahlquist(0.8))
+    decayed = fit(model, dahlquist(0.8))
     assert decayed.method.startswith("black box")
     assert decayed.values["k"] == pytest.approx(0.8, rel=1e-3)
     assert abs(decayed.values["k"] - 0.8) < 5 * (decayed.stderr["k"] or 0.0)
@@ -189,7 +193,7 @@ def test_exact_derivatives_give_the_fit_of_the_black_box(folder: Path, version: 
         {"mu": (0.1, 5.0)},
     )
     record = van_der_pol(2.3)
-    exact, differences = model.fit(record), model.fit(record, exact=False)
+    exact, differences = fit(model, record), fit(model, record, exact=False)
     assert exact.method.startswith("exact")
     assert differences.method.startswith("black box")
     assert exact.values["mu"] == pytest.approx(differences.values["mu"], rel=1e-6)
@@ -201,7 +205,7 @@ def test_an_axis_with_noisy_starts_that_are_estimated(
     folder: Path, plain: Record, version: int, kinds: tuple[str, ...]
 ) -> None:
     model = axis_model(fmu(folder, "Axis", Make(version, kinds)), [*PARAMETERS, "idle"])
-    found = model.fit(plain.window(0, 3))
+    found = fit(model, plain.window(0, 3))
     assert found.method.startswith("exact" if kinds == ME else "black box")
     for name, value in TRUTH.items():
         assert abs(found.values[name] - value) < 5 * (found.stderr[name] or 0.0), name
@@ -215,7 +219,7 @@ def test_an_axis_with_noisy_starts_that_are_estimated(
 def test_a_value_that_ends_at_its_bound_is_said(folder: Path, plain: Record) -> None:
     path = fmu(folder, "Axis", Make(2, CS))
     bounds = dict.fromkeys(PARAMETERS, (-math.inf, math.inf)) | {"gravity": (0.0, 5.5)}
-    found = axis_model(path, bounds).fit(plain.window(0, 3))
+    found = fit(axis_model(path, bounds), plain.window(0, 3))
     assert found.at_bound == ("gravity",)
     assert found.stderr["gravity"] is None
     assert found.parameters["gravity"]["at_bound"]
@@ -223,10 +227,10 @@ def test_a_value_that_ends_at_its_bound_is_said(folder: Path, plain: Record) -> 
 
 def test_compare_tells_the_true_values_from_wrong_ones(folder: Path, plain: Record) -> None:
     model = axis_model(fmu(folder, "Axis", Make(3, CS))).with_values(TRUTH)
-    right = model.compare(plain.window(5, 8)).outputs["motor_position"]
-    wrong = (
-        model.with_values({"viscous": 1.2}).compare(plain.window(5, 8)).outputs["motor_position"]
-    )
+    right = compare(model, plain.window(5, 8)).outputs["motor_position"]
+    wrong = compare(model.with_values({"viscous": 1.2}), plain.window(5, 8)).outputs[
+        "motor_position"
+    ]
     assert 0.8 < right.ratio < 1.15
     assert wrong.ratio > 10
     assert wrong.fit_percent < right.fit_percent
@@ -297,7 +301,7 @@ def test_an_fmu_without_usable_derivatives_is_a_black_box_and_it_is_said(
 ) -> None:
     model = axis_model(fmu(folder, "Axis", make), ["inertia"]).with_values(TRUTH)
     model = replace(model, constants={k: v for k, v in TRUTH.items() if k != "inertia"})
-    found = model.fit(plain.window(0, 1))
+    found = fit(model, plain.window(0, 1))
     assert found.method.startswith("black box: ")
     assert why in found.method
     assert found.values["inertia"] == pytest.approx(TRUTH["inertia"], rel=2e-3)
@@ -337,7 +341,7 @@ def test_model_exchange_follows_scipy(folder: Path) -> None:
 
 def test_nothing_is_missing_from_the_true_model(folder: Path, plain: Record) -> None:
     model = axis_model(fmu(folder, "Axis", Make(2, CS))).with_values(TRUTH)
-    found = model.diagnose(plain)
+    found = diagnose(model, plain)
     assert found.claims == ()
     assert 0.8 < found.error.balances["axis"].ratio < 1.2
     with pytest.raises(InputError, match="nothing significant"):
@@ -350,9 +354,9 @@ def test_a_hidden_effect_is_named_added_outside_and_explains_the_rest(
     folder: Path, dragged: Record, version: int, kinds: tuple[str, ...]
 ) -> None:
     train, held = dragged.window(0, 7), dragged.window(7, 12)
-    model = axis_model(fmu(folder, "Axis", Make(version, kinds))).fit(train).model
-    before = model.compare(held).outputs["motor_position"]
-    found = model.diagnose(train, held)
+    model = fit(axis_model(fmu(folder, "Axis", Make(version, kinds))), train).model
+    before = compare(model, held).outputs["motor_position"]
+    found = diagnose(model, train, held)
     assert found.claims[0].effects[0] == "quadratic_drag"
     assert found.error.balances["axis"].ratio > RATIO_LIMIT
     larger = found.refit()
@@ -360,10 +364,10 @@ def test_a_hidden_effect_is_named_added_outside_and_explains_the_rest(
     assert larger.values[f"{PREFIX}motor_quadratic_drag"] == pytest.approx(DRAG, rel=0.05)
     for name, value in TRUTH.items():
         assert larger.values[name] == pytest.approx(value, rel=0.02)
-    after = larger.compare(held).outputs["motor_position"]
+    after = compare(larger, held).outputs["motor_position"]
     assert before.ratio > 5
     assert after.ratio < 2
-    assert larger.model.diagnose(train, held).claims == ()
+    assert diagnose(larger.model, train, held).claims == ()
 
 
 # --- export ---------------------------------------------------------------------------------------
@@ -392,9 +396,7 @@ def outside_run(model: UserModel, record: Record) -> FloatArray:
     window = model.windows([record])[0]
     values = {p.name: p.value for p in model.parameters}
     assert model.correction is not None
-    return model.runner().run(
-        window, values, feedback=model.correction.feedback(model, model.values)
-    )
+    return model.runner().run(window, values, feedback=feedback_of(model, model.values))
 
 
 @pytest.mark.parametrize(
@@ -678,13 +680,13 @@ def test_each_thing_that_cannot_be_used_is_said_in_one_line(
     )
     assert "state events" in line(lambda: load_user_model(events, {"motor_position": "y"}))
     assert "kind = 'me' is not possible" in line(lambda: load_user_model(path, CHANNELS, kind="me"))
-    assert "no parameter to fit" in line(lambda: load_user_model(path, CHANNELS).fit(plain))
+    assert "no parameter to fit" in line(lambda: fit(load_user_model(path, CHANNELS), plain))
     assert "has no channel motor_torque" in line(
-        lambda: axis_model(path).fit(plain.without("motor_torque"))
+        lambda: fit(axis_model(path), plain.without("motor_torque"))
     )
     free = load_user_model(path, {"motor_position": "angle"}, ["inertia"])
-    assert "no drive channel" in line(lambda: free.diagnose(plain))
-    assert "too short" in line(lambda: axis_model(path).fit(plain.take(slice(0, 5))))
+    assert "no drive channel" in line(lambda: diagnose(free, plain))
+    assert "too short" in line(lambda: fit(axis_model(path), plain.take(slice(0, 5))))
     assert "cannot ride outside" in line(
         lambda: outside_correction(["cubic_stiffness"], Joint(), {}, "file")
     )

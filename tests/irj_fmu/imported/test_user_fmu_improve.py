@@ -1,0 +1,108 @@
+"""`irj improve` with a user's FMU as the model: hidden, added outside, gone; and never an
+all-clear over the floor.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+
+from identification.data.record import Record
+from identification.diagnosis.improve import RATIO_LIMIT
+from irj_fmu.imported.compare import compare
+from irj_fmu.imported.diagnose import diagnose
+from irj_fmu.imported.file import load_user_joint
+from irj_fmu.imported.fit import fit
+from irj_fmu.imported.improve import improve
+from tests.irj_fmu.imported.test_user_fmu import DRAG, FILE, axis
+from tests.user_fmus.make import Make, build
+from workbench.cli.main import main
+
+SCHEMA = Path(__file__).parents[2] / "data" / "improve.schema.json"
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Joint file and FMU."""
+    folder = tmp_path_factory.mktemp("improve")
+    build("Axis", folder, Make(2, ("CoSimulation",))).replace(folder / "axis.fmu")
+    (folder / "user.toml").write_text(FILE.format(fmu="axis.fmu"))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def plain() -> Record:
+    return axis(seconds=10.0, h=4e-3)
+
+
+def test_nothing_is_added_where_nothing_is_hidden(place: Path, plain: Record) -> None:
+    found = improve(load_user_joint(place / "user.toml"), plain.window(0, 6), plain.window(6, 10))
+    assert found.found.added == ()
+    assert found.outcome == "complete"
+    assert found.outputs[-1].outputs["motor_position"].ratio < RATIO_LIMIT
+
+
+def test_no_all_clear_where_an_output_stands_above_its_floor(place: Path, plain: Record) -> None:
+    """An error of the encoder cannot ride outside as a torque: it is not named, and not kept
+    quiet.
+    """
+    q = plain["motor_position"]
+    wrong = plain.with_channel("motor_position", q + 1e-3 * np.sin(20 * q))
+    train, held = wrong.window(0, 6), wrong.window(6, 10)
+    fitted = fit(load_user_joint(place / "user.toml"), train)
+    assert compare(fitted, held).outputs["motor_position"].ratio > RATIO_LIMIT
+    assert diagnose(fitted, train, held).diagnosis.outcome == "unexplained"
+    found = improve(fitted.model, train, held, max_additions=1)
+    assert found.outcome == "unexplained"
+    assert found.found.verdict == "unexplained"
+
+
+def test_a_hidden_effect_is_named_and_explained_on_the_command_line(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record = axis(lambda _q, w: DRAG * w * abs(w), seconds=10.0, h=4e-3)
+    for name, part in (("train", record.window(0, 6)), ("held", record.window(6, 10))):
+        columns = {
+            "time_s": part.time,
+            "motor_position_rad": part["motor_position"],
+            "motor_torque_N.m": part["motor_torque"],
+        }
+        np.savez(place / f"{name}.npz", **columns)
+    train, held, joint, better, data, report = (
+        str(place / n)
+        for n in ("train.npz", "held.npz", "user.toml", "better.toml", "i.json", "r.html")
+    )
+    assert (
+        main(
+            [
+                "improve",
+                train,
+                "--held-out",
+                held,
+                "--joint",
+                joint,
+                "-o",
+                better,
+                "--json",
+                data,
+                "--report",
+                report,
+            ]
+        )
+        == 0
+    )
+    found = json.loads(Path(data).read_text())
+    jsonschema.validate(found, json.loads(SCHEMA.read_text()))
+    assert "quadratic_drag" in found["claims"][0]["effects"]
+    assert len(found["steps"]) == len(found["outputs"]) == 2
+    before, after = (o["motor_position"]["ratio"] for o in found["outputs"])
+    assert before > 5
+    assert after < RATIO_LIMIT
+    assert found["verdict"] == "complete"
+    assert "quadratic drag" in Path(report).read_text(encoding="utf-8").lower()
+    assert load_user_joint(better).correction is not None
+    assert "outputs on held-out data" in capsys.readouterr().out

@@ -1,0 +1,146 @@
+"""Hosts that do everything wrong, in C, on every FMU that is shipped: a status and a line,
+never a crash.
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from identification.online.estimator import OnlineOptions
+from irj_fmu.estimator.native import NativeSpec, build_native
+from irj_fmu.fmi.compiler import find_compiler, header_folder
+from irj_fmu.plant.fmi3 import build_plant_fmi3
+from irj_fmu.plant.joint import PlantOptions, plant_spec
+from irj_fmu.plant.library import build_plant
+from irj_fmu.plant.reference import reference_joint
+from tests.irj_fmu.test_fmu_package import LOADER, clean_environment, pack
+
+HERE = Path(__file__).parents[1]
+OF_2 = ("plant", "native", "slave")
+EVERY = (*OF_2, "plant3")
+STRANGER = "the instance is NULL, was freed already or is not of this FMU"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("hostile")
+
+
+@pytest.fixture(scope="module")
+def programs(folder: Path) -> dict[int, Path]:
+    found = {}
+    for version, name in ((2, "fmu_hostile"), (3, "fmu_hostile3")):
+        found[version] = folder / name
+        command = [
+            *find_compiler(),
+            str(HERE / f"{name}.c"),
+            "-O1",
+            f"-I{header_folder()}",
+            "-o",
+            str(found[version]),
+            "-ldl",
+            "-lm",
+        ]
+        subprocess.run(command, check=True)
+    return found
+
+
+def made(folder: Path, what: str) -> Path:
+    path = folder / f"{what}.fmu"
+    if path.exists():
+        return path
+    joint = reference_joint("hd3")
+    if what == "native":
+        return build_native(
+            NativeSpec(joint, "native", OnlineOptions(optimise=False), None, 1e-3), path
+        )
+    if what == "slave":  # the shim is that of every estimator
+        return pack(folder, name=path.name).path
+    spec = plant_spec(joint, PlantOptions(name=what))
+    return build_plant(spec, path) if what == "plant" else build_plant_fmi3(spec, path)
+
+
+def command(programs: dict[int, Path], folder: Path, what: str) -> list[str]:
+    """The probe's command line for an FMU, extracted to a folder with an odd name."""
+    from fmpy import platform, platform_tuple, read_model_description
+
+    place = folder / f"{what} ü #1"
+    if not place.exists():
+        with zipfile.ZipFile(made(folder, what)) as archive:
+            archive.extractall(place)
+    description: Any = read_model_description(str(place))
+    readable = next(
+        v
+        for v in description.modelVariables
+        if v.causality == "output" and v.type in ("Real", "Float64")
+    )
+    if what == "plant3":
+        library = (
+            place / "binaries" / platform_tuple / f"{description.modelExchange.modelIdentifier}.so"
+        )
+        return [
+            str(programs[3]),
+            str(library),
+            description.instantiationToken,
+            str(readable.valueReference),
+            str(description.numberOfContinuousStates),
+        ]
+    library = place / "binaries" / platform / f"{description.coSimulation.modelIdentifier}.so"
+    return [
+        str(programs[2]),
+        str(library),
+        (place / "resources").as_uri(),
+        description.guid,
+        "1",
+        str(int(what == "slave")),
+        str(readable.valueReference),
+    ]
+
+
+@pytest.mark.parametrize("what", EVERY)
+def test_wrong_calls_get_a_status_and_a_line(
+    programs: dict[int, Path], folder: Path, what: str
+) -> None:
+    done = subprocess.run(
+        command(programs, folder, what), env=clean_environment(), capture_output=True, text=True
+    )
+    assert (done.returncode, done.stdout) == (0, "0 failed\n"), done.stdout + done.stderr[-2000:]
+    assert done.stderr.count(STRANGER) > 50
+
+
+def test_the_plant_in_model_exchange_stands_it_too(programs: dict[int, Path], folder: Path) -> None:
+    """An instance for model exchange refuses the steps of the probe, and nothing else happens."""
+    line = command(programs, folder, "plant")
+    done = subprocess.run([*line[:4], "0", *line[5:]], capture_output=True, text=True)
+    refused = {text for text in done.stdout.splitlines() if not text.endswith(" failed")}
+    assert done.returncode == 1, done.stderr[-2000:]
+    assert refused == {"fDoStep(c, 1e-3 * i, 1e-3, 1)", "fDoStep(other, 3e-3, 1e-3, 1)"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what", EVERY)
+def test_valgrind_finds_no_invalid_access(
+    programs: dict[int, Path], folder: Path, tmp_path: Path, what: str
+) -> None:
+    valgrind = shutil.which("valgrind")
+    assert valgrind is not None, "install valgrind"
+    (tmp_path / "loader.supp").write_text(LOADER)
+    python = (
+        ["--undef-value-errors=no", f"--suppressions={tmp_path}/loader.supp"]
+        if what == "slave"
+        else ["--leak-check=full"]
+    )
+    done = subprocess.run(
+        [valgrind, "--error-exitcode=9", *python, *command(programs, folder, what)],
+        env=clean_environment(PYTHONMALLOC="malloc"),
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr[-4000:]
+    assert "ERROR SUMMARY: 0 errors" in done.stderr
