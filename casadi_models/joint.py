@@ -29,7 +29,6 @@ from .equations import (
 )
 from .functions import MEMORY_STEP, JointFunctions
 from .parameter import Parameter, Role
-from .shown import shown
 from .sides import side_factor
 from .term import (
     CALIBRATION,
@@ -41,6 +40,7 @@ from .term import (
     Term,
     smoothing,
 )
+from .text.shown import shown
 from .transmission import MODELS, STARTS, signed_ratio
 
 __all__ = ["MEMORY_STEP", "Equations", "JointModel", "Term", "inverse_dynamics", "time_derivative"]
@@ -394,7 +394,7 @@ class JointModel:
         return Symbols.of(self)
 
     def _repr_latex_(self) -> str:
-        """The equations and values in a notebook (see :mod:`casadi_models.shown`)."""
+        """The equations and values in a notebook (see :mod:`casadi_models.text.shown`)."""
         return shown(self, "latex")
 
     @cached_property

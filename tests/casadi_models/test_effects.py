@@ -15,10 +15,10 @@ import pytest
 
 from casadi_models import EFFECTS, JointModel, LocalSignals, Signals
 from casadi_models.effect import Effect, Place, Registry
-from casadi_models.effects_doc import main, page
 from casadi_models.parameter import Parameter
 from casadi_models.quantities import side_power
 from casadi_models.simulate import simulate
+from casadi_models.text.effects_doc import main, page
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -329,7 +329,7 @@ def test_contract_keys_are_there() -> None:
 def test_page_is_fresh(tmp_path: Path) -> None:
     written = Path(__file__).resolve().parents[2] / "docs" / "effects.md"
     assert written.read_text(encoding="utf-8") == page(), (
-        "run python -m casadi_models.effects_doc --write docs/effects.md"
+        "run python -m casadi_models.text.effects_doc --write docs/effects.md"
     )
     assert main(["--write", str(tmp_path / "effects.md")]) == 0
     assert (tmp_path / "effects.md").read_text(encoding="utf-8") == page()

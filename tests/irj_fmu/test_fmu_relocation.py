@@ -51,7 +51,7 @@ def environment(place: Path) -> Path:
     return folder / "bin"
 
 
-def run(c_host: Path, unzipped: Path, place: Path, **more: str) -> subprocess.CompletedProcess[str]:  # noqa: F811
+def run(c_host: Path, unzipped: Path, place: Path, **more: str) -> subprocess.CompletedProcess[str]:
     """A C host as another user, with a home of their own and nothing of this environment."""
     return subprocess.run(
         host_command(c_host, unzipped, 1, 3),
@@ -87,8 +87,12 @@ def test_no_file_holds_a_path_of_the_builder(tmp_path: Path, place: Path) -> Non
 
 @pytest.mark.parametrize("way", ["PATH", "variable", "side file"])
 def test_it_runs_elsewhere_with_another_environment(
-    c_host: Path, unzipped: Path, place: Path, environment: Path, way: str
-) -> None:  # noqa: F811
+    c_host: Path,
+    unzipped: Path,
+    place: Path,
+    environment: Path,
+    way: str,
+) -> None:
     note = unzipped / "resources" / "python.txt"
     more = {
         "PATH": {"PATH": f"{environment}{os.pathsep}{os.defpath}"},
@@ -106,7 +110,7 @@ def test_it_runs_elsewhere_with_another_environment(
     assert np.isfinite([float(x) for x in done.stdout.split()]).all()
 
 
-def test_what_is_missing_is_said_in_one_line(c_host: Path, unzipped: Path, place: Path) -> None:  # noqa: F811
+def test_what_is_missing_is_said_in_one_line(c_host: Path, unzipped: Path, place: Path) -> None:
     bare = place / "bare"
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(bare)], check=True)
     done = run(
@@ -120,14 +124,17 @@ def test_what_is_missing_is_said_in_one_line(c_host: Path, unzipped: Path, place
 
 @pytest.mark.parametrize("named", ["/nowhere/python3", "/bin/true"])
 def test_a_wrong_interpreter_is_named(
-    c_host: Path, unzipped: Path, place: Path, named: str
-) -> None:  # noqa: F811
+    c_host: Path,
+    unzipped: Path,
+    place: Path,
+    named: str,
+) -> None:
     done = run(c_host, unzipped, place, IRJ_PYTHON=named)
     assert done.returncode == 4
     assert f"IRJ_PYTHON names {named}, which is no Python" in done.stderr
 
 
-def test_nothing_of_python_at_all(c_host: Path, unzipped: Path, place: Path) -> None:  # noqa: F811
+def test_nothing_of_python_at_all(c_host: Path, unzipped: Path, place: Path) -> None:
     """An empty PATH: the system's libpython may still be there, and then the packages are what
     is missing.
     """

@@ -232,9 +232,9 @@ def _improved(arguments: Namespace, report: str | None, most: int) -> UserImprov
     if report:
         from workbench.show.report import write_report
 
-        print(
-            f"report: {write_report(found.found, report, records=[*records, *held], command=arguments.command)}"
-        )
+        every = [*records, *held]
+        made = write_report(found.found, report, records=every, command=arguments.command)
+        print(f"report: {made}")
     return found
 
 

@@ -1,4 +1,4 @@
-"""The effect library as a page: ``python -m casadi_models.effects_doc --write docs/effects.md``."""
+"""The effect library as a page: ``python -m casadi_models.text.effects_doc --write docs/effects.md``."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from .effect import EFFECTS, Effect
-from .parameter import Parameter
+from ..effect import EFFECTS, Effect
+from ..parameter import Parameter
 
 HEADER: Final = """# The effect library
 
 Generated from the declarations in `casadi_models/effects/` by
-`python -m casadi_models.effects_doc --write docs/effects.md`. Do not edit it by hand.
+`python -m casadi_models.text.effects_doc --write docs/effects.md`. Do not edit it by hand.
 
 All torques, angles and inertias are referred to the link and in SI units. An amplitude (plain) enters
 the law linearly, 0 means that the effect is absent. A shape parameter (*in italics*) enters nonlinearly and
