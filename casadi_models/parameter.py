@@ -56,11 +56,12 @@ class Parameter:
     role : str
         What the library may ask the parameter for, whatever its name:
         ``inertia`` (a joint without it does not move), ``stiffness`` (linear stiffness of the
-        transmission), ``stiffening`` (of its cube), ``gravity`` (torque at 90 degrees, upright
-        positive), ``static`` (friction torque that holds a joint at rest, in either direction),
-        ``delay`` (time by which a channel is late), ``smoothing`` (velocity over which friction
-        changes its sign, a nuisance), ``compliance`` (between motor and a link that is not
-        recorded), ``exponent`` and ``order`` (shapes that are taken from their grid as they stand),
+        transmission), ``stiffening`` (of its cube), ``weight`` (gravity torque at 90 degrees,
+        upright positive), ``static`` (friction torque that holds a joint at rest, in either
+        direction), ``delay`` (time by which a channel is late), ``smoothing`` (velocity over which
+        friction changes its sign, a nuisance), ``compliance`` (between motor and a link that is
+        not recorded), ``exponent`` and ``order`` (shapes that are taken from their grid as they
+        stand),
         ``range`` (where a table begins and ends: a fit leaves it as it stands).
     typical : float, mapping of place to float, or None
         A usual size, link-referred: what `irj simulate` takes where the joint file gives no value.

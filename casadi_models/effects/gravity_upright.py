@@ -19,7 +19,13 @@ def _stored(s: LocalSignals, p: SimpleNamespace) -> Expression:
     family="torque",
     acts_on=("link",),
     parameters=(
-        signed("gravity_torque", "N.m", "gravity torque at 90 degrees; positive: upright at zero"),
+        signed(
+            "gravity_torque",
+            "N.m",
+            "gravity torque at 90 degrees; positive: upright at zero",
+            role="weight",
+            typical=105.18,
+        ),
     ),
     absence="the residual of the link follows the sine of its angle",
     excitation="a long slow swing",
