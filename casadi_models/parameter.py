@@ -56,14 +56,18 @@ class Parameter:
     role : str
         What the library may ask the parameter for, whatever its name:
         ``inertia`` (a joint without it does not move), ``stiffness`` (linear stiffness of the
-        transmission), ``stiffening`` (of its cube), ``gravity`` (torque at 90 degrees, upright
-        positive), ``static`` (friction torque that holds a joint at rest, in either direction),
-        ``delay`` (time by which a channel is late), ``smoothing`` (velocity over which friction
-        changes its sign, a nuisance), ``compliance`` (between motor and a link that is not
-        recorded), ``exponent`` and ``order`` (shapes that are taken from their grid as they stand),
+        transmission), ``stiffening`` (of its cube), ``weight`` (gravity torque at 90 degrees,
+        upright positive), ``static`` (friction torque that holds a joint at rest, in either
+        direction), ``delay`` (time by which a channel is late), ``smoothing`` (velocity over which
+        friction changes its sign, a nuisance), ``compliance`` (between motor and a link that is
+        not recorded), ``exponent`` and ``order`` (shapes that are taken from their grid as they
+        stand),
         ``range`` (where a table begins and ends: a fit leaves it as it stands).
     typical : float, mapping of place to float, or None
         A usual size, link-referred: what `irj simulate` takes where the joint file gives no value.
+    added : bool
+        The effect was once without it: a joint file with fitted values of the effect's others but
+        not of this one has it at its start.
     """
 
     name: str
@@ -77,6 +81,7 @@ class Parameter:
     scale: Scale = "absolute"
     role: Role = ""
     typical: Typical = field(default=None, hash=False)
+    added: bool = False
 
     def __post_init__(self) -> None:
         if not self.low <= self.start <= self.high:
@@ -124,10 +129,18 @@ def amplitude(
 
 
 def signed(
-    name: str, unit: str, meaning: str, *, role: Role = "", typical: Typical = None
+    name: str,
+    unit: str,
+    meaning: str,
+    *,
+    role: Role = "",
+    typical: Typical = None,
+    added: bool = False,
 ) -> Parameter:
     """An amplitude that may have either sign."""
-    return Parameter(name, unit, 0.0, -math.inf, math.inf, meaning, role=role, typical=typical)
+    return Parameter(
+        name, unit, 0.0, -math.inf, math.inf, meaning, role=role, typical=typical, added=added
+    )
 
 
 def shape(

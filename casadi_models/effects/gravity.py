@@ -32,6 +32,7 @@ def _stored(s: LocalSignals, p: SimpleNamespace) -> Expression:
             "N.m",
             "cosine part of the gravity torque: all of it where the link is level at zero",
             typical=5.0,
+            added=True,
         ),
     ),
     common=True,

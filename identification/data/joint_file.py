@@ -212,6 +212,7 @@ def parse_joint(data: Mapping[str, Any], source: str = "joint") -> Joint:
         _pitch(table.pop("pitch", None), kind, source),
     )
     known = {k: _known(k, v, model, source) for k, v in table.items()}
+    joint = replace(joint, fitted={**joint.fitted, **_added(joint.fitted, model)})
     for p in model.parameters:
         if p.name in joint.fitted and not p.low - 1e-9 <= joint.fitted[p.name] <= p.high + 1e-9:
             bounds = f"{p.low:g} to {p.high:g} {p.unit}"
@@ -220,6 +221,17 @@ def parse_joint(data: Mapping[str, Any], source: str = "joint") -> Joint:
                 f"physical bounds {bounds}; correct it or fit again"
             )
     return replace(joint, known=known, orders=orders, pitch=pitch)
+
+
+def _added(fitted: Mapping[str, float], model: JointModel) -> dict[str, float]:
+    """Values of the parameters that an effect did not have when a file's values were fitted."""
+    return {
+        p.name: p.start
+        for term in model.terms
+        if any(n in fitted for n in term.names)
+        for p in term.parameters
+        if p.added and p.name not in fitted
+    }
 
 
 def _orders(entry: Any, source: str) -> tuple[float, ...]:

@@ -126,8 +126,11 @@ def test_stribeck_is_found_without_noise() -> None:
     assert {"motor_stribeck_extra", "motor_viscous", "motor_coulomb", "stiffness"} <= {
         r.name for r in rows
     }
-    assert max(r.error for r in rows) < 0.5
+    assert max(r.error for r in rows if r.plant) < 0.5
     assert max(r.sigmas for r in rows) < 2.0
+    level = {r.name: r for r in rows}
+    assert level["gravity_cosine"].plant == 0.0
+    assert abs(level["gravity_cosine"].estimate) < 0.005 * level["gravity_torque"].plant
 
 
 def test_plant_reads_its_drive_late_where_the_model_says_so() -> None:

@@ -1,0 +1,27 @@
+"""Joint files written before an effect had all the parameters it has now."""
+
+from __future__ import annotations
+
+from identification.data.joint_file import parse_joint
+
+OLD = {
+    "joint": {"gear_ratio": -160.0, "model": "hd1", "effects": ["viscous", "gravity"]},
+    "fitted": {
+        "total_inertia": {"value": 14.0},
+        "gravity_torque": {"value": 105.0},
+    },
+}
+
+
+def test_a_coefficient_the_file_could_not_have_is_zero() -> None:
+    """Gravity was a sine alone: the model that the values belong to has no cosine."""
+    joint = parse_joint(OLD)
+    assert joint.fitted["gravity_cosine"] == 0.0
+    assert "motor_viscous" not in joint.fitted, "a value that was not fitted stays unknown"
+
+
+def test_it_is_no_value_where_the_effect_was_not_fitted_or_has_one() -> None:
+    bare = parse_joint({"joint": OLD["joint"]})
+    assert bare.fitted == {}
+    given = {**OLD["fitted"], "gravity_cosine": {"value": -3.0}}
+    assert parse_joint({**OLD, "fitted": given}).fitted["gravity_cosine"] == -3.0
