@@ -12,7 +12,6 @@ import pytest
 
 from casadi_models import JointModel
 from casadi_models.equations import inverse_dynamics
-from casadi_models.transmission import build
 from identification import Joint, Record, fit
 from identification.balance.balances import residual_expressions
 from identification.balance.sensing import sense
@@ -50,7 +49,7 @@ def channels() -> tuple[np.ndarray, dict[str, np.ndarray], np.ndarray]:
     path = np.column_stack(
         [a @ np.sin(angle), (a * w) @ np.cos(angle), -(a * w**2) @ np.sin(angle)]
     )
-    model = build("hd3", RATIO, effects=EFFECTS).with_values(TRUE)
+    model = JointModel.by_name("hd3", RATIO, effects=EFFECTS).with_values(TRUE)
     run = Follower(model, DT, controller=Controller(25.0, 0.9), substeps=8).run(path)
     noise = {
         "motor_position": 1e-6 * RATIO,
@@ -115,7 +114,7 @@ def test_on_the_balance_of_an_axis_the_channel_takes_it_away() -> None:
 def test_every_balance_of_the_link_holds_it_with_its_sign(name: str) -> None:
     """d residual / d coupling torque: 1 where the link's torques are balanced, 0 elsewhere."""
     t, table, coupling = channels()
-    model = build(name, RATIO, effects=EFFECTS)
+    model = JointModel.by_name(name, RATIO, effects=EFFECTS)
     expected = {
         "motor": 0.0,
         "link": 1.0,
@@ -134,7 +133,11 @@ def test_every_balance_of_the_link_holds_it_with_its_sign(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "model", [build("hd1", RATIO, effects=EFFECTS), build("hd3", RATIO, effects=EFFECTS)]
+    "model",
+    [
+        JointModel.by_name("hd1", RATIO, effects=EFFECTS),
+        JointModel.by_name("hd3", RATIO, effects=EFFECTS),
+    ],
 )
 def test_regressor_and_dynamics_agree_and_a_simulation_feels_none(model: JointModel) -> None:
     """The coupling torque drives the link: its slope in the inverse dynamics is -1 in the row
