@@ -4,8 +4,10 @@ amplitudes that may leave their bound.
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
+import jsonschema
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -14,6 +16,7 @@ from identification import Improvement, improve, load_joint, read
 from identification.diagnosis.order_tracking import BLOCK, Peak, Samples, clipped, peaks
 from tests.hidden_effect.generator import generate_case
 
+SCHEMA = Path(__file__).parents[2] / "data" / "improve.schema.json"
 FloatArray = npt.NDArray[np.float64]
 
 
@@ -31,6 +34,12 @@ def test_laws_of_the_position_that_together_imitate_a_soft_stop_are_partial(tmp_
     assert "Only part of the structure is explained by" in found.reason
     left = next(u for u in found.unexplained if u.balance == "link")
     assert left.axis == "link_position"
+    # what no name explains is a curve over that variable, and a claim of its own in the data
+    (learned,) = found.learned
+    assert (learned.balance, learned.curve.label) == ("link", "learned_position@link")
+    data = json.loads(json.dumps(found.as_json()))
+    jsonschema.validate(data, json.loads(SCHEMA.read_text()))
+    assert [c["effects"] for c in data["claims"] if "curve" in c] == [["learned"]]
 
 
 def test_a_law_of_the_position_that_is_really_there_is_whole(tmp_path: Path) -> None:
