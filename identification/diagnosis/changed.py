@@ -20,6 +20,7 @@ import numpy.typing as npt
 from casadi_models import EFFECTS, JointModel
 from casadi_models.term import LINK_INERTIA, TOTAL_INERTIA
 from identification.balance.balances import balances_of
+from identification.balance.calibration import names_of_runs
 from identification.balance.dataset import HOLD_NAME, Dataset, load_dataset, prepared_model
 from identification.data.joint_file import Joint
 from identification.data.prepare import STANDARD_GRAVITY
@@ -292,7 +293,8 @@ def _prepared(reference: Joint, records: Sequence[Record], tell: Progress) -> _S
     if not records:
         raise InputError("no record to compare with the reference; give at least one")
     plain = prepared_model(replace(reference, known={}), records[0])
-    lacking = [n for n in plain.parameter_names if n not in reference.fitted and n != HOLD_NAME]
+    own = (HOLD_NAME, *plain.calibration)
+    lacking = [n for n in plain.parameter_names if n not in reference.fitted and n not in own]
     if lacking:
         raise InputError(
             f"{where}: has no fitted value of {', '.join(lacking)}, which these records ask for; "
@@ -314,7 +316,8 @@ def _prepared(reference: Joint, records: Sequence[Record], tell: Progress) -> _S
     for label in _calibrations(plain, data):
         model = model.add(label)
     values = {**{p.name: p.start for p in model.parameters}, **plain.values}
-    values.update({n: refit.values[n] for n in _nuisances(plain)})
+    of_runs = names_of_runs(plain, data.train)
+    values.update({n: refit.values[n] for n in (*_nuisances(plain), *of_runs)})
     names = tuple(model.parameter_names)
     balances = balances_of(model, data.sensing, wrt=names)
     error = assess(refit.model, data, data.train, refit.values)
@@ -378,8 +381,11 @@ def _shared(
 
 
 def _nuisances(model: JointModel) -> tuple[str, ...]:
-    """What says nothing of the joint: it is taken as the refit has it."""
-    return tuple(n for n in model.parameter_names if n in (*model.named("smoothing"), HOLD_NAME))
+    """What says nothing of the joint, calibration of single records included: it is taken as the
+    refit has it.
+    """
+    told = (*model.named("smoothing"), *model.calibration, HOLD_NAME)
+    return tuple(n for n in model.parameter_names if n in told)
 
 
 def _prior(reference: Joint, model: JointModel, values: dict[str, float]) -> FloatArray:

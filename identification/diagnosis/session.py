@@ -338,7 +338,8 @@ class Session:
             )
         error = replace(end.held_out, balances=ratios)
         where = self.bench.places(end, error, lines, RATIO_LIMIT) if over else []
-        learned = self.bench.learned(end, error) if over and last is not None else ()
+        # a curve stands for what no name explains: not while a name would be the next
+        learned = self.bench.learned(end, error) if over and following is None else ()
         judged = [self._partial(c, steps[0], end, where) for c in claims]
         where = self._with_frequency(where, judged, steps)
         verdict, reason = verdict_of(

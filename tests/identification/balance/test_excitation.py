@@ -20,7 +20,7 @@ from identification.balance.excitation import (
 )
 
 T = 0.002 * np.arange(8000)
-JOINT = Joint("one", 1.0, model_name="hd1", effects=("viscous",))
+JOINT = Joint("one", "rotary", model_name="hd1", effects=("viscous",))
 
 
 def record(position: np.ndarray, torque: np.ndarray | None = None, name: str = "run") -> Record:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from identification import Joint, Record, fit, load_joint, read
+from identification.balance.calibration import is_of_run
 from identification.balance.stamps import evened, longest_hole, slots_of
 from identification.data.check.checks import check, gate, repair
 from identification.diagnosis.places import running_time
@@ -192,9 +193,17 @@ def test_runs_are_laid_end_to_end_and_no_curve_joins_them(
     assert len(both.segments()) == 2
     joined, apart = fit(joint, [both]), fit(joint, parts)
     for name, value in apart.solution.values.items():
+        if is_of_run(name):
+            continue
         assert joined.solution.values[name] == pytest.approx(value, rel=0.01, abs=1e-6), (
             "the noise level of a file is one"
         )
+    # a file has one zero of the link encoder; both parts were logged with the same one
+    zeros = [v for n, v in apart.solution.values.items() if is_of_run(n)]
+    one = [v for n, v in joined.solution.values.items() if is_of_run(n)]
+    assert len(zeros) == len(parts)
+    assert len(one) == 1
+    assert min(zeros) <= one[0] <= max(zeros)
     w = joined.data.train[0]
     assert sorted(w.block[w.stretch == 0].tolist())[-1] < min(
         b for b in w.block[w.stretch == 1].tolist() if b >= 0

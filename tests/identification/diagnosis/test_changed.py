@@ -14,12 +14,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from casadi_models.transmission import build
+from casadi_models import JointModel
 from identification import Joint, Record, fit, load_joint
 from identification.data.joint_file import parse_joint
 from identification.data.prepare import STANDARD_GRAVITY
-from identification.diagnosis import changed
-from identification.diagnosis.changed import discovery_rates
+from identification.diagnosis.changed import changed, discovery_rates
 from identification.errors import InputError
 from identification.planning.follow import Controller, Follower
 from tests.recorded_world import planted
@@ -53,7 +52,7 @@ LOADED = {
 
 @cache
 def follower() -> Follower:
-    model = build("hd3", RATIO, effects=EFFECTS).with_values(TRUE)
+    model = JointModel.by_name("hd3", RATIO, effects=EFFECTS).with_values(TRUE)
     return Follower(model, DT, controller=Controller(25.0, 0.9), substeps=8)
 
 
