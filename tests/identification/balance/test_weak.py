@@ -74,7 +74,7 @@ def test_vectorised_evaluation_equals_casadi(key: str) -> None:
     function = ca.Function("f", [e.signals.vector(), e.memory, e.parameters, e.clock], [out])
     rng = np.random.default_rng(0)
     points = 40
-    signals = rng.standard_normal((14, points))
+    signals = rng.standard_normal((e.signals.vector().shape[0], points))
     memory = rng.uniform(-1, 1, (e.memory.shape[0], points))
     values = np.abs(rng.standard_normal(e.parameters.shape[0])) + 0.1
     fast = Vectorised(function)(points, signals, memory, values, np.array([1e-3]))
