@@ -254,11 +254,13 @@ class RowMaker:
         self._still = _standstill(self.weights)
 
     def _sharpen(self) -> None:
-        """Velocities below which a side counts as standing still."""
-        smooth = dict(zip(self.model.parameter_names, self.model.value_vector(), strict=True))
+        """Velocities below which a side counts as standing still.
+
+        A smoothing velocity that only stands for a jump says nothing of where friction turns over:
+        rows at rest, which would tell, take no part in the fit of a joint file.
+        """
         self.sharp = [
-            2 * min(sum(smooth[n] for n in self.model.named("smoothing", side)), SHARP)
-            for side in ("motor", "link")
+            2 * SHARP if self.model.named("smoothing", side) else 0.0 for side in ("motor", "link")
         ]
 
     def _slope_function(self, expressions: Mapping[str, Any], signals: Any, p: Any) -> Any:
