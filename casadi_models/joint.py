@@ -29,7 +29,6 @@ from .equations import (
 )
 from .functions import MEMORY_STEP, JointFunctions
 from .parameter import Parameter, Role
-from .shown import shown
 from .sides import side_factor
 from .term import (
     CALIBRATION,
@@ -41,11 +40,14 @@ from .term import (
     Term,
     smoothing,
 )
+from .text.shown import shown
 from .transmission import MODELS, STARTS, signed_ratio
 
 __all__ = ["MEMORY_STEP", "Equations", "JointModel", "Term", "inverse_dynamics", "time_derivative"]
 
 _FRICTION_SIDES: Final = ("motor", "link")
+TWIST: Final = "transmission_compliance"
+"""Effect by which the transmission twists at all."""
 SHOWN: Final = 22
 """Parameters that `print` shows: the whole text stays within 25 lines."""
 
@@ -257,7 +259,7 @@ class JointModel:
     @property
     def is_elastic(self) -> bool:
         """True where motor and link move separately."""
-        return self.has("transmission_compliance")
+        return self.has(TWIST)
 
     @property
     def knows_load(self) -> bool:
@@ -394,7 +396,7 @@ class JointModel:
         return Symbols.of(self)
 
     def _repr_latex_(self) -> str:
-        """The equations and values in a notebook (see :mod:`casadi_models.shown`)."""
+        """The equations and values in a notebook (see :mod:`casadi_models.text.shown`)."""
         return shown(self, "latex")
 
     @cached_property

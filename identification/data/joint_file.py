@@ -10,8 +10,8 @@ from typing import Any, Final, final
 
 from casadi_models import JointModel
 from casadi_models.term import INERTIAS
+from casadi_models.text.typed_law import TypedLaw
 from casadi_models.transmission import MODELS
-from casadi_models.typed_law import TypedLaw
 from identification.data.own_effects import TABLE, load_remembered, remembered
 from identification.data.plain_text import from_toml, toml_key, toml_string, toml_value
 from identification.data.typed_laws import LAWS, hold_laws, law_lines, read_laws

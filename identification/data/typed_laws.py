@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final
 
-from casadi_models.typed_law import LawError, TypedLaw, register
+from casadi_models.text.typed_law import LawError, TypedLaw, register
 from identification.errors import InputError
 
 LAWS: Final = "laws"

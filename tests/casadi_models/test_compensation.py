@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from casadi_models import EFFECTS, JointModel
-from casadi_models.compensation import friction_compensation
+from casadi_models.text.compensation import friction_compensation
 from workbench.cli.main import main
 
 FRICTION = sorted(k for k, e in EFFECTS.items() if e.family == "friction" and not e.states)

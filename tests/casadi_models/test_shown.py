@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from casadi_models import EFFECTS, JointModel
-from casadi_models.shown import shown, shown_equations
-from casadi_models.written import LANGUAGES, identifier, written
+from casadi_models.text.shown import shown, shown_equations
+from casadi_models.text.written import LANGUAGES, identifier, written
 from workbench.cli.main import main
 
 DEMO = Path(__file__).resolve().parents[2] / "workbench" / "demo"

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from casadi_models import EFFECTS, JointModel, LocalSignals
-from casadi_models.typed_law import LawError, TypedLaw, effect_of, register
+from casadi_models.text.typed_law import LawError, TypedLaw, effect_of, register
 from identification import load_joint
 from identification.data.own_effects import files_of
 from identification.errors import InputError

@@ -6,7 +6,7 @@ from argparse import Namespace
 from dataclasses import replace
 
 from casadi_models import EFFECTS
-from casadi_models.typed_law import LawError, TypedLaw, derived_key, register
+from casadi_models.text.typed_law import LawError, TypedLaw, derived_key, register
 from identification.data.joint_file import Joint, toml_text
 from identification.errors import InputError
 from workbench.cli.files import open_joint, write_json, write_text

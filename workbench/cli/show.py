@@ -10,9 +10,9 @@ import casadi as ca
 import numpy as np
 
 from casadi_models import JointModel
-from casadi_models.compensation import friction_compensation
-from casadi_models.shown import shown, shown_equations, values_of
-from casadi_models.written import LANGUAGES, written
+from casadi_models.text.compensation import friction_compensation
+from casadi_models.text.shown import shown, shown_equations, values_of
+from casadi_models.text.written import LANGUAGES, written
 from identification.errors import InputError
 from workbench.cli.files import open_joint, write_json, write_text
 

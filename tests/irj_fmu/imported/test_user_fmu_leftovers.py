@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.irj_fmu.imported.test_user_fmu import FILE, axis
 
 from irj_fmu.imported.file import load_user_joint
 from irj_fmu.imported.fit import fit
+from tests.irj_fmu.imported.test_user_fmu import FILE, axis
 from tests.user_fmus.make import Make, build
 from workbench.cli.main import main
 

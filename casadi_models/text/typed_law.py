@@ -21,12 +21,12 @@ from typing import Any, Final, cast, final
 import casadi as ca
 import numpy as np
 
-from .effect import EFFECTS, PLACE_SIDE, Effect, Family, Place
-from .equations import jointly_linear
-from .parameter import Parameter
-from .quantities import BASE_NAMES, BaseUnit, UnitError, base_unit, factors, linear_unit, named
-from .signals import Expression, LocalSignals
-from .term import INERTIAS, LOAD_COMPLIANCE, SWINGING_SHARE, smoothing
+from ..effect import EFFECTS, PLACE_SIDE, Effect, Family, Place
+from ..equations import jointly_linear
+from ..parameter import Parameter
+from ..quantities import BASE_NAMES, BaseUnit, UnitError, base_unit, factors, linear_unit, named
+from ..signals import Expression, LocalSignals
+from ..term import INERTIAS, LOAD_COMPLIANCE, SWINGING_SHARE, smoothing
 
 
 class LawError(ValueError):
@@ -555,7 +555,7 @@ class TypedLaw:
         """Python source that declares the same effect where the file cannot be read, such as in
         an FMU.
         """
-        head = "from casadi_models.typed_law import TypedLaw, register"
+        head = "from casadi_models.text.typed_law import TypedLaw, register"
         return f"{head}\n\nregister({self!r})\n".encode()
 
 

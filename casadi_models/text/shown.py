@@ -1,7 +1,7 @@
 """The equations of a joint for a reader: balances, laws, values, as text, LaTeX or sympy code.
 
 Each equation is a sum of parts, one per effect, taken from the model's own CasADi expressions
-(:func:`casadi_models.equations.placed_laws`) and written by :mod:`casadi_models.written`.
+(:func:`casadi_models.equations.placed_laws`) and written by :mod:`casadi_models.text.written`.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from typing import Any, Final, final
 
 import casadi as ca
 
-from .equations import PlacedLaw, Solvable, bare_twist, placed_laws, time_derivative
-from .quantities import linear_unit
-from .signals import SIGNAL_UNITS, Expression, Signals
+from ..equations import PlacedLaw, Solvable, bare_twist, placed_laws, time_derivative
+from ..quantities import linear_unit
+from ..signals import SIGNAL_UNITS, Expression, Signals
 from .written import Language, identifier, latex_name, written
 
 LATEX_SIGNALS: Final[Mapping[str, str]] = {

@@ -17,7 +17,7 @@ from typing import Any, Final, Literal, final
 
 import casadi as ca
 
-from .signals import Expression
+from ..signals import Expression
 
 Language = Literal["text", "latex", "sympy"]
 LANGUAGES: Final[tuple[Language, ...]] = ("text", "latex", "sympy")
