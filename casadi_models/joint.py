@@ -46,6 +46,8 @@ from .transmission import MODELS, STARTS, signed_ratio
 __all__ = ["MEMORY_STEP", "Equations", "JointModel", "Term", "inverse_dynamics", "time_derivative"]
 
 _FRICTION_SIDES: Final = ("motor", "link")
+TWIST: Final = "transmission_compliance"
+"""Effect by which the transmission twists at all."""
 SHOWN: Final = 22
 """Parameters that `print` shows: the whole text stays within 25 lines."""
 
@@ -257,7 +259,7 @@ class JointModel:
     @property
     def is_elastic(self) -> bool:
         """True where motor and link move separately."""
-        return self.has("transmission_compliance")
+        return self.has(TWIST)
 
     @property
     def knows_load(self) -> bool:

@@ -10,7 +10,8 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import numpy.typing as npt
 
-from casadi_models import EFFECTS, JointModel
+from casadi_models import JointModel
+from casadi_models.joint import TWIST
 from casadi_models.term import SIDE_INERTIAS, TOTAL_INERTIA
 from identification.data.joint_file import Joint
 from identification.data.record import Record
@@ -69,12 +70,6 @@ class Sensing:
 
 TEMPERATURE_CHANGE: Final = 2.0
 """Change of the temperature over the records that is worth the name [K]."""
-TWIST: Final = next(
-    e.key
-    for e in EFFECTS.values()
-    if e.stage == "structure" and any(p.role == "stiffness" for p in e.parameters)
-)
-"""Effect by which a transmission twists at all."""
 DRIVES: Final = ("motor_torque", "motor_current", "motor_voltage")
 
 

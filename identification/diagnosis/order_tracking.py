@@ -21,6 +21,8 @@ from typing import Final, final
 import numpy as np
 import numpy.typing as npt
 
+from identification.fitting.covariance import follows
+
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
@@ -428,21 +430,10 @@ def confirmed(peak: Peak, samples: Samples, candidates: int) -> bool:
     candidates : int
         Lines that are put to this test.
     """
-    from scipy.special import stdtrit
-
     wave = peak.wave(samples)
     names, inverse = np.unique(samples.block, return_inverse=True)
-    top = np.bincount(
-        inverse, weights=samples.weight * wave * samples.residual, minlength=len(names)
+    scores, sizes = (
+        np.bincount(inverse, weights=samples.weight * wave * x, minlength=len(names))
+        for x in (samples.residual, wave)
     )
-    under = np.bincount(inverse, weights=samples.weight * wave**2, minlength=len(names))
-    total = float(under.sum())
-    if len(names) < 3 or total <= 0:
-        return False
-    slope = float(top.sum()) / total
-    spread = (
-        math.sqrt(float(np.sum((top - slope * under) ** 2)) * len(names) / (len(names) - 1)) / total
-    )
-    if spread == 0:
-        return slope > 0
-    return slope / spread > float(stdtrit(len(names) - 1, 1 - ALPHA / max(candidates, 1)))
+    return follows(scores, sizes, ALPHA / max(candidates, 1))

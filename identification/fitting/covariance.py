@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Final
 
@@ -112,6 +113,33 @@ def errors_of_blocks(
     return np.asarray(
         np.sqrt(np.maximum(np.diag(covariance), 0.0)) * wider / size, dtype=np.float64
     )
+
+
+def follows(scores: FloatArray, sizes: FloatArray, alpha: float) -> bool:
+    """True where the slope over one column is positive in most blocks: one-sided t over blocks.
+
+    Parameters
+    ----------
+    scores, sizes : (blocks,) arrays
+        Weighted products of the column with what it has to follow, and with itself.
+    alpha : float
+        Probability of a yes where the slope is zero.
+
+    Returns
+    -------
+    bool
+        False with fewer than three blocks, or where the column is zero.
+    """
+    from scipy.special import stdtrit
+
+    count, total = len(sizes), float(sizes.sum())
+    if count < 3 or total <= 0:
+        return False
+    slope = float(scores.sum()) / total
+    spread = math.sqrt(float(np.sum((scores - slope * sizes) ** 2)) * count / (count - 1)) / total
+    if spread == 0:
+        return slope > 0
+    return slope / spread > float(stdtrit(count - 1, 1 - alpha))
 
 
 def process_errors(

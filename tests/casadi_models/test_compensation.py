@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from casadi_models import EFFECTS, JointModel
-from casadi_models.compensation import friction_compensation
+from casadi_models.text.compensation import friction_compensation
 from workbench.cli.main import main
 
 FRICTION = sorted(k for k, e in EFFECTS.items() if e.family == "friction" and not e.states)
@@ -31,11 +31,11 @@ def test_it_is_the_drive_at_constant_speed(key: str) -> None:
     model = loaded(JointModel(gear_ratio=50.0).add("gravity").add(key))
     p, f = model.value_vector(), friction_compensation(model)
     theta = np.array([p[model.parameter_names.index(n)] for n in model.linear_parameters])
-    gravity = p[model.parameter_names.index("gravity_torque")]
+    sine, cosine = (p[model.parameter_names.index(n)] for n in ("gravity_torque", "gravity_cosine"))
     for q, v, temperature in ((0.4, 0.7, 3.0), (-1.1, -0.2, 0.0), (2.0, 0.05, -4.0)):
         y, rest = (np.array(x) for x in model.regressor([q, v], [0.0], [0.0, temperature, 0.0], p))
         torque = (y @ theta + rest.ravel()).item()
-        load = -gravity * np.sin(q)
+        load = -sine * np.sin(q) - cosine * np.cos(q)
         assert float(f(q, v, load, temperature, p)) == pytest.approx(torque - load, rel=1e-9)
 
 

@@ -24,7 +24,9 @@ sympy = pytest.importorskip("sympy")
 
 
 def model_with(key: str, place: str) -> JointModel:
-    model = JointModel.harmonic_drive(3).add("gravity").add("coulomb")
+    model = JointModel.harmonic_drive(3).add("coulomb")
+    if not model.add("gravity").has_form_of(key):  # another form of gravity stands for it
+        model = model.add("gravity")
     label = f"{key}@{place}" if len(EFFECTS[key].acts_on) > 1 else key
     return model if label in model.effects else model.add(label)
 

@@ -391,7 +391,8 @@ def test_typo_in_the_joint_table(
     [
         (
             "[known]\nstifness = 3.0",
-            "[known] stifness: the model has no such parameter; it has gravity_torque",
+            "[known] stifness: the model has no such parameter; it has "
+            "gravity_cosine, gravity_torque",
         ),
         (
             '[known]\nstiffness = { value = 3.0, unit = "kg" }',

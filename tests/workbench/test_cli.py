@@ -116,6 +116,8 @@ def test_demo_data_are_what_simulate_makes(
             str(DEMO / "joint.toml"),
             "--hide",
             HIDDEN,
+            "--set",
+            "gravity_cosine=0",
             "--seconds",
             str(seconds),
             "--rate",
@@ -356,7 +358,12 @@ def test_own_effects_from_a_file(
 IN_START_MODEL = {"viscous", "coulomb", "gravity", "transmission_compliance", "structural_damping"}
 
 
-@pytest.mark.parametrize("key", sorted(set(EFFECTS) - IN_START_MODEL))
+START_MODEL = load_joint(DEMO / "joint.toml").model()
+
+
+@pytest.mark.parametrize(
+    "key", sorted(k for k in set(EFFECTS) - IN_START_MODEL if not START_MODEL.has_form_of(k))
+)
 def test_every_effect_can_be_hidden_and_changes_the_record(key: str, tmp_path: Path) -> None:
     tables = []
     for hide in ([], ["--hide", key]):

@@ -89,7 +89,7 @@ def export_code(kind: str, joint_path: str, folder: Path) -> list[Path]:
     """
     import casadi as ca
 
-    from casadi_models.compensation import friction_compensation
+    from casadi_models.text.compensation import friction_compensation
 
     model = open_joint(joint_path).model()
     functions = [getattr(model, name) for name in FUNCTIONS]

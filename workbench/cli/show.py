@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from casadi_models import JointModel
-from casadi_models.compensation import friction_compensation
+from casadi_models.text.compensation import friction_compensation
 from casadi_models.text.shown import shown, shown_equations, values_of
 from casadi_models.text.written import LANGUAGES, written
 from identification.errors import InputError

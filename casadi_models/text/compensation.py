@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any, Final
 
 import casadi as ca
 
-from .equations import PlacedLaw, placed_laws
-from .signals import Expression, Signals
+from ..equations import PlacedLaw, placed_laws
+from ..signals import Expression, Signals
 
 if TYPE_CHECKING:
-    from .joint import JointModel
+    from ..joint import JointModel
 
 SETTLED: Final = 1e6
 """Way over which a joint has slid, so that laws with memory have settled [rad]: far beyond any
