@@ -433,7 +433,10 @@ def confirmed(peak: Peak, samples: Samples, candidates: int) -> bool:
     wave = peak.wave(samples)
     names, inverse = np.unique(samples.block, return_inverse=True)
     scores, sizes = (
-        np.bincount(inverse, weights=samples.weight * wave * x, minlength=len(names))
+        np.asarray(
+            np.bincount(inverse, weights=samples.weight * wave * x, minlength=len(names)),
+            dtype=np.float64,
+        )
         for x in (samples.residual, wave)
     )
     return follows(scores, sizes, ALPHA / max(candidates, 1))

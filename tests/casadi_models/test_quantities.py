@@ -134,6 +134,8 @@ def test_a_wrong_power_or_sign_is_seen_by_that_comparison(key: str) -> None:
         shaft = run(effect, place, one, ratio, motor=True) * (
             1 / ratio if place in ANGLES else ratio
         )
+        if effect.table and not shaft.any():
+            continue  # a knot beyond the path tells nothing
         for wrong in (ratio, 1 / ratio, -1.0):
             link = {q.name: one[q.name] * side_factor(effect, q, ratio) for q in effect.parameters}
             link[p.name] *= wrong

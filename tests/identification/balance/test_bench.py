@@ -161,10 +161,12 @@ def test_jacobian_is_the_derivative_of_the_rows(key: str, place: str, sensors: s
     data = prepared(case)
     through_memory = set(memory_shapes_of(case.model, case.model.parameter_names))
     term = next(t for t in case.model.terms if t.effect.key == key and t.place == place)
+    # the ends of a table's range stay where they are in every fit: no derivative of them is used
+    apart = through_memory | set(case.model.named("range"))
     names = [
         n
         for n in (*term.names, "stiffness", "motor_coulomb")
-        if n in case.model.parameter_names and n not in through_memory
+        if n in case.model.parameter_names and n not in apart
     ]
     balances = balances_of(case.model, case.sensing)
     bare = balances_of(case.model, case.sensing, wrt=())
