@@ -247,7 +247,7 @@ class UserInstance:
             )
             given = (*given, ctypes.addressof(self._callbacks), 0, 0)
         else:
-            self.callbacks = _LOG3(_note(self.messages))
+            self._callbacks = _LOG3(_note(self.messages))
             token, place = (
                 str(fmu.description.instantiationToken).encode(),
                 f"{fmu.folder / 'resources'}/",
