@@ -268,10 +268,12 @@ def _still_helps(other: Trial, best: Trial) -> bool:
 def simplest(
     best: Trial, names: Sequence[str], ranking: Ranking, refused: frozenset[str] = frozenset()
 ) -> Trial:
-    """Of the names that cannot be told apart, the one with the fewest parameters."""
+    """Of the names that cannot be told apart, one that hardly a joint is without; then the one
+    with the fewest parameters.
+    """
     usable = ranking.significant - refused
     alike = [t for t in ranking.trials if t.key in names and t.candidate.label in usable]
-    return min(alike or [best], key=lambda t: (len(t.values), not t.effect.common, -t.score))
+    return min(alike or [best], key=lambda t: (not t.effect.common, len(t.values), -t.score))
 
 
 def make_claim(

@@ -347,7 +347,12 @@ def _fallen(error: Error, balance: str, percent: float) -> Error:
     """An error after a fall of the RMS of one balance."""
     share = 1 - percent / 100
     before = error.balances[balance]
-    after = replace(before, rms=before.rms * share, ratio=before.ratio * share)
+    after = replace(
+        before,
+        rms=before.rms * share,
+        ratio=before.ratio * share,
+        residual=before.residual * share,
+    )
     power = sum(e.rms**2 for e in error.balances.values())
     left = math.sqrt(max(power - before.rms**2 + after.rms**2, 0.0) / power) if power > 0 else 1.0
     return replace(

@@ -124,15 +124,22 @@ def brfd(channel: str) -> Improvement:
     return improve(train, joint(kind="linear", model="hd1", effects=["viscous"]), [test])
 
 
-@pytest.mark.parametrize("channel", ["motor_torque", "link_torque"])
-def test_friction_device_with_backlash_is_a_displacement_memory(channel: str) -> None:
+@pytest.mark.parametrize(
+    ("channel", "low", "high"), [("motor_torque", 70.0, 77.0), ("link_torque", 52.0, 57.0)]
+)
+def test_friction_device_with_backlash_is_a_displacement_memory(
+    channel: str, low: float, high: float
+) -> None:
+    """A torque sensor before a clamped link shows a transmission: its spring takes a part of the
+    memory already.
+    """
     found = brfd(channel)
     assert found.ranking is not None
     order = [t.key for t in found.ranking.trials]
     memory = min(order.index(k) for k in ("hysteresis", "lugre", "backlash") if k in order)
     assert all(order.index(k) > memory for k in VELOCITY_LAWS if k in order)
     errors = [s.held_out.relative_error_percent for s in found.steps]
-    assert 70.0 < errors[0] < 77.0
+    assert low < errors[0] < high
     assert errors[-1] <= 20.0
 
 
