@@ -422,7 +422,7 @@ def test_runs_in_a_c_host(tmp_path: Path) -> None:
             *numbers,
         ],
         cwd="/",
-        env={"PATH": os.defpath, "LC_ALL": "C.UTF-8"},
+        env={"PATH": os.defpath, "LC_ALL": "C.UTF-8", "IRJ_PYTHON": sys.executable},
         capture_output=True,
         text=True,
         check=False,

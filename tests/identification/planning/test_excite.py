@@ -154,7 +154,7 @@ def test_selection_keeps_the_limits_and_names_the_best(full: Experiment, model: 
     free = select(full, motions, criterion="fisher")
     worst = [max(e.relative_deviation.values()) for e in free.tried]
     assert max(free.best.relative_deviation.values()) == min(worst)
-    assert set(free.best.by_effect(model)) == set(model.effects) - {"gravity"}
+    assert set(free.best.by_effect(model)) == set(model.effects) - {"gravity_upright"}
     slow = select(full, motions, criterion="fisher", limits=Limits(speed=0.5))
     assert slow.best.motion.parameters["speed"] == pytest.approx(0.3)
     assert all(e.broken == ("speed",) for e in slow.tried if e.motion.parameters["speed"] > 0.6)
