@@ -12,12 +12,9 @@ from typing import Any
 from identification.data.check.gate import gate_warnings
 from identification.data.joint_file import Joint, toml_text
 from identification.data.record import Record
-from identification.diagnosis.compare import compare
-from identification.diagnosis.diagnose import diagnose
 from identification.diagnosis.improve import Improvement, improve
 from identification.diagnosis.locate import Unexplained
 from identification.fitting.fit import Fit, fit
-from workbench.cli.changed import compared
 from workbench.cli.files import (
     alike,
     distinct,
@@ -46,12 +43,12 @@ def improve_files(
     records, _ = _training(train, other_payload, joint)
     held, _ = open_records(held_out, joint)
     alike([*train, *other_payload, *held_out], [*records, *held], joint)
-    since = (
-        compared(open_joint(reference), [r for r in records if r.payload != "other"])
-        if reference
-        else None
-    )
-    if since is not None:  # what has moved is not known any more
+    since = None
+    if reference:
+        from workbench.cli.changed import compared
+
+        since = compared(open_joint(reference), [r for r in records if r.payload != "other"])
+        # what has moved is not known any more
         gone = {n for c in since.changes for n in (c.parameter, *c.tied)}
         joint = replace(joint, known={n: k for n, k in joint.known.items() if n not in gone})
     found = improve(records, joint, held, max_additions=max_additions, progress=progress_bar)
@@ -272,6 +269,8 @@ def _print_parameters(parameters: Mapping[str, Mapping[str, Any]]) -> None:
 
 def run_compare(arguments: Namespace) -> int:
     """`irj compare`."""
+    from identification.diagnosis.compare import compare
+
     joint = open_joint(arguments.joint)
     records, _ = open_records(arguments.records, joint)
     basis = open_records(arguments.fit_records, joint)[0] if arguments.fit_records else records
@@ -295,6 +294,8 @@ def run_compare(arguments: Namespace) -> int:
 
 def run_diagnose(arguments: Namespace) -> int:
     """`irj diagnose`."""
+    from identification.diagnosis.diagnose import diagnose
+
     distinct(
         training=arguments.records,
         other_payload=arguments.other_payload,
