@@ -16,6 +16,8 @@ import numpy as np
 import numpy.typing as npt
 from numpy.lib.stride_tricks import sliding_window_view
 
+from casadi_models.signals import one_line
+
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
@@ -214,6 +216,9 @@ class WeakRecord:
     rest: Mapping[str, FloatArray] = field(default_factory=dict)
     support: FloatArray | None = None
     name: str = ""
+
+    def __repr__(self) -> str:
+        return one_line(self)
 
     def taking(self, balance: str) -> npt.NDArray[np.bool_]:
         """Rows that take part in a balance, shape (rows,): the one mask of every fit, error,
