@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 import sys
 from argparse import Namespace
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -30,7 +30,7 @@ from workbench.show.replayed import AFTERMATH, READINGS, UNESTIMATED, Replay
 if TYPE_CHECKING:
     from identification.data.joint_file import Joint
     from identification.data.record import Record
-    from identification.faults.detector import Fault
+    from identification.faults.detector import Fault, FaultEvent
     from identification.planning.trajectories import Excitation, Selection
 
 FloatArray = npt.NDArray[np.float64]
@@ -187,7 +187,12 @@ def track(record: Record, joint: Joint, detector_state: bytes | None = None) -> 
 
 
 def replay(
-    record: Record, joint: Joint, detector_state: bytes | None = None, tried: Sequence[Fault] = ()
+    record: Record,
+    joint: Joint,
+    detector_state: bytes | None = None,
+    tried: Sequence[Fault] = (),
+    *,
+    progress: Callable[[str, float], None] = progress_bar,
 ) -> Replay:
     """Replay a record through the online estimator, sample by sample.
 
@@ -201,6 +206,8 @@ def replay(
         Of a detector calibrated with healthy records.
     tried : sequence of Fault
         Faults put into the readings; their times count from the first sample.
+    progress : callable
+        ``progress(text, share)``, some hundred times.
 
     Raises
     ------
@@ -228,17 +235,25 @@ def replay(
     used, failed = readings.copy(), np.zeros(readings.shape, dtype=bool)
     every = max(1, len(even) // POINTS)
     course: list[tuple[float, FloatArray, FloatArray, FloatArray]] = []
+    looks: list[tuple[int, list[float]]] = []
     events: list[dict[str, Any]] = []
+    verdicts: list[tuple[float, FaultEvent]] = []
     fault, detector = 0, estimator.detector
     for part in even.segments():
         estimator.reset()
+        told = None
+        worst = [0.0] * len(READINGS)
         before: tuple[bool, ...] = (False,) * len(READINGS)
         quiet = [-math.inf] * len(READINGS)
         for k in range(part.start, part.stop):
             now = float(even.time[k])
             estimator.update(now, rows[k], valid[k])
+            worst = [max(a, b) for a, b in zip(worst, estimator.score, strict=True)]
             codes = []
             if detector is not None:
+                if detector.last_event is not told:
+                    verdicts += [(now, e) for e in _since(detector.events, told)]
+                    told = detector.last_event
                 replaced = detector.replaced
                 used[k], failed[k] = estimator.readings, replaced
                 if replaced != before:
@@ -260,11 +275,16 @@ def replay(
                 )
                 codes += [fault] if fault and not known else []
             events += [{"time": now, "fault": code, "text": fault_text(code)} for code in codes]
-            if (k + 1) % every == 0 and not estimator.warming_up:
+            if (k + 1) % every:
+                continue
+            looks.append((k, worst))
+            worst = [0.0] * len(READINGS)
+            if not estimator.warming_up:
                 course.append(
                     (now, estimator.theta.copy(), estimator.sigma.copy(), estimator.ratio.copy())
                 )
-        progress_bar(f"tracking {record.name}", part.stop / len(even))
+            progress(f"tracking {record.name}", (k + 1) / len(even))
+        progress(f"tracking {record.name}", part.stop / len(even))
     if not course and not events:
         longest = max(part.stop - part.start for part in even.segments()) * even.dt
         where = (
@@ -287,7 +307,10 @@ def replay(
         values=values,
         sigmas=sigmas,
         ratios=ratios,
+        looks=np.array([k for k, _ in looks], dtype=np.int64),
+        scores=np.array([row for _, row in looks]).reshape(-1, len(READINGS)),
         events=tuple(events),
+        verdicts=tuple(verdicts),
         healthy=healthy,
         readings=readings,
         used=used,
@@ -295,6 +318,12 @@ def replay(
         tried=tuple(tried),
         calibrated=estimator.detector is not None and detector_state is not None,
     )
+
+
+def _since(events: Sequence[FaultEvent], known: FaultEvent | None) -> Sequence[FaultEvent]:
+    """Events after one that is known; all where the detector has started anew."""
+    places = [k for k, e in enumerate(events) if e is known]
+    return events[places[-1] + 1 :] if places else events
 
 
 def fault_text(code: int) -> str:
