@@ -162,6 +162,31 @@ def effect_keys(root: Path = ROOT) -> list[str]:
     return sorted(set(out))
 
 
+PLAIN: Final = (0.0, 0.5, 1.0, 2.0)
+"""Numbers that need no reason where they are compared: signs, halves, wholes and twices."""
+ROUNDING: Final = 1e-8
+"""Numbers below this keep rounding apart from zero and decide nothing."""
+
+
+def literals(root: Path = ROOT) -> list[str]:
+    """Comparisons of identification with a number that has no name, and so no reason."""
+    out = []
+    for name, file in modules(root).items():
+        if not name.startswith("identification"):
+            continue
+        for node in ast.walk(tree_of(file)):
+            if isinstance(node, ast.Compare) and any(
+                isinstance(c, ast.Constant)
+                and isinstance(c.value, float)
+                and c.value not in PLAIN
+                and abs(c.value) > ROUNDING
+                for side in (node.left, *node.comparators)
+                for c in ast.walk(side)
+            ):
+                out.append(f"{file.relative_to(root)}:{node.lineno} {ast.unparse(node)}")
+    return out
+
+
 def skips(root: Path = ROOT) -> int:
     """Lines that the formatter is told to leave alone."""
     mark = "# fmt: " + "skip"
@@ -295,6 +320,7 @@ def main() -> None:
             str(len(long_calls(root))),
         ),
         ("conditions on effect keys outside casadi_models", str(len(effect_keys(root)))),
+        ("literals in comparisons of identification", str(len(literals(root)))),
         ("modules that `import identification` loads", str(len(at_import))),
         (
             "modules loaded after one `irj improve` / of methods that it does not call",

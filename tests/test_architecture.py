@@ -392,6 +392,11 @@ def test_the_formatter_formats_everything() -> None:
     assert house.skips() == 0
 
 
+def test_what_judges_records_and_claims_compares_with_no_number_without_a_name() -> None:
+    rooms = ("identification/diagnosis/", "identification/data/check/", "identification/balance/")
+    assert [where for where in house.literals() if where.startswith(rooms)] == []
+
+
 def test_no_object_reads_a_private_member_of_another() -> None:
     assert house.private_access() == []
 

@@ -18,6 +18,12 @@ stamps written with few digits.
 """
 
 
+KEPT: Final = 0.95
+"""Share of the fourth differences that counts: the rest may be jumps of the motion and spikes."""
+CUT_DEVIATION: Final = 0.87
+"""Standard deviation of a unit normal variable that is cut at that quantile of its size (0.871)."""
+
+
 def noise_level(
     values: FloatArray, segments: tuple[slice, ...], time: FloatArray | None = None
 ) -> float:
@@ -49,10 +55,10 @@ def noise_level(
         return 0.0
     fourth = np.concatenate(parts)
     magnitude = np.abs(fourth)
-    cut = fourth[magnitude <= np.quantile(magnitude, 0.95)]
+    cut = fourth[magnitude <= np.quantile(magnitude, KEPT)]
     if not len(cut):
         return 0.0
-    return float(np.std(cut) / 0.87)
+    return float(np.std(cut) / CUT_DEVIATION)
 
 
 _LEVELS: Final[WeakKeyDictionary[Record, dict[tuple[str, float], float]]] = WeakKeyDictionary()

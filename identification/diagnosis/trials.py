@@ -41,6 +41,24 @@ REFINE_SHARE: Final = 0.1
 KERNEL_SHARE: Final = 0.4
 """Share of rows that count as independent under white noise: four rows per kernel length."""
 
+UNCORRELATED: Final = 0.05
+"""Autocorrelation below which rows count as independent: twice its own scatter over 1600 rows, the
+rows of 40 s.
+"""
+
+LONGEST_LAG: Final = 60
+"""Rows up to which correlation is followed: fifteen kernel lengths, longer than any block holds
+together.
+"""
+
+NO_COLUMN: Final = 1e-12
+"""Size of a column, as a share of the largest one, below which it is rounding."""
+
+DEPENDENT: Final = 1e-9
+"""Singular value, as a share of the largest one, below which columns are dependent: far over the
+rounding of their sums, far below what records can show.
+"""
+
 
 @final
 @dataclass(frozen=True)
@@ -198,7 +216,7 @@ def make_base(solution: Solution, data: Dataset) -> Base:
     towards = np.concatenate([np.ones(len(free)), list(signs.values())])
     jw = j * towards * weight[:, None]
     norms = np.linalg.norm(jw, axis=0)
-    alive = norms > 1e-12 * max(float(norms.max(initial=0.0)), 1e-300)
+    alive = norms > NO_COLUMN * max(float(norms.max(initial=0.0)), 1e-300)
     back = alive & (np.arange(len(norms)) >= len(free))
     alive[len(free) :] = False
     inward = jw[:, back] / norms[back]
@@ -258,7 +276,7 @@ def span_of(columns: FloatArray) -> FloatArray:
     """Orthonormal columns that span the same space."""
     left, singular, _ = np.linalg.svd(columns, full_matrices=False)
     return np.asarray(
-        left[:, singular > 1e-9 * max(float(singular[0]) if len(singular) else 0.0, 1e-300)],
+        left[:, singular > DEPENDENT * max(float(singular[0]) if len(singular) else 0.0, 1e-300)],
         dtype=np.float64,
     )
 
@@ -300,9 +318,9 @@ def effective_share(residual: FloatArray) -> float:
     if power <= 0:
         return 1.0
     total = 1.0
-    for lag in range(1, min(60, len(x) - 1)):
+    for lag in range(1, min(LONGEST_LAG, len(x) - 1)):
         rho = float(x[:-lag] @ x[lag:]) / power
-        if rho < 0.05:
+        if rho < UNCORRELATED:
             break
         total += 2 * rho
     return 1.0 / total

@@ -99,6 +99,14 @@ HIGHEST_SWING: Final = 4.0
 """Highest frequency of such a link in units of 1/kernel (the kernel's -3 dB point is 0.93):
 faster ones are rigid to these rows.
 """
+COLLINEAR: Final = 1e4
+"""Growth of a parameter's error by the others from which it is not identified: all but one part in
+1e8 of its column's power is theirs.
+"""
+NO_COLUMN: Final = 1e-12
+"""Size of a column, as a share of the largest one, below which it is rounding."""
+AT_BOUND: Final = 1e-9
+"""Relative distance from a bound within which a parameter stands at it: rounding of the step."""
 
 
 def solve(
@@ -302,14 +310,14 @@ def _with_errors(
         n
         for n in free
         if any(
-            math.isfinite(limit) and abs(values[n] - limit) <= 1e-9 * max(abs(limit), 1e-300)
+            math.isfinite(limit) and abs(values[n] - limit) <= AT_BOUND * max(abs(limit), 1e-300)
             for limit in limits[n]
         )
         and n not in smoothing
     ]
     usable = np.array(
         [
-            norm > 1e-12 * norms.max() and n not in at_bound
+            norm > NO_COLUMN * norms.max() and n not in at_bound
             for n, norm in zip(free, norms, strict=True)
         ]
     )
@@ -318,7 +326,7 @@ def _with_errors(
     unidentified = [
         n
         for n, norm in zip(free, norms, strict=True)
-        if norm <= 1e-12 * norms.max() and n not in smoothing
+        if norm <= NO_COLUMN * norms.max() and n not in smoothing
     ]
     index = np.flatnonzero(usable)
     if len(index):
@@ -334,7 +342,11 @@ def _with_errors(
             other = int(np.argmax(np.abs(corr[k])))
             correlation[free[i]] = (free[int(index[other])], float(corr[k, other]))
             weak = size is not None and values[free[i]] != 0 and size[k] > abs(values[free[i]])
-            if (spread[k] > 1e4 or weak) and free[i] not in smoothing and not is_of_run(free[i]):
+            if (
+                (spread[k] > COLLINEAR or weak)
+                and free[i] not in smoothing
+                and not is_of_run(free[i])
+            ):
                 unidentified.append(free[i])
     kept = dict(values)
     model = balances.model
