@@ -19,6 +19,7 @@ from identification.balance.calibration import bare, names_of_runs, settled
 from identification.balance.dataset import HOLD_NAME
 from identification.balance.weak import WeakRecord
 from identification.diagnosis.candidates import Candidate, NotTestable, shape_grid
+from identification.fitting.covariance import wald
 from identification.fitting.engine import Dataset, Solution, Stacked, row_weights, stack
 from identification.fitting.signed_fit import projected_gain, signed_fit
 from identification.fitting.start_values import bounds_of
@@ -615,8 +616,6 @@ def _held_out_drop(
 
 def _wald(added: FloatArray, base: Base, delta: FloatArray) -> float:
     """p-value of the amplitudes, scores clustered by block."""
-    from scipy.special import fdtrc
-
     p, own = base.parts
     q = base.orthonormal
     moving = base.inward[:, delta[p:own] > 0]
@@ -633,8 +632,4 @@ def _wald(added: FloatArray, base: Base, delta: FloatArray) -> float:
     )
     begins = base.firsts[np.flatnonzero(np.diff(base.block[base.order[base.firsts]], prepend=-1))]
     scores = np.add.reduceat((c * residual[:, None])[base.order], begins, axis=0)
-    inverse = np.linalg.pinv(c.T @ c, rcond=1e-10)
-    covariance = inverse @ (scores.T @ scores) @ inverse * blocks / (blocks - 1)
-    d = delta[own:][active]
-    statistic = float(d @ np.linalg.pinv(covariance, rcond=1e-12) @ d) / len(active)
-    return float(fdtrc(len(active), blocks - len(active), statistic))
+    return wald(c.T @ c, scores, delta[own:][active])
