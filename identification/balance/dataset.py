@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from casadi_models import JointModel, hold
 from identification.balance.calibration import unknowns_of
+from identification.balance.memory import cache_of
 from identification.balance.noise import level_of
 from identification.balance.sensing import Sensing, adapt, check_alike, sense, signals_of
 from identification.balance.stamps import evened
@@ -38,6 +39,10 @@ POINTWISE_KERNELS: Final = (0.01, 0.014, 0.02, 0.03)
 STILL: Final = 3.0
 """Pointwise speed of a side at rest, in standard deviations of its noise: 0.3 % of samples at
 rest lie above.
+"""
+PREPARED: Final = 16_000_000
+"""Values of prepared records that a thread keeps (128 MB): two records of 40 s at 1 kHz at every
+kernel of the verdict.
 """
 VELOCITY_NOISE: Final = 2e-3
 """Noise of a pointwise velocity, as a share of the record's speed, that is small enough."""
@@ -133,10 +138,11 @@ def load_dataset(
     prepared: list[WeakRecord] = []
     first = 0
     for record in (*train, *held_out):
-        made = weak_record(record, joint, sensing, length, first, curved=model.lagging_load)
-        made = replace(made, name=run_name(record))
-        if record.payload != train[0].payload:
-            made = replace(made, masked=_of_the_link(record, sensing))
+        other = record.payload != train[0].payload
+        masked = _of_the_link(record, sensing) if other else frozenset[str]()
+        made = _once(record, joint, sensing, length, first, curved=model.lagging_load)
+        if masked:
+            made = replace(made, masked=masked)
         first = max(first, 1 + int(made.block.max(initial=first - 1)))
         prepared.append(made)
     count = len(train)
@@ -169,6 +175,32 @@ def load_dataset(
         train_names=tuple(r.name for r in train),
         held_out_names=tuple(r.name for r in held_out),
     )
+
+
+def _once(
+    record: Record,
+    joint: Joint,
+    sensing: Sensing,
+    length: float,
+    first_block: int,
+    *,
+    curved: bool,
+) -> WeakRecord:
+    """:func:`weak_record` by its name, prepared once for the verbs that follow each other on a
+    record.
+    """
+
+    def make() -> tuple[WeakRecord, int]:
+        made = weak_record(record, joint, sensing, length, first_block, curved=curved)
+        tables = (made.averaged, made.points, made.smooth, made.curved)
+        return replace(made, name=run_name(record)), sum(
+            x.size for table in tables for x in table.values()
+        )
+
+    scales = (joint.gear_ratio, joint.torque_per_current, joint.torque_per_voltage)
+    law = (scales, sensing, length, first_block, curved)
+    found: WeakRecord = cache_of("prepared").get(record, law, make, PREPARED)
+    return found
 
 
 def run_name(record: Record) -> str:

@@ -288,16 +288,35 @@ class WeakRecord:
         """Signals at the points as rows in the order of `names`, zeros where one is not there;
         made once, not to be written to.
         """
-        if names not in self._tables:
-            out = np.zeros((len(names), int(self.starts[-1])))
+        return self._table("points", names, self.points, int(self.starts[-1]))
+
+    def means(self, names: tuple[str, ...]) -> FloatArray:
+        """Averages of the signals as columns, as :meth:`table`."""
+        return self._table("averaged", names, self.averaged, self.rows, columns=True)
+
+    def bends(self, names: tuple[str, ...]) -> FloatArray:
+        """Second derivatives of these averages as columns, as :meth:`table`."""
+        return self._table("curved", names, self.curved, self.rows, columns=True)
+
+    def _table(
+        self,
+        kind: str,
+        names: tuple[str, ...],
+        signals: Mapping[str, FloatArray],
+        count: int,
+        *,
+        columns: bool = False,
+    ) -> FloatArray:
+        if (kind, names) not in self._tables:
+            out = np.zeros((len(names), count))
             for i, name in enumerate(names):
-                if name in self.points:
-                    out[i] = self.points[name]
-            self._tables[names] = out
-        return self._tables[names]
+                if name in signals:
+                    out[i] = signals[name]
+            self._tables[kind, names] = np.ascontiguousarray(out.T) if columns else out
+        return self._tables[kind, names]
 
     @cached_property
-    def _tables(self) -> dict[tuple[str, ...], FloatArray]:
+    def _tables(self) -> dict[tuple[str, tuple[str, ...]], FloatArray]:
         return {}
 
     def _sparse(self, order: int) -> Any:
