@@ -55,6 +55,9 @@ REST_SHARE: Final = 0.01
 weighs a hundredth of its limit in the row, which is what noise leaves of it elsewhere; the kernels
 taper, so that only rows whose edge touches a rest are near it."""
 
+STRETCH: Final = 4096
+"""Windows multiplied at a time: some hundred kilobytes."""
+
 
 def kernel(length: float, dt: float, order: int = 0) -> FloatArray:
     """Samples of the cos^4 kernel or of a derivative of it, for correlation with a signal.
@@ -160,6 +163,17 @@ class Grid:
         return _strided(values, np.ones(1), self.segments, self.half, self.stride)
 
 
+def _at(windows: FloatArray, where: IntArray, weights: FloatArray) -> FloatArray:
+    """Products of some windows with the weights, a stretch at a time: copies of all windows at once
+    would not stay in the cache.
+    """
+    out = np.empty(len(where))
+    for first in range(0, len(where), STRETCH):
+        part = where[first : first + STRETCH]
+        np.matmul(windows[part], weights, out=out[first : first + STRETCH])
+    return out
+
+
 def _strided(
     values: FloatArray, weights: FloatArray, segments: tuple[slice, ...], half: int, stride: int
 ) -> FloatArray:
@@ -168,8 +182,7 @@ def _strided(
     for segment in segments:
         x = values[segment]
         rows = np.arange(half, len(x) - half, stride)
-        windows = sliding_window_view(x, len(weights))[rows - own]
-        parts.append(windows @ weights)
+        parts.append(_at(sliding_window_view(x, len(weights)), rows - own, weights))
     return np.concatenate(parts) if parts else np.empty(0)
 
 
@@ -483,7 +496,7 @@ def _pointwise(
         x = values[segment]
         inner = sliding_window_view(x, len(weights))[::1]
         centres = np.clip(np.arange(0, len(x), step) - half, 0, len(inner) - 1)
-        filtered = inner[centres] @ weights
+        filtered = _at(inner, centres, weights)
         soft.append(filtered)
         raw.append(x[::step] if order == 0 else filtered)
     if not raw:
