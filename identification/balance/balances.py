@@ -173,6 +173,11 @@ class Balances:
         Parameters whose Jacobian columns are wanted; all by default.
     columns_only : bool
         The residual itself is not wanted and reads zero.
+
+    Attributes
+    ----------
+    law : Law
+        What the residuals depend on beside the record and the values.
     """
 
     def __init__(
@@ -195,7 +200,7 @@ class Balances:
         self._curved = _Part(model, curved, columns, columns_only=columns_only) if curved else None
         self._memory = Memory(model) if self._plain.remembers else None
         self._law = Law(model.structure)
-        self._whole = Law(model.structure, sensing, columns_only)
+        self.law = Law(model.structure, sensing, columns_only)
 
     def memory_values(self, data: WeakRecord, values: Mapping[str, float]) -> FloatArray:
         """Internal states of displacement-memory effects at the points, (states, points); not
@@ -226,7 +231,7 @@ class Balances:
                 full += self._curved.rows(data.bends(_NAMES), data.curve, data, memory, p)
             return full
 
-        full = rows() if self.wrt else residuals_of(data, (self._whole, tuple(p)), rows)
+        full = rows() if self.wrt else residuals_of(data, (self.law, tuple(p)), rows)
         width = 1 + len(self.wrt)
         return {
             b: (full[:, i * width], full[:, i * width + 1 : (i + 1) * width])

@@ -7,7 +7,7 @@ from __future__ import annotations
 import threading
 import weakref
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Mapping
 from typing import Any, Final, Generic, TypeVar, final
 
 import numpy as np
@@ -18,6 +18,9 @@ T = TypeVar("T")
 
 MOST: Final = 4_000_000
 """Values of each kind that a thread keeps (32 MB)."""
+
+NUMBERS: Final = 2000
+"""Single numbers that a thread keeps."""
 
 _kept = threading.local()
 
@@ -68,6 +71,29 @@ def residuals_of(record: Any, law: Hashable, make: Callable[[], FloatArray]) -> 
     (rows, balances) array, read-only
     """
     return _array("residuals", record, law, make)
+
+
+def numbers_of(
+    record: Any, law: Hashable, make: Callable[[], Mapping[str, float]]
+) -> Mapping[str, float]:
+    """Numbers fitted on one record alone, from memory where the same ones were asked for there.
+
+    Parameters
+    ----------
+    record : object
+        The record; held weakly, known by identity.
+    law : hashable
+        What they depend on beside the record.
+    make : callable
+        Gives them by name.
+    """
+
+    def made() -> tuple[Mapping[str, float], int]:
+        numbers = make()
+        return numbers, len(numbers)
+
+    found: Mapping[str, float] = cache_of("numbers").get(record, law, made, NUMBERS)
+    return found
 
 
 @final
@@ -134,4 +160,4 @@ def _array(kind: str, record: Any, law: Hashable, make: Callable[[], FloatArray]
     return found
 
 
-__all__ = ["Cache", "Law", "cache_of", "residuals_of", "states_of"]
+__all__ = ["Cache", "Law", "cache_of", "numbers_of", "residuals_of", "states_of"]
