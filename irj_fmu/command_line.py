@@ -29,6 +29,8 @@ INTERRUPTED: Final = 130
 """Exit code after Ctrl-C."""
 STOPPED: Final[list[int]] = []
 """Signals that came during this command."""
+LONGEST: Final = 2000
+"""Characters of a message: some lines of a terminal, with the whole effect library in it."""
 _BAR: Final = [False]
 """Whether the last line on the terminal is a progress bar that goes on."""
 
@@ -48,8 +50,12 @@ def counted(number: int, what: str) -> str:
 
 
 def one_line(text: str) -> str:
-    """A message as the command line prints it."""
-    return "irj: " + " ".join(str(text).split())
+    """A message as the command line prints it: of a very long one the two ends, signs that would
+    steer a terminal as escapes.
+    """
+    plain = "".join(c if c.isprintable() or c.isspace() else repr(c)[1:-1] for c in str(text))
+    line = "irj: " + " ".join(plain.split())
+    return line if len(line) <= LONGEST else f"{line[: LONGEST // 2]} ... {line[-LONGEST // 2 :]}"
 
 
 def checkpoint() -> None:

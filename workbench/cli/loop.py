@@ -10,7 +10,7 @@ from importlib.resources import as_file, files
 from typing import Any
 
 from identification.data.check.gate import gate_warnings
-from identification.data.joint_file import Joint, toml_text
+from identification.data.joint_file import Joint
 from identification.data.record import Record
 from identification.diagnosis.compare import compare
 from identification.diagnosis.diagnose import diagnose
@@ -21,6 +21,7 @@ from workbench.cli.changed import compared
 from workbench.cli.files import (
     alike,
     distinct,
+    enlarged,
     open_joint,
     open_records,
     progress_bar,
@@ -320,10 +321,7 @@ def run_diagnose(arguments: Namespace) -> int:
     for key in arguments.why:
         print(found.why(key))
     if arguments.output and found.claims:
-        write_text(
-            arguments.output,
-            toml_text(replace(joint, effects=(*joint.effects, found.claims[0].label))),
-        )
+        write_text(arguments.output, enlarged(joint, found.claims[0].label))
         print(f"joint file with {found.claims[0].label}: {arguments.output}")
     elif arguments.output:
         print(f"nothing is named: {arguments.output} is not written")

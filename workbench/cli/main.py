@@ -367,6 +367,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             errors="backslashreplace"
         )  # a terminal that lacks a sign must not cost the results
     parser = _parser()
+    if any("\0" in word for word in given):
+        parser.error("an argument holds a zero byte; no name of a file or effect has one")
     arguments, rest = parser.parse_known_args(given)
     arguments.rest = rest
     if arguments.module == "fmi":

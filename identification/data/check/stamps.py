@@ -20,6 +20,8 @@ _WITHOUT_TIME: Final = 0.1
 _REPEATED_LIMIT: Final = 1 / 3
 """Share of repeated stamps above which the median step may be no period of the clock any more."""
 _REGULAR: Final = 0.2
+FASTEST: Final = 1e-9
+"""Step that no logger of a joint has [s]: converters of currents take at least some ten ns."""
 
 
 def check_size(record: Record) -> list[Finding]:
@@ -143,7 +145,10 @@ def check_sampling(record: Record) -> list[Finding]:
         )
         message = f"{record.name}: the stamps of a clock of {dt:.4g} s are {off}; {how}"
         findings.append(Finding("repair", "jitter", message, "time"))
-    if dt >= 0.5 or dt < 2e-6:
+    if dt < FASTEST:
+        message = f"{record.name}: the sampling step is {dt:.4g} s: correct the unit of time"
+        findings.append(Finding("refuse", "time_unit", message, "time"))
+    elif dt >= 0.5 or dt < 2e-6:
         unit = "ms" if dt >= 0.5 else "s"
         message = (
             f"{record.name}: the sampling step is {dt:.4g} s: is time in {unit}? correct "
