@@ -373,19 +373,20 @@ class Result:
     sets: tuple[tuple[str, ...], ...]
     parameters: Mapping[str, tuple[float, float]]
 
-    def differences(self, other: Result) -> tuple[float, float]:
-        """Largest difference of a parameter: relative, and in standard errors; infinite where
-        the parameters are not the same.
+    def differences(self, other: Result) -> tuple[float, float, str]:
+        """Largest difference of a parameter: relative, in standard errors (where it has one), and
+        whose the first is; infinite where the parameters are not the same.
         """
-        if set(self.parameters) != set(other.parameters):
-            return np.inf, np.inf
+        if odd := set(self.parameters) ^ set(other.parameters):
+            return np.inf, np.inf, ", ".join(sorted(odd))
         relative = sigmas = 0.0
+        whose = ""
         for name, (a, error) in self.parameters.items():
             gap = abs(a - other.parameters[name][0])
-            if gap:
-                relative = max(relative, gap / max(abs(a), error))
-                sigmas = max(sigmas, gap / error if error else np.inf)
-        return relative, sigmas
+            own = gap / max(abs(a), error) if gap else 0.0
+            relative, whose = max((relative, whose), (own, name))
+            sigmas = max(sigmas, gap / error if error else 0.0)
+        return relative, sigmas, whose
 
 
 def result_of(given: Told) -> Result:
@@ -417,7 +418,7 @@ def row(name: str, transform: str, folder: Path, base: Told, result: Result) -> 
     if given.same(base):
         return {**out, "ok": True, "said": "same records"}
     found = result_of(given)
-    relative, sigmas = result.differences(found)
+    relative, sigmas, whose = result.differences(found)
     agree = found.verdict == result.verdict and found.sets == result.sets
     return {
         **out,
@@ -426,7 +427,7 @@ def row(name: str, transform: str, folder: Path, base: Told, result: Result) -> 
         "sets": found.sets == result.sets,
         "relative": relative,
         "sigmas": sigmas,
-        "said": "" if agree else f"{found.verdict} {found.sets}",
+        "said": whose if agree else f"{found.verdict} {found.sets}",
     }
 
 

@@ -16,6 +16,10 @@ EVEN: Final = 1e-3
 """Spread of the steps, as a share of the median one, below which stamps count as even: that of
 stamps written with few digits.
 """
+TIE: Final = 1e-6
+"""Relative difference below which two fourth differences are one: those of a quantised channel
+are whole steps, told apart by rounding only (1e-12 of them), and go in or out of the cut together.
+"""
 
 
 def noise_level(
@@ -49,7 +53,7 @@ def noise_level(
         return 0.0
     fourth = np.concatenate(parts)
     magnitude = np.abs(fourth)
-    cut = fourth[magnitude <= np.quantile(magnitude, 0.95)]
+    cut = fourth[magnitude <= np.quantile(magnitude, 0.95) * (1.0 + TIE)]
     if not len(cut):
         return 0.0
     return float(np.std(cut) / 0.87)
