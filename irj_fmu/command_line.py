@@ -22,6 +22,7 @@ from typing import IO, Any, Final, NoReturn, final
 
 from identification.crash import internal_error
 from identification.errors import InputError
+from identification.scratch import hold, release
 
 CRASHED: Final = 3
 """Exit code after an error of the program itself: no answer, neither yes nor no."""
@@ -145,6 +146,7 @@ def run_alone(main: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
         return crashed(error, shlex.join([Path(sys.argv[0]).name, *argv]))
     finally:
         STOPPED.clear()
+        release()
 
 
 def no_memory(error: MemoryError) -> str:
@@ -189,12 +191,14 @@ def terminable() -> Iterator[None]:
 
 
 def check_output(path: str | Path, inputs: Sequence[str | Path] = ()) -> None:
-    """Refuse a result file that cannot be written or would replace an input.
+    """Refuse a result file that cannot be written or would replace an input; from then on it is
+    held against other processes (see :func:`identification.scratch.hold`).
 
     Raises
     ------
     InputError
-        It is a folder, its folder is missing or not writable, or it is one of the inputs.
+        Another process is writing it; it is a folder, its folder is missing or not writable, or it
+        is one of the inputs.
     """
     target = Path(path)
     if not str(path):
@@ -215,6 +219,8 @@ def check_output(path: str | Path, inputs: Sequence[str | Path] = ()) -> None:
             f"{path}: its folder is not writable ({error.strerror}); write somewhere else"
         ) from None
     keep_inputs([target], inputs)
+    if not is_special(target):
+        hold(target)
 
 
 def keep_inputs(targets: Sequence[str | Path], inputs: Sequence[str | Path]) -> None:
@@ -286,6 +292,7 @@ def replace_files(folder: Path, content: Mapping[str, bytes]) -> list[Path]:
     whole = False
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        hold(folder)
         for name, text in content.items():
             parts[folder / name] = part = folder / f".{name}.{secrets.token_hex(4)}.part"
             part.write_bytes(text)

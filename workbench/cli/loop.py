@@ -90,9 +90,12 @@ def run_improve(arguments: Namespace) -> int:
         reference=arguments.reference,
     )
     print_improvement(found)
-    _write_improvement(found, records, arguments.report, arguments.output, arguments.command)
-    write_picture(found, arguments.picture)
     write_json(arguments.json, data)
+    if arguments.output:
+        write_text(arguments.output, found.to_joint_file())
+        print(f"joint file: {arguments.output}")
+    write_picture(found, arguments.picture)
+    _write_report(found, records, arguments.report, arguments.command)
     return 0
 
 
@@ -105,8 +108,8 @@ def run_report(arguments: Namespace) -> int:
         other_payload=arguments.other_payload,
     )
     print(found.reason)
-    _write_improvement(found, records, arguments.output, None, arguments.command)
     write_json(arguments.json, data)
+    _write_report(found, records, arguments.output, arguments.command)
     return 0
 
 
@@ -122,26 +125,20 @@ def run_demo(arguments: Namespace) -> int:
             [names["train.npz"]], [names["held_out.npz"]], names["joint.toml"]
         )
     print_improvement(found)
-    _write_improvement(found, records, arguments.report, None, arguments.command)
-    write_picture(found, arguments.picture)
     write_json(arguments.json, data)
+    write_picture(found, arguments.picture)
+    _write_report(found, records, arguments.report, arguments.command)
     return 0
 
 
-def _write_improvement(
-    found: Improvement,
-    records: Sequence[Record],
-    report: str | None,
-    output: str | None,
-    command: str,
+def _write_report(
+    found: Improvement, records: Sequence[Record], report: str | None, command: str
 ) -> None:
+    """The report comes last: what it is drawn from stands on the disk before it is drawn."""
     if report:
         from workbench.show.report import write_report
 
         print(f"report: {write_report(found, report, records=records, command=command)}")
-    if output:
-        write_text(output, found.to_joint_file())
-        print(f"joint file: {output}")
 
 
 def write_picture(found: Improvement, path: str | None) -> None:

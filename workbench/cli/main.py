@@ -18,6 +18,7 @@ from typing import Any, TextIO, cast, final
 
 from identification import __version__
 from identification.errors import InputError
+from identification.scratch import release
 from irj_fmu.command_line import (
     STOPPED,
     OneLineParser,
@@ -393,6 +394,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             return crashed(error, arguments.command)
         finally:
             STOPPED.clear()
+            release()
 
 
 def _run(arguments: argparse.Namespace) -> int:
