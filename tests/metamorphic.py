@@ -275,8 +275,10 @@ TRANSFORMS: Final[Mapping[str, tuple[bool, Transform]]] = {
     "two files each": (False, lambda c: replace(c, train=_halves(c.train), held=_halves(c.held))),
     "half the rate": (False, lambda c: c.tables(lambda t: {k: v[::2] for k, v in t.items()})),
     "zero moved": (False, _zero_moved),
-    "mirrored": (False, _mirrored),
+    "mirrored": (True, _mirrored),
 }
+TURNED: Final = ("motor remounted", "mirrored")
+"""Here an angle is counted the other way, and parameters agree up to their signs."""
 TWICE: Final = "a record twice"
 """Refused in one line: a run counts once."""
 
@@ -373,16 +375,20 @@ class Result:
     sets: tuple[tuple[str, ...], ...]
     parameters: Mapping[str, tuple[float, float]]
 
-    def differences(self, other: Result) -> tuple[float, float, str]:
+    def differences(self, other: Result, signs: bool = True) -> tuple[float, float, str]:
         """Largest difference of a parameter: relative, in standard errors (where it has one), and
         whose the first is; infinite where the parameters are not the same.
+
+        Without `signs` sizes are compared: seen from the other end, an odd law of an angle changes
+        the sign of its parameter.
         """
         if odd := set(self.parameters) ^ set(other.parameters):
             return np.inf, np.inf, ", ".join(sorted(odd))
         relative = sigmas = 0.0
         whose = ""
         for name, (a, error) in self.parameters.items():
-            gap = abs(a - other.parameters[name][0])
+            b = other.parameters[name][0]
+            gap = abs(a - b) if signs else abs(abs(a) - abs(b))
             own = gap / max(abs(a), error) if gap else 0.0
             relative, whose = max((relative, whose), (own, name))
             sigmas = max(sigmas, gap / error if error else 0.0)
@@ -396,7 +402,9 @@ def result_of(given: Told) -> Result:
     return Result(
         found.verdict,
         tuple(sorted(tuple(sorted(c.effects)) for c in found.claims)),
-        {n: (p["value"], p["stderr"] or 0.0) for n, p in table.items()},
+        {  # a phase follows from its two parts
+            n: (p["value"], p["stderr"] or 0.0) for n, p in table.items() if p["meaning"] != "phase"
+        },
     )
 
 
@@ -418,7 +426,7 @@ def row(name: str, transform: str, folder: Path, base: Told, result: Result) -> 
     if given.same(base):
         return {**out, "ok": True, "said": "same records"}
     found = result_of(given)
-    relative, sigmas, whose = result.differences(found)
+    relative, sigmas, whose = result.differences(found, signs=transform not in TURNED)
     agree = found.verdict == result.verdict and found.sets == result.sets
     return {
         **out,

@@ -58,7 +58,9 @@ def result(base: Told) -> Result:
     return result_of(base)
 
 
-@pytest.mark.parametrize("name", [n for n, (notation, _) in TRANSFORMS.items() if notation])
+@pytest.mark.parametrize(
+    "name", [n for n, (notation, _) in TRANSFORMS.items() if notation and n != "mirrored"]
+)
 def test_another_notation_is_the_same_joint(
     name: str, base: Told, fitted: dict[str, float], tmp_path: Path
 ) -> None:
@@ -69,15 +71,15 @@ def test_another_notation_is_the_same_joint(
         assert values(given) == pytest.approx(fitted, rel=NOTATION, abs=0)
 
 
-@pytest.mark.parametrize("name", ["motor remounted", "records reversed", "two runs each"])
+@pytest.mark.parametrize("name", ["mirrored", "records reversed", "two runs each"])
 def test_the_same_is_named(name: str, result: Result, tmp_path: Path) -> None:
     other = TRANSFORMS[name][1](short("stribeck"))
     assert other is not None
     found = result_of(told(other, tmp_path))
     assert found.verdict == result.verdict
     assert found.sets == result.sets
-    if name == "motor remounted":
-        assert result.differences(found)[0] <= NOTATION
+    if name == "mirrored":
+        assert result.differences(found, signs=False)[0] <= NOTATION
 
 
 def test_a_run_given_twice_is_refused(base: Told) -> None:

@@ -21,7 +21,6 @@ FALSE_DISCOVERY: Final = 0.05
 MINOR_DROP: Final = 2.5
 MINOR_HELD_OUT: Final = 2.0
 MINOR_GAIN: Final = 100.0
-SET_P: Final = 0.05
 SET_LOST: Final = 0.15
 SET_RMS: Final = 1.5
 LARGEST_SET: Final = 4

@@ -16,18 +16,6 @@ from identification.balance.dataset import HOLD_NAME
 from identification.data.joint_file import Joint
 from identification.diagnosis.candidates import Candidate, NotTestable
 from identification.diagnosis.claims import (
-    COMMON_DROP,
-    GAIN,
-    HELD_OUT_DROP,
-    LARGEST_SET,
-    LATE_DROP,
-    MAJOR_DROP,
-    MINOR_DROP,
-    MINOR_GAIN,
-    MINOR_HELD_OUT,
-    SET_LOST,
-    SET_RMS,
-    UNSEEN_DROP,
     Ranking,
     _discoveries,
     _major,
@@ -119,6 +107,11 @@ def test_discoveries_are_those_of_benjamini_and_hochberg(base: Base) -> None:
     assert _discoveries(trials[9:]) == set()
     assert _discoveries(trials[:1]) == {"stribeck#0"}
     assert _discoveries([]) == set()
+    limits = [trial(base, "stribeck", label=f"stribeck#{k}", p=0.05 * k / 4) for k in (1, 2, 3, 4)]
+    assert len(_discoveries(limits)) == 4
+    over = [replace(t, p_value=t.p_value * 1.001) for t in limits]
+    assert _discoveries(over) == set()
+    assert _discoveries([*over[:1], limits[1], *over[2:]]) == {"stribeck#1", "stribeck#2"}
 
 
 def test_a_later_discovery_takes_the_earlier_ones_with_it(base: Base) -> None:
@@ -133,23 +126,23 @@ def test_a_later_discovery_takes_the_earlier_ones_with_it(base: Base) -> None:
 
 @pytest.mark.parametrize(
     ("key", "least", "least_held"),
-    [("stribeck", MAJOR_DROP, HELD_OUT_DROP), ("coulomb", COMMON_DROP, COMMON_DROP / 2)],
+    [("stribeck", 10.0, 5.0), ("coulomb", 4.0, 2.0)],
 )
 def test_the_fall_that_is_asked_for(key: str, least: float, least_held: float, base: Base) -> None:
     assert _major(trial(base, key, drop=least), base)
     assert not _major(trial(base, key, drop=least * 0.999), base)
     assert _major(trial(base, key, drop=least, held=least_held), base)
     assert not _major(trial(base, key, drop=90.0, held=least_held * 0.999), base)
-    assert not _major(trial(base, key, drop=90.0, gain=GAIN), base)
-    assert _major(trial(base, key, drop=least, gain=GAIN * 1.001), base)
+    assert not _major(trial(base, key, drop=90.0, gain=3.0), base), "odds of 20 to 1, in nats"
+    assert _major(trial(base, key, drop=least, gain=3.001), base)
 
 
 def test_an_effect_with_dynamics_of_its_own_must_take_more(base: Base) -> None:
     assert EFFECTS["flexible_mode"].stage == "late"
-    assert _major(trial(base, "flexible_mode", drop=LATE_DROP), base)
-    assert _major(trial(base, "flexible_mode", drop=LATE_DROP, held=LATE_DROP), base)
-    assert not _major(trial(base, "flexible_mode", drop=LATE_DROP - 0.1), base)
-    assert not _major(trial(base, "flexible_mode", drop=90.0, held=LATE_DROP - 0.1), base)
+    assert _major(trial(base, "flexible_mode", drop=30.0), base)
+    assert _major(trial(base, "flexible_mode", drop=30.0, held=30.0), base)
+    assert not _major(trial(base, "flexible_mode", drop=30.0 - 0.1), base)
+    assert not _major(trial(base, "flexible_mode", drop=90.0, held=30.0 - 0.1), base)
 
 
 def test_a_delay_must_be_longer_than_half_a_sample(base: Base) -> None:
@@ -183,10 +176,10 @@ def test_an_unseen_link_asks_for_more(base: Base) -> None:
     if model.load_compliance(values) <= 0:
         pytest.fail("a link on a compliance has none")
     seen = replace(base, solution=replace(base.solution, model=model, values=values))
-    assert not _major(trial(base, "stribeck", drop=UNSEEN_DROP - 0.1), seen)
-    assert _major(trial(base, "stribeck", drop=UNSEEN_DROP), seen)
-    assert _major(trial(base, "stribeck", drop=UNSEEN_DROP - 0.1), base)
-    assert _major(trial(base, "coulomb", drop=COMMON_DROP), seen)
+    assert not _major(trial(base, "stribeck", drop=20.0 - 0.1), seen)
+    assert _major(trial(base, "stribeck", drop=20.0), seen)
+    assert _major(trial(base, "stribeck", drop=20.0 - 0.1), base)
+    assert _major(trial(base, "coulomb", drop=4.0), seen)
 
 
 # --- which goes first -----------------------------------------------------------------------------
@@ -217,7 +210,7 @@ def test_the_one_that_only_its_held_out_fall_keeps_back(base: Base) -> None:
     assert nearly(ranking(good), base, frozenset(["stribeck"])) is None
     other = trial(base, "cyclic_torque")
     assert nearly(ranking(other, good, significant=("cyclic_torque",)), base, frozenset()) is None
-    small = trial(base, "stribeck", p=1e-5, held=1.0, drop=MAJOR_DROP - 1)
+    small = trial(base, "stribeck", p=1e-5, held=1.0, drop=10.0 - 1)
     assert nearly(ranking(small), base, frozenset()) is None
     unsure = trial(base, "stribeck", p=0.05 / 2 + 1e-6, held=1.0)
     assert nearly(ranking(unsure, trial(base, "viscous", p=1.0)), base, frozenset()) is None
@@ -253,14 +246,14 @@ def test_a_set_holds_what_explains_as_much(base: Base) -> None:
         return confusion_set(best, [best, other], base) == ("stribeck", "cyclic_torque")
 
     assert named(100.0, 10.0)
-    assert named(100 * (1 - SET_LOST) + 0.1, 9.0, 1e-3), "it loses little"
-    assert not named(100 * (1 - SET_LOST) - 0.1, 9.0, 1e-3), "it loses more, in every block"
+    assert named(100 * (1 - 0.15) + 0.1, 9.0, 1e-3), "it loses little"
+    assert not named(100 * (1 - 0.15) - 0.1, 9.0, 1e-3), "it loses more, in every block"
     sure = math.sqrt(count) / 2.0  # the spread at which a difference of 1 has t = 2
     assert named(50.0, 9.0, sure * 1.02), "the blocks do not agree which is better"
     assert not named(50.0, 9.0, sure * 0.98)
     assert not named(0.0, 10.0)
-    assert not named(100.0, 10.0, rms=SET_RMS * 1.01)
-    assert named(100.0, 10.0, rms=SET_RMS)
+    assert not named(100.0, 10.0, rms=1.5 * 1.01)
+    assert named(100.0, 10.0, rms=1.5)
     assert not named(100.0, 10.0, drop=19.9)
     assert named(100.0, 10.0, drop=20.0)
     held = replace(best, held_out_drop_percent=30.0)
@@ -297,7 +290,7 @@ def test_a_long_set_keeps_the_significant_names_in_their_order(base: Base) -> No
     trials = tuple(trial(base, k) for k in keys)
     few = ranking(*trials, significant=keys[4:])
     assert shortened(keys, few) == ("stribeck", "cyclic_torque", "hysteresis", "lugre")
-    assert len(shortened(keys, few)) == LARGEST_SET
+    assert len(shortened(keys, few)) == 4
     assert shortened(keys, ranking(*trials, significant=keys)) == keys
     assert shortened(keys[:3], ranking(*trials)) == keys[:3]
 
@@ -336,7 +329,7 @@ def test_what_a_claim_says(base: Base) -> None:
 
 
 def test_minor_claims_are_small_and_certain(base: Base) -> None:
-    certain = {"score": MINOR_GAIN, "drop": MINOR_DROP, "held": MINOR_HELD_OUT, "p": 0.01}
+    certain = {"score": 100.0, "drop": 2.5, "held": 2.0, "p": 0.01}
     good = trial(base, "stribeck", **certain)
     assert minor_claims(ranking(good), base) == [good]
     for key, worse in (("score", 99.9), ("drop", 2.49), ("held", 1.99), ("p", 0.0101)):
