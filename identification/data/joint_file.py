@@ -31,6 +31,8 @@ _JOINT_KEYS: Final = frozenset(
         "virtual_work",
     )
 )
+LARGEST_RATIO: Final = 1e75
+"""Its fourth power, that of cubic friction between motor side and link, is still a number."""
 _KNOWN_KEYS: Final = ("value", "low", "high", "unit", "side", "source", "note")
 _TABLES: Final = ("joint", "known", "columns", "fitted", "calibration", "provenance", TABLE, LAWS)
 
@@ -161,13 +163,21 @@ def parse_joint(data: Mapping[str, Any], source: str = "joint") -> Joint:
     ratio = _number(table, "gear_ratio", source, 1.0)
     if ratio is None or ratio == 0:
         raise InputError(f"{source}: gear_ratio is 0; give theta_motor / theta_link with its sign")
+    if not 1 / LARGEST_RATIO < abs(ratio) < LARGEST_RATIO:
+        raise InputError(
+            f"{source}: gear_ratio = {ratio:g} is out of what can be computed with; give "
+            "theta_motor / theta_link"
+        )
     constant = _number(table, "motor_constant", source, None)
     per_current = _number(table, "torque_per_current", source, None)
-    if constant == 0 or per_current == 0:
-        raise InputError(
-            f"{source}: {'motor_constant' if constant == 0 else 'torque_per_current'} is 0; give "
-            "the torque per ampere"
-        )
+    per_voltage = _number(table, "torque_per_voltage", source, None)
+    for key, value, per in (
+        ("motor_constant", constant, "ampere"),
+        ("torque_per_current", per_current, "ampere"),
+        ("torque_per_voltage", per_voltage, "volt"),
+    ):
+        if value == 0:
+            raise InputError(f"{source}: {key} is 0; give the torque per {per}")
     if constant is not None and per_current is not None:
         raise InputError(
             f"{source}: motor_constant and torque_per_current are both given; keep one of them"
@@ -175,11 +185,15 @@ def parse_joint(data: Mapping[str, Any], source: str = "joint") -> Joint:
     name = str(table.get("model", "hd1"))
     if name not in MODELS:
         raise InputError(f"{source}: model = {name!r} is not known; use one of {', '.join(MODELS)}")
+    if isinstance(table.get("name"), Mapping | list):
+        raise InputError(f'{source}: name must be a text, as name = "axis 3"')
     effects = table.get("effects", [])
     if not isinstance(effects, list) or not all(isinstance(e, str) for e in effects):
         raise InputError(
             f'{source}: effects must be a list of names, as effects = ["viscous", "coulomb"]'
         )
+    if nought := next((e for e in effects if e.partition("#")[2] == "0"), None):
+        raise InputError(f"{source}: effect {nought!r} is not understood; the first is #1")
     if constant is not None and not 0 < abs(ratio * constant) < math.inf:
         raise InputError(
             f"{source}: gear_ratio times motor_constant is {ratio * constant:g}; correct one of "
@@ -190,7 +204,7 @@ def parse_joint(data: Mapping[str, Any], source: str = "joint") -> Joint:
         kind=kind,
         gear_ratio=ratio,
         torque_per_current=ratio * constant if constant is not None else per_current,
-        torque_per_voltage=_number(table, "torque_per_voltage", source, None),
+        torque_per_voltage=per_voltage,
         model_name=name,
         effects=tuple(effects),
         columns=data.get("columns"),
@@ -198,7 +212,7 @@ def parse_joint(data: Mapping[str, Any], source: str = "joint") -> Joint:
         source=source,
         fitted={k: _fitted(k, v, source) for k, v in data.get("fitted", {}).items()},
         errors={
-            k: _entry_number(v, "stderr", f"{source}: [fitted] {k}")
+            k: _stderr(v, f"{source}: [fitted] {k}")
             for k, v in data.get("fitted", {}).items()
             if "stderr" in v
         },
@@ -301,14 +315,17 @@ def _known(name: str, entry: Any, model: JointModel, source: str) -> Known:
     unit = parameters[name].unit if name in parameters else extra[name]
     scale = 1.0
     if "unit" in entry:
-        given, wanted = base_unit(str(entry["unit"])), base_unit(unit)
+        try:
+            given, wanted = base_unit(str(entry["unit"])), base_unit(unit)
+        except InputError as error:
+            raise InputError(f"{source}: [known] {name}: {error}") from None
         if not same_dimension(given, wanted):
             raise InputError(
                 f"{source}: [known] {name} has unit {entry['unit']!r}; it must be one like {unit}"
             )
         scale = given.factor / wanted.factor
     if entry.get("side") == "motor":
-        scale *= model.side_factor(name)
+        scale *= _on_link(name, model, source)
     for key in entry:
         if key not in _KNOWN_KEYS:
             raise InputError(
@@ -352,6 +369,17 @@ def _known(name: str, entry: Any, model: JointModel, source: str) -> Known:
     return Known(**values)
 
 
+def _on_link(name: str, model: JointModel, source: str) -> float:
+    """What refers a motor-side value to the link."""
+    term = next((t for t in model.terms if name in t.names), None)
+    if term is not None and term.effect.table is not None and model.gear_ratio < 0:
+        raise InputError(
+            f"{source}: [known] {name} is one knot of a curve, and with a negative gear ratio "
+            "the curve of the motor side runs the other way: give its values on the link side"
+        )
+    return model.side_factor(name)
+
+
 def _entry_number(entry: Mapping[str, Any], key: str, where: str) -> float:
     value = entry[key]
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
@@ -365,6 +393,13 @@ def _fitted(name: str, entry: Any, source: str) -> float:
             f"{source}: [fitted] {name} must be a table with value, as {name} = {{ value = 1.0 }}"
         )
     return _entry_number(entry, "value", f"{source}: [fitted] {name}")
+
+
+def _stderr(entry: Mapping[str, Any], where: str) -> float:
+    found = _entry_number(entry, "stderr", where)
+    if found < 0:
+        raise InputError(f"{where}: stderr = {found:g} is below zero; correct it or leave it out")
+    return found
 
 
 def _flag(table: Mapping[str, Any], key: str, source: str) -> bool:

@@ -18,6 +18,7 @@ from typing import Any, TextIO, cast, final
 
 from identification import __version__
 from identification.errors import InputError
+from identification.scratch import release
 from irj_fmu.command_line import (
     STOPPED,
     OneLineParser,
@@ -367,6 +368,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             errors="backslashreplace"
         )  # a terminal that lacks a sign must not cost the results
     parser = _parser()
+    if any("\0" in word for word in given):
+        parser.error("an argument holds a zero byte; no name of a file or effect has one")
     arguments, rest = parser.parse_known_args(given)
     arguments.rest = rest
     if arguments.module == "fmi":
@@ -391,6 +394,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             return crashed(error, arguments.command)
         finally:
             STOPPED.clear()
+            release()
 
 
 def _run(arguments: argparse.Namespace) -> int:
