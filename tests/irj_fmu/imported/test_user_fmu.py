@@ -480,10 +480,10 @@ w = "motor_velocity"
 
 def irj(*arguments: str) -> int:
     """`irj`, with the module that the joint file asks for."""
-    from workbench.cli.main import _parser
+    from workbench.cli.main import parser as made
     from workbench.cli.user_fmu import module_of
 
-    parser = _parser()
+    parser = made()
     given, rest = parser.parse_known_args(arguments)
     if given.verb == "diagnose" and rest[:1] == ["-o"]:
         given.output, rest = rest[1], rest[2:]
