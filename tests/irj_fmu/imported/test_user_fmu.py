@@ -99,10 +99,11 @@ def axis(
     h: float = 2e-3,
     noise: float = 1e-5,
     seed: int = 2,
+    motion: Callable[[FloatArray], FloatArray] = swing,
 ) -> Record:
     """An axis under a controller, integrated here: its torque is held between samples."""
     t = h * np.arange(round(seconds / h))
-    reference, rate = swing(t), np.gradient(swing(t), h)
+    reference, rate = motion(t), np.gradient(motion(t), h)
 
     def slope(q: float, w: float, u: float) -> tuple[float, float]:
         resist = (
