@@ -31,6 +31,8 @@ FloatArray = npt.NDArray[np.float64]
 LONGEST_STEP: Final = 1e-3
 """Longest step of the integrator [s]: a sample that is longer is made in several. Friction's slope
 over inertia is some 1000 1/s at zero velocity."""
+SHORTEST: Final = 1e-9
+"""Shortest time between two samples [s]: stamps that repeat give no infinite noise."""
 MOST_DECAY: Final = 2.0
 """Largest rate of the linearised joint times the step: at 2 the implicit midpoint takes a velocity
 to zero in one step, above it the velocity would change its sign every step."""
@@ -402,7 +404,7 @@ class JointFilter:
         inputs[:, :, 1] = drive
         inputs[:, :, 7:13] = used * there
         inputs[:, :, 7] = used[:, :, 0]  # a missing drive is held
-        inputs[:, :, 13] = np.diff(time, prepend=states[0].time)
+        inputs[:, :, 13] = np.maximum(np.diff(time, prepend=states[0].time), SHORTEST)
         inputs[:, :, 14] = time
         start = np.stack([s.flat() for s in states])
         given = (start, inputs.reshape(count * length, -1), self.parameters(levels or Levels()))
