@@ -22,7 +22,7 @@ from identification.faults.bank_statistics import limits, statistics
 from identification.faults.core import ABSURD, CURRENT, SENSORS
 from identification.faults.types import FaultEvent, Verdict
 from identification.online.filter import FilterState, JointFilter, Levels
-from identification.online.pulse import REPEATS, Pulse
+from identification.online.pulse import Pulse
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
@@ -186,8 +186,12 @@ class FaultBank:
         for k, (now, row) in enumerate(zip(time.tolist(), rows.tolist(), strict=True)):
             pulse.add(now, row)
             out[k] = pulse.failed
+        own = rows[:, list(self.sensors)]
         for first, _ in _stretches(out):
-            out[max(first - REPEATS, 0) : first] = True  # it takes some samples to be sure
+            begin = first  # it takes some samples to be sure
+            while begin > 0 and np.array_equal(own[begin], own[begin - 1]):
+                begin -= 1
+            out[begin:first] = True
         return out
 
     def flags(self, count: int) -> FloatArray:
