@@ -18,7 +18,7 @@ import numpy.typing as npt
 from casadi_models import JointModel
 from identification.errors import InputError
 from identification.faults.bank_levels import SETTLE, Piece, first_levels, likeliest
-from identification.faults.bank_statistics import limits, statistics
+from identification.faults.bank_statistics import WINDOWS, limits, statistics
 from identification.faults.core import ABSURD, CURRENT, SENSORS
 from identification.faults.types import FaultEvent, Verdict
 from identification.online.filter import FilterState, JointFilter, Levels
@@ -44,6 +44,13 @@ GAP: Final = 0.05
 LOST: Final = 0.03
 """A reading that is missing for longer fails, one that is missing for a shorter time is bridged
 [s]."""
+BISECTIONS: Final = 8
+"""Halvings of the logarithm of a size: to a few percent."""
+ANNOUNCED: Final = 1.5
+"""Offsets that are announced over those that a record shows to be just seen: other places of the
+motion need more."""
+NAMED_AT: Final = (1.0, 2.0, 4.0, 8.0, 16.0)
+"""Multiples of the offset that is seen at which it is tried whether it is named."""
 ONE: Final = (Verdict.SENSOR, Verdict.CURRENT_OR_FRICTION)
 """Verdicts that name one sensor."""
 CALIBRATION: Final = ("link_encoder_zero",)
@@ -70,12 +77,15 @@ class BankTrack:
         ``residuals`` names the statistics' filters that were over their limits.
     failed : (n, 6) bool array
         Where a sensor counts as failed.
+    readings : (n, 6) array
+        Readings with failed ones replaced by what the others say.
     scores : (n, filters) array
         Largest statistic of each filter over its limit; the first one reads all sensors.
     """
 
     events: tuple[FaultEvent, ...]
     failed: BoolArray
+    readings: FloatArray
     scores: FloatArray
 
 
@@ -166,16 +176,47 @@ class FaultBank:
         rows : (n, 6) array
             In the order of :data:`identification.faults.core.SENSORS`; NaN is a missing reading.
         """
-        tuning = self.tuning
-        if tuning is None:
-            raise InputError("fault bank: calibrate it with healthy records first")
+        tuning = self.tuned
         clean = np.where(np.abs(rows) < ABSURD, rows, np.nan)
         dead = self.dead(time, np.nan_to_num(clean))
         work = _Work(self, tuning, time, np.where(dead[:, None], np.nan, clean), dead)
         work.go()
         return BankTrack(
-            tuple(sorted(work.events, key=lambda e: e.sample)), work.failed, work.scores
+            tuple(sorted(work.events, key=lambda e: e.sample)),
+            work.failed,
+            work.readings,
+            work.scores,
         )
+
+    def smallest(self, healthy: Piece) -> dict[str, tuple[float, float]]:
+        """The smallest offset of each sensor that is seen, and the smallest that is named, in the
+        unit of the reading; infinite where none is.
+
+        Bisected on a healthy record, at some times of its motion, and times :data:`ANNOUNCED`.
+        """
+        time, rows = healthy.time, healthy.rows
+        places = [
+            int(np.searchsorted(time, time[0] + share * (time[-1] - time[0])))
+            for share in (0.35, 0.65, 0.9)
+        ]
+        probes = [_Probe(self, time, rows, place) for place in places]
+        spread = np.nanstd(rows, axis=0)
+        out = {}
+        for k, sensor in enumerate(self.sensors):
+            low, high = 0.0, max(4.0 * float(spread[sensor]), 1e-9)
+            for _ in range(BISECTIONS):
+                middle = high * 0.03 if low == 0.0 else (low * high) ** 0.5
+                if all(p.scores(sensor, middle)[0] > 1 for p in probes):
+                    high = middle
+                else:
+                    low = middle
+            seen, named = ANNOUNCED * high, np.inf
+            for factor in NAMED_AT:
+                if all(told(p.scores(sensor, factor * seen)[1:]) == k for p in probes):
+                    named = factor * seen
+                    break
+            out[SENSORS[sensor]] = (seen, named)
+        return out
 
     def dead(self, time: FloatArray, rows: FloatArray) -> BoolArray:
         """Samples that tell nothing: no reading has changed a bit for some samples although the
@@ -194,6 +235,19 @@ class FaultBank:
             out[begin:first] = True
         return out
 
+    @property
+    def tuned(self) -> Tuning:
+        """The tuning.
+
+        Raises
+        ------
+        InputError
+            There is none yet.
+        """
+        if self.tuning is None:
+            raise InputError("fault bank: calibrate it with healthy records first")
+        return self.tuning
+
     def flags(self, count: int) -> FloatArray:
         """Which reading each filter uses, (filters, count, 6)."""
         table = np.tile(np.array(self.measured, dtype=np.float64), (1 + len(self.sensors), 1))
@@ -210,6 +264,50 @@ class FaultBank:
         ]
 
 
+def told(worst: FloatArray) -> int | None:
+    """The sensor whose filter alone is innocent, by the largest scores of the filters without one
+    sensor each; None where several are, or none.
+    """
+    order = np.argsort(worst)
+    best, second = worst[order[0]], worst[order[1]]
+    alone = int(np.sum(worst < 1)) == 1
+    clearly = best < min(NEXT[0] * second, 1.0) and second > NEXT[1]
+    return int(order[0]) if alone or clearly else None
+
+
+class _Probe:
+    """Filters just before a fault that is tried at one place of a record."""
+
+    def __init__(self, bank: FaultBank, time: FloatArray, rows: FloatArray, place: int) -> None:
+        self.bank = bank
+        back, ahead = round(WINDOWS[-1] / bank.dt), round(WAITS[0] / bank.dt)
+        first = max(place - back, 0)
+        states = bank.started(time, rows, bank.tuned.levels)
+        if first > 0:
+            flags = bank.flags(first)
+            states = list(
+                bank.joint.run(
+                    states, time[:first], rows[:first], flags, levels=bank.tuned.levels
+                ).last
+            )
+        self.states, self.begin = states, place - first
+        self.time, self.rows = time[first : place + ahead], rows[first : place + ahead]
+
+    def scores(self, sensor: int, offset: float) -> FloatArray:
+        """Largest score of each filter after an offset of a sensor, (filters,)."""
+        bank, rows = self.bank, self.rows.copy()
+        rows[self.begin :, sensor] += offset
+        course = bank.joint.run(
+            self.states, self.time, rows, bank.flags(len(rows)), levels=bank.tuned.levels
+        )
+        return np.array(
+            [
+                (statistics(course, k, bank.dt) / bank.tuned.limits[k])[self.begin :].max()
+                for k in range(len(self.states))
+            ]
+        )
+
+
 class _Work:
     """One run of a bank over a record."""
 
@@ -220,6 +318,7 @@ class _Work:
         self.events: list[FaultEvent] = []
         self.failed = np.zeros(rows.shape, dtype=np.bool_)
         self.scores = np.zeros((len(time), 1 + len(bank.sensors)))
+        self.readings = rows.copy()
         self.quiet = -np.inf
 
     def go(self) -> None:
@@ -268,10 +367,12 @@ class _Work:
                 sensor = SENSORS.index(sensors[0]) if verdict in ONE else -1
             if sensor >= 0:
                 calm = int(np.searchsorted(self.time, self.time[min(alarm, gone)] - BEFORE))
+                kept = self.readings[:decided].copy()  # a verdict does not change what was read
                 healthy = self._with_calibration(
                     self._advanced(states, at, decided, 1 + bank.sensors.index(sensor)),
                     self._advanced(states, at, max(calm, at), 0),
                 )
+                self.readings[:decided] = kept
                 at, state = self._await(healthy, decided, last, sensor)
                 if at >= last:
                     return
@@ -317,6 +418,9 @@ class _Work:
         run = bank.joint.run(
             [states[which]], self.time[part], self.rows[part], flags, levels=self.tuning.levels
         )
+        if which:
+            sensor = bank.sensors[which - 1]
+            self.readings[part, sensor] = bank.joint.expected(run, self.rows[part])[:, sensor]
         return run.last[0]
 
     def _with_calibration(self, state: FilterState, known: FilterState) -> FilterState:
@@ -338,18 +442,12 @@ class _Work:
         for wait in WAITS:
             end = min(int(np.searchsorted(self.time, self.time[alarm] + wait)), last)
             worst = self.scores[begin:end, 1:].max(axis=0)
-            order = np.argsort(worst)
-            innocent = [names[i] for i in order if worst[i] < 1]
-            best, second = worst[order[0]], worst[order[1]]
-            alone = len(innocent) == 1
-            if alone or (best < min(NEXT[0] * second, 1.0) and second > NEXT[1]):
-                found = names[int(order[0])]
-                pair = SENSORS.index(found) == CURRENT
-                return (
-                    end - 1,
-                    Verdict.CURRENT_OR_FRICTION if pair else Verdict.SENSOR,
-                    (found,),
-                )
+            innocent = [names[i] for i in np.argsort(worst) if worst[i] < 1]
+            one = told(worst)
+            if one is not None:
+                pair = SENSORS.index(names[one]) == CURRENT
+                verdict = Verdict.CURRENT_OR_FRICTION if pair else Verdict.SENSOR
+                return end - 1, verdict, (names[one],)
             if not innocent:
                 return end - 1, Verdict.PLANT, ()
             if end == last:
@@ -371,6 +469,7 @@ class _Work:
             there = np.isfinite(self.rows[part, sensor]).all()
             if there and scores[:, 0].max() < 1 and end < last:
                 self.failed[begin:end, sensor] = True
+                self._advanced([state] * (1 + len(bank.sensors)), at, end, without)
                 run = [state] * (1 + len(bank.sensors))
                 return end, self._advanced(run, at, end, 0)
             over = np.flatnonzero(scores[:, 0] >= 1)

@@ -141,6 +141,8 @@ class Course:
         Disturbances of motor, transmission and link, and their standard deviations [N.m].
     states : (filters, n, states) array
         The joint's state.
+    used_drive : bool
+        Whether the first filter reads the drive.
     last : tuple of FilterState
     """
 
@@ -149,6 +151,7 @@ class Course:
     disturbance: FloatArray
     deviation: FloatArray
     states: FloatArray
+    used_drive: bool
     last: tuple[FilterState, ...]
 
 
@@ -415,7 +418,27 @@ class JointFilter:
             for row in end
         )
         cut = np.split(out, [5, 10, 13, 16], axis=2)
-        return Course(cut[0], cut[1], cut[2], cut[3], cut[4], last)
+        return Course(
+            cut[0], cut[1], cut[2], cut[3], cut[4], used_drive=bool(used[0, 0, 0]), last=last
+        )
+
+    def expected(self, course: Course, readings: FloatArray) -> FloatArray:
+        """Readings (n, 6) as the first filter of a course expects them after each sample.
+
+        The drive is the given one plus the disturbance of the motor, which is all of it where the
+        filter does not read the drive and it is given as zero.
+        """
+        values, last = np.array(list(self.values.values())), self.estimate(course.last[0])
+        names = self.model.parameter_names
+        for name, (value, _) in last.items():
+            values[names.index(name)] = value
+        motor = course.disturbance[0, :, 0]
+        drive = np.where(course.used_drive, np.nan_to_num(readings[:, 0]), 0.0) + motor
+        inputs = np.zeros((3, len(drive)))
+        inputs[0] = drive
+        run = self.functions.disturbed.map(len(drive))
+        found = run(course.states[0].T, inputs, values, course.disturbance[0, :, 1:].T)[1]
+        return np.column_stack([drive, np.array(found).T])
 
     def estimate(self, state: FilterState) -> dict[str, tuple[float, float]]:
         """Value and standard deviation of each free parameter."""

@@ -5,7 +5,8 @@ on a file.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, final
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +15,7 @@ from identification.data.joint_file import Joint
 from identification.data.record import Record
 from identification.errors import InputError
 from identification.online.options import OnlineOptions, prepared
+from identification.online.verdict import CURRENT_OR_FRICTION, HELD, MISSING, PLANT
 from irj_fmu.estimator.healthy import online_readings
 
 if TYPE_CHECKING:
@@ -21,6 +23,9 @@ if TYPE_CHECKING:
     from identification.faults.detector import Fault
 
 FloatArray = npt.NDArray[np.float64]
+
+DERIVED: Final = {2: 1, 4: 3}
+"""Velocities and the positions that they are derived from where they are not measured."""
 
 
 def measured_sensors(record: Record) -> tuple[bool, ...]:
@@ -79,3 +84,72 @@ def judged(
 ) -> BankTrack:
     """What a bank says about a record, stamps and missing readings as they are."""
     return bank.run(record.time, np.array(online_readings(record, joint, faults)[0]))
+
+
+@final
+@dataclass(frozen=True)
+class Judgement:
+    """A bank's verdicts on the samples of an evenly sampled record.
+
+    Attributes
+    ----------
+    events : tuple of dict
+        ``time`` [s], ``fault`` (code as the estimator's), ``text``.
+    failed : (n, 6) bool array
+        Where a reading is not to be used.
+    readings : (n, 6) array
+        Readings with failed ones replaced.
+    """
+
+    events: tuple[dict[str, Any], ...]
+    failed: npt.NDArray[np.bool_]
+    readings: FloatArray
+
+
+def judgement(
+    bank: FaultBank, record: Record, even: Record, joint: Joint, faults: Sequence[Fault] = ()
+) -> Judgement:
+    """What a bank says about a record, brought to the samples of its even form.
+
+    Parameters
+    ----------
+    bank : FaultBank
+    record : Record
+        As read, missing readings and uneven stamps as they are.
+    even : Record
+        What the estimator replays.
+    joint : Joint
+    faults : sequence of Fault
+        Tried on purpose.
+    """
+    from identification.faults.core import SENSORS
+    from identification.faults.types import Verdict
+
+    track = judged(bank, record, joint, faults)
+    at = np.clip(np.searchsorted(record.time, even.time + 1e-9) - 1, 0, len(record) - 1)
+    failed, readings = track.failed[at], track.readings[at]
+    for velocity, position in DERIVED.items():
+        if velocity not in bank.sensors:
+            failed[:, velocity] = failed[:, position]
+            change = np.gradient(readings[:, position], even.time)
+            readings[:, velocity] = change
+    events = []
+    for event in track.events:
+        first = SENSORS.index(event.sensors[0]) + 1 if event.sensors else 0
+        code = {
+            Verdict.SENSOR: first,
+            Verdict.DROPOUT: MISSING + first,
+            Verdict.CURRENT_OR_FRICTION: CURRENT_OR_FRICTION,
+            Verdict.PLANT: PLANT,
+        }.get(event.verdict, HELD)
+        if event.verdict is not Verdict.RECOVERED:
+            events.append(
+                {
+                    "time": float(record.time[event.sample]),
+                    "first": float(record.time[event.first]),
+                    "fault": code,
+                    "sensors": list(event.sensors),
+                    "verdict": event.verdict,
+                }
+            )
+    return Judgement(tuple(events), failed, readings)
