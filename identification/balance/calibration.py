@@ -15,10 +15,12 @@ import numpy as np
 import numpy.typing as npt
 
 from casadi_models import JointModel
-from casadi_models.term import CALIBRATION
+from casadi_models.hold import CLOCKS, HOLD_DELAY, HOLD_NAME, UNKNOWNS
 from identification.balance.balances import Balances, balances_of
+from identification.balance.clocks import MOST_SKEW, SIGNAL, USUAL_SKEW, at_stamps, one_way
 from identification.balance.sensing import Sensing
 from identification.balance.weak import WeakRecord
+from identification.data.prepare import shift_channel
 from identification.data.record import Record
 
 FloatArray = npt.NDArray[np.float64]
@@ -27,6 +29,8 @@ ROUNDS: Final = 8
 """Gauss-Newton steps for the unknowns of one record: the balances are nearly straight lines in
 them.
 """
+SHIFTED: Final = 0.01
+"""Skew below which a record is left as it is [samples]."""
 SETTLED: Final = 1e-4
 """Size of a step, as a share of the residual's norm, at which these steps end: far below what
 one row tells.
@@ -71,14 +75,32 @@ class Found:
 
 
 def unknowns_of(model: JointModel, sensing: Sensing) -> tuple[str, ...]:
-    """Calibration unknowns that a model on these channels has: a zero between the encoders
-    wherever their difference is a twist.
+    """Calibration unknowns that a model on these channels has.
+
+    A zero between the encoders, and a skew of theirs, wherever their difference is a twist; a skew
+    of the torque sensor where two balances share its reading; that of the drive where a torque or
+    a twist is measured beside it: with the motion alone it would be friction. A channel whose delay
+    the model names has no skew.
     """
-    return (
-        ("link_encoder_zero",)
-        if model.is_elastic and sensing.both_positions and not sensing.clamped_link
-        else ()
-    )
+    twist = model.is_elastic and sensing.both_positions and not sensing.clamped_link
+    torque = sensing.has_torque and not sensing.clamped_link
+    there = {
+        "link_encoder_zero": twist,
+        "link_encoder_skew": twist,
+        "torque_sensor_skew": torque and len(sensing.balances) > 1,
+        HOLD_NAME: (torque or twist) and HOLD_DELAY in model.effects,
+    }
+    return _without_named(model, tuple(n for n, is_there in there.items() if is_there))
+
+
+def named_late(model: JointModel) -> JointModel:
+    """The model without the skews of channels whose delay it names."""
+    return replace(model, calibration=_without_named(model, model.calibration))
+
+
+def _without_named(model: JointModel, names: tuple[str, ...]) -> tuple[str, ...]:
+    named = {t.place for t in model.terms if t.effect.is_delay and t.label != HOLD_DELAY}
+    return tuple(n for n in names if n not in CLOCKS or CLOCKS[n].place not in named)
 
 
 def of_run(name: str, record: WeakRecord) -> str:
@@ -104,9 +126,36 @@ def names_of_runs(model: JointModel, records: Sequence[WeakRecord]) -> tuple[str
 def values_on(
     model: JointModel, record: WeakRecord, values: Mapping[str, float]
 ) -> Mapping[str, float]:
-    """Values with those of this record in the place of the common ones."""
+    """Values with those of this record in the place of the common ones, skews less the whole
+    samples that were taken off it.
+    """
     own = {n: values[of_run(n, record)] for n in model.calibration if of_run(n, record) in values}
-    return {**values, **own} if own else values
+    return at_stamps(model, record, {**values, **own} if own else values)
+
+
+def limits_of_runs(
+    model: JointModel, records: Sequence[WeakRecord]
+) -> dict[str, tuple[float, float]]:
+    """Bounds of all unknowns of all records: a skew is a few samples."""
+    out = dict.fromkeys(names_of_runs(model, records), (-np.inf, np.inf))
+    for w in records:
+        most = MOST_SKEW * w.grid.dt
+        out.update({of_run(n, w): (-most, most) for n in model.calibration if n in CLOCKS})
+    return out
+
+
+def usual_sizes(model: JointModel, records: Sequence[WeakRecord]) -> dict[str, float]:
+    """Standard deviation of the unknowns before the records are asked, for those that have one [s].
+
+    Where nothing tells a skew from friction (two encoders without torque sensor), it stays as small
+    as the friction, which is never negative, allows.
+    """
+    return {
+        of_run(n, w): USUAL_SKEW * w.grid.dt
+        for w in records
+        for n in model.calibration
+        if n in CLOCKS
+    }
 
 
 def start_values(
@@ -120,7 +169,9 @@ def start_values(
     """
     out = {}
     for w in records:
-        if not model.calibration:
+        late = {p: w.shifts.get(p, 0.0) for p in SIGNAL}
+        out.update({of_run(n, w): late[CLOCKS[n].place] for n in model.calibration if n in CLOCKS})
+        if "link_encoder_zero" not in model.calibration:
             continue
         a = w.averaged
         twist = a["motor_position"] - a["link_position"]
@@ -133,10 +184,13 @@ def start_values(
             np.sign(v),
         ]
         matrix = np.column_stack(columns)
-        found = np.linalg.lstsq(
-            matrix / np.maximum(np.linalg.norm(matrix, axis=0), 1e-300), twist, rcond=1e-9
-        )[0]
-        out[of_run("link_encoder_zero", w)] = -float(found[0]) / np.sqrt(w.rows)
+        norms = np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
+        found = np.linalg.lstsq(matrix / norms, twist, rcond=1e-9)[0] / norms
+        out[of_run("link_encoder_zero", w)] = -float(found[0])
+        if "link_encoder_skew" in model.calibration:
+            most = MOST_SKEW * w.grid.dt
+            start = late["link_position_sensor"] + float(found[2])
+            out[of_run("link_encoder_skew", w)] = min(max(start, -most), most)
     return out
 
 
@@ -144,15 +198,17 @@ def without_calibration(
     record: Record, model: JointModel, values: Mapping[str, float], run: str
 ) -> Record:
     """The record with what the calibration of this run, or the common one, says taken off its
-    readings.
+    readings; the hold of the drive stays.
     """
-    zero = "link_encoder_zero"
-    if zero not in model.calibration:
-        return record
-    off = values.get(f"{zero}[{run}]", values[zero])
-    return replace(
-        record, channels={**record.channels, "link_position": record["link_position"] - off}
-    )
+    off = {n: values.get(f"{n}[{run}]", values[n]) for n in model.calibration if n != HOLD_NAME}
+    for name, value in off.items():
+        sensor = UNKNOWNS[name].sensor
+        if UNKNOWNS[name].what == "zero":
+            channels = {**record.channels, sensor: record[sensor] - value}
+            record = replace(record, channels=channels)
+        elif abs(value) > SHIFTED * record.dt:
+            record = shift_channel(record, sensor, value)
+    return record
 
 
 def settled(
@@ -181,15 +237,21 @@ def _fitted_on_itself(
     balances: Balances, record: WeakRecord, values: Mapping[str, float], names: Sequence[str]
 ) -> dict[str, float]:
     """Unknowns of one record by least squares, each balance in units of what it leaves at that
-    step.
+    step; a skew that the record does not tell stays as in the values.
     """
     now = {n: float(values[n]) for n in names}
-    seen = [b for b in balances.balances if b not in record.masked]
+    turning = ~one_way(record) if any(n in CLOCKS for n in names) else np.False_
+    rows = {b: record.taking(b) & ~turning for b in balances.balances}
+    usual = usual_sizes(balances.model, [record])
+    known = np.diag([1 / usual[of_run(n, record)] if n in CLOCKS else 0.0 for n in names])
+    usually = dict(now)
+    seen = [b for b in balances.balances if rows[b].any()]
     for _ in range(ROUNDS):
-        found = balances.evaluate(record, {**values, **now})
-        scale = {b: max(float(np.sqrt(np.mean(found[b][0] ** 2))), 1e-300) for b in seen}
-        r = np.concatenate([found[b][0] / scale[b] for b in seen])
-        j = np.concatenate([found[b][1] / scale[b] for b in seen])
+        found = balances.evaluate(record, at_stamps(balances.model, record, {**values, **now}))
+        scale = {b: max(float(np.sqrt(np.mean(found[b][0][rows[b]] ** 2))), 1e-300) for b in seen}
+        moved = np.array([now[n] - usually[n] for n in names])
+        r = np.concatenate([*(found[b][0][rows[b]] / scale[b] for b in seen), known @ moved])
+        j = np.concatenate([*(found[b][1][rows[b]] / scale[b] for b in seen), known])
         norms = np.linalg.norm(j, axis=0)
         if not np.any(norms) or not np.all(np.isfinite(j)):
             break
@@ -215,7 +277,7 @@ def calibration_found(
     out = []
     for run, w in enumerate(records):
         for name in model.calibration:
-            what, sensor = CALIBRATION[name].what, CALIBRATION[name].sensor
+            what, sensor = UNKNOWNS[name].what, UNKNOWNS[name].sensor
             own = of_run(name, w)
             out.append(
                 Found(
@@ -235,11 +297,14 @@ __all__ = [
     "bare",
     "calibration_found",
     "is_of_run",
+    "limits_of_runs",
+    "named_late",
     "names_of_runs",
     "of_run",
     "settled",
     "start_values",
     "unknowns_of",
+    "usual_sizes",
     "values_on",
     "without_calibration",
 ]

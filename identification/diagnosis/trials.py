@@ -188,7 +188,7 @@ def make_base(solution: Solution, data: Dataset) -> Base:
     )
     smoothing = model.named("smoothing")
     free = [n for n in solution.free if n not in solution.at_bound or n in smoothing]
-    free += names_of_runs(model, data.train)
+    free += [n for n in names_of_runs(model, data.train) if n not in solution.at_bound]
     signs = _inward_signs(solution, data)
     names = [*free, *signs]
     balances = balances_of(model, data.sensing, wrt=bare(names))

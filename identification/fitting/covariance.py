@@ -115,6 +115,23 @@ def errors_of_blocks(
     )
 
 
+def known_errors(jacobian: FloatArray, prior: FloatArray) -> FloatArray:
+    """Standard error that what is known beforehand leaves in each parameter: blocks of time do not
+    tell of it.
+
+    Parameters
+    ----------
+    jacobian : (n, p) array
+        All rows, those of the prior among them.
+    prior : (k, p) array
+        Those of the prior.
+    """
+    if not len(prior):
+        return np.zeros(jacobian.shape[1])
+    inverse = np.linalg.pinv(jacobian.T @ jacobian, rcond=RANK, hermitian=True)
+    return np.asarray(np.linalg.norm(prior @ inverse, axis=0), dtype=np.float64)
+
+
 def follows(scores: FloatArray, sizes: FloatArray, alpha: float) -> bool:
     """True where the slope over one column is positive in most blocks: one-sided t over blocks.
 

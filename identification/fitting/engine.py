@@ -15,7 +15,7 @@ import numpy.typing as npt
 from casadi_models import JointModel
 from casadi_models.term import HANGING, LOAD_COMPLIANCE
 from identification.balance.balances import Balances, balances_of
-from identification.balance.calibration import bare, is_of_run, names_of_runs
+from identification.balance.calibration import bare, is_of_run, names_of_runs, usual_sizes
 from identification.balance.dataset import Dataset, load_dataset, prepared_model, weak_record
 from identification.balance.excitation import attenuation
 from identification.balance.stacked import (
@@ -29,7 +29,7 @@ from identification.balance.stacked import (
     taking_part,
 )
 from identification.errors import InputError
-from identification.fitting.covariance import block_errors, correlations
+from identification.fitting.covariance import block_errors, correlations, known_errors
 from identification.fitting.start_values import bounds_of, starts
 from identification.fitting.weak_form import WeakForm
 
@@ -178,7 +178,7 @@ def _fitted(
     values.update({n: v for n, v in fixed.items() if v is not None})
     limits = bounds_of(model, known, data)
     shapes = {p.name for p in model.parameters if p.is_shape}
-    runs = names_of_runs(model, data.train)
+    runs, usual = names_of_runs(model, data.train), usual_sizes(model, data.train)
     apart = {*fixed, *held, *model.calibration, *model.named("range")}
     free = [
         *(n for n in model.parameter_names if n not in apart),
@@ -202,13 +202,14 @@ def _fitted(
         tell(("first pass", "second pass")[number], 0.2 + 0.35 * number)
         sigma = _sigmas(model, data, values)
         weights = row_weights(balances, data, values, sigma, data.train)
-        values, used = WeakForm(balances, data, values, tuple(free), weights).fitted(
+        values, used = WeakForm(balances, data, values, tuple(free), weights, usual).fitted(
             limits, iterations
         )
     sigma = _sigmas(model, data, values)
     weights = row_weights(balances, data, values, sigma, data.train)
     tell("standard errors", 0.9)
-    return _with_errors(WeakForm(balances, data, values, tuple(free), weights), limits, sigma, used)
+    problem = WeakForm(balances, data, values, tuple(free), weights, usual)
+    return _with_errors(problem, limits, sigma, used)
 
 
 def _sigmas(model: JointModel, data: Dataset, values: Mapping[str, float]) -> dict[str, float]:
@@ -293,9 +294,16 @@ def _with_errors(
     balances, data, values, free = problem.balances, problem.data, problem.values, problem.free
     weights = {b: np.asarray(w, dtype=np.float64) for b, w in problem.weights.items()}
     stacked = problem.stacked(np.array([values[n] for n in free]))
-    j = np.concatenate([stacked.jacobian[b] * weights[b][:, None] for b in balances.balances])
-    r = np.concatenate([stacked.residual[b] * weights[b] for b in balances.balances])
-    block = np.tile(stacked.block, len(balances.balances))
+    prior = problem.prior
+    j = np.concatenate(
+        [*(stacked.jacobian[b] * weights[b][:, None] for b in balances.balances), prior]
+    )
+    x = np.array([values[n] for n in free])
+    r = np.concatenate([*(stacked.residual[b] * weights[b] for b in balances.balances), prior @ x])
+    # what is known beforehand belongs to no block of time: it scatters by itself
+    block = np.concatenate(
+        [np.tile(stacked.block, len(balances.balances)), np.full(len(prior), -1)]
+    )
     norms = np.linalg.norm(j, axis=0)
     smoothing = balances.model.named("smoothing")
     at_bound = [
@@ -326,7 +334,8 @@ def _with_errors(
         errors = block_errors(scaled, r, block)
         pulled = {name.replace(" ", "_"): share for name, share in attenuation(data).items()}
         biases = np.array([pulled.get(free[i], 0.0) * values[free[i]] for i in index.tolist()])
-        size = None if errors is None else np.hypot(errors / norms[index], biases)
+        unsure = known_errors(scaled, prior[:, index] / norms[index])
+        size = None if errors is None else np.hypot(np.hypot(errors, unsure) / norms[index], biases)
         spread, corr = correlations(scaled.T @ scaled)
         corr[:, [is_of_run(free[i]) for i in index.tolist()]] = 0.0
         for k, i in enumerate(index.tolist()):

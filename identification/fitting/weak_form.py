@@ -4,7 +4,7 @@ move."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Final, final
 
@@ -57,6 +57,8 @@ class WeakForm:
         The parameters that move, in the order of the problem's vector.
     weights : mapping of str to float or (rows,) array
         1/sigma of each balance, or of each of its rows.
+    usual : mapping of str to float
+        Standard deviation about zero of parameters that are known to be small: a row each.
     """
 
     balances: Balances
@@ -64,6 +66,16 @@ class WeakForm:
     values: Mapping[str, float]
     free: tuple[str, ...]
     weights: Mapping[str, float | FloatArray]
+    usual: Mapping[str, float] = field(default_factory=dict)
+
+    @cached_property
+    def prior(self) -> FloatArray:
+        """Rows of what is known of single parameters, (known, free): 1/sigma in their column."""
+        known = [i for i, n in enumerate(self.free) if n in self.usual]
+        out = np.zeros((len(known), len(self.free)))
+        for row, i in enumerate(known):
+            out[row, i] = 1 / self.usual[self.free[i]]
+        return out
 
     @cached_property
     def _bare(self) -> Balances:
@@ -101,15 +113,23 @@ class WeakForm:
         return Stacked(found.residual, jacobian, found.block, found.taking)
 
     def residual(self, x: FloatArray) -> FloatArray:
-        """Weighted rows, one balance after the other."""
+        """Weighted rows, one balance after the other, then those of the prior."""
         rows = stack(self._bare, self.data.train, self.at(x)).residual
-        return np.concatenate([rows[b] * self.weights[b] for b in self.balances.balances])
+        return np.concatenate(
+            [*(rows[b] * self.weights[b] for b in self.balances.balances), self.prior @ x]
+        )
 
     def jacobian(self, x: FloatArray) -> FloatArray:
         """Their derivative, (rows, free)."""
         found = self.stacked(x).jacobian
         return np.concatenate(
-            [found[b] * np.atleast_1d(self.weights[b])[:, None] for b in self.balances.balances]
+            [
+                *(
+                    found[b] * np.atleast_1d(self.weights[b])[:, None]
+                    for b in self.balances.balances
+                ),
+                self.prior,
+            ]
         )
 
     def fitted(
