@@ -17,7 +17,16 @@ import numpy.typing as npt
 from casadi_models import JointModel
 from casadi_models.hold import CLOCKS, HOLD_DELAY, HOLD_NAME, UNKNOWNS
 from identification.balance.balances import Balances, balances_of
-from identification.balance.clocks import MOST_SKEW, SIGNAL, USUAL_SKEW, at_stamps, one_way
+from identification.balance.clocks import (
+    ENCODERS,
+    MOST_SKEW,
+    SIGNAL,
+    SURE,
+    USUAL_SKEW,
+    at_stamps,
+    lateness,
+    one_way,
+)
 from identification.balance.sensing import Sensing
 from identification.balance.weak import WeakRecord
 from identification.data.prepare import shift_channel
@@ -28,6 +37,10 @@ FloatArray = npt.NDArray[np.float64]
 ROUNDS: Final = 8
 """Gauss-Newton steps for the unknowns of one record: the balances are nearly straight lines in
 them.
+"""
+TOLD: Final = 0.3
+"""Standard error of a skew from which on it is only bounded [samples]: the lag from which on clocks
+count as out of step.
 """
 SHIFTED: Final = 0.01
 """Skew below which a record is left as it is [samples]."""
@@ -53,6 +66,8 @@ class Found:
         Reading at the true zero, or the time by which the channel is late [unit].
     stderr : float or None
     unit : str
+    bounded : bool
+        True for a skew that these records hardly tell: only its band is worth a word.
     """
 
     what: str
@@ -61,6 +76,7 @@ class Found:
     value: float
     stderr: float | None
     unit: str
+    bounded: bool = False
 
     def as_json(self) -> dict[str, Any]:
         """The shape of `improve --json`."""
@@ -144,18 +160,42 @@ def limits_of_runs(
     return out
 
 
-def usual_sizes(model: JointModel, records: Sequence[WeakRecord]) -> dict[str, float]:
-    """Standard deviation of the unknowns before the records are asked, for those that have one [s].
+def within_limits(
+    model: JointModel, records: Sequence[WeakRecord], values: Mapping[str, float]
+) -> tuple[str, ...]:
+    """Unknowns of all records that do not stand at a bound: those that still move."""
+    limits = limits_of_runs(model, records)
+    return tuple(n for n, (low, high) in limits.items() if low < values[n] < high)
 
-    Where nothing tells a skew from friction (two encoders without torque sensor), it stays as small
-    as the friction, which is never negative, allows.
+
+def usual(
+    model: JointModel, records: Sequence[WeakRecord], *, torque: bool
+) -> dict[str, tuple[float, float]]:
+    """Middle and standard deviation of the unknowns before the balances are asked [s, rad].
+
+    Where nothing tells a skew from friction (two encoders without torque sensor), it stays as near
+    to what friction cannot explain as the friction, which is never negative, allows.
     """
-    return {
-        of_run(n, w): USUAL_SKEW * w.grid.dt
-        for w in records
-        for n in model.calibration
-        if n in CLOCKS
-    }
+    out, begin = {}, start_values(model, records, torque=torque)
+    for w in records:
+        for n in model.calibration:
+            if n not in CLOCKS:
+                # the twist passes its zero somewhere, or as far from it as it moves
+                a = w.averaged
+                late = begin.get(of_run("link_encoder_skew", w), 0.0) - w.shifts.get(
+                    "link_position_sensor", 0.0
+                )
+                twist = a["motor_position"] - a["link_position"] - late * a["link_velocity"]
+                out[of_run(n, w)] = begin[of_run(n, w)], max(float(np.ptp(twist)), 1e-12)
+                continue
+            middle, place = 0.0, CLOCKS[n].place
+            if place in ENCODERS and not torque:
+                late, error, _ = lateness(w, place, torque=torque)
+                if abs(late) > SURE * error:
+                    most = MOST_SKEW * w.grid.dt
+                    middle = min(max(w.shifts.get(place, 0.0) + late, -most), most)
+            out[of_run(n, w)] = middle, USUAL_SKEW * w.grid.dt
+    return out
 
 
 def start_values(
@@ -242,9 +282,9 @@ def _fitted_on_itself(
     now = {n: float(values[n]) for n in names}
     turning = ~one_way(record) if any(n in CLOCKS for n in names) else np.False_
     rows = {b: record.taking(b) & ~turning for b in balances.balances}
-    usual = usual_sizes(balances.model, [record])
-    known = np.diag([1 / usual[of_run(n, record)] if n in CLOCKS else 0.0 for n in names])
-    usually = dict(now)
+    size = USUAL_SKEW * record.grid.dt
+    known = np.diag([1 / size if n in CLOCKS else 0.0 for n in names])
+    usually, limits = dict(now), limits_of_runs(balances.model, [record])
     seen = [b for b in balances.balances if rows[b].any()]
     for _ in range(ROUNDS):
         found = balances.evaluate(record, at_stamps(balances.model, record, {**values, **now}))
@@ -258,7 +298,7 @@ def _fitted_on_itself(
         scaled = j / np.where(norms > 0, norms, 1.0)
         step = np.linalg.lstsq(scaled, -r, rcond=1e-9)[0]
         now = {
-            n: now[n] + float(s) / (norm or 1.0)
+            n: float(np.clip(now[n] + float(s) / (norm or 1.0), *limits[of_run(n, record)]))
             for n, s, norm in zip(names, step, norms, strict=True)
         }
         if float(np.linalg.norm(scaled @ step)) < SETTLED * float(np.linalg.norm(r)):
@@ -279,14 +319,16 @@ def calibration_found(
         for name in model.calibration:
             what, sensor = UNKNOWNS[name].what, UNKNOWNS[name].sensor
             own = of_run(name, w)
+            error = stderr.get(own)
             out.append(
                 Found(
                     what,
                     sensor,
                     run,
                     float(values.get(own, values[name])),
-                    stderr.get(own),
+                    error,
                     units[name],
+                    name in CLOCKS and error is not None and error > TOLD * w.grid.dt,
                 )
             )
     return tuple(out)
@@ -304,7 +346,8 @@ __all__ = [
     "settled",
     "start_values",
     "unknowns_of",
-    "usual_sizes",
+    "usual",
+    "within_limits",
     "values_on",
     "without_calibration",
 ]

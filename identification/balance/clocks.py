@@ -1,12 +1,15 @@
-"""Channels that are late against the motor encoder: whole samples are taken off the readings
-before the balances are made, what is left of a sample is fitted with the model.
+"""Channels that are late against the motor encoder: the lateness is taken off the readings before
+the balances are made, what is left of it is fitted with the model.
 
-A skew of several samples is no small number: its Taylor series in the model would change the
-inertias by percents. A shift by whole samples is exact and leaves the noise as it is.
+A skew of a sample is no small number: its Taylor series in the model would change the inertias, and
+the second order of a torque, which no derivative shows, the skew itself. An encoder is shifted by
+whole samples, which leaves its noise as it is, and has the second order in the model; torques are
+interpolated: their noise changes above a quarter of the sampling rate, which no kernel passes.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from typing import Final
 
@@ -36,8 +39,12 @@ cycle. It decides only what the records do not tell.
 """
 SHIFTS: Final = 4
 """Rounds in which shifts are looked for: one channel's comes out wrong while another is late."""
+NEAR: Final = 0.05
+"""Lateness that is left to the model [samples]: its square is under a hundredth."""
+ENCODERS: Final = frozenset({"link_position_sensor"})
+"""Places whose readings are shifted by whole samples."""
 SURE: Final = 3.0
-"""Standard errors by which a channel must be later than half a sample."""
+"""Standard errors by which a channel must be late (an encoder: later than half a sample)."""
 ONE_WAY: Final = 1e-3
 """Share of a row's kernel in which the joint may move the other way."""
 FEW: Final = 0.1
@@ -73,26 +80,43 @@ def at_stamps(
 
 
 def shifted(
-    signals: Mapping[str, FloatArray], segments: tuple[slice, ...], late: Mapping[str, int]
+    signals: Mapping[str, FloatArray], segments: tuple[slice, ...], late: Mapping[str, float]
 ) -> tuple[dict[str, FloatArray], tuple[slice, ...]]:
-    """Signals of late sensors at their true sample, and the stretches in which all are there.
+    """Signals of late sensors at their true time, and the stretches in which all are there.
 
     Parameters
     ----------
     signals : mapping of str to (n,) array
     segments : tuple of slice
-    late : mapping of str to int
-        Samples by which the sensor of a place is late.
+    late : mapping of str to float
+        Samples by which the sensor of a place is late; a part of a sample by the cubic through four
+        readings.
     """
-    out = {**signals, **{SIGNAL[p]: np.roll(signals[SIGNAL[p]], -k) for p, k in late.items()}}
-    first, last = min((0, *late.values())), max((0, *late.values()))
-    return out, tuple(slice(s.start - first, max(s.stop - last, s.start - first)) for s in segments)
+    out = {**signals, **{SIGNAL[p]: _moved(signals[SIGNAL[p]], k) for p, k in late.items()}}
+    first = math.ceil(max((0.0, *(1 - k for k in late.values()))))
+    last = math.ceil(max((0.0, *(2 + k for k in late.values()))))
+    return out, tuple(slice(s.start + first, max(s.stop - last, s.start + first)) for s in segments)
+
+
+def _moved(x: FloatArray, late: float) -> FloatArray:
+    whole = math.floor(late)
+    f = late - whole
+    if f == 0:
+        return np.roll(x, -whole)
+    weights = (
+        -f * (f - 1) * (f - 2) / 6,
+        (f + 1) * (f - 1) * (f - 2) / 2,
+        -(f + 1) * f * (f - 2) / 2,
+        (f + 1) * f * (f - 1) / 6,
+    )
+    parts = (w * np.roll(x, 1 - whole - i) for i, w in enumerate(weights))
+    return np.asarray(sum(parts), dtype=np.float64)
 
 
 def in_time(
-    make: Callable[[Mapping[str, int]], WeakRecord], places: Iterable[str], torque: bool
+    make: Callable[[Mapping[str, float]], WeakRecord], places: Iterable[str], torque: bool
 ) -> WeakRecord:
-    """A record whose late channels are shifted by whole samples.
+    """A record whose late channels are shifted.
 
     Parameters
     ----------
@@ -103,13 +127,14 @@ def in_time(
     torque : bool
         Whether the torque of the link is measured.
     """
-    shifts: dict[str, int] = {}
+    shifts: dict[str, float] = {}
     made, wanted = make(shifts), tuple(places)
     for _ in range(SHIFTS):
-        dt, moved = made.grid.dt, dict(shifts)
+        moved = dict(shifts)
         for place in wanted:
-            late = _late(made, place, torque=torque) / dt
-            moved[place] = moved.get(place, 0) + round(late)
+            late = _late(made, place, torque=torque) / made.grid.dt
+            step = round(late) if place in ENCODERS else late if abs(late) > NEAR else 0.0
+            moved[place] = moved.get(place, 0.0) + step
         if moved == shifts:
             break
         shifts = {p: k for p, k in moved.items() if k}
@@ -126,8 +151,16 @@ def one_way(record: WeakRecord) -> npt.NDArray[np.bool_]:
 
 
 def _late(made: WeakRecord, place: str, *, torque: bool) -> float:
-    """Time by which a channel is certainly late [s]: reading = what it follows from, less the time
-    times its rate.
+    """Time by which a channel is certainly late [s]."""
+    late, error, _ = lateness(made, place, torque=torque)
+    least = 0.5 * made.grid.dt if place in ENCODERS else 0.0
+    sure = abs(late) - SURE * error > least
+    return late if sure else 0.0
+
+
+def lateness(made: WeakRecord, place: str, *, torque: bool) -> tuple[float, float, float]:
+    """Time by which a channel is late, its standard error, and the part of it that viscous friction
+    may be [s]: reading = what it follows from, less the time times its rate.
     """
     kept = one_way(made)
     a = {n: x[kept] for n, x in made.averaged.items()}
@@ -136,22 +169,21 @@ def _late(made: WeakRecord, place: str, *, torque: bool) -> float:
         q, v = a[f"{side}_position"], a[f"{side}_velocity"]
         return [np.ones(len(v)), v, np.sign(v), a[f"{side}_acceleration"], np.sin(q), np.cos(q)]
 
-    if place == "link_position_sensor":
-        effort, twist = a["torque" if torque else "drive"], a["motor_position"] - a["link_position"]
-        one, v, _, bend, *_ = motion("link")
-        late, error = _slope(twist, [one, effort, bend, np.sign(v)], v)
-        if not torque:
-            # the twist under viscous friction is such a lateness too
-            friction, _ = _slope(effort, [one, np.sign(v), bend], v)
-            soft, _ = _slope(twist, [one, v, bend], effort)
-            error = error + abs(friction * soft) / SURE
-    elif place == "torque_sensor":
-        late, error = _slope(a["torque"], motion("link"), -a["torque_rate"])
-    else:
+    if place == "torque_sensor":
+        return *_slope(a["torque"], motion("link"), -a["torque_rate"]), 0.0
+    if place == "drive":
         load = [a["torque"]] if torque else []
-        late, error = _slope(a["drive"], [*motion("motor"), *load], -a["drive_rate"])
-    sure = abs(late) - SURE * error > 0.5 * made.grid.dt
-    return late if sure else 0.0
+        return *_slope(a["drive"], [*motion("motor"), *load], -a["drive_rate"]), 0.0
+    effort, twist = a["torque" if torque else "drive"], a["motor_position"] - a["link_position"]
+    one, v, _, bend, *_ = motion("link")
+    late, error = _slope(twist, [one, effort, bend, np.sign(v)], v)
+    if torque:
+        return late, error, 0.0
+    # the twist under viscous friction is such a lateness too
+    friction, _ = _slope(effort, [one, np.sign(v), bend], v)
+    soft, _ = _slope(twist, [one, v, bend], effort)
+    apart = min(abs(friction * soft), abs(late))
+    return math.copysign(abs(late) - apart, late), error, apart
 
 
 def _slope(values: FloatArray, others: list[FloatArray], column: FloatArray) -> tuple[float, float]:
@@ -177,6 +209,7 @@ __all__ = [
     "at_stamps",
     "carrier",
     "in_time",
+    "lateness",
     "one_way",
     "places_of",
     "shifted",

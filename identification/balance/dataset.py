@@ -233,7 +233,7 @@ def weak_record(
         for c, level in noise.items()
     }
 
-    def made_with(shifts: Mapping[str, int]) -> WeakRecord:
+    def made_with(shifts: Mapping[str, float]) -> WeakRecord:
         moved, parts = shifted(signals, segments, shifts)
         made = prepare(
             record.time,

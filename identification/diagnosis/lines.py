@@ -190,7 +190,7 @@ def at_every_sample(
         record = record.resampled()
     signals, dt = signals_of(record, joint, sensing), record.dt
     long = max(7, 2 * round(SLOW_KERNEL / dt / 2) + 1)
-    late = {} if like is None else {p: round(x / dt) for p, x in like.shifts.items()}
+    late = {} if like is None else {p: x / dt for p, x in like.shifts.items()}
     signals, parts = shifted(signals, tuple(record.segments()), late)
     segments = tuple(s for s in parts if s.stop - s.start > 2 * max(long, SMOOTHED[-1]))
     starts = np.concatenate([[0], np.cumsum([s.stop - s.start for s in segments])]).astype(np.int64)

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from casadi_models import Effect
 from identification.balance.balances import Balances, balances_of
-from identification.balance.calibration import bare, names_of_runs, settled
+from identification.balance.calibration import bare, names_of_runs, settled, within_limits
 from identification.balance.dataset import HOLD_NAME
 from identification.balance.weak import WeakRecord
 from identification.diagnosis.candidates import Candidate, NotTestable, shape_grid
@@ -214,7 +214,7 @@ def make_base(solution: Solution, data: Dataset) -> Base:
     )
     if data.held_out:
         held = stack(balances, data.held_out, solution.values, names)
-        own = names_of_runs(model, data.held_out)
+        own = within_limits(model, data.held_out, solution.values)
         apart = flatten(
             stack(
                 balances_of(model, data.sensing, wrt=bare(own)), data.held_out, solution.values, own

@@ -32,7 +32,13 @@ NORMAL: Final = 1.959964
 """The normal distribution's bound of 95 %."""
 
 
-def block_errors(jacobian: FloatArray, residual: FloatArray, block: IntArray) -> FloatArray | None:
+def block_errors(
+    jacobian: FloatArray,
+    residual: FloatArray,
+    block: IntArray,
+    noise: tuple[FloatArray, FloatArray] | None = None,
+    whole: FloatArray | None = None,
+) -> FloatArray | None:
     """Standard error of each parameter of a least-squares fit whose rows depend on each other
     within blocks.
 
@@ -48,6 +54,10 @@ def block_errors(jacobian: FloatArray, residual: FloatArray, block: IntArray) ->
         Weighted, at the fit.
     block : (n,) int array
         Block of each row, -1 for none: such rows take part in the fit only.
+    noise : ((blocks, p, p) array, (blocks, p) array), optional
+        What noise of the columns adds to the products of each block; taken off.
+    whole : (p, p) array, optional
+        Normal matrix of all rows, that of the noise taken off.
 
     Returns
     -------
@@ -60,7 +70,9 @@ def block_errors(jacobian: FloatArray, residual: FloatArray, block: IntArray) ->
     parts = np.split(order, np.searchsorted(block[order], numbers))[1:]
     grams = np.array([jacobian[rows].T @ jacobian[rows] for rows in parts])
     scores = np.array([jacobian[rows].T @ residual[rows] for rows in parts])
-    return errors_of_blocks(grams, scores, jacobian.T @ jacobian)
+    if noise is not None:
+        grams, scores = grams - noise[0], scores - noise[1]
+    return errors_of_blocks(grams, scores, jacobian.T @ jacobian if whole is None else whole)
 
 
 def errors_of_blocks(
@@ -115,20 +127,20 @@ def errors_of_blocks(
     )
 
 
-def known_errors(jacobian: FloatArray, prior: FloatArray) -> FloatArray:
+def known_errors(whole: FloatArray, prior: FloatArray) -> FloatArray:
     """Standard error that what is known beforehand leaves in each parameter: blocks of time do not
     tell of it.
 
     Parameters
     ----------
-    jacobian : (n, p) array
-        All rows, those of the prior among them.
+    whole : (p, p) array
+        Normal matrix, rows of the prior among those that it is made of.
     prior : (k, p) array
         Those of the prior.
     """
     if not len(prior):
-        return np.zeros(jacobian.shape[1])
-    inverse = np.linalg.pinv(jacobian.T @ jacobian, rcond=RANK, hermitian=True)
+        return np.zeros(len(whole))
+    inverse = np.linalg.pinv(whole, rcond=RANK, hermitian=True)
     return np.asarray(np.linalg.norm(prior @ inverse, axis=0), dtype=np.float64)
 
 
