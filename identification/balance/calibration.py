@@ -325,10 +325,10 @@ def calibration_found(
                     what,
                     sensor,
                     run,
-                    float(values.get(own, values[name])),
-                    error,
-                    units[name],
-                    name in CLOCKS and error is not None and error > TOLD * w.grid.dt,
+                    value=float(values.get(own, values[name])),
+                    stderr=error,
+                    unit=units[name],
+                    bounded=name in CLOCKS and error is not None and error > TOLD * w.grid.dt,
                 )
             )
     return tuple(out)
