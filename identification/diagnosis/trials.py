@@ -470,6 +470,8 @@ def _refined(
 
 
 def _collinear_reason(candidate: Candidate) -> str:
+    if candidate.effect.is_delay:
+        return "what is late up to 3.5 samples is in the calibration already"
     names = ", ".join(candidate.effect.confused_with) or "what the model has already"
     separate = (
         f"; {candidate.effect.separate_by} would separate them"
