@@ -192,7 +192,13 @@ def print_improvement(found: Improvement) -> None:
     for learned in found.learned:
         print(f"learned: {learned.sentence}")
     for c in found.calibration:
-        if c.stderr is not None and abs(c.value) > 2 * c.stderr:
+        if c.bounded:
+            print(
+                f"calibration bounded: {c.what} of {c.sensor} in {found.data.train_names[c.run]} "
+                f"within {2 * (c.stderr or 0.0):.2g} {c.unit} of {c.value:.4g} {c.unit}; these "
+                "records cannot tell it from viscous friction, a torque sensor would"
+            )
+        elif c.stderr is not None and abs(c.value) > 2 * c.stderr:
             name = found.data.train_names[c.run]
             print(
                 f"calibration found: {c.what} of {c.sensor} in {name} {c.value:.4g} +- "
