@@ -49,7 +49,13 @@ from identification.diagnosis.locate import Unexplained, spectral_peak
 from identification.diagnosis.outcome import refusals
 from identification.diagnosis.rival_table import is_absorbed
 from identification.diagnosis.trials import Base, Trial
-from identification.diagnosis.verdict import hardly_a_model, verdict_of, without_link
+from identification.diagnosis.verdict import (
+    hardly_a_model,
+    unseen,
+    verdict_of,
+    without_link,
+    without_motor,
+)
 from identification.errors import InputError
 from identification.fitting.assess import RATIO_LIMIT
 from identification.fitting.engine import Solution, load_dataset, prepared_model
@@ -364,7 +370,9 @@ class Session:
                 *hardly_a_model(steps[0]),
                 *excitation_warnings(self.data),
                 *self._about_temperature(judged),
+                *unseen(solution),
                 *without_link(solution),
+                *without_motor(self.data),
                 *self._warnings,
             ),
             refused=refusals(

@@ -9,7 +9,9 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 from casadi_models import EFFECTS
+from identification.balance.dataset import Dataset
 from identification.data.formats import number
+from identification.diagnosis.candidates import turns_unseen
 from identification.diagnosis.claims import Claim
 from identification.diagnosis.improvement import Step
 from identification.diagnosis.locate import Unexplained
@@ -125,6 +127,28 @@ def hardly_a_model(start: Step) -> tuple[str, ...]:
             f"the torque: {doubt}"
         )
     return tuple(out)
+
+
+def unseen(solution: Solution) -> tuple[str, ...]:
+    """Parameters of the model that no channel of the records shows."""
+    kept = [n for n in solution.unidentified if n not in solution.free]
+    if not kept:
+        return ()
+    many = len(kept) > 1
+    return (
+        f"{', '.join(kept)}: no channel of these records shows {'them' if many else 'it'}; "
+        f"{'they keep their values' if many else 'it keeps its value'}",
+    )
+
+
+def without_motor(data: Dataset) -> tuple[str, ...]:
+    """What is hidden where the link alone is recorded behind a gear."""
+    if not turns_unseen(data) or not data.sensing.has_drive:
+        return ()
+    return (
+        "the motor position is not recorded: the link stands in for it; the twist between them and "
+        "the instant at which the motor turns leave a rest over the noise",
+    )
 
 
 def without_link(solution: Solution) -> tuple[str, ...]:

@@ -125,7 +125,7 @@ def solve(
     Raises
     ------
     InputError
-        A free parameter that moves no output.
+        An inertia or a stiffness that the channels would show, but not this motion.
     """
     if not model.lagging_load or LOAD_COMPLIANCE.name in data.joint.known:
         return _fitted(model, data, iterations, start or {}, progress)
@@ -179,7 +179,8 @@ def _fitted(
     limits = bounds_of(model, known, data)
     shapes = {p.name for p in model.parameters if p.is_shape}
     runs = names_of_runs(model, data.train)
-    apart = {*fixed, *held, *model.calibration, *model.named("range")}
+    unseen = [n for n in unseen_by(model, data) if n not in fixed]
+    apart = {*fixed, *held, *unseen, *model.calibration, *model.named("range")}
     free = [
         *(n for n in model.parameter_names if n not in apart),
         *runs,
@@ -208,7 +209,26 @@ def _fitted(
     sigma = _sigmas(model, data, values)
     weights = row_weights(balances, data, values, sigma, data.train)
     tell("standard errors", 0.9)
-    return _with_errors(WeakForm(balances, data, values, tuple(free), weights), limits, sigma, used)
+    found = _with_errors(
+        WeakForm(balances, data, values, tuple(free), weights), limits, sigma, used
+    )
+    return replace(found, unidentified=(*found.unidentified, *unseen))
+
+
+def unseen_by(model: JointModel, data: Dataset) -> tuple[str, ...]:
+    """Inertias, stiffness and amplitudes that stand in no balance of these channels: they keep
+    their values.
+
+    The inertia of the link is one where motor and torque sensor are recorded and the link is not.
+    """
+    holding = balances_of(model, data.sensing, wrt=()).holding
+    if model.lagging_load:  # the swing of an unseen link enters by its second derivative
+        return ()
+    return tuple(
+        p.name
+        for p in model.parameters
+        if not p.is_shape and p.name not in holding and p.name not in model.calibration
+    )
 
 
 def _sigmas(model: JointModel, data: Dataset, values: Mapping[str, float]) -> dict[str, float]:
