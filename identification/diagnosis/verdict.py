@@ -37,11 +37,14 @@ def _remainder(claim: Claim, unit: str) -> str:
 
 
 def _names(claims: Sequence[Claim]) -> str:
+    # names that share one curve are told in one sentence
     return " and ".join(
-        EFFECTS[c.effects[0]].title
-        if len(c.effects) == 1
-        else "one of (" + ", ".join(c.effects) + ")"
-        for c in claims
+        dict.fromkeys(
+            (c.like or EFFECTS[c.effects[0]].title)
+            if len(c.effects) == 1
+            else "one of (" + ", ".join(c.effects) + ")"
+            for c in claims
+        )
     )
 
 

@@ -247,8 +247,8 @@ def _best_start(
     free: Sequence[str],
     limits: Mapping[str, tuple[float, float]],
 ) -> dict[str, float]:
-    """Friction laws with a shape near zero velocity have several valleys: the best of a few
-    smoothing velocities and exponents.
+    """Laws with a shape near zero velocity or zero torque have several valleys: the best of a few
+    smoothing velocities and exponents, and of a few sizes of a gap.
     """
     shaped = [t for t in balances.model.terms if t.effect.several_valleys]
     if not shaped:
@@ -259,8 +259,16 @@ def _best_start(
         for n in balances.model.named("exponent")
         if any(n in t.names for t in shaped) and n in free
     ]
+    gaps = [
+        n
+        for t in shaped
+        for n, p in zip(t.names, t.effect.parameters, strict=True)
+        if p.is_shape and p.scale == "torsion" and n in free
+    ]
     trials = [dict(values)]
-    for share in (0.003, 0.01):
+    for factor in GAP_FACTORS if gaps else ():
+        trials.append({**values, **{n: factor * values[n] for n in gaps}})
+    for share in (0.003, 0.01) if smooth else ():
         for power in (1.0, 2.0) if exponents else (1.0,):
             moved = {
                 n: min(max(share * data.ranges["velocity"], limits[n][0]), limits[n][1])
@@ -281,6 +289,12 @@ def _best_start(
         if best is None or cost < best[0]:
             best = (cost, fitted)
     return best[1] if best is not None else values
+
+
+GAP_FACTORS: Final = (0.1, 0.3, 3.0)
+"""Sizes from which a gap of the transmission is fitted beside its start value: inside a gap that is
+too wide nothing is carried, its stiffness goes to its bound, and the gap then moves nothing. A
+catalogue is wrong by a factor 3, a start by guess by 10."""
 
 
 def _check_moves(problem: WeakForm) -> None:
