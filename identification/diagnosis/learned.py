@@ -256,7 +256,7 @@ def equivalences(
     groups: dict[tuple[str, str, str], list[Claim]] = {}
     for c in claims:
         if c.label in places and c.effect.stage == "law" and not c.effect.common:
-            over = _variable(c.effect)
+            over = variable_of(c.effect)
             mark = (places[c.label], over or c.label, c.balance)
             groups.setdefault(mark, []).append(c)
     if not groups:
@@ -270,7 +270,7 @@ def equivalences(
     return out
 
 
-def _variable(effect: Effect) -> str:
+def variable_of(effect: Effect) -> str:
     """The variable over which a law is a curve; empty where it is none of one variable."""
     if effect.memory is not None:
         return ""
@@ -287,7 +287,7 @@ def _tables() -> list[Table]:
 def _held_against(
     group: Sequence[Claim], place: str, balance: str, named: Base
 ) -> Equivalence | None:
-    over = _variable(group[0].effect)
+    over = variable_of(group[0].effect)
     one_balance = balance in ("axis", "sum")
 
     def own(candidate: Candidate) -> bool:

@@ -47,7 +47,7 @@ from identification.diagnosis.improvement import (
     judged_drop,
     made_worse,
 )
-from identification.diagnosis.learned import marked
+from identification.diagnosis.learned import marked, variable_of
 from identification.diagnosis.locate import Unexplained, spectral_peak
 from identification.diagnosis.outcome import refusals
 from identification.diagnosis.rival_table import is_absorbed
@@ -161,6 +161,7 @@ class Session:
         self._warnings = tuple(warnings)
         self._refused: dict[str, str] = {}
         self._doubted: dict[str, str] = {}
+        self._located: dict[str, str] = {}
 
     @property
     def data(self) -> Dataset:
@@ -229,13 +230,13 @@ class Session:
             if len(standing.claims) >= most:
                 break
             ranking = self._confirmed(ranking, base, standing.now)
-            best = ranking.best(frozenset(self._refused) | aside)
+            best = ranking.best(self._out(ranking, aside))
             may_move = not late and not self.data.sensing.one_sided
             over = max(e.ratio for e in standing.now.held_out.balances.values()) > RATIO_LIMIT
             if best is None and may_move and over:
                 late = True
                 ranking = self.bench.ranking(base, late=True)
-                best = ranking.best(frozenset(self._refused) | aside)
+                best = ranking.best(self._out(ranking, aside))
             if best is None:
                 cleared = self._without_wrong(standing, decided=lean)
                 if cleared is None:
@@ -245,9 +246,9 @@ class Session:
                 ranking = self.bench.ranking(base)
                 continue
             names = confusion_set(best, ranking.everything, base)
-            best = simplest(best, names, ranking, frozenset(self._refused) | aside)
+            best = simplest(best, names, ranking, self._out(ranking, aside))
             best, names = self._by_whole_fit(
-                best, names, ranking, standing.now, self._refused.keys() | aside
+                best, names, ranking, standing.now, self._out(ranking, aside)
             )
             claim = make_claim(best, ranking, base, shortened(names, ranking))
             label = best.candidate.label
@@ -608,6 +609,17 @@ class Session:
         made = self._replay(claims, standing, alone.values)
         return made if len(made.claims) == len(claims) else None
 
+    def _out(self, ranking: Ranking, aside: Collection[str]) -> frozenset[str]:
+        """Labels that are not taken up: refused ones, those set aside, and in a balance whose
+        missing torque was seen to be a curve over one variable the laws of others.
+        """
+        elsewhere = {
+            t.candidate.label
+            for t in ranking.everything
+            if t.balance in self._located and variable_of(t.effect) != self._located[t.balance]
+        }
+        return frozenset(self._refused) | frozenset(aside) | elsewhere
+
     def _without_wrong(self, standing: _Standing, *, decided: bool) -> _Standing | None:
         """The steps without the names that a curve over their own variable shows to be wrong; None
         where there are none.
@@ -621,8 +633,10 @@ class Session:
         wrong = {label: e for label, e in wrong.items() if e.is_wrong}
         if not wrong:
             return None
-        for label, found in wrong.items():
-            self._refused[label] = f"is held against a curve: {found.sentence}"
+        for c in standing.claims:
+            if c.label in wrong:
+                self._refused[c.label] = f"is held against a curve: {wrong[c.label].sentence}"
+                self._located[c.balance] = variable_of(c.effect)
         return self._replay([c for c in standing.claims if c.label not in wrong], standing)
 
     def _revise(self, standing: _Standing) -> _Standing:
