@@ -49,6 +49,8 @@ ALIKE: Final = 0.05
 FEWER: Final = 0.4
 """Numbers that names of one variable may have together, as a share of the curve's freedom: with
 more, a sum of laws imitates the curve."""
+HALF: Final = 0.5
+"""Share missed from which a curve over any variable, and not the name, is what is missing."""
 OUTSIDE: Final = 2.0
 """Standard errors by which a parameter must want to pass its bound."""
 
@@ -196,6 +198,9 @@ class Equivalence:
         "NAME"; "like NAME, which explains 97 %"; or that it is not the name.
     curve : Curve or None
         The curve beside the name, where it certainly gains.
+    own : bool
+        False where the law is no curve over one variable: the best curve of any may then show
+        something else that is missing beside it.
     beaten : bool
         True where more than one name of one variable share the work of a curve that is simpler.
     """
@@ -205,19 +210,22 @@ class Equivalence:
     sentence: str
     curve: Curve | None = None
     beaten: bool = False
+    own: bool = True
 
     @property
     def is_name(self) -> bool:
         """True where the name is shown to be as good as the curve, and nothing shows that it is
         not.
         """
+        if not self.own:
+            return not self.is_wrong
         small = self.share_missed + ONE_SIDED * self.stderr < EQUIVALENT
         return small and not self.beaten and self.curve is None
 
     @property
     def is_wrong(self) -> bool:
         """True where the curve shows that the law is another one."""
-        return self.curve is not None and self.share_missed > ALIKE
+        return self.curve is not None and self.share_missed > (ALIKE if self.own else HALF)
 
     def as_json(self) -> dict[str, Any]:
         """As data."""
@@ -302,7 +310,7 @@ def _held_against(
     bare = lacking(named, {c.label for c in group})
     title = " and ".join(c.effect.title for c in group)
     before, rows = squares_left(bare, balance), _rows(named, balance)
-    found = _missed(before, beside.before, beside.after, title, rows)
+    found = replace(_missed(before, beside.before, beside.after, title, rows), own=bool(over))
     if beside.gain.is_certain:
         said = found.sentence if found.share_missed > ALIKE else _like(title, found.share_missed)
         found = replace(found, curve=beside.curves[0], sentence=said)
@@ -334,6 +342,8 @@ def _missed(
     sentence = _like(title, share)
     if share + ONE_SIDED * stderr < EQUIVALENT:
         sentence = title
+    elif share - ONE_SIDED * stderr < EQUIVALENT:
+        sentence = f"{title} or a law like it"
     elif share - ONE_SIDED * stderr > ALIKE:
         sentence = (
             f"not {title}, which explains {100 * (1 - share):.3g} % of what a curve over its own "
