@@ -137,7 +137,7 @@ def solve(
     Raises
     ------
     InputError
-        A free parameter that moves no output.
+        An inertia or a stiffness that the channels would show, but not this motion.
     """
     if not model.lagging_load or LOAD_COMPLIANCE.name in data.joint.known:
         return _fitted(model, data, iterations, start or {}, progress)
@@ -192,7 +192,8 @@ def _fitted(
     shapes = {p.name for p in model.parameters if p.is_shape}
     runs = names_of_runs(model, data.train)
     known_before = usual(model, data.train, torque=data.sensing.has_torque)
-    apart = {*fixed, *held, *model.calibration, *model.named("range")}
+    unseen = [n for n in unseen_by(model, data) if n not in fixed]
+    apart = {*fixed, *held, *unseen, *model.calibration, *model.named("range")}
     free = [
         *(n for n in model.parameter_names if n not in apart),
         *runs,
@@ -224,7 +225,24 @@ def _fitted(
     problem = WeakForm(balances, data, values, tuple(free), weights, known_before)
     values, noise = unbiased(problem, limits)
     problem = replace(problem, values=values)
-    return _with_errors(problem, limits, sigma, used, noise)
+    found = _with_errors(problem, limits, sigma, used, noise)
+    return replace(found, unidentified=(*found.unidentified, *unseen))
+
+
+def unseen_by(model: JointModel, data: Dataset) -> tuple[str, ...]:
+    """Inertias, stiffness and amplitudes that stand in no balance of these channels: they keep
+    their values.
+
+    The inertia of the link is one where motor and torque sensor are recorded and the link is not.
+    """
+    holding = balances_of(model, data.sensing, wrt=()).holding
+    if model.lagging_load:  # the swing of an unseen link enters by its second derivative
+        return ()
+    return tuple(
+        p.name
+        for p in model.parameters
+        if not p.is_shape and p.name not in holding and p.name not in model.calibration
+    )
 
 
 def _sigmas(model: JointModel, data: Dataset, values: Mapping[str, float]) -> dict[str, float]:
@@ -243,8 +261,8 @@ def _best_start(
     free: Sequence[str],
     limits: Mapping[str, tuple[float, float]],
 ) -> dict[str, float]:
-    """Friction laws with a shape near zero velocity have several valleys: the best of a few
-    smoothing velocities and exponents.
+    """Laws with a shape near zero velocity or zero torque have several valleys: the best of a few
+    smoothing velocities and exponents, and of a few sizes of a gap.
     """
     shaped = [t for t in balances.model.terms if t.effect.several_valleys]
     if not shaped:
@@ -255,8 +273,16 @@ def _best_start(
         for n in balances.model.named("exponent")
         if any(n in t.names for t in shaped) and n in free
     ]
+    gaps = [
+        n
+        for t in shaped
+        for n, p in zip(t.names, t.effect.parameters, strict=True)
+        if p.is_shape and p.scale == "torsion" and n in free
+    ]
     trials = [dict(values)]
-    for share in (0.003, 0.01):
+    for factor in GAP_FACTORS if gaps else ():
+        trials.append({**values, **{n: factor * values[n] for n in gaps}})
+    for share in (0.003, 0.01) if smooth else ():
         for power in (1.0, 2.0) if exponents else (1.0,):
             moved = {
                 n: min(max(share * data.ranges["velocity"], limits[n][0]), limits[n][1])
@@ -277,6 +303,12 @@ def _best_start(
         if best is None or cost < best[0]:
             best = (cost, fitted)
     return best[1] if best is not None else values
+
+
+GAP_FACTORS: Final = (0.1, 0.3, 3.0)
+"""Sizes from which a gap of the transmission is fitted beside its start value: inside a gap that is
+too wide nothing is carried, its stiffness goes to its bound, and the gap then moves nothing. A
+catalogue is wrong by a factor 3, a start by guess by 10."""
 
 
 def _check_moves(problem: WeakForm) -> None:

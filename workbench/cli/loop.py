@@ -163,6 +163,8 @@ def print_improvement(found: Improvement) -> None:
         names = (
             claim.effects[0] if len(claim.effects) == 1 else "{" + ", ".join(claim.effects) + "}"
         )
+        if claim.like:
+            names = claim.like
         said, rest = (
             ("in part", "; structure is left that is not in the library")
             if claim.partial
