@@ -22,6 +22,8 @@ from identification.errors import InputError
 from identification.fitting.fit import Fit
 from identification.fitting.fit import fit as fit
 from identification.search.mcs import mcs as mcs
+from identification.variants.exploration import Exploration
+from identification.variants.explore import explore as explore
 from identification.version import VERSION
 
 if TYPE_CHECKING:
@@ -43,6 +45,7 @@ __all__ = [
     "Changes",
     "Comparison",
     "Diagnosis",
+    "Exploration",
     "FaultDetector",
     "Fit",
     "Improvement",
@@ -54,6 +57,7 @@ __all__ = [
     "changed",
     "compare",
     "diagnose",
+    "explore",
     "fit",
     "improve",
     "load_joint",

@@ -1,0 +1,132 @@
+"""A variant fitted with its shapes free, on the weighting that all variants share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final, final
+
+import numpy as np
+import numpy.typing as npt
+
+from casadi_models import JointModel
+from identification.balance.balances import balances_of
+from identification.balance.calibration import settled
+from identification.balance.dataset import HOLD_NAME, Dataset
+from identification.balance.stacked import references, rms, row_weights, stack, taking_part
+from identification.diagnosis.trials import make_base
+from identification.fitting.engine import Solution, stepped
+
+FloatArray = npt.NDArray[np.float64]
+
+STEPS: Final = 8
+"""Gauss-Newton steps of a variant from its place on the grid at most; they bring its error to
+within 1 % of a converged fit (`python -m benchmarks.explore`)."""
+LEAST_DELAY: Final = 1.0
+"""Samples up to which a late channel is no effect: a logger reads its channels, and holds its
+commands, somewhere within a sample."""
+
+
+@final
+@dataclass(frozen=True)
+class Weighting:
+    """What makes variants comparable: the weights of one fit, on training and held-out rows.
+
+    Attributes
+    ----------
+    like : Solution
+    held : mapping of str to (rows,) array
+    """
+
+    like: Solution
+    held: Mapping[str, FloatArray]
+
+    @classmethod
+    def of(cls, like: Solution, data: Dataset) -> Weighting:
+        """The weighting of a fit."""
+        balances = balances_of(like.model, data.sensing, wrt=())
+        values = settled(like.model, data.sensing, data.held_out, like.values)
+        return cls(like, row_weights(balances, data, values, like.sigma, data.held_out))
+
+
+@final
+@dataclass(frozen=True)
+class Refit:
+    """A fitted variant and its errors.
+
+    Attributes
+    ----------
+    solution : Solution
+    cost : float
+        Weighted sum of squares of the training rows.
+    squares, rows : (blocks, balances) arrays
+        Cross-validated squares of each training block, and how many rows it has.
+    held : (balances,) array
+        RMS on held-out records, in the units of the weights.
+    relative_error_percent : float
+        100 norm(residual) / norm(measured) on held-out records.
+    """
+
+    solution: Solution
+    cost: float
+    squares: FloatArray
+    rows: FloatArray
+    held: FloatArray
+    relative_error_percent: float
+
+    @property
+    def parameters(self) -> int:
+        """Free parameters, without nuisances."""
+        model = self.solution.model
+        aside = {HOLD_NAME, *model.named("smoothing"), *model.calibration}
+        return sum(n not in aside for n in self.solution.free)
+
+
+def refitted(
+    model: JointModel,
+    data: Dataset,
+    starts: tuple[Mapping[str, float], ...],
+    weighting: Weighting,
+    *,
+    steps: int = STEPS,
+) -> Refit:
+    """A variant from the best of some starts: shapes near zero velocity have several valleys."""
+    found = min(
+        (stepped(model, data, s, weighting.like, iterations=steps) for s in starts),
+        key=lambda f: f[1],
+    )
+    solution, cost = found
+    base = make_base(solution, data)
+    balances = balances_of(solution.model, data.sensing, wrt=())
+    values = settled(model, data.sensing, [*data.train, *data.held_out], solution.values)
+    residual = stack(balances, data.held_out, values).residual
+    taking = {b: taking_part(b, data.held_out) for b in balances.balances}
+    measured = references(data, data.held_out)
+    left = np.concatenate([residual[b][taking[b]] for b in balances.balances])
+    size = np.concatenate([measured[b][taking[b]] for b in balances.balances])
+    return Refit(
+        solution,
+        cost,
+        base.crossed,
+        base.numbers.astype(np.float64),
+        np.array(
+            [rms((residual[b] * weighting.held[b])[taking[b]]) for b in balances.balances],
+            dtype=np.float64,
+        ),
+        100 * float(np.linalg.norm(left)) / (float(np.linalg.norm(size)) or 1e-300),
+    )
+
+
+def physical(refit: Refit, added: tuple[str, ...], data: Dataset) -> str:
+    """Why a part that was added to a variant is none; empty where every part is one."""
+    values = refit.solution.values
+    for term in refit.solution.model.terms:
+        if term.label not in added:
+            continue
+        pairs = zip(term.names, term.effect.parameters, strict=True)
+        sizes = [abs(values[n]) for n, p in pairs if not p.is_shape]
+        if not any(sizes):
+            return f"{term.label} has the size 0"
+        if term.effect.is_delay and max(sizes) <= LEAST_DELAY * data.train[0].grid.dt:
+            return f"{term.label} is shorter than a sample"
+    return ""
