@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, final
@@ -18,8 +19,12 @@ from identification.representation import html_of
 from identification.variants.lattice import added_to
 from identification.variants.screen import PER_PARAMETER
 
+NAME: Final = 57
+"""Letters of a variant's name in the table; its lines have 100."""
 PRINTED: Final = 14
 """Rows of the printed table."""
+IN_SHORT: Final = 6
+"""Rows of the table in a session."""
 ALTERNATIVES: Final = 3
 """Alternatives that are printed in one line."""
 
@@ -201,7 +206,7 @@ class Exploration:
         return joint_text(self.joint, self.recommended.solution, self.data)
 
     def __repr__(self) -> str:
-        return "\n".join(table_of(self)[:25])
+        return "\n".join(table_of(self, IN_SHORT)[:25])
 
     def _repr_html_(self) -> str | None:
         return html_of(self)
@@ -287,10 +292,13 @@ def agreement_of(
     """Whether `improve` and the exploration agree, in a sentence."""
     added = added_to(start, found.model)
     named = f"`improve` adds {_listed(added)}" if added else "`improve` adds nothing"
+    gone = [label for label in added if improved is None or label not in improved.labels]
+    if gone:
+        named += f", of which {_listed(gone)} comes out with no size"
+    if improved is None:
+        return f"{named}."
     if improved is recommended:
         return f"{named}: the same."
-    if improved is None:
-        return f"{named}; fitted as a variant, a part of it has the size 0."
     keys = {label.partition("@")[0].partition("#")[0] for label in recommended.added}
     sets = [set(c.effects) for c in found.claims]
     if (
@@ -311,24 +319,30 @@ def agreement_of(
     )
 
 
-def table_of(found: Exploration) -> list[str]:
-    """The result as lines of at most 100 characters."""
-    chosen = list(found.variants[:PRINTED])
-    for v in (*found.front, found.start, *([found.improved] if found.improved else [])):
-        if v not in chosen and len(chosen) < PRINTED + 5:
-            chosen.append(v)
+def table_of(found: Exploration, most: int = PRINTED) -> list[str]:
+    """The result as lines: a table 100 characters wide, then sentences.
+
+    Parameters
+    ----------
+    found : Exploration
+    most : int
+        Variants of the table, beside the start model and the choice of `improve`.
+    """
+    chosen = list(found.variants[:most])
+    chosen += [v for v in (found.improved, found.start) if v is not None and v not in chosen]
     lines = [
-        f"{'':3}{'variant':<44}{'par.':>5}{'held-out %':>11}{'of start':>9}"
+        f"{'':3}{'variant':<{NAME}}{'par.':>5}{'held-out %':>11}{'of start':>9}"
         f"{'score':>7}{'best in':>8}"
     ]
     for v in sorted(chosen, key=found.variants.index):
         mark = "*" if v is found.recommended else "=" if v.tied else " "
         mark += "i" if v is found.improved else " "
-        name = v.name if len(v.name) <= 43 else v.name[:40] + "..."
+        name, *more = textwrap.wrap(v.name, NAME - 1, break_on_hyphens=False)
         lines.append(
-            f"{mark:<3}{name:<44}{v.parameters:>5}{v.relative_error_percent:>11.3f}"
+            f"{mark:<3}{name:<{NAME}}{v.parameters:>5}{v.relative_error_percent:>11.3f}"
             f"{v.error_percent:>7.1f} %{v.score:>7.2f}{v.chosen_percent:>6.0f} %"
         )
+        lines += [f"{'':5}{line}" for line in more]
     lines += [
         f"{found.screened} variants scored, {len(found.variants)} fitted. * recommended, = tied, "
         "i improve.",

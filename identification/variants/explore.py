@@ -35,7 +35,7 @@ from identification.variants.lattice import (
     missing_from,
     nodes_of,
 )
-from identification.variants.refit import Refit, Weighting, physical, refitted
+from identification.variants.refit import Refit, Weighting, physical, refitted, with_size
 from identification.variants.screen import LARGEST, PER_PARAMETER, Scored, Screen
 
 SHOWN: Final = 40
@@ -105,12 +105,15 @@ class _Search:
         self.found: dict[object, Refit] = {}
         self.apart: dict[str, str] = {}
         self.screened = 0
+        self.last: object = None
         self.weighting = Weighting.of(start, self.data)
 
     def result(self, improvement: Improvement) -> Exploration:
         """The whole search."""
         nodes, refused = nodes_of(self.start.model, self.data)
         last = improvement.steps[-1].solution
+        last = replace(last, model=with_size(last, added_to(self.start.model, last.model)))
+        self.last = self._mark(last.model)
         first = self._screen(self.start, nodes, {}, 0.0)
         ranked = first.search()
         self._fit(self.start.model, self.start.values)
@@ -304,8 +307,7 @@ class _Search:
                 lost = 100 * (math.exp(plain / balances) - 1)
                 (effect,), (by,) = gone, came
                 stand_ins.append(StandIn(effect, by, lost, tied[k]))
-        last = improvement.steps[-1].solution.model
-        improved = next((variants[k] for k, m in enumerate(marks) if m == self._mark(last)), None)
+        improved = next((variants[k] for k, m in enumerate(marks) if m == self.last), None)
         return Exploration(
             self.session.joint,
             self.data,

@@ -10,9 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from casadi_models import JointModel
+from casadi_models.term import Term
 from identification.balance.balances import balances_of
 from identification.balance.calibration import settled
-from identification.balance.dataset import HOLD_NAME, Dataset
+from identification.balance.dataset import HOLD_NAME, Dataset, without
 from identification.balance.stacked import references, rms, row_weights, stack, taking_part
 from identification.diagnosis.trials import make_base
 from identification.fitting.engine import Solution, stepped
@@ -117,14 +118,28 @@ def refitted(
     )
 
 
+def with_size(solution: Solution, added: tuple[str, ...]) -> JointModel:
+    """The model of a fit without those of the added parts that came out with no size."""
+    model = solution.model
+    for term in solution.model.terms:
+        if term.label in added and not any(_sizes(term, solution.values)):
+            model = without(model, term.label)
+    return model
+
+
+def _sizes(term: Term, values: Mapping[str, float]) -> list[float]:
+    """Sizes of the amplitudes of a part."""
+    pairs = zip(term.names, term.effect.parameters, strict=True)
+    return [abs(values[n]) for n, p in pairs if not p.is_shape]
+
+
 def physical(refit: Refit, added: tuple[str, ...], data: Dataset) -> str:
     """Why a part that was added to a variant is none; empty where every part is one."""
     values = refit.solution.values
     for term in refit.solution.model.terms:
         if term.label not in added:
             continue
-        pairs = zip(term.names, term.effect.parameters, strict=True)
-        sizes = [abs(values[n]) for n, p in pairs if not p.is_shape]
+        sizes = _sizes(term, values)
         if not any(sizes):
             return f"{term.label} has the size 0"
         if term.effect.is_delay and max(sizes) <= LEAST_DELAY * data.train[0].grid.dt:

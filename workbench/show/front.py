@@ -14,9 +14,9 @@ from workbench.show.results import spaced, table, text
 ROWS: Final = 11
 """Variants that are named beside the picture."""
 LINE: Final = 15
-LETTERS: Final = 74
+LETTERS: Final = 84
 """Letters of a line beside the picture."""
-BESIDE: Final = 480
+BESIDE: Final = 560
 WORST: Final = 1.15
 """Error, in units of that of the start model, up to which a variant is drawn."""
 
@@ -49,8 +49,8 @@ def exploration_picture(found: Exploration) -> str:
     ]
     sentences = [found.reason, found.agreement]
     lines = [w for s in sentences for w in (*textwrap.wrap(s, LETTERS), "")][:-1]
-    height = max(LINE * (len(named) + len(lines) + 4), 300)
-    picture = front_picture(dots, front, height - 60)
+    height = max(LINE * (len(named) + len(lines) + 2), 300)
+    picture = front_picture(dots, front, height - 34)
     legend = (
         _word(54, 18, AFTER, "\u25cf recommended")
         + _word(150, 18, AFTER, "\u25cb tied")
@@ -111,7 +111,7 @@ def _drawn(found: Exploration) -> tuple[list[Variant], list[int]]:
 
 def _short(v: Variant) -> str:
     """Name of a variant in one line."""
-    return textwrap.shorten(v.name, 46, placeholder=" ...")
+    return textwrap.shorten(v.name, 58, placeholder=" ...")
 
 
 def _said(found: Exploration, v: Variant) -> str:

@@ -338,6 +338,13 @@ def front_picture(dots: Sequence[Dot], front: Sequence[int], height: int = HEIGH
         )
     for k in sorted(range(len(dots)), key=lambda i: (dots[i].best, dots[i].number > 0)):
         body += _dot(dots[k], frame.across(dots[k].parameters), frame.up(errors[k]))
+    lowest: dict[int, float] = {}  # of each column: numbers stand under each other
+    for k in sorted(range(len(dots)), key=lambda i: frame.up(errors[i])):
+        if dots[k].number:
+            column = dots[k].parameters
+            y = max(frame.up(errors[k]) + 4, lowest.get(column, -math.inf) + 11)
+            lowest[column] = y
+            body += _text(frame.across(column) + 10, y, str(dots[k].number), "start")
     least = min(d.error for d in dots)
     return _svg(
         f"Held-out error against free parameters: {len(dots)} variants with {few} to {many} "
@@ -364,7 +371,7 @@ def _dot(dot: Dot, x: float, y: float) -> str:
         f'<circle class="s-{kind}" fill="{fill}" stroke="{colour}" stroke-width="1.6" '
         f'opacity="{opacity}" cx="{x:.1f}" cy="{y:.1f}" r="{size}"/>'
     )
-    return out + (_text(x, y - 10, str(dot.number)) if dot.number else "")
+    return out
 
 
 def bar(share: float, label: str) -> str:
