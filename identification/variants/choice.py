@@ -20,6 +20,11 @@ SEED: Final = 14
 """Of these resamplings: the same records give the same answer."""
 TIE_QUANTILE: Final = 0.05
 """A variant ties with the best where it does better in this share of the resamplings."""
+TIE_MARGIN: Final = 0.5 * PER_PARAMETER
+"""Difference of the scores below which variants tie however certain it is: 5 % of a balance's RMS,
+below which one effect counts as good as two elsewhere
+(:data:`identification.diagnosis.session.SAME_WITH_ONE_LESS`); what no model holds shifts the RMS of
+laws that are one column on the records by as much."""
 WINDOWS: Final = 4
 """Parts of the records, one after the other, in which the choice is made again."""
 FRONT_LEAST: Final = 0.01
@@ -37,7 +42,8 @@ class Judged:
     best : int
         The variant with the lowest score of those with every effect of the joint's own model.
     score : (variants,) array
-        Sum over balances of ln RMS of blocks that the fit did not see, and .10 per parameter.
+        Sum over balances of ln RMS of blocks that the fit did not see, held-out records among
+        them, and .10 per parameter.
     behind : (variants,) array
         The 5 % quantile of score less that of the best, over resampled blocks: a tie up to 0.
     chosen : (variants,) array
@@ -106,6 +112,39 @@ def _on(
 ) -> FloatArray:
     """Scores on some of the blocks."""
     return score_of(squares[:, blocks].sum(axis=1), rows[:, blocks].sum(axis=1), parameters)
+
+
+def tied_with_best(
+    scores: Judged, whole: Sequence[bool], parts: Sequence[frozenset[str]]
+) -> list[bool]:
+    """Which variants the records do not tell from the best one, itself among them.
+
+    One that holds all parts of another tie and more, and is no better, says nothing beside it.
+
+    Parameters
+    ----------
+    scores : Judged
+    whole : sequence of bool
+        Which variants have every effect of the joint's own model.
+    parts : sequence of frozenset of str
+        Labels of each.
+    """
+    behind = scores.score - scores.score[scores.best]
+    alike = [
+        w and bool(q <= 0 or d <= TIE_MARGIN)
+        for w, q, d in zip(whole, scores.behind, behind, strict=True)
+    ]
+    return [
+        k == scores.best
+        or (
+            alike[k]
+            and not any(
+                alike[j] and parts[j] < parts[k] and behind[j] <= behind[k]
+                for j in range(len(parts))
+            )
+        )
+        for k in range(len(parts))
+    ]
 
 
 def front_of(parameters: Sequence[int], error: Sequence[float]) -> list[int]:

@@ -15,6 +15,7 @@ from identification.diagnosis.candidates import NotTestable
 from identification.diagnosis.improvement import Improvement
 from identification.fitting.engine import Solution
 from identification.fitting.joint_text import joint_text
+from identification.fitting.parameters import parameter_table
 from identification.representation import html_of
 from identification.variants.lattice import added_to
 from identification.variants.screen import PER_PARAMETER
@@ -50,7 +51,7 @@ class Variant:
         RMS on held-out records in percent of that of the joint's own model, mean of the balances'
         logarithms.
     score : float
-        On blocks of the training records that its fit did not see (see
+        On blocks that its fit did not see, those of the held-out records among them (see
         :data:`identification.variants.screen.PER_PARAMETER`), less that of the recommended one;
         below 0 for a variant that lacks an effect of the joint's own model.
     tied : bool
@@ -200,6 +201,13 @@ class Exploration:
     def warnings(self) -> tuple[str, ...]:
         """What to doubt about records and start model."""
         return self.improvement.warnings
+
+    @property
+    def parameters(self) -> dict[str, dict[str, Any]]:
+        """Parameters of the recommended variant (see
+        :func:`identification.fitting.parameters.parameter_table`).
+        """
+        return parameter_table(self.recommended.solution, self.data)
 
     def to_joint_file(self) -> str:
         """The joint with the recommended variant, as the text of a joint file."""

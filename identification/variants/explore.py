@@ -25,7 +25,7 @@ from identification.diagnosis.improvement import Improvement
 from identification.diagnosis.session import Session
 from identification.errors import InputError
 from identification.fitting.engine import Solution, reweighed
-from identification.variants.choice import front_of, judged
+from identification.variants.choice import front_of, judged, tied_with_best
 from identification.variants.exploration import Exploration, StandIn, Variant, agreement_of
 from identification.variants.lattice import (
     Node,
@@ -271,11 +271,7 @@ class _Search:
         scores = judged(refits, whole)
         best = scores.best
         parts = [frozenset(visible_labels(r.solution.model)) for r in refits]
-        # more parts than the recommended, and no better: nothing that could be taken for it
-        tied = [
-            k == best or (whole[k] and bool(scores.behind[k] <= 0) and not parts[k] > parts[best])
-            for k in range(len(refits))
-        ]
+        tied = tied_with_best(scores, whole, parts)
         variants = [
             Variant(
                 self._name(refit, self.names.get(mark, "")),

@@ -61,7 +61,8 @@ class Refit:
     cost : float
         Weighted sum of squares of the training rows.
     squares, rows : (blocks, balances) arrays
-        Cross-validated squares of each training block, and how many rows it has.
+        Squares of each block that the fit did not see, and how many rows it has: of the training
+        records by cross-validation, then those of the held-out records.
     held : (balances,) array
         RMS on held-out records, in the units of the weights.
     relative_error_percent : float
@@ -98,6 +99,7 @@ def refitted(
     )
     solution, cost = found
     base = make_base(solution, data)
+    own = base.crossed, base.numbers.astype(np.float64)
     balances = balances_of(solution.model, data.sensing, wrt=())
     values = settled(model, data.sensing, [*data.train, *data.held_out], solution.values)
     residual = stack(balances, data.held_out, values).residual
@@ -105,17 +107,34 @@ def refitted(
     measured = references(data, data.held_out)
     left = np.concatenate([residual[b][taking[b]] for b in balances.balances])
     size = np.concatenate([measured[b][taking[b]] for b in balances.balances])
+    seen = _by_block(data, residual, weighting)
     return Refit(
         solution,
         cost,
-        base.crossed,
-        base.numbers.astype(np.float64),
+        np.vstack([own[0], seen[0]]),
+        np.vstack([own[1], seen[1]]),
         np.array(
             [rms((residual[b] * weighting.held[b])[taking[b]]) for b in balances.balances],
             dtype=np.float64,
         ),
         100 * float(np.linalg.norm(left)) / (float(np.linalg.norm(size)) or 1e-300),
     )
+
+
+def _by_block(
+    data: Dataset, residual: Mapping[str, FloatArray], weighting: Weighting
+) -> tuple[FloatArray, FloatArray]:
+    """Weighted squares of each held-out block and balance, and how many rows it has."""
+    number = np.concatenate([w.block for w in data.held_out])
+    inside = number >= 0
+    which, place = np.unique(number[inside], return_inverse=True)
+    squares, rows = [], []
+    for b, r in residual.items():
+        taking = taking_part(b, data.held_out)[inside].astype(np.float64)
+        weighted = (r * weighting.held[b])[inside]
+        squares.append(np.bincount(place, taking * weighted**2, len(which)))
+        rows.append(np.bincount(place, taking, len(which)))
+    return np.array(squares, dtype=np.float64).T, np.array(rows, dtype=np.float64).T
 
 
 def with_size(solution: Solution, added: tuple[str, ...]) -> JointModel:
