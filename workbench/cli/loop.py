@@ -41,7 +41,7 @@ def improve_files(
     """
     distinct(training=train, other_payload=other_payload, held_out=held_out)
     joint = open_joint(joint_path)
-    records, _ = _training(train, other_payload, joint)
+    records, _ = training(train, other_payload, joint)
     held, _ = open_records(held_out, joint)
     alike([*train, *other_payload, *held_out], [*records, *held], joint)
     since = None
@@ -54,12 +54,12 @@ def improve_files(
         joint = replace(joint, known={n: k for n, k in joint.known.items() if n not in gone})
     found = improve(records, joint, held, max_additions=max_additions, progress=progress_bar)
     progress_bar("done", 1.0)
-    _print_warnings(found.warnings, [*records, *held])
+    print_warnings(found.warnings, [*records, *held])
     data = found.as_json() if since is None else {**found.as_json(), "changed": since.as_json()}
     return data, found, [*records, *held]
 
 
-def _print_warnings(warnings: Sequence[str], records: Sequence[Record]) -> None:
+def print_warnings(warnings: Sequence[str], records: Sequence[Record]) -> None:
     """Warnings on stderr, without those that were printed when the records were opened."""
     said = gate_warnings(records)
     for text in warnings:
@@ -67,7 +67,7 @@ def _print_warnings(warnings: Sequence[str], records: Sequence[Record]) -> None:
             print(f"irj: {text}", file=sys.stderr)
 
 
-def _training(
+def training(
     paths: Sequence[str], other_payload: Sequence[str], joint: Joint
 ) -> tuple[list[Record], list[str]]:
     """Training records, those with another payload marked, and the warnings."""
@@ -235,7 +235,7 @@ def run_fit(arguments: Namespace) -> int:
     """`irj fit`."""
     distinct(training=arguments.records, other_payload=arguments.other_payload)
     joint = open_joint(arguments.joint)
-    records, warnings = _training(arguments.records, arguments.other_payload, joint)
+    records, warnings = training(arguments.records, arguments.other_payload, joint)
     alike([*arguments.records, *arguments.other_payload], records, joint)
     fitted = fit(joint, records)
     if arguments.refine:
@@ -308,7 +308,7 @@ def run_diagnose(arguments: Namespace) -> int:
         held_out=arguments.held_out,
     )
     joint = open_joint(arguments.joint)
-    records, _ = _training(arguments.records, arguments.other_payload, joint)
+    records, _ = training(arguments.records, arguments.other_payload, joint)
     held, _ = open_records(arguments.held_out, joint)
     alike(
         [*arguments.records, *arguments.other_payload, *arguments.held_out],
@@ -317,7 +317,7 @@ def run_diagnose(arguments: Namespace) -> int:
     )
     found = diagnose(fit(joint, records), held, progress=progress_bar)
     progress_bar("done", 1.0)
-    _print_warnings(found.warnings, [*records, *held])
+    print_warnings(found.warnings, [*records, *held])
     if found.data.note:
         print(f"note: {found.data.note}")
     print(found)

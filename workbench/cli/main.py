@@ -200,6 +200,31 @@ def parser() -> OneLineParser:
         metavar="REFERENCE",
         help="fitted joint file: first say what changed since, before any new effect is looked for",
     )
+    explored = verb(
+        "explore",
+        "explore",
+        "hold all variants of the model against each other: error, parameters, ties",
+        records=True,
+        joint=True,
+    )
+    other_payload(explored)
+    explored.add_argument(
+        "--held-out",
+        nargs="+",
+        action="extend",
+        metavar="REC",
+        default=[],
+        help="records the fit must not see",
+    )
+    explored.add_argument(
+        "--picture", metavar="FILE.svg", help="draw the held-out error against the parameters"
+    )
+    explored.add_argument(
+        "--out", metavar="DIR", help="folder for the variants as Parquet, with JSON and picture"
+    )
+    explored.add_argument(
+        "-o", "--output", metavar="FILE", help="write the joint file of the recommended variant"
+    )
     moved = verb("changed", "changed", "which parameters of a fitted joint moved, by how much")
     moved.add_argument("reference", metavar="REFERENCE", help="joint file written by a fit")
     moved.add_argument("records", nargs="+", metavar="REC", help="record files")
