@@ -43,7 +43,7 @@ def improve_files(
     """
     distinct(training=train, other_payload=other_payload, held_out=held_out)
     joint = open_joint(joint_path)
-    records, _ = _training(train, other_payload, joint)
+    records, _ = marked_training(train, other_payload, joint)
     held, _ = open_records(held_out, joint)
     alike([*train, *other_payload, *held_out], [*records, *held], joint)
     since = (
@@ -56,12 +56,12 @@ def improve_files(
         joint = replace(joint, known={n: k for n, k in joint.known.items() if n not in gone})
     found = improve(records, joint, held, max_additions=max_additions, progress=progress_bar)
     progress_bar("done", 1.0)
-    _print_warnings(found.warnings, [*records, *held])
+    print_warnings(found.warnings, [*records, *held])
     data = found.as_json() if since is None else {**found.as_json(), "changed": since.as_json()}
     return data, found, [*records, *held]
 
 
-def _print_warnings(warnings: Sequence[str], records: Sequence[Record]) -> None:
+def print_warnings(warnings: Sequence[str], records: Sequence[Record]) -> None:
     """Warnings on stderr, without those that were printed when the records were opened."""
     said = gate_warnings(records)
     for text in warnings:
@@ -69,7 +69,7 @@ def _print_warnings(warnings: Sequence[str], records: Sequence[Record]) -> None:
             print(f"irj: {text}", file=sys.stderr)
 
 
-def _training(
+def marked_training(
     paths: Sequence[str], other_payload: Sequence[str], joint: Joint
 ) -> tuple[list[Record], list[str]]:
     """Training records, those with another payload marked, and the warnings."""
@@ -232,7 +232,7 @@ def run_fit(arguments: Namespace) -> int:
     """`irj fit`."""
     distinct(training=arguments.records, other_payload=arguments.other_payload)
     joint = open_joint(arguments.joint)
-    records, warnings = _training(arguments.records, arguments.other_payload, joint)
+    records, warnings = marked_training(arguments.records, arguments.other_payload, joint)
     alike([*arguments.records, *arguments.other_payload], records, joint)
     fitted = fit(joint, records)
     if arguments.refine:
@@ -301,7 +301,7 @@ def run_diagnose(arguments: Namespace) -> int:
         held_out=arguments.held_out,
     )
     joint = open_joint(arguments.joint)
-    records, _ = _training(arguments.records, arguments.other_payload, joint)
+    records, _ = marked_training(arguments.records, arguments.other_payload, joint)
     held, _ = open_records(arguments.held_out, joint)
     alike(
         [*arguments.records, *arguments.other_payload, *arguments.held_out],
@@ -310,7 +310,7 @@ def run_diagnose(arguments: Namespace) -> int:
     )
     found = diagnose(fit(joint, records), held, progress=progress_bar)
     progress_bar("done", 1.0)
-    _print_warnings(found.warnings, [*records, *held])
+    print_warnings(found.warnings, [*records, *held])
     if found.data.note:
         print(f"note: {found.data.note}")
     print(found)
