@@ -37,6 +37,10 @@ SENSORS: Final = MappingProxyType(
 """Noise of the sensors before any record is there: the thesis's table B.1, link-referred
 [N.m, rad; N, m]."""
 
+ABSORBED: Final = 0.5
+"""Share of an effect's squares that another must take before the two are called alike: a small
+effect is not like every other one."""
+
 
 @final
 @dataclass(frozen=True)
@@ -104,7 +108,10 @@ class Blind:
 
 
 def _hint(one: str, other: str) -> str:
-    hint = next((EFFECTS[n].separate_by for n in (one, other) if EFFECTS[n].separate_by), "")
+    told = [EFFECTS[n].told_by for n in (one, other)] + [
+        EFFECTS[n].separate_by for n in (one, other)
+    ]
+    hint = next((text for text in told if text), "")
     return f"; {hint} would separate them" if hint else ""
 
 
@@ -137,7 +144,7 @@ def blind_spots(joint: Joint, motion: Motion) -> Blind:
     base = make_base(solve(prepared, data), data)
     candidates, refused = offered(prepared, data)
     unseen = {n.effect: Unseen(n.effect, n.why) for n in refused}
-    shown: dict[str, tuple[FloatArray, FloatArray]] = {}
+    shown: dict[str, tuple[FloatArray, list[FloatArray]]] = {}
     for candidate in candidates:
         key = candidate.effect.key
         found = _columns(candidate, base)
@@ -163,8 +170,10 @@ def blind_spots(joint: Joint, motion: Motion) -> Blind:
     )
 
 
-def _columns(candidate: Candidate, base: Base) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-    """Span of the candidate's columns outside the base over all its shapes, what one of typical
+def _columns(
+    candidate: Candidate, base: Base
+) -> tuple[list[FloatArray], FloatArray, FloatArray] | None:
+    """Span of the candidate's columns outside the base at each of its shapes, what one of typical
     size adds outside the base, and altogether; None where it has no column at all."""
     data = base.data
     balances = balances_of(
@@ -183,8 +192,7 @@ def _columns(candidate: Candidate, base: Base) -> tuple[FloatArray, FloatArray, 
         for shapes in shape_grid(candidate, data)
     ]
     q = base.orthonormal
-    every = span_of(np.column_stack([_apart(c, q) for c in spans]))
-    return every, _apart(signal, q), signal
+    return [span_of(_apart(c, q)) for c in spans], _apart(signal, q), signal
 
 
 def _apart(values: FloatArray, q: FloatArray) -> FloatArray:
@@ -204,16 +212,21 @@ def _why(candidate: Candidate, share: float, nats: float) -> str:
     return f"{what}{f'; {effect.separate_by} would show it' if effect.separate_by else ''}"
 
 
-def _alike(shown: dict[str, tuple[FloatArray, FloatArray]]) -> tuple[tuple[str, str], ...]:
+def _alike(shown: dict[str, tuple[FloatArray, list[FloatArray]]]) -> tuple[tuple[str, str], ...]:
     """Pairs of which each, at its typical size, could be taken for the other."""
     names = list(shown)
     out = []
     for k, one in enumerate(names):
         for other in names[:k]:
-            left = [
-                0.5 * INDEPENDENT_SHARE * float(np.sum(_apart(shown[a][0], shown[b][1]) ** 2))
-                for a, b in ((one, other), (other, one))
-            ]
-            if min(left) < enough():
+            if any(_taken(shown[a], shown[b]) for a, b in ((one, other), (other, one))):
                 out.append((other, one))
     return tuple(out)
+
+
+def _taken(
+    one: tuple[FloatArray, list[FloatArray]], other: tuple[FloatArray, list[FloatArray]]
+) -> bool:
+    """Whether one effect of typical size could be taken for another of some shape."""
+    left = min(float(np.sum(_apart(one[0], span) ** 2)) for span in other[1])
+    whole = float(one[0] @ one[0])
+    return 0.5 * INDEPENDENT_SHARE * left < enough() and left < (1 - ABSORBED) * whole

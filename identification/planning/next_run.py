@@ -14,13 +14,14 @@ import numpy.typing as npt
 from casadi_models import EFFECTS
 from identification.balance.balances import balances_of
 from identification.balance.calibration import names_of_runs
-from identification.balance.dataset import Dataset
+from identification.balance.dataset import Dataset, without
 from identification.balance.stacked import row_weights
 from identification.balance.weak import WeakRecord
 from identification.data.formats import words
 from identification.diagnosis.claims import Claim
 from identification.diagnosis.improvement import Improvement
-from identification.fitting.engine import Solution
+from identification.fitting.covariance import correlations
+from identification.fitting.engine import Solution, solve
 from identification.fitting.information import form_of, information, white_errors
 from identification.planning.motion import Motion
 from identification.planning.rivals import (
@@ -50,9 +51,12 @@ Progress = Callable[[str, float], None]
 LENGTHS: Final = (10.0, 15.0, 20.0, 30.0, 45.0, 60.0, 90.0)
 """Lengths that are proposed [s]: the shortest that is enough, else the longest."""
 DECIDED: Final = 2.0
-"""t over blocks of the difference of two log-likelihoods above which a name counts as behind."""
+"""Normal deviate over blocks of a difference of log-likelihoods from which a name is behind."""
 KNOWN: Final = 0.1
 """Standard error over value from which a parameter counts as identified, as in `irj plan`."""
+STOOD_IN: Final = 10.0
+"""Standard error in units of the one with all others known from which others stand in for a
+parameter."""
 SHOWN: Final = 3
 """Runs that are shown for each set."""
 
@@ -314,53 +318,75 @@ def _for_set(
     claim: Claim, last: Solution, data: Dataset, simulated: _Simulated
 ) -> tuple[list[Proposal], list[str], list[str]]:
     """Proposals for one set, what is told apart already, what no motion separates."""
-    _, rivals = rivals_of(claim, last, data)
+    start = solve(without(last.model, claim.label), data, start=last.values)
+    rivals = rivals_of(claim.effects, claim.balance, start, data)
     if len(rivals) < 2:
         return [], [], []
     contest = Contest(rivals, data)
     alive, told = _alive(contest)
     if len(alive) < 2:
         return [], told, []
-    if len(alive) < len(rivals):
-        contest = Contest(alive, data)
-    behind = contest.ahead[:, 0]
-    before = min(abs(float(behind[i] - behind[j])) for i in range(len(behind)) for j in range(i))
-    names = tuple(r.name for r in contest.rivals)
-    scored = []
-    for run, rows in simulated.rows():
-        apart = contest.distances(rows)
-        np.fill_diagonal(apart, math.inf)
-        scored.append((float(apart.min()), run, apart))
-    scored.sort(key=lambda s: -s[0])
-    if not scored:
-        return [], told, [f"{' / '.join(names)}: no motion keeps the limits; widen them"]
-    most = np.max([np.minimum(s[2], s[2].T) for s in scored], axis=0) * LENGTHS[-1] / SIMULATED
-    stuck = _stuck(names, most)
-    if stuck and len(names) == 2:
-        return [], told, stuck
-    if stuck:  # the others of the set may still be told apart
-        scored = sorted(
-            ((float(np.where(most < FEWEST, math.inf, a).min()), run, a) for _, run, a in scored),
-            key=lambda s: -s[0],
-        )
-        if not math.isfinite(scored[0][0]):
-            return [], told, stuck
-    out = []
-    for least, run, apart in scored[:SHOWN]:
-        seconds = next((t for t in LENGTHS if least * t / SIMULATED >= enough()), LENGTHS[-1])
-        scale = seconds / SIMULATED
-        out.append(
-            Proposal(
-                names,
-                run,
-                seconds,
-                before,
-                least * scale,
-                power(least * scale),
-                MappingProxyType(_meanings(names, apart * scale)),
-            )
-        )
-    return out, told, stuck
+    runs = simulated.rows()
+    if not runs:
+        listed = " / ".join(r.name for r in alive)
+        return [], told, [f"{listed}: no motion keeps the limits; widen them"]
+    contest = Contest(alive, data)
+    apart = [contest.distances(rows) for _, rows in runs]
+    simple, same = _one_law(contest, _most(apart))
+    told += same
+    kept = [k for k, r in enumerate(contest.rivals) if r.name in simple]
+    if len(kept) < 2:
+        return [], told, []
+    behind = contest.ahead[kept, 0]
+    apart = [a[np.ix_(kept, kept)] for a in apart]
+    names = tuple(contest.rivals[k].name for k in kept)
+    most = _most(apart)
+    never = _stuck(names, most)
+    # what no motion separates is no reason to choose one
+    counted = [np.where(most < FEWEST, math.inf, a) for a in apart]
+    scored = [(float(c.min()), run, a) for c, (run, _), a in zip(counted, runs, apart, strict=True)]
+    scored = sorted((s for s in scored if math.isfinite(s[0])), key=lambda s: -s[0])
+    before = min(abs(float(behind[i] - behind[j])) for i in range(len(kept)) for j in range(i))
+    return [_proposal(names, one, before, most) for one in scored[:SHOWN]], told, never
+
+
+def _most(apart: Sequence[FloatArray]) -> FloatArray:
+    """The best that any run could do for each pair in the longest time, whichever name is true."""
+    return np.asarray(np.max([np.minimum(a, a.T) for a in apart], axis=0) * LENGTHS[-1] / SIMULATED)
+
+
+def _one_law(contest: Contest, most: FloatArray) -> tuple[set[str], list[str]]:
+    """Names without those that, as fitted, are a simpler one on every motion: parameters that
+    change nothing are no name.
+    """
+    kept, told = {r.name for r in contest.rivals}, []
+    counts = [len(contest.free(r)) for r in contest.rivals]
+    for i, rival in enumerate(contest.rivals):
+        for j, simpler in enumerate(contest.rivals):
+            if counts[j] < counts[i] and most[i, j] < FEWEST and rival.name in kept:
+                kept.discard(rival.name)
+                told.append(
+                    f"{rival.name} as fitted is {simpler.name} on every motion that was tried; the "
+                    "name with fewer parameters stands"
+                )
+    return kept, told
+
+
+def _proposal(
+    names: tuple[str, ...], scored: tuple[float, Run, FloatArray], before: float, most: FloatArray
+) -> Proposal:
+    least, run, apart = scored
+    seconds = next((t for t in LENGTHS if least * t / SIMULATED >= enough()), LENGTHS[-1])
+    scale = seconds / SIMULATED
+    return Proposal(
+        names,
+        run,
+        seconds,
+        before,
+        least * scale,
+        power(least * scale),
+        MappingProxyType(_meanings(names, np.where(most < FEWEST, math.inf, apart) * scale)),
+    )
 
 
 def _alive(contest: Contest) -> tuple[list[Rival], list[str]]:
@@ -370,7 +396,7 @@ def _alive(contest: Contest) -> tuple[list[Rival], list[str]]:
         if nats > enough() and t > DECIDED:
             told.append(
                 f"{contest.leader.name} fits better than {rival.name} by {nats:.3g} nats over "
-                f"blocks (t = {t:.2g})"
+                f"blocks (deviate {t:.2g})"
             )
         else:
             alive.append(rival)
@@ -383,9 +409,9 @@ def _stuck(names: Sequence[str], most: FloatArray) -> list[str]:
     for i in range(len(names)):
         for j in range(i):
             if most[i, j] < FEWEST:
-                hints = [EFFECTS[names[k]].separate_by for k in (j, i)]
+                hints = [EFFECTS[names[k]].told_by for k in (j, i)]
                 hint = next((h for h in hints if h), "a value known beforehand for one of them")
-                out.append(f"{names[j]} from {names[i]}; {hint}")
+                out.append(f"{names[j]} from {names[i]}; what does: {hint}")
     return out
 
 
@@ -394,12 +420,12 @@ def _meanings(names: Sequence[str], apart: FloatArray) -> dict[str, str]:
     out = {}
     for i, name in enumerate(names):
         j = int(np.argmin(apart[i]))
+        if not math.isfinite(apart[i, j]):
+            continue
+        more = ", and of the others by more" if len(names) > 2 else ""
         out[name] = (
             f"where {words(name)} is true, its fit comes out ahead of {words(names[j])} by about "
-            f"{apart[i, j]:.2g} nats, and of the others by more"
-            if len(names) > 2
-            else f"where {words(name)} is true, its fit comes out ahead by about "
-            f"{apart[i, j]:.2g} nats"
+            f"{apart[i, j]:.2g} nats{more}"
         )
     return out
 
@@ -412,10 +438,14 @@ def _for_parameters(
         p.name for p in solution.model.parameters if p.name in solution.model.calibration
     }
     free = tuple(n for n in solution.free if n not in solution.at_bound)
-    wanted = [n for n in solution.unidentified if n in free and n not in nuisance]
+    old = information(form_of(solution, data, free, solution.weights), len(free))
+    spread = dict(zip(free, correlations(old)[0], strict=True))
+    # an amplitude near zero is known to be near zero: only what others stand in for is to plan for
+    wanted = [
+        n for n in solution.unidentified if n in free and n not in nuisance and spread[n] > STOOD_IN
+    ]
     if not wanted:
         return None, []
-    old = information(form_of(solution, data, free, solution.weights), len(free))
     now = _relative(old, free, solution.values)
     best: tuple[float, Run, dict[str, float], float] | None = None
     for run, rows in simulated.rows():

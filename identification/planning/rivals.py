@@ -11,13 +11,13 @@ from typing import Final, final
 import numpy as np
 import numpy.typing as npt
 
+from casadi_models import EFFECTS
 from identification.balance.balances import balances_of
 from identification.balance.calibration import names_of_runs
-from identification.balance.dataset import Dataset, without
+from identification.balance.dataset import Dataset
 from identification.balance.stacked import INDEPENDENT_SHARE, row_weights
-from identification.balance.weak import WeakRecord
+from identification.balance.weak import REST_SHARE, RESTING_SIDES, WeakRecord
 from identification.diagnosis.candidates import offered
-from identification.diagnosis.claims import Claim
 from identification.diagnosis.trials import Trial, make_base, try_candidate
 from identification.fitting.covariance import RANK
 from identification.fitting.engine import Solution, solve
@@ -29,6 +29,8 @@ ROUNDS: Final = 3
 """Gauss-Newton steps in which a rival adapts to a run of another: shapes are no straight lines."""
 FEWEST: Final = 3.0
 """Log-likelihood from which a name counts as better, as in every comparison of claims [nats]."""
+TURN_WIDTHS: Final = 3.0
+"""Smoothing velocities up to which friction has not yet reached its level (to 1 %)."""
 SURE: Final = 1.6449
 """Normal quantile of 95 %: a run is long enough where so many of them come out above `FEWEST`."""
 
@@ -51,31 +53,39 @@ class Rival:
     solution: Solution
 
 
-def rivals_of(claim: Claim, last: Solution, data: Dataset) -> tuple[Solution, list[Rival]]:
-    """The model without a claim, and with every name of its set in the claim's place, each fitted
-    from the best point of its grid.
+def rivals_of(names: Sequence[str], balance: str, start: Solution, data: Dataset) -> list[Rival]:
+    """Every name of a set, fitted from the best point of its grid.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Effect keys.
+    balance : str
+        Where the set was claimed: of several places of a name, one that helps there.
+    start : Solution
+        The fit of the model without any of them.
+    data : Dataset
     """
-    start = solve(without(last.model, claim.label), data, start=last.values)
     base = make_base(start, data)
-    found = offered(start.model, data)[0] + offered(start.model, data, late=True)[0]
+    candidates = offered(start.model, data, late=True)[0]
     best: dict[str, Trial] = {}
-    for candidate in found:
-        if candidate.effect.key not in claim.effects:
+    for candidate in candidates:
+        if candidate.effect.key not in names:
             continue
         trial = try_candidate(candidate, base)
         if not isinstance(trial, Trial):
             continue
         old = best.get(trial.key)
-        here = trial.balance == claim.balance
-        if old is None or (here, trial.score) > (old.balance == claim.balance, old.score):
+        here = trial.balance == balance
+        if old is None or (here, trial.score) > (old.balance == balance, old.score):
             best[trial.key] = trial
-    return start, [
+    return [
         Rival(
             key,
             best[key].candidate.label,
             solve(best[key].candidate.model, data, start={**start.values, **best[key].values}),
         )
-        for key in claim.effects
+        for key in names
         if key in best
     ]
 
@@ -127,16 +137,20 @@ class Contest:
 
     @cached_property
     def ahead(self) -> FloatArray:
-        """By how much the leader is ahead of each rival on the old records, and its t over
-        blocks: (rivals, 2).
+        """By how much the leader is ahead of each rival on the old records, and how sure that is
+        over blocks, as a normal deviate: by their mean or by their signs.  (rivals, 2)
         """
         first = self.rivals.index(self.leader)
         squares = [_by_block(r, block) for r, _, block in self._old]
         out = np.zeros((len(self.rivals), 2))
         for k, own in enumerate(squares):
             difference = 0.5 * INDEPENDENT_SHARE * (own - squares[first])
-            spread = float(np.std(difference, ddof=1)) * math.sqrt(len(difference))
-            out[k] = difference.sum(), float(difference.sum()) / spread if spread > 0 else 0.0
+            count = len(difference)
+            spread = float(np.std(difference, ddof=1)) * math.sqrt(count) if count > 1 else 0.0
+            mean = float(difference.sum()) / spread if spread > 0 else 0.0
+            # one block may hold most of a difference that all of them show
+            signs = float(np.sign(difference).sum()) / math.sqrt(count)
+            out[k] = difference.sum(), max(mean, signs)
         return out
 
     @cached_property
@@ -151,7 +165,7 @@ class Contest:
 
     def distances(self, rows: WeakRecord) -> FloatArray:
         """Expected log-likelihood by which name i, where it is true, comes out ahead of name j
-        after a run, (rivals, rivals) [nats].
+        after a run, (rivals, rivals), infinite on the diagonal [nats].
 
         One clean motion, of the model that all have in common, serves all: only the differences of
         the laws on it count. Name j may adapt as far as the old records let it.
@@ -160,16 +174,20 @@ class Contest:
         leader = self.leader.solution
         values = {**leader.values, **dict.fromkeys(names_of_runs(leader.model, [rows]), 0.0)}
         balances = balances_of(leader.model, new.sensing, wrt=())
-        weights = {
-            b: w * rows.taking(b)
-            for b, w in row_weights(balances, new, values, leader.sigma, [rows]).items()
-        }
-        here = [self._rest(rival, new, weights) for rival in self.rivals]
-        out = np.zeros((len(self.rivals), len(self.rivals)))
-        for j, rival in enumerate(self.rivals):
-            for i in range(len(self.rivals)):
-                if i != j:
-                    out[i, j] = self._least(rival, self.information[j], here[i], new, weights)
+        whole = row_weights(balances, new, values, leader.sigma, [rows])
+        calm = {b: w * ~_turning(leader, rows, b) for b, w in whole.items()}
+        out = np.full((len(self.rivals), len(self.rivals)), math.inf)
+        for weights, at_turns in ((whole, True), (calm, False)):
+            pairs = [
+                (i, j)
+                for i, one in enumerate(self.rivals)
+                for j, other in enumerate(self.rivals)
+                if i != j and (_about_turns(one) or _about_turns(other)) == at_turns
+            ]
+            here = {k: self._rest(self.rivals[k], new, weights) for p in pairs for k in p}
+            for i, j in pairs:
+                known = self.information[j]
+                out[i, j] = self._least(self.rivals[j], known, here[i], new, weights)
         return out
 
     def _rest(self, rival: Rival, new: Dataset, weights: Mapping[str, FloatArray]) -> FloatArray:
@@ -223,6 +241,26 @@ class Contest:
                 break
             x, left, best = moved, after, reached
         return best
+
+
+def _about_turns(rival: Rival) -> bool:
+    """Whether a law says what happens while the motion turns round."""
+    effect = EFFECTS[rival.name]
+    return effect.memory is not None or effect.shapes_reversal
+
+
+def _turning(solution: Solution, rows: WeakRecord, balance: str) -> npt.NDArray[np.bool_]:
+    """Rows that touch a turn of a side whose friction acts in the balance: there dry friction is an
+    inequality, and the width of its change a stand-in.
+    """
+    out = np.zeros(rows.rows, dtype=np.bool_)
+    for side in RESTING_SIDES.get(balance, ()):
+        velocity = rows.points[f"{side}_velocity"]
+        widths = [solution.values[n] for n in solution.model.named("smoothing", side)]
+        slow = np.abs(velocity) < TURN_WIDTHS * max(widths, default=0.0)
+        turns = np.diff(np.sign(velocity), append=velocity[-1]) != 0
+        out |= rows.average((slow | turns).astype(np.float64)) > REST_SHARE
+    return out
 
 
 def _by_block(residual: FloatArray, block: npt.NDArray[np.int64]) -> FloatArray:

@@ -41,8 +41,9 @@ LOADS: Final = MappingProxyType(
 )
 """Loads that are tried: share of gravity torque and of link inertia.  Without gravity the inertia
 is left at its half, since the link itself stays."""
-ROUNDING: Final = 0.12
-"""Width of the window that rounds the corners of every motion [s]: some kernels."""
+ROUNDING: Final = 0.3
+"""Width of the window that rounds the corners of every motion [s]: several kernels, and slow enough
+for a drive."""
 SLOW: Final = 0.2
 """Speed of the slow motions as a share of the fastest: Stribeck velocities lie below it."""
 
@@ -103,7 +104,7 @@ class Run:
         """The reference to follow, at rest at its first sample."""
         time = np.arange(max(2, round(seconds / dt)), dtype=np.float64) * dt
         shape = FAMILIES[self.family](time, self.half, self.speed)
-        path = _rounded(shape, round(ROUNDING / dt))
+        path = _rounded(_begun(time) * shape, round(ROUNDING / dt))
         velocity = np.gradient(path, dt)
         top, fast = float(np.abs(path).max()), float(np.abs(velocity).max())
         share = min(1.0, self.half / max(top, 1e-300), self.speed / max(fast, 1e-300))
@@ -120,8 +121,14 @@ class Run:
         )
 
 
+def _begun(time: FloatArray) -> FloatArray:
+    """From 0 to 1 over the first second: every motion begins at rest at its middle."""
+    s = np.clip(time, 0.0, 1.0)
+    return np.asarray(s**3 * (10 - 15 * s + 6 * s**2))
+
+
 def _rounded(path: FloatArray, width: int) -> FloatArray:
-    """Corners rounded; from rest at the first sample."""
+    """Corners rounded."""
     window = np.hanning(2 * (width // 2) + 3)[1:-1]
     half = len(window) // 2
     padded = np.concatenate([np.full(half, path[0]), path, np.full(half, path[-1])])
@@ -155,7 +162,8 @@ def _pick(time: FloatArray, half: float, speed: float) -> FloatArray:
 
 def _steps(time: FloatArray, half: float, speed: float) -> FloatArray:
     """Small slow moves to and fro that wander over the travel."""
-    middles = np.repeat(np.linspace(-0.9, 0.9, 19), 2)
+    wave = np.concatenate([np.arange(0, 7), np.arange(5, -7, -1), np.arange(-5, 0)]) / 7
+    middles = np.repeat(wave, 2)
     to_and_fro = np.where(np.arange(len(middles)) % 2 == 0, 0.06, -0.06)
     return _moves(time, half * (middles + to_and_fro), SLOW * speed, 0.2)
 
