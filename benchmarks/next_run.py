@@ -22,7 +22,7 @@ import numpy.typing as npt
 from identification import Joint, Record
 from identification.data.joint_file import Known
 from identification.fitting.engine import load_dataset, prepared_model, solve
-from identification.planning.rivals import FEWEST, Contest, Rival, enough, rivals_of
+from identification.planning.rivals import Contest, Rival, enough, rivals_of
 from identification.planning.runs import (
     SIMULATED,
     Plant,
@@ -53,10 +53,10 @@ SPAN: Final = 10.0
 """Length of the record on which they tie [s]."""
 SECONDS: Final = 15.0
 """Length of the proposed run and of the random one [s]."""
+MOST_DRAWN: Final = 4
+"""Joints that are drawn at most for each one whose names tie."""
 SPEED: Final = float(np.radians(60.0))
 """What the joints may do [rad/s]."""
-CERTAIN: Final = 2.0
-"""t over blocks from which a name counts as behind, as in `irj next`."""
 
 
 @final
@@ -101,16 +101,14 @@ def judged(contest: Contest, truth: str) -> tuple[float, bool, bool]:
     if truth not in likelihood:
         return -np.inf, False, False
     found = likelihood[truth] - max(v for n, v in likelihood.items() if n != truth)
-    left = [
-        n
-        for n, (nats, t) in zip(names, contest.ahead, strict=True)
-        if not (nats > FEWEST and t > CERTAIN)
-    ]
+    left = [r.name for r in contest.alive]
     return float(found), left == [truth], truth in left
 
 
-def one_joint(which: str, truth: str, seed: int, size: float) -> list[tuple[str, Outcome, Run]]:
-    """Before, after the proposed run, after a random one."""
+def one_joint(
+    which: str, truth: str, seed: int, size: float = 1.0
+) -> list[tuple[str, Outcome, Run]]:
+    """Before, after the proposed run, after a random one; empty where no names tie."""
     balance, names = SETS[which]
     case = simulate_case(truth, seed, span=SPAN, size=size, records=("train",))
     joint = Joint(
@@ -126,6 +124,9 @@ def one_joint(which: str, truth: str, seed: int, size: float) -> list[tuple[str,
     model = prepared_model(joint, old)
     data = load_dataset([old], [], joint, model)
     rivals = rivals_of(names, balance, solve(model, data), data)
+    rivals = list(Contest(rivals, data).alive)
+    if len(rivals) < 2:
+        return []
     contest = Contest(rivals, data)
     space = workspace_of(data, Limits(speed=SPEED))
     plant = Plant(contest.leader.solution.model, DT)
@@ -201,10 +202,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     better, joints = 0, 0
     for which in given.sets:
         names = SETS[which][1]
-        for k in range(given.joints):
-            truth = names[k % len(names)]
+        drawn = done = 0
+        while done < given.joints and drawn < MOST_DRAWN * given.joints:
+            truth = names[drawn % len(names)]
+            results = one_joint(which, truth, given.start + drawn, given.size)
+            drawn += 1
+            if not results:
+                continue
+            done += 1
             joints += 1
-            results = one_joint(which, truth, given.start + k, given.size)
             for kind, outcome, run in results:
                 counts[kind] += outcome.one
                 inside[kind] += outcome.in_set
@@ -218,6 +224,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                     flush=True,
                 )
             better += results[1][1].found > results[2][1].found
+        print(f"{which}: {done} of {drawn} joints tie on the short record")
     print(
         f"one right name: before {counts['before']}, proposed {counts['proposed']}, random "
         f"{counts['random']} of {joints}; truth left: {inside['before']}, {inside['proposed']}, "

@@ -229,10 +229,10 @@ def _published(name: str, row: Mapping[str, Any], path: Path) -> Entry:
         name,
         joint,
         values,
-        {},
-        {n: parameters[n].unit for n in values},
-        {"type": module, "source": PUBLISHED, "referred to": "joint side"},
-        tuple(left),
+        errors={},
+        units={n: parameters[n].unit for n in values},
+        provenance={"type": module, "source": PUBLISHED, "referred to": "joint side"},
+        left_out=tuple(left),
     )
 
 

@@ -53,9 +53,10 @@ class Trusted:
         `kind` is one of `CLASSES`.
     value : float
     stderr : float or None
-        The larger of the errors from blocks and from white rows.
+        As the fit states it, from blocks.
     low, high : float or None
-        95 % interval; from a profile for shapes.
+        95 % interval: from the standard error; for shapes from a profile, with the larger of the
+        errors from blocks and from white rows.
     records, windows : tuple of (float or None)
         Value on each training record and in each of `WINDOWS` windows, where these tell it.
     partner : str or None
@@ -142,8 +143,10 @@ class Trust:
 
 def kind_of(model: JointModel, parameter: Parameter) -> str:
     """Class of a parameter (one of `CLASSES`), from its declaration."""
-    if parameter.role in ("inertia", "stiffness"):
-        return parameter.role
+    if parameter.name in model.inertias:
+        return "inertia"
+    if parameter.name == model.stiffness_name:
+        return "stiffness"
     if parameter.is_shape:
         return "shape"
     friction = any(parameter.name in t.names and t.effect.family == "friction" for t in model.terms)
@@ -243,10 +246,12 @@ class _Judge:
         k = self.moving.index(p.name)
         from_blocks = self.solution.stderr.get(p.name)
         white = float(self.white[k])
-        known = [e for e in (from_blocks, white) if e is not None and math.isfinite(e)]
-        if not known or not math.isfinite(white):
+        if not math.isfinite(white):
             return replace(bare_one, why="flat: no value of it is worse than another")
-        error = max(known)
+        stated = white if from_blocks is None else from_blocks
+        # few blocks tell of a shape and may agree by chance; of all others white rows say too
+        # little: the noise of accelerations has no slow part
+        error = max(stated, white) if p.is_shape else stated
         low, high = value - NORMAL * error, value + NORMAL * error
         if p.is_shape and profiles and error < abs(value):
             low, high = self._profiled(p.name, error, error / white)
@@ -257,7 +262,7 @@ class _Judge:
         verdict, why = self._verdict(p, value, share, rho)
         return replace(
             bare_one,
-            stderr=error,
+            stderr=stated,
             low=low,
             high=high,
             records=tuple(v[p.name] for v in by_record),
@@ -316,7 +321,7 @@ class _Judge:
             return (
                 ("only in combination", "its interval contains zero")
                 if tied
-                else ("not", "flat: its interval contains zero")
+                else ("not", "its interval contains zero")
             )
         if p.name in self.solution.unidentified:
             return "only in combination", "not identifiable by itself"

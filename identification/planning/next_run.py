@@ -27,7 +27,6 @@ from identification.planning.motion import Motion
 from identification.planning.rivals import (
     FEWEST,
     Contest,
-    Rival,
     enough,
     power,
     rivals_of,
@@ -50,8 +49,6 @@ Progress = Callable[[str, float], None]
 
 LENGTHS: Final = (10.0, 15.0, 20.0, 30.0, 45.0, 60.0, 90.0)
 """Lengths that are proposed [s]: the shortest that is enough, else the longest."""
-DECIDED: Final = 2.0
-"""Normal deviate over blocks of a difference of log-likelihoods from which a name is behind."""
 KNOWN: Final = 0.1
 """Standard error over value from which a parameter counts as identified, as in `irj plan`."""
 STOOD_IN: Final = 10.0
@@ -286,9 +283,9 @@ def next_run(
         sharpened,
         tuple(told),
         (*cannot, *lost),
-        space,
-        data.train[0].grid.dt,
-        "rad" if data.joint.kind == "rotary" else "m",
+        space=space,
+        dt=data.train[0].grid.dt,
+        unit="rad" if data.joint.kind == "rotary" else "m",
     )
 
 
@@ -323,7 +320,13 @@ def _for_set(
     if len(rivals) < 2:
         return [], [], []
     contest = Contest(rivals, data)
-    alive, told = _alive(contest)
+    alive = contest.alive
+    told = [
+        f"{contest.leader.name} fits better than {rival.name} by {nats:.3g} nats over blocks "
+        f"(deviate {deviate:.2g})"
+        for rival, (nats, deviate) in zip(contest.rivals, contest.ahead, strict=True)
+        if rival not in alive
+    ]
     if len(alive) < 2:
         return [], told, []
     runs = simulated.rows()
@@ -383,24 +386,10 @@ def _proposal(
         run,
         seconds,
         before,
-        least * scale,
-        power(least * scale),
-        MappingProxyType(_meanings(names, np.where(most < FEWEST, math.inf, apart) * scale)),
+        nats=least * scale,
+        power=power(least * scale),
+        means=MappingProxyType(_meanings(names, np.where(most < FEWEST, math.inf, apart) * scale)),
     )
-
-
-def _alive(contest: Contest) -> tuple[list[Rival], list[str]]:
-    """Rivals that the whole fits on the old records leave, and sentences about the others."""
-    alive, told = [], []
-    for rival, (nats, t) in zip(contest.rivals, contest.ahead, strict=True):
-        if nats > enough() and t > DECIDED:
-            told.append(
-                f"{contest.leader.name} fits better than {rival.name} by {nats:.3g} nats over "
-                f"blocks (deviate {t:.2g})"
-            )
-        else:
-            alive.append(rival)
-    return alive, told
 
 
 def _stuck(names: Sequence[str], most: FloatArray) -> list[str]:

@@ -29,6 +29,8 @@ ROUNDS: Final = 3
 """Gauss-Newton steps in which a rival adapts to a run of another: shapes are no straight lines."""
 FEWEST: Final = 3.0
 """Log-likelihood from which a name counts as better, as in every comparison of claims [nats]."""
+DECIDED: Final = 2.0
+"""Normal deviate over blocks of a difference of log-likelihoods from which a name is behind."""
 TURN_WIDTHS: Final = 3.0
 """Smoothing velocities up to which friction has not yet reached its level (to 1 %)."""
 SURE: Final = 1.6449
@@ -152,6 +154,15 @@ class Contest:
             signs = float(np.sign(difference).sum()) / math.sqrt(count)
             out[k] = difference.sum(), max(mean, signs)
         return out
+
+    @property
+    def alive(self) -> tuple[Rival, ...]:
+        """Rivals that the whole fits on the old records leave."""
+        return tuple(
+            rival
+            for rival, (nats, deviate) in zip(self.rivals, self.ahead, strict=True)
+            if not (nats > enough() and deviate > DECIDED)
+        )
 
     @cached_property
     def information(self) -> list[FloatArray]:
