@@ -89,7 +89,7 @@ def test_without_gravity_the_drive_holds_nothing() -> None:
 
 
 def test_the_proposed_run_tells_the_names_apart_as_expected() -> None:
-    before, proposed, _ = one_joint("viscous", "cubic_viscous", 8001, 0.5)
+    before, proposed, _ = one_joint("gain", "added_spring", 8002)
     assert not before[1].one
     assert proposed[1].one
     assert 0.5 < proposed[1].found / proposed[1].expected < 2.0
