@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -185,7 +184,3 @@ def main(argv: Sequence[str] | None = None) -> int:
     if given.names:
         names(given)
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -10,7 +10,6 @@ follows the one that came out.
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -250,7 +249,3 @@ def main(argv: Sequence[str] | None = None) -> int:
         f"{enough():.1f} nats"
     )
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
