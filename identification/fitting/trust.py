@@ -216,8 +216,8 @@ class _Judge:
         return np.where(self.block >= 0, self.block * WINDOWS // last, -1)
 
     def _on(self, rows: npt.NDArray[np.bool_]) -> dict[str, float | None]:
-        """Values that some of the rows alone give: one Gauss-Newton step; None where these tell a
-        parameter less well than its size."""
+        """Values that some of the rows alone give: one Gauss-Newton step; None where these do not
+        tell a parameter to `KNOWN`."""
         j, r = self.j[rows], self.r[rows]
         gram = j.T @ j
         size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
@@ -227,7 +227,7 @@ class _Judge:
         out: dict[str, float | None] = {}
         for k, n in enumerate(self.moving):
             value = self.solution.values[n]
-            known = math.isfinite(errors[k]) and errors[k] < abs(value)
+            known = math.isfinite(errors[k]) and errors[k] < KNOWN * abs(value)
             out[n] = value + float(step[k]) if known else None
         return out
 
