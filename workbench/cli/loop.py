@@ -15,6 +15,7 @@ from identification.data.record import Record
 from identification.diagnosis.improve import Improvement, improve
 from identification.diagnosis.locate import Unexplained
 from identification.fitting.fit import Fit, fit
+from identification.fitting.trust import Trust, trust
 from workbench.cli.files import (
     alike,
     distinct,
@@ -56,7 +57,16 @@ def improve_files(
     progress_bar("done", 1.0)
     print_warnings(found.warnings, [*records, *held])
     data = found.as_json() if since is None else {**found.as_json(), "changed": since.as_json()}
+    judged = trusted(found)
+    data["trust"] = judged.as_json() if judged is not None else []
     return data, found, [*records, *held]
+
+
+def trusted(found: Improvement) -> Trust | None:
+    """Which number of the last step to trust; None where nothing was fitted."""
+    if not found.steps:
+        return None
+    return trust(found.steps[-1].solution, found.data, profiles=False)
 
 
 def print_warnings(warnings: Sequence[str], records: Sequence[Record]) -> None:
@@ -135,7 +145,8 @@ def _write_report(
     if report:
         from workbench.show.report import write_report
 
-        print(f"report: {write_report(found, report, records=records, command=command)}")
+        made = write_report(found, report, records=records, command=command, trust=trusted(found))
+        print(f"report: {made}")
 
 
 def write_picture(found: Improvement, path: str | None) -> None:
@@ -287,14 +298,16 @@ def run_compare(arguments: Namespace) -> int:
         joint,
         once=False,
     )
-    comparison = compare(fit(joint, basis), records, linear=not arguments.no_linear)
+    fitted = fit(joint, basis)
+    comparison = compare(fitted, records, linear=not arguments.no_linear)
     print(comparison)
     for place in comparison.places[:5]:
         print(
             f"  {place.balance} balance against {place.title}: explains "
             f"{max(place.share_percent, 0):.0f} % of what is left there"
         )
-    write_json(arguments.json, comparison.as_json())
+    judged = trust(fitted.solution, fitted.data, profiles=False)
+    write_json(arguments.json, {**comparison.as_json(), "trust": judged.as_json()})
     return 0
 
 
