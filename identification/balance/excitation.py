@@ -120,8 +120,8 @@ def excitation_warnings(data: Dataset) -> tuple[str, ...]:
     if pulled:
         worst = ", ".join(f"{name} by about {share:.2g} %" for name, share in pulled.items())
         out.append(
-            f"noise of the positions lowers the {worst}: `irj fit --refine` takes that off, "
-            "finer encoders avoid it"
+            f"noise of the positions would lower the {worst}: the fit takes that off as far as the "
+            "noise is white, finer encoders avoid it"
         )
     return tuple(out)
 

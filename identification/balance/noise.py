@@ -16,6 +16,10 @@ EVEN: Final = 1e-3
 """Spread of the steps, as a share of the median one, below which stamps count as even: that of
 stamps written with few digits.
 """
+TIE: Final = 1e-6
+"""Relative difference below which two fourth differences are one: those of a quantised channel
+are whole steps, told apart by rounding only (1e-12 of them), and go in or out of the cut together.
+"""
 
 
 KEPT: Final = 0.95
@@ -55,7 +59,7 @@ def noise_level(
         return 0.0
     fourth = np.concatenate(parts)
     magnitude = np.abs(fourth)
-    cut = fourth[magnitude <= np.quantile(magnitude, KEPT)]
+    cut = fourth[magnitude <= np.quantile(magnitude, KEPT) * (1.0 + TIE)]
     if not len(cut):
         return 0.0
     return float(np.std(cut) / CUT_DEVIATION)

@@ -135,7 +135,7 @@ def floor_rows(
     """
     values = settled(model, data.sensing, [*data.train, *records], values)
     known = {id(w): _drawn_floors(model, data, values, w) for w in (*data.train, *records)}
-    kept = _share_that_fits(model, data, values, [known[id(w)] for w in data.train])
+    kept = noise_believed(model, data, values, [known[id(w)] for w in data.train])
     return {
         b: np.concatenate([np.full(w.rows, kept[b] * known[id(w)][b]) for w in records])
         if records
@@ -178,15 +178,17 @@ def _sure_rms(change: FloatArray, either: FloatArray) -> float:
     return level
 
 
-def _share_that_fits(
+def noise_believed(
     model: JointModel,
     data: Dataset,
     values: Mapping[str, float],
-    levels: Sequence[Mapping[str, float]],
+    levels: Sequence[Mapping[str, float]] | None = None,
 ) -> dict[str, float]:
-    """Share of the levels of noise of the training records that what these records leave
-    allows, 1 where there is no contradiction.
+    """Share of the levels of noise of the training records (as drawn, or `levels`) that what these
+    records leave allows, by balance: 1 where there is no contradiction.
     """
+    if levels is None:
+        levels = [_drawn_floors(model, data, values, w) for w in data.train]
     residual = stack(balances_of(model, data.sensing, wrt=()), data.train, values).residual
     either = _unsure(balances_of(model, data.sensing, wrt=()), data, values, data.train)
     out = dict.fromkeys(residual, 1.0)

@@ -215,6 +215,9 @@ class WeakRecord:
         Share of each row's kernel that was measured and not bridged; 1 everywhere where it is None.
     name : str
         Tells the record from all others: its calibration unknowns go by it.
+    shifts : mapping of str to float
+        By the place of a late sensor, the whole samples that are taken off its readings already
+        [s].
     """
 
     grid: Grid
@@ -229,6 +232,7 @@ class WeakRecord:
     rest: Mapping[str, FloatArray] = field(default_factory=dict)
     support: FloatArray | None = None
     name: str = ""
+    shifts: Mapping[str, float] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return one_line(self)

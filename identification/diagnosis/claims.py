@@ -10,7 +10,7 @@ from typing import Any, Final, final
 import numpy as np
 
 from casadi_models import EFFECTS, Effect
-from identification.balance.dataset import HOLD_NAME
+from identification.balance.clocks import MOST_SKEW, carrier
 from identification.diagnosis.candidates import Candidate, NotTestable, offered
 from identification.diagnosis.trials import Base, Trial, try_candidate
 
@@ -59,6 +59,8 @@ UNSEEN_DROP: Final = 20.0
 """Fall of the RMS where the link is not recorded: its motion leaves structure of 10 times the
 floor in the balance.
 """
+HALF_SAMPLE: Final = 0.5
+"""Delay from which on a channel whose clock is not calibrated is late [samples]."""
 COMMON_DROP: Final = 4.0
 """Fall of the RMS that is enough for an effect declared as common: hardly a joint is without it."""
 PLAIN_FIRST: Final = 0.5
@@ -242,9 +244,12 @@ def _major(trial: Trial, base: Base) -> bool:
     if trial.effect.stage == "late":
         return trial.cv_drop_percent >= LATE_DROP and (math.isnan(held) or held >= LATE_DROP)
     if trial.effect.is_delay:
-        dt = base.data.train[0].grid.dt
-        hold = base.solution.values.get(HOLD_NAME, 0.0) if trial.candidate.place == "drive" else 0.0
-        return max(abs(trial.values[n] + hold) for n in trial.candidate.amplitudes) > dt / 2
+        model, place = base.solution.model, trial.candidate.place
+        name = carrier(model, place)
+        late = base.solution.values[name] if name is not None else 0.0
+        least = MOST_SKEW if name in model.calibration else HALF_SAMPLE
+        found = max(abs(trial.values[n] + late) for n in trial.candidate.amplitudes)
+        return found > least * base.data.train[0].grid.dt
     return True
 
 

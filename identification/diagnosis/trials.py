@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from casadi_models import Effect
 from identification.balance.balances import Balances, balances_of
-from identification.balance.calibration import bare, names_of_runs, settled
+from identification.balance.calibration import bare, names_of_runs, settled, within_limits
 from identification.balance.dataset import HOLD_NAME
 from identification.balance.weak import WeakRecord
 from identification.diagnosis.candidates import Candidate, NotTestable, shape_grid
@@ -207,7 +207,7 @@ def make_base(solution: Solution, data: Dataset) -> Base:
     )
     smoothing = model.named("smoothing")
     free = [n for n in solution.free if n not in solution.at_bound or n in smoothing]
-    free += names_of_runs(model, data.train)
+    free += [n for n in names_of_runs(model, data.train) if n not in solution.at_bound]
     signs = _inward_signs(solution, data)
     names = [*free, *signs]
     balances = balances_of(model, data.sensing, wrt=bare(names))
@@ -233,7 +233,7 @@ def make_base(solution: Solution, data: Dataset) -> Base:
     )
     if data.held_out:
         held = stack(balances, data.held_out, solution.values, names)
-        own = names_of_runs(model, data.held_out)
+        own = within_limits(model, data.held_out, solution.values)
         apart = flatten(
             stack(
                 balances_of(model, data.sensing, wrt=bare(own)), data.held_out, solution.values, own
@@ -489,6 +489,8 @@ def _refined(
 
 
 def _collinear_reason(candidate: Candidate) -> str:
+    if candidate.effect.is_delay:
+        return "what is late up to 3.5 samples is in the calibration already"
     names = ", ".join(candidate.effect.confused_with) or "what the model has already"
     separate = (
         f"; {candidate.effect.separate_by} would separate them"

@@ -104,7 +104,13 @@ def wald(gram: FloatArray, scores: FloatArray, amplitudes: FloatArray) -> float:
     return float(fdtrc(count, blocks - count, statistic))
 
 
-def block_errors(jacobian: FloatArray, residual: FloatArray, block: IntArray) -> FloatArray | None:
+def block_errors(
+    jacobian: FloatArray,
+    residual: FloatArray,
+    block: IntArray,
+    noise: tuple[FloatArray, FloatArray] | None = None,
+    whole: FloatArray | None = None,
+) -> FloatArray | None:
     """Standard error of each parameter of a least-squares fit whose rows depend on each other
     within blocks.
 
@@ -120,6 +126,10 @@ def block_errors(jacobian: FloatArray, residual: FloatArray, block: IntArray) ->
         Weighted, at the fit.
     block : (n,) int array
         Block of each row, -1 for none: such rows take part in the fit only.
+    noise : ((blocks, p, p) array, (blocks, p) array), optional
+        What noise of the columns adds to the products of each block; taken off.
+    whole : (p, p) array, optional
+        Normal matrix of all rows, that of the noise taken off.
 
     Returns
     -------
@@ -132,7 +142,9 @@ def block_errors(jacobian: FloatArray, residual: FloatArray, block: IntArray) ->
     parts = np.split(order, np.searchsorted(block[order], numbers))[1:]
     grams = np.array([jacobian[rows].T @ jacobian[rows] for rows in parts])
     scores = np.array([jacobian[rows].T @ residual[rows] for rows in parts])
-    return errors_of_blocks(grams, scores, jacobian.T @ jacobian)
+    if noise is not None:
+        grams, scores = grams - noise[0], scores - noise[1]
+    return errors_of_blocks(grams, scores, jacobian.T @ jacobian if whole is None else whole)
 
 
 def errors_of_blocks(
@@ -185,6 +197,23 @@ def errors_of_blocks(
     return np.asarray(
         np.sqrt(np.maximum(np.diag(covariance), 0.0)) * wider / size, dtype=np.float64
     )
+
+
+def known_errors(whole: FloatArray, prior: FloatArray) -> FloatArray:
+    """Standard error that what is known beforehand leaves in each parameter: blocks of time do not
+    tell of it.
+
+    Parameters
+    ----------
+    whole : (p, p) array
+        Normal matrix, rows of the prior among those that it is made of.
+    prior : (k, p) array
+        Those of the prior.
+    """
+    if not len(prior):
+        return np.zeros(len(whole))
+    inverse = np.linalg.pinv(whole, rcond=RANK, hermitian=True)
+    return np.asarray(np.linalg.norm(prior @ inverse, axis=0), dtype=np.float64)
 
 
 def follows(scores: FloatArray, sizes: FloatArray, alpha: float) -> bool:

@@ -15,9 +15,8 @@ import numpy.typing as npt
 from casadi_models import JointModel
 from casadi_models.term import HANGING, LOAD_COMPLIANCE
 from identification.balance.balances import Balances, balances_of
-from identification.balance.calibration import bare, is_of_run, names_of_runs
+from identification.balance.calibration import bare, is_of_run, names_of_runs, usual
 from identification.balance.dataset import Dataset, load_dataset, prepared_model, weak_record
-from identification.balance.excitation import attenuation
 from identification.balance.stacked import (
     Stacked,
     floor_rows,
@@ -29,7 +28,12 @@ from identification.balance.stacked import (
     taking_part,
 )
 from identification.errors import InputError
-from identification.fitting.covariance import block_errors, correlations
+from identification.fitting.covariance import block_errors, correlations, known_errors
+from identification.fitting.errors_in_variables import (
+    NoiseProducts,
+    unbiased,
+    whole_without,
+)
 from identification.fitting.start_values import bounds_of, starts
 from identification.fitting.weak_form import WeakForm
 
@@ -187,6 +191,7 @@ def _fitted(
     limits = bounds_of(model, known, data)
     shapes = {p.name for p in model.parameters if p.is_shape}
     runs = names_of_runs(model, data.train)
+    known_before = usual(model, data.train, torque=data.sensing.has_torque)
     apart = {*fixed, *held, *model.calibration, *model.named("range")}
     free = [
         *(n for n in model.parameter_names if n not in apart),
@@ -210,13 +215,16 @@ def _fitted(
         tell(("first pass", "second pass")[number], 0.2 + 0.35 * number)
         sigma = _sigmas(model, data, values)
         weights = row_weights(balances, data, values, sigma, data.train)
-        values, used = WeakForm(balances, data, values, tuple(free), weights).fitted(
+        values, used = WeakForm(balances, data, values, tuple(free), weights, known_before).fitted(
             limits, iterations
         )
     sigma = _sigmas(model, data, values)
     weights = row_weights(balances, data, values, sigma, data.train)
     tell("standard errors", 0.9)
-    return _with_errors(WeakForm(balances, data, values, tuple(free), weights), limits, sigma, used)
+    problem = WeakForm(balances, data, values, tuple(free), weights, known_before)
+    values, noise = unbiased(problem, limits)
+    problem = replace(problem, values=values)
+    return _with_errors(problem, limits, sigma, used, noise)
 
 
 def _sigmas(model: JointModel, data: Dataset, values: Mapping[str, float]) -> dict[str, float]:
@@ -294,16 +302,24 @@ def _with_errors(
     limits: Mapping[str, tuple[float, float]],
     sigma: Mapping[str, float],
     used: int,
+    noise: NoiseProducts,
 ) -> Solution:
-    """Standard errors from blocks of time and from what noise of the positions takes off; what
-    cannot be identified is said.
+    """Standard errors from blocks of time, without what noise adds to the columns; what cannot be
+    identified is said.
     """
-    balances, data, values, free = problem.balances, problem.data, problem.values, problem.free
+    balances, values, free = problem.balances, problem.values, problem.free
     weights = {b: np.asarray(w, dtype=np.float64) for b, w in problem.weights.items()}
     stacked = problem.stacked(np.array([values[n] for n in free]))
-    j = np.concatenate([stacked.jacobian[b] * weights[b][:, None] for b in balances.balances])
-    r = np.concatenate([stacked.residual[b] * weights[b] for b in balances.balances])
-    block = np.tile(stacked.block, len(balances.balances))
+    prior = problem.prior
+    x = np.array([values[n] for n in free])
+    j = problem.jacobian(x) * ~np.outer(~problem.one_way, problem.clocks)
+    r = np.concatenate(
+        [*(stacked.residual[b] * weights[b] for b in balances.balances), problem.surprise(x)]
+    )
+    # what is known beforehand belongs to no block of time: it scatters by itself
+    block = np.concatenate(
+        [np.tile(stacked.block, len(balances.balances)), np.full(len(prior), -1)]
+    )
     norms = np.linalg.norm(j, axis=0)
     smoothing = balances.model.named("smoothing")
     at_bound = [
@@ -328,13 +344,19 @@ def _with_errors(
         for n, norm in zip(free, norms, strict=True)
         if norm <= NO_COLUMN * norms.max() and n not in smoothing
     ]
+    # without stiffness the link would fall off: the twist follows no torque of these records
+    unidentified += [n for n in balances.model.named("stiffness") if n in at_bound]
     index = np.flatnonzero(usable)
     if len(index):
         scaled = j[:, index] / norms[index]
-        errors = block_errors(scaled, r, block)
-        pulled = {name.replace(" ", "_"): share for name, share in attenuation(data).items()}
-        biases = np.array([pulled.get(free[i], 0.0) * values[free[i]] for i in index.tolist()])
-        size = None if errors is None else np.hypot(errors / norms[index], biases)
+        unit = np.outer(norms[index], norms[index])
+        within = np.ix_(index, index)
+        whole = whole_without(scaled.T @ scaled, noise.whole[0][within] / unit)
+        grams, scores = noise.by_block(weights, stacked.block)
+        apart = (grams[:, index][:, :, index] / unit, scores[:, index] / norms[index])
+        errors = block_errors(scaled, r, block, apart, whole)
+        unsure = known_errors(whole, prior[:, index] / norms[index])
+        size = None if errors is None else np.hypot(errors, unsure) / norms[index]
         spread, corr = correlations(scaled.T @ scaled)
         corr[:, [is_of_run(free[i]) for i in index.tolist()]] = 0.0
         for k, i in enumerate(index.tolist()):

@@ -10,7 +10,7 @@ from importlib.resources import as_file, files
 from typing import Any
 
 from identification.data.check.gate import gate_warnings
-from identification.data.joint_file import Joint, toml_text
+from identification.data.joint_file import Joint
 from identification.data.record import Record
 from identification.diagnosis.improve import Improvement, improve
 from identification.diagnosis.locate import Unexplained
@@ -18,6 +18,7 @@ from identification.fitting.fit import Fit, fit
 from workbench.cli.files import (
     alike,
     distinct,
+    enlarged,
     open_joint,
     open_records,
     progress_bar,
@@ -86,9 +87,12 @@ def run_improve(arguments: Namespace) -> int:
         reference=arguments.reference,
     )
     print_improvement(found)
-    _write_improvement(found, records, arguments.report, arguments.output, arguments.command)
-    write_picture(found, arguments.picture)
     write_json(arguments.json, data)
+    if arguments.output:
+        write_text(arguments.output, found.to_joint_file())
+        print(f"joint file: {arguments.output}")
+    write_picture(found, arguments.picture)
+    _write_report(found, records, arguments.report, arguments.command)
     return 0
 
 
@@ -101,8 +105,8 @@ def run_report(arguments: Namespace) -> int:
         other_payload=arguments.other_payload,
     )
     print(found.reason)
-    _write_improvement(found, records, arguments.output, None, arguments.command)
     write_json(arguments.json, data)
+    _write_report(found, records, arguments.output, arguments.command)
     return 0
 
 
@@ -118,26 +122,20 @@ def run_demo(arguments: Namespace) -> int:
             [names["train.npz"]], [names["held_out.npz"]], names["joint.toml"]
         )
     print_improvement(found)
-    _write_improvement(found, records, arguments.report, None, arguments.command)
-    write_picture(found, arguments.picture)
     write_json(arguments.json, data)
+    write_picture(found, arguments.picture)
+    _write_report(found, records, arguments.report, arguments.command)
     return 0
 
 
-def _write_improvement(
-    found: Improvement,
-    records: Sequence[Record],
-    report: str | None,
-    output: str | None,
-    command: str,
+def _write_report(
+    found: Improvement, records: Sequence[Record], report: str | None, command: str
 ) -> None:
+    """The report comes last: what it is drawn from stands on the disk before it is drawn."""
     if report:
         from workbench.show.report import write_report
 
         print(f"report: {write_report(found, report, records=records, command=command)}")
-    if output:
-        write_text(output, found.to_joint_file())
-        print(f"joint file: {output}")
 
 
 def write_picture(found: Improvement, path: str | None) -> None:
@@ -194,7 +192,13 @@ def print_improvement(found: Improvement) -> None:
     for learned in found.learned:
         print(f"learned: {learned.sentence}")
     for c in found.calibration:
-        if c.stderr is not None and abs(c.value) > 2 * c.stderr:
+        if c.bounded:
+            print(
+                f"calibration bounded: {c.what} of {c.sensor} in {found.data.train_names[c.run]} "
+                f"within {2 * (c.stderr or 0.0):.2g} {c.unit} of {c.value:.4g} {c.unit}; these "
+                "records cannot tell it from viscous friction, a torque sensor would"
+            )
+        elif c.stderr is not None and abs(c.value) > 2 * c.stderr:
             name = found.data.train_names[c.run]
             print(
                 f"calibration found: {c.what} of {c.sensor} in {name} {c.value:.4g} +- "
@@ -321,10 +325,7 @@ def run_diagnose(arguments: Namespace) -> int:
     for key in arguments.why:
         print(found.why(key))
     if arguments.output and found.claims:
-        write_text(
-            arguments.output,
-            toml_text(replace(joint, effects=(*joint.effects, found.claims[0].label))),
-        )
+        write_text(arguments.output, enlarged(joint, found.claims[0].label))
         print(f"joint file with {found.claims[0].label}: {arguments.output}")
     elif arguments.output:
         print(f"nothing is named: {arguments.output} is not written")

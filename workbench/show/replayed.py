@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any, Final, final
 
 import numpy as np
@@ -62,6 +63,10 @@ class Replay:
     tried : tuple of Fault
     calibrated : bool
         The detector's limits come from healthy records.
+    banked : bool
+        A fault bank has looked at the readings, not the estimator's own detector.
+    smallest : mapping of str to pair of float
+        Smallest offset of each sensor that the bank sees, and that it names.
     """
 
     record: Record
@@ -80,6 +85,13 @@ class Replay:
     failed: npt.NDArray[np.bool_]
     tried: tuple[Fault, ...] = ()
     calibrated: bool = False
+    banked: bool = False
+    smallest: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    @property
+    def watched(self) -> bool:
+        """Whether sensor faults were looked for."""
+        return self.banked or self.estimator.detector is not None
 
     def spans(self, reading: int | None = None) -> list[tuple[float, float]]:
         """Times [s] from which to which a reading is replaced; any reading where none is named."""
@@ -98,8 +110,12 @@ class Replay:
         return {
             "record": self.record.name,
             "time": self.time.tolist(),
-            "detector": estimator.detector is not None,
+            "detector": self.watched,
             "calibrated": self.calibrated,
+            "smallest": {
+                name: {"seen": a, "named": b if np.isfinite(b) else None}
+                for name, (a, b) in self.smallest.items()
+            },
             "events": list(self.events),
             "replaced": [
                 {"reading": name, "from": a, "to": b}

@@ -18,6 +18,8 @@ _NAN_LIMIT: Final = 0.2
 """Share of the rows without a number above which a channel is refused: where every fifth row is
 lost, no stretch is left that a kernel fits into.
 """
+LARGEST: Final = 1e150
+"""Values whose square is no floating-point number any more (1e308)."""
 _BRIDGED: Final = 2
 """Rows of a hole that is bridged, at most."""
 _EFFORT: Final = ("motor_current", "motor_voltage", "motor_torque", "link_torque")
@@ -93,6 +95,21 @@ def check_nan(record: Record) -> list[Finding]:
                 f", in the other {int(left.sum())} {dropped}" if 0 < left.sum() < bad.size else ""
             )
             findings.append(Finding("repair", "nan", f"{where}: {advice}", channel, row))
+    return findings
+
+
+def check_absurd(record: Record) -> list[Finding]:
+    """Refuse finite values with which nothing can be computed."""
+    findings = []
+    for channel, values in (("time", record.time), *record.channels.items()):
+        bad = np.flatnonzero(np.isfinite(values) & (np.abs(values) > LARGEST))
+        if bad.size:
+            row = int(bad[0])
+            message = (
+                f"{record.name}: {channel} is {values[row]:.4g} in row {row + 1}: no sensor reads "
+                "that, export it again"
+            )
+            findings.append(Finding("refuse", "absurd", message, channel, row))
     return findings
 
 

@@ -32,6 +32,8 @@ _FASTEST: Final = 2e-6
 """Sampling step [s] below which time is doubted: 1 kHz stamped in s and read as ms is at 1e-6, the
 fastest drives log at 1e-5.
 """
+FASTEST: Final = 1e-9
+"""Step that no logger of a joint has [s]: converters of currents take at least some ten ns."""
 
 
 def check_size(record: Record) -> list[Finding]:
@@ -155,7 +157,10 @@ def check_sampling(record: Record) -> list[Finding]:
         )
         message = f"{record.name}: the stamps of a clock of {dt:.4g} s are {off}; {how}"
         findings.append(Finding("repair", "jitter", message, "time"))
-    if dt >= _SLOWEST or dt < _FASTEST:
+    if dt < FASTEST:
+        message = f"{record.name}: the sampling step is {dt:.4g} s: correct the unit of time"
+        findings.append(Finding("refuse", "time_unit", message, "time"))
+    elif dt >= _SLOWEST or dt < _FASTEST:
         unit = "ms" if dt >= _SLOWEST else "s"
         message = (
             f"{record.name}: the sampling step is {dt:.4g} s: is time in {unit}? correct "

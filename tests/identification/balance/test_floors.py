@@ -91,7 +91,7 @@ def test_a_short_record_is_fitted_without_standard_errors() -> None:
     assert found.solution.values["stiffness"] == pytest.approx(2.2e4, rel=0.05)
 
 
-def test_what_noise_takes_off_an_inertia_is_said() -> None:
+def test_what_noise_would_take_off_an_inertia_is_said_and_taken_off() -> None:
     clean = record("clean", 3, False, *FAST)
     noisy: list[Record] = []
     rng = np.random.default_rng(8)
@@ -105,9 +105,9 @@ def test_what_noise_takes_off_an_inertia_is_said() -> None:
         data = load_dataset([spoilt], [], JOINT, prepared_model(JOINT, spoilt))
         solution = fit(JOINT, [spoilt]).solution
         found, error = solution.values["link_inertia"], solution.stderr["link_inertia"]
-        assert attenuation(data)["link inertia"] == pytest.approx(1 - found / 3.0, abs=0.04)
         assert error is not None
         assert abs(found - 3.0) < 3 * error
+        assert 3 * error < 3.0 * attenuation(data)["link inertia"]
         assert any("link inertia by about" in w for w in excitation_warnings(data))
 
 
