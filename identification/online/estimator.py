@@ -36,8 +36,7 @@ from identification.online.pulse import GAP, Pulse
 from identification.online.row_check import LEAST, RowCheck
 from identification.online.rows import RowMaker
 from identification.online.samples import Samples
-from identification.online.state import Sample, State, joined, parted
-from identification.online.state_bytes import pack, unpack
+from identification.online.state import Sample, State, joined, pack, parted, unpack
 from identification.online.two_step import Reoptimiser, make_two_step
 from identification.online.verdict import (
     FAULT_TEXT,
