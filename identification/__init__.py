@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from identification.recursive.estimator import RecursiveLeastSquares
     from identification.search.mcs import mcs
     from identification.two_step.algorithm import TwoStep
+    from identification.variants.exploration import Exploration
+    from identification.variants.explore import explore
 
 __version__ = VERSION
 
@@ -34,6 +36,7 @@ _HOMES: Final = {
     "Changes": "diagnosis.changed",
     "Comparison": "diagnosis.compare",
     "Diagnosis": "diagnosis.diagnose",
+    "Exploration": "variants.exploration",
     "FaultDetector": "faults.detector",
     "Fit": "fitting.fit",
     "Improvement": "diagnosis.improve",
@@ -45,6 +48,7 @@ _HOMES: Final = {
     "changed": "diagnosis.changed",
     "compare": "diagnosis.compare",
     "diagnose": "diagnosis.diagnose",
+    "explore": "variants.explore",
     "fit": "fitting.fit",
     "improve": "diagnosis.improve",
     "load_joint": "data.joint_file",
@@ -58,6 +62,7 @@ __all__ = [
     "Changes",
     "Comparison",
     "Diagnosis",
+    "Exploration",
     "FaultDetector",
     "Fit",
     "Improvement",
@@ -69,6 +74,7 @@ __all__ = [
     "changed",
     "compare",
     "diagnose",
+    "explore",
     "fit",
     "improve",
     "load_joint",

@@ -195,6 +195,11 @@ class Balances:
         expressions = residual_expressions(model, sensing)
         columns = [self.names.index(n) for n in self.wrt]
         self.balances = tuple(expressions)
+        # what stands in no balance moves nothing, whatever its value
+        entries = ca.jacobian_sparsity(
+            ca.vertcat(*expressions.values()), model.equations.parameters
+        ).get_triplet()[1]
+        self.holding: frozenset[str] = frozenset(self.names[i] for i in set(entries))
         curved = curved_expressions(model, sensing)
         self._plain = _Part(model, expressions, columns, columns_only=columns_only)
         self._curved = _Part(model, curved, columns, columns_only=columns_only) if curved else None

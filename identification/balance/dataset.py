@@ -238,6 +238,7 @@ def seen_from_the_motor(sensing: Sensing, joint: Joint) -> bool:
     """
     return (
         sensing.balances == ("axis",)
+        and sensing.moving == "motor_position"
         and not sensing.both_positions
         and abs(joint.gear_ratio) != 1.0
     )

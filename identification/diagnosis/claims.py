@@ -82,6 +82,12 @@ class Claim:
     held_out_drop_percent : float
     separate_by : str or None
         The run that would separate the names.
+    partial : bool
+        True where structure is left that the names do not explain.
+    contribution : float
+        RMS of what the effect adds to its balance [N.m].
+    like : str
+        "like NAME, which explains 97 %", where the law is not shown to be as good as a curve.
     """
 
     effects: tuple[str, ...]
@@ -91,6 +97,7 @@ class Claim:
     separate_by: str | None = None
     partial: bool = False
     contribution: float = 0.0
+    like: str = ""
 
     @property
     def effect(self) -> Effect:
@@ -107,6 +114,8 @@ class Claim:
         }
         if self.partial:
             out["partial"] = True
+        if self.like:
+            out["like"] = self.like
         return out
 
 

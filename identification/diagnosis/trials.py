@@ -86,6 +86,8 @@ class Base:
         Parameters of the columns of `jacobian`.
     norms : (p,) array
         What these columns were divided by.
+    inward_names : tuple of str
+        Parameters of the columns of `inward`.
     """
 
     solution: Solution
@@ -106,6 +108,7 @@ class Base:
     held_weight: FloatArray
     names: tuple[str, ...]
     norms: FloatArray
+    inward_names: tuple[str, ...] = ()
 
     @property
     def parts(self) -> tuple[int, int]:
@@ -270,6 +273,7 @@ def make_base(solution: Solution, data: Dataset) -> Base:
         held_weight=held_weights,
         names=tuple(n for n, a in zip(free, alive, strict=False) if a),
         norms=norms[alive],
+        inward_names=tuple(n for n, b in zip(names, back, strict=True) if b),
     )
 
 

@@ -18,9 +18,10 @@ from identification.data.record import Record
 from identification.diagnosis.bench import Progress
 from identification.diagnosis.candidates import Candidate, NotTestable, offered
 from identification.diagnosis.claims import Claim, Ranking, rank
+from identification.diagnosis.curve import Curve
 from identification.diagnosis.diagnose import Diagnosis
 from identification.diagnosis.improvement import Improvement, Step, visible_keys
-from identification.diagnosis.learned import LearnedClaim
+from identification.diagnosis.learned import Doubt, Equivalence, LearnedClaim
 from identification.diagnosis.lines import Line
 from identification.diagnosis.locate import Unexplained, locate
 from identification.diagnosis.session import Session, with_held_out
@@ -336,6 +337,14 @@ class FmuBench:
 
     def learned(self, step: Step, error: Error) -> tuple[LearnedClaim, ...]:
         """None: a curve cannot ride outside an FMU yet."""
+        return ()
+
+    def held_against(self, claims: Sequence[Claim], step: Step) -> Mapping[str, Equivalence]:
+        """None: a curve cannot ride outside an FMU yet."""
+        return {}
+
+    def artefacts(self, step: Step, curves: Sequence[Curve], start: Step) -> tuple[Doubt, ...]:
+        """None: the FMU has its own parameters."""
         return ()
 
     def same_sign(self, trial: Trial, solution: Solution) -> bool:

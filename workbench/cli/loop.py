@@ -15,6 +15,7 @@ from identification.data.record import Record
 from identification.diagnosis.improve import Improvement, improve
 from identification.diagnosis.locate import Unexplained
 from identification.fitting.fit import Fit, fit
+from identification.fitting.trust import Trust, trust
 from workbench.cli.files import (
     alike,
     distinct,
@@ -41,7 +42,7 @@ def improve_files(
     """
     distinct(training=train, other_payload=other_payload, held_out=held_out)
     joint = open_joint(joint_path)
-    records, _ = _training(train, other_payload, joint)
+    records, _ = training(train, other_payload, joint)
     held, _ = open_records(held_out, joint)
     alike([*train, *other_payload, *held_out], [*records, *held], joint)
     since = None
@@ -54,12 +55,21 @@ def improve_files(
         joint = replace(joint, known={n: k for n, k in joint.known.items() if n not in gone})
     found = improve(records, joint, held, max_additions=max_additions, progress=progress_bar)
     progress_bar("done", 1.0)
-    _print_warnings(found.warnings, [*records, *held])
+    print_warnings(found.warnings, [*records, *held])
     data = found.as_json() if since is None else {**found.as_json(), "changed": since.as_json()}
+    judged = trusted(found)
+    data["trust"] = judged.as_json() if judged is not None else []
     return data, found, [*records, *held]
 
 
-def _print_warnings(warnings: Sequence[str], records: Sequence[Record]) -> None:
+def trusted(found: Improvement) -> Trust | None:
+    """Which number of the last step to trust; None where nothing was fitted."""
+    if not found.steps:
+        return None
+    return trust(found.steps[-1].solution, found.data, profiles=False)
+
+
+def print_warnings(warnings: Sequence[str], records: Sequence[Record]) -> None:
     """Warnings on stderr, without those that were printed when the records were opened."""
     said = gate_warnings(records)
     for text in warnings:
@@ -67,7 +77,7 @@ def _print_warnings(warnings: Sequence[str], records: Sequence[Record]) -> None:
             print(f"irj: {text}", file=sys.stderr)
 
 
-def _training(
+def training(
     paths: Sequence[str], other_payload: Sequence[str], joint: Joint
 ) -> tuple[list[Record], list[str]]:
     """Training records, those with another payload marked, and the warnings."""
@@ -135,7 +145,8 @@ def _write_report(
     if report:
         from workbench.show.report import write_report
 
-        print(f"report: {write_report(found, report, records=records, command=command)}")
+        made = write_report(found, report, records=records, command=command, trust=trusted(found))
+        print(f"report: {made}")
 
 
 def write_picture(found: Improvement, path: str | None) -> None:
@@ -163,6 +174,8 @@ def print_improvement(found: Improvement) -> None:
         names = (
             claim.effects[0] if len(claim.effects) == 1 else "{" + ", ".join(claim.effects) + "}"
         )
+        if claim.like:
+            names = claim.like
         said, rest = (
             ("in part", "; structure is left that is not in the library")
             if claim.partial
@@ -233,7 +246,7 @@ def run_fit(arguments: Namespace) -> int:
     """`irj fit`."""
     distinct(training=arguments.records, other_payload=arguments.other_payload)
     joint = open_joint(arguments.joint)
-    records, warnings = _training(arguments.records, arguments.other_payload, joint)
+    records, warnings = training(arguments.records, arguments.other_payload, joint)
     alike([*arguments.records, *arguments.other_payload], records, joint)
     fitted = fit(joint, records)
     if arguments.refine:
@@ -285,14 +298,16 @@ def run_compare(arguments: Namespace) -> int:
         joint,
         once=False,
     )
-    comparison = compare(fit(joint, basis), records, linear=not arguments.no_linear)
+    fitted = fit(joint, basis)
+    comparison = compare(fitted, records, linear=not arguments.no_linear)
     print(comparison)
     for place in comparison.places[:5]:
         print(
             f"  {place.balance} balance against {place.title}: explains "
             f"{max(place.share_percent, 0):.0f} % of what is left there"
         )
-    write_json(arguments.json, comparison.as_json())
+    judged = trust(fitted.solution, fitted.data, profiles=False)
+    write_json(arguments.json, {**comparison.as_json(), "trust": judged.as_json()})
     return 0
 
 
@@ -306,7 +321,7 @@ def run_diagnose(arguments: Namespace) -> int:
         held_out=arguments.held_out,
     )
     joint = open_joint(arguments.joint)
-    records, _ = _training(arguments.records, arguments.other_payload, joint)
+    records, _ = training(arguments.records, arguments.other_payload, joint)
     held, _ = open_records(arguments.held_out, joint)
     alike(
         [*arguments.records, *arguments.other_payload, *arguments.held_out],
@@ -315,7 +330,7 @@ def run_diagnose(arguments: Namespace) -> int:
     )
     found = diagnose(fit(joint, records), held, progress=progress_bar)
     progress_bar("done", 1.0)
-    _print_warnings(found.warnings, [*records, *held])
+    print_warnings(found.warnings, [*records, *held])
     if found.data.note:
         print(f"note: {found.data.note}")
     print(found)

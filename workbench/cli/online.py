@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from identification.data.record import Record
     from identification.faults.bank import FaultBank
     from identification.faults.detector import Fault, FaultEvent
-    from identification.planning.trajectories import Excitation, Selection
+    from identification.planning.trajectories import Selection
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -523,7 +523,7 @@ def run_plan(arguments: Namespace) -> int:
             "--max-speed or --max-torque"
         )
     chosen = select(experiment, [t.motion for t in allowed], limits=limits)
-    _write_motion(arguments.output, chosen.best)
+    write_bytes(arguments.output, chosen.best.motion.text.encode())
     _print_plan(arguments.output, chosen, len(tried) - len(allowed), bool(joint.fitted))
     best = chosen.best
     data = {
@@ -537,17 +537,6 @@ def run_plan(arguments: Namespace) -> int:
     }
     write_json(arguments.json, data)
     return 0
-
-
-def _write_motion(path: str, best: Excitation) -> None:
-    import io
-
-    from identification.planning.trajectories import COLUMNS
-
-    text = io.StringIO()
-    rows = np.column_stack([best.motion.time, best.motion.table])
-    np.savetxt(text, rows, delimiter=",", header=",".join(COLUMNS), comments="", fmt="%.9g")
-    write_bytes(path, text.getvalue().encode())
 
 
 def _print_plan(path: str, chosen: Selection, refused: int, fitted: bool) -> None:
