@@ -22,7 +22,7 @@ from workbench.cli.files import (
     write_json,
     write_text,
 )
-from workbench.cli.loop import training, print_warnings
+from workbench.cli.loop import print_warnings, training
 
 UNPLANNED: Final = Run("multisine", 0.0, math.radians(60.0), math.radians(60.0))
 """The motion that is judged where no file is given and nothing has been recorded [rad, rad/s]."""
