@@ -336,6 +336,9 @@ class JointFunctions:
             "link_position_sensor": (e.true_link_position, s.link_position, s.link_velocity),
             "torque_sensor": (e.torque, s.torque, s.torque_rate),
         }[place]
+        # what is of second order in a delay stands in the rates beyond
+        beyond = [s.motor_acceleration, s.link_acceleration, s.motor_jerk, s.link_jerk]
+        (found,) = ca.substitute([found], beyond, [ca.SX(0)] * len(beyond))
         gain, lag = ca.jacobian(found, channel), ca.jacobian(found, channel_rate)
         (zero,) = ca.substitute([found], [channel, channel_rate], [ca.SX(0), ca.SX(0)])
         return (true - (zero if offset else 0) - lag * rate / gain) / gain

@@ -39,7 +39,7 @@ def instances() -> dict[type, Any]:
     train = identification.read(DEMO / "train.npz", joint=joint)
     held = identification.read(DEMO / "held_out.npz", joint=joint)
     fitted = identification.fit(joint, train)
-    model = fitted.model
+    model, explored = fitted.model, identification.explore(train, joint, held)
     fitted_joint = parse_joint(tomllib.loads(fitted.to_joint_file()), "joint")
     rng = np.random.default_rng(1)
     u = rng.standard_normal((600, 1))
@@ -51,7 +51,8 @@ def instances() -> dict[type, Any]:
         fitted,
         identification.compare(fitted, held, linear=False),
         identification.diagnose(fitted, held),
-        identification.improve(train, joint, held),
+        explored,
+        explored.improvement,
         identification.changed(fitted_joint, held),
         identification.InputError("one line"),
         identification.RecursiveLeastSquares([0.0, 0.0], [1.0, 1.0]),

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from casadi_models import JointModel, hold
 from identification.balance.calibration import named_late, unknowns_of
-from identification.balance.clocks import in_time, places_of, shifted
+from identification.balance.clocks import SIGNAL, in_time, places_of, shifted
 from identification.balance.memory import cache_of
 from identification.balance.noise import level_of
 from identification.balance.sensing import Sensing, adapt, check_alike, sense, signals_of
@@ -267,8 +267,12 @@ def weak_record(
         for c, level in noise.items()
     }
 
+    last: list[tuple[Mapping[str, float], WeakRecord]] = []
+
     def made_with(shifts: Mapping[str, float]) -> WeakRecord:
         moved, parts = shifted(signals, segments, shifts)
+        known, before = last.pop() if last else ({}, None)
+        changed = {SIGNAL[p] for p in {*shifts, *known} if shifts.get(p, 0.0) != known.get(p, 0.0)}
         made = prepare(
             record.time,
             moved,
@@ -277,8 +281,12 @@ def weak_record(
             first_block=first_block,
             pointwise=pointwise,
             curved=curved,
+            before=before,
+            same=set(signals) - changed,
         )
-        return replace(made, shifts={p: k * record.dt for p, k in shifts.items()})
+        made = replace(made, shifts={p: k * record.dt for p, k in shifts.items()})
+        last.append((dict(shifts), made))
+        return made
 
     made = in_time(made_with, late, sensing.has_torque) if late else made_with({})
     made = _with_rests(made, noise)

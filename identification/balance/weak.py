@@ -7,7 +7,7 @@ nonlinear are evaluated at the samples (velocities from a shorter kernel) and th
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Final, final
@@ -374,6 +374,8 @@ def prepare(
     overlap: int = 4,
     first_block: int = 0,
     curved: bool = False,
+    before: WeakRecord | None = None,
+    same: Collection[str] = (),
 ) -> WeakRecord:
     """Average a uniformly sampled record with the kernel.
 
@@ -396,6 +398,11 @@ def prepare(
         Rows per kernel length.
     curved : bool
         Second derivatives of the averages too.
+    before : WeakRecord, optional
+        Made of the same record with some signals moved: where the rows are the same, those of the
+        signals `same` are taken over.
+    same : collection of str
+        Signals that are as they were in `before`.
 
     Returns
     -------
@@ -416,7 +423,16 @@ def prepare(
     grid = Grid(
         length, dt, stride=stride, step=step, segments=long_enough, half=half, pointwise=short
     )
-    averaged, points, smooth, bent = filtered(grid, signals, curved=curved)
+    over = set(same) if before is not None and before.grid == grid else set[str]()
+    found = filtered(grid, {n: x for n, x in signals.items() if n not in over}, curved=curved)
+    averaged, points, smooth, bent = found
+    if before is not None:
+        for name in (n for source in over & set(POSITION_CHAINS) for n in POSITION_CHAINS[source]):
+            for own, old in zip(
+                found, (before.averaged, before.points, before.smooth, before.curved), strict=True
+            ):
+                if name in old:
+                    own[name] = old[name]
     for name, values in (("temperature", signals.get("temperature")), ("time", time)):
         if values is not None:
             averaged[name] = grid.correlate(values, differentiated_kernel(length, dt, 0))

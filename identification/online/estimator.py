@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Final, final
+from typing import Any, Final, final
 
 import numpy as np
 import numpy.typing as npt
@@ -36,7 +36,7 @@ from identification.online.pulse import GAP, Pulse
 from identification.online.row_check import LEAST, RowCheck
 from identification.online.rows import RowMaker
 from identification.online.samples import Samples
-from identification.online.state_bytes import pack, unpack
+from identification.online.state import Sample, State, joined, pack, parted, unpack
 from identification.online.two_step import Reoptimiser, make_two_step
 from identification.online.verdict import (
     FAULT_TEXT,
@@ -61,31 +61,6 @@ _ALL: Final = [True] * 6
 _NONE_FAILED: Final = (False,) * 6
 
 
-_PLAIN: Final = (
-    "_since",
-    "_rows",
-    "_strained",
-    "_last_good",
-    "fault",
-    "score",
-    "readings",
-    "plant_alarm",
-    "events",
-)
-_ARRAYS: Final = (
-    "level",
-    "theta",
-    "sigma",
-    "residual",
-    "floor",
-    "ratio",
-    "_square",
-    "_torque",
-    "_scale",
-)
-"""What changes from sample to sample, besides samples, rows, watch, recursion, detector and
-search.
-"""
 _PREFIX: Final = "two_step."
 _GUARD: Final = "guard."
 
@@ -207,7 +182,6 @@ class OnlineEstimator:
 
     def reset(self) -> None:
         """Before the first sample."""
-        count, n = len(self.balances), len(self.names)
         self.rows = self._plain_rows
         self.rows.reset()
         self.watch.reset()
@@ -219,20 +193,73 @@ class OnlineEstimator:
         if self.detector is not None:
             self.detector.reset()
         self.samples.reset()
-        self._since = self._rows = self._strained = 0
-        self._last_good = [0.0] * 6
         self._collected: list[tuple[FloatArray, FloatArray, FloatArray]] = []
         self.estimator: RecursiveLeastSquares | None = None
-        self._scale = np.ones(n)
         values = dict(zip(self.model.parameter_names, self.model.value_vector(), strict=True))
-        self.theta = np.array([values[name] for name in self.names])
-        self.sigma = np.zeros(n)
-        self.residual, self.floor, self.ratio = np.zeros(count), np.zeros(count), np.zeros(count)
-        self._square, self._torque, self.level = np.zeros(count), np.zeros(count), np.zeros(count)
-        self.fault, self.score = NONE, [0.0] * 6
-        self.plant_alarm = 0
-        self.readings = [0.0] * 6
-        self.events: list[str] = []
+        theta = np.array([values[name] for name in self.names])
+        self._sampled, self._now = Sample.first(), State.first(theta, len(self.balances))
+
+    def _set(self, **changes: Any) -> None:
+        """Go on to the next state."""
+        self._now = replace(self._now, **changes)
+
+    def _tell(self, text: str) -> None:
+        self._set(events=(*self._now.events, text))
+
+    @property
+    def theta(self) -> FloatArray:
+        """Estimated parameters, (parameters,)."""
+        return self._now.theta
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Their standard deviations, (parameters,)."""
+        return self._now.sigma
+
+    @property
+    def residual(self) -> FloatArray:
+        """Residual of the last row, (balances,) [N.m]."""
+        return self._now.residual
+
+    @property
+    def floor(self) -> FloatArray:
+        """What noise alone would leave, (balances,) [N.m]."""
+        return self._now.floor
+
+    @property
+    def ratio(self) -> FloatArray:
+        """Root mean square of the last seconds over the floor, (balances,)."""
+        return self._now.ratio
+
+    @property
+    def level(self) -> FloatArray:
+        """Size of the residual after the first window, (balances,) [N.m]."""
+        return self._now.level
+
+    @property
+    def fault(self) -> int:
+        """Code of the most severe fault now."""
+        return self._now.fault
+
+    @property
+    def plant_alarm(self) -> int:
+        """Code of a change of the joint itself."""
+        return self._now.plant_alarm
+
+    @property
+    def score(self) -> list[float]:
+        """How far each reading's residuals are from their limits (1: at the limit)."""
+        return self._now.score
+
+    @property
+    def readings(self) -> list[float]:
+        """The readings, failed ones replaced."""
+        return self._sampled.readings
+
+    @property
+    def events(self) -> list[str]:
+        """What was told so far."""
+        return list(self._now.events)
 
     @property
     def warming_up(self) -> bool:
@@ -254,19 +281,19 @@ class OnlineEstimator:
     @property
     def least(self) -> FloatArray:
         """What counts as noise of each balance at least [N.m], (balances,)."""
-        share = self.options.floor_share * np.sqrt(self._torque)
+        share = self.options.floor_share * np.sqrt(self._now.torque)
         found: FloatArray = np.maximum(np.maximum(self.floor, share), LEAST)
         return found
 
     @property
     def made(self) -> int:
         """Rows so far."""
-        return self._rows
+        return self._now.rows
 
     @property
     def wanted(self) -> bool:
         """True where the residuals stay over their limit although the linear parameters follow."""
-        return self._strained >= self.confirm
+        return self._now.strained >= self.confirm
 
     def reoptimise(self) -> bool:
         """Search the shapes as soon as there are rows enough; False where there are none."""
@@ -341,20 +368,20 @@ class OnlineEstimator:
             values
             if good is self._all and self._whole
             else [
-                v if g else held for v, g, held in zip(values, good, self._last_good, strict=True)
+                v if g else held
+                for v, g, held in zip(values, good, self._sampled.last_good, strict=True)
             ]
         )
-        self._last_good = used
-        failed = self._detect(values, good)
+        failed, shown = self._detect(values, good, used)
+        since = self._sampled.since + 1
+        self._sampled = Sample(since % self.rows.timing.stride, used, shown)
         q = used
         self.samples.add((q[Q_M], q[Q_L] if self.present[Q_L] else q[Q_M], q[TAU], q[DRIVE]))
         self.samples.mark(
             good if counts else [False] * 6, failed, self.watch, whole=counts and good is self._all
         )
         made = False
-        self._since += 1
-        if self._since >= self.rows.timing.stride:
-            self._since = 0
+        if since >= self.rows.timing.stride:
             made = self._row(time, enable)
             self._judge(given if not self.pulse.jumped else good)
         if looked:
@@ -363,25 +390,26 @@ class OnlineEstimator:
             self._advance(self.two_step)
         return made
 
-    def _detect(self, readings: list[float], good: list[bool]) -> Sequence[bool]:
-        """Run the fault detector; readings with failed ones replaced go to `self.readings`."""
+    def _detect(
+        self, readings: list[float], good: list[bool], used: list[float]
+    ) -> tuple[Sequence[bool], list[float]]:
+        """Run the fault detector: which readings failed, and the readings with these replaced."""
         detector = self.detector
         if detector is None:
-            self.readings = list(self._last_good)
+            shown = list(used)
             if not good[Q_L]:
-                self.readings[Q_L], self.readings[W_L] = self._link_from_motor()
-            return _NONE_FAILED
+                shown[Q_L], shown[W_L] = self._link_from_motor(used)
+            return _NONE_FAILED, shown
         row = (
             readings
             if good is self._all and self._whole
             else [v if g else math.nan for v, g in zip(readings, good, strict=True)]
         )
-        self.readings = detector.update(row)
-        return detector.replaced
+        shown = detector.update(row)
+        return detector.replaced, shown
 
-    def _link_from_motor(self) -> tuple[float, float]:
+    def _link_from_motor(self, q: list[float]) -> tuple[float, float]:
         """Link position and velocity from the motor, torsion taken off."""
-        q = self._last_good
         name = self.model.stiffness_name
         at = self.names.index(name) if name in self.names and self.options.has_torque else -1
         stiffness = float(self.theta[at]) if at >= 0 else 0.0
@@ -394,7 +422,7 @@ class OnlineEstimator:
         if found is None:
             return False
         y, h = found
-        self._rows += 1
+        self._set(rows=self._now.rows + 1)
         on: BoolArray = ~np.any(self.rows.uses & self.samples.lost, axis=1)
         shares = self._shares()
         if self.two_step is not None:
@@ -402,7 +430,8 @@ class OnlineEstimator:
         if self.estimator is None:
             if enable and on.all():
                 self._collected.append((y, h, shares))
-                self._torque += self.rows.signals[self._reference] ** 2
+                power = self.rows.signals[self._reference] ** 2
+                self._set(torque=self._now.torque + power)
                 if len(self._collected) >= self.collect:
                     with single_thread():
                         self._begin()
@@ -418,30 +447,33 @@ class OnlineEstimator:
                 self.floor,
                 self.level,
                 self.rows.signals[self._reference],
-                self._square,
-                self._torque,
+                self._now.square,
+                self._now.torque,
                 self.options.floor_share,
             ),
         )
-        self.residual, self.ratio = check.error.copy(), check.ratio.copy()
-        self._square, self._torque = check.square.copy(), check.torque.copy()
+        self._set(
+            residual=check.error.copy(),
+            ratio=check.ratio.copy(),
+            square=check.square.copy(),
+            torque=check.torque.copy(),
+        )
         if not enable:
             return True
         if not on.any():
-            self.theta = self._within(self.guard.blind(self.estimator))
+            self._set(theta=self._within(self.guard.blind(self.estimator)))
             return True
         for b, use in enumerate(on.tolist()):
             self.estimator.enable(b, use)
         theta = self.estimator.update(check.y, check.h)
         noise = self.estimator.engine_for("noise").part("fast", "noise")
         np.maximum(noise, check.least**2, out=noise)
-        self._strained = self._strained + 1 if check.over.any() else 0
-        self.theta = self._within(
-            self._guarded(self.guard, theta, check.weighted_error, check.least, on)
-        )
+        self._set(strained=self._now.strained + 1 if check.over.any() else 0)
+        shown = self._guarded(self.guard, theta, check.weighted_error, check.least, on)
+        self._set(theta=self._within(shown))
         if (
             self.two_step is not None
-            and self.two_step.due(self._strained)
+            and self.two_step.due(self._now.strained)
             and not self.guard.several
         ):
             self._launch(self.two_step)
@@ -459,7 +491,7 @@ class OnlineEstimator:
 
     def _size(self) -> FloatArray:
         """Size of the residuals now."""
-        found: FloatArray = np.maximum(np.maximum(self.floor, np.sqrt(self._square)), LEAST)
+        found: FloatArray = np.maximum(np.maximum(self.floor, np.sqrt(self._now.square)), LEAST)
         return found
 
     def _weight_of(self, shares: FloatArray, theta: FloatArray, size: FloatArray) -> FloatArray:
@@ -474,23 +506,24 @@ class OnlineEstimator:
     def _begin(self) -> None:
         """Start the recursion from the collected rows."""
         y, h, shares = (np.array([row[i] for row in self._collected]) for i in range(3))
-        self._torque /= len(y)
-        least = np.maximum(self.options.floor_share * np.sqrt(self._torque), LEAST)
+        self._set(torque=self._now.torque / len(y))
+        least = np.maximum(self.options.floor_share * np.sqrt(self._now.torque), LEAST)
         first, weight = first_estimate(y, h, least, partial(self._weight_of, shares))
         least = np.maximum(least, self.rows.floor(first.tolist(), self.watch.noise[list(SAMPLED)]))
         y, h = y * weight, h * weight[:, :, None]
-        self._scale = np.maximum(np.maximum(np.abs(first), np.abs(self.theta)), least_range(h, y))
+        size = np.maximum(np.abs(first), np.abs(self.theta))
+        self._set(scale=np.maximum(size, least_range(h, y)))
         self.estimator = self.recursion(self.theta)
         started = self.estimator.begin(y, h, least, overlap=self.rows.timing.overlap)
         if started.undetermined:
             names = ", ".join(self.names[i] for i in started.undetermined)
-            self.events.append(f"not determined by the first window: {names}")
-        self.theta = self._within(self.estimator.theta)
-        self.sigma = self.estimator.deviation
-        self._square = np.mean((y - h @ self.theta) ** 2, axis=0)
+            self._tell(f"not determined by the first window: {names}")
+        theta = self._within(self.estimator.theta)
+        square = np.mean((y - h @ theta) ** 2, axis=0)
+        self._set(theta=theta, sigma=self.estimator.deviation, square=square)
         self._collected = []
         self._floors()
-        self.level = np.sqrt(self._square)
+        self._set(level=np.sqrt(square))
         self.guard.start(self.estimator)
         if self.two_step is not None and not self.two_step.known:
             self._launch(self.two_step, first=True)
@@ -510,7 +543,7 @@ class OnlineEstimator:
 
     def recursion(self, values: FloatArray) -> RecursiveLeastSquares:
         """A fresh recursion that begins at the given values, shape (parameters,)."""
-        return self._factory()(values, self._scale)
+        return self._factory()(values, self._now.scale)
 
     def retune(self, options: OnlineOptions) -> None:
         """Take up other forgetting bounds and floors while running; the estimate stays."""
@@ -534,18 +567,15 @@ class OnlineEstimator:
         if self.estimator is None:
             return
         noise = self.watch.noise[list(SAMPLED)]
-        self.floor = self.rows.floor(self.theta.tolist(), noise)
-        self.sigma = self.estimator.deviation
-        self._ratios()
-
-    def _ratios(self) -> None:
-        self.ratio = np.sqrt(self._square) / self.least
+        floor = self.rows.floor(self.theta.tolist(), noise)
+        self._set(floor=floor, sigma=self.estimator.deviation)
+        self._set(ratio=np.sqrt(self._now.square) / self.least)
 
     def _judge(self, good: list[bool]) -> None:
         """The most severe fault now, and the scores."""
         detector = self.detector
         if detector is not None:
-            self.plant_alarm, self.score = plant_alarm(detector, self.dt), detector.scores()
+            self._set(plant_alarm=plant_alarm(detector, self.dt), score=detector.scores())
         missing = [
             not g and (self.needs[i] or (detector is not None and self.present[i]))
             for i, g in enumerate(good)
@@ -559,8 +589,8 @@ class OnlineEstimator:
             found = implausible(self.names, self.theta, self.sigma, self.joint.fitted)
         found = found or self.plant_alarm or (HELD if self.guard.on_probation else NONE)
         if found != self.fault and found:
-            self.events.append(f"fault {found}")
-        self.fault = found
+            self._tell(f"fault {found}")
+        self._set(fault=found)
 
     # --- state ------------------------------------------------------------------------------------
 
@@ -568,8 +598,8 @@ class OnlineEstimator:
         """Everything the estimator will use again, as bytes; of a running search what it
         started from and how far it is.
         """
-        plain = {name: getattr(self, name) for name in _PLAIN}
-        arrays = {name: getattr(self, name) for name in _ARRAYS} | {"watch": self.watch.numbers()}
+        plain, arrays = parted(self._sampled, self._now)
+        arrays["watch"] = self.watch.numbers()
         plain["samples"], arrays["samples"] = self.samples.state()
         if self._collected:
             arrays |= {
@@ -610,8 +640,7 @@ class OnlineEstimator:
                 "restore: the state is of another joint, sample time or options; give one of this "
                 "estimator"
             )
-        for name in (*_PLAIN, *_ARRAYS):
-            setattr(self, name, plain[name] if name in plain else arrays[name])
+        self._sampled, self._now = joined(Sample, plain, arrays), joined(State, plain, arrays)
         self.watch.load(arrays["watch"])
         self.samples.restore(plain["samples"], arrays["samples"])
         self._collected = (
@@ -649,9 +678,9 @@ class OnlineEstimator:
             return self.theta
         told = guard.step(self.estimator, theta, error, np.maximum(least, self.level), on)
         if told:
-            self.events.append(f"estimate {told}")
+            self._tell(f"estimate {told}")
         if told == "back":
-            self._square[:], self._strained = self.level**2, 0
+            self._set(square=self.level**2, strained=0)
             if self.two_step is not None:
                 self.two_step.forget(guard.held_for)
         return guard.theta
@@ -661,15 +690,15 @@ class OnlineEstimator:
         window = two.window()
         weight = self._weight_of(window.shares, self.theta, self._size()) * window.on
         two.launch(weight, self.theta, self.level, self.least, self._factory(), first=first)
-        self.events.append(str(two.mode))
+        self._tell(str(two.mode))
 
     def _advance(self, two: Reoptimiser) -> None:
         """Do the portions of a sample, and take up what the search has found."""
         found, guard = two.advance(), self.guard
         if found is None:
             return
-        self.events.append(found.text)
-        self._strained = 0
+        self._tell(found.text)
+        self._set(strained=0)
         if found.eta is None:
             return
         trusted = (
@@ -679,9 +708,14 @@ class OnlineEstimator:
             return
         self.rows = two.reshaped(found.eta, found.deviation, self.rows)
         if found.estimator is not None:
-            self.estimator, self._scale = found.estimator, found.scale
-            self.theta, self.sigma = found.estimator.theta, found.estimator.deviation
-            self._square, self.level = found.level**2, found.level
+            self.estimator = found.estimator
+            self._set(
+                scale=found.scale,
+                theta=found.estimator.theta,
+                sigma=found.estimator.deviation,
+                square=found.level**2,
+                level=found.level,
+            )
         if self.estimator is not None:
             guard.start(self.estimator)
         self._floors()

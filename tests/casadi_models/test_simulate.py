@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -214,3 +215,28 @@ def test_a_late_channel_is_late(place: str, column: int) -> None:
     error_late = np.abs(shown[100:] - true[98:-2]).max()
     error_plain = np.abs(shown[100:] - true[100:]).max()
     assert error_late < 0.15 * error_plain
+
+
+def test_a_late_link_encoder_reads_what_was_true_a_moment_before() -> None:
+    """Readings of a model whose clocks are calibrated: the true value less the skew times its
+    rate, acceleration of the moment included.
+    """
+    late = 3e-4
+    names = ("link_encoder_zero", "link_encoder_skew", "torque_sensor_skew")
+    plain = JointModel.harmonic_drive("hd3")
+    model = replace(plain, calibration=names)
+    values = dict.fromkeys(plain.parameter_names, 1.0) | {"stiffness": 2e4}
+    on_time = {**values, **dict.fromkeys(names, 0.0)}
+    skewed = {**on_time, "link_encoder_skew": late}
+    x, u = [0.3, 0.4, 0.299, 0.38], [5.0, 0.0, 0.0]
+
+    def asked(function: str, chosen: dict[str, float]) -> np.ndarray:
+        p = [chosen[n] for n in model.parameter_names]
+        return np.array(getattr(model.functions, function)(x, u, p)).ravel()
+
+    rates = asked("dynamics", skewed)
+    assert np.array_equal(rates, asked("dynamics", on_time))  # states are true values
+    true, read = asked("outputs", on_time), asked("outputs", skewed)
+    assert read[2] == pytest.approx(true[2] - late * rates[2], abs=1e-12)
+    assert read[3] == pytest.approx(true[3] - late * rates[3], abs=1e-12)
+    assert np.array_equal(np.delete(read, [2, 3]), np.delete(true, [2, 3]))
