@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
 import importlib
 import io
 import os
@@ -55,6 +56,7 @@ def _port(text: str) -> int:
     return value
 
 
+@functools.cache
 def _parser() -> argparse.ArgumentParser:
     parser = OneLineParser(
         prog="irj", description="Tells which physics a geared joint's model is missing."
