@@ -114,9 +114,9 @@ def sweep(folder: Path, start: str = "") -> None:
 
 def _swept_runs(outer: Path) -> None:
     """Remove the temporary folders and locks of runs that are no more."""
-    for lock in _lock_folder(outer).glob("*"):
+    for place in _lock_folder(outer).glob("*"):
         with contextlib.suppress(OSError):
-            if (free := _taken(lock, new=False)) is not None:
+            if (free := _taken(place, new=False)) is not None:
                 _given_back(free)
     for left in outer.glob(f"{_PREFIX}*"):
         with contextlib.suppress(OSError):

@@ -24,7 +24,7 @@ from casadi_models.vectorised import Vectorised
 from identification.balance.balances import Memory, residual_expressions
 from identification.balance.dataset import Dataset
 from identification.balance.sensing import Sensing, signals_of
-from identification.balance.weak import POSITION_CHAINS, Grid, WeakRecord, kernel
+from identification.balance.weak import POSITION_CHAINS, Grid, WeakRecord, kernel, whole
 from identification.data.joint_file import Joint
 from identification.data.record import Record
 from identification.diagnosis.candidates import observable
@@ -185,7 +185,7 @@ def at_every_sample(record: Record, joint: Joint, sensing: Sensing) -> WeakRecor
     if inside.any() and np.ptp(steps[inside]) > 0.02 * float(np.median(steps[inside])):
         record = record.resampled()
     signals, dt = signals_of(record, joint, sensing), record.dt
-    long = max(7, 2 * round(SLOW_KERNEL / dt / 2) + 1)
+    long = max(7, 2 * whole(SLOW_KERNEL / dt / 2) + 1)
     segments = tuple(s for s in record.segments() if s.stop - s.start > 2 * max(long, SMOOTHED[-1]))
     starts = np.concatenate([[0], np.cumsum([s.stop - s.start for s in segments])]).astype(np.int64)
     points: dict[str, FloatArray] = {}
