@@ -20,6 +20,8 @@ _WITHOUT_TIME: Final = 0.1
 _REPEATED_LIMIT: Final = 1 / 3
 """Share of repeated stamps above which the median step may be no period of the clock any more."""
 _REGULAR: Final = 0.2
+MOST_SLOTS: Final = 2.0**53
+"""Samples that may be missing at one place: numbers that can be counted one by one."""
 FASTEST: Final = 1e-9
 """Step that no logger of a joint has [s]: converters of currents take at least some ten ns."""
 
@@ -74,6 +76,15 @@ def check_stamps(record: Record) -> list[Finding]:
             "the file by time"
         )
         return [Finding("refuse", "time_decreases", message, "time", row)]
+    usual = steps[inside & (steps > 0.0)]
+    far = np.flatnonzero(inside & (steps > MOST_SLOTS * np.median(usual))) if usual.size else usual
+    if far.size:
+        row = int(far[0]) + 1
+        message = (
+            f"{record.name}: time jumps by {steps[row - 1]:.4g} s at {at(record, row)}: no record "
+            "pauses so long, export it again"
+        )
+        return [Finding("refuse", "time_jumps", message, "time", row)]
     repeated = np.flatnonzero(inside & (steps == 0.0))
     if not repeated.size:
         return [
