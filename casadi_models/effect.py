@@ -167,6 +167,8 @@ class Effect:
         True for sine and cosine of the position: no law of a linear axis.
     separate_by : str
         The run that separates it from what it is confused with.
+    told_by : str
+        What tells it from them where no motion does.
     formerly : tuple of str
         Keys of effects of older files that are part of this one.
     candidate : bool
@@ -198,6 +200,7 @@ class Effect:
     periodic: bool = False
     angular: bool = False
     separate_by: str = ""
+    told_by: str = ""
     formerly: tuple[str, ...] = ()
     candidate: bool = True
     requires: tuple[Requirement, ...] = ()
@@ -524,6 +527,7 @@ def effect(
     periodic: bool = False,
     angular: bool = False,
     separate_by: str = "",
+    told_by: str = "",
     formerly: tuple[str, ...] = (),
     candidate: bool = True,
     requires: tuple[Requirement, ...] = (),
@@ -565,6 +569,7 @@ def effect(
                 periodic=periodic,
                 angular=angular,
                 separate_by=separate_by,
+                told_by=told_by,
                 candidate=candidate,
                 requires=requires,
                 contains=contains,

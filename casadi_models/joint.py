@@ -83,7 +83,7 @@ class JointModel:
         True for a geared joint seen from the motor side: the link hangs on a compliance and its
         position is not recorded.
     calibration : tuple of str
-        Calibration unknowns of the sensors (keys of :data:`casadi_models.term.CALIBRATION`): in the
+        Calibration unknowns of the sensors (keys of :data:`casadi_models.hold.UNKNOWNS`): in the
         readings only, no physics.
     name : str
         Name in reports.
@@ -352,7 +352,7 @@ class JointModel:
             found[LOAD_COMPLIANCE.name] = LOAD_COMPLIANCE
             if "link_inertia" not in self.inertias:
                 found[SWINGING_SHARE.name] = SWINGING_SHARE
-        found.update({n: CALIBRATION[n].parameter for n in self.calibration})
+        found.update({n: CALIBRATION[n].parameter for n in self.calibration if n in CALIBRATION})
         for term in self.terms:
             found.update({p.name: p for p in term.parameters})
         for place in _FRICTION_SIDES:

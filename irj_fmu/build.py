@@ -425,10 +425,10 @@ def _run(path: Path, command: Sequence[str]) -> None:
 # --- command line ---------------------------------------------------------------------------------
 
 
-def parser(prog: str = "build_fmu.py") -> argparse.ArgumentParser:
+def parser(prog: str = "build_fmu.py") -> OneLineParser:
     """Arguments of ``build_fmu.py`` and ``irj export``."""
     made = OneLineParser(prog=prog, description="Build, validate and try the FMUs of a joint file.")
-    made.add_argument("kind", choices=KINDS)
+    made.add_argument("kind", choices=KINDS, help="what is built (irj export: default plant)")
     made.add_argument("--joint", required=True, type=Path, help="joint file (TOML), fitted or not")
     made.add_argument(
         "--out", default=Path("dist"), type=Path, help="folder of the results (default: dist)"

@@ -44,6 +44,22 @@ class OneLineParser(argparse.ArgumentParser):
         """Print the line and exit with 2."""
         self.exit(2, f"{one_line(message)}; see `{self.prog} --help`\n")
 
+    @property
+    def arguments(self) -> tuple[argparse.Action, ...]:
+        """Everything that may be given, but verbs; hidden options are left out."""
+        return tuple(
+            a
+            for a in self._actions
+            if not isinstance(a.choices, dict) and a.help != argparse.SUPPRESS
+        )
+
+    @property
+    def verbs(self) -> dict[str, OneLineParser]:
+        """The parsers of the verbs by name, in their order."""
+        return {
+            k: v for a in self._actions if isinstance(a.choices, dict) for k, v in a.choices.items()
+        }
+
 
 def counted(number: int, what: str) -> str:
     """A number and what is counted, as ``1 run`` or ``3 runs``."""

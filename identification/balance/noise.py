@@ -18,6 +18,12 @@ stamps written with few digits.
 """
 
 
+KEPT: Final = 0.95
+"""Share of the fourth differences that counts: the rest may be jumps of the motion and spikes."""
+CUT_DEVIATION: Final = 0.87
+"""Standard deviation of a unit normal variable that is cut at that quantile of its size (0.871)."""
+
+
 def noise_level(
     values: FloatArray, segments: tuple[slice, ...], time: FloatArray | None = None
 ) -> float:
@@ -50,8 +56,8 @@ def noise_level(
     magnitude = np.sort(np.abs(np.concatenate(parts)))
     # by number and not by value: those of a quantised channel are whole steps, and rounding would
     # decide which of the equal ones lie over a limit
-    smallest = magnitude[: int(0.95 * (len(magnitude) - 1)) + 1]
-    return float(np.sqrt(np.mean(smallest**2)) / 0.87)
+    smallest = magnitude[: int(KEPT * (len(magnitude) - 1)) + 1]
+    return float(np.sqrt(np.mean(smallest**2)) / CUT_DEVIATION)
 
 
 _LEVELS: Final[WeakKeyDictionary[Record, dict[tuple[str, float], float]]] = WeakKeyDictionary()

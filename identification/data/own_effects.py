@@ -18,7 +18,8 @@ from typing import Any, Final
 
 from casadi_models import EFFECTS
 from casadi_models.effect import EffectFile
-from identification.data.plain_text import toml_string, toml_value
+from identification.data.joint_schema import OWN_EFFECTS
+from identification.data.plain_text import toml_string
 from identification.errors import InputError
 
 TABLE: Final = "own_effects"
@@ -45,8 +46,8 @@ def remembered(labels: Iterable[str]) -> list[str]:
     """The lines of a joint file that name the files of these effects."""
     lines, used = [], _keys(labels)
     for found in (f for f in EFFECTS.files if used & set(f.keys)):
-        entry = {"sha256": found.sha256, "keys": found.keys}
-        lines.append(f"{toml_string(str(found.path))} = {toml_value(entry)}")
+        entry = OWN_EFFECTS.inline({"sha256": found.sha256, "keys": found.keys})
+        lines.append(f"{toml_string(str(found.path))} = {entry}")
     return ["", f"[{TABLE}]", *lines] if lines else []
 
 

@@ -115,7 +115,7 @@ def check(
         findings += [
             f for f in check_ratio(usable, gear_ratio) if f.severity != "warn" or not jumps
         ]
-        findings += check_delay(usable)
+        findings += check_delay(usable, gear_ratio)
         if not any(finding.severity == "refuse" for finding in findings):
             findings += check_torque(usable, gear_ratio, torque_per_current)
             findings += check_work(usable, gear_ratio, torque_per_current)
