@@ -235,6 +235,7 @@ REFUSED: dict[str, tuple[Mapping[str, npt.NDArray[np.float64]], str]] = {
     "time that stands": ({**TABLE, "time_s": T * 0}, "repeat the one before"),
     "time backwards": ({**TABLE, "time_s": -T}, "time runs backwards"),
     "time of no clock": ({**TABLE, "time_s": T * 1e-300}, "correct the unit of time"),
+    "a stamp far away": ({**TABLE, "time_s": np.where(T > 0.4, T + 4e149, T)}, "time jumps by"),
     "huge time": ({**TABLE, "time_s": T * 1e308}, "no sensor reads that"),
     "huge current": ({**TABLE, "motor_current_A": 1.7e308 * np.sin(9 * T)}, "no sensor reads that"),
     "endless current": ({**TABLE, "motor_current_A": T + np.inf}, "leave"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
 import importlib
 import io
 import os
@@ -55,6 +56,7 @@ def _port(text: str) -> int:
     return value
 
 
+@functools.cache
 def parser() -> OneLineParser:
     """Arguments of every verb; those of export, cosim and batch go through to their own."""
     made = OneLineParser(
