@@ -29,6 +29,7 @@ from identification.diagnosis.locate import Unexplained, locate
 from identification.diagnosis.trials import Base, Trial, make_base, try_candidate
 from identification.fitting.assess import RATIO_LIMIT, VERDICT_KERNELS, BalanceError, Error, assess
 from identification.fitting.engine import Dataset, Solution, load_dataset, prepared_model, solve
+from identification.fitting.first_fit import first_fit
 
 Progress = Callable[[str, float], None]
 
@@ -128,7 +129,7 @@ class JointBench:
 
     def start(self) -> Solution:
         """The fit of the joint's own model."""
-        return solve(prepared_model(self.joint, self._train[0]), self.data)
+        return first_fit(prepared_model(self.joint, self._train[0]), self.data)
 
     def fitted(
         self, model: JointModel, start: Mapping[str, float], *, again: bool = False

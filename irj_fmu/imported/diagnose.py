@@ -25,7 +25,7 @@ from identification.diagnosis.learned import Doubt, Equivalence, LearnedClaim
 from identification.diagnosis.lines import Line
 from identification.diagnosis.locate import Unexplained, locate
 from identification.diagnosis.session import Session, with_held_out
-from identification.diagnosis.trials import Base, Trial, make_base
+from identification.diagnosis.trials import Base, Trial, make_base, span_of
 from identification.errors import InputError
 from identification.fitting.assess import RATIO_LIMIT, BalanceError, Error, assess
 from identification.fitting.engine import (
@@ -431,8 +431,7 @@ def with_nuisance(base: Base, columns: Sequence[FloatArray], names: Sequence[str
     if not kept:
         return base
     jacobian = np.column_stack([base.jacobian, *extra])
-    left, singular, _ = np.linalg.svd(jacobian, full_matrices=False)
-    orthonormal = left[:, singular > 1e-9 * float(singular[0])]
+    orthonormal = span_of(jacobian)
     return replace(
         base,
         jacobian=jacobian,

@@ -55,15 +55,17 @@ def test_a_law_of_the_position_that_is_really_there_is_whole(tmp_path: Path) -> 
     assert not any(c.partial for c in found.claims)
 
 
-def test_a_small_delay_is_found_where_damping_stands_at_zero_without_it(tmp_path: Path) -> None:
+def test_a_delay_of_a_sample_is_a_skew_of_the_clock_and_no_claim(tmp_path: Path) -> None:
     found = improved(
         generate_case("channel_delay", 7000, size=0.5, dirt=True, folder=tmp_path / "case")
     )
-    assert "structural_damping" in found.steps[0].solution.at_bound
-    assert [c.effects for c in found.claims] == [("channel_delay",)]
-    solution = found.steps[-1].solution
-    assert solution.values["torque_sensor_delay"] == pytest.approx(0.00265, rel=0.1)
-    assert "structural_damping" not in solution.at_bound
+    assert found.claims == ()
+    assert found.verdict == "nothing_missing"
+    late = [c for c in found.calibration if c.sensor == "link_torque"]
+    assert [c.what for c in late] == ["skew", "skew"]
+    for skew in late:
+        assert skew.value == pytest.approx(0.00265, rel=0.1)
+    assert "structural_damping" not in found.steps[-1].solution.at_bound
 
 
 def test_a_line_goes_on_over_the_stroke_and_a_burst_does_not() -> None:
