@@ -155,7 +155,8 @@ class Effect:
         True where a fit of its shapes has several minima: it starts from several points.
     takes_up : callable or None
         ``takes_up(signals, parameters)``: twist that a law of the transmission takes up before its
-        other laws, the linear stiffness apart, feel any; 0 where the law is absent.
+        other laws feel any, the linear stiffness and laws with memory apart; 0 where the law is
+        absent.
     of_displacement : bool
         True for a law of the torsion that also makes sense on the position of an axis without gear.
     shapes_reversal : bool

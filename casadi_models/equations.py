@@ -208,10 +208,14 @@ class _Builder:
         return replace(view, torsion=view.torsion - taken, taken=taken)
 
     def seen(self, term: Term, view: _View, beyond: _View) -> _View:
-        """The view of a term: beyond what others take up, if it is a law of the transmission."""
-        spring = any(p.role == "stiffness" for p in term.effect.parameters)
-        first = term.place != "transmission" or spring or term.effect.takes_up is not None
-        return view if first else beyond
+        """The view of a term: beyond what others take up, if it is a law of the transmission.
+
+        Friction between the two sides (a law with memory) acts whether they touch or not.
+        """
+        effect = term.effect
+        spring = any(p.role == "stiffness" for p in effect.parameters)
+        whole = spring or effect.takes_up is not None or effect.memory is not None
+        return view if whole or term.place != "transmission" else beyond
 
     def local(self, term: Term, view: _View, rate: Expression | None = None) -> LocalSignals:
         """What the law of a term sees; `rate` from :meth:`torsion_rate` where it is at hand."""
