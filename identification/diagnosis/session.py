@@ -517,7 +517,7 @@ class Session:
         left = {k: common_rms(fitted[best.key], e, best.balance)[1] for k, e in fitted.items()}
         near = (1 + SAME_WITH_ONE_LESS / 100) * min(left.values())
         alike = [t for t in (best, *relatives) if left[t.key] <= near]
-        found = min(alike, key=lambda t: (len(t.values), left[t.key]))
+        found = min(alike, key=lambda t: (not t.effect.common, len(t.values), left[t.key]))
         for t in (best, *relatives):
             if left[t.key] > SET_RMS * left[found.key]:
                 more = 100 * (left[t.key] / left[found.key] - 1)
