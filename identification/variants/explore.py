@@ -22,6 +22,7 @@ from identification.data.record import Record
 from identification.diagnosis.bench import Progress
 from identification.diagnosis.candidates import NotTestable
 from identification.diagnosis.improvement import Improvement
+from identification.diagnosis.learned import with_curves
 from identification.diagnosis.session import Session
 from identification.errors import InputError
 from identification.fitting.engine import Solution, reweighed
@@ -35,7 +36,15 @@ from identification.variants.lattice import (
     missing_from,
     nodes_of,
 )
-from identification.variants.refit import Refit, Weighting, physical, refitted, with_size
+from identification.variants.refit import (
+    Held,
+    Refit,
+    Weighting,
+    held_of,
+    physical,
+    refitted,
+    with_size,
+)
 from identification.variants.screen import LARGEST, PER_PARAMETER, Scored, Screen
 
 SHOWN: Final = 40
@@ -159,7 +168,7 @@ class _Search:
             return
         refit = refitted(model, self.data, starts, self.weighting)
         added = added_to(self.start.model, model)
-        if not np.all(np.isfinite(refit.held)) or physical(refit, added, self.data):
+        if not np.all(np.isfinite(refit.held.rms)) or physical(refit, added, self.data):
             return
         self.found[mark] = refit
         if name:
@@ -279,8 +288,8 @@ class _Search:
                 added=added_to(self.start.model, refit.solution.model),
                 dropped=missing_from(self.start.model, refit.solution.model),
                 parameters=refit.parameters,
-                relative_error_percent=refit.relative_error_percent,
-                error_percent=100 * float(np.exp(np.mean(np.log(refit.held / own.held)))),
+                relative_error_percent=refit.held.relative_error_percent,
+                error_percent=_of_start(refit.held, own.held),
                 score=float(scores.score[k] - scores.score[best]),
                 tied=tied[k],
                 chosen_percent=100 * float(scores.chosen[k]),
@@ -288,9 +297,11 @@ class _Search:
             )
             for k, (mark, refit) in enumerate(zip(marks, refits, strict=True))
         ]
-        front = front_of([v.parameters for v in variants], [v.error_percent for v in variants])
+        curve = self._curved(improvement, own)
+        shown = [*variants, *([curve] if curve is not None else [])]
+        front = front_of([v.parameters for v in shown], [v.error_percent for v in shown])
         order = sorted(range(len(variants)), key=lambda k: (not whole[k], scores.score[k]))
-        balances = refits[0].held.size
+        balances = own.held.rms.size
         recommended = variants[best]
         stand_ins = []
         for k in order:
@@ -307,9 +318,9 @@ class _Search:
         return Exploration(
             self.session.joint,
             self.data,
-            variants=tuple(variants[k] for k in order),
+            variants=(*(variants[k] for k in order), *shown[len(variants) :]),
             screened=self.screened,
-            front=tuple(variants[k] for k in front),
+            front=tuple(shown[k] for k in front),
             recommended=recommended,
             ties=tuple(variants[k] for k in order if tied[k]),
             windows=tuple(variants[k].name for k in scores.windows),
@@ -326,6 +337,34 @@ class _Search:
             ),
         )
 
+    def _curved(self, improvement: Improvement, own: Refit) -> Variant | None:
+        """The last model of `improve` with its learned curves, where they lower the error: what no
+        name explains.
+        """
+        last = improvement.steps[-1].solution
+        refit = self.found.get(self.last)
+        if not improvement.learned or refit is None:
+            return None
+        solution = with_curves(last, improvement.learned)
+        held = held_of(solution, self.data, self.weighting)
+        if not _of_start(held, refit.held) < 100:  # no curve beyond the steady rows it was drawn on
+            return None
+        freedom = sum(c.curve.freedom for c in improvement.learned)
+        added = added_to(self.start.model, solution.model)
+        return Variant(
+            " ".join(f"+ {label}" for label in added),
+            visible_labels(solution.model),
+            added=added,
+            dropped=(),
+            parameters=refit.parameters + math.ceil(freedom),
+            relative_error_percent=held.relative_error_percent,
+            error_percent=_of_start(held, own.held),
+            score=math.nan,
+            tied=False,
+            chosen_percent=0.0,
+            solution=solution,
+        )
+
     def _name(self, refit: Refit, name: str) -> str:
         model = refit.solution.model
         if name:
@@ -334,6 +373,13 @@ class _Search:
         dropped = missing_from(self.start.model, model)
         told = [f"+ {label}" for label in added] + [f"- {label}" for label in dropped]
         return " ".join(told) or "start model"
+
+
+def _of_start(held: Held, start: Held) -> float:
+    """Held-out error in percent of that of the joint's own model, mean of the balances'
+    logarithms.
+    """
+    return 100 * float(np.exp(np.mean(np.log(held.rms / start.rms))))
 
 
 def _restricted(start: Solution, like: Solution) -> Solution:

@@ -52,6 +52,27 @@ class Weighting:
 
 @final
 @dataclass(frozen=True)
+class Held:
+    """Errors on the held-out records.
+
+    Attributes
+    ----------
+    squares, rows : (blocks, balances) arrays
+        Weighted squares of each block, and how many rows it has.
+    rms : (balances,) array
+        In the units of the weights.
+    relative_error_percent : float
+        100 norm(residual) / norm(measured).
+    """
+
+    squares: FloatArray
+    rows: FloatArray
+    rms: FloatArray
+    relative_error_percent: float
+
+
+@final
+@dataclass(frozen=True)
 class Refit:
     """A fitted variant and its errors.
 
@@ -63,18 +84,14 @@ class Refit:
     squares, rows : (blocks, balances) arrays
         Squares of each block that the fit did not see, and how many rows it has: of the training
         records by cross-validation, then those of the held-out records.
-    held : (balances,) array
-        RMS on held-out records, in the units of the weights.
-    relative_error_percent : float
-        100 norm(residual) / norm(measured) on held-out records.
+    held : Held
     """
 
     solution: Solution
     cost: float
     squares: FloatArray
     rows: FloatArray
-    held: FloatArray
-    relative_error_percent: float
+    held: Held
 
     @property
     def parameters(self) -> int:
@@ -99,24 +116,31 @@ def refitted(
     )
     solution, cost = found
     base = make_base(solution, data)
-    own = base.crossed, base.numbers.astype(np.float64)
-    balances = balances_of(solution.model, data.sensing, wrt=())
+    seen = held_of(solution, data, weighting)
+    return Refit(
+        solution,
+        cost,
+        np.vstack([base.crossed, seen.squares]),
+        np.vstack([base.numbers.astype(np.float64), seen.rows]),
+        seen,
+    )
+
+
+def held_of(solution: Solution, data: Dataset, weighting: Weighting) -> Held:
+    """Errors of a model with its values on the held-out records."""
+    model = solution.model
+    balances = balances_of(model, data.sensing, wrt=())
     values = settled(model, data.sensing, [*data.train, *data.held_out], solution.values)
     residual = stack(balances, data.held_out, values).residual
     taking = {b: taking_part(b, data.held_out) for b in balances.balances}
     measured = references(data, data.held_out)
     left = np.concatenate([residual[b][taking[b]] for b in balances.balances])
     size = np.concatenate([measured[b][taking[b]] for b in balances.balances])
-    seen = _by_block(data, residual, weighting)
-    return Refit(
-        solution,
-        cost,
-        np.vstack([own[0], seen[0]]),
-        np.vstack([own[1], seen[1]]),
-        np.array(
-            [rms((residual[b] * weighting.held[b])[taking[b]]) for b in balances.balances],
-            dtype=np.float64,
-        ),
+    squares, rows = _by_block(data, residual, weighting)
+    return Held(
+        squares,
+        rows,
+        np.array([rms((residual[b] * weighting.held[b])[taking[b]]) for b in balances.balances]),
         100 * float(np.linalg.norm(left)) / (float(np.linalg.norm(size)) or 1e-300),
     )
 
