@@ -148,11 +148,17 @@ def tied_with_best(
 
 
 def front_of(parameters: Sequence[int], error: Sequence[float]) -> list[int]:
-    """Variants on the front of error against parameters, the fewest parameters first."""
+    """Variants on the front of error against parameters, the fewest parameters first.
+
+    Each is better than all with fewer parameters; those that are as good with as many parameters
+    stand side by side.
+    """
     out: list[int] = []
     lowest = np.inf
-    for k in sorted(range(len(error)), key=lambda i: (parameters[i], error[i])):
-        if error[k] < lowest * (1 - FRONT_LEAST):
-            out.append(k)
-            lowest = error[k]
+    for count in sorted(set(parameters)):
+        here = sorted((k for k, p in enumerate(parameters) if p == count), key=lambda k: error[k])
+        best = error[here[0]]
+        if best < lowest * (1 - FRONT_LEAST):
+            out += [k for k in here if error[k] <= best * (1 + FRONT_LEAST)]
+            lowest = best
     return out

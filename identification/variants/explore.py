@@ -14,6 +14,7 @@ import numpy as np
 
 from casadi_models import JointModel
 from casadi_models.transmission import MODELS
+from identification.balance.balances import Balances
 from identification.balance.calibration import unknowns_of
 from identification.balance.dataset import visible_labels, without
 from identification.balance.sensing import sense
@@ -59,7 +60,7 @@ FIRST: Final = 3
 ROUNDS: Final = 2
 """Expansions about a fitted variant with further parts."""
 FURTHER: Final = 2
-"""Parts that are tried at once beside the best variant."""
+"""Parts that are tried at once to find the point of expansion, and beside the best variant."""
 
 
 def explore(
@@ -123,8 +124,9 @@ class _Search:
         last = improvement.steps[-1].solution
         last = replace(last, model=with_size(last, added_to(self.start.model, last.model)))
         self.last = self._mark(last.model)
-        first = self._screen(self.start, nodes, {}, 0.0)
-        ranked = first.search()
+        laws: dict[tuple[str, bool | None], Balances] = {}
+        first = self._screen(self.start, nodes, {}, 0.0, laws=laws)
+        ranked = first.search(FURTHER)
         self._fit(self.start.model, self.start.values)
         self._fit(last.model, last.values)
         for scored in itertools.islice(first.worth(ranked), FIRST):
@@ -136,11 +138,12 @@ class _Search:
             like = reweighed(best.solution, self.data)
             self.weighting = Weighting.of(like, self.data)
             self.found.clear()
-            screen = self._screen(_restricted(self.start, like), nodes, _shapes(like), 0.3)
-            ranked = screen.search()
+            screen = self._screen(
+                _restricted(self.start, like), nodes, _shapes(like), 0.3, laws=laws
+            )
             self._fit(self.start.model, {**like.values, **self.start.values})
             self._fit(last.model, {**like.values, **last.values})
-        self._fit_chosen(screen, ranked, best.solution.values)
+        self._fit_chosen(screen, screen.search(), best.solution.values)
         for _ in range(ROUNDS):
             if not self._grown():
                 break
@@ -157,9 +160,17 @@ class _Search:
         nodes: Sequence[Node],
         more: Mapping[str, Mapping[str, float]],
         share: float,
+        *,
+        laws: dict[tuple[str, bool | None], Balances] | None = None,
     ) -> Screen:
         base = self.session.bench.base(solution)
-        return Screen(base, nodes, more, lambda text, part: self.progress(text, share + 0.2 * part))
+        return Screen(
+            base,
+            nodes,
+            more,
+            laws=laws,
+            progress=lambda text, part: self.progress(text, share + 0.2 * part),
+        )
 
     def _fit(self, model: JointModel, *starts: Mapping[str, float], name: str = "") -> None:
         """Fit a variant once; one whose parts are none is passed over."""

@@ -326,7 +326,8 @@ def front_picture(dots: Sequence[Dot], front: Sequence[int], height: int = HEIGH
     body = _axes(
         frame, "free parameters", "held-out error [% of start]", logarithmic=True, counted=True
     )
-    stairs = [(frame.across(dots[k].parameters), frame.up(errors[k])) for k in front]
+    treads = {dots[k].parameters: errors[k] for k in reversed(front)}  # the best of each column
+    stairs = [(frame.across(n), frame.up(treads[n])) for n in sorted(treads)]
     if stairs:
         line = f"M{stairs[0][0]:.1f} {stairs[0][1]:.1f}" + "".join(
             f"H{x:.1f}V{y:.1f}" for x, y in stairs[1:]

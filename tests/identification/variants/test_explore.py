@@ -159,6 +159,8 @@ def test_parts_that_do_not_go_together_are_never_in_one_variant() -> None:
 
 def test_front_holds_what_no_variant_with_as_few_parameters_beats() -> None:
     assert front_of([5, 6, 6, 7, 8], [10.0, 4.0, 3.0, 2.99, 1.0]) == [0, 2, 4]
+    # as good with as many parameters: side by side
+    assert front_of([5, 6, 6, 7], [10.0, 3.0, 3.01, 4.0]) == [0, 1, 2]
 
 
 def test_a_parameter_costs_ten_percent_of_one_balance() -> None:
