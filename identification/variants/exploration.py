@@ -159,6 +159,8 @@ class Exploration:
         Not to be told from it on these records, the best first.
     windows : tuple of str
         Name of the best variant in each part of the records, one after the other.
+    by_record : tuple of (str, str)
+        Each record, and the name of the variant that is the best on it alone.
     stand_ins : tuple of StandIn
     improvement : Improvement
         What `improve` decides on the same records.
@@ -181,6 +183,7 @@ class Exploration:
     recommended: Variant
     ties: tuple[Variant, ...]
     windows: tuple[str, ...]
+    by_record: tuple[tuple[str, str], ...]
     stand_ins: tuple[StandIn, ...]
     improvement: Improvement
     improved: Variant | None
@@ -237,6 +240,7 @@ class Exploration:
             "ties": [list(v.labels) for v in self.ties],
             "stability": {
                 "windows": list(self.windows),
+                "records": [{"record": r, "best": name} for r, name in self.by_record],
                 "resampled_percent": self.recommended.chosen_percent,
             },
             "stand_ins": [s.as_json() for s in self.stand_ins],

@@ -41,6 +41,7 @@ from identification.variants.refit import (
     Held,
     Refit,
     Weighting,
+    blocks_of,
     held_of,
     physical,
     refitted,
@@ -288,7 +289,7 @@ class _Search:
         refits, marks = list(self.found.values()), list(self.found)
         own = self.found[self._mark(self.start.model)]
         whole = [self._whole(r) for r in refits]
-        scores = judged(refits, whole)
+        scores = judged(refits, whole, blocks_of(self.data))
         best = scores.best
         parts = [frozenset(visible_labels(r.solution.model)) for r in refits]
         tied = tied_with_best(scores, whole, parts)
@@ -335,6 +336,14 @@ class _Search:
             recommended=recommended,
             ties=tuple(variants[k] for k in order if tied[k]),
             windows=tuple(variants[k].name for k in scores.windows),
+            by_record=tuple(
+                (name, variants[k].name)
+                for name, k in zip(
+                    (*self.data.train_names, *self.data.held_out_names),
+                    scores.records,
+                    strict=True,
+                )
+            ),
             stand_ins=tuple(stand_ins),
             improvement=improvement,
             improved=improved,

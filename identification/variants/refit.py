@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final, final
+from typing import Any, Final, final
 
 import numpy as np
 import numpy.typing as npt
@@ -120,10 +120,15 @@ def refitted(
     return Refit(
         solution,
         cost,
-        np.vstack([base.crossed, seen.squares]),
-        np.vstack([base.numbers.astype(np.float64), seen.rows]),
+        np.vstack([_padded(base.crossed, data.blocks), seen.squares]),
+        np.vstack([_padded(base.numbers, data.blocks), seen.rows]),
         seen,
     )
+
+
+def _padded(found: npt.NDArray[Any], blocks: int) -> FloatArray:
+    """With a row of zeros for each of the last blocks in which no row takes part."""
+    return np.vstack([found, np.zeros((blocks - len(found), found.shape[1]))])
 
 
 def held_of(solution: Solution, data: Dataset, weighting: Weighting) -> Held:
@@ -159,6 +164,15 @@ def _by_block(
         squares.append(np.bincount(place, taking * weighted**2, len(which)))
         rows.append(np.bincount(place, taking, len(which)))
     return np.array(squares, dtype=np.float64).T, np.array(rows, dtype=np.float64).T
+
+
+def blocks_of(data: Dataset) -> tuple[npt.NDArray[np.int64], ...]:
+    """The blocks of each record, training and held-out, as :class:`Refit` counts them."""
+    first = data.blocks
+    held = np.unique(np.concatenate([w.block[w.block >= 0] for w in data.held_out]))
+    out = [np.unique(w.block[w.block >= 0]) for w in data.train]
+    out += [first + np.searchsorted(held, np.unique(w.block[w.block >= 0])) for w in data.held_out]
+    return tuple(out)
 
 
 def with_size(solution: Solution, added: tuple[str, ...]) -> JointModel:
