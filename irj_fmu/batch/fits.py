@@ -30,8 +30,9 @@ from typing import Any, Final, final
 from casadi_models import EFFECTS
 from identification import __version__
 from identification.data.plain_text import from_toml
+from identification.data.schema import refuse_unknown
 from identification.errors import InputError
-from irj_fmu.batch.checks import flag, known, names, table
+from irj_fmu.batch.checks import flag, names, table
 from irj_fmu.batch.fit_worker import Answer, Parcel, answered
 from irj_fmu.batch.worker import enter
 from irj_fmu.command_line import finite, replace_file
@@ -137,9 +138,9 @@ def load_fit_study(path: str | Path) -> FitStudy:
     source = Path(path)
     where = str(source)
     data = from_toml(source.read_text(encoding="utf-8-sig"), where)
-    known(data, ("study", "joint"), f"{where}: a study with a task")
+    refuse_unknown(data, ("study", "joint"), f"{where}: a study with a task")
     study = table(data, "study", where)
-    known(study, _STUDY_KEYS, f"{where}: [study]")
+    refuse_unknown(study, _STUDY_KEYS, f"{where}: [study]")
     task = study.get("task")
     if task not in TASKS:
         raise InputError(f"{where}: [study] task = {task!r}; use one of {', '.join(TASKS)}")
@@ -163,7 +164,7 @@ def _jobs(entry: Any, number: int, source: Path) -> Iterator[Job]:
     where = f"{source}: [[joint]] {number}"
     if not isinstance(entry, Mapping):
         raise InputError(f"{where}: must be a table; write [[joint]] on a line of its own")
-    known(entry, _JOINT_KEYS, where)
+    refuse_unknown(entry, _JOINT_KEYS, where)
     file = entry.get("joint")
     if not isinstance(file, str) or not (source.parent / file).is_file():
         raise InputError(f"{where}: joint = {file!r}; give the path of a joint file")

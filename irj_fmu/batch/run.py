@@ -177,7 +177,7 @@ def _clear(chunks: Path) -> None:
 # --- command line ---------------------------------------------------------------------------------
 
 
-def parser() -> argparse.ArgumentParser:
+def parser() -> OneLineParser:
     """Arguments of ``irj batch``."""
     made = OneLineParser(
         prog="irj batch",
