@@ -26,7 +26,9 @@ from identification.version import VERSION
 
 if TYPE_CHECKING:
     from identification.faults.detector import FaultDetector
+    from identification.fitting.trust import trust
     from identification.linear.subspace import moesp
+    from identification.planning.next_run import next_run
     from identification.recursive.estimator import RecursiveLeastSquares
     from identification.two_step.algorithm import TwoStep
 
@@ -34,6 +36,8 @@ __version__ = VERSION
 
 _LATE = {
     "moesp": "linear.subspace",
+    "next_run": "planning.next_run",
+    "trust": "fitting.trust",
     "RecursiveLeastSquares": "recursive.estimator",
     "TwoStep": "two_step.algorithm",
     "FaultDetector": "faults.detector",
@@ -59,7 +63,9 @@ __all__ = [
     "load_joint",
     "mcs",
     "moesp",
+    "next_run",
     "read",
+    "trust",
 ]
 
 

@@ -21,7 +21,7 @@ import numpy.typing as npt
 from identification import Joint, Record
 from identification.data.joint_file import Known
 from identification.fitting.engine import load_dataset, prepared_model, solve
-from identification.planning.rivals import Contest, Rival, enough, rivals_of
+from identification.planning.rivals import Contest, enough, rivals_of
 from identification.planning.runs import (
     SIMULATED,
     Plant,
@@ -168,13 +168,8 @@ def one_joint(
         )
         fresh = record_of(new.measured[kind], kind, "same" if run.load == 1 else "none", **more)
         both = load_dataset([old, fresh], [], joint, model)
-        again = Contest(
-            [
-                Rival(r.name, r.label, solve(r.solution.model, both, start=r.solution.values))
-                for r in rivals
-            ],
-            both,
-        )
+        tied = [r.name for r in rivals]
+        again = Contest(rivals_of(tied, balance, solve(model, both), both), both)
         after, one, within = judged(again, truth)
         expected = _expected(contest, truth, apart)
         out.append((kind, Outcome(expected, after, one, within), run))
