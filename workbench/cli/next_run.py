@@ -22,7 +22,7 @@ from workbench.cli.files import (
     write_json,
     write_text,
 )
-from workbench.cli.loop import marked_training, print_warnings
+from workbench.cli.loop import print_warnings, training
 
 UNPLANNED: Final = Run("multisine", 0.0, math.radians(60.0), math.radians(60.0))
 """The motion that is judged where no file is given and nothing has been recorded [rad, rad/s]."""
@@ -79,7 +79,7 @@ def _after(arguments: Namespace, limits: Limits) -> dict[str, Any]:
         held_out=arguments.held_out,
     )
     joint = open_joint(arguments.joint)
-    records, _ = marked_training(arguments.records, arguments.other_payload, joint)
+    records, _ = training(arguments.records, arguments.other_payload, joint)
     held, _ = open_records(arguments.held_out, joint)
     paths = [*arguments.records, *arguments.other_payload, *arguments.held_out]
     alike(paths, [*records, *held], joint)

@@ -7,14 +7,14 @@ from argparse import Namespace
 from identification.fitting.fit import fit
 from identification.fitting.trust import trust
 from workbench.cli.files import alike, distinct, open_joint, write_json
-from workbench.cli.loop import marked_training
+from workbench.cli.loop import training
 
 
 def run_trust(arguments: Namespace) -> int:
     """`irj trust REC... --joint J`."""
     distinct(training=arguments.records, other_payload=arguments.other_payload)
     joint = open_joint(arguments.joint)
-    records, warnings = marked_training(arguments.records, arguments.other_payload, joint)
+    records, warnings = training(arguments.records, arguments.other_payload, joint)
     alike([*arguments.records, *arguments.other_payload], records, joint)
     fitted = fit(joint, records)
     found = trust(fitted.solution, fitted.data)
