@@ -109,7 +109,9 @@ def judged(contest: Contest, truth: str) -> tuple[float, bool, bool]:
     likelihood = dict(zip(names, contest.likelihood, strict=True))
     if truth not in likelihood:
         return -np.inf, False, False
-    found = likelihood[truth] - max(v for n, v in likelihood.items() if n != truth)
+    # a name that does not help at all on both records has no fit: the truth is alone
+    others = [v for n, v in likelihood.items() if n != truth]
+    found = likelihood[truth] - max(others, default=-np.inf)
     left = [r.name for r in contest.alive]
     return float(found), left == [truth], truth in left
 
@@ -170,8 +172,8 @@ def one_joint(
         fresh = record_of(new.measured[kind], kind, "same" if run.load == 1 else "none", **more)
         both = load_dataset([old, fresh], [], joint, model)
         tied = [r.name for r in rivals]
-        again = Contest(rivals_of(tied, balance, solve(model, both), both), both)
-        after, one, within = judged(again, truth)
+        left = rivals_of(tied, balance, solve(model, both), both)
+        after, one, within = judged(Contest(left, both), truth) if left else (-np.inf, False, False)
         expected = _expected(contest, truth, apart)
         out.append((kind, Outcome(expected, after, one, within), run))
     return out
