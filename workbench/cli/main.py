@@ -421,7 +421,11 @@ def parser() -> OneLineParser:
     )
     other_payload(trusted)
     joints = verb("joints", "joints", "the library of identified joints")
-    joints.add_argument("what", choices=("list", "show", "compare"))
+    joints.add_argument(
+        "what",
+        choices=("list", "show", "compare"),
+        help="list them, show values and where they come from, or put several side by side",
+    )
     joints.add_argument("names", nargs="*", metavar="NAME", help="names, types or files of joints")
     joints.add_argument(
         "--library",
