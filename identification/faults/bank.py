@@ -21,7 +21,8 @@ from identification.faults.bank_levels import SETTLE, Piece, first_levels, likel
 from identification.faults.bank_statistics import WINDOWS, limits, statistics
 from identification.faults.core import ABSURD, CURRENT, SENSORS
 from identification.faults.types import FaultEvent, Verdict
-from identification.online.filter import FilterState, JointFilter, Levels
+from identification.online.filter import TWIST, FilterState, JointFilter, Levels
+from identification.online.filter_step import BALANCES
 from identification.online.pulse import Pulse
 
 FloatArray = npt.NDArray[np.float64]
@@ -39,6 +40,12 @@ PLANT_REST: Final = 5.0
 """No second report about the joint itself for this long [s]."""
 BLIND: Final = 1.0
 """Seconds after a start whose innovations do not count: they tell what was not known then."""
+FIRST: Final = 0.5
+"""Seconds after which velocities are known and the calibration is found anew."""
+OPENED: Final = 0.1 * TWIST
+"""Standard deviation of the calibration there [rad]: ten times what these seconds leave wrong."""
+LINK_STATE: Final = 2
+"""The link position in the joint's state."""
 GAP: Final = 0.05
 """A gap between stamps beyond this starts the filters anew [s]."""
 LOST: Final = 0.03
@@ -110,7 +117,7 @@ class FaultBank:
     sensors : tuple of int
         Numbers of the sensors there are; filter k + 1 leaves out the k-th.
     blind : int
-        Samples after a start whose innovations do not count.
+        Samples after :meth:`begun` whose innovations do not count.
     """
 
     def __init__(
@@ -131,7 +138,7 @@ class FaultBank:
         self.dt = dt
         self.joint = JointFilter(replace(model, calibration=CALIBRATION), dt, CALIBRATION)
         self.tuning = tuning
-        self.blind = round(BLIND / dt)
+        self.blind = round((BLIND - FIRST) / dt)
 
     # --- before the run ---------------------------------------------------------------------------
 
@@ -154,9 +161,15 @@ class FaultBank:
             parts = []
             for piece in long:
                 table = np.broadcast_to(flags[k], (1, len(piece.time), 6))
-                state = self.started(piece.time, piece.rows, levels)[k : k + 1]
-                course = self.joint.run(state, piece.time, piece.rows, table, levels=levels)
-                late = piece.time - piece.time[0] > SETTLE
+                states, at = self.begun(piece.time, piece.rows, levels)
+                course = self.joint.run(
+                    states[k : k + 1],
+                    piece.time[at:],
+                    piece.rows[at:],
+                    table[:, at:],
+                    levels=levels,
+                )
+                late = piece.time[at:] - piece.time[0] > SETTLE
                 parts.append(statistics(course, 0, self.dt, self.blind)[late])
             motor, *others = levels.disturbance
             motor = motor if flags[k, CURRENT] else levels.unknown_drive
@@ -255,13 +268,35 @@ class FaultBank:
             table[k + 1, sensor] = 0.0
         return np.repeat(table[:, None, :], count, axis=1)
 
-    def started(self, time: FloatArray, rows: FloatArray, levels: Levels) -> list[FilterState]:
-        """All filters at the first sample of a stretch."""
+    def begun(
+        self, time: FloatArray, rows: FloatArray, levels: Levels
+    ) -> tuple[list[FilterState], int]:
+        """All filters after the first :data:`FIRST` seconds of a stretch, and how many samples that
+        took.
+
+        Velocities are not known at the first sample, and a filter that is linearised at wrong ones
+        is too sure of what it found: disturbances and calibration are opened again.
+        """
         first = np.nan_to_num(rows[0]).tolist()
-        return [
+        states = [
             self.joint.start(float(time[0]), first, used.tolist(), levels=levels)
             for used in self.flags(1)[:, 0]
         ]
+        count = min(round(FIRST / self.dt), len(time))
+        run = self.joint.run(states, time[:count], rows[:count], self.flags(count), levels=levels)
+        return [self._opened(state, levels) for state in run.last], count
+
+    def _opened(self, state: FilterState, levels: Levels) -> FilterState:
+        """A filter whose disturbances, encoders' zero and so the link are unsure again."""
+        joint, at = self.joint, self.joint.states
+        own = slice(at, at + BALANCES)
+        mean, covariance = state.mean.copy(), state.covariance.copy()
+        mean[own] = 0.0
+        covariance[own, :] = covariance[:, own] = 0.0
+        covariance[own, own] = np.diag(np.square(levels.disturbance))
+        way = np.zeros(joint.size)
+        way[-1], way[LINK_STATE] = OPENED, -OPENED
+        return replace(state, mean=mean, covariance=covariance + np.outer(way, way))
 
 
 def told(worst: FloatArray) -> int | None:
@@ -282,14 +317,13 @@ class _Probe:
         self.bank = bank
         back, ahead = round(WINDOWS[-1] / bank.dt), round(WAITS[0] / bank.dt)
         first = max(place - back, 0)
-        states = bank.started(time, rows, bank.tuned.levels)
-        if first > 0:
-            flags = bank.flags(first)
-            states = list(
-                bank.joint.run(
-                    states, time[:first], rows[:first], flags, levels=bank.tuned.levels
-                ).last
-            )
+        levels = bank.tuned.levels
+        states, at = bank.begun(time, rows, levels)
+        first = max(first, at)
+        if first > at:
+            part, flags = slice(at, first), bank.flags(first - at)
+            run = bank.joint.run(states, time[part], rows[part], flags, levels=levels)
+            states = list(run.last)
         self.states, self.begin = states, place - first
         self.time, self.rows = time[first : place + ahead], rows[first : place + ahead]
 
@@ -348,8 +382,9 @@ class _Work:
         """Filters from a fresh start up to a gap."""
         bank, levels = self.bank, self.tuning.levels
         part = slice(first, last)
-        states = bank.started(self.time[part], self.rows[part], levels)
-        at, armed, blind = first, self.time[first] + SETTLE, bank.blind
+        armed, blind = self.time[first] + SETTLE, bank.blind
+        states, taken = bank.begun(self.time[part], self.rows[part], levels)
+        at = first + taken
         while at < last:
             part = slice(at, last)
             scores = self._scored(states, part, blind)
@@ -382,8 +417,9 @@ class _Work:
                 at = min(decided + 1, last)
                 if at < last:
                     rest = slice(at, last)
-                    states = bank.started(self.time[rest], self.rows[rest], levels)
                     armed, blind = self.time[at] + SETTLE, bank.blind
+                    states, taken = bank.begun(self.time[rest], self.rows[rest], levels)
+                    at += taken
 
     def _lost(self, first: int, last: int) -> tuple[int, int]:
         """First sample of a stretch from which a reading is missing for long, and its sensor."""
