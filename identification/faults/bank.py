@@ -46,6 +46,8 @@ OPENED: Final = 0.1 * TWIST
 """Standard deviation of the calibration there [rad]: ten times what these seconds leave wrong."""
 LINK_STATE: Final = 2
 """The link position in the joint's state."""
+CHUNK: Final = 60.0
+"""Stretches in which a record is worked on, so that hours of it need no more memory [s]."""
 GAP: Final = 0.05
 """A gap between stamps beyond this starts the filters anew [s]."""
 LOST: Final = 0.03
@@ -150,7 +152,13 @@ class FaultBank:
         InputError
             The records are too short.
         """
-        long = [p for p in healthy if p.time[-1] - p.time[0] > 2 * SETTLE]
+        size = max(round(CHUNK / self.dt), 1)
+        cut = [
+            Piece(p.time[k : k + size], p.rows[k : k + size])
+            for p in healthy
+            for k in range(0, len(p.time), size)
+        ]
+        long = [p for p in cut if p.time[-1] - p.time[0] > 2 * SETTLE]
         if not long:
             raise InputError(f"fault bank: give healthy records longer than {2 * SETTLE:g} s")
         first = first_levels(long, self.dt, self.measured)
@@ -384,20 +392,31 @@ class _Work:
         part = slice(first, last)
         armed, blind = self.time[first] + SETTLE, bank.blind
         states, taken = bank.begun(self.time[part], self.rows[part], levels)
-        at = first + taken
+        at, skip, history = first + taken, 0, round(WINDOWS[-1] / bank.dt)
+        length = chunk = round(CHUNK / bank.dt)
         while at < last:
-            part = slice(at, last)
-            scores = self._scored(states, part, blind)
-            self.scores[part] = scores
-            over = np.flatnonzero((scores[:, 0] > 1) & (self.time[part] > armed))
-            alarm = at + int(over[0]) if len(over) else last
-            gone, missing = self._lost(at, last)
-            if min(alarm, gone) >= last:
-                return
+            end = min(at + length, last)
+            scores = self._scored(states, slice(at, end), blind)
+            self.scores[at + skip : end] = scores[skip:]
+            over = (scores[:, 0] > 1) & (self.time[at:end] > armed)
+            over[:skip] = False
+            alarm = at + int(np.argmax(over)) if over.any() else end
+            gone, missing = self._lost(at + skip, end)
+            if min(alarm, gone) >= end:
+                if end == last:
+                    return
+                back = max(end - history, at)
+                states = self._moved(states, at, back)
+                skip, at, blind, length = end - back, back, 0, chunk
+                continue
+            if alarm < gone and end < last and self.time[end - 1] - self.time[alarm] < WAITS[-1]:
+                length += chunk  # a verdict may need what comes
+                continue
+            length, skip = chunk, 0
             if gone <= alarm:
                 decided, sensor = gone, missing
             else:
-                decided, verdict, sensors = self._decide(alarm, last)
+                decided, verdict, sensors = self._decide(alarm, end)
                 self._report(alarm, decided, verdict, sensors)
                 sensor = SENSORS.index(sensors[0]) if verdict in ONE else -1
             if sensor >= 0:
@@ -420,6 +439,16 @@ class _Work:
                     armed, blind = self.time[at] + SETTLE, bank.blind
                     states, taken = bank.begun(self.time[rest], self.rows[rest], levels)
                     at += taken
+
+    def _moved(self, states: Sequence[FilterState], first: int, last: int) -> list[FilterState]:
+        """All filters after the samples of a stretch."""
+        if last <= first:
+            return list(states)
+        bank, part = self.bank, slice(first, last)
+        flags = bank.flags(last - first)
+        levels = self.tuning.levels
+        run = bank.joint.run(states, self.time[part], self.rows[part], flags, levels=levels)
+        return list(run.last)
 
     def _lost(self, first: int, last: int) -> tuple[int, int]:
         """First sample of a stretch from which a reading is missing for long, and its sensor."""
