@@ -38,8 +38,8 @@ RECOVER: Final = 1.1
 """A failed sensor must agree with the others for this long to be read again [s]."""
 PLANT_REST: Final = 5.0
 """No second report about the joint itself for this long [s]."""
-BLIND: Final = 1.0
-"""Seconds after a start whose innovations do not count: they tell what was not known then."""
+HEAD: Final = 1.0
+"""Seconds at the beginning in which every reading is believed."""
 FIRST: Final = 0.5
 """Seconds after which velocities are known and the calibration is found anew."""
 OPENED: Final = 0.1 * TWIST
@@ -118,8 +118,6 @@ class FaultBank:
     ----------
     sensors : tuple of int
         Numbers of the sensors there are; filter k + 1 leaves out the k-th.
-    blind : int
-        Samples after :meth:`begun` whose innovations do not count.
     """
 
     def __init__(
@@ -140,7 +138,6 @@ class FaultBank:
         self.dt = dt
         self.joint = JointFilter(replace(model, calibration=CALIBRATION), dt, CALIBRATION)
         self.tuning = tuning
-        self.blind = round((BLIND - FIRST) / dt)
 
     # --- before the run ---------------------------------------------------------------------------
 
@@ -178,7 +175,7 @@ class FaultBank:
                     levels=levels,
                 )
                 late = piece.time[at:] - piece.time[0] > SETTLE
-                parts.append(statistics(course, 0, self.dt, self.blind)[late])
+                parts.append(statistics(course, 0, self.dt)[late])
             motor, *others = levels.disturbance
             motor = motor if flags[k, CURRENT] else levels.unknown_drive
             found.append(limits(parts, self.dt, (motor, *others)))
@@ -279,20 +276,26 @@ class FaultBank:
     def begun(
         self, time: FloatArray, rows: FloatArray, levels: Levels
     ) -> tuple[list[FilterState], int]:
-        """All filters after the first :data:`FIRST` seconds of a stretch, and how many samples that
+        """All filters after the first :data:`HEAD` seconds of a stretch, and how many samples that
         took.
 
-        Velocities are not known at the first sample, and a filter that is linearised at wrong ones
-        is too sure of what it found: disturbances and calibration are opened again.
+        They go their own ways from there: up to there all readings are believed, so that each knows
+        the encoders' zero and where the motor stands. Velocities are not known at the first sample,
+        and a filter that is linearised at wrong ones is too sure of what it found: disturbances and
+        calibration are opened again after :data:`FIRST` seconds.
         """
-        first = np.nan_to_num(rows[0]).tolist()
-        states = [
-            self.joint.start(float(time[0]), first, used.tolist(), levels=levels)
-            for used in self.flags(1)[:, 0]
-        ]
-        count = min(round(FIRST / self.dt), len(time))
-        run = self.joint.run(states, time[:count], rows[:count], self.flags(count), levels=levels)
-        return [self._opened(state, levels) for state in run.last], count
+        flags, at = self.flags(1)[0, 0], 0
+        state = self.joint.start(
+            float(time[0]), np.nan_to_num(rows[0]).tolist(), flags.tolist(), levels=levels
+        )
+        for seconds in (FIRST, HEAD):
+            end = min(round(seconds / self.dt), len(time))
+            if end > at:
+                table = np.broadcast_to(flags, (1, end - at, 6))
+                run = self.joint.run([state], time[at:end], rows[at:end], table, levels=levels)
+                state = self._opened(run.last[0], levels) if at == 0 else run.last[0]
+                at = end
+        return [state] * (1 + len(self.sensors)), at
 
     def _opened(self, state: FilterState, levels: Levels) -> FilterState:
         """A filter whose disturbances, encoders' zero and so the link are unsure again."""
@@ -390,13 +393,13 @@ class _Work:
         """Filters from a fresh start up to a gap."""
         bank, levels = self.bank, self.tuning.levels
         part = slice(first, last)
-        armed, blind = self.time[first] + SETTLE, bank.blind
+        armed = self.time[first] + SETTLE
         states, taken = bank.begun(self.time[part], self.rows[part], levels)
         at, skip, history = first + taken, 0, round(WINDOWS[-1] / bank.dt)
         length = chunk = round(CHUNK / bank.dt)
         while at < last:
             end = min(at + length, last)
-            scores = self._scored(states, slice(at, end), blind)
+            scores = self._scored(states, slice(at, end))
             self.scores[at + skip : end] = scores[skip:]
             over = (scores[:, 0] > 1) & (self.time[at:end] > armed)
             over[:skip] = False
@@ -407,7 +410,7 @@ class _Work:
                     return
                 back = max(end - history, at)
                 states = self._moved(states, at, back)
-                skip, at, blind, length = end - back, back, 0, chunk
+                skip, at, length = end - back, back, chunk
                 continue
             if alarm < gone and end < last and self.time[end - 1] - self.time[alarm] < WAITS[-1]:
                 length += chunk  # a verdict may need what comes
@@ -431,12 +434,12 @@ class _Work:
                 if at >= last:
                     return
                 self._say(at, at, Verdict.RECOVERED, (SENSORS[sensor],))
-                states, armed, blind = [state] * (1 + len(bank.sensors)), self.time[at], 0
+                states, armed = [state] * (1 + len(bank.sensors)), self.time[at]
             else:
                 at = min(decided + 1, last)
                 if at < last:
                     rest = slice(at, last)
-                    armed, blind = self.time[at] + SETTLE, bank.blind
+                    armed = self.time[at] + SETTLE
                     states, taken = bank.begun(self.time[rest], self.rows[rest], levels)
                     at += taken
 
@@ -460,16 +463,15 @@ class _Work:
                     break
         return found
 
-    def _scored(self, states: Sequence[FilterState], part: slice, blind: int = 0) -> FloatArray:
-        """Scores of all filters over a stretch; its first samples may count for nothing."""
+    def _scored(self, states: Sequence[FilterState], part: slice) -> FloatArray:
+        """Scores of all filters over a stretch."""
         bank, tuning = self.bank, self.tuning
         time, rows = self.time[part], self.rows[part]
         course = bank.joint.run(states, time, rows, bank.flags(len(time)), levels=tuning.levels)
         out = np.zeros((len(time), len(states)))
         for k in range(len(states)):
-            shares = statistics(course, k, bank.dt, blind) / tuning.limits[k]
+            shares = statistics(course, k, bank.dt) / tuning.limits[k]
             out[:, k] = np.nan_to_num(shares.max(axis=1), nan=np.inf)
-        out[:blind] = 0.0
         return out
 
     def _advanced(
