@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 import sys
 from argparse import Namespace
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from identification.data.joint_file import Joint
     from identification.data.record import Record
     from identification.faults.bank import FaultBank
-    from identification.faults.detector import Fault
-    from identification.planning.trajectories import Excitation, Selection
+    from identification.faults.detector import Fault, FaultEvent
+    from identification.planning.trajectories import Selection
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -253,6 +253,8 @@ def replay(
     detector_state: bytes | None = None,
     tried: Sequence[Fault] = (),
     watch: tuple[FaultBank, Record, dict[str, tuple[float, float]]] | None = None,
+    *,
+    progress: Callable[[str, float], None] = progress_bar,
 ) -> Replay:
     """Replay a record through the online estimator, sample by sample.
 
@@ -266,6 +268,8 @@ def replay(
         Of a detector calibrated with healthy records.
     tried : sequence of Fault
         Faults put into the readings; their times count from the first sample.
+    progress : callable
+        ``progress(text, share)``, some hundred times.
     watch : tuple, optional
         A fault bank that looks for faults in place of the estimator's detector, the record as read,
         and the smallest offsets that it sees.
@@ -306,17 +310,25 @@ def replay(
     rows = np.nan_to_num(readings).tolist()
     every = max(1, len(even) // POINTS)
     course: list[tuple[float, FloatArray, FloatArray, FloatArray]] = []
+    looks: list[tuple[int, list[float]]] = []
     events: list[dict[str, Any]] = []
+    verdicts: list[tuple[float, FaultEvent]] = []
     fault, detector = 0, estimator.detector
     for part in even.segments():
         estimator.reset()
+        told = None
+        worst = [0.0] * len(READINGS)
         before: tuple[bool, ...] = (False,) * len(READINGS)
         quiet = [-math.inf] * len(READINGS)
         for k in range(part.start, part.stop):
             now = float(even.time[k])
             estimator.update(now, rows[k], valid[k])
+            worst = [max(a, b) for a, b in zip(worst, estimator.score, strict=True)]
             codes = []
             if detector is not None:
+                if detector.last_event is not told:
+                    verdicts += [(now, e) for e in _since(detector.events, told)]
+                    told = detector.last_event
                 replaced = detector.replaced
                 used[k], failed[k] = estimator.readings, replaced
                 if replaced != before:
@@ -338,11 +350,16 @@ def replay(
                 )
                 codes += [fault] if fault and not known else []
             events += [{"time": now, "fault": code, "text": fault_text(code)} for code in codes]
-            if (k + 1) % every == 0 and not estimator.warming_up:
+            if (k + 1) % every:
+                continue
+            looks.append((k, worst))
+            worst = [0.0] * len(READINGS)
+            if not estimator.warming_up:
                 course.append(
                     (now, estimator.theta.copy(), estimator.sigma.copy(), estimator.ratio.copy())
                 )
-        progress_bar(f"tracking {record.name}", part.stop / len(even))
+            progress(f"tracking {record.name}", (k + 1) / len(even))
+        progress(f"tracking {record.name}", part.stop / len(even))
     if judged is not None:
         events = [_bank_event(e) for e in judged.events]
     if not course and not events:
@@ -367,7 +384,10 @@ def replay(
         values=values,
         sigmas=sigmas,
         ratios=ratios,
+        looks=np.array([k for k, _ in looks], dtype=np.int64),
+        scores=np.array([row for _, row in looks]).reshape(-1, len(READINGS)),
         events=tuple(events),
+        verdicts=tuple(verdicts),
         healthy=healthy,
         readings=readings,
         used=used,
@@ -378,6 +398,12 @@ def replay(
         banked=watch is not None,
         smallest={} if watch is None else watch[2],
     )
+
+
+def _since(events: Sequence[FaultEvent], known: FaultEvent | None) -> Sequence[FaultEvent]:
+    """Events after one that is known; all where the detector has started anew."""
+    places = [k for k, e in enumerate(events) if e is known]
+    return events[places[-1] + 1 :] if places else events
 
 
 def _bank_event(event: dict[str, Any]) -> dict[str, Any]:
@@ -497,7 +523,7 @@ def run_plan(arguments: Namespace) -> int:
             "--max-speed or --max-torque"
         )
     chosen = select(experiment, [t.motion for t in allowed], limits=limits)
-    _write_motion(arguments.output, chosen.best)
+    write_bytes(arguments.output, chosen.best.motion.text.encode())
     _print_plan(arguments.output, chosen, len(tried) - len(allowed), bool(joint.fitted))
     best = chosen.best
     data = {
@@ -511,17 +537,6 @@ def run_plan(arguments: Namespace) -> int:
     }
     write_json(arguments.json, data)
     return 0
-
-
-def _write_motion(path: str, best: Excitation) -> None:
-    import io
-
-    from identification.planning.trajectories import COLUMNS
-
-    text = io.StringIO()
-    rows = np.column_stack([best.motion.time, best.motion.table])
-    np.savetxt(text, rows, delimiter=",", header=",".join(COLUMNS), comments="", fmt="%.9g")
-    write_bytes(path, text.getvalue().encode())
 
 
 def _print_plan(path: str, chosen: Selection, refused: int, fitted: bool) -> None:

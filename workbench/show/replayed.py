@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from identification.data.record import Record
-from identification.faults.detector import Fault
+from identification.faults.detector import Fault, FaultEvent
 from identification.online.estimator import OnlineEstimator
 
 FloatArray = npt.NDArray[np.float64]
@@ -47,8 +47,14 @@ class Replay:
     time, values, sigmas, ratios
         Course of the estimate at some hundred points: (m,) [s], (m, parameters) twice, (m,
         balances).
+    looks : (k,) int array
+        Samples at which the course is looked at, those of the warm-up too.
+    scores : (k, 6) array
+        Largest residual of each reading since the look before, as a share of its limit.
     events : tuple of dict
         ``time``, ``fault``, ``text``.
+    verdicts : tuple of (time, FaultEvent)
+        What the fault detector said, and when [s].
     healthy, readings, used : (n, 6) array
         As recorded; with the faults tried on purpose, NaN where there is none; with failed ones
         replaced. Link-referred SI.
@@ -69,7 +75,10 @@ class Replay:
     values: FloatArray
     sigmas: FloatArray
     ratios: FloatArray
+    looks: npt.NDArray[np.int64]
+    scores: FloatArray
     events: tuple[dict[str, Any], ...]
+    verdicts: tuple[tuple[float, FaultEvent], ...]
     healthy: FloatArray
     readings: FloatArray
     used: FloatArray
