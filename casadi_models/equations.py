@@ -249,7 +249,9 @@ class _Builder:
             **self.corrected("torque_sensor", "torque", "torque_rate"),
         )
         zero = self.symbols.parameters.get("link_encoder_zero")
-        return s if zero is None else s.with_values(link_position=s.link_position - zero)
+        if zero is not None:
+            s = s.with_values(link_position=s.link_position - zero)
+        return in_time(s, self.symbols.parameters)
 
     def gravity(self, view: _View) -> Expression:
         """Torques on the link that depend on its position only."""
@@ -265,6 +267,22 @@ class _Builder:
         if not self.model.virtual_work or not any(t.place == "torsion" for t in self.model.terms):
             return ca.SX(1), ca.SX(1)
         return 1 - ca.jacobian(error, raw.motor_position), 1 + ca.jacobian(error, raw.link_position)
+
+
+def in_time(s: Signals, parameters: Mapping[str, Expression]) -> Signals:
+    """Signals of late readings at their true time, by their Taylor series about the stamps: to the
+    second order where the derivatives are there.
+    """
+    late = parameters.get("link_encoder_skew")
+    if late is not None:
+        q, v, a, j = (getattr(s, n) for n in _LINK_CHAIN)
+        s = s.with_values(
+            link_position=q + late * (v + late / 2 * a),
+            link_velocity=v + late * (a + late / 2 * j),
+            link_acceleration=a + late * j,
+        )
+    late = parameters.get("torque_sensor_skew")
+    return s if late is None else s.with_values(torque=s.torque + late * s.torque_rate)
 
 
 def bare_twist(model: Structure, s: Signals) -> Expression:

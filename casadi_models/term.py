@@ -135,12 +135,22 @@ class Unknown:
     what : {"zero", "skew", "offset"}
     sensor : str
         Channel of the record.
+    place : str
+        Place of the effects that act on that sensor.
     parameter : Parameter
     """
 
     what: str
     sensor: str
+    place: Place
     parameter: Parameter
+
+
+def _late(name: str, meaning: str) -> Parameter:
+    """A time by which a reading is behind the clock of the record."""
+    return Parameter(
+        name, "s", start=0.0, low=-math.inf, high=math.inf, meaning=meaning, side="sensor"
+    )
 
 
 CALIBRATION: Final = {
@@ -149,6 +159,7 @@ CALIBRATION: Final = {
         Unknown(
             "zero",
             "link_position",
+            "link_position_sensor",
             Parameter(
                 "link_encoder_zero",
                 "rad",
@@ -158,6 +169,18 @@ CALIBRATION: Final = {
                 meaning="reading of the link encoder less that of the motor encoder, without twist",
                 side="sensor",
             ),
+        ),
+        Unknown(
+            "skew",
+            "link_position",
+            "link_position_sensor",
+            _late("link_encoder_skew", "time by which the link encoder is behind the motor's"),
+        ),
+        Unknown(
+            "skew",
+            "link_torque",
+            "torque_sensor",
+            _late("torque_sensor_skew", "time by which the torque sensor is behind the encoder"),
         ),
     )
 }

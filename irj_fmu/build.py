@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final, final
 from identification.data.joint_file import Joint, load_joint
 from identification.data.own_effects import files_of
 from identification.errors import InputError
+from identification.scratch import hold
 from irj_fmu.command_line import (
     OneLineParser,
     check_output,
@@ -128,6 +129,7 @@ def build(
         [request.source, *request.healthy],
     )
     made_folders = _prepare(request.out)
+    hold(request.out)
     done: list[Path] = []
     try:
         with tempfile.TemporaryDirectory(prefix=".build-", dir=request.out) as temporary:

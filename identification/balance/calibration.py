@@ -9,16 +9,29 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Final, final
 
 import numpy as np
 import numpy.typing as npt
 
 from casadi_models import JointModel
-from casadi_models.term import CALIBRATION
+from casadi_models.hold import CLOCKS, HOLD_DELAY, HOLD_NAME, UNKNOWNS
 from identification.balance.balances import Balances, balances_of
+from identification.balance.clocks import (
+    ENCODERS,
+    MOST_SKEW,
+    SIGNAL,
+    SURE,
+    USUAL_SKEW,
+    at_stamps,
+    lateness,
+    one_way,
+)
+from identification.balance.memory import numbers_of
 from identification.balance.sensing import Sensing
 from identification.balance.weak import WeakRecord
+from identification.data.prepare import shift_channel
 from identification.data.record import Record
 
 FloatArray = npt.NDArray[np.float64]
@@ -27,6 +40,12 @@ ROUNDS: Final = 8
 """Gauss-Newton steps for the unknowns of one record: the balances are nearly straight lines in
 them.
 """
+TOLD: Final = 0.3
+"""Standard error of a skew from which on it is only bounded [samples]: the lag from which on clocks
+count as out of step.
+"""
+SHIFTED: Final = 0.01
+"""Skew below which a record is left as it is [samples]."""
 SETTLED: Final = 1e-4
 """Size of a step, as a share of the residual's norm, at which these steps end: far below what
 one row tells.
@@ -49,6 +68,8 @@ class Found:
         Reading at the true zero, or the time by which the channel is late [unit].
     stderr : float or None
     unit : str
+    bounded : bool
+        True for a skew that these records hardly tell: only its band is worth a word.
     """
 
     what: str
@@ -57,6 +78,7 @@ class Found:
     value: float
     stderr: float | None
     unit: str
+    bounded: bool = False
 
     def as_json(self) -> dict[str, Any]:
         """The shape of `improve --json`."""
@@ -71,14 +93,32 @@ class Found:
 
 
 def unknowns_of(model: JointModel, sensing: Sensing) -> tuple[str, ...]:
-    """Calibration unknowns that a model on these channels has: a zero between the encoders
-    wherever their difference is a twist.
+    """Calibration unknowns that a model on these channels has.
+
+    A zero between the encoders, and a skew of theirs, wherever their difference is a twist; a skew
+    of the torque sensor where two balances share its reading; that of the drive where a torque or
+    a twist is measured beside it: with the motion alone it would be friction. A channel whose delay
+    the model names has no skew.
     """
-    return (
-        ("link_encoder_zero",)
-        if model.is_elastic and sensing.both_positions and not sensing.clamped_link
-        else ()
-    )
+    twist = model.is_elastic and sensing.both_positions and not sensing.clamped_link
+    torque = sensing.has_torque and not sensing.clamped_link
+    there = {
+        "link_encoder_zero": twist,
+        "link_encoder_skew": twist,
+        "torque_sensor_skew": torque and len(sensing.balances) > 1,
+        HOLD_NAME: (torque or twist) and HOLD_DELAY in model.effects,
+    }
+    return _without_named(model, tuple(n for n, is_there in there.items() if is_there))
+
+
+def named_late(model: JointModel) -> JointModel:
+    """The model without the skews of channels whose delay it names."""
+    return replace(model, calibration=_without_named(model, model.calibration))
+
+
+def _without_named(model: JointModel, names: tuple[str, ...]) -> tuple[str, ...]:
+    named = {t.place for t in model.terms if t.effect.is_delay and t.label != HOLD_DELAY}
+    return tuple(n for n in names if n not in CLOCKS or CLOCKS[n].place not in named)
 
 
 def of_run(name: str, record: WeakRecord) -> str:
@@ -104,9 +144,60 @@ def names_of_runs(model: JointModel, records: Sequence[WeakRecord]) -> tuple[str
 def values_on(
     model: JointModel, record: WeakRecord, values: Mapping[str, float]
 ) -> Mapping[str, float]:
-    """Values with those of this record in the place of the common ones."""
+    """Values with those of this record in the place of the common ones, skews less the whole
+    samples that were taken off it.
+    """
     own = {n: values[of_run(n, record)] for n in model.calibration if of_run(n, record) in values}
-    return {**values, **own} if own else values
+    return at_stamps(model, record, {**values, **own} if own else values)
+
+
+def limits_of_runs(
+    model: JointModel, records: Sequence[WeakRecord]
+) -> dict[str, tuple[float, float]]:
+    """Bounds of all unknowns of all records: a skew is a few samples."""
+    out = dict.fromkeys(names_of_runs(model, records), (-np.inf, np.inf))
+    for w in records:
+        most = MOST_SKEW * w.grid.dt
+        out.update({of_run(n, w): (-most, most) for n in model.calibration if n in CLOCKS})
+    return out
+
+
+def within_limits(
+    model: JointModel, records: Sequence[WeakRecord], values: Mapping[str, float]
+) -> tuple[str, ...]:
+    """Unknowns of all records that do not stand at a bound: those that still move."""
+    limits = limits_of_runs(model, records)
+    return tuple(n for n, (low, high) in limits.items() if low < values[n] < high)
+
+
+def usual(
+    model: JointModel, records: Sequence[WeakRecord], *, torque: bool
+) -> dict[str, tuple[float, float]]:
+    """Middle and standard deviation of the unknowns before the balances are asked [s, rad].
+
+    Where nothing tells a skew from friction (two encoders without torque sensor), it stays as near
+    to what friction cannot explain as the friction, which is never negative, allows.
+    """
+    out, begin = {}, start_values(model, records, torque=torque)
+    for w in records:
+        for n in model.calibration:
+            if n not in CLOCKS:
+                # the twist passes its zero somewhere, or as far from it as it moves
+                a = w.averaged
+                late = begin.get(of_run("link_encoder_skew", w), 0.0) - w.shifts.get(
+                    "link_position_sensor", 0.0
+                )
+                twist = a["motor_position"] - a["link_position"] - late * a["link_velocity"]
+                out[of_run(n, w)] = begin[of_run(n, w)], max(float(np.ptp(twist)), 1e-12)
+                continue
+            middle, place = 0.0, CLOCKS[n].place
+            if place in ENCODERS and not torque:
+                late, error, _ = lateness(w, place, torque=torque)
+                if abs(late) > SURE * error:
+                    most = MOST_SKEW * w.grid.dt
+                    middle = min(max(w.shifts.get(place, 0.0) + late, -most), most)
+            out[of_run(n, w)] = middle, USUAL_SKEW * w.grid.dt
+    return out
 
 
 def start_values(
@@ -120,7 +211,9 @@ def start_values(
     """
     out = {}
     for w in records:
-        if not model.calibration:
+        late = {p: w.shifts.get(p, 0.0) for p in SIGNAL}
+        out.update({of_run(n, w): late[CLOCKS[n].place] for n in model.calibration if n in CLOCKS})
+        if "link_encoder_zero" not in model.calibration:
             continue
         a = w.averaged
         twist = a["motor_position"] - a["link_position"]
@@ -133,10 +226,13 @@ def start_values(
             np.sign(v),
         ]
         matrix = np.column_stack(columns)
-        found = np.linalg.lstsq(
-            matrix / np.maximum(np.linalg.norm(matrix, axis=0), 1e-300), twist, rcond=1e-9
-        )[0]
-        out[of_run("link_encoder_zero", w)] = -float(found[0]) / np.sqrt(w.rows)
+        norms = np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
+        found = np.linalg.lstsq(matrix / norms, twist, rcond=1e-9)[0] / norms
+        out[of_run("link_encoder_zero", w)] = -float(found[0])
+        if "link_encoder_skew" in model.calibration:
+            most = MOST_SKEW * w.grid.dt
+            start = late["link_position_sensor"] + float(found[2])
+            out[of_run("link_encoder_skew", w)] = min(max(start, -most), most)
     return out
 
 
@@ -144,15 +240,17 @@ def without_calibration(
     record: Record, model: JointModel, values: Mapping[str, float], run: str
 ) -> Record:
     """The record with what the calibration of this run, or the common one, says taken off its
-    readings.
+    readings; the hold of the drive stays.
     """
-    zero = "link_encoder_zero"
-    if zero not in model.calibration:
-        return record
-    off = values.get(f"{zero}[{run}]", values[zero])
-    return replace(
-        record, channels={**record.channels, "link_position": record["link_position"] - off}
-    )
+    off = {n: values.get(f"{n}[{run}]", values[n]) for n in model.calibration if n != HOLD_NAME}
+    for name, value in off.items():
+        sensor = UNKNOWNS[name].sensor
+        if UNKNOWNS[name].what == "zero":
+            channels = {**record.channels, sensor: record[sensor] - value}
+            record = replace(record, channels=channels)
+        elif abs(value) > SHIFTED * record.dt:
+            record = shift_channel(record, sensor, value)
+    return record
 
 
 def settled(
@@ -173,7 +271,10 @@ def settled(
     for w in records:
         missing = [n for n in model.calibration if of_run(n, w) not in out]
         if missing:
-            out.update(_fitted_on_itself(balances_of(model, sensing, wrt=missing), w, out, missing))
+            balances = balances_of(model, sensing, wrt=missing)
+            law = (balances.law, tuple(missing), tuple(float(out[n]) for n in balances.names))
+            fitted = partial(_fitted_on_itself, balances, w, out, missing)
+            out.update(numbers_of(w, law, fitted))
     return out
 
 
@@ -181,22 +282,28 @@ def _fitted_on_itself(
     balances: Balances, record: WeakRecord, values: Mapping[str, float], names: Sequence[str]
 ) -> dict[str, float]:
     """Unknowns of one record by least squares, each balance in units of what it leaves at that
-    step.
+    step; a skew that the record does not tell stays as in the values.
     """
     now = {n: float(values[n]) for n in names}
-    seen = [b for b in balances.balances if b not in record.masked]
+    turning = ~one_way(record) if any(n in CLOCKS for n in names) else np.False_
+    rows = {b: record.taking(b) & ~turning for b in balances.balances}
+    size = USUAL_SKEW * record.grid.dt
+    known = np.diag([1 / size if n in CLOCKS else 0.0 for n in names])
+    usually, limits = dict(now), limits_of_runs(balances.model, [record])
+    seen = [b for b in balances.balances if rows[b].any()]
     for _ in range(ROUNDS):
-        found = balances.evaluate(record, {**values, **now})
-        scale = {b: max(float(np.sqrt(np.mean(found[b][0] ** 2))), 1e-300) for b in seen}
-        r = np.concatenate([found[b][0] / scale[b] for b in seen])
-        j = np.concatenate([found[b][1] / scale[b] for b in seen])
+        found = balances.evaluate(record, at_stamps(balances.model, record, {**values, **now}))
+        scale = {b: max(float(np.sqrt(np.mean(found[b][0][rows[b]] ** 2))), 1e-300) for b in seen}
+        moved = np.array([now[n] - usually[n] for n in names])
+        r = np.concatenate([*(found[b][0][rows[b]] / scale[b] for b in seen), known @ moved])
+        j = np.concatenate([*(found[b][1][rows[b]] / scale[b] for b in seen), known])
         norms = np.linalg.norm(j, axis=0)
         if not np.any(norms) or not np.all(np.isfinite(j)):
             break
         scaled = j / np.where(norms > 0, norms, 1.0)
         step = np.linalg.lstsq(scaled, -r, rcond=1e-9)[0]
         now = {
-            n: now[n] + float(s) / (norm or 1.0)
+            n: float(np.clip(now[n] + float(s) / (norm or 1.0), *limits[of_run(n, record)]))
             for n, s, norm in zip(names, step, norms, strict=True)
         }
         if float(np.linalg.norm(scaled @ step)) < SETTLED * float(np.linalg.norm(r)):
@@ -215,16 +322,18 @@ def calibration_found(
     out = []
     for run, w in enumerate(records):
         for name in model.calibration:
-            what, sensor = CALIBRATION[name].what, CALIBRATION[name].sensor
+            what, sensor = UNKNOWNS[name].what, UNKNOWNS[name].sensor
             own = of_run(name, w)
+            error = stderr.get(own)
             out.append(
                 Found(
                     what,
                     sensor,
                     run,
-                    float(values.get(own, values[name])),
-                    stderr.get(own),
-                    units[name],
+                    value=float(values.get(own, values[name])),
+                    stderr=error,
+                    unit=units[name],
+                    bounded=name in CLOCKS and error is not None and error > TOLD * w.grid.dt,
                 )
             )
     return tuple(out)
@@ -235,11 +344,15 @@ __all__ = [
     "bare",
     "calibration_found",
     "is_of_run",
+    "limits_of_runs",
+    "named_late",
     "names_of_runs",
     "of_run",
     "settled",
     "start_values",
     "unknowns_of",
+    "usual",
+    "within_limits",
     "values_on",
     "without_calibration",
 ]

@@ -11,7 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from casadi_models import JointModel, hold
-from identification.balance.calibration import unknowns_of
+from identification.balance.calibration import named_late, unknowns_of
+from identification.balance.clocks import in_time, places_of, shifted
+from identification.balance.memory import cache_of
 from identification.balance.noise import level_of
 from identification.balance.sensing import Sensing, adapt, check_alike, sense, signals_of
 from identification.balance.stamps import evened
@@ -38,6 +40,10 @@ POINTWISE_KERNELS: Final = (0.01, 0.014, 0.02, 0.03)
 STILL: Final = 3.0
 """Pointwise speed of a side at rest, in standard deviations of its noise: 0.3 % of samples at
 rest lie above.
+"""
+PREPARED: Final = 16_000_000
+"""Values of prepared records that a thread keeps (128 MB): two records of 40 s at 1 kHz at every
+kernel of the verdict.
 """
 VELOCITY_NOISE: Final = 2e-3
 """Noise of a pointwise velocity, as a share of the record's speed, that is small enough."""
@@ -133,10 +139,19 @@ def load_dataset(
     prepared: list[WeakRecord] = []
     first = 0
     for record in (*train, *held_out):
-        made = weak_record(record, joint, sensing, length, first, curved=model.lagging_load)
-        made = replace(made, name=run_name(record))
-        if record.payload != train[0].payload:
-            made = replace(made, masked=_of_the_link(record, sensing))
+        other = record.payload != train[0].payload
+        masked = _of_the_link(record, sensing) if other else frozenset[str]()
+        made = _once(
+            record,
+            joint,
+            sensing,
+            length,
+            first,
+            curved=model.lagging_load,
+            late=places_of(model),
+        )
+        if masked:
+            made = replace(made, masked=masked)
         first = max(first, 1 + int(made.block.max(initial=first - 1)))
         prepared.append(made)
     count = len(train)
@@ -171,6 +186,33 @@ def load_dataset(
     )
 
 
+def _once(
+    record: Record,
+    joint: Joint,
+    sensing: Sensing,
+    length: float,
+    first_block: int,
+    *,
+    curved: bool,
+    late: Sequence[str],
+) -> WeakRecord:
+    """:func:`weak_record` by its name, prepared once for the verbs that follow each other on a
+    record.
+    """
+
+    def make() -> tuple[WeakRecord, int]:
+        made = weak_record(record, joint, sensing, length, first_block, curved=curved, late=late)
+        tables = (made.averaged, made.points, made.smooth, made.curved)
+        return replace(made, name=run_name(record)), sum(
+            x.size for table in tables for x in table.values()
+        )
+
+    scales = (joint.gear_ratio, joint.torque_per_current, joint.torque_per_voltage)
+    law = (scales, sensing, length, first_block, curved, tuple(late))
+    found: WeakRecord = cache_of("prepared").get(record, law, make, PREPARED)
+    return found
+
+
 def run_name(record: Record) -> str:
     """Name of a record with a mark of its samples: another run under the same name is another
     run.
@@ -196,6 +238,7 @@ def seen_from_the_motor(sensing: Sensing, joint: Joint) -> bool:
     """
     return (
         sensing.balances == ("axis",)
+        and sensing.moving == "motor_position"
         and not sensing.both_positions
         and abs(joint.gear_ratio) != 1.0
     )
@@ -209,25 +252,35 @@ def weak_record(
     first_block: int = 0,
     *,
     curved: bool = False,
+    late: Sequence[str] = (),
 ) -> WeakRecord:
-    """One record, resampled to uniform time where needed, averaged with the kernel."""
+    """One record, resampled to uniform time where needed, averaged with the kernel; the channels
+    of the places `late` are shifted by whole samples where they are late.
+    """
     noise = measured_noise(record, joint, sensing)
     record = evened(record)
     signals, segments = signals_of(record, joint, sensing), tuple(record.segments())
     length = max(length, KERNEL_SAMPLES * record.dt)
     longest = length / 2 if length <= CLAIM_KERNEL else 0.06
-    made = prepare(
-        record.time,
-        signals,
-        segments,
-        length=length,
-        first_block=first_block,
-        pointwise={
-            c: pointwise_kernel(signals[c], segments, record.dt, longest, level)
-            for c, level in noise.items()
-        },
-        curved=curved,
-    )
+    pointwise = {
+        c: pointwise_kernel(signals[c], segments, record.dt, longest, level)
+        for c, level in noise.items()
+    }
+
+    def made_with(shifts: Mapping[str, float]) -> WeakRecord:
+        moved, parts = shifted(signals, segments, shifts)
+        made = prepare(
+            record.time,
+            moved,
+            parts,
+            length=length,
+            first_block=first_block,
+            pointwise=pointwise,
+            curved=curved,
+        )
+        return replace(made, shifts={p: k * record.dt for p, k in shifts.items()})
+
+    made = in_time(made_with, late, sensing.has_torque) if late else made_with({})
     made = _with_rests(made, noise)
     if record.measured is not None and not record.measured.all():
         made = replace(
@@ -332,22 +385,27 @@ def _ranges(data: Sequence[WeakRecord], clamped: bool) -> dict[str, float]:
 
 
 def with_effect(model: JointModel, label: str) -> JointModel:
-    """The model with one more effect; a delay of the drive, of any length, takes the place of
-    the nuisance.
+    """The model with one more effect; a delay of a channel, of any length, takes the place of the
+    skew of its clock.
     """
-    return (
-        model.drop(HOLD_DELAY)
-        if label == hold.DRIVE_DELAY and HOLD_DELAY in model.effects
-        else model
-    ).add(label)
+    if label == hold.DRIVE_DELAY and HOLD_DELAY in model.effects:
+        model = model.drop(HOLD_DELAY)
+    return named_late(model.add(label))
 
 
 def without(model: JointModel, label: str) -> JointModel:
-    """The model without an effect; where a delay of the drive goes, the hold is a nuisance
-    again.
+    """The model without an effect; where a delay of a channel goes, the skew of its clock is
+    unknown again.
     """
+    late = next((t.place for t in model.terms if t.label == label and t.effect.is_delay), None)
     smaller = model.drop(label)
-    return smaller.add(HOLD_DELAY) if label == hold.DRIVE_DELAY else smaller
+    if label == hold.DRIVE_DELAY:
+        smaller = smaller.add(HOLD_DELAY)
+    clocks = tuple(
+        n for n, u in hold.CLOCKS.items() if u.place == late and n not in smaller.calibration
+    )
+    there = smaller.calibration
+    return replace(smaller, calibration=there + clocks) if there else smaller
 
 
 def visible_labels(model: JointModel) -> tuple[str, ...]:

@@ -16,6 +16,16 @@ EVEN: Final = 1e-3
 """Spread of the steps, as a share of the median one, below which stamps count as even: that of
 stamps written with few digits.
 """
+TIE: Final = 1e-6
+"""Relative difference below which two fourth differences are one: those of a quantised channel
+are whole steps, told apart by rounding only (1e-12 of them), and go in or out of the cut together.
+"""
+
+
+KEPT: Final = 0.95
+"""Share of the fourth differences that counts: the rest may be jumps of the motion and spikes."""
+CUT_DEVIATION: Final = 0.87
+"""Standard deviation of a unit normal variable that is cut at that quantile of its size (0.871)."""
 
 
 def noise_level(
@@ -49,10 +59,10 @@ def noise_level(
         return 0.0
     fourth = np.concatenate(parts)
     magnitude = np.abs(fourth)
-    cut = fourth[magnitude <= np.quantile(magnitude, 0.95)]
+    cut = fourth[magnitude <= np.quantile(magnitude, KEPT) * (1.0 + TIE)]
     if not len(cut):
         return 0.0
-    return float(np.std(cut) / 0.87)
+    return float(np.std(cut) / CUT_DEVIATION)
 
 
 _LEVELS: Final[WeakKeyDictionary[Record, dict[tuple[str, float], float]]] = WeakKeyDictionary()

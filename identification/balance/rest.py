@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from casadi_models import JointModel
 from identification.balance.balances import balances_of
+from identification.balance.calibration import settled, values_on
 from identification.balance.dataset import Dataset
 from identification.balance.stacked import floor_rows, rms, sticking_torque
 from identification.balance.weak import RESTING_SIDES, WeakRecord
@@ -76,7 +77,8 @@ def rest_check(
     """
     balances = balances_of(model, data.sensing, wrt=())
     floor = floor_rows(model, data, values, records)
-    parts = [balances.evaluate(w, values) for w in records]
+    values = settled(model, data.sensing, records, values)
+    parts = [balances.evaluate(w, values_on(model, w, values)) for w in records]
     out = {}
     for balance in balances.balances:
         if balance not in RESTING_SIDES:

@@ -135,7 +135,7 @@ def floor_rows(
     """
     values = settled(model, data.sensing, [*data.train, *records], values)
     known = {id(w): _drawn_floors(model, data, values, w) for w in (*data.train, *records)}
-    kept = _share_that_fits(model, data, values, [known[id(w)] for w in data.train])
+    kept = noise_believed(model, data, values, [known[id(w)] for w in data.train])
     return {
         b: np.concatenate([np.full(w.rows, kept[b] * known[id(w)][b]) for w in records])
         if records
@@ -150,14 +150,15 @@ def _drawn_floors(
     """RMS of what drawn noise changes in each balance of one record."""
     balances = balances_of(model, data.sensing, wrt=())
     power = dict.fromkeys(balances.balances, 0.0)
-    either = _unsure(balances, data, values, [record])
     drawn = draws_of(record, data.noise)
+    seen = drawn[0].record
+    either = _unsure(balances, data, values, [seen])
     values = values_on(model, record, values)
     for draw in drawn:
-        calm = balances.evaluate(draw.calm, values, remembered=record)
+        calm = balances.evaluate(draw.calm, values, remembered=seen)
         noisy = balances.evaluate(draw.noisy, values)
         for b in power:
-            rows = record.taking(b)
+            rows = seen.taking(b)
             power[b] += _sure_rms((noisy[b][0] - calm[b][0])[rows], either[b][rows]) ** 2
     return {b: math.sqrt(p / len(drawn)) for b, p in power.items()}
 
@@ -177,15 +178,17 @@ def _sure_rms(change: FloatArray, either: FloatArray) -> float:
     return level
 
 
-def _share_that_fits(
+def noise_believed(
     model: JointModel,
     data: Dataset,
     values: Mapping[str, float],
-    levels: Sequence[Mapping[str, float]],
+    levels: Sequence[Mapping[str, float]] | None = None,
 ) -> dict[str, float]:
-    """Share of the levels of noise of the training records that what these records leave
-    allows, 1 where there is no contradiction.
+    """Share of the levels of noise of the training records (as drawn, or `levels`) that what these
+    records leave allows, by balance: 1 where there is no contradiction.
     """
+    if levels is None:
+        levels = [_drawn_floors(model, data, values, w) for w in data.train]
     residual = stack(balances_of(model, data.sensing, wrt=()), data.train, values).residual
     either = _unsure(balances_of(model, data.sensing, wrt=()), data, values, data.train)
     out = dict.fromkeys(residual, 1.0)

@@ -27,6 +27,8 @@ from identification.data.typed_laws import LAWS, hold_laws, law_lines, read_laws
 from identification.data.units import base_unit, same_dimension
 from identification.errors import InputError
 
+LARGEST_RATIO: Final = 1e75
+"""Its fourth power, that of cubic friction between motor side and link, is still a number."""
 _TABLES: Final = ("joint", "known", "columns", "fitted", "calibration", "provenance", TABLE, LAWS)
 
 
@@ -151,15 +153,24 @@ def parse_joint(data: Mapping[str, Any], source: str = "joint") -> Joint:
     )
     if ratio == 0:
         raise InputError(f"{source}: gear_ratio is 0; give theta_motor / theta_link with its sign")
-    if constant == 0 or per_current == 0:
+    if not 1 / LARGEST_RATIO < abs(ratio) < LARGEST_RATIO:
         raise InputError(
-            f"{source}: {'motor_constant' if constant == 0 else 'torque_per_current'} is 0; give "
-            "the torque per ampere"
+            f"{source}: gear_ratio = {ratio:g} is out of what can be computed with; give "
+            "theta_motor / theta_link"
         )
+    for key, per in (
+        ("motor_constant", "ampere"),
+        ("torque_per_current", "ampere"),
+        ("torque_per_voltage", "volt"),
+    ):
+        if given[key] == 0:
+            raise InputError(f"{source}: {key} is 0; give the torque per {per}")
     if constant is not None and per_current is not None:
         raise InputError(
             f"{source}: motor_constant and torque_per_current are both given; keep one of them"
         )
+    if nought := next((e for e in given["effects"] if e.partition("#")[2] == "0"), None):
+        raise InputError(f"{source}: effect {nought!r} is not understood; the first is #1")
     if constant is not None and not 0 < abs(ratio * constant) < math.inf:
         raise InputError(
             f"{source}: gear_ratio times motor_constant is {ratio * constant:g}; correct one of "
@@ -267,14 +278,17 @@ def _known(name: str, entry: Any, model: JointModel, source: str) -> Known:
     unit = parameters[name].unit if name in parameters else extra[name]
     scale = 1.0
     if given["unit"] is not None:
-        own, wanted = base_unit(given["unit"]), base_unit(unit)
+        try:
+            own, wanted = base_unit(given["unit"]), base_unit(unit)
+        except InputError as error:
+            raise InputError(f"{source}: [known] {name}: {error}") from None
         if not same_dimension(own, wanted):
             raise InputError(
                 f"{source}: [known] {name} has unit {given['unit']!r}; it must be one like {unit}"
             )
         scale = own.factor / wanted.factor
     if given["side"] == "motor":
-        scale *= model.side_factor(name)
+        scale *= _on_link(name, model, source)
     values = {k: given[k] * scale for k in ("value", "low", "high") if given[k] is not None}
     if not values:
         raise InputError(f"{source}: [known] {name} has neither value nor low nor high")
@@ -304,12 +318,29 @@ def _known(name: str, entry: Any, model: JointModel, source: str) -> Known:
     return Known(**values)
 
 
+def _on_link(name: str, model: JointModel, source: str) -> float:
+    """What refers a motor-side value to the link."""
+    term = next((t for t in model.terms if name in t.names), None)
+    if term is not None and term.effect.table is not None and model.gear_ratio < 0:
+        raise InputError(
+            f"{source}: [known] {name} is one knot of a curve, and with a negative gear ratio "
+            "the curve of the motor side runs the other way: give its values on the link side"
+        )
+    return model.side_factor(name)
+
+
 def _fitted(name: str, entry: Any, source: str) -> dict[str, Any]:
     if not isinstance(entry, Mapping) or "value" not in entry:
         raise InputError(
             f"{source}: [fitted] {name} must be a table with value, as {name} = {{ value = 1.0 }}"
         )
-    return FITTED.read(entry, f"{source}: [fitted] {name}")
+    given = FITTED.read(entry, f"{source}: [fitted] {name}")
+    if given["stderr"] is not None and given["stderr"] < 0:
+        raise InputError(
+            f"{source}: [fitted] {name}: stderr = {given['stderr']:g} is below zero; correct it or "
+            "leave it out"
+        )
+    return given
 
 
 def toml_text(

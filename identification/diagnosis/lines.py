@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, final
 
@@ -22,8 +22,11 @@ import numpy.typing as npt
 from casadi_models import EFFECTS, JointModel, Signals
 from casadi_models.vectorised import Vectorised
 from identification.balance.balances import Memory, residual_expressions
-from identification.balance.dataset import Dataset
+from identification.balance.calibration import settled, values_on
+from identification.balance.clocks import shifted
+from identification.balance.dataset import Dataset, run_name
 from identification.balance.sensing import Sensing, signals_of
+from identification.balance.stamps import EVEN
 from identification.balance.weak import POSITION_CHAINS, Grid, WeakRecord, kernel
 from identification.data.joint_file import Joint
 from identification.data.record import Record
@@ -84,6 +87,8 @@ SLOW_KERNEL: Final = 0.03
 is drawn [s]: quantisation wipes out both.
 """
 NORMAL_95: Final = 1.96
+MOVING: Final = 0.05
+"""Weight, as a share of the largest, above which a sample belongs to the motion."""
 
 
 @final
@@ -177,16 +182,20 @@ def orders_of(lines: Sequence[Line], joint: Joint) -> dict[str, tuple[float, ...
     return {k: tuple(line.order * turn for line in lines if k in line.effects) for k in keys}
 
 
-def at_every_sample(record: Record, joint: Joint, sensing: Sensing) -> WeakRecord:
+def at_every_sample(
+    record: Record, joint: Joint, sensing: Sensing, like: WeakRecord | None = None
+) -> WeakRecord:
     """Signals of a record at every sample: torque, drive and positions as recorded, derivatives
-    over seven samples.
+    over seven samples; late channels shifted as in the rows `like`.
     """
     steps, inside = np.diff(record.time), np.diff(record.segment) == 0
-    if inside.any() and np.ptp(steps[inside]) > 0.02 * float(np.median(steps[inside])):
+    if inside.any() and np.ptp(steps[inside]) > EVEN * float(np.median(steps[inside])):
         record = record.resampled()
     signals, dt = signals_of(record, joint, sensing), record.dt
     long = max(7, 2 * round(SLOW_KERNEL / dt / 2) + 1)
-    segments = tuple(s for s in record.segments() if s.stop - s.start > 2 * max(long, SMOOTHED[-1]))
+    late = {} if like is None else {p: x / dt for p, x in like.shifts.items()}
+    signals, parts = shifted(signals, tuple(record.segments()), late)
+    segments = tuple(s for s in parts if s.stop - s.start > 2 * max(long, SMOOTHED[-1]))
     starts = np.concatenate([[0], np.cumsum([s.stop - s.start for s in segments])]).astype(np.int64)
     points: dict[str, FloatArray] = {}
     smooth: dict[str, FloatArray] = {}
@@ -219,6 +228,8 @@ def at_every_sample(record: Record, joint: Joint, sensing: Sensing) -> WeakRecor
         time=points["time"],
         block=_seconds(points["time"], starts),
         starts=starts,
+        name="" if like is None else like.name,
+        shifts={p: k * dt for p, k in late.items()},
     )
 
 
@@ -283,7 +294,7 @@ class _Pointwise:
         self._memory = Memory(model) if e.memory_terms else None
         self._states = int(e.memory.shape[0])
 
-    def at(self, rows: WeakRecord, values: dict[str, float]) -> dict[str, FloatArray]:
+    def at(self, rows: WeakRecord, values: Mapping[str, float]) -> dict[str, FloatArray]:
         """Residual (n,), or columns (n, wrt), of every balance at the samples."""
         p = np.array([float(values[n]) for n in self.names])
         count = len(rows.time)
@@ -306,7 +317,7 @@ class _Pointwise:
 
 def highest_order(samples: Samples, dt: float) -> float:
     """Order that is at half the sampling rate at the median speed."""
-    moving = samples.weight[samples.weight > 0.05 * float(samples.weight.max(initial=0.0))]
+    moving = samples.weight[samples.weight > MOVING * float(samples.weight.max(initial=0.0))]
     return math.pi / (dt * float(np.median(moving))) if len(moving) else 0.0
 
 
@@ -379,10 +390,15 @@ def _tracked(
 ) -> tuple[list[_Tracked], tuple[WeakRecord, ...]]:
     """Every balance at every smoothing; the training runs."""
     law = _Pointwise(solution.model, data.sensing)
-    runs = tuple(at_every_sample(r, data.joint, data.sensing) for r in train)
-    unseen = tuple(at_every_sample(r, data.joint, data.sensing) for r in held_out)
-    values = dict(solution.values)
-    residuals = [[law.at(w, values) for w in part] for part in (runs, unseen)]
+    known = {w.name: w for w in (*data.train, *data.held_out)}
+    found = settled(solution.model, data.sensing, list(known.values()), solution.values)
+    runs, unseen = (
+        tuple(at_every_sample(r, data.joint, data.sensing, known.get(run_name(r))) for r in part)
+        for part in (train, held_out)
+    )
+    residuals = [
+        [law.at(w, values_on(solution.model, w, found)) for w in part] for part in (runs, unseen)
+    ]
     out: list[_Tracked] = []
     for balance in law.balances:
         joined = [
@@ -654,7 +670,10 @@ def _gains(
     out = []
     for order in orders:
         normal, right = np.zeros((len(amplitudes), len(amplitudes))), np.zeros(len(amplitudes))
-        at = [law.at(w, {**values, shape: float(order) * turn}) for w in scan.runs]
+        at = [
+            law.at(w, values_on(model, w, {**values, shape: float(order) * turn}))
+            for w in scan.runs
+        ]
         for one, noise in chosen:
             raw = np.concatenate(
                 [

@@ -15,10 +15,11 @@ import numpy.typing as npt
 
 from casadi_models import Effect
 from identification.balance.balances import Balances, balances_of
-from identification.balance.calibration import bare, names_of_runs, settled
+from identification.balance.calibration import bare, names_of_runs, settled, within_limits
 from identification.balance.dataset import HOLD_NAME
 from identification.balance.weak import WeakRecord
 from identification.diagnosis.candidates import Candidate, NotTestable, shape_grid
+from identification.fitting.covariance import wald
 from identification.fitting.engine import Dataset, Solution, Stacked, row_weights, stack
 from identification.fitting.signed_fit import projected_gain, signed_fit
 from identification.fitting.start_values import bounds_of
@@ -40,6 +41,24 @@ REFINE_SHARE: Final = 0.1
 
 KERNEL_SHARE: Final = 0.4
 """Share of rows that count as independent under white noise: four rows per kernel length."""
+
+UNCORRELATED: Final = 0.05
+"""Autocorrelation below which rows count as independent: twice its own scatter over 1600 rows, the
+rows of 40 s.
+"""
+
+LONGEST_LAG: Final = 60
+"""Rows up to which correlation is followed: fifteen kernel lengths, longer than any block holds
+together.
+"""
+
+NO_COLUMN: Final = 1e-12
+"""Size of a column, as a share of the largest one, below which it is rounding."""
+
+DEPENDENT: Final = 1e-9
+"""Singular value, as a share of the largest one, below which columns are dependent: far over the
+rounding of their sums, far below what records can show.
+"""
 
 
 @final
@@ -67,6 +86,8 @@ class Base:
         Parameters of the columns of `jacobian`.
     norms : (p,) array
         What these columns were divided by.
+    inward_names : tuple of str
+        Parameters of the columns of `inward`.
     """
 
     solution: Solution
@@ -87,6 +108,7 @@ class Base:
     held_weight: FloatArray
     names: tuple[str, ...]
     norms: FloatArray
+    inward_names: tuple[str, ...] = ()
 
     @property
     def parts(self) -> tuple[int, int]:
@@ -188,7 +210,7 @@ def make_base(solution: Solution, data: Dataset) -> Base:
     )
     smoothing = model.named("smoothing")
     free = [n for n in solution.free if n not in solution.at_bound or n in smoothing]
-    free += names_of_runs(model, data.train)
+    free += [n for n in names_of_runs(model, data.train) if n not in solution.at_bound]
     signs = _inward_signs(solution, data)
     names = [*free, *signs]
     balances = balances_of(model, data.sensing, wrt=bare(names))
@@ -198,7 +220,7 @@ def make_base(solution: Solution, data: Dataset) -> Base:
     towards = np.concatenate([np.ones(len(free)), list(signs.values())])
     jw = j * towards * weight[:, None]
     norms = np.linalg.norm(jw, axis=0)
-    alive = norms > 1e-12 * max(float(norms.max(initial=0.0)), 1e-300)
+    alive = norms > NO_COLUMN * max(float(norms.max(initial=0.0)), 1e-300)
     back = alive & (np.arange(len(norms)) >= len(free))
     alive[len(free) :] = False
     inward = jw[:, back] / norms[back]
@@ -214,7 +236,7 @@ def make_base(solution: Solution, data: Dataset) -> Base:
     )
     if data.held_out:
         held = stack(balances, data.held_out, solution.values, names)
-        own = names_of_runs(model, data.held_out)
+        own = within_limits(model, data.held_out, solution.values)
         apart = flatten(
             stack(
                 balances_of(model, data.sensing, wrt=bare(own)), data.held_out, solution.values, own
@@ -251,6 +273,7 @@ def make_base(solution: Solution, data: Dataset) -> Base:
         held_weight=held_weights,
         names=tuple(n for n, a in zip(free, alive, strict=False) if a),
         norms=norms[alive],
+        inward_names=tuple(n for n, b in zip(names, back, strict=True) if b),
     )
 
 
@@ -258,7 +281,7 @@ def span_of(columns: FloatArray) -> FloatArray:
     """Orthonormal columns that span the same space."""
     left, singular, _ = np.linalg.svd(columns, full_matrices=False)
     return np.asarray(
-        left[:, singular > 1e-9 * max(float(singular[0]) if len(singular) else 0.0, 1e-300)],
+        left[:, singular > DEPENDENT * max(float(singular[0]) if len(singular) else 0.0, 1e-300)],
         dtype=np.float64,
     )
 
@@ -300,9 +323,9 @@ def effective_share(residual: FloatArray) -> float:
     if power <= 0:
         return 1.0
     total = 1.0
-    for lag in range(1, min(60, len(x) - 1)):
+    for lag in range(1, min(LONGEST_LAG, len(x) - 1)):
         rho = float(x[:-lag] @ x[lag:]) / power
-        if rho < 0.05:
+        if rho < UNCORRELATED:
             break
         total += 2 * rho
     return 1.0 / total
@@ -470,6 +493,8 @@ def _refined(
 
 
 def _collinear_reason(candidate: Candidate) -> str:
+    if candidate.effect.is_delay:
+        return "what is late up to 3.5 samples is in the calibration already"
     names = ", ".join(candidate.effect.confused_with) or "what the model has already"
     separate = (
         f"; {candidate.effect.separate_by} would separate them"
@@ -597,8 +622,6 @@ def _held_out_drop(
 
 def _wald(added: FloatArray, base: Base, delta: FloatArray) -> float:
     """p-value of the amplitudes, scores clustered by block."""
-    from scipy.special import fdtrc
-
     p, own = base.parts
     q = base.orthonormal
     moving = base.inward[:, delta[p:own] > 0]
@@ -615,8 +638,4 @@ def _wald(added: FloatArray, base: Base, delta: FloatArray) -> float:
     )
     begins = base.firsts[np.flatnonzero(np.diff(base.block[base.order[base.firsts]], prepend=-1))]
     scores = np.add.reduceat((c * residual[:, None])[base.order], begins, axis=0)
-    inverse = np.linalg.pinv(c.T @ c, rcond=1e-10)
-    covariance = inverse @ (scores.T @ scores) @ inverse * blocks / (blocks - 1)
-    d = delta[own:][active]
-    statistic = float(d @ np.linalg.pinv(covariance, rcond=1e-12) @ d) / len(active)
-    return float(fdtrc(len(active), blocks - len(active), statistic))
+    return wald(c.T @ c, scores, delta[own:][active])

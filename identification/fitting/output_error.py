@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from identification.balance.calibration import is_of_run, without_calibration
-from identification.balance.dataset import run_name
+from identification.balance.dataset import HOLD_NAME, run_name
 from identification.data.record import Record
 from identification.errors import InputError
 from identification.fitting.assess import assess
@@ -202,7 +202,7 @@ def refine(
     free = tuple(n for n in fit.solution.free if n not in fit.solution.unidentified)
     start = {n: float(v) for n, v in fit.solution.values.items() if not is_of_run(n)}
     given = [without_calibration(r, model, fit.solution.values, run_name(r)) for r in given]
-    start.update(dict.fromkeys(model.calibration, 0.0))
+    start.update({n: 0.0 for n in model.calibration if n != HOLD_NAME})
     data = cut_windows(given, fit.joint, fit.data.sensing, window)
     start, substeps = _followable(model, start, data)
     smoothing = model.named("smoothing")

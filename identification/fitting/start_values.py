@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 
 from casadi_models import JointModel
-from identification.balance.calibration import names_of_runs, start_values
+from identification.balance.calibration import limits_of_runs, start_values
 from identification.balance.dataset import HOLD_NAME, Dataset
 from identification.data.joint_file import Known
 
@@ -45,5 +44,5 @@ def bounds_of(
             low = max(low, k.low) if k.low is not None else low
             high = min(high, k.high) if k.high is not None else high
         out[p.name] = (low, high)
-    out.update(dict.fromkeys(names_of_runs(model, data.train), (-math.inf, math.inf)))
+    out.update(limits_of_runs(model, data.train))
     return out

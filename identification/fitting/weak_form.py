@@ -4,7 +4,7 @@ move."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Final, final
 
@@ -12,7 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from casadi_models import JointModel
+from casadi_models.hold import CLOCKS
 from identification.balance.balances import Balances, balances_of
+from identification.balance.calibration import bare
+from identification.balance.clocks import one_way
 from identification.balance.dataset import Dataset
 from identification.balance.stacked import Stacked, stack
 from identification.fitting.least_squares import least_squares
@@ -57,6 +60,8 @@ class WeakForm:
         The parameters that move, in the order of the problem's vector.
     weights : mapping of str to float or (rows,) array
         1/sigma of each balance, or of each of its rows.
+    usual : mapping of str to (float, float)
+        Middle and standard deviation of parameters that are known beforehand: a row each.
     """
 
     balances: Balances
@@ -64,6 +69,21 @@ class WeakForm:
     values: Mapping[str, float]
     free: tuple[str, ...]
     weights: Mapping[str, float | FloatArray]
+    usual: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    @cached_property
+    def prior(self) -> FloatArray:
+        """Rows of what is known of single parameters, (known, free): 1/sigma in their column."""
+        known = [i for i, n in enumerate(self.free) if n in self.usual]
+        out = np.zeros((len(known), len(self.free)))
+        for row, i in enumerate(known):
+            out[row, i] = 1 / self.usual[self.free[i]][1]
+        return out
+
+    def surprise(self, x: FloatArray) -> FloatArray:
+        """How far parameters are from what is known of them, in standard deviations, (known,)."""
+        middle = np.array([self.usual.get(n, (0.0, 1.0))[0] for n in self.free])
+        return np.asarray(self.prior @ (x - middle), dtype=np.float64)
 
     @cached_property
     def _bare(self) -> Balances:
@@ -84,6 +104,34 @@ class WeakForm:
             dtype=bool,
         )
 
+    @cached_property
+    def clocks(self) -> npt.NDArray[np.bool_]:
+        """Which of the free parameters are skews of clocks."""
+        return np.array([bare([n])[0] in CLOCKS for n in self.free], dtype=bool)
+
+    @cached_property
+    def bent(self) -> npt.NDArray[np.bool_]:
+        """Which of the free parameters bend the rows: shapes and smoothing velocities."""
+        model = self.balances.model
+        names = {p.name for p in model.parameters if p.is_shape} | set(model.named("smoothing"))
+        return np.array([n in names for n in self.free], dtype=bool)
+
+    @cached_property
+    def one_way(self) -> npt.NDArray[np.bool_]:
+        """Rows within which the joint does not turn, all balances and the prior, (rows,)."""
+        told = np.concatenate([one_way(w) for w in self.data.train])
+        parts = [told] * len(self.balances.balances)
+        return np.concatenate([*parts, np.ones(len(self.prior), dtype=bool)])
+
+    @property
+    def rows(self) -> int:
+        """Rows of each balance."""
+        return sum(w.rows for w in self.data.train)
+
+    def moved(self, x: FloatArray) -> WeakForm:
+        """The same problem with other values of the free parameters."""
+        return replace(self, values=self.at(x))
+
     def at(self, x: FloatArray) -> dict[str, float]:
         """Values of every parameter."""
         return {**self.values, **dict(zip(self.free, map(float, x), strict=True))}
@@ -101,15 +149,23 @@ class WeakForm:
         return Stacked(found.residual, jacobian, found.block, found.taking)
 
     def residual(self, x: FloatArray) -> FloatArray:
-        """Weighted rows, one balance after the other."""
+        """Weighted rows, one balance after the other, then those of the prior."""
         rows = stack(self._bare, self.data.train, self.at(x)).residual
-        return np.concatenate([rows[b] * self.weights[b] for b in self.balances.balances])
+        return np.concatenate(
+            [*(rows[b] * self.weights[b] for b in self.balances.balances), self.surprise(x)]
+        )
 
     def jacobian(self, x: FloatArray) -> FloatArray:
         """Their derivative, (rows, free)."""
         found = self.stacked(x).jacobian
         return np.concatenate(
-            [found[b] * np.atleast_1d(self.weights[b])[:, None] for b in self.balances.balances]
+            [
+                *(
+                    found[b] * np.atleast_1d(self.weights[b])[:, None]
+                    for b in self.balances.balances
+                ),
+                self.prior,
+            ]
         )
 
     def fitted(

@@ -301,6 +301,23 @@ def parameter_errors(truth: Mapping[str, Any], parameters: Mapping[str, Any]) ->
     return errors
 
 
+def _told_as_skew(truth: Mapping[str, Any], result: Json) -> set[str]:
+    """A hidden delay of up to a few samples is the skew of a clock: right where the calibration
+    has it, within a tenth.
+    """
+    hidden = truth.get("hidden", {}).get("channel_delay")
+    if hidden is None or "delay_s" not in hidden:
+        return set()
+    late = [
+        float(c["value"])
+        for c in result.get("calibration", [])
+        if c["what"] == "skew" and c["sensor"] == hidden["delayed_channel"]
+    ]
+    delay = float(hidden["delay_s"])
+    near = bool(late) and all(abs(x - delay) < 0.1 * delay for x in late)
+    return {"channel_delay"} if near else set()
+
+
 def score(truth: Mapping[str, Any], result: Json) -> Score:
     """Score one result.
 
@@ -312,11 +329,12 @@ def score(truth: Mapping[str, Any], result: Json) -> Score:
         What ``irj improve --json`` writes (``improve.schema.json``).
     """
     names = hidden_names(truth)
+    skewed = _told_as_skew(truth, result) & set(names)
     orders = _true_orders(truth)
     claims, entries, lined = _claims(result, orders)
     accepted = {n: equivalents(n, truth) for n in names}
     strict, both = _match(claims, accepted)
-    in_set = set(strict) | (lined & set(names))
+    in_set = set(strict) | (lined & set(names)) | skewed
     in_class = set(both) | in_set
     taken = set(both.values())
     single = [i for i, e in enumerate(entries) if len(e["effects"]) == 1]

@@ -18,6 +18,7 @@ from typing import Any, TextIO, cast, final
 
 from identification import __version__
 from identification.errors import InputError
+from identification.scratch import release
 from irj_fmu.command_line import (
     STOPPED,
     OneLineParser,
@@ -199,6 +200,31 @@ def parser() -> OneLineParser:
         metavar="REFERENCE",
         help="fitted joint file: first say what changed since, before any new effect is looked for",
     )
+    explored = verb(
+        "explore",
+        "explore",
+        "hold all variants of the model against each other: error, parameters, ties",
+        records=True,
+        joint=True,
+    )
+    other_payload(explored)
+    explored.add_argument(
+        "--held-out",
+        nargs="+",
+        action="extend",
+        metavar="REC",
+        default=[],
+        help="records the fit must not see",
+    )
+    explored.add_argument(
+        "--picture", metavar="FILE.svg", help="draw the held-out error against the parameters"
+    )
+    explored.add_argument(
+        "--out", metavar="DIR", help="folder for the variants as Parquet, with JSON and picture"
+    )
+    explored.add_argument(
+        "-o", "--output", metavar="FILE", help="write the joint file of the recommended variant"
+    )
     moved = verb("changed", "changed", "which parameters of a fitted joint moved, by how much")
     moved.add_argument("reference", metavar="REFERENCE", help="joint file written by a fit")
     moved.add_argument("records", nargs="+", metavar="REC", help="record files")
@@ -354,6 +380,55 @@ def parser() -> OneLineParser:
         default=float("inf"),
         help="drive torque on the link side [Nm]",
     )
+    following = verb(
+        "next",
+        "next_run",
+        "the run that would tell names apart; without records, what a planned run cannot show",
+    )
+    following.add_argument("records", nargs="*", metavar="REC", help="record files")
+    following.add_argument("--joint", metavar="J", required=True, help="joint file (TOML)")
+    other_payload(following)
+    following.add_argument(
+        "--held-out",
+        nargs="+",
+        action="extend",
+        metavar="REC",
+        default=[],
+        help="records the fit must not see",
+    )
+    following.add_argument(
+        "-o", "--output", metavar="FILE", help="the proposed motion as CSV, as `irj plan` writes it"
+    )
+    following.add_argument(
+        "--motion", metavar="FILE", help="without records: the motion that is planned (CSV)"
+    )
+    for option, unit, text in (
+        ("position", "DEG", "half of the link's workspace [deg; m on a linear axis]"),
+        ("speed", "DEG_S", "link speed [deg/s; m/s]"),
+        ("torque", "NM", "drive torque on the link side [Nm; N]"),
+    ):
+        following.add_argument(
+            f"--max-{option}", type=float, metavar=unit, help=f"{text}; default: as in the records"
+        )
+    trusted = verb(
+        "trust",
+        "trust",
+        "which number of a fit to trust: intervals, windows, what it trades with",
+        records=True,
+        joint=True,
+    )
+    other_payload(trusted)
+    joints = verb("joints", "joints", "the library of identified joints")
+    joints.add_argument("what", choices=("list", "show", "compare"))
+    joints.add_argument("names", nargs="*", metavar="NAME", help="names, types or files of joints")
+    joints.add_argument(
+        "--library",
+        nargs="+",
+        action="extend",
+        metavar="PATH",
+        default=[],
+        help="more joints: joint files, folders of them, a table of published parameters (.json)",
+    )
     for name, text in (
         ("export", "export as FMU, C or CasADi function"),
         ("cosim", "co-simulate plant and estimator FMU"),
@@ -378,6 +453,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stdout.reconfigure(
             errors="backslashreplace"
         )  # a terminal that lacks a sign must not cost the results
+    if any("\0" in word for word in given):
+        parser().error("an argument holds a zero byte; no name of a file or effect has one")
     arguments, rest = parser().parse_known_args(given)
     arguments.rest = rest
     if arguments.module == "fmi":
@@ -402,6 +479,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             return crashed(error, arguments.command)
         finally:
             STOPPED.clear()
+            release()
 
 
 def _run(arguments: argparse.Namespace) -> int:

@@ -11,7 +11,7 @@ from typing import Final
 from casadi_models import JointModel
 from casadi_models.term import HANGING, LOAD_COMPLIANCE
 from identification.balance.balances import balances_of
-from identification.balance.calibration import bare, is_of_run, names_of_runs
+from identification.balance.calibration import bare, is_of_run, names_of_runs, usual
 from identification.fitting.engine import Dataset, Solution
 from identification.fitting.start_values import bounds_of, starts
 from identification.fitting.weak_form import WeakForm
@@ -55,7 +55,9 @@ def first_look(
         values[n] = min(max(values[n], limits[n][0]), limits[n][1])
     balances = balances_of(model, data.sensing, wrt=bare(free))
     steps = STEPS_MEMORY if model.equations.memory_terms else STEPS
-    values, used = WeakForm(balances, data, values, tuple(free), now.weights).fitted(limits, steps)
+    before = usual(model, data.train, torque=data.sensing.has_torque)
+    problem = WeakForm(balances, data, values, tuple(free), now.weights, before)
+    values, used = problem.fitted(limits, steps)
     kept = {k: float(v) for k, v in values.items()}
     own = {k: v for k, v in kept.items() if not is_of_run(k)}
     return Solution(

@@ -1,0 +1,216 @@
+"""Channels that are late against the motor encoder: the lateness is taken off the readings before
+the balances are made, what is left of it is fitted with the model.
+
+A skew of a sample is no small number: its Taylor series in the model would change the inertias, and
+the second order of a torque, which no derivative shows, the skew itself. An encoder is shifted by
+whole samples, which leaves its noise as it is, and has the second order in the model; torques are
+interpolated: their noise changes above a quarter of the sampling rate, which no kernel passes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from casadi_models import JointModel
+from casadi_models.hold import CLOCKS
+from identification.balance.weak import WeakRecord
+
+FloatArray = npt.NDArray[np.float64]
+
+SIGNAL: Final[Mapping[str, str]] = {
+    "drive": "drive",
+    "torque_sensor": "torque",
+    "link_position_sensor": "link_position",
+}
+"""Signal of a sensor's place, by the names of :class:`casadi_models.Signals`."""
+MOST_SKEW: Final = 3.5
+"""Largest skew between the clocks of one logger [samples]: a reading waits for the sensor's cycle,
+for that of the bus and for the logger's, one sample each, and a held value counts from its middle.
+What is later is no clock but a delay, to be named.
+"""
+USUAL_SKEW: Final = 1.0
+"""Standard deviation of a skew before the records are asked [samples]: sources are read once in a
+cycle. It decides only what the records do not tell.
+"""
+SHIFTS: Final = 4
+"""Rounds in which shifts are looked for: one channel's comes out wrong while another is late."""
+NEAR: Final = 0.05
+"""Lateness that is left to the model [samples]: its square is under a hundredth."""
+ENCODERS: Final = frozenset({"link_position_sensor"})
+"""Places whose readings are shifted by whole samples."""
+SURE: Final = 3.0
+"""Standard errors by which a channel must be late (an encoder: later than half a sample)."""
+ONE_WAY: Final = 1e-3
+"""Share of a row's kernel in which the joint may move the other way."""
+FEW: Final = 0.1
+"""Share of such rows below which a motion turns all the time: then its turns tell the clocks."""
+INDEPENDENT: Final = 0.4
+"""Share of the rows that count as independent: four rows to a kernel length."""
+
+
+def carrier(model: JointModel, place: str) -> str | None:
+    """Parameter that says how late the channel of a place is; None where the model has none."""
+    skews = (n for n in model.calibration if n in CLOCKS and CLOCKS[n].place == place)
+    return next(iter((*skews, *model.named("delay", place))), None)
+
+
+def places_of(model: JointModel) -> tuple[str, ...]:
+    """Places whose channels may be shifted: those of which the model says how late they are beyond
+    the hold of a command.
+    """
+    calibrated = any(n in CLOCKS for n in model.calibration)
+    return tuple(p for p in SIGNAL if calibrated and carrier(model, p) is not None)
+
+
+def at_stamps(
+    model: JointModel, record: WeakRecord, values: Mapping[str, float]
+) -> Mapping[str, float]:
+    """Values with the skews as they are left in the rows of a record that was shifted already."""
+    left = {}
+    for place, shift in record.shifts.items():
+        name = carrier(model, place)
+        if name is not None:
+            left[name] = values[name] - shift
+    return {**values, **left} if left else values
+
+
+def shifted(
+    signals: Mapping[str, FloatArray], segments: tuple[slice, ...], late: Mapping[str, float]
+) -> tuple[dict[str, FloatArray], tuple[slice, ...]]:
+    """Signals of late sensors at their true time, and the stretches in which all are there.
+
+    Parameters
+    ----------
+    signals : mapping of str to (n,) array
+    segments : tuple of slice
+    late : mapping of str to float
+        Samples by which the sensor of a place is late; a part of a sample by the cubic through four
+        readings.
+    """
+    out = {**signals, **{SIGNAL[p]: _moved(signals[SIGNAL[p]], k) for p, k in late.items()}}
+    first = math.ceil(max((0.0, *(1 - k for k in late.values()))))
+    last = math.ceil(max((0.0, *(2 + k for k in late.values()))))
+    return out, tuple(slice(s.start + first, max(s.stop - last, s.start + first)) for s in segments)
+
+
+def _moved(x: FloatArray, late: float) -> FloatArray:
+    whole = math.floor(late)
+    f = late - whole
+    if f == 0:
+        return np.roll(x, -whole)
+    weights = (
+        -f * (f - 1) * (f - 2) / 6,
+        (f + 1) * (f - 1) * (f - 2) / 2,
+        -(f + 1) * f * (f - 2) / 2,
+        (f + 1) * f * (f - 1) / 6,
+    )
+    parts = (w * np.roll(x, 1 - whole - i) for i, w in enumerate(weights))
+    return np.asarray(sum(parts), dtype=np.float64)
+
+
+def in_time(
+    make: Callable[[Mapping[str, float]], WeakRecord], places: Iterable[str], torque: bool
+) -> WeakRecord:
+    """A record whose late channels are shifted.
+
+    Parameters
+    ----------
+    make : callable
+        Makes the rows with the channels of some places shifted by so many samples.
+    places : iterable of str
+        Whose channels may be shifted.
+    torque : bool
+        Whether the torque of the link is measured.
+    """
+    shifts: dict[str, float] = {}
+    made, wanted = make(shifts), tuple(places)
+    for _ in range(SHIFTS):
+        moved = dict(shifts)
+        for place in wanted:
+            late = _late(made, place, torque=torque) / made.grid.dt
+            step = round(late) if place in ENCODERS else late if abs(late) > NEAR else 0.0
+            moved[place] = moved.get(place, 0.0) + step
+        if moved == shifts:
+            break
+        shifts = {p: k for p, k in moved.items() if k}
+        made = make(shifts)
+    return made
+
+
+def one_way(record: WeakRecord) -> npt.NDArray[np.bool_]:
+    """Rows within which the joint does not turn, shape (rows,): where dry friction turns it has a
+    rate that no lateness explains. All rows where hardly any is such a row.
+    """
+    same = np.abs(record.average(np.sign(record.points["motor_velocity"]))) > 1 - ONE_WAY
+    return np.asarray(same if np.mean(same) > FEW else np.ones(record.rows, dtype=np.bool_))
+
+
+def _late(made: WeakRecord, place: str, *, torque: bool) -> float:
+    """Time by which a channel is certainly late [s]."""
+    late, error, _ = lateness(made, place, torque=torque)
+    least = 0.5 * made.grid.dt if place in ENCODERS else 0.0
+    sure = abs(late) - SURE * error > least
+    return late if sure else 0.0
+
+
+def lateness(made: WeakRecord, place: str, *, torque: bool) -> tuple[float, float, float]:
+    """Time by which a channel is late, its standard error, and the part of it that viscous friction
+    may be [s]: reading = what it follows from, less the time times its rate.
+    """
+    kept = one_way(made)
+    a = {n: x[kept] for n, x in made.averaged.items()}
+
+    def motion(side: str) -> list[FloatArray]:
+        q, v = a[f"{side}_position"], a[f"{side}_velocity"]
+        return [np.ones(len(v)), v, np.sign(v), a[f"{side}_acceleration"], np.sin(q), np.cos(q)]
+
+    if place == "torque_sensor":
+        return *_slope(a["torque"], motion("link"), -a["torque_rate"]), 0.0
+    if place == "drive":
+        load = [a["torque"]] if torque else []
+        return *_slope(a["drive"], [*motion("motor"), *load], -a["drive_rate"]), 0.0
+    effort, twist = a["torque" if torque else "drive"], a["motor_position"] - a["link_position"]
+    one, v, _, bend, *_ = motion("link")
+    late, error = _slope(twist, [one, effort, bend, np.sign(v)], v)
+    if torque:
+        return late, error, 0.0
+    # the twist under viscous friction is such a lateness too
+    friction, _ = _slope(effort, [one, np.sign(v), bend], v)
+    soft, _ = _slope(twist, [one, v, bend], effort)
+    apart = min(abs(friction * soft), abs(late))
+    return math.copysign(abs(late) - apart, late), error, apart
+
+
+def _slope(values: FloatArray, others: list[FloatArray], column: FloatArray) -> tuple[float, float]:
+    """Slope over a column beside others, with its standard error."""
+    basis, _ = np.linalg.qr(_scaled(np.column_stack(others)))
+    own = column - basis @ (basis.T @ column)
+    power = float(own @ own)
+    if power <= 1e-18 * float(column @ column):
+        return 0.0, np.inf
+    slope = float(own @ values) / power
+    left = values - basis @ (basis.T @ values) - slope * own
+    return slope, float(np.sqrt(left @ left / (INDEPENDENT * len(values)) / power))
+
+
+def _scaled(matrix: FloatArray) -> FloatArray:
+    return np.asarray(matrix / np.maximum(np.linalg.norm(matrix, axis=0), 1e-300))
+
+
+__all__ = [
+    "MOST_SKEW",
+    "SIGNAL",
+    "USUAL_SKEW",
+    "at_stamps",
+    "carrier",
+    "in_time",
+    "lateness",
+    "one_way",
+    "places_of",
+    "shifted",
+]

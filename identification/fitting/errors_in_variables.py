@@ -1,0 +1,178 @@
+"""What noise of the measured signals does to a least-squares fit, taken off it.
+
+The columns of the weak form hold measured signals, so noise adds to their squares and pulls the
+parameters: an inertia a little, the part of a damping that nothing else tells from the skew of a
+clock nearly wholly. The products of what drawn noise changes in columns and residual estimate that
+share; without it the normal equations have the true parameters as their solution (Fuller 1987,
+Measurement Error Models, section 2.2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final, final
+
+import numpy as np
+import numpy.typing as npt
+
+from identification.balance.drawn_noise import draws_of
+from identification.balance.stacked import noise_believed, stack
+from identification.fitting.weak_form import WeakForm
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+MOST_NOISE: Final = 0.9
+"""Largest share of the information on a direction that may be noise: the draws know it within 3 %,
+and what is left must stand clear of that.
+"""
+STEPS: Final = 3
+"""Newton steps from the least squares: the products change little with the parameters."""
+
+
+@final
+@dataclass(frozen=True)
+class NoiseProducts:
+    """What noise adds to the normal equations of each balance.
+
+    Attributes
+    ----------
+    gram : mapping of str to (p, p) array
+        To the products of the weighted columns.
+    score : mapping of str to (p,) array
+        To their products with the weighted residual.
+    """
+
+    gram: Mapping[str, FloatArray]
+    score: Mapping[str, FloatArray]
+
+    @property
+    def whole(self) -> tuple[FloatArray, FloatArray]:
+        """Both over all balances."""
+        grams, scores = np.array(list(self.gram.values())), np.array(list(self.score.values()))
+        return np.asarray(grams.sum(axis=0)), np.asarray(scores.sum(axis=0))
+
+    def by_block(
+        self, weights: Mapping[str, FloatArray], block: IntArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Both for each block of rows, (blocks, p, p) and (blocks, p): by the squares of its
+        weights.
+
+        Parameters
+        ----------
+        weights : mapping of str to (rows,) array
+        block : (rows,) int array
+            Block of each row, -1 for none.
+        """
+        numbers = np.unique(block[block >= 0])
+        share = {
+            b: np.array([np.sum(w[block == n] ** 2) for n in numbers]) / max(float(w @ w), 1e-300)
+            for b, w in weights.items()
+        }
+        return (
+            np.asarray(sum(share[b][:, None, None] * g for b, g in self.gram.items())),
+            np.asarray(sum(share[b][:, None] * x for b, x in self.score.items())),
+        )
+
+
+def noise_products(problem: WeakForm) -> NoiseProducts:
+    """What noise adds to the normal equations at the values of a problem.
+
+    Shapes and smoothing velocities bend the columns, where first order does not hold: they are left
+    as they are.
+    """
+    balances, data, free = problem.balances, problem.data, problem.free
+    model, count = balances.model, len(free)
+    straight = ~problem.bent
+    gram = {b: np.zeros((count, count)) for b in balances.balances}
+    score = {b: np.zeros(count) for b in balances.balances}
+    believed = noise_believed(model, data, problem.values)
+    first = 0
+    for record in data.train:
+        rows = slice(first, first + record.rows)
+        first = rows.stop
+        drawn = draws_of(record, data.noise)
+        for draw in drawn:
+            calm, noisy = (
+                stack(balances, [w], problem.values, free) for w in (draw.calm, draw.noisy)
+            )
+            for b in balances.balances:
+                weight = np.broadcast_to(problem.weights[b], (problem.rows,))[rows]
+                weight = weight * (believed[b] / np.sqrt(len(drawn)))
+                moved = (noisy.jacobian[b] - calm.jacobian[b]) * weight[:, None] * straight
+                gram[b] += moved.T @ moved
+                score[b] += moved.T @ ((noisy.residual[b] - calm.residual[b]) * weight)
+    return NoiseProducts(gram, score)
+
+
+def whole_without(whole: FloatArray, noise: FloatArray) -> FloatArray:
+    """A normal matrix without what noise adds to it, as far as that is certain.
+
+    Parameters
+    ----------
+    whole, noise : (p, p) array
+        Columns scaled alike; `whole` positive definite but for rounding.
+    """
+    value, vector = np.linalg.eigh(whole)
+    kept = value > 1e-12 * value[-1]
+    root = vector[:, kept] * np.sqrt(value[kept])
+    white = vector[:, kept] / np.sqrt(value[kept])
+    share, direction = np.linalg.eigh(white.T @ noise @ white)
+    left = root @ direction
+    return np.asarray(left * (1 - np.clip(share, 0.0, MOST_NOISE)) @ left.T, dtype=np.float64)
+
+
+def unbiased(
+    problem: WeakForm, limits: Mapping[str, tuple[float, float]]
+) -> tuple[dict[str, float], NoiseProducts]:
+    """Values at which the normal equations hold without the noise, inside the limits, and what
+    noise adds there.
+
+    The clocks follow from rows within which the joint does not turn: where dry friction turns, the
+    torque hangs on the very instant of the turn.
+
+    Parameters
+    ----------
+    problem : WeakForm
+        At the least-squares fit.
+    limits : mapping of str to (low, high)
+        Parameters that stand at one stay there.
+    """
+    low, high = (np.array([limits[n][k] for n in problem.free]) for k in (0, 1))
+    x = np.array([problem.values[n] for n in problem.free])
+    moves = (x > low) & (x < high)
+    clocks = problem.clocks
+    noise = noise_products(problem)
+    for _ in range(STEPS):
+        rows, jacobian = problem.residual(x), problem.jacobian(x)
+        step = np.zeros(len(x))
+        if clocks.any():
+            told = problem.one_way
+            step[clocks] = _newton(
+                jacobian[told], rows[told], noise, moves & ~problem.bent, float(np.mean(told))
+            )[clocks]
+        step += _newton(jacobian, rows + jacobian @ step, noise, moves & ~clocks)
+        x[moves] = np.clip(x + step, low, high)[moves]
+        problem = problem.moved(x)
+        noise = noise_products(problem)
+    return dict(problem.values), noise
+
+
+def _newton(
+    jacobian: FloatArray,
+    rows: FloatArray,
+    noise: NoiseProducts,
+    moves: npt.NDArray[np.bool_],
+    share: float = 1.0,
+) -> FloatArray:
+    """Step of the parameters that move to where these rows, less a share of the noise, hold."""
+    out = np.zeros(len(moves))
+    size = np.linalg.norm(jacobian, axis=0)
+    moved = moves & (size > 1e-12 * size.max())
+    scaled, unit = jacobian[:, moved] / size[moved], np.outer(size[moved], size[moved])
+    added, pulled = noise.whole
+    score = scaled.T @ rows - share * pulled[moved] / size[moved]
+    whole = whole_without(scaled.T @ scaled, share * added[np.ix_(moved, moved)] / unit)
+    out[moved] = -np.linalg.pinv(whole, rcond=1e-12, hermitian=True) @ score / size[moved]
+    return out

@@ -1,0 +1,174 @@
+"""Channels that are late: their clocks are calibrated, and what is said of the joint stays."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.interpolate import CubicSpline
+
+from identification import Improvement, Record, fit, improve, load_joint, read
+from identification.balance.calibration import values_on
+from identification.balance.clocks import MOST_SKEW
+from identification.balance.dataset import run_name
+from identification.fitting.engine import floors, load_dataset, prepared_model, solve
+from identification.fitting.fit import Fit
+from tests.identification.diagnosis.test_other_payload import (
+    DT,
+    JOINT,
+    PER_AMPERE,
+    RATIO,
+    TRUE,
+    follower,
+)
+
+DEMO = Path(__file__).resolve().parents[3] / "workbench" / "demo"
+CHANNELS = ("link_position", "link_torque", "motor_current")
+
+
+def late(run: Record, channel: str, samples: int) -> Record:
+    """The run with one channel late by whole samples."""
+    return replace(run, channels={**run.channels, channel: np.roll(run[channel], samples)}).take(
+        np.arange(len(run)) >= 10
+    )
+
+
+@cache
+def demo(channel: str, samples: int) -> Improvement:
+    train, held = (late(read(DEMO / f"{n}.npz"), channel, samples) for n in ("train", "held_out"))
+    return improve([train], load_joint(DEMO / "joint.toml"), [held])
+
+
+@pytest.mark.parametrize(
+    ("channel", "samples"), [("link_position", 3), ("link_torque", 1), ("motor_current", 3)]
+)
+def test_claims_and_parameters_do_not_hang_on_a_late_channel(channel: str, samples: int) -> None:
+    plain, found = demo(channel, 0), demo(channel, samples)
+    assert [c.effects for c in found.claims] == [c.effects for c in plain.claims] == [("stribeck",)]
+    assert found.verdict == plain.verdict == "complete"
+    before, after = (f.steps[-1].solution for f in (plain, found))
+    for name, error in before.stderr.items():
+        if error is not None and "[" not in name:
+            assert abs(after.values[name] - before.values[name]) < 2 * error, name
+    was, now = (
+        next(c for c in f.calibration if c.what == "skew" and c.sensor == channel)
+        for f in (plain, found)
+    )
+    assert now.stderr is not None
+    moved = samples * read(DEMO / "train.npz").dt
+    assert abs(now.value - was.value - moved) < 2 * now.stderr + 1e-7
+
+
+def test_a_skew_is_in_the_joint_file_and_on_the_page_and_is_no_effect() -> None:
+    found = demo("link_position", 3)
+    assert "[calibration]" in found.to_joint_file()
+    assert "skew of link_position" in found.to_joint_file()
+    assert "skew of the link position" in found._repr_html_()
+    assert not any("skew" in n for n in found.as_json()["steps"][-1]["parameters"])
+
+
+def test_a_delay_beyond_a_logger_is_claimed_whole() -> None:
+    samples = round(MOST_SKEW) + 5
+    found = demo("link_torque", samples)
+    assert ("channel_delay",) in [c.effects for c in found.claims]
+    delay = found.steps[-1].solution.values["torque_sensor_delay"]
+    dt = read(DEMO / "train.npz").dt
+    assert delay == pytest.approx(samples * dt, abs=0.1 * dt)
+
+
+@cache
+def motion() -> tuple[np.ndarray, object]:
+    """A run of the joint without noise."""
+    t = np.arange(round(30.0 / DT)) * DT
+    w, a = 2 * np.pi * np.array([0.21, 0.73, 1.9]), np.array([0.5, 0.2, 0.08])
+    phase = w[:, None] * t + np.array([[0.3], [1.1], [2.5]])
+    reference = [a @ np.sin(phase), (a * w) @ np.cos(phase), -(a * w**2) @ np.sin(phase)]
+    return t, follower(True).run(np.column_stack(reference))
+
+
+@cache
+def fitted(channel: str, samples: float, torque: bool = True) -> Fit:
+    """The fit of a run whose channel is late by part of a sample, read with noise of its own."""
+    t, run = motion()
+    rng = np.random.default_rng(5)
+
+    def seen(name: str, values: np.ndarray) -> np.ndarray:
+        return CubicSpline(t, values)(t - samples * DT) if name == channel else values
+
+    motor, link = 2 * np.pi / 9000, 2 * np.pi / 100_000
+    q = np.round(seen("link_position", run.states[:, 2]) / link) * link
+    channels = {
+        "motor_current": seen("motor_current", run.drive / PER_AMPERE)
+        + rng.normal(0, 0.004, len(t)),
+        "motor_position": np.round(run.states[:, 0] * RATIO / motor) * motor,
+        "link_position": q,
+        "link_torque": seen("link_torque", run.torque) + rng.normal(0, 0.05, len(t)),
+    }
+    if not torque:
+        del channels["link_torque"]
+    record = Record.from_channels(t, channels, name="run").take(np.arange(len(t)) >= 10)
+    return fit(JOINT, [record])
+
+
+@pytest.mark.parametrize("channel", CHANNELS)
+@pytest.mark.parametrize("samples", [0.1, 0.5])
+def test_part_of_a_sample_is_found_too(channel: str, samples: float) -> None:
+    found, plain = fitted(channel, samples), fitted(channel, 0.0)
+    was, now = (
+        next(c for c in f.as_json()["calibration"] if (c["what"], c["sensor"]) == ("skew", channel))
+        for f in (plain, found)
+    )
+    assert now["value"] - was["value"] == pytest.approx(
+        samples * DT, abs=3 * float(np.hypot(now["stderr"], was["stderr"]))
+    )
+    for name in ("motor_viscous", "link_inertia", "stiffness", "gravity_torque", "motor_coulomb"):
+        error = plain.solution.stderr[name]
+        assert error is not None
+        assert found.solution.values[name] == pytest.approx(
+            plain.solution.values[name], abs=2 * error
+        ), name
+
+
+def test_two_encoders_alone_bound_their_skew_by_the_viscous_friction() -> None:
+    """Without torque the twist under friction is a lateness: what is said is a band."""
+    found = fitted("link_position", 3.0, torque=False)
+    skew = next(
+        c
+        for c in found.as_json()["calibration"]
+        if (c["what"], c["sensor"]) == ("skew", "link_position")
+    )
+    friction = (TRUE["motor_viscous"] + TRUE["link_viscous"]) / TRUE["stiffness"]
+    assert abs(skew["value"] - 3 * DT) < 1.2 * friction
+    assert found.solution.values["stiffness"] == pytest.approx(TRUE["stiffness"], rel=0.01)
+
+
+@pytest.mark.parametrize("name", ["link_encoder_skew", "torque_sensor_skew", "drive_delay_0"])
+def test_floors_are_continuous_where_a_skew_goes_to_zero(name: str) -> None:
+    joint, train = load_joint(DEMO / "joint.toml"), read(DEMO / "train.npz")
+    model = prepared_model(joint, train)
+    data = load_dataset([train], [], joint, model)
+    values = dict(solve(model, data).values)
+    own = f"{name}[{run_name(train)}]"
+    at = {
+        x: floors(model, data, {**values, own: data.train[0].shifts.get("drive", 0.0) + x})
+        if name.startswith("drive")
+        else floors(model, data, {**values, own: x})
+        for x in (0.0, 1e-9, 1e-7, 1e-5)
+    }
+    for x in (1e-9, 1e-7, 1e-5):
+        for balance, floor in at[0.0].items():
+            assert at[x][balance] == pytest.approx(floor, rel=0.02), (x, balance)
+
+
+def test_whole_samples_are_taken_off_the_rows_and_not_off_the_value() -> None:
+    joint = load_joint(DEMO / "joint.toml")
+    run = late(read(DEMO / "train.npz"), "link_position", 3)
+    model = prepared_model(joint, run)
+    (rows,) = load_dataset([run], [], joint, model).train
+    assert rows.shifts["link_position_sensor"] == pytest.approx(3 * run.dt)
+    values = dict.fromkeys(model.parameter_names, 0.0) | {f"link_encoder_skew[{rows.name}]": 0.008}
+    left = values_on(model, rows, values)["link_encoder_skew"]
+    assert left == pytest.approx(0.008 - 3 * run.dt)
