@@ -47,7 +47,11 @@ def own_joint(folder: Path) -> None:
         as_csv(DEMO / "held_out.npz", folder / name)
     for name in ("train.npz", "held_out.npz", "joint.toml"):
         shutil.copy(DEMO / name, folder / name)
-    shutil.copy(DEMO / "joint.toml", folder / "axis3.toml")
+    for number in (1, 2, 3):
+        shutil.copy(DEMO / "joint.toml", folder / f"axis{number}.toml")
+    for name in ("axis1/run1.csv", "axis1/test.csv", "axis2/run1.csv"):
+        (folder / name).parent.mkdir(exist_ok=True)
+        shutil.copy(folder / ("run2.csv" if "test" in name else "run1.csv"), folder / name)
 
 
 def multisine(t: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
@@ -105,6 +109,7 @@ def test_a_page_runs_as_it_stands(
     tmp_path: Path,
 ) -> None:
     for name in given(ROOT / page):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
         shutil.copy(readers[READERS.get(page, own_joint)] / name, tmp_path / name)
     run(ROOT / page, tmp_path)
     for drawn in tmp_path.glob("*.svg"):

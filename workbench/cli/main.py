@@ -419,7 +419,7 @@ def parser() -> OneLineParser:
     )
     other_payload(trusted)
     joints = verb("joints", "joints", "the library of identified joints")
-    joints.add_argument("what", choices=("list", "show", "compare"))
+    joints.add_argument("what", choices=("list", "show", "compare"), help="what is done")
     joints.add_argument("names", nargs="*", metavar="NAME", help="names, types or files of joints")
     joints.add_argument(
         "--library",
