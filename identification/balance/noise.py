@@ -101,3 +101,20 @@ def _fourth(x: FloatArray, time: FloatArray | None) -> FloatArray:
         total += x[i : i + count] / weight
         power += weight**-2
     return np.asarray(total / np.sqrt(power), dtype=np.float64)
+
+
+def effective_share(residual: FloatArray) -> float:
+    """Share of rows that count as independent (initial positive sequence of the
+    autocorrelation).
+    """
+    x = residual - residual.mean()
+    power = float(x @ x)
+    if power <= 0:
+        return 1.0
+    total = 1.0
+    for lag in range(1, min(60, len(x) - 1)):
+        rho = float(x[:-lag] @ x[lag:]) / power
+        if rho < 0.05:
+            break
+        total += 2 * rho
+    return 1.0 / total

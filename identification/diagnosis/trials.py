@@ -17,6 +17,7 @@ from casadi_models import Effect
 from identification.balance.balances import Balances, balances_of
 from identification.balance.calibration import bare, names_of_runs, settled, within_limits
 from identification.balance.dataset import HOLD_NAME
+from identification.balance.noise import effective_share
 from identification.balance.weak import WeakRecord
 from identification.diagnosis.candidates import Candidate, NotTestable, shape_grid
 from identification.fitting.engine import Dataset, Solution, Stacked, row_weights, stack
@@ -289,23 +290,6 @@ def flatten(
     size = len(stacked.block)
     block = np.concatenate([np.where(stacked.taking[b], stacked.block, -1) for b in balances])
     return r, j, block, np.repeat(np.arange(len(balances)), size)
-
-
-def effective_share(residual: FloatArray) -> float:
-    """Share of rows that count as independent (initial positive sequence of the
-    autocorrelation).
-    """
-    x = residual - residual.mean()
-    power = float(x @ x)
-    if power <= 0:
-        return 1.0
-    total = 1.0
-    for lag in range(1, min(60, len(x) - 1)):
-        rho = float(x[:-lag] @ x[lag:]) / power
-        if rho < 0.05:
-            break
-        total += 2 * rho
-    return 1.0 / total
 
 
 def columns(
