@@ -285,7 +285,7 @@ def peer(data: Path, engine: str) -> dict[str, Any]:
         port = int(free.getsockname()[1])
     command = [
         sys.executable,
-        str(ROOT / "benchmarks" / "peer_page.py"),
+        str(ROOT / "benchmarks" / "peer" / "page.py"),
         "--port",
         str(port),
         "--engine",

@@ -162,6 +162,31 @@ def effect_keys(root: Path = ROOT) -> list[str]:
     return sorted(set(out))
 
 
+PLAIN: Final = (0.0, 0.5, 1.0, 2.0)
+"""Numbers that need no reason where they are compared: signs, halves, wholes and twices."""
+ROUNDING: Final = 1e-8
+"""Numbers below this keep rounding apart from zero and decide nothing."""
+
+
+def literals(root: Path = ROOT) -> list[str]:
+    """Comparisons of identification with a number that has no name, and so no reason."""
+    out = []
+    for name, file in modules(root).items():
+        if not name.startswith("identification"):
+            continue
+        for node in ast.walk(tree_of(file)):
+            if isinstance(node, ast.Compare) and any(
+                isinstance(c, ast.Constant)
+                and isinstance(c.value, float)
+                and c.value not in PLAIN
+                and abs(c.value) > ROUNDING
+                for side in (node.left, *node.comparators)
+                for c in ast.walk(side)
+            ):
+                out.append(f"{file.relative_to(root)}:{node.lineno} {ast.unparse(node)}")
+    return out
+
+
 def skips(root: Path = ROOT) -> int:
     """Lines that the formatter is told to leave alone."""
     mark = "# fmt: " + "skip"
@@ -187,12 +212,31 @@ def lines(root: Path, parts: tuple[str, ...]) -> tuple[int, int]:
     return total, comments
 
 
-def loaded(root: Path = ROOT) -> int:
-    """Modules of the packages that `import identification` loads."""
-    code = (
-        "import sys, json, identification; print(json.dumps([m for m in sys.modules "
-        f"if m.partition('.')[0] in {LAYERS!r}]))"
-    )
+METHODS: Final = ("search", "two_step", "linear", "recursive", "faults", "planning", "online")
+"""Rooms of identification that hold methods of their own, which no verb of the loop needs."""
+_LOADED: Final = """
+import contextlib, io, json, sys
+def mine():
+    return sorted(m for m in sys.modules if m.partition(".")[0] in LAYERS)
+import identification
+states = [mine()]
+if IMPROVE:
+    from workbench.entry import main
+    demo = ROOT + "/workbench/demo/"
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        code = main(["improve", demo + "train.npz", "--held-out", demo + "held_out.npz",
+                     "--joint", demo + "joint.toml"])
+    assert code == 0, code
+    states.append(mine())
+print(json.dumps(states))
+"""
+
+
+def loaded(root: Path = ROOT, *, improve: bool = False) -> list[list[str]]:
+    """Modules of the packages that `import identification` loads and, where asked for, those that
+    are loaded after one `irj improve` on the demo's records.
+    """
+    code = f"LAYERS, ROOT, IMPROVE = {LAYERS!r}, {str(root)!r}, {improve!r}\n{_LOADED}"
     done = subprocess.run(
         [sys.executable, "-c", code],
         env={**os.environ, "PYTHONPATH": str(root)},
@@ -201,7 +245,14 @@ def loaded(root: Path = ROOT) -> int:
         text=True,
         check=True,
     )
-    return len(json.loads(done.stdout))
+    found: list[list[str]] = json.loads(done.stdout)
+    return found
+
+
+def methods(loaded_modules: list[str]) -> list[str]:
+    """Those of the modules that belong to a method of its own (:data:`METHODS`)."""
+    rooms = tuple(f"identification.{room}" for room in METHODS)
+    return [m for m in loaded_modules if m.startswith(rooms)]
 
 
 _COUNT: Final = """
@@ -257,6 +308,7 @@ def main() -> None:
     library, comments = lines(root, LAYERS)
     tests, _ = lines(root, ("tests",))
     sensed, noise = demo_calls(root)
+    at_import, after = loaded(root, improve=True)
     rows = [
         ("import circles (late and type-only imports too)", f"{len(found)}"),
         ("largest circle, modules", f"{max(map(len, found), default=0)}"),
@@ -268,7 +320,12 @@ def main() -> None:
             str(len(long_calls(root))),
         ),
         ("conditions on effect keys outside casadi_models", str(len(effect_keys(root)))),
-        ("modules that `import identification` loads", str(loaded(root))),
+        ("literals in comparisons of identification", str(len(literals(root)))),
+        ("modules that `import identification` loads", str(len(at_import))),
+        (
+            "modules loaded after one `irj improve` / of methods that it does not call",
+            f"{len(after)} / {len(methods(after))}",
+        ),
         ("`irj demo`: calls of sense / noise_level", f"{sensed} / {noise}"),
         ("library lines (Python, C, web)", str(library)),
         ("comments per 100 library lines", f"{100 * comments / library:.2f}"),

@@ -9,7 +9,9 @@ from __future__ import annotations
 import difflib
 import hashlib
 import importlib
+import math
 import pkgutil
+import re
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
@@ -56,6 +58,8 @@ PLACE_SIDE: Final[dict[str, Side]] = {
 
 
 Stage = Literal["structure", "plain", "law", "late"]
+_KEY: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+"""What stands in joint files and on the command line, and begins names of parameters."""
 TORQUE_SENSOR: Final = "torque sensor"
 SECOND_BALANCE: Final = "second balance"
 ANYTHING_KNOWN: Final = "anything known"
@@ -163,6 +167,8 @@ class Effect:
         True for sine and cosine of the position: no law of a linear axis.
     separate_by : str
         The run that separates it from what it is confused with.
+    told_by : str
+        What tells it from them where no motion does.
     formerly : tuple of str
         Keys of effects of older files that are part of this one.
     candidate : bool
@@ -194,6 +200,7 @@ class Effect:
     periodic: bool = False
     angular: bool = False
     separate_by: str = ""
+    told_by: str = ""
     formerly: tuple[str, ...] = ()
     candidate: bool = True
     requires: tuple[Requirement, ...] = ()
@@ -250,6 +257,10 @@ class Effect:
             rate that returns anything but scalar expressions.
         """
         where = f"effect {self.key!r}"
+        if not isinstance(self.key, str) or _KEY.fullmatch(self.key) is None:
+            raise ValueError(f"{where}: a key has letters, digits and underscores, as my_friction")
+        if self.key in self.needs:
+            raise ValueError(f"{where}: needs itself, so it could never be added")
         for word, found, known in (
             *(("place", place, get_args(Place)) for place in self.acts_on),
             ("family", self.family, get_args(Family)),
@@ -259,13 +270,18 @@ class Effect:
                 raise ValueError(f"{where}: no {word} {found!r}; use one of {', '.join(known)}")
         if not isinstance(self.acts_on, tuple) or not self.acts_on:
             raise ValueError(f"{where}: acts_on must be a tuple of places, as ('motor',)")
+        names = [p.name for p in self.parameters]
         for p in self.parameters:
+            if names.count(p.name) > 1:
+                raise ValueError(f"{where}: two parameters are called {p.name!r}; rename one")
             try:
                 side_power(p.unit)
             except UnitError as error:
                 raise ValueError(f"{where}: parameter {p.name!r}: {error}") from None
         local, values = self._symbols()
-        _scalar(self.law(local, values), f"{where}: its law")
+        law = self.law(local, values)
+        _scalar(law, f"{where}: its law")
+        _known_only(ca.SX(law), local, values, f"{where}: its law")
         if self.potential is not None:
             _scalar(self.potential(local, values), f"{where}: its potential")
         if self.memory is not None:
@@ -443,6 +459,29 @@ class Registry(Mapping[str, Effect]):
                     )
 
 
+def _known_only(law: ca.SX, local: LocalSignals, values: SimpleNamespace, where: str) -> None:
+    """Refuse symbols that nobody gives a value, numbers that are none, and what no parameter
+    changes.
+    """
+    own = list(vars(values).values())
+    given = ca.vertcat(
+        *own, *local.memory, *(getattr(local, f.name) for f in fields(local) if f.name != "memory")
+    )
+    names = {e.name() for e in ca.vertsplit(given)}
+    used = ca.symvar(law)
+    for symbol in used:
+        if symbol.name() not in names:
+            raise ValueError(f"{where} has a symbol {symbol.name()!r} of its own; use s and p")
+    steps = ca.Function("law", used, [law])
+    for k in range(steps.n_instructions()):
+        if steps.instruction_id(k) == ca.OP_CONST and not math.isfinite(
+            steps.instruction_constant(k)
+        ):
+            raise ValueError(f"{where} holds {steps.instruction_constant(k):g}, no finite number")
+    if own and not ca.depends_on(law, ca.vertcat(*own)):
+        raise ValueError(f"{where} depends on none of its parameters")
+
+
 def _scalar(found: Any, what: str) -> None:
     """Refuse anything but one expression or number."""
     if found is None:
@@ -488,6 +527,7 @@ def effect(
     periodic: bool = False,
     angular: bool = False,
     separate_by: str = "",
+    told_by: str = "",
     formerly: tuple[str, ...] = (),
     candidate: bool = True,
     requires: tuple[Requirement, ...] = (),
@@ -529,6 +569,7 @@ def effect(
                 periodic=periodic,
                 angular=angular,
                 separate_by=separate_by,
+                told_by=told_by,
                 candidate=candidate,
                 requires=requires,
                 contains=contains,

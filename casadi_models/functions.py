@@ -4,6 +4,7 @@ step.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, Final, final
 
@@ -39,11 +40,22 @@ class JointFunctions:
     one; all link-referred. Inputs u: :data:`INPUTS`. Parameters p in the order of
     ``model.parameter_names``. States are true values; what the sensors add appears in
     :attr:`outputs` only.
+
+    Parameters
+    ----------
+    model : Solvable
+    open_to_disturbances : bool
+        True: :attr:`disturbed` has torques beyond the model's laws as inputs; elsewhere these are
+        zero and cost nothing.
     """
 
-    def __init__(self, model: Solvable) -> None:
+    def __init__(self, model: Solvable, *, open_to_disturbances: bool = False) -> None:
         self._model = model
         self._equations: Equations = model.true_equations
+        self._beyond = ca.SX.sym("d", 2) if open_to_disturbances else ca.SX.zeros(2, 1)
+        if open_to_disturbances:
+            passed_on = self._equations.transmitted + self._beyond[0]
+            self._equations = replace(self._equations, transmitted=passed_on)
         mechanical = ("motor_position", "motor_velocity", "link_position", "link_velocity")
         self.state_names: tuple[str, ...] = (
             mechanical if model.is_elastic else ("position", "velocity")
@@ -92,7 +104,7 @@ class JointFunctions:
         if self._model.is_elastic:
             torque = carried_torque(e)
             motor = e.drive - e.motor_resistance - torque * e.motor_lever
-            link = torque * e.link_lever - e.link_resistance
+            link = torque * e.link_lever - e.link_resistance + self._beyond[1]
             motor, link = ca.substitute([motor, link], [s.torque], [torque])
             motor, link, torque = self._substituted(motor, link, torque)
             motor = affine_solution(motor, s.motor_acceleration, e.inertia["motor_inertia"])
@@ -102,8 +114,8 @@ class JointFunctions:
         share = e.inertia.get("link_inertia", ca.SX(0))
         right, carried = ca.substitute(
             [
-                e.drive - e.motor_resistance - e.link_resistance,
-                share * s.link_acceleration + e.link_resistance,
+                e.drive - e.motor_resistance - e.link_resistance + self._beyond[1],
+                share * s.link_acceleration + e.link_resistance - self._beyond[1],
             ],
             *one,
         )
@@ -264,6 +276,28 @@ class JointFunctions:
         its rate.
         """
         x, z, u, p = self._symbols
+        return ca.Function(
+            "outputs", [ca.vertcat(x, z), u, p], [self._readings], ["x", "u", "p"], ["y"]
+        )
+
+    @cached_property
+    def disturbed(self) -> Any:
+        """(x, u, p, d) -> dx/dt, readings as in :attr:`outputs`.
+
+        d: torque of the transmission beyond its law, and torque on the link from elsewhere [N.m]
+        (none on a rigid joint's transmission). One on the motor is a part of the drive.
+        """
+        x, z, u, p = self._symbols
+        d = self._beyond if self._beyond.is_symbolic() else ca.SX.sym("none", 2)
+        given = [ca.vertcat(x, z), u, p, d]
+        return ca.Function(
+            "disturbed", given, [self.rates, self._readings], ["x", "u", "p", "d"], ["dx", "y"]
+        )
+
+    @cached_property
+    def _readings(self) -> Expression:
+        """The five readings of :attr:`outputs`."""
+        x = self._symbols[0]
         accelerations, true_torque = self._both(self._solution[0]), self._solution[1]
         motor = (x[0], x[1])
         link = (x[2], x[3]) if self._model.is_elastic else motor
@@ -275,10 +309,7 @@ class JointFunctions:
             self._reading("link_position_sensor", link[1], accelerations[1], offset=False),
             self._reading("torque_sensor", true_torque, torque_rate),
         ]
-        rows = self._substituted(*rows)  # a sensor may read the angle too
-        return ca.Function(
-            "outputs", [ca.vertcat(x, z), u, p], [ca.vertcat(*rows)], ["x", "u", "p"], ["y"]
-        )
+        return ca.vertcat(*self._substituted(*rows))  # a sensor may read the angle too
 
     @cached_property
     def drive_lag(self) -> Any:

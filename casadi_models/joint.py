@@ -12,6 +12,7 @@ A rigid model has one degree of freedom, q_m = q_l.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -48,6 +49,8 @@ __all__ = ["MEMORY_STEP", "Equations", "JointModel", "Term", "inverse_dynamics",
 _FRICTION_SIDES: Final = ("motor", "link")
 TWIST: Final = "transmission_compliance"
 """Effect by which the transmission twists at all."""
+_NUMBER: Final = re.compile(r"0|[1-9][0-9]{0,2}", re.ASCII)
+"""Which of several effects of one kind; 0 belongs to a record, not to the joint."""
 SHOWN: Final = 22
 """Parameters that `print` shows: the whole text stays within 25 lines."""
 
@@ -232,7 +235,12 @@ class JointModel:
         bare, _, number = label.partition("#")
         key, _, place = bare.partition("@")
         found = EFFECTS[key]
-        instance = int(number) if number else 1
+        instance = int(number) if _NUMBER.fullmatch(number) else 1
+        if ("#" in label and not _NUMBER.fullmatch(number)) or ("@" in bare and not place):
+            raise ValueError(
+                f"effect {label!r} is not understood; write {key}, {key}@{found.acts_on[0]}, or "
+                f"{key}#2 for a second one"
+            )
         if place:
             if place not in found.acts_on:
                 raise ValueError(

@@ -186,9 +186,9 @@ TABLE: Final[Mapping[str, BaseUnit]] = {
     "cd": BaseUnit(cd=1),
 }
 
-_PREFIXES: Final = {"u": 1e-6, "m": 1e-3, "c": 1e-2, "k": 1e3, "M": 1e6}
+PREFIXES: Final = {"u": 1e-6, "m": 1e-3, "c": 1e-2, "k": 1e3, "M": 1e6}
 """Prefixes of SI that a joint meets; nano is written out above for metre and second."""
-_PREFIXED: Final = frozenset(
+PREFIXED: Final = frozenset(
     ["rad", "m", "s", "Hz", "A", "V", "Ohm", "H", "Wb", "g", "N", "Nm", "J", "W", "Pa", "K", "mol"]
 )
 """Names that take a prefix."""
@@ -269,9 +269,9 @@ def named(name: str, counts_per_turn: float | None = None) -> BaseUnit:
         return _scaled(_ANGLE, TURN / counts_per_turn)
     if name in TABLE:
         return TABLE[name]
-    if name[:1] in _PREFIXES and name[1:] in _PREFIXED:
+    if name[:1] in PREFIXES and name[1:] in PREFIXED:
         unit = TABLE[name[1:]]
-        return _scaled(unit, _PREFIXES[name[0]] * unit.factor)
+        return _scaled(unit, PREFIXES[name[0]] * unit.factor)
     raise UnitError(f"unit {name!r} is not known")
 
 

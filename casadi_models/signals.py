@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any, Final, final
 
@@ -75,6 +76,9 @@ class Signals:
         """A copy with some signals replaced."""
         return replace(self, **values)
 
+    def __repr__(self) -> str:
+        return one_line(self)
+
 
 @final
 @dataclass(frozen=True)
@@ -122,6 +126,24 @@ class LocalSignals:
     memory: tuple[Expression, ...]
     gear_ratio: Expression
     clock: Expression = math.nan
+
+    def __repr__(self) -> str:
+        return one_line(self)
+
+
+def one_line(thing: Any) -> str:
+    """A dataclass in one line: arrays by their shape, mappings by their keys, the rest as it is."""
+    parts = (f"{f.name}={_shortly(getattr(thing, f.name))}" for f in fields(thing) if f.repr)
+    return f"{type(thing).__name__}({', '.join(parts)})"
+
+
+def _shortly(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(map(str, value)) + "}"
+    size = getattr(value, "shape", None)
+    if size is None:
+        return repr(value)
+    return f"{size} array" if max(size, default=0) > 1 else str(value)
 
 
 def gain_error(reading: Expression, error: Expression) -> Expression:

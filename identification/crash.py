@@ -6,11 +6,12 @@ import os
 import platform
 import secrets
 import sys
-import tempfile
 import time
 import traceback
 from pathlib import Path
 from typing import Final
+
+from identification.scratch import outer_folder
 
 FOLDER: Final = "IRJ_CRASHES"
 """Environment variable with the folder of traces, in place of the usual one."""
@@ -56,7 +57,7 @@ def _folders() -> list[Path]:
         found.append(state / "irj" / "crashes")
     except RuntimeError:  # a user without a home
         pass
-    return [*found, Path(tempfile.gettempdir())]
+    return [*found, outer_folder()]
 
 
 def _kept(folder: Path, text: str) -> Path | None:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final, final
 from identification.data.joint_file import Joint, load_joint
 from identification.data.own_effects import files_of
 from identification.errors import InputError
+from identification.scratch import hold
 from irj_fmu.command_line import (
     OneLineParser,
     check_output,
@@ -128,6 +129,7 @@ def build(
         [request.source, *request.healthy],
     )
     made_folders = _prepare(request.out)
+    hold(request.out)
     done: list[Path] = []
     try:
         with tempfile.TemporaryDirectory(prefix=".build-", dir=request.out) as temporary:
@@ -423,10 +425,10 @@ def _run(path: Path, command: Sequence[str]) -> None:
 # --- command line ---------------------------------------------------------------------------------
 
 
-def parser(prog: str = "build_fmu.py") -> argparse.ArgumentParser:
+def parser(prog: str = "build_fmu.py") -> OneLineParser:
     """Arguments of ``build_fmu.py`` and ``irj export``."""
     made = OneLineParser(prog=prog, description="Build, validate and try the FMUs of a joint file.")
-    made.add_argument("kind", choices=KINDS)
+    made.add_argument("kind", choices=KINDS, help="what is built (irj export: default plant)")
     made.add_argument("--joint", required=True, type=Path, help="joint file (TOML), fitted or not")
     made.add_argument(
         "--out", default=Path("dist"), type=Path, help="folder of the results (default: dist)"

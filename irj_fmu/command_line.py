@@ -22,6 +22,7 @@ from typing import IO, Any, Final, NoReturn, final
 
 from identification.crash import internal_error
 from identification.errors import InputError
+from identification.scratch import hold, release
 
 CRASHED: Final = 3
 """Exit code after an error of the program itself: no answer, neither yes nor no."""
@@ -29,6 +30,8 @@ INTERRUPTED: Final = 130
 """Exit code after Ctrl-C."""
 STOPPED: Final[list[int]] = []
 """Signals that came during this command."""
+LONGEST: Final = 2000
+"""Characters of a message: some lines of a terminal, with the whole effect library in it."""
 _BAR: Final = [False]
 """Whether the last line on the terminal is a progress bar that goes on."""
 
@@ -41,6 +44,22 @@ class OneLineParser(argparse.ArgumentParser):
         """Print the line and exit with 2."""
         self.exit(2, f"{one_line(message)}; see `{self.prog} --help`\n")
 
+    @property
+    def arguments(self) -> tuple[argparse.Action, ...]:
+        """Everything that may be given, but verbs; hidden options are left out."""
+        return tuple(
+            a
+            for a in self._actions
+            if not isinstance(a.choices, dict) and a.help != argparse.SUPPRESS
+        )
+
+    @property
+    def verbs(self) -> dict[str, OneLineParser]:
+        """The parsers of the verbs by name, in their order."""
+        return {
+            k: v for a in self._actions if isinstance(a.choices, dict) for k, v in a.choices.items()
+        }
+
 
 def counted(number: int, what: str) -> str:
     """A number and what is counted, as ``1 run`` or ``3 runs``."""
@@ -48,8 +67,12 @@ def counted(number: int, what: str) -> str:
 
 
 def one_line(text: str) -> str:
-    """A message as the command line prints it."""
-    return "irj: " + " ".join(str(text).split())
+    """A message as the command line prints it: of a very long one the two ends, signs that would
+    steer a terminal as escapes.
+    """
+    plain = "".join(c if c.isprintable() or c.isspace() else repr(c)[1:-1] for c in str(text))
+    line = "irj: " + " ".join(plain.split())
+    return line if len(line) <= LONGEST else f"{line[: LONGEST // 2]} ... {line[-LONGEST // 2 :]}"
 
 
 def checkpoint() -> None:
@@ -139,6 +162,7 @@ def run_alone(main: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
         return crashed(error, shlex.join([Path(sys.argv[0]).name, *argv]))
     finally:
         STOPPED.clear()
+        release()
 
 
 def no_memory(error: MemoryError) -> str:
@@ -183,12 +207,14 @@ def terminable() -> Iterator[None]:
 
 
 def check_output(path: str | Path, inputs: Sequence[str | Path] = ()) -> None:
-    """Refuse a result file that cannot be written or would replace an input.
+    """Refuse a result file that cannot be written or would replace an input; from then on it is
+    held against other processes (see :func:`identification.scratch.hold`).
 
     Raises
     ------
     InputError
-        It is a folder, its folder is missing or not writable, or it is one of the inputs.
+        Another process is writing it; it is a folder, its folder is missing or not writable, or it
+        is one of the inputs.
     """
     target = Path(path)
     if not str(path):
@@ -209,6 +235,8 @@ def check_output(path: str | Path, inputs: Sequence[str | Path] = ()) -> None:
             f"{path}: its folder is not writable ({error.strerror}); write somewhere else"
         ) from None
     keep_inputs([target], inputs)
+    if not is_special(target):
+        hold(target)
 
 
 def keep_inputs(targets: Sequence[str | Path], inputs: Sequence[str | Path]) -> None:
@@ -280,6 +308,7 @@ def replace_files(folder: Path, content: Mapping[str, bytes]) -> list[Path]:
     whole = False
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        hold(folder)
         for name, text in content.items():
             parts[folder / name] = part = folder / f".{name}.{secrets.token_hex(4)}.part"
             part.write_bytes(text)

@@ -406,23 +406,21 @@ def table(rows: Sequence[Row]) -> str:
     return "\n".join(lines)
 
 
-def main(argv: Sequence[str]) -> int:
-    """``irj cosim``: print the table of convergence; 0 where every limit holds, 1 where not, 2
-    on unusable input.
-    """
-    parser = OneLineParser(
+def parser() -> OneLineParser:
+    """Arguments of ``irj cosim``."""
+    made = OneLineParser(
         prog="irj cosim", description="Co-simulate plants and estimators and compare."
     )
-    parser.add_argument(
+    made.add_argument(
         "names",
         nargs="*",
         metavar="NAME",
         help=f"reference joints: {', '.join(NAMES)} (default: all)",
     )
-    parser.add_argument(
+    made.add_argument(
         "--joint", action="append", default=[], type=Path, help="a fitted joint file as a plant"
     )
-    parser.add_argument(
+    made.add_argument(
         "--published",
         nargs=2,
         action="append",
@@ -430,10 +428,17 @@ def main(argv: Sequence[str]) -> int:
         metavar=("FILE", "KEY"),
         help="a row of a table of published friction parameters",
     )
-    parser.add_argument("--stop", type=float, default=40.0, help="length in s (default: 40)")
-    parser.add_argument("--cc", help="C compiler")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the table as JSON")
-    arguments = parser.parse_args(argv)
+    made.add_argument("--stop", type=float, default=40.0, help="length in s (default: 40)")
+    made.add_argument("--cc", help="C compiler")
+    made.add_argument("--json", type=Path, metavar="FILE", help="write the table as JSON")
+    return made
+
+
+def main(argv: Sequence[str]) -> int:
+    """``irj cosim``: print the table of convergence; 0 where every limit holds, 1 where not, 2
+    on unusable input.
+    """
+    arguments = parser().parse_args(argv)
     try:
         if arguments.json is not None:
             check_output(

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 def main(argv: Sequence[str] | None = None) -> int:
     """Run `irj`; see :func:`workbench.cli.main.main`."""
     try:
+        from identification.scratch import own_folder
         from workbench.cli.main import main as run
     except KeyboardInterrupt:
         sys.stderr.write("irj: interrupted\n")
@@ -20,7 +21,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stderr.write(f"irj: internal error, cannot be loaded ({detail}); install it again\n")
         return 3
     try:
-        return run(argv)
+        with own_folder():
+            return run(argv)
     except KeyboardInterrupt:
         sys.stderr.write("irj: interrupted\n")
         return 130

@@ -28,6 +28,7 @@ from ..signals import Expression, LocalSignals
     confused_with=("current_offset", "cyclic_torque"),
     needs=("coulomb",),
     separate_by="a standstill with the brake closed: an offset stays, friction does not",
+    told_by="the current read with the drive off and the brake closed: an offset stays",
 )
 def asymmetric_coulomb(s: LocalSignals, p: SimpleNamespace) -> Expression:
     """Same torque in both directions while moving."""

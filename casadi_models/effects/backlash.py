@@ -43,6 +43,7 @@ def _stored(s: LocalSignals, p: SimpleNamespace) -> Expression:
         ),
     ),
     of_displacement=True,
+    several_valleys=True,
     absence="the transmission carries nothing near zero torque; knocks when it is crossed",
     excitation="torque reversals at low load",
     source="field knowledge",

@@ -25,6 +25,7 @@ from ..signals import Expression, LocalSignals
     source="field knowledge",
     confused_with=("asymmetric_coulomb", "cyclic_torque"),
     separate_by="a standstill with the brake closed: an offset stays, friction does not",
+    told_by="the current read with the drive off and the brake closed: an offset stays",
 )
 def current_offset(s: LocalSignals, p: SimpleNamespace) -> Expression:
     """Constant torque."""

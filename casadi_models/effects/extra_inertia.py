@@ -25,6 +25,7 @@ from ..term import SIDE_INERTIAS
     source="thesis table 4.2 (design against identified inertia)",
     confused_with=("motor_constant_error",),
     separate_by="the catalogue inertia as a known value, or a run without payload",
+    told_by="the catalogue inertia as a known value",
 )
 def extra_inertia(s: LocalSignals, p: SimpleNamespace) -> Expression:
     """Torque that accelerates the extra inertia."""

@@ -37,6 +37,7 @@ from ..signals import Expression, LocalSignals
     source="thesis section 4.3.2 (constant 18 % above the catalogue)",
     confused_with=("torque_sensor_gain", "cyclic_torque", "added_spring"),
     separate_by="a run without payload or with the axis horizontal",
+    told_by="the catalogue inertia of the motor as a known value, or a known weight on the link",
 )
 def motor_constant_error(s: LocalSignals, p: SimpleNamespace) -> Expression:
     """Torque missing by the wrong constant."""

@@ -27,6 +27,7 @@ from ..signals import Expression, LocalSignals
     needs=("transmission_compliance",),
     confused_with=("transmission_compliance",),
     separate_by="the catalogue stiffness of the gear, or a position measured before the sensor",
+    told_by="the catalogue stiffness of the gear as a known value",
 )
 def torque_sensor_compliance(s: LocalSignals, p: SimpleNamespace) -> Expression:
     """Twist of the sensor."""

@@ -25,6 +25,7 @@ from ..signals import Expression, LocalSignals, gain_error
     source="field knowledge",
     confused_with=("motor_constant_error", "gravity"),
     separate_by="a known payload, or a run without payload",
+    told_by="a known weight on the link",
 )
 def torque_sensor_gain(s: LocalSignals, p: SimpleNamespace) -> Expression:
     """True torque minus reading."""

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from casadi_models import JointModel, Signals
 from casadi_models.affine import AffineParts
 from casadi_models.vectorised import Vectorised
-from identification.balance.memory import states_of
+from identification.balance.memory import Law, residuals_of, states_of
 from identification.balance.sensing import Sensing
 from identification.balance.weak import WeakRecord
 
@@ -128,18 +128,16 @@ class _Part:
 
     def rows(
         self,
-        averaged: Mapping[str, FloatArray],
+        averaged: FloatArray,
         average: Callable[[FloatArray], FloatArray],
         data: WeakRecord,
         memory: FloatArray,
         p: Sequence[float],
     ) -> FloatArray:
-        """Averages (rows, expressions and columns) with the internal states given at the points."""
-        matrix = np.zeros((data.rows, len(_NAMES)))
-        for i, name in enumerate(_NAMES):
-            if name in averaged:
-                matrix[:, i] = averaged[name]
-        full: FloatArray = matrix @ np.array(self._linear(p)).T
+        """Averages (rows, expressions and columns) with the internal states given at the points;
+        `averaged` are those of the signals, (rows, signals).
+        """
+        full: FloatArray = averaged @ np.array(self._linear(p)).T
         if self.needed:
             count = len(data.points["motor_position"])
             full[:, self.needed] += average(self._rest(count, data.table(_NAMES), memory, p).T)
@@ -175,6 +173,11 @@ class Balances:
         Parameters whose Jacobian columns are wanted; all by default.
     columns_only : bool
         The residual itself is not wanted and reads zero.
+
+    Attributes
+    ----------
+    law : Law
+        What the residuals depend on beside the record and the values.
     """
 
     def __init__(
@@ -192,10 +195,17 @@ class Balances:
         expressions = residual_expressions(model, sensing)
         columns = [self.names.index(n) for n in self.wrt]
         self.balances = tuple(expressions)
+        # what stands in no balance moves nothing, whatever its value
+        entries = ca.jacobian_sparsity(
+            ca.vertcat(*expressions.values()), model.equations.parameters
+        ).get_triplet()[1]
+        self.holding: frozenset[str] = frozenset(self.names[i] for i in set(entries))
         curved = curved_expressions(model, sensing)
         self._plain = _Part(model, expressions, columns, columns_only=columns_only)
         self._curved = _Part(model, curved, columns, columns_only=columns_only) if curved else None
         self._memory = Memory(model) if self._plain.remembers else None
+        self._law = Law(model.structure)
+        self.law = Law(model.structure, sensing, columns_only)
 
     def memory_values(self, data: WeakRecord, values: Mapping[str, float]) -> FloatArray:
         """Internal states of displacement-memory effects at the points, (states, points); not
@@ -206,7 +216,7 @@ class Balances:
         if memory is None:
             return np.zeros((self.model.equations.memory.shape[0], count))
         p = np.array([float(values[n]) for n in self.names])
-        law = (self.model.structure, tuple(p[memory.depends].tolist()))
+        law = (self._law, tuple(p[memory.depends].tolist()))
         return states_of(data, law, lambda: memory.along(data, p))
 
     def evaluate(
@@ -218,10 +228,15 @@ class Balances:
         known already.
         """
         p = [float(values[n]) for n in self.names]
-        memory = self.memory_values(remembered or data, values)
-        full = self._plain.rows(data.averaged, data.average, data, memory, p)
-        if self._curved is not None:
-            full += self._curved.rows(data.curved, data.curve, data, memory, p)
+
+        def rows() -> FloatArray:
+            memory = self.memory_values(remembered or data, values)
+            full = self._plain.rows(data.means(_NAMES), data.average, data, memory, p)
+            if self._curved is not None:
+                full += self._curved.rows(data.bends(_NAMES), data.curve, data, memory, p)
+            return full
+
+        full = rows() if self.wrt else residuals_of(data, (self.law, tuple(p)), rows)
         width = 1 + len(self.wrt)
         return {
             b: (full[:, i * width], full[:, i * width + 1 : (i + 1) * width])

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Final, final
 
 import numpy as np
@@ -27,6 +28,7 @@ from identification.balance.clocks import (
     lateness,
     one_way,
 )
+from identification.balance.memory import numbers_of
 from identification.balance.noise import effective_share
 from identification.balance.sensing import Sensing
 from identification.balance.weak import WeakRecord
@@ -270,7 +272,10 @@ def settled(
     for w in records:
         missing = [n for n in model.calibration if of_run(n, w) not in out]
         if missing:
-            out.update(_fitted_on_itself(balances_of(model, sensing, wrt=missing), w, out, missing))
+            balances = balances_of(model, sensing, wrt=missing)
+            law = (balances.law, tuple(missing), tuple(float(out[n]) for n in balances.names))
+            fitted = partial(_fitted_on_itself, balances, w, out, missing)
+            out.update(numbers_of(w, law, fitted))
     return out
 
 

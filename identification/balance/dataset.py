@@ -13,6 +13,7 @@ import numpy.typing as npt
 from casadi_models import JointModel, hold
 from identification.balance.calibration import named_late, unknowns_of
 from identification.balance.clocks import in_time, places_of, shifted
+from identification.balance.memory import cache_of
 from identification.balance.noise import level_of
 from identification.balance.sensing import Sensing, adapt, check_alike, sense, signals_of
 from identification.balance.stamps import evened
@@ -39,6 +40,10 @@ POINTWISE_KERNELS: Final = (0.01, 0.014, 0.02, 0.03)
 STILL: Final = 3.0
 """Pointwise speed of a side at rest, in standard deviations of its noise: 0.3 % of samples at
 rest lie above.
+"""
+PREPARED: Final = 16_000_000
+"""Values of prepared records that a thread keeps (128 MB): two records of 40 s at 1 kHz at every
+kernel of the verdict.
 """
 VELOCITY_NOISE: Final = 2e-3
 """Noise of a pointwise velocity, as a share of the record's speed, that is small enough."""
@@ -134,7 +139,9 @@ def load_dataset(
     prepared: list[WeakRecord] = []
     first = 0
     for record in (*train, *held_out):
-        made = weak_record(
+        other = record.payload != train[0].payload
+        masked = _of_the_link(record, sensing) if other else frozenset[str]()
+        made = _once(
             record,
             joint,
             sensing,
@@ -143,9 +150,8 @@ def load_dataset(
             curved=model.lagging_load,
             late=places_of(model),
         )
-        made = replace(made, name=run_name(record))
-        if record.payload != train[0].payload:
-            made = replace(made, masked=_of_the_link(record, sensing))
+        if masked:
+            made = replace(made, masked=masked)
         first = max(first, 1 + int(made.block.max(initial=first - 1)))
         prepared.append(made)
     count = len(train)
@@ -180,6 +186,33 @@ def load_dataset(
     )
 
 
+def _once(
+    record: Record,
+    joint: Joint,
+    sensing: Sensing,
+    length: float,
+    first_block: int,
+    *,
+    curved: bool,
+    late: Sequence[str],
+) -> WeakRecord:
+    """:func:`weak_record` by its name, prepared once for the verbs that follow each other on a
+    record.
+    """
+
+    def make() -> tuple[WeakRecord, int]:
+        made = weak_record(record, joint, sensing, length, first_block, curved=curved, late=late)
+        tables = (made.averaged, made.points, made.smooth, made.curved)
+        return replace(made, name=run_name(record)), sum(
+            x.size for table in tables for x in table.values()
+        )
+
+    scales = (joint.gear_ratio, joint.torque_per_current, joint.torque_per_voltage)
+    law = (scales, sensing, length, first_block, curved, tuple(late))
+    found: WeakRecord = cache_of("prepared").get(record, law, make, PREPARED)
+    return found
+
+
 def run_name(record: Record) -> str:
     """Name of a record with a mark of its samples: another run under the same name is another
     run.
@@ -205,6 +238,7 @@ def seen_from_the_motor(sensing: Sensing, joint: Joint) -> bool:
     """
     return (
         sensing.balances == ("axis",)
+        and sensing.moving == "motor_position"
         and not sensing.both_positions
         and abs(joint.gear_ratio) != 1.0
     )

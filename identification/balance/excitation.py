@@ -24,6 +24,11 @@ FEWEST_REVERSALS: Final = 4
 SLOW_SHARE: Final = 0.02
 """Share of the top speed below which a direction is not told."""
 
+ONE_SPEED: Final = 0.75
+"""Share of the samples within a tenth of the top speed from which a motion is said to run at one
+speed: a triangle spends nearly all its time there, a sine less than a third.
+"""
+
 HELD: Final = 0.02
 """Change of the speed within a kernel, as a share of it, up to which a speed counts as held."""
 
@@ -62,7 +67,7 @@ def not_identifiable(data: Dataset) -> str:
             "The joint does not move in the training records: record a motion with reversals "
             "at several speeds."
         )
-    moving = np.sign(speed[np.abs(speed) > 0.02 * top])
+    moving = np.sign(speed[np.abs(speed) > SLOW_SHARE * top])
     if not np.any(moving > 0) or not np.any(moving < 0):
         return (
             "The motor never reverses in the training records: friction cannot be told from "
@@ -102,7 +107,7 @@ def excitation_warnings(data: Dataset) -> tuple[str, ...]:
             "from it; add a multisine record"
         )
     levels = np.histogram(np.abs(speed) / top, bins=10, range=(0, 1))[0] / max(len(speed), 1)
-    if float(levels.max()) > 0.75 and int(np.argmax(levels)) > 2:
+    if float(levels.max()) > ONE_SPEED and int(np.argmax(levels)) > 2:
         out.append(
             "the training records run at one speed nearly all the time (triangle only): add a "
             "multisine record before trusting small claims"

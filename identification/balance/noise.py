@@ -16,6 +16,25 @@ EVEN: Final = 1e-3
 """Spread of the steps, as a share of the median one, below which stamps count as even: that of
 stamps written with few digits.
 """
+TIE: Final = 1e-6
+"""Relative difference below which two fourth differences are one: those of a quantised channel
+are whole steps, told apart by rounding only (1e-12 of them), and go in or out of the cut together.
+"""
+
+
+KEPT: Final = 0.95
+"""Share of the fourth differences that counts: the rest may be jumps of the motion and spikes."""
+CUT_DEVIATION: Final = 0.87
+"""Standard deviation of a unit normal variable that is cut at that quantile of its size (0.871)."""
+
+LONGEST_LAG: Final = 60
+"""Rows up to which correlation is followed: fifteen kernel lengths, longer than any block holds
+together.
+"""
+UNCORRELATED: Final = 0.05
+"""Autocorrelation below which rows count as independent: twice its own scatter over 1600 rows, the
+rows of 40 s.
+"""
 
 
 def noise_level(
@@ -49,10 +68,10 @@ def noise_level(
         return 0.0
     fourth = np.concatenate(parts)
     magnitude = np.abs(fourth)
-    cut = fourth[magnitude <= np.quantile(magnitude, 0.95)]
+    cut = fourth[magnitude <= np.quantile(magnitude, KEPT) * (1.0 + TIE)]
     if not len(cut):
         return 0.0
-    return float(np.std(cut) / 0.87)
+    return float(np.std(cut) / CUT_DEVIATION)
 
 
 _LEVELS: Final[WeakKeyDictionary[Record, dict[tuple[str, float], float]]] = WeakKeyDictionary()
@@ -112,9 +131,9 @@ def effective_share(residual: FloatArray) -> float:
     if power <= 0:
         return 1.0
     total = 1.0
-    for lag in range(1, min(60, len(x) - 1)):
+    for lag in range(1, min(LONGEST_LAG, len(x) - 1)):
         rho = float(x[:-lag] @ x[lag:]) / power
-        if rho < 0.05:
+        if rho < UNCORRELATED:
             break
         total += 2 * rho
     return 1.0 / total

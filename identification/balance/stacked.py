@@ -150,14 +150,15 @@ def _drawn_floors(
     """RMS of what drawn noise changes in each balance of one record."""
     balances = balances_of(model, data.sensing, wrt=())
     power = dict.fromkeys(balances.balances, 0.0)
-    either = _unsure(balances, data, values, [record])
     drawn = draws_of(record, data.noise)
+    seen = drawn[0].record
+    either = _unsure(balances, data, values, [seen])
     values = values_on(model, record, values)
     for draw in drawn:
-        calm = balances.evaluate(draw.calm, values, remembered=record)
+        calm = balances.evaluate(draw.calm, values, remembered=seen)
         noisy = balances.evaluate(draw.noisy, values)
         for b in power:
-            rows = record.taking(b)
+            rows = seen.taking(b)
             power[b] += _sure_rms((noisy[b][0] - calm[b][0])[rows], either[b][rows]) ** 2
     return {b: math.sqrt(p / len(drawn)) for b, p in power.items()}
 

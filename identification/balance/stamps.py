@@ -33,6 +33,10 @@ CLEAR: Final = 0.3
 """Length of the mean phasor of the stamps from which their slots are told: jitter of a quarter
 of a period has 0.29.
 """
+CHANCE: Final = 3.0
+"""Length of the mean phasor of n stamps without a clock, times the root of n, that chance leaves
+one time in eight thousand (exp(-9)).
+"""
 LOCAL: Final = 129
 """Stamps over which the logger's clock is followed: clocks drift slowly."""
 CLEARLY: Final = 0.05
@@ -188,7 +192,7 @@ def _period(time: FloatArray, period: float) -> float:
             break
         apart = time[lag:] - time[:-lag]
         phasor = complex(np.mean(np.exp(2j * np.pi * apart / period)))
-        if abs(phasor) < 3.0 / np.sqrt(len(apart)):
+        if abs(phasor) < CHANCE / np.sqrt(len(apart)):
             break
         period *= 1.0 + float(np.angle(phasor)) / (2.0 * np.pi * float(np.median(apart)) / period)
     return period
@@ -241,7 +245,7 @@ def _in_stretches(
     """As `_followed`, stretch by stretch between pauses after which the clock may have another
     phase.
     """
-    pauses = np.flatnonzero(np.diff(time) > (longest_hole(period) + 1.5) * period) + 1
+    pauses = np.flatnonzero(np.diff(time) > (longest_hole(period) + ALONE) * period) + 1
     edges = [0, *pauses.tolist(), len(time)]
     numbers, off = [], []
     last = -1

@@ -16,6 +16,8 @@ import numpy as np
 import numpy.typing as npt
 from numpy.lib.stride_tricks import sliding_window_view
 
+from casadi_models.signals import one_line
+
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
@@ -52,6 +54,9 @@ REST_SHARE: Final = 0.01
 """Share of a row's kernel that may be at rest: a choice. At 1 % the unknown friction of the rest
 weighs a hundredth of its limit in the row, which is what noise leaves of it elsewhere; the kernels
 taper, so that only rows whose edge touches a rest are near it."""
+
+STRETCH: Final = 4096
+"""Windows multiplied at a time: some hundred kilobytes."""
 
 
 def kernel(length: float, dt: float, order: int = 0) -> FloatArray:
@@ -158,6 +163,17 @@ class Grid:
         return _strided(values, np.ones(1), self.segments, self.half, self.stride)
 
 
+def _at(windows: FloatArray, where: IntArray, weights: FloatArray) -> FloatArray:
+    """Products of some windows with the weights, a stretch at a time: copies of all windows at once
+    would not stay in the cache.
+    """
+    out = np.empty(len(where))
+    for first in range(0, len(where), STRETCH):
+        part = where[first : first + STRETCH]
+        np.matmul(windows[part], weights, out=out[first : first + STRETCH])
+    return out
+
+
 def _strided(
     values: FloatArray, weights: FloatArray, segments: tuple[slice, ...], half: int, stride: int
 ) -> FloatArray:
@@ -166,8 +182,7 @@ def _strided(
     for segment in segments:
         x = values[segment]
         rows = np.arange(half, len(x) - half, stride)
-        windows = sliding_window_view(x, len(weights))[rows - own]
-        parts.append(windows @ weights)
+        parts.append(_at(sliding_window_view(x, len(weights)), rows - own, weights))
     return np.concatenate(parts) if parts else np.empty(0)
 
 
@@ -218,6 +233,9 @@ class WeakRecord:
     support: FloatArray | None = None
     name: str = ""
     shifts: Mapping[str, float] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        return one_line(self)
 
     def taking(self, balance: str) -> npt.NDArray[np.bool_]:
         """Rows that take part in a balance, shape (rows,): the one mask of every fit, error,
@@ -287,16 +305,35 @@ class WeakRecord:
         """Signals at the points as rows in the order of `names`, zeros where one is not there;
         made once, not to be written to.
         """
-        if names not in self._tables:
-            out = np.zeros((len(names), int(self.starts[-1])))
+        return self._table("points", names, self.points, int(self.starts[-1]))
+
+    def means(self, names: tuple[str, ...]) -> FloatArray:
+        """Averages of the signals as columns, as :meth:`table`."""
+        return self._table("averaged", names, self.averaged, self.rows, columns=True)
+
+    def bends(self, names: tuple[str, ...]) -> FloatArray:
+        """Second derivatives of these averages as columns, as :meth:`table`."""
+        return self._table("curved", names, self.curved, self.rows, columns=True)
+
+    def _table(
+        self,
+        kind: str,
+        names: tuple[str, ...],
+        signals: Mapping[str, FloatArray],
+        count: int,
+        *,
+        columns: bool = False,
+    ) -> FloatArray:
+        if (kind, names) not in self._tables:
+            out = np.zeros((len(names), count))
             for i, name in enumerate(names):
-                if name in self.points:
-                    out[i] = self.points[name]
-            self._tables[names] = out
-        return self._tables[names]
+                if name in signals:
+                    out[i] = signals[name]
+            self._tables[kind, names] = np.ascontiguousarray(out.T) if columns else out
+        return self._tables[kind, names]
 
     @cached_property
-    def _tables(self) -> dict[tuple[str, ...], FloatArray]:
+    def _tables(self) -> dict[tuple[str, tuple[str, ...]], FloatArray]:
         return {}
 
     def _sparse(self, order: int) -> Any:
@@ -463,7 +500,7 @@ def _pointwise(
         x = values[segment]
         inner = sliding_window_view(x, len(weights))[::1]
         centres = np.clip(np.arange(0, len(x), step) - half, 0, len(inner) - 1)
-        filtered = inner[centres] @ weights
+        filtered = _at(inner, centres, weights)
         soft.append(filtered)
         raw.append(x[::step] if order == 0 else filtered)
     if not raw:

@@ -2,32 +2,73 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, final
 
+from identification.data.schema import meant
 from identification.errors import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from casadi_models.parameter import Side
+
 KINDS: Final = ("rotary", "linear")
 
-_UNITS: Final[Mapping[str, tuple[str, str]]] = {
-    "motor_current": ("A", "A"),
-    "motor_torque": ("N.m", "N"),
-    "motor_voltage": ("V", "V"),
-    "motor_position": ("rad", "m"),
-    "motor_velocity": ("rad/s", "m/s"),
-    "motor_acceleration": ("rad/s2", "m/s2"),
-    "link_position": ("rad", "m"),
-    "link_velocity": ("rad/s", "m/s"),
-    "link_acceleration": ("rad/s2", "m/s2"),
-    "link_torque": ("N.m", "N"),
-    "coupling_torque": ("N.m", "N"),
-    "temperature": ("K", "K"),
-    "reference_position": ("rad", "m"),
-    "run": ("1", "1"),
-}
-CHANNELS: Final = tuple(_UNITS)
+
+@final
+@dataclass(frozen=True)
+class Channel:
+    """One channel of a record.
+
+    Attributes
+    ----------
+    name : str
+    rotary, linear : str
+        SI unit on a rotary joint and on a linear axis.
+    side : {"motor", "gear", "link", "none"}
+        Where it is measured.
+    meaning : str
+        A clause for the reader of the reference page.
+    """
+
+    name: str
+    rotary: str
+    linear: str
+    side: Side
+    meaning: str
+
+    def unit(self, kind: str) -> str:
+        """SI unit on an axis of this kind, ``"rotary"`` or ``"linear"``."""
+        return self.linear if kind == "linear" else self.rotary
+
+
+TIME: Final = Channel("time", "s", "s", "none", "time stamp of the row; required, may be uneven")
+_DECLARED: Final = (
+    Channel("motor_current", "A", "A", "motor", "current of the motor, torque-producing part"),
+    Channel("motor_torque", "N.m", "N", "motor", "torque on the motor shaft, in place of current"),
+    Channel("motor_voltage", "V", "V", "motor", "voltage of the drive, in place of a current"),
+    Channel("motor_position", "rad", "m", "motor", "reading of the motor's encoder"),
+    Channel("motor_velocity", "rad/s", "m/s", "motor", "velocity, where it is recorded"),
+    Channel("motor_acceleration", "rad/s2", "m/s2", "motor", "acceleration, where it is recorded"),
+    Channel("link_position", "rad", "m", "link", "reading of the link's encoder"),
+    Channel("link_velocity", "rad/s", "m/s", "link", "velocity, where it is recorded"),
+    Channel("link_acceleration", "rad/s2", "m/s2", "link", "acceleration, where it is recorded"),
+    Channel("link_torque", "N.m", "N", "link", "torque that the gear puts into the link"),
+    Channel(
+        "coupling_torque",
+        "N.m",
+        "N",
+        "link",
+        "torque on the link that is known from elsewhere (other axes), positive where it drives",
+    ),
+    Channel("temperature", "K", "K", "none", "temperature of the gear or its oil"),
+    Channel("reference_position", "rad", "m", "link", "what the controller wants the link to do"),
+    Channel("run", "1", "1", "none", "number of the run, where one file holds several"),
+)
+DECLARED: Final[Mapping[str, Channel]] = {c.name: c for c in _DECLARED}
+"""Every channel but time, by name."""
+CHANNELS: Final = tuple(DECLARED)
 
 
 def channel_unit(channel: str, kind: str = "rotary") -> str:
@@ -47,10 +88,11 @@ def channel_unit(channel: str, kind: str = "rotary") -> str:
     """
     if kind not in KINDS:
         raise InputError(f"kind is {kind!r}: it is 'rotary' or 'linear'")
-    if channel == "time":
-        return "s"
-    if channel not in _UNITS:
+    if channel == TIME.name:
+        return TIME.unit(kind)
+    if channel not in DECLARED:
         raise InputError(
             f"channel {channel!r} is not known: it is one of time, {', '.join(CHANNELS)}"
+            f"{meant(channel, (TIME.name, *CHANNELS))}"
         )
-    return _UNITS[channel][KINDS.index(kind)]
+    return DECLARED[channel].unit(kind)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Final, final
 
 from identification.data.formula import Formula
-from identification.data.plain_text import toml_string
+from identification.data.joint_schema import COLUMN
 from identification.data.units import base_unit, same_dimension
 from identification.errors import InputError
 
@@ -77,20 +77,15 @@ class Column:
 
     def toml(self) -> str:
         """Return ``channel = { column = ..., unit = ... }``."""
-        items = [
-            f"column = {toml_string(self.column)}"
-            if self.formula is None
-            else f"formula = {toml_string(self.formula.text)}"
-        ]
-        if self.channel != "run":
-            items.append(f"unit = {toml_string(self.unit)}")
-        if self.scale != 1.0:
-            items.append(f"scale = {self.scale!r}")
-        if self.sign != 1:
-            items.append(f"sign = {self.sign}")
-        if self.counts_per_turn is not None:
-            items.append(f"counts_per_turn = {self.counts_per_turn!r}")
-        return f"{self.channel} = {{ {', '.join(items)} }}"
+        values = {
+            "column": self.column if self.formula is None else None,
+            "formula": self.formula.text if self.formula is not None else None,
+            "unit": self.unit if self.channel != "run" else None,
+            "scale": self.scale if self.scale != 1.0 else None,
+            "sign": self.sign if self.sign != 1 else None,
+            "counts_per_turn": self.counts_per_turn,
+        }
+        return f"{self.channel} = {COLUMN.inline(values)}"
 
 
 @final

@@ -4,7 +4,6 @@ only ever shown.
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -12,6 +11,7 @@ from identification.data.channels import CHANNELS, channel_unit
 from identification.data.column import Column, header_unit, shown, split_unit
 from identification.data.formula import Formula, parse_formula
 from identification.data.guess import fragment, guess_columns
+from identification.data.joint_schema import COLUMN
 from identification.data.plain_text import from_toml, toml_string
 from identification.data.units import check_unit
 from identification.errors import InputError
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
 NAMES: Final = ("time", *CHANNELS)
-_KEYS: Final = frozenset({"column", "formula", "unit", "scale", "sign", "counts_per_turn", "step"})
 
 
 def channel_of(name: str) -> str | None:
@@ -178,33 +177,31 @@ def _entry(
     table: dict[str, Any] = (
         {"column": spec} if isinstance(spec, str) else dict(spec) if hasattr(spec, "keys") else {}
     )
-    if not table or (unknown := set(table) - _KEYS):
-        said = f"unknown key {', '.join(sorted(unknown))}" if table else f"{spec!r} is not a table"
+    if not table:
         raise InputError(
-            f"{where}: {said}: write {{ column = ... or formula = ..., unit = ..., scale, sign, "
-            f"counts_per_turn }}"
+            f"{where}: {spec!r} is not a table: write {{ column = ... or formula = ..., unit = "
+            f"..., scale, sign, counts_per_turn }}"
         )
-    step = _number(table, "step", where)
+    given = COLUMN.read(table, where)
+    step, sign, scale, counts, unit = (
+        given[k] for k in ("step", "sign", "scale", "counts_per_turn", "unit")
+    )
     if step is not None:
         if channel != "time" or step <= 0.0:
             raise InputError(
                 f"{where}: step {step!r} is for time only, and positive: give the sampling step"
             )
         return Column(
-            "time", "", _fitting(table.get("unit", "s"), wanted, None, channel), step=step
+            "time", "", _fitting("s" if unit is None else unit, wanted, None, channel), step=step
         )
-    formula = _formula(table, names, channel, where)
-    column = table.get("column") if formula is None else ""
-    if not isinstance(column, str) or (formula is None and column not in names):
+    formula = _formula(given, names, channel, where)
+    column = given["column"] if formula is None else ""
+    if formula is None and column not in names:
         raise InputError(f"{where}: no column {column!r} in the file: it has {shown(names)}")
-    sign = _number(table, "sign", where)
-    if sign not in {None, 1.0, -1.0}:
-        raise InputError(f"{where}: sign is {table['sign']!r}: it is 1 or -1")
-    scale = _number(table, "scale", where)
-    if scale is not None and (scale == 0.0 or not math.isfinite(scale)):
-        raise InputError(f"{where}: scale is {scale!r}: give a finite number that is not zero")
-    counts = _number(table, "counts_per_turn", where)
-    unit = table.get("unit")
+    if sign not in (1.0, -1.0):
+        raise InputError(f"{where}: sign is {sign!r}: it is 1 or -1")
+    if scale == 0.0:
+        raise InputError(f"{where}: scale is 0: give a number that is not zero")
     if unit is None and formula is None:
         own = recognise_quietly(column, kind, units.get(column))
         unit = (
@@ -214,7 +211,7 @@ def _entry(
         )
     if channel == "run":
         return Column("run", column, "1")
-    if not isinstance(unit, str):
+    if unit is None:
         said = f"column {column!r}" if formula is None else f"formula {formula.text!r}"
         raise InputError(
             f"{where}: {said} has no unit: add unit = {toml_string(wanted)}, or what it is in"
@@ -224,8 +221,8 @@ def _entry(
         channel,
         column,
         fitting,
-        1.0 if scale is None else scale,
-        -1 if sign == -1.0 else 1,
+        scale,
+        int(sign),
         counts,
         formula=formula,
     )
@@ -235,10 +232,10 @@ def _formula(
     table: Mapping[str, Any], names: Sequence[str], channel: str, where: str
 ) -> Formula | None:
     """The formula of an entry, None where it names a column."""
-    text = table.get("formula")
+    text = table["formula"]
     if text is None:
         return None
-    if "column" in table or not isinstance(text, str):
+    if table["column"] is not None:
         raise InputError(f'{where}: give either column = "..." or formula = "...", each a text')
     if channel == "run":
         raise InputError(f"{where}: runs are told by a column, not by a formula")
@@ -248,11 +245,7 @@ def _formula(
         raise InputError(f"{where}: {error}") from None
 
 
-def _fitting(unit: Any, wanted: str, counts: float | None, channel: str) -> str:
-    if not isinstance(unit, str):
-        raise InputError(
-            f"[columns] {channel}: unit {unit!r} must be text, for example {toml_string(wanted)}"
-        )
+def _fitting(unit: str, wanted: str, counts: float | None, channel: str) -> str:
     try:
         check_unit(unit, wanted, counts, channel)
     except InputError as error:
@@ -268,15 +261,6 @@ def _other_kind(unit: str, wanted: str, channel: str) -> str:
         if header_unit(unit.replace("/", "_"), channel_unit(channel, other))
         else ""
     )
-
-
-def _number(table: Mapping[str, Any], key: str, where: str) -> float | None:
-    value = table.get(key)
-    if value is None:
-        return None
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise InputError(f"{where}: {key} is {value!r}: give a number")
-    return float(value)
 
 
 def recognise_quietly(name: str, kind: str, unit: str | None = None) -> Column | None:

@@ -11,27 +11,24 @@ from typing import Any, Final, final
 from casadi_models import JointModel
 from casadi_models.term import INERTIAS
 from casadi_models.text.typed_law import TypedLaw
-from casadi_models.transmission import MODELS
+from identification.data.joint_schema import (
+    CALIBRATION,
+    FITTED,
+    JOINT,
+    KNOWN,
+    KNOWN_LINES,
+    PITCH,
+    PROVENANCE,
+)
 from identification.data.own_effects import TABLE, load_remembered, remembered
-from identification.data.plain_text import from_toml, toml_key, toml_string, toml_value
+from identification.data.plain_text import from_toml, toml_key, toml_value
+from identification.data.schema import Schema, meant
 from identification.data.typed_laws import LAWS, hold_laws, law_lines, read_laws
 from identification.data.units import base_unit, same_dimension
 from identification.errors import InputError
 
-_JOINT_KEYS: Final = frozenset(
-    (
-        "name",
-        "kind",
-        "gear_ratio",
-        "motor_constant",
-        "torque_per_current",
-        "torque_per_voltage",
-        "model",
-        "effects",
-        "virtual_work",
-    )
-)
-_KNOWN_KEYS: Final = ("value", "low", "high", "unit", "side", "source", "note")
+LARGEST_RATIO: Final = 1e75
+"""Its fourth power, that of cubic friction between motor side and link, is still a number."""
 _TABLES: Final = ("joint", "known", "columns", "fitted", "calibration", "provenance", TABLE, LAWS)
 
 
@@ -143,75 +140,67 @@ def parse_joint(data: Mapping[str, Any], source: str = "joint") -> Joint:
         if key not in _TABLES:
             raise InputError(
                 f"{source}: unknown table [{key}]; a joint file has [{'], ['.join(_TABLES)}]"
+                f"{meant(key, _TABLES)}"
             )
         if not isinstance(value, Mapping):
             raise InputError(f"{source}: {key} must be a table, as [{key}] on a line of its own")
     table = data.get("joint")
     if not isinstance(table, Mapping):
         raise InputError(f"{source}: no [joint] table; it needs at least gear_ratio and model")
-    for key in table:
-        if key not in _JOINT_KEYS:
-            raise InputError(
-                f"{source}: [joint] has an unknown key {key!r}; known: "
-                f"{', '.join(sorted(_JOINT_KEYS))}"
-            )
-    kind = str(table.get("kind", "rotary"))
-    if kind not in ("rotary", "linear"):
-        raise InputError(f"{source}: kind = {kind!r}; use 'rotary' or 'linear'")
-    ratio = _number(table, "gear_ratio", source, 1.0)
-    if ratio is None or ratio == 0:
+    given = JOINT.read(table, f"{source}: [joint]")
+    kind, ratio, constant, per_current = (
+        given[k] for k in ("kind", "gear_ratio", "motor_constant", "torque_per_current")
+    )
+    if ratio == 0:
         raise InputError(f"{source}: gear_ratio is 0; give theta_motor / theta_link with its sign")
-    constant = _number(table, "motor_constant", source, None)
-    per_current = _number(table, "torque_per_current", source, None)
-    if constant == 0 or per_current == 0:
+    if not 1 / LARGEST_RATIO < abs(ratio) < LARGEST_RATIO:
         raise InputError(
-            f"{source}: {'motor_constant' if constant == 0 else 'torque_per_current'} is 0; give "
-            "the torque per ampere"
+            f"{source}: gear_ratio = {ratio:g} is out of what can be computed with; give "
+            "theta_motor / theta_link"
         )
+    for key, per in (
+        ("motor_constant", "ampere"),
+        ("torque_per_current", "ampere"),
+        ("torque_per_voltage", "volt"),
+    ):
+        if given[key] == 0:
+            raise InputError(f"{source}: {key} is 0; give the torque per {per}")
     if constant is not None and per_current is not None:
         raise InputError(
             f"{source}: motor_constant and torque_per_current are both given; keep one of them"
         )
-    name = str(table.get("model", "hd1"))
-    if name not in MODELS:
-        raise InputError(f"{source}: model = {name!r} is not known; use one of {', '.join(MODELS)}")
-    effects = table.get("effects", [])
-    if not isinstance(effects, list) or not all(isinstance(e, str) for e in effects):
-        raise InputError(
-            f'{source}: effects must be a list of names, as effects = ["viscous", "coulomb"]'
-        )
+    if nought := next((e for e in given["effects"] if e.partition("#")[2] == "0"), None):
+        raise InputError(f"{source}: effect {nought!r} is not understood; the first is #1")
     if constant is not None and not 0 < abs(ratio * constant) < math.inf:
         raise InputError(
             f"{source}: gear_ratio times motor_constant is {ratio * constant:g}; correct one of "
             "them"
         )
+    fitted = {k: _fitted(k, v, source) for k, v in data.get("fitted", {}).items()}
     joint = Joint(
-        name=str(table.get("name", Path(source).stem)),
+        name=Path(source).stem if given["name"] is None else given["name"],
         kind=kind,
         gear_ratio=ratio,
         torque_per_current=ratio * constant if constant is not None else per_current,
-        torque_per_voltage=_number(table, "torque_per_voltage", source, None),
-        model_name=name,
-        effects=tuple(effects),
+        torque_per_voltage=given["torque_per_voltage"],
+        model_name=given["model"],
+        effects=given["effects"],
         columns=data.get("columns"),
-        virtual_work=_flag(table, "virtual_work", source),
+        virtual_work=given["virtual_work"],
         source=source,
-        fitted={k: _fitted(k, v, source) for k, v in data.get("fitted", {}).items()},
-        errors={
-            k: _entry_number(v, "stderr", f"{source}: [fitted] {k}")
-            for k, v in data.get("fitted", {}).items()
-            if "stderr" in v
-        },
+        fitted={k: v["value"] for k, v in fitted.items()},
+        errors={k: v["stderr"] for k, v in fitted.items() if v["stderr"] is not None},
         laws=read_laws(data.get(LAWS, {}), kind, source),
     )
     load_remembered(data.get(TABLE, {}), source)
     model = joint.model()
-    table = dict(data.get("known", {}))
+    table = data.get("known", {})
+    lines = KNOWN_LINES.names
     orders, pitch = (
-        _orders(table.pop("orders", []), source),
-        _pitch(table.pop("pitch", None), kind, source),
+        _orders(table.get("orders", []), source),
+        _pitch(table.get("pitch"), kind, source),
     )
-    known = {k: _known(k, v, model, source) for k, v in table.items()}
+    known = {k: _known(k, v, model, source) for k, v in table.items() if k not in lines}
     joint = replace(joint, fitted={**joint.fitted, **_added(joint.fitted, model)})
     for p in model.parameters:
         if p.name in joint.fitted and not p.low - 1e-9 <= joint.fitted[p.name] <= p.high + 1e-9:
@@ -256,32 +245,19 @@ def _pitch(entry: Any, kind: str, source: str) -> float | None:
         )
     table = entry if isinstance(entry, Mapping) else {"value": entry}
     where = f"{source}: [known] pitch"
-    if "value" not in table or not set(table) <= {"value", "unit"}:
+    if "value" not in table or not set(table) <= set(PITCH.names):
         raise InputError(
             f"{where} must be a number of metres, or a table, as pitch = {{ value = 10.0, unit = "
             f'"mm" }}'
         )
-    given = base_unit(str(table.get("unit", "m")))
+    read = PITCH.read(table, where)
+    given = base_unit(read["unit"])
     if not same_dimension(given, base_unit("m")):
-        raise InputError(f"{where} has unit {table['unit']!r}; it must be one like m")
-    found = _entry_number(table, "value", where) * given.factor
+        raise InputError(f"{where} has unit {read['unit']!r}; it must be one like m")
+    found = float(read["value"] * given.factor)
     if not 0 < found < math.inf:
         raise InputError(f"{where} = {found:g} m must be positive and finite")
     return found
-
-
-def _number(table: Mapping[str, Any], key: str, source: str, default: float | None) -> float | None:
-    value = table.get(key, default)
-    if value is None:
-        return None
-    if (
-        isinstance(value, bool)
-        or not isinstance(value, int | float)
-        or value != value
-        or abs(value) == float("inf")
-    ):
-        raise InputError(f"{source}: {key} = {value!r} is not a finite number")
-    return float(value)
 
 
 def _known(name: str, entry: Any, model: JointModel, source: str) -> Known:
@@ -290,7 +266,7 @@ def _known(name: str, entry: Any, model: JointModel, source: str) -> Known:
     if name not in parameters and name not in extra:
         raise InputError(
             f"{source}: [known] {name}: the model has no such parameter; it has "
-            f"{', '.join(sorted(parameters))}"
+            f"{', '.join(sorted(parameters))}{meant(name, (*parameters, *extra))}"
         )
     if isinstance(entry, int | float):
         entry = {"value": entry}
@@ -298,32 +274,22 @@ def _known(name: str, entry: Any, model: JointModel, source: str) -> Known:
         raise InputError(
             f"{source}: [known] {name} must be a number or a table with value, or low and high"
         )
+    given = KNOWN.read(entry, f"{source}: [known] {name}")
     unit = parameters[name].unit if name in parameters else extra[name]
     scale = 1.0
-    if "unit" in entry:
-        given, wanted = base_unit(str(entry["unit"])), base_unit(unit)
-        if not same_dimension(given, wanted):
+    if given["unit"] is not None:
+        try:
+            own, wanted = base_unit(given["unit"]), base_unit(unit)
+        except InputError as error:
+            raise InputError(f"{source}: [known] {name}: {error}") from None
+        if not same_dimension(own, wanted):
             raise InputError(
-                f"{source}: [known] {name} has unit {entry['unit']!r}; it must be one like {unit}"
+                f"{source}: [known] {name} has unit {given['unit']!r}; it must be one like {unit}"
             )
-        scale = given.factor / wanted.factor
-    if entry.get("side") == "motor":
-        scale *= model.side_factor(name)
-    for key in entry:
-        if key not in _KNOWN_KEYS:
-            raise InputError(
-                f"{source}: [known] {name} has an unknown key {key!r}; known: "
-                f"{', '.join(_KNOWN_KEYS)}"
-            )
-    if entry.get("side", "link") not in ("motor", "link", "gear", "sensor", "none"):
-        raise InputError(
-            f"{source}: [known] {name} has side = {entry['side']!r}; use 'motor' or 'link'"
-        )
-    values = {
-        k: _entry_number(entry, k, f"{source}: [known] {name}") * scale
-        for k in ("value", "low", "high")
-        if k in entry
-    }
+        scale = own.factor / wanted.factor
+    if given["side"] == "motor":
+        scale *= _on_link(name, model, source)
+    values = {k: given[k] * scale for k in ("value", "low", "high") if given[k] is not None}
     if not values:
         raise InputError(f"{source}: [known] {name} has neither value nor low nor high")
     if not all(map(math.isfinite, values.values())):
@@ -352,26 +318,29 @@ def _known(name: str, entry: Any, model: JointModel, source: str) -> Known:
     return Known(**values)
 
 
-def _entry_number(entry: Mapping[str, Any], key: str, where: str) -> float:
-    value = entry[key]
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(f"{where}: {key} = {value!r} is not a finite number")
-    return float(value)
+def _on_link(name: str, model: JointModel, source: str) -> float:
+    """What refers a motor-side value to the link."""
+    term = next((t for t in model.terms if name in t.names), None)
+    if term is not None and term.effect.table is not None and model.gear_ratio < 0:
+        raise InputError(
+            f"{source}: [known] {name} is one knot of a curve, and with a negative gear ratio "
+            "the curve of the motor side runs the other way: give its values on the link side"
+        )
+    return model.side_factor(name)
 
 
-def _fitted(name: str, entry: Any, source: str) -> float:
+def _fitted(name: str, entry: Any, source: str) -> dict[str, Any]:
     if not isinstance(entry, Mapping) or "value" not in entry:
         raise InputError(
             f"{source}: [fitted] {name} must be a table with value, as {name} = {{ value = 1.0 }}"
         )
-    return _entry_number(entry, "value", f"{source}: [fitted] {name}")
-
-
-def _flag(table: Mapping[str, Any], key: str, source: str) -> bool:
-    value = table.get(key, True)
-    if not isinstance(value, bool):
-        raise InputError(f"{source}: {key} = {value!r}; use true or false")
-    return value
+    given = FITTED.read(entry, f"{source}: [fitted] {name}")
+    if given["stderr"] is not None and given["stderr"] < 0:
+        raise InputError(
+            f"{source}: [fitted] {name}: stderr = {given['stderr']:g} is below zero; correct it or "
+            "leave it out"
+        )
+    return given
 
 
 def toml_text(
@@ -387,62 +356,45 @@ def toml_text(
     The calibration is a note: another record has its own. Labels of effects `outside` of a user's
     FMU have their files remembered too.
     """
-    lines = [
-        "[joint]",
-        f"name = {toml_string(joint.name)}",
-        f'kind = "{joint.kind}"',
-        f"gear_ratio = {joint.gear_ratio!r}",
-    ]
-    if joint.torque_per_current is not None:
-        lines.append(f"torque_per_current = {joint.torque_per_current!r}")
-    if joint.torque_per_voltage is not None:
-        lines.append(f"torque_per_voltage = {joint.torque_per_voltage!r}")
-    lines += [f'model = "{joint.model_name}"', f"effects = {toml_value(joint.effects)}"]
-    if not joint.virtual_work:
-        lines.append("virtual_work = false")
+    head = {
+        "name": joint.name,
+        "kind": joint.kind,
+        "gear_ratio": joint.gear_ratio,
+        "torque_per_current": joint.torque_per_current,
+        "torque_per_voltage": joint.torque_per_voltage,
+        "model": joint.model_name,
+        "effects": joint.effects,
+        "virtual_work": None if joint.virtual_work else False,
+    }
+    lines = ["[joint]", *JOINT.lines(head)]
     lines += law_lines(joint.laws)
     lines += remembered((*joint.effects, *outside))
     if joint.known or joint.orders or joint.pitch is not None:
         lines += ["", "[known]"]
-        if joint.orders:
-            lines.append(f"orders = [{', '.join(repr(h) for h in joint.orders)}]")
-        if joint.pitch is not None:
-            lines.append(f"pitch = {joint.pitch!r}")
+        lines += KNOWN_LINES.lines({"orders": joint.orders or None, "pitch": joint.pitch})
         for name, known in joint.known.items():
-            parts = [
-                f"{k} = {getattr(known, k)!r}"
-                for k in ("value", "low", "high")
-                if getattr(known, k) is not None
-            ]
-            lines.append(f"{name} = {{ {', '.join(parts)} }}")
+            values = {"value": known.value, "low": known.low, "high": known.high}
+            lines.append(f"{name} = {KNOWN.inline(values)}")
     if joint.columns:
         lines += ["", "[columns]"]
         for channel, entry in joint.columns.items():
             lines.append(f"{toml_key(channel)} = {toml_value(entry)}")
     if parameters:
-        lines += ["", "[fitted]"]
-        for name, p in parameters.items():
-            error = f", stderr = {p['stderr']:.6g}" if p.get("stderr") is not None else ""
-            lines.append(
-                f'{name} = {{ value = {p["value"]:.10g}{error}, unit = "{p["unit"]}", side = '
-                f'"{p["side"]}" }}'
-            )
+        lines += ["", "[fitted]", *_entries(FITTED, parameters)]
     if calibration:
-        lines += ["", "[calibration]"]
-        for name, c in calibration.items():
-            error = f", stderr = {c['stderr']:.6g}" if c.get("stderr") is not None else ""
-            lines.append(
-                f"{toml_string(name)} = {{ value = {c['value']:.10g}{error}, "
-                f'unit = "{c["unit"]}" }}'
-            )
+        lines += ["", "[calibration]", *_entries(CALIBRATION, calibration)]
     if provenance:
-        lines += [
-            "",
-            "[provenance]",
-            *(f"{toml_key(k)} = {toml_string(v)}" for k, v in provenance.items()),
-        ]
+        lines += ["", "[provenance]", *PROVENANCE.lines(provenance)]
     text = "\n".join(lines) + "\n"
     from_toml(
         text, f"{joint.source or joint.name}, as it would be written"
     )  # it may replace the file it came from
     return text
+
+
+def _entries(schema: Schema, entries: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """One line for each name of a table; what the table has no key for is left out."""
+    return [
+        f"{toml_key(name)} = {schema.inline({k: v for k, v in e.items() if k in schema.names})}"
+        for name, e in entries.items()
+    ]

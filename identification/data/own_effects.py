@@ -18,7 +18,8 @@ from typing import Any, Final
 
 from casadi_models import EFFECTS
 from casadi_models.effect import EffectFile
-from identification.data.plain_text import toml_string, toml_value
+from identification.data.joint_schema import OWN_EFFECTS
+from identification.data.plain_text import toml_string
 from identification.errors import InputError
 
 TABLE: Final = "own_effects"
@@ -45,8 +46,8 @@ def remembered(labels: Iterable[str]) -> list[str]:
     """The lines of a joint file that name the files of these effects."""
     lines, used = [], _keys(labels)
     for found in (f for f in EFFECTS.files if used & set(f.keys)):
-        entry = {"sha256": found.sha256, "keys": found.keys}
-        lines.append(f"{toml_string(str(found.path))} = {toml_value(entry)}")
+        entry = OWN_EFFECTS.inline({"sha256": found.sha256, "keys": found.keys})
+        lines.append(f"{toml_string(str(found.path))} = {entry}")
     return ["", f"[{TABLE}]", *lines] if lines else []
 
 
@@ -64,6 +65,8 @@ def register(name: str | Path) -> EffectFile:
             f"{path}: no such file; --effects takes a Python file that declares effects"
         )
     found = _loaded(path, _content(path))
+    if not found.keys:
+        raise InputError(f"{path}: declares no effect; see docs/extending.md for how to")
     _remember(found.sha256)
     return found
 
@@ -123,7 +126,10 @@ def _place(name: str, source: str) -> Path:
     """Where the file lies: as named, or beside the joint file."""
     folder = Path(source).parent
     places = [folder / name, folder / Path(name.replace("\\", "/")).name]
-    found = next((p for p in places if p.is_file()), None)
+    try:
+        found = next((p for p in places if p.is_file()), None)
+    except OSError:  # a name that no disk can hold
+        found = None
     if found is None:
         raise InputError(
             f"{source}: its effect file {name} is not there; give the file with --effects FILE"
@@ -154,10 +160,9 @@ def _loaded(path: Path, content: bytes) -> EffectFile:
                 "ignore"
             )  # Python's own remarks on the text; what matters is an error
             return EFFECTS.load_code(path, content)
-    except (
-        Exception,
-        SystemExit,
-    ) as error:  # a user's file may fail in any way, or end the program
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # a user's file may fail in any way, or end the program
         raise InputError(
             f"{path}: cannot be used as effects ({type(error).__name__}: {error})"
         ) from None

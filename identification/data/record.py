@@ -97,7 +97,8 @@ def _restarts(time: FloatArray) -> IntArray:
     out = np.zeros(time.shape, dtype=np.int64)
     if time.ndim != 1 or time.size < 2:
         return out
-    steps = np.diff(time)
+    with np.errstate(invalid="ignore"):  # stamps that are infinite
+        steps = np.diff(time)
     back = np.flatnonzero(steps < 0.0) + 1
     if not back.size:
         return out
@@ -284,7 +285,8 @@ class Record:
     @property
     def duration(self) -> float:
         """Measured time [s]: the sum over segments of last stamp minus first."""
-        return float(sum(self.time[s.stop - 1] - self.time[s.start] for s in self.segments()))
+        with np.errstate(invalid="ignore"):  # stamps that are infinite
+            return float(sum(self.time[s.stop - 1] - self.time[s.start] for s in self.segments()))
 
     def take(self, rows: slice | npt.NDArray[np.bool_] | IntArray, *notes: str) -> Record:
         """Return the record of some rows; a stretch interrupted by left-out rows becomes several

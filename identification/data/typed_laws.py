@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from casadi_models.text.typed_law import LawError, TypedLaw, register
+from identification.data.joint_schema import LAW
 from identification.errors import InputError
 
 LAWS: Final = "laws"
@@ -36,7 +37,7 @@ def read_laws(table: Any, kind: str, source: str) -> dict[str, TypedLaw]:
     found = {}
     for key, entry in table.items():
         where = f"{source}: [{LAWS}] {key}"
-        if not isinstance(entry, Mapping) or set(entry) != {"law", "on", "parameters"}:
+        if not isinstance(entry, Mapping) or set(entry) != set(LAW.names):
             raise InputError(f"{where} must be a table {_ENTRY}")
         places, parameters = entry["on"], entry["parameters"]
         lists = all(
@@ -66,14 +67,10 @@ def hold_laws(laws: Mapping[str, TypedLaw], source: str) -> None:
 
 def law_lines(laws: Mapping[str, TypedLaw]) -> list[str]:
     """The lines of a joint file that hold these laws."""
-    lines = []
-    for key, law in laws.items():
-        places, parameters = (
-            ", ".join(f'"{x}"' for x in own) for own in (law.places, law.parameters)
-        )
-        lines.append(
-            f'{key} = {{ law = "{law.text}", on = [{places}], parameters = [{parameters}] }}'
-        )
+    lines = [
+        f"{key} = {LAW.inline({'law': w.text, 'on': w.places, 'parameters': w.parameters})}"
+        for key, w in laws.items()
+    ]
     return ["", f"[{LAWS}]", *lines] if lines else []
 
 

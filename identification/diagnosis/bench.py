@@ -13,14 +13,23 @@ from identification.balance.sensing import Sensing
 from identification.data.joint_file import Joint
 from identification.data.record import Record
 from identification.diagnosis.candidates import offered
-from identification.diagnosis.claims import Ranking, rank
+from identification.diagnosis.claims import Claim, Ranking, rank
+from identification.diagnosis.curve import Curve
 from identification.diagnosis.improvement import Step, visible_keys
-from identification.diagnosis.learned import LearnedClaim, learned_claims
+from identification.diagnosis.learned import (
+    Doubt,
+    Equivalence,
+    LearnedClaim,
+    artefacts,
+    equivalences,
+    learned_claims,
+)
 from identification.diagnosis.lines import Line, find_lines, orders_of
 from identification.diagnosis.locate import Unexplained, locate
 from identification.diagnosis.trials import Base, Trial, make_base, try_candidate
 from identification.fitting.assess import RATIO_LIMIT, VERDICT_KERNELS, BalanceError, Error, assess
 from identification.fitting.engine import Dataset, Solution, load_dataset, prepared_model, solve
+from identification.fitting.first_fit import first_fit
 
 Progress = Callable[[str, float], None]
 
@@ -78,6 +87,12 @@ class Bench(Protocol):
     def learned(self, step: Step, error: Error) -> tuple[LearnedClaim, ...]:
         """Curves over one variable of what is left in the balances over their floor."""
 
+    def held_against(self, claims: Sequence[Claim], step: Step) -> Mapping[str, Equivalence]:
+        """The names of claims against curves over their own variables, by label."""
+
+    def artefacts(self, step: Step, curves: Sequence[Curve], start: Step) -> tuple[Doubt, ...]:
+        """Reasons why the parameters of a model cannot be those of its laws."""
+
     def same_sign(self, trial: Trial, solution: Solution) -> bool:
         """Whether a small effect has the same sign at half and at double kernel."""
 
@@ -109,11 +124,12 @@ class JointBench:
         self._train, self._held = list(train), list(held)
         self._solved: dict[tuple[object, ...], Solution] = {}
         self._ratios: dict[tuple[int, bool], tuple[Solution, dict[str, BalanceError]]] = {}
+        self._equal: dict[tuple[object, ...], tuple[Solution, dict[str, Equivalence]]] = {}
         self._kernels: dict[float, Dataset] = {round(data.kernel, 9): data}
 
     def start(self) -> Solution:
         """The fit of the joint's own model."""
-        return solve(prepared_model(self.joint, self._train[0]), self.data)
+        return first_fit(prepared_model(self.joint, self._train[0]), self.data)
 
     def fitted(
         self, model: JointModel, start: Mapping[str, float], *, again: bool = False
@@ -217,6 +233,18 @@ class JointBench:
     def learned(self, step: Step, error: Error) -> tuple[LearnedClaim, ...]:
         """See :func:`identification.diagnosis.learned.learned_claims`."""
         return learned_claims(step.solution, self.data, error, RATIO_LIMIT)
+
+    def held_against(self, claims: Sequence[Claim], step: Step) -> Mapping[str, Equivalence]:
+        """See :func:`identification.diagnosis.learned.equivalences`; worked out once a model."""
+        mark = (id(step.solution), tuple(c.label for c in claims))
+        if mark not in self._equal:
+            # the solution is kept with its answer: its identity is not given to another one
+            self._equal[mark] = step.solution, equivalences(claims, step.solution, self.data)
+        return self._equal[mark][1]
+
+    def artefacts(self, step: Step, curves: Sequence[Curve], start: Step) -> tuple[Doubt, ...]:
+        """See :func:`identification.diagnosis.learned.artefacts`."""
+        return artefacts(step.solution, self.data, curves, start.solution)
 
     def same_sign(self, trial: Trial, solution: Solution) -> bool:
         """A minor effect must have the same sign at half and at double kernel."""

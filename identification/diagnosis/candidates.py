@@ -20,6 +20,10 @@ from identification.balance.sensing import Sensing
 WARM_UP: Final = 15.0
 """Shortest run in which a warm-up is looked for without a temperature channel [s]."""
 
+UNSEEN_TURN: Final = (
+    "counts from where the motor turns, and the twist of the gear hides that; record motor_position"
+)
+
 
 @final
 @dataclass(frozen=True)
@@ -135,6 +139,11 @@ def offered(
             and (data.joint.kind == "linear" or _turns(data) < 2)
         ):
             places = []
+        if effect.memory is not None and "motor" in places and turns_unseen(data):
+            places.remove("motor")
+            if not places:
+                refused.append(NotTestable(effect.key, UNSEEN_TURN))
+                continue
         if not places:
             refused.append(
                 NotTestable(
@@ -159,6 +168,11 @@ def offered(
                 continue
             out.extend(_placed(effect, place, model))
     return out, refused
+
+
+def turns_unseen(data: Dataset) -> bool:
+    """Whether the motor turns where nobody sees it: behind a gear, the link alone recorded."""
+    return data.sensing.moving == "link_position" and abs(data.joint.gear_ratio) != 1.0
 
 
 def _shortest(data: Dataset) -> float:

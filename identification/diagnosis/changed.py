@@ -30,7 +30,7 @@ from identification.diagnosis.candidates import observable
 from identification.diagnosis.claims import FALSE_DISCOVERY, GAIN, LARGEST_SET
 from identification.errors import InputError
 from identification.fitting.assess import Error, assess
-from identification.fitting.covariance import FEWEST_BLOCKS, RANK, errors_of_blocks
+from identification.fitting.covariance import FEWEST_BLOCKS, errors_of_blocks, inverse
 from identification.fitting.engine import Solution, solve, stack
 from identification.fitting.start_values import bounds_of
 from identification.fitting.weak_form import WeakForm
@@ -624,7 +624,7 @@ class _Point:
         """Step to the minimum of rows with these normal equations, the others held; (p,)."""
         step = np.zeros(len(total) - 1)
         if len(free):
-            step[list(free)] = -_inverse(total[np.ix_(free, free)]) @ total[list(free), -1]
+            step[list(free)] = -inverse(total[np.ix_(free, free)]) @ total[list(free), -1]
         return step
 
     def squares(self, moved: Sequence[int]) -> FloatArray:
@@ -697,7 +697,7 @@ class _Point:
         scores = (grams[:, :-1, -1] + grams[:, :-1, :-1] @ step)[:, free]
         grams = grams[:, :-1, :-1]
         pulled = (
-            -_inverse(total[np.ix_(free, free)])
+            -inverse(total[np.ix_(free, free)])
             @ total[np.ix_(free, held)]
             * self.search.spread[held]
         )
@@ -717,16 +717,6 @@ class _Point:
         out = np.full(len(self.x), np.inf)
         out[self.search.free(moved)] = self.free_errors(moved)
         return out
-
-
-def _inverse(gram: FloatArray) -> FloatArray:
-    """Inverse of normal equations, columns scaled alike; directions that are rounding stay."""
-    size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-    return np.asarray(
-        np.linalg.pinv(gram / np.outer(size, size), rcond=RANK, hermitian=True)
-        / np.outer(size, size),
-        dtype=np.float64,
-    )
 
 
 def _two_sided(z: float) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 import numpy.typing as npt
@@ -20,8 +20,10 @@ from identification.diagnosis.session import refuse_unlike
 from identification.fitting.assess import Error, assess
 from identification.fitting.engine import load_dataset, stack
 from identification.fitting.fit import Fit
-from identification.linear.ceiling import Ceiling, ceiling
 from identification.representation import html_of
+
+if TYPE_CHECKING:
+    from identification.linear.ceiling import Ceiling
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -150,7 +152,11 @@ def compare(fitted: Fit, records: Record | Sequence[Record], *, linear: bool = T
     worst = _worst(time, np.asarray(power), stretch)
     unseen = not any(_same(r, seen) for r in given for seen in fitted.records)
     floor = {b: e.floor for b, e in error.balances.items()}
-    above = ceiling(fitted.data, data.train, residual, floor, unseen=unseen) if linear else None
+    above = None
+    if linear:  # the one place that fits models without physics: no other verb loads them
+        from identification.linear.ceiling import ceiling
+
+        above = ceiling(fitted.data, data.train, residual, floor, unseen=unseen)
     return Comparison(
         ", ".join(r.name for r in given),
         error,

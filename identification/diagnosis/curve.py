@@ -9,7 +9,7 @@ time.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import SimpleNamespace
@@ -32,7 +32,7 @@ from identification.balance.stacked import stack
 from identification.balance.weak import WeakRecord
 from identification.diagnosis.candidates import OBSERVED_BY, Candidate
 from identification.diagnosis.places import student
-from identification.diagnosis.trials import Base, columns, make_base
+from identification.diagnosis.trials import Base, columns, make_base, span_of
 from identification.fitting.covariance import NORMAL
 
 FloatArray = npt.NDArray[np.float64]
@@ -589,7 +589,18 @@ def find_curves(
     certain : bool
         False: the best curves are given even where they gain little.
     """
-    base = steadily_moving(base)
+    return curves_on(steadily_moving(base), balance, only, most=most, certain=certain)
+
+
+def curves_on(
+    base: Base,
+    balance: str,
+    only: Callable[[Candidate], bool] | None = None,
+    *,
+    most: int = MOST_CURVES,
+    certain: bool = True,
+) -> Located:
+    """As `find_curves`, on a base from `steadily_moving`."""
     where = base.balances.index(balance)
     evaluate = _unweighted(base)
     candidates = [c for c in _candidates(base, balance) if only is None or only(c)]
@@ -611,6 +622,43 @@ def find_curves(
             chosen, now = kept, _system(base, kept, where)
             gains = [_alone(base, chosen, t, now) for t in chosen]
     return _located(base, balance, chosen, gains, (bare, now))
+
+
+def squares_left(base: Base, balance: str) -> FloatArray:
+    """Cross-validated squares of each block of a balance without any curve, (blocks,)."""
+    return _system(base, (), base.balances.index(balance)).crossed
+
+
+def lacking(base: Base, labels: Collection[str]) -> Base:
+    """The base without some terms of its model: their torque goes back into the residual, the
+    rest is fitted anew by whoever solves it.
+    """
+    solution, data = base.solution, base.data
+    terms = [t for t in solution.model.terms if t.label in labels]
+    gone = {n for t in terms for n in t.names}
+    absent = {
+        n: 0.0
+        for t in terms
+        for n, p in zip(t.names, t.effect.parameters, strict=True)
+        if not p.is_shape
+    }
+    balances = balances_of(solution.model, data.sensing, wrt=())
+    values = solution.values
+    with_them, without_them = (
+        stack(balances, data.train, v).residual for v in (values, {**values, **absent})
+    )
+    torque = np.concatenate([without_them[b] - with_them[b] for b in base.balances])
+    kept = [i for i, n in enumerate(base.names) if n not in gone]
+    jacobian = base.jacobian[:, kept]
+    return replace(
+        base,
+        residual=base.residual + torque * base.weight,
+        jacobian=jacobian,
+        orthonormal=span_of(jacobian),
+        names=tuple(base.names[i] for i in kept),
+        norms=base.norms[kept],
+        held_jacobian=base.held_jacobian[:, kept],
+    )
 
 
 def _simplest(trials: Sequence[tuple[_Tried, _System]]) -> tuple[_Tried, _System]:
@@ -821,4 +869,16 @@ def _of_base(
     return total, slopes
 
 
-__all__ = ["Curve", "Gain", "Located", "basis", "find_curves", "gain", "penalty", "steadily_moving"]
+__all__ = [
+    "Curve",
+    "Gain",
+    "Located",
+    "basis",
+    "curves_on",
+    "find_curves",
+    "gain",
+    "lacking",
+    "penalty",
+    "squares_left",
+    "steadily_moving",
+]

@@ -11,17 +11,27 @@ from typing import Any, Final, final
 import numpy as np
 import numpy.typing as npt
 
-from casadi_models import EFFECTS, JointModel
-from identification.balance.dataset import Dataset, without
+from casadi_models import EFFECTS, Effect, JointModel
+from casadi_models.table import Table
+from identification.balance.dataset import Dataset
 from identification.balance.stacked import sticking_torque
 from identification.diagnosis.candidates import Candidate
 from identification.diagnosis.claims import Claim
-from identification.diagnosis.curve import Curve, Gain, find_curves, gain
+from identification.diagnosis.curve import (
+    Curve,
+    Gain,
+    curves_on,
+    find_curves,
+    gain,
+    lacking,
+    squares_left,
+    steadily_moving,
+)
 from identification.diagnosis.places import AXIS_TITLES, Branch, Place
 from identification.diagnosis.trials import Base, make_base
 from identification.fitting.assess import Error
 from identification.fitting.covariance import block_errors
-from identification.fitting.engine import Solution, solve
+from identification.fitting.engine import Solution
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -36,6 +46,11 @@ OVERLAP: Final = 2.5
 """Rows that count as one: four of them overlap in a kernel that tapers."""
 ALIKE: Final = 0.05
 """Share missed up to which a law is still said to be like the name."""
+FEWER: Final = 0.4
+"""Numbers that names of one variable may have together, as a share of the curve's freedom: with
+more, a sum of laws imitates the curve."""
+HALF: Final = 0.5
+"""Share missed from which a curve over any variable, and not the name, is what is missing."""
 OUTSIDE: Final = 2.0
 """Standard errors by which a parameter must want to pass its bound."""
 
@@ -181,16 +196,36 @@ class Equivalence:
         Share of the explained squares.
     sentence : str
         "NAME"; "like NAME, which explains 97 %"; or that it is not the name.
+    curve : Curve or None
+        The curve beside the name, where it certainly gains.
+    own : bool
+        False where the law is no curve over one variable: the best curve of any may then show
+        something else that is missing beside it.
+    beaten : bool
+        True where more than one name of one variable share the work of a curve that is simpler.
     """
 
     share_missed: float
     stderr: float
     sentence: str
+    curve: Curve | None = None
+    beaten: bool = False
+    own: bool = True
 
     @property
     def is_name(self) -> bool:
-        """True where the name is shown to be as good as the curve."""
-        return self.share_missed + ONE_SIDED * self.stderr < EQUIVALENT
+        """True where the name is shown to be as good as the curve, and nothing shows that it is
+        not.
+        """
+        if not self.own:
+            return not self.is_wrong
+        small = self.share_missed + ONE_SIDED * self.stderr < EQUIVALENT
+        return small and not self.beaten and self.curve is None
+
+    @property
+    def is_wrong(self) -> bool:
+        """True where the curve shows that the law is another one."""
+        return self.curve is not None and self.share_missed > (ALIKE if self.own else HALF)
 
     def as_json(self) -> dict[str, Any]:
         """As data."""
@@ -198,51 +233,94 @@ class Equivalence:
 
 
 def equivalence(claim: Claim, solution: Solution, data: Dataset) -> Equivalence | None:
-    """The name of a claim against the best curve over the variables that its law reads.
+    """The name of a claim against the best curve over the variables that its law reads; None where
+    the effect is not in the model, or no curve can be held against it.
+    """
+    return equivalences([claim], solution, data).get(claim.label)
+
+
+def equivalences(
+    claims: Sequence[Claim], solution: Solution, data: Dataset
+) -> dict[str, Equivalence]:
+    """The names of claims against the best curves over the variables that their laws read.
 
     A test that merely fails to reject a name has no power: the share that the name misses, with its
-    error, must be shown to be small.
+    error, must be shown to be small. Names of one variable are held against its curve together: a
+    sum of laws must also need far fewer numbers than the curve.
 
     Parameters
     ----------
-    claim : Claim
-        One whose effect is in the model.
+    claims : sequence of Claim
+        Those whose effect hardly a joint is without, or that is not in the model, are left out.
     solution : Solution
-        Fit of the model with it.
+        Fit of the model with all of them.
     data : Dataset
 
     Returns
     -------
-    Equivalence or None
-        None where the effect cannot be taken out alone, or no curve has its variable.
+    dict of label to Equivalence
     """
-    model = without(solution.model, claim.label)
-    if model.terms == solution.model.terms:
-        return None
-    named = make_base(solution, data)
-    less = solve(model, data, start=solution.values)
-    # the same rows with the same weights, so that the squares compare
-    bare = make_base(replace(less, weights=solution.weights, sigma=solution.sigma), data)
-    place = next(t.place for t in solution.model.terms if t.label == claim.label)
-    reads = EFFECTS[claim.effects[0]].reads
+    places = {t.label: t.place for t in solution.model.terms}
+    groups: dict[tuple[str, str, str], list[Claim]] = {}
+    for c in claims:
+        if c.label in places and c.effect.stage == "law" and not c.effect.common:
+            over = variable_of(c.effect)
+            mark = (places[c.label], over or c.label, c.balance)
+            groups.setdefault(mark, []).append(c)
+    if not groups:
+        return {}
+    named = steadily_moving(make_base(solution, data))
+    out: dict[str, Equivalence] = {}
+    for (place, _, balance), group in groups.items():
+        found = _held_against(group, place, balance, named)
+        if found is not None:
+            out |= {c.label: found for c in group}
+    return out
+
+
+def variable_of(effect: Effect) -> str:
+    """The variable over which a law is a curve; empty where it is none of one variable."""
+    if effect.memory is not None:
+        return ""
+    own = {t.over for t in _tables() if t.over in effect.reads}
+    if len(own) == 1:
+        return own.pop()
+    return "velocity" if effect.reads == {"direction"} else ""
+
+
+def _tables() -> list[Table]:
+    return [e.table for e in EFFECTS.values() if e.table is not None]
+
+
+def _held_against(
+    group: Sequence[Claim], place: str, balance: str, named: Base
+) -> Equivalence | None:
+    over = variable_of(group[0].effect)
+    one_balance = balance in ("axis", "sum")
 
     def own(candidate: Candidate) -> bool:
         table = candidate.effect.table
-        if table is None or candidate.place != place:
+        if table is None or not (one_balance or candidate.place == place):
             return False
-        return table.over in reads and table.odd == ("direction" in reads or table.of_speed)
+        return not over or table.over == over
 
-    before = find_curves(bare, claim.balance, lambda c: False).before
-    beside = find_curves(named, claim.balance, own, most=1, certain=False)
+    beside = curves_on(named, balance, own, most=1, certain=False)
     if not beside.curves:
         return None
-    return _missed(
-        before,
-        beside.before,
-        beside.after,
-        EFFECTS[claim.effects[0]].title,
-        _rows(named, claim.balance),
-    )
+    bare = lacking(named, {c.label for c in group})
+    title = " and ".join(c.effect.title for c in group)
+    before, rows = squares_left(bare, balance), _rows(named, balance)
+    found = replace(_missed(before, beside.before, beside.after, title, rows), own=bool(over))
+    if beside.gain.is_certain:
+        said = found.sentence if found.share_missed > ALIKE else _like(title, found.share_missed)
+        found = replace(found, curve=beside.curves[0], sentence=said)
+    if len(group) > 1 and over:
+        alone = curves_on(bare, balance, own, most=1, certain=False).curves[0]
+        labels = {c.label for c in group}
+        names = {n for t in named.solution.model.terms if t.label in labels for n in t.names}
+        if len(names & set(named.names)) > FEWER * alone.freedom:
+            found = replace(found, beaten=True, sentence=_like(title, found.share_missed))
+    return found
 
 
 def _rows(base: Base, balance: str) -> int:
@@ -257,25 +335,52 @@ def _missed(
     curve beside it.
     """
     explained = max(float(before.sum() - min(curve.sum(), name.sum())), 1e-300)
-    share = max(float(name.sum() - curve.sum()), 0.0) / explained
+    share = min(max(float(name.sum() - curve.sum()), 0.0) / explained, 1.0)
     found: Gain = gain(name, curve)
     least = LEAST_ERROR * float(name.sum()) / (rows / OVERLAP) / explained
     stderr = max(share / found.t if found.t > 0 else 0.0, least)
-    explains = f"{100 * max(1 - share, 0.0):.3g} %"
-    sentence = f"like {title}, which explains {explains}"
+    sentence = _like(title, share)
     if share + ONE_SIDED * stderr < EQUIVALENT:
         sentence = title
-    elif share > ALIKE:
+    elif share - ONE_SIDED * stderr < EQUIVALENT:
+        sentence = f"{title} or a law like it"
+    elif share - ONE_SIDED * stderr > ALIKE:
         sentence = (
-            f"not {title}, which explains {explains} of what a curve over its own variable does"
+            f"not {title}, which explains {100 * (1 - share):.3g} % of what a curve over its own "
+            "variable does"
         )
     return Equivalence(share, stderr, sentence)
+
+
+def _like(title: str, share: float) -> str:
+    return f"like {title}, which explains {100 * (1 - share):.3g} %"
 
 
 # --- what forbids "complete" ----------------------------------------------------------------------
 
 
-def artefacts(solution: Solution, data: Dataset, curves: Sequence[Curve] = ()) -> tuple[str, ...]:
+@final
+@dataclass(frozen=True)
+class Doubt:
+    """A parameter that cannot be that of its law.
+
+    Attributes
+    ----------
+    place : str
+        Where its law acts; empty where it is no law's.
+    sentence : str
+    """
+
+    place: str
+    sentence: str
+
+
+def artefacts(
+    solution: Solution,
+    data: Dataset,
+    curves: Sequence[Curve] = (),
+    start: Solution | None = None,
+) -> tuple[Doubt, ...]:
     """Reasons why the parameters of a model cannot be those of its laws: any of them forbids
     ``complete``.
 
@@ -285,18 +390,42 @@ def artefacts(solution: Solution, data: Dataset, curves: Sequence[Curve] = ()) -
     data : Dataset
     curves : sequence of Curve
         From :func:`identification.diagnosis.curve.find_curves` on the same model.
+    start : Solution, optional
+        Fit of the model before anything was added.
 
     Returns
     -------
-    tuple of str
-        An amplitude that its bound holds back by more than `OUTSIDE` errors; dry friction that lies
+    tuple of Doubt
+        An amplitude that its bound holds back by more than `OUTSIDE` errors, or that was there by
+        as much before the additions and has gone to its bound with them; dry friction that lies
         outside the band of a curve over velocity at zero speed. A bare sign does not tell: the fit
         without the true law gives a positive Coulomb torque where there is none.
     """
-    return (*_held_back(solution, data), *_no_dry_friction(solution, curves))
+    gone = _gone(solution, start)
+    named = {d.sentence.partition(" ")[0] for d in gone}
+    held = [d for d in _held_back(solution, data) if d.sentence.partition(" ")[0] not in named]
+    return (*gone, *held, *_no_dry_friction(solution, curves))
 
 
-def _held_back(solution: Solution, data: Dataset) -> list[str]:
+def _gone(solution: Solution, start: Solution | None) -> list[Doubt]:
+    out = []
+    for name in solution.at_bound if start is not None else ():
+        if start is None or _is_shape(solution, name) or name not in solution.free:
+            continue
+        before, error = start.values.get(name), start.stderr.get(name)
+        if before is None or error is None or abs(before) <= OUTSIDE * error:
+            continue
+        out.append(
+            Doubt(
+                _place(solution, name),
+                f"{name} was {before:.3g} before the additions and ends at its bound "
+                f"({solution.values[name]:.3g}): they do its work, or another law does theirs",
+            )
+        )
+    return out
+
+
+def _held_back(solution: Solution, data: Dataset) -> list[Doubt]:
     base = make_base(solution, data)
     count = base.inward.shape[1]
     if not count:
@@ -306,14 +435,15 @@ def _held_back(solution: Solution, data: Dataset) -> list[str]:
     if errors is None:
         return []
     step = np.linalg.lstsq(both, -base.residual, rcond=None)[0]
-    held = [n for n in solution.at_bound if n in solution.free and not _is_shape(solution, n)]
     out = []
-    for name, d, e in zip(held, step[-count:], errors[-count:], strict=False):
+    for name, d, e in zip(base.inward_names, step[-count:], errors[-count:], strict=True):
         if d < -OUTSIDE * e:
             out.append(
-                f"{name} stands at its bound ({solution.values[name]:.3g}) and would pass it by "
-                f"{-d / e:.2g} standard errors: "
-                "another law does its work"
+                Doubt(
+                    _place(solution, name),
+                    f"{name} stands at its bound ({solution.values[name]:.3g}) and would pass it "
+                    f"by {-d / e:.2g} standard errors: another law does its work",
+                )
             )
     return out
 
@@ -322,8 +452,12 @@ def _is_shape(solution: Solution, name: str) -> bool:
     return any(p.name == name and p.is_shape for p in solution.model.parameters)
 
 
-def _no_dry_friction(solution: Solution, curves: Sequence[Curve]) -> list[str]:
-    out = []
+def _place(solution: Solution, name: str) -> str:
+    return next((t.place for t in solution.model.terms if name in t.names), "")
+
+
+def _no_dry_friction(solution: Solution, curves: Sequence[Curve]) -> list[Doubt]:
+    out = {}
     for c in curves:
         table = EFFECTS[c.label.partition("@")[0]].table
         place = c.label.partition("@")[2]
@@ -333,9 +467,31 @@ def _no_dry_friction(solution: Solution, curves: Sequence[Curve]) -> list[str]:
         slope = (c.y[1] - c.y[0]) / (c.x[1] - c.x[0])
         low, high = c.low[0] - slope * c.x[0], c.high[0] - slope * c.x[0]
         if torque and not low <= torque <= high:
-            out.append(
+            out[place] = Doubt(
+                place,
                 f"the dry friction of the {place} side, {torque:.3g} {c.y_unit}, is an artefact: "
-                "the curve over velocity "
-                f"starts between {low:.3g} and {high:.3g} {c.y_unit}"
+                f"the curve over velocity starts between {low:.3g} and {high:.3g} {c.y_unit}",
             )
-    return out
+    return list(out.values())
+
+
+def marked(
+    claim: Claim,
+    solution: Solution,
+    found: Equivalence | None,
+    doubts: Sequence[Doubt],
+) -> Claim:
+    """The claim with what a curve over its own variable says of its name, and the parameters beside
+    it.
+
+    A friction law beside a base whose own friction has become impossible does the work of another
+    one.
+    """
+    if len(claim.effects) > 1 or found is None:
+        return claim
+    if not found.is_name:
+        return replace(claim, like=found.sentence)
+    place = next((t.place for t in solution.model.terms if t.label == claim.label), "")
+    if claim.effect.family == "friction" and any(d.place == place for d in doubts):
+        return replace(claim, like=_like(claim.effect.title, found.share_missed))
+    return claim

@@ -26,6 +26,7 @@ from identification.balance.calibration import settled, values_on
 from identification.balance.clocks import shifted
 from identification.balance.dataset import Dataset, run_name
 from identification.balance.sensing import Sensing, signals_of
+from identification.balance.stamps import EVEN
 from identification.balance.weak import POSITION_CHAINS, Grid, WeakRecord, kernel
 from identification.data.joint_file import Joint
 from identification.data.record import Record
@@ -86,6 +87,8 @@ SLOW_KERNEL: Final = 0.03
 is drawn [s]: quantisation wipes out both.
 """
 NORMAL_95: Final = 1.96
+MOVING: Final = 0.05
+"""Weight, as a share of the largest, above which a sample belongs to the motion."""
 
 
 @final
@@ -186,7 +189,7 @@ def at_every_sample(
     over seven samples; late channels shifted as in the rows `like`.
     """
     steps, inside = np.diff(record.time), np.diff(record.segment) == 0
-    if inside.any() and np.ptp(steps[inside]) > 0.02 * float(np.median(steps[inside])):
+    if inside.any() and np.ptp(steps[inside]) > EVEN * float(np.median(steps[inside])):
         record = record.resampled()
     signals, dt = signals_of(record, joint, sensing), record.dt
     long = max(7, 2 * round(SLOW_KERNEL / dt / 2) + 1)
@@ -314,7 +317,7 @@ class _Pointwise:
 
 def highest_order(samples: Samples, dt: float) -> float:
     """Order that is at half the sampling rate at the median speed."""
-    moving = samples.weight[samples.weight > 0.05 * float(samples.weight.max(initial=0.0))]
+    moving = samples.weight[samples.weight > MOVING * float(samples.weight.max(initial=0.0))]
     return math.pi / (dt * float(np.median(moving))) if len(moving) else 0.0
 
 

@@ -21,10 +21,25 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
 BINS: Final = 24
+"""Bins of a table over one variable: each holds some sixty rows of a record of 40 s."""
 AXIS_R2: Final = 0.15
 """Share of the residual below which a variable is not said to hold it."""
 PEAK: Final = 10.0
+"""Power of a peak over the median of the spectrum: averaged over four segments or more, noise
+reaches it once in 1e4 spectra.
+"""
 NEAR_PEAK: Final = 5.0
+"""Power of a peak over the median of its own octaves: a residual that is merely slow falls
+smoothly.
+"""
+LOWEST_PEAK: Final = 1.5
+"""Frequency [Hz] from which on a peak is looked for: the motion itself is slower."""
+DIRECTION_GAIN: Final = 0.02
+"""Share of the residual that a table must hold more with the direction than without to be said to
+depend on it: twice the columns hold about as much by chance.
+"""
+WINDOW_SHARE: Final = 0.6
+"""Share of the residual's power that the named stretch of the variable holds: most of it."""
 LINEAR: Final = {"rad": "m", "rad/s": "m/s", "N.m": "N"}
 
 
@@ -194,7 +209,7 @@ def _axis(
     plain = table_r2(residual, index, block, size)
     direction = (velocity > 0).astype(np.int64)
     both = table_r2(residual, index * 2 + direction, block, 2 * size)
-    by_direction = both > plain + 0.02
+    by_direction = both > plain + DIRECTION_GAIN
     power = np.asarray(np.bincount(index, weights=residual**2, minlength=size), dtype=np.float64)
     low, high = _window(edges, power)
     return Unexplained(
@@ -203,14 +218,14 @@ def _axis(
 
 
 def _window(edges: FloatArray, power: FloatArray) -> tuple[float, float]:
-    """Shortest run of bins that holds 60 % of the residual's power."""
+    """Shortest run of bins that holds most of the residual's power."""
     total = float(power.sum())
     best = (0, len(power) - 1)
     for first in range(len(power)):
         held = 0.0
         for last in range(first, len(power)):
             held += float(power[last])
-            if held >= 0.6 * total:
+            if held >= WINDOW_SHARE * total:
                 if edges[last + 1] - edges[first] < edges[best[1] + 1] - edges[best[0]]:
                     best = (first, last)
                 break
@@ -245,7 +260,7 @@ def _peak(data: Dataset, r: FloatArray) -> float | None:
     if not spectra or len({len(s) for s in spectra}) != 1:
         return None
     power = np.mean(spectra, axis=0)
-    use = frequency > 1.5
+    use = frequency > LOWEST_PEAK
     k = int(np.argmax(np.where(use, power, 0.0)))
     # a residual that is merely slow has its largest power at the lowest frequency: a peak stands
     # over its own octaves too

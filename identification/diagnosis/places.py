@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from casadi_models.quantities import linear_unit
+from casadi_models.signals import one_line
 from identification.balance.balances import balances_of
 from identification.balance.weak import WeakRecord
 from identification.diagnosis.locate import axes as signals_of_rows
@@ -89,6 +90,9 @@ class Branch:
     high: FloatArray
     rows: IntArray
 
+    def __repr__(self) -> str:
+        return one_line(self)
+
 
 @final
 @dataclass(frozen=True)
@@ -117,6 +121,9 @@ class Place:
     branches: tuple[Branch, ...]
     share_percent: float
     strength: float
+
+    def __repr__(self) -> str:
+        return one_line(self)
 
     def as_json(self) -> dict[str, Any]:
         """The place as data; NaN becomes None."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Final, final
@@ -29,6 +29,7 @@ from identification.diagnosis.bench import Bench, JointBench, Progress
 from identification.diagnosis.claims import (
     HELD_OUT_DROP,
     LARGEST_SET,
+    SET_RMS,
     Claim,
     Ranking,
     confusion_set,
@@ -41,15 +42,23 @@ from identification.diagnosis.claims import (
 from identification.diagnosis.improvement import (
     Improvement,
     Step,
+    common_rms,
     held_drop,
     judged_drop,
     made_worse,
 )
+from identification.diagnosis.learned import marked, variable_of
 from identification.diagnosis.locate import Unexplained, spectral_peak
 from identification.diagnosis.outcome import refusals
 from identification.diagnosis.rival_table import is_absorbed
 from identification.diagnosis.trials import Base, Trial
-from identification.diagnosis.verdict import hardly_a_model, verdict_of, without_link
+from identification.diagnosis.verdict import (
+    hardly_a_model,
+    unseen,
+    verdict_of,
+    without_link,
+    without_motor,
+)
 from identification.errors import InputError
 from identification.fitting.assess import RATIO_LIMIT
 from identification.fitting.engine import Solution, load_dataset, prepared_model
@@ -112,6 +121,12 @@ def with_held_out(
     return [p[0] for p in pairs], [p[1] for p in pairs], note
 
 
+RELATIVE_SHARE: Final = 0.3
+"""Share of the best trial's log-likelihood from which a relative of its name is fitted too."""
+MOST_RELATIVES: Final = 3
+"""Relatives that are fitted at most: each costs a whole fit."""
+
+
 @final
 @dataclass(frozen=True)
 class _Standing:
@@ -146,6 +161,7 @@ class Session:
         self._warnings = tuple(warnings)
         self._refused: dict[str, str] = {}
         self._doubted: dict[str, str] = {}
+        self._located: dict[str, str] = {}
 
     @property
     def data(self) -> Dataset:
@@ -214,17 +230,26 @@ class Session:
             if len(standing.claims) >= most:
                 break
             ranking = self._confirmed(ranking, base, standing.now)
-            best = ranking.best(frozenset(self._refused) | aside)
+            best = ranking.best(self._out(ranking, aside))
             may_move = not late and not self.data.sensing.one_sided
             over = max(e.ratio for e in standing.now.held_out.balances.values()) > RATIO_LIMIT
             if best is None and may_move and over:
                 late = True
                 ranking = self.bench.ranking(base, late=True)
-                best = ranking.best(frozenset(self._refused) | aside)
+                best = ranking.best(self._out(ranking, aside))
             if best is None:
-                break
+                cleared = self._without_wrong(standing, decided=lean)
+                if cleared is None:
+                    break
+                standing = cleared
+                base = self.bench.base(standing.now.solution)
+                ranking = self.bench.ranking(base)
+                continue
             names = confusion_set(best, ranking.everything, base)
-            best = simplest(best, names, ranking, frozenset(self._refused) | aside)
+            best = simplest(best, names, ranking, self._out(ranking, aside))
+            best, names = self._by_whole_fit(
+                best, names, ranking, standing.now, self._out(ranking, aside)
+            )
             claim = make_claim(best, ranking, base, shortened(names, ranking))
             label = best.candidate.label
             if len(claim.effects) > LARGEST_SET:
@@ -269,6 +294,8 @@ class Session:
                 base = self.bench.base(standing.now.solution)
                 share = len(standing.claims) / max(most, 1)
                 ranking = self.bench.ranking(base, progress=self._within(0.2 + 0.6 * share, 0.0))
+        if len(standing.claims) >= most:
+            standing = self._without_wrong(standing, decided=lean) or standing
         if unnamed is not None and not any(
             t.key in unnamed.effects and t.candidate.label in ranking.significant
             for t in ranking.everything
@@ -341,10 +368,17 @@ class Session:
         # a curve stands for what no name explains: not while a name would be the next
         learned = self.bench.learned(end, error) if over and following is None else ()
         judged = [self._partial(c, steps[0], end, where) for c in claims]
+        held = self.bench.held_against(claims, end)
+        curves = [e.curve for e in held.values() if e.curve is not None]
+        doubts = self.bench.artefacts(end, [*curves, *(c.curve for c in learned)], steps[0])
+        judged = [marked(c, solution, held.get(c.label), doubts) for c in judged]
         where = self._with_frequency(where, judged, steps)
         verdict, reason = verdict_of(
             judged, where, ratios, steps, following, few=few_reversals(self.data), unnamed=unnamed
         )
+        if doubts and verdict in ("complete", "nothing_missing"):
+            why = "; ".join(d.sentence for d in doubts)
+            verdict, reason = "unexplained", f"{reason} But {why}."
         named = {c for x in judged for c in x.effects}
         shown = tuple(self.bench.shown(s) for s in steps)
         return Improvement(
@@ -364,7 +398,9 @@ class Session:
                 *hardly_a_model(steps[0]),
                 *excitation_warnings(self.data),
                 *self._about_temperature(judged),
+                *unseen(solution),
                 *without_link(solution),
+                *without_motor(self.data),
                 *self._warnings,
             ),
             refused=refusals(
@@ -451,6 +487,49 @@ class Session:
         )
         return replace(ranking, everything=renewed, significant=ranking.significant | {label})
 
+    def _by_whole_fit(
+        self,
+        best: Trial,
+        names: tuple[str, ...],
+        ranking: Ranking,
+        now: Step,
+        refused: Collection[str],
+    ) -> tuple[Trial, tuple[str, ...]]:
+        """The best of a name and its relatives that come near it, each fitted with all that is in
+        the model, and the names that this leaves.
+
+        A trial holds the shapes of the model where they are. A gap that had to do the work of the
+        missing law stands wrong; a law that corrects the gap then does better than the true one.
+        """
+        relatives = [
+            t
+            for t in ranking.trials
+            if t.balance == best.balance
+            and t.key not in names
+            and (t.key in best.effect.confused_with or best.key in t.effect.confused_with)
+            and t.candidate.label in ranking.significant
+            and t.candidate.label not in refused
+            and t.score >= RELATIVE_SHARE * best.score
+        ][:MOST_RELATIVES]
+        if not relatives:
+            return best, names
+        fitted = {t.key: self.bench.added(t, now).train for t in (best, *relatives)}
+        left = {k: common_rms(fitted[best.key], e, best.balance)[1] for k, e in fitted.items()}
+        least = min(left.values())
+        near = 1 + SAME_WITH_ONE_LESS / 100
+        alike = [t for t in (best, *relatives) if left[t.key] <= near * least]
+        found = min(alike, key=lambda t: (len(t.values), left[t.key]))
+        if found.key == best.key:
+            return best, names
+        for key, rms in left.items():
+            if key != found.key and rms > SET_RMS * left[found.key]:
+                self._doubted[key] = (
+                    f"leaves {100 * (rms / left[found.key] - 1):.3g} % more than "
+                    f"{found.effect.title} once both are fitted with the rest"
+                )
+        kept = [t.key for t in alike if left[t.key] <= SET_RMS * left[found.key]]
+        return found, (found.key, *(k for k in kept if k != found.key))
+
     def _told_apart(self, new: Claim, standing: _Standing) -> _Standing | None:
         """A name of an earlier set that asks to be added beside it: where it alone does better,
         it takes the set's place.
@@ -529,6 +608,36 @@ class Session:
         claims = [new if i == position else c for i, c in enumerate(standing.claims)]
         made = self._replay(claims, standing, alone.values)
         return made if len(made.claims) == len(claims) else None
+
+    def _out(self, ranking: Ranking, aside: Collection[str]) -> frozenset[str]:
+        """Labels that are not taken up: refused ones, those set aside, and in a balance whose
+        missing torque was seen to be a curve over one variable the laws of others.
+        """
+        elsewhere = {
+            t.candidate.label
+            for t in ranking.everything
+            if t.balance in self._located and variable_of(t.effect) != self._located[t.balance]
+        }
+        return frozenset(self._refused) | frozenset(aside) | elsewhere
+
+    def _without_wrong(self, standing: _Standing, *, decided: bool) -> _Standing | None:
+        """The steps without the names that a curve over their own variable shows to be wrong; None
+        where there are none.
+
+        `decided`: one effect was looked for; while others are missing its curve shows them too.
+        """
+        if not standing.claims or (decided and self._over(standing.now)):
+            return None
+        held = self.bench.held_against(standing.claims, standing.now)
+        wrong = {c.label: held[c.label] for c in standing.claims if c.label in held}
+        wrong = {label: e for label, e in wrong.items() if e.is_wrong}
+        if not wrong:
+            return None
+        for c in standing.claims:
+            if c.label in wrong:
+                self._refused[c.label] = f"is held against a curve: {wrong[c.label].sentence}"
+                self._located[c.balance] = variable_of(c.effect)
+        return self._replay([c for c in standing.claims if c.label not in wrong], standing)
 
     def _revise(self, standing: _Standing) -> _Standing:
         """Judge every earlier claim given all the others: drop it, swap it, or renew its set."""

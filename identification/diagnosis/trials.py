@@ -20,6 +20,7 @@ from identification.balance.dataset import HOLD_NAME
 from identification.balance.noise import effective_share
 from identification.balance.weak import WeakRecord
 from identification.diagnosis.candidates import Candidate, NotTestable, shape_grid
+from identification.fitting.covariance import wald
 from identification.fitting.engine import Dataset, Solution, Stacked, row_weights, stack
 from identification.fitting.signed_fit import projected_gain, signed_fit
 from identification.fitting.start_values import bounds_of
@@ -41,6 +42,15 @@ REFINE_SHARE: Final = 0.1
 
 KERNEL_SHARE: Final = 0.4
 """Share of rows that count as independent under white noise: four rows per kernel length."""
+
+
+NO_COLUMN: Final = 1e-12
+"""Size of a column, as a share of the largest one, below which it is rounding."""
+
+DEPENDENT: Final = 1e-9
+"""Singular value, as a share of the largest one, below which columns are dependent: far over the
+rounding of their sums, far below what records can show.
+"""
 
 
 @final
@@ -68,6 +78,8 @@ class Base:
         Parameters of the columns of `jacobian`.
     norms : (p,) array
         What these columns were divided by.
+    inward_names : tuple of str
+        Parameters of the columns of `inward`.
     """
 
     solution: Solution
@@ -88,6 +100,7 @@ class Base:
     held_weight: FloatArray
     names: tuple[str, ...]
     norms: FloatArray
+    inward_names: tuple[str, ...] = ()
 
     @property
     def parts(self) -> tuple[int, int]:
@@ -199,7 +212,7 @@ def make_base(solution: Solution, data: Dataset) -> Base:
     towards = np.concatenate([np.ones(len(free)), list(signs.values())])
     jw = j * towards * weight[:, None]
     norms = np.linalg.norm(jw, axis=0)
-    alive = norms > 1e-12 * max(float(norms.max(initial=0.0)), 1e-300)
+    alive = norms > NO_COLUMN * max(float(norms.max(initial=0.0)), 1e-300)
     back = alive & (np.arange(len(norms)) >= len(free))
     alive[len(free) :] = False
     inward = jw[:, back] / norms[back]
@@ -252,6 +265,7 @@ def make_base(solution: Solution, data: Dataset) -> Base:
         held_weight=held_weights,
         names=tuple(n for n, a in zip(free, alive, strict=False) if a),
         norms=norms[alive],
+        inward_names=tuple(n for n, b in zip(names, back, strict=True) if b),
     )
 
 
@@ -259,7 +273,7 @@ def span_of(columns: FloatArray) -> FloatArray:
     """Orthonormal columns that span the same space."""
     left, singular, _ = np.linalg.svd(columns, full_matrices=False)
     return np.asarray(
-        left[:, singular > 1e-9 * max(float(singular[0]) if len(singular) else 0.0, 1e-300)],
+        left[:, singular > DEPENDENT * max(float(singular[0]) if len(singular) else 0.0, 1e-300)],
         dtype=np.float64,
     )
 
@@ -583,8 +597,6 @@ def _held_out_drop(
 
 def _wald(added: FloatArray, base: Base, delta: FloatArray) -> float:
     """p-value of the amplitudes, scores clustered by block."""
-    from scipy.special import fdtrc
-
     p, own = base.parts
     q = base.orthonormal
     moving = base.inward[:, delta[p:own] > 0]
@@ -601,8 +613,4 @@ def _wald(added: FloatArray, base: Base, delta: FloatArray) -> float:
     )
     begins = base.firsts[np.flatnonzero(np.diff(base.block[base.order[base.firsts]], prepend=-1))]
     scores = np.add.reduceat((c * residual[:, None])[base.order], begins, axis=0)
-    inverse = np.linalg.pinv(c.T @ c, rcond=1e-10)
-    covariance = inverse @ (scores.T @ scores) @ inverse * blocks / (blocks - 1)
-    d = delta[own:][active]
-    statistic = float(d @ np.linalg.pinv(covariance, rcond=1e-12) @ d) / len(active)
-    return float(fdtrc(len(active), blocks - len(active), statistic))
+    return wald(c.T @ c, scores, delta[own:][active])

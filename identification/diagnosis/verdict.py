@@ -9,7 +9,9 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 from casadi_models import EFFECTS
+from identification.balance.dataset import Dataset
 from identification.data.formats import number
+from identification.diagnosis.candidates import turns_unseen
 from identification.diagnosis.claims import Claim
 from identification.diagnosis.improvement import Step
 from identification.diagnosis.locate import Unexplained
@@ -35,11 +37,14 @@ def _remainder(claim: Claim, unit: str) -> str:
 
 
 def _names(claims: Sequence[Claim]) -> str:
+    # names that share one curve are told in one sentence
     return " and ".join(
-        EFFECTS[c.effects[0]].title
-        if len(c.effects) == 1
-        else "one of (" + ", ".join(c.effects) + ")"
-        for c in claims
+        dict.fromkeys(
+            (c.like or EFFECTS[c.effects[0]].title)
+            if len(c.effects) == 1
+            else "one of (" + ", ".join(c.effects) + ")"
+            for c in claims
+        )
     )
 
 
@@ -125,6 +130,28 @@ def hardly_a_model(start: Step) -> tuple[str, ...]:
             f"the torque: {doubt}"
         )
     return tuple(out)
+
+
+def unseen(solution: Solution) -> tuple[str, ...]:
+    """Parameters of the model that no channel of the records shows."""
+    kept = [n for n in solution.unidentified if n not in solution.free]
+    if not kept:
+        return ()
+    many = len(kept) > 1
+    return (
+        f"{', '.join(kept)}: no channel of these records shows {'them' if many else 'it'}; "
+        f"{'they keep their values' if many else 'it keeps its value'}",
+    )
+
+
+def without_motor(data: Dataset) -> tuple[str, ...]:
+    """What is hidden where the link alone is recorded behind a gear."""
+    if not turns_unseen(data) or not data.sensing.has_drive:
+        return ()
+    return (
+        "the motor position is not recorded: the link stands in for it; the twist between them and "
+        "the instant at which the motor turns leave a rest over the noise",
+    )
 
 
 def without_link(solution: Solution) -> tuple[str, ...]:

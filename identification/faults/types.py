@@ -25,6 +25,8 @@ class Verdict(Enum):
         "The current sensor failed or the motor's friction changed: the readings cannot tell which."
     )
     PLANT = "The joint changed, the sensors agree with each other: identify it again."
+    ONE_OF = "One of these sensors failed: the readings cannot tell which."
+    DEAD = "All readings stand still although the joint moved, or time has stopped."
     RECOVERED = "The sensor agrees with the estimate again; its reading is used."
 
     def __str__(self) -> str:

@@ -1,4 +1,6 @@
-"""The one covariance behind every "+-": from blocks of time, honest with few blocks too."""
+"""The one covariance behind every "+-": from blocks of time, honest with few blocks too; and from
+the information alone where there is no residual yet or its noise is known to be white.
+"""
 
 from __future__ import annotations
 
@@ -30,6 +32,76 @@ MOST_TIED: Final = 0.999
 """Largest correlation of neighbouring samples that a short record can tell from 1."""
 NORMAL: Final = 1.959964
 """The normal distribution's bound of 95 %."""
+BLIND: Final = 1e-9
+"""Singular value, columns scaled alike and as a share of the largest one, below which the rows do
+not see a direction: rounding of their sums."""
+SEEN: Final = 1e-3
+"""Share of a parameter in directions that the rows do not see from which its error is infinite."""
+TESTED: Final = 1e-10
+"""Share of the largest information on what is tested below which a direction is not."""
+
+
+def inverse(gram: FloatArray) -> FloatArray:
+    """Inverse of a normal matrix (p, p), columns scaled alike; directions of which the rows know
+    nothing (:data:`RANK`) add nothing.
+    """
+    size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    return np.asarray(
+        np.linalg.pinv(gram / np.outer(size, size), rcond=RANK, hermitian=True)
+        / np.outer(size, size),
+        dtype=np.float64,
+    )
+
+
+def white_errors(
+    jacobian: FloatArray, deviation: float = 1.0
+) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+    """Cramer-Rao bound of each parameter under white noise: what a motion can tell at best.
+
+    Parameters
+    ----------
+    jacobian : (n, p) array
+        Weighted, in any scale of its columns.
+    deviation : float
+        Standard deviation of the weighted noise.
+
+    Returns
+    -------
+    errors : (p,) array
+        Infinite for a parameter that the rows do not see.
+    lost : (p,) bool array
+        Which these are.
+    """
+    norm = np.linalg.norm(jacobian, axis=0)
+    safe = np.where(norm > 0, norm, 1.0)
+    _, sigma, vt = np.linalg.svd(np.linalg.qr(jacobian / safe, mode="r"))
+    weak = sigma <= BLIND * max(float(sigma.max(initial=0.0)), 1e-300)
+    weak = np.concatenate([weak, np.ones(len(vt) - len(sigma), dtype=bool)])
+    sigma = np.concatenate([sigma, np.ones(len(vt) - len(sigma))])
+    spread = np.where(weak[:, None], 0.0, vt / np.where(weak, 1.0, sigma)[:, None])
+    errors = deviation * np.linalg.norm(spread, axis=0) / safe
+    lost = (norm == 0) | (np.linalg.norm(np.where(weak[:, None], vt, 0.0), axis=0) > SEEN)
+    return np.where(lost, math.inf, errors), lost
+
+
+def wald(gram: FloatArray, scores: FloatArray, amplitudes: FloatArray) -> float:
+    """p-value of amplitudes that are all zero in truth: Wald's test on the sandwich over blocks.
+
+    Parameters
+    ----------
+    gram : (p, p) array
+        Normal matrix of their columns, those of the other parameters projected out.
+    scores : (blocks, p) array
+        Products of these columns with the residual within each block.
+    amplitudes : (p,) array
+    """
+    from scipy.special import fdtrc
+
+    count, blocks = len(amplitudes), len(scores)
+    bread = np.linalg.pinv(gram, rcond=TESTED)
+    covariance = bread @ (scores.T @ scores) @ bread * blocks / (blocks - 1)
+    statistic = float(amplitudes @ np.linalg.pinv(covariance, rcond=RANK) @ amplitudes) / count
+    return float(fdtrc(count, blocks - count, statistic))
 
 
 def block_errors(
@@ -189,14 +261,10 @@ def process_errors(
     bottom = sum(float(np.sum(r**2)) for r in series)
     rho = min(max(top / bottom if bottom > 0 else 0.0, 0.0), MOST_TIED)
     gram = jacobian.T @ jacobian
-    size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-    inverse = np.linalg.pinv(gram / np.outer(size, size), rcond=RANK)
     variance = (
         float(residual @ residual) / max(len(residual) - len(gram), 1) * (1 + rho) / (1 - rho)
     )
-    return np.asarray(
-        np.sqrt(np.maximum(np.diag(inverse), 0.0) * variance) / size, dtype=np.float64
-    )
+    return np.asarray(np.sqrt(np.maximum(np.diag(inverse(gram)), 0.0) * variance), dtype=np.float64)
 
 
 def correlations(gram: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -216,9 +284,9 @@ def correlations(gram: FloatArray) -> tuple[FloatArray, FloatArray]:
         Correlations, zero on the diagonal.
     """
     size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-    inverse = np.linalg.pinv(gram / np.outer(size, size), rcond=RANK)
-    spread = np.sqrt(np.maximum(np.diag(inverse), 1e-300))
-    together = np.asarray(inverse / np.outer(spread, spread), dtype=np.float64)
+    scaled = inverse(gram) * np.outer(size, size)
+    spread = np.sqrt(np.maximum(np.diag(scaled), 1e-300))
+    together = np.asarray(scaled / np.outer(spread, spread), dtype=np.float64)
     np.fill_diagonal(together, 0.0)
     return np.asarray(spread, dtype=np.float64), together
 

@@ -47,10 +47,12 @@ __all__ = [
     "load_dataset",
     "prepared_model",
     "references",
+    "reweighed",
     "rms",
     "row_weights",
     "solve",
     "stack",
+    "stepped",
     "taking_part",
     "weak_record",
 ]
@@ -104,6 +106,14 @@ HIGHEST_SWING: Final = 4.0
 """Highest frequency of such a link in units of 1/kernel (the kernel's -3 dB point is 0.93):
 faster ones are rigid to these rows.
 """
+COLLINEAR: Final = 1e4
+"""Growth of a parameter's error by the others from which it is not identified: all but one part in
+1e8 of its column's power is theirs.
+"""
+NO_COLUMN: Final = 1e-12
+"""Size of a column, as a share of the largest one, below which it is rounding."""
+AT_BOUND: Final = 1e-9
+"""Relative distance from a bound within which a parameter stands at it: rounding of the step."""
 
 
 def solve(
@@ -130,7 +140,7 @@ def solve(
     Raises
     ------
     InputError
-        A free parameter that moves no output.
+        An inertia or a stiffness that the channels would show, but not this motion.
     """
     if not model.lagging_load or LOAD_COMPLIANCE.name in data.joint.known:
         return _fitted(model, data, iterations, start or {}, progress)
@@ -176,24 +186,10 @@ def _fitted(
     held: frozenset[str] = frozenset(),
 ) -> Solution:
     """The fit itself; the parameters `held` keep their start values."""
-    known = data.joint.known
-    values = starts(model, data)
-    values.update({k: v for k, v in start.items() if k in values})
-    fixed = {n: k.value for n, k in known.items() if k.value is not None and n in values}
-    values.update({n: v for n, v in fixed.items() if v is not None})
-    limits = bounds_of(model, known, data)
+    values, free, limits, unseen = _posed(model, data, start, held)
     shapes = {p.name for p in model.parameters if p.is_shape}
-    runs = names_of_runs(model, data.train)
     known_before = usual(model, data.train, torque=data.sensing.has_torque)
-    apart = {*fixed, *held, *model.calibration, *model.named("range")}
-    free = [
-        *(n for n in model.parameter_names if n not in apart),
-        *runs,
-    ]
     balances = balances_of(model, data.sensing, wrt=bare(free))
-    for n in free:
-        low, high = limits[n]
-        values[n] = min(max(values[n], low), high)
     tell = progress or (lambda text, share: None)
     tell("start values", 0.0)
     # first pass without shapes: linear amplitudes from any start
@@ -220,7 +216,126 @@ def _fitted(
     problem = WeakForm(balances, data, values, tuple(free), weights, before)
     values, noise = unbiased(problem, limits)
     problem = replace(problem, values=values)
-    return _with_errors(problem, limits, sigma, used, noise=noise, share=share)
+    found = _with_errors(problem, limits, sigma, used, noise=noise, share=share)
+    return replace(found, unidentified=(*found.unidentified, *unseen))
+
+
+def unseen_by(model: JointModel, data: Dataset) -> tuple[str, ...]:
+    """Inertias, stiffness and amplitudes that stand in no balance of these channels: they keep
+    their values.
+
+    The inertia of the link is one where motor and torque sensor are recorded and the link is not.
+    """
+    holding = balances_of(model, data.sensing, wrt=()).holding
+    if model.lagging_load:  # the swing of an unseen link enters by its second derivative
+        return ()
+    return tuple(
+        p.name
+        for p in model.parameters
+        if not p.is_shape and p.name not in holding and p.name not in model.calibration
+    )
+
+
+def _posed(
+    model: JointModel, data: Dataset, start: Mapping[str, float], held: frozenset[str]
+) -> tuple[dict[str, float], list[str], dict[str, tuple[float, float]], list[str]]:
+    """Start values inside their bounds, the parameters that are free, the bounds, and those that
+    no balance holds.
+    """
+    known = data.joint.known
+    values = starts(model, data)
+    values.update({k: v for k, v in start.items() if k in values})
+    fixed = {n: k.value for n, k in known.items() if k.value is not None and n in values}
+    values.update({n: v for n, v in fixed.items() if v is not None})
+    limits = bounds_of(model, known, data)
+    unseen = [n for n in unseen_by(model, data) if n not in fixed]
+    apart = {*fixed, *held, *unseen, *model.calibration, *model.named("range")}
+    free = [
+        *(n for n in model.parameter_names if n not in apart),
+        *names_of_runs(model, data.train),
+    ]
+    for n in free:
+        low, high = limits[n]
+        values[n] = min(max(values[n], low), high)
+    return values, free, limits, unseen
+
+
+def stepped(
+    model: JointModel,
+    data: Dataset,
+    start: Mapping[str, float],
+    like: Solution,
+    *,
+    iterations: int,
+) -> tuple[Solution, float]:
+    """A few steps of a fit, on the weighting of another one: models that are held against each
+    other need one weighting.
+
+    Parameters
+    ----------
+    model : JointModel
+    data : Dataset
+    start : mapping of str to float
+        Values to start from.
+    like : Solution
+        Whose weights count.
+    iterations : int
+
+    Returns
+    -------
+    (Solution, float)
+        Without standard errors; and the weighted sum of squares.
+    """
+    held = frozenset(n for n in HANGING if n in like.values and n not in like.free)
+    values, free, limits, _ = _posed(model, data, start, held)
+    balances = balances_of(model, data.sensing, wrt=bare(free))
+    known_before = usual(model, data.train, torque=data.sensing.has_torque)
+    theirs = balances_of(like.model, data.sensing, wrt=())
+    before = _beside(known_before, _independent(theirs, data, like.values))
+    problem = WeakForm(balances, data, values, tuple(free), like.weights, before)
+    values, used = problem.fitted(limits, iterations)
+    rows = problem.residual(np.array([values[n] for n in free]))
+    own = {n: x for n, x in values.items() if not is_of_run(n)}
+    for n in model.calibration:
+        own[n] = float(np.mean([values[k] for k in free if is_of_run(k) and bare([k]) == (n,)]))
+    found = Solution(
+        replace(model, values=own),
+        {**values, **own},
+        stderr=dict.fromkeys(values),
+        free=tuple(n for n in free if not is_of_run(n)),
+        weights=like.weights,
+        sigma=like.sigma,
+        at_bound=_at_bound(model, values, free, limits),
+        iterations=used,
+    )
+    return found, float(rows @ rows)
+
+
+def reweighed(solution: Solution, data: Dataset) -> Solution:
+    """A fit with the weights that belong to its own values."""
+    sigma = _sigmas(solution.model, data, solution.values)
+    balances = balances_of(solution.model, data.sensing, wrt=())
+    weights = row_weights(balances, data, solution.values, sigma, data.train)
+    return replace(solution, weights=weights, sigma=sigma)
+
+
+def _at_bound(
+    model: JointModel,
+    values: Mapping[str, float],
+    free: Sequence[str],
+    limits: Mapping[str, tuple[float, float]],
+) -> tuple[str, ...]:
+    """Free parameters that stand at a bound; a smoothing velocity is none of them."""
+    smoothing = model.named("smoothing")
+    return tuple(
+        n
+        for n in free
+        if any(
+            math.isfinite(limit) and abs(values[n] - limit) <= AT_BOUND * max(abs(limit), 1e-300)
+            for limit in limits[n]
+        )
+        and n not in smoothing
+    )
 
 
 def _independent(balances: Balances, data: Dataset, values: Mapping[str, float]) -> float:
@@ -255,8 +370,8 @@ def _best_start(
     free: Sequence[str],
     limits: Mapping[str, tuple[float, float]],
 ) -> dict[str, float]:
-    """Friction laws with a shape near zero velocity have several valleys: the best of a few
-    smoothing velocities and exponents.
+    """Laws with a shape near zero velocity or zero torque have several valleys: the best of a few
+    smoothing velocities and exponents, and of a few sizes of a gap.
     """
     shaped = [t for t in balances.model.terms if t.effect.several_valleys]
     if not shaped:
@@ -267,8 +382,16 @@ def _best_start(
         for n in balances.model.named("exponent")
         if any(n in t.names for t in shaped) and n in free
     ]
+    gaps = [
+        n
+        for t in shaped
+        for n, p in zip(t.names, t.effect.parameters, strict=True)
+        if p.is_shape and p.scale == "torsion" and n in free
+    ]
     trials = [dict(values)]
-    for share in (0.003, 0.01):
+    for factor in GAP_FACTORS if gaps else ():
+        trials.append({**values, **{n: factor * values[n] for n in gaps}})
+    for share in (0.003, 0.01) if smooth else ():
         for power in (1.0, 2.0) if exponents else (1.0,):
             moved = {
                 n: min(max(share * data.ranges["velocity"], limits[n][0]), limits[n][1])
@@ -289,6 +412,12 @@ def _best_start(
         if best is None or cost < best[0]:
             best = (cost, fitted)
     return best[1] if best is not None else values
+
+
+GAP_FACTORS: Final = (0.1, 0.3, 3.0)
+"""Sizes from which a gap of the transmission is fitted beside its start value: inside a gap that is
+too wide nothing is carried, its stiffness goes to its bound, and the gap then moves nothing. A
+catalogue is wrong by a factor 3, a start by guess by 10."""
 
 
 def _check_moves(problem: WeakForm) -> None:
@@ -336,18 +465,10 @@ def _with_errors(
     )
     norms = np.linalg.norm(j, axis=0)
     smoothing = balances.model.named("smoothing")
-    at_bound = [
-        n
-        for n in free
-        if any(
-            math.isfinite(limit) and abs(values[n] - limit) <= 1e-9 * max(abs(limit), 1e-300)
-            for limit in limits[n]
-        )
-        and n not in smoothing
-    ]
+    at_bound = _at_bound(balances.model, values, free, limits)
     usable = np.array(
         [
-            norm > 1e-12 * norms.max() and n not in at_bound
+            norm > NO_COLUMN * norms.max() and n not in at_bound
             for n, norm in zip(free, norms, strict=True)
         ]
     )
@@ -356,7 +477,7 @@ def _with_errors(
     unidentified = [
         n
         for n, norm in zip(free, norms, strict=True)
-        if norm <= 1e-12 * norms.max() and n not in smoothing
+        if norm <= NO_COLUMN * norms.max() and n not in smoothing
     ]
     # without stiffness the link would fall off: the twist follows no torque of these records
     unidentified += [n for n in balances.model.named("stiffness") if n in at_bound]
@@ -379,7 +500,11 @@ def _with_errors(
             other = int(np.argmax(np.abs(corr[k])))
             correlation[free[i]] = (free[int(index[other])], float(corr[k, other]))
             weak = size is not None and values[free[i]] != 0 and size[k] > abs(values[free[i]])
-            if (spread[k] > 1e4 or weak) and free[i] not in smoothing and not is_of_run(free[i]):
+            if (
+                (spread[k] > COLLINEAR or weak)
+                and free[i] not in smoothing
+                and not is_of_run(free[i])
+            ):
                 unidentified.append(free[i])
     kept = dict(values)
     model = balances.model
@@ -393,7 +518,7 @@ def _with_errors(
         free=tuple(n for n in free if not is_of_run(n)),
         weights=weights,
         sigma=sigma,
-        at_bound=tuple(at_bound),
+        at_bound=at_bound,
         unidentified=tuple(unidentified),
         correlation=correlation,
         iterations=used,

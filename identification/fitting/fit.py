@@ -13,7 +13,8 @@ from identification.data.joint_file import Joint
 from identification.data.record import Record
 from identification.errors import InputError
 from identification.fitting.assess import Error, assess
-from identification.fitting.engine import Dataset, Solution, load_dataset, prepared_model, solve
+from identification.fitting.engine import Dataset, Solution, load_dataset, prepared_model
+from identification.fitting.first_fit import first_fit
 from identification.fitting.joint_text import calibration_of, joint_text
 from identification.fitting.parameters import parameter_table
 from identification.representation import html_of
@@ -152,7 +153,7 @@ def fit(
         raise InputError("no record to fit; give at least one")
     prepared = prepared_model(whole, train[0])
     data = load_dataset(train, gated(list(held_out), whole), whole, prepared)
-    solution = solve(prepared, data)
+    solution = first_fit(prepared, data)
     return Fit(
         whole,
         solution,

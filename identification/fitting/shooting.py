@@ -15,6 +15,7 @@ import numpy.typing as npt
 from casadi_models import JointModel
 from identification.balance.noise import noise_level
 from identification.balance.sensing import Sensing, signals_of
+from identification.balance.stamps import EVEN
 from identification.data.joint_file import Joint
 from identification.data.record import Record
 from identification.errors import InputError
@@ -123,13 +124,13 @@ def cut_windows(
     inputs: list[FloatArray] = []
     noise: list[list[float]] = []
     for record in records:
-        if abs(record.dt - dt) > 0.02 * dt:
+        if abs(record.dt - dt) > EVEN * dt:
             raise InputError(
                 f"{record.name}: sample time {record.dt:.3g} s, other records {dt:.3g} s; refine "
                 "them one by one"
             )
         inside = np.diff(record.segment) == 0
-        if inside.any() and float(np.ptp(np.diff(record.time)[inside])) > 0.02 * dt:
+        if inside.any() and float(np.ptp(np.diff(record.time)[inside])) > EVEN * dt:
             record = record.resampled(dt)
         signals = signals_of(record, joint, sensing)
         segments = tuple(record.segments())

@@ -50,15 +50,13 @@ def signed_fit(
     for _ in range(len(lows) + 1):
         index = np.flatnonzero(active)
         part = np.ix_(index, index)
-        white = _whitened(gram[part] if whole is None else whole[part])
         if whole is None:
-            solved = white.T @ right[index]
+            white = _whitened(gram[part])
+            solved = white @ (white.T @ right[index])
         else:
-            value, vector = np.linalg.eigh(white.T @ gram[part] @ white)
-            kept = vector[:, value > _LEAST]
-            solved = kept @ ((kept.T @ (white.T @ right[index])) / value[value > _LEAST])
+            solved = part_inverse(gram[part], whole[part]) @ right[index]
         out[:] = 0.0
-        out[index] = white @ solved
+        out[index] = solved
         wrong = [
             first + i
             for i, low in enumerate(lows)
@@ -68,6 +66,21 @@ def signed_fit(
             break
         active[wrong] = False
     return out
+
+
+def part_inverse(part: FloatArray, whole: FloatArray) -> FloatArray:
+    """Inverse of the normal matrix of a part of the rows, on the directions of which that part
+    holds a fair share of what all rows know; zero on the others.
+
+    Parameters
+    ----------
+    part, whole : (n, n) arrays
+        Normal matrices of the part and of all rows.
+    """
+    white = _whitened(whole)
+    value, vector = np.linalg.eigh(white.T @ part @ white)
+    kept = white @ vector[:, value > _LEAST]
+    return np.asarray((kept / value[value > _LEAST]) @ kept.T, dtype=np.float64)
 
 
 def _whitened(gram: FloatArray) -> FloatArray:

@@ -26,7 +26,7 @@ _LOOP: Final = """
 #include <string.h>
 EXPORT void irj_windows(
     long long windows, long long length,
-    const double *start, const double *inputs, const double *p, double *out) {{
+    const double *start, const double *inputs, const double *p, double *out, double *end) {{
   const double *arg[{arg}];
   double *res[{res}];
   casadi_int iw[{iw}];
@@ -42,6 +42,7 @@ EXPORT void irj_windows(
       memcpy(a, b, sizeof a);
       inputs += {inputs}; out += {outputs};
     }}
+    memcpy(end + i * {states}, a, sizeof a);
   }}
 }}
 """
@@ -56,20 +57,34 @@ class WindowRun:
     sample : casadi.Function
         (state, inputs, p) -> (state one sample later, outputs at the sample).
     length : int
-        Samples of a window.
+        Samples of a window; :meth:`run` takes others too.
     samples : int
         Samples of all windows that will be run: long records are worth a compiler, where there is
         one.
     """
 
     def __init__(self, sample: Any, length: int, samples: int) -> None:
-        self._sample, self._length = sample, length
+        self._sample = sample
         self._outputs = int(sample.size1_out(1))
         self._native = _compiled(sample) if samples >= LONG else None
-        self._window: Any = None if self._native is not None else sample.mapaccum("window", length)
+        self._windows: dict[int, Any] = (
+            {} if self._native is not None else {length: sample.mapaccum("window", length)}
+        )
 
     def __call__(self, start: FloatArray, inputs: FloatArray, p: FloatArray) -> FloatArray:
-        """Outputs (windows, length, outputs).
+        """Outputs (windows, length, outputs); see :meth:`run`."""
+        return self.run(start, inputs, p)[0]
+
+    @property
+    def is_compiled(self) -> bool:
+        """True where the samples run as C."""
+        return self._native is not None
+
+    def run(
+        self, start: FloatArray, inputs: FloatArray, p: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Outputs (windows, length, outputs), and the states after the last sample (windows,
+        state).
 
         Parameters
         ----------
@@ -77,16 +92,20 @@ class WindowRun:
         inputs : (windows * length, inputs) array
         p : (parameters,) array
         """
-        count = len(start)
+        count, length = len(start), len(inputs) // len(start)
         if self._native is None:
-            run = self._window.map(count)
-            return np.asarray(run(start.T, inputs.T, p)[1].full().T).reshape(
-                count, self._length, self._outputs
+            if length not in self._windows:
+                self._windows[length] = self._sample.mapaccum("window", length)
+            states, found = self._windows[length].map(count)(start.T, inputs.T, p)
+            return (
+                np.asarray(found.full().T).reshape(count, length, self._outputs),
+                np.asarray(states.full().T[length - 1 :: length]),
             )
-        out = np.empty((count, self._length, self._outputs))
+        out = np.empty((count, length, self._outputs))
         given = [np.ascontiguousarray(a, dtype=np.float64) for a in (start, inputs, p)]
-        self._native(count, self._length, *(a.ctypes.data for a in (*given, out)))
-        return out
+        end = np.empty((count, given[0].shape[1]))
+        self._native(count, length, *(a.ctypes.data for a in (*given, out, end)))
+        return out, end
 
 
 def _compiled(sample: Any) -> Any:
@@ -110,6 +129,6 @@ def _compiled(sample: Any) -> Any:
         run = build(generator.dump() + _LOOP.format(**sizes), "windows").irj_windows
     except NoCompilerError:
         return None
-    run.argtypes = [ctypes.c_longlong, ctypes.c_longlong, *([ctypes.c_void_p] * 4)]
+    run.argtypes = [ctypes.c_longlong, ctypes.c_longlong, *([ctypes.c_void_p] * 5)]
     run.restype = None
     return run

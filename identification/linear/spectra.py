@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from identification.balance.sensing import Sensing, signals_of
+from identification.balance.stamps import EVEN
 from identification.data.joint_file import Joint
 from identification.data.record import Record
 
@@ -31,6 +32,8 @@ WINDOW: Final = (1.0, 8.0)
 """Shortest and longest window [s]."""
 AVERAGES: Final = 6
 """Windows, half overlapping, in the longest stretch at least."""
+ALIKE: Final = 0.01
+"""Difference of two sample times up to which their spectra are averaged: a hundredth of a band."""
 TOP: Final = 0.4
 """Highest frequency shown, as a part of the sampling rate."""
 ACROSS, THROUGH = "motor velocity to link velocity", "drive torque to motor velocity"
@@ -153,11 +156,11 @@ def stretches(records: Sequence[Record], joint: Joint, sensing: Sensing) -> list
     out: list[Stretch] = []
     for given in records:
         steps = given.steps()
-        uneven = bool(steps.size) and float(np.ptp(steps)) > 0.02 * given.dt
+        uneven = bool(steps.size) and float(np.ptp(steps)) > EVEN * given.dt
         record = given.resampled() if uneven else given
         signals = signals_of(record, joint, sensing)
         for s in record.segments():
-            if s.stop - s.start < 64 or (out and abs(record.dt / out[0].dt - 1) > 0.01):
+            if s.stop - s.start < 64 or (out and abs(record.dt / out[0].dt - 1) > ALIKE):
                 continue
             motor, link = (
                 np.gradient(signals[n][s], record.dt) for n in ("motor_position", "link_position")

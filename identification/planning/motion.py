@@ -60,10 +60,16 @@ class Motion:
         """Position, velocity, acceleration, (n, 3)."""
         return np.column_stack([self.position, self.velocity, self.acceleration])
 
+    @property
+    def text(self) -> str:
+        """The motion as a CSV file with the header of :data:`COLUMNS`."""
+        rows = np.column_stack([self.time, self.table])
+        lines = (",".join(f"{v:.9g}" for v in row) for row in rows.tolist())
+        return "\n".join([",".join(COLUMNS), *lines]) + "\n"
+
     def save(self, path: str | Path) -> None:
         """Write a CSV file with the header of :data:`COLUMNS`."""
-        rows = np.column_stack([self.time, self.table])
-        np.savetxt(path, rows, delimiter=",", header=",".join(COLUMNS), comments="", fmt="%.9g")
+        Path(path).write_text(self.text, encoding="utf-8")
 
     @staticmethod
     def load(path: str | Path) -> Motion:

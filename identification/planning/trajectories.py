@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from casadi_models import JointModel
 from identification.errors import InputError
+from identification.fitting.covariance import white_errors
 from identification.planning.follow import Controller, Followed, Follower
 from identification.planning.motion import COLUMNS, WORKSPACE, Motion, sinusoidal, triangular
 from identification.search.mcs import mcs
@@ -264,16 +265,9 @@ class Experiment:
 
     def _deviations(self, phi: FloatArray) -> dict[str, float]:
         """Cramer-Rao bound from the Fisher information phi' R^-1 phi, relative to the values."""
-        weighted = (phi / self.noise[None, :, None]).reshape(-1, len(self.parameters))
-        norm = np.linalg.norm(weighted, axis=0)
-        safe = np.where(norm > 0, norm, 1.0)
-        _, sigma, vt = np.linalg.svd(weighted / safe, full_matrices=False)
-        weak = sigma <= 1e-10 * max(float(sigma[0]), 1e-300)
-        spread = np.where(weak[:, None], 0.0, vt / np.where(weak, 1.0, sigma)[:, None])
-        deviation = np.linalg.norm(spread, axis=0) / safe
-        deviation[
-            (norm == 0) | (np.linalg.norm(np.where(weak[:, None], vt, 0.0), axis=0) > 1e-3)
-        ] = math.inf
+        deviation, _ = white_errors(
+            (phi / self.noise[None, :, None]).reshape(-1, len(self.parameters))
+        )
         with np.errstate(divide="ignore"):
             relative = np.where(self._values != 0, deviation / np.abs(self._values), math.inf)
         return dict(zip(self.parameters, relative.tolist(), strict=True))

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from identification.errors import InputError
+from identification.fitting.covariance import white_errors
 from identification.two_step.varpro import Projection
 from identification.two_step.varpro_model import SeparableModel
 from identification.two_step.varpro_search import (
@@ -255,16 +256,8 @@ def cramer_rao(
     slopes = problem.slopes(z) if len(z) else np.zeros((len(matrix), 0))
     active = np.ones(len(theta), dtype=bool) if sign is None else ~sign | (theta > 0)
     full = np.hstack([matrix[:, active], slopes])
-    norm = np.linalg.norm(full, axis=0)
-    safe = np.where(norm > 0, norm, 1.0)
-    _, sigma, vt = np.linalg.svd(np.linalg.qr(full / safe, mode="r"))
     degrees = max(1, problem.samples - full.shape[1])
-    scale = math.sqrt(square / degrees)
-    weak = sigma <= 1e-8 * max(float(sigma[0]), 1e-300)
-    spread = np.where(weak[:, None], 0.0, vt / np.where(weak, 1.0, sigma)[:, None])
-    deviation = scale * np.linalg.norm(spread, axis=0) / safe
-    lost = (norm == 0) | (np.linalg.norm(np.where(weak[:, None], vt, 0.0), axis=0) > 1e-3)
-    deviation[lost] = math.inf
+    deviation, lost = white_errors(full, math.sqrt(square / degrees))
     out = np.zeros(len(theta) + len(z))
     out[: len(theta)][active] = deviation[: int(active.sum())]
     out[len(theta) :] = deviation[int(active.sum()) :]

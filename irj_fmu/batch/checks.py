@@ -2,23 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
-import math
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from typing import Any, TypeAlias
 
+from identification.data.schema import finite
 from identification.errors import InputError
 
 Value: TypeAlias = float | int | bool | str
-
-
-def known(entry: Mapping[str, Any], keys: Collection[str], where: str) -> None:
-    """Refuse a key that is not among `keys`."""
-    for key in entry:
-        if key not in keys:
-            close = difflib.get_close_matches(key, list(keys), 1)
-            hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(keys)}"
-            raise InputError(f"{where}: unknown key {key!r}; {hint}")
 
 
 def table(data: Mapping[str, Any], key: str, where: str) -> Mapping[str, Any]:
@@ -40,20 +30,13 @@ def names(entry: Mapping[str, Any], key: str, where: str) -> tuple[str, ...]:
     return tuple(found)
 
 
-def number(entry: Any, where: str) -> float:
-    """A finite number."""
-    if isinstance(entry, bool) or not isinstance(entry, int | float) or not math.isfinite(entry):
-        raise InputError(f"{where}: {entry!r} is not a finite number")
-    return float(entry)
-
-
 def value(entry: Any, where: str) -> Value:
     """A finite number, true, false or a text."""
     if isinstance(entry, bool | str):
         return entry
     if isinstance(entry, int):
         return entry
-    return number(entry, where)
+    return finite(entry, where)
 
 
 def flag(entry: Mapping[str, Any], key: str, where: str, default: bool) -> bool:

@@ -16,6 +16,8 @@ from pathlib import Path
 from typing import Any, Final, final
 
 from identification.errors import InputError
+from irj_fmu.batch.fits import PARAMETERS, is_fit_study, load_fit_study, run_fits
+from irj_fmu.batch.fits import SUMMARY as FIT_SUMMARY
 from irj_fmu.batch.fleet import Progress, run_batches
 from irj_fmu.batch.plan import plan
 from irj_fmu.batch.results import SUMMARY, Run, runs_of, write_csv, write_npz, write_summary
@@ -175,7 +177,7 @@ def _clear(chunks: Path) -> None:
 # --- command line ---------------------------------------------------------------------------------
 
 
-def parser() -> argparse.ArgumentParser:
+def parser() -> OneLineParser:
     """Arguments of ``irj batch``."""
     made = OneLineParser(
         prog="irj batch",
@@ -228,6 +230,8 @@ def main(argv: Sequence[str]) -> int:
 def _main(arguments: argparse.Namespace) -> int:
     if arguments.jobs is not None and arguments.jobs < 1:
         raise InputError(f"--jobs {arguments.jobs}: give at least 1")
+    if is_fit_study(arguments.study):
+        return _fits(arguments)
     study = load_study(arguments.study)
     _check_results(arguments, study)
     if arguments.dry_run:
@@ -274,6 +278,44 @@ def _main(arguments: argparse.Namespace) -> int:
         if path is not None:
             sys.stdout.write(f"{path}\n")
     write_json(arguments.json, _report(study, found))
+    return 1 if arguments.fail_on_error and found.failed else 0
+
+
+def _fits(arguments: argparse.Namespace) -> int:
+    """A study that fits."""
+    study = load_fit_study(arguments.study)
+    folder = arguments.out or default_folder(study.source)
+    if arguments.dry_run:
+        sys.stdout.write(f"study {study.name}: {study.task}, {counted(len(study.jobs), 'job')}\n")
+        return 0
+    keep_inputs([folder / n for n in (FIT_SUMMARY, PARAMETERS)], study.inputs)
+    if arguments.json is not None:
+        check_output(arguments.json, study.inputs)
+    bar = _Bar()
+    with _held(folder), _executor(arguments.dask) as (executor, workers):
+        found = run_fits(
+            study,
+            out=folder,
+            executor=executor,
+            jobs=arguments.jobs or workers,
+            fresh=arguments.fresh,
+            progress=bar.show if sys.stderr.isatty() else None,
+        )
+    there = f" ({found.there} {'was' if found.there == 1 else 'were'} there)" if found.there else ""
+    sys.stdout.write(
+        f"study {study.name}: {study.task}, {counted(len(found.jobs), 'job')}{there}, "
+        f"{len(found.failed)} failed\n"
+    )
+    for job, answer in found.failed[:5]:
+        sys.stdout.write(f"  {job.name} failed: {answer.reason}\n")
+    for path in found.files:
+        sys.stdout.write(f"{path}\n")
+    rows = [
+        {"job": j.name, "passed": not a.reason, "reason": a.reason or None, **a.figures}
+        for j, a in zip(found.jobs, found.answers, strict=True)
+    ]
+    done = {"study": study.name, "task": study.task, "there": found.there, "jobs": rows}
+    write_json(arguments.json, done)
     return 1 if arguments.fail_on_error and found.failed else 0
 
 

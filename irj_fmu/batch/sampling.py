@@ -10,14 +10,13 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from identification.data.schema import finite
 from identification.errors import InputError
-from irj_fmu.batch.checks import known, number, table, value
+from irj_fmu.batch.checks import table, value
+from irj_fmu.batch.study_schema import AXIS, DRAW, METHODS, RANDOM
 
 MOST: Final = 1_000_000
 """Runs of one model with one record."""
-METHODS: Final = ("independent", "latin")
-_AXIS: Final = ("low", "high", "count", "spacing")
-_DRAW: Final = ("low", "high", "spacing", "mean", "deviation", "choose")
 Case = dict[str, Any]
 
 
@@ -94,7 +93,7 @@ def axis(entry: Any, where: str) -> list[Any]:
         raise InputError(
             f"{where}: give a list of values, or {{ low = ..., high = ..., count = ... }}"
         )
-    known(entry, _AXIS, where)
+    AXIS.check(entry, where)
     low, high, is_log = _range(entry, where)
     count = entry.get("count")
     if isinstance(count, bool) or not isinstance(count, int) or not 2 <= count <= MOST:
@@ -115,14 +114,12 @@ def draws(entry: Mapping[str, Any], where: str) -> list[Case]:
     if not entry:
         return []
     place = f"{where}: [random]"
-    known(entry, ("count", "seed", "method", "parameters"), place)
+    RANDOM.check(entry, place)
     parameters = table(entry, "parameters", place)
     count, seed = (
         _counted(entry, key, place, default) for key, default in (("count", 0), ("seed", 0))
     )
-    method = entry.get("method", "independent")
-    if method not in METHODS:
-        raise InputError(f"{place}: method = {method!r}; use one of {', '.join(METHODS)}")
+    method = RANDOM["method"].read(entry, place)
     if not parameters or not 1 <= count <= MOST:
         raise InputError(f"{place}: give count, from 1 to {MOST}, and [random.parameters]")
     generator = np.random.default_rng(seed)
@@ -144,7 +141,7 @@ def _drawn(entry: Any, share: npt.NDArray[np.float64], where: str) -> Sequence[A
         raise InputError(
             f"{where}: give {{ low, high }}, {{ mean, deviation }} or {{ choose = [...] }}"
         )
-    known(entry, _DRAW, where)
+    DRAW.check(entry, where)
     kinds = [
         bool({"low", "high"} & entry.keys()),
         bool({"mean", "deviation"} & entry.keys()),
@@ -164,7 +161,7 @@ def _drawn(entry: Any, share: npt.NDArray[np.float64], where: str) -> Sequence[A
         from scipy.special import ndtri
 
         mean, deviation = (
-            number(entry.get(key), f"{where}: {key}") for key in ("mean", "deviation")
+            finite(entry.get(key), f"{where}: {key}") for key in ("mean", "deviation")
         )
         if deviation <= 0:
             raise InputError(f"{where}: deviation = {deviation:g} is not positive")
@@ -178,10 +175,8 @@ def _drawn(entry: Any, share: npt.NDArray[np.float64], where: str) -> Sequence[A
 
 
 def _range(entry: Mapping[str, Any], where: str) -> tuple[float, float, bool]:
-    low, high = (number(entry.get(key), f"{where}: {key}") for key in ("low", "high"))
-    spacing = entry.get("spacing", "linear")
-    if spacing not in ("linear", "log"):
-        raise InputError(f"{where}: spacing = {spacing!r}; use linear or log")
+    low, high = (finite(entry.get(key), f"{where}: {key}") for key in ("low", "high"))
+    spacing = AXIS["spacing"].read(entry, where)
     if low >= high:
         raise InputError(f"{where}: low = {low:g} is not below high = {high:g}")
     if spacing == "log" and low <= 0:

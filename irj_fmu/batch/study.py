@@ -5,31 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, final
+from typing import Any, final
 
 from identification.data.plain_text import from_toml
+from identification.data.schema import finite, refuse_unknown
 from identification.errors import InputError
-from irj_fmu.batch.checks import Value, flag, known, names, number, table, value
+from irj_fmu.batch.checks import Value, flag, names, table, value
 from irj_fmu.batch.sampling import cases_of
+from irj_fmu.batch.study_schema import FORMATS, INPUT, KINDS, MODEL, RECORDS, STUDY, TABLES
 from irj_fmu.host.signals import Table
-
-FORMATS: Final = ("npz", "csv", "none")
-_TABLES: Final = ("study", "model", "records", "inputs", "compare", "grid", "case", "random")
-_STUDY_KEYS: Final = ("name", "step", "stop", "record", "every", "chunk", "format")
-_MODEL_KEYS: Final = (
-    "name",
-    "fmu",
-    "joint",
-    "kind",
-    "add",
-    "drop",
-    "set",
-    "controller",
-    "motion",
-    "sensors",
-)
-_RECORD_KEYS: Final = ("files", "columns", "start_state")
-KINDS: Final = ("plant", "estimator")
 
 
 @final
@@ -131,27 +115,20 @@ def load_study(path: str | Path) -> Study:
         raise InputError(f"{path}: not a text file; a study file is TOML") from None
     data = from_toml(text, str(path))
     where = str(path)
-    known(data, _TABLES, where)
+    refuse_unknown(data, TABLES, where)
     study = table(data, "study", where)
     records = table(data, "records", where)
-    known(study, _STUDY_KEYS, f"{where}: [study]")
-    known(records, _RECORD_KEYS, f"{where}: [records]")
-    chosen = str(study.get("format", "npz"))
-    if chosen not in FORMATS:
-        raise InputError(f"{where}: [study] format = {chosen!r}; use one of {', '.join(FORMATS)}")
-    columns = records.get("columns")
-    if columns is not None and not isinstance(columns, str):
-        raise InputError(
-            f"{where}: [records] columns must be the path of a TOML file with a [columns] table"
-        )
+    given = STUDY.read(study, f"{where}: [study]")
+    of_records = RECORDS.read(records, f"{where}: [records]")
+    columns = of_records["columns"]
     return Study(
         source=path,
-        name=" ".join(str(study.get("name", path.stem)).split()),
+        name=" ".join((path.stem if given["name"] is None else given["name"]).split()),
         models=_models(data, path),
         cases=tuple(cases_of(data, where)),
         files=_files(records, path),
         columns=None if columns is None else path.parent / columns,
-        start_state=flag(records, "start_state", f"{where}: [records]", True),
+        start_state=of_records["start_state"],
         inputs={
             name: _input(name, entry, where) for name, entry in table(data, "inputs", where).items()
         },
@@ -159,12 +136,12 @@ def load_study(path: str | Path) -> Study:
             name: _text(channel, f"{where}: [compare] {name}")
             for name, channel in table(data, "compare", where).items()
         },
-        step=_positive(study, "step", where),
-        stop=_positive(study, "stop", where),
+        step=_positive(given["step"], f"{where}: [study] step"),
+        stop=_positive(given["stop"], f"{where}: [study] stop"),
         record=names(study, "record", f"{where}: [study]"),
         every=_whole(study, "every", where, 1),
         chunk=_whole(study, "chunk", where, 0),
-        format=chosen,
+        format=given["format"],
     )
 
 
@@ -187,7 +164,7 @@ def _model(entry: Any, number: int, path: Path) -> ModelEntry:
     where = f"{path}: [[model]] {number}"
     if not isinstance(entry, Mapping):
         raise InputError(f"{where}: must be a table; write [[model]] on a line of its own")
-    known(entry, _MODEL_KEYS, where)
+    given = MODEL.read(entry, where)
     if ("fmu" in entry) == ("joint" in entry):
         raise InputError(f"{where}: give either fmu or joint")
     is_fmu = "fmu" in entry
@@ -198,18 +175,15 @@ def _model(entry: Any, number: int, path: Path) -> ModelEntry:
         for key in ("kind", "add", "drop", "controller", "motion", "sensors"):
             if key in entry:
                 raise InputError(f"{where}: {key} goes with a joint file; an FMU is taken as it is")
-    kind = "fmu" if is_fmu else str(entry.get("kind", "plant"))
-    if kind not in ("fmu", *KINDS):
-        raise InputError(f"{where}: kind = {kind!r}; use one of {', '.join(KINDS)}")
     values = table(entry, "set", where)
     return ModelEntry(
-        name=str(entry.get("name", place.stem)),
+        name=place.stem if given["name"] is None else given["name"],
         path=place,
-        kind=kind,
+        kind="fmu" if is_fmu else given["kind"],
         add=names(entry, "add", where),
         drop=names(entry, "drop", where),
         values={n: value(v, f"{where}: set {n}") for n, v in values.items()},
-        **{key: flag(entry, key, where, False) for key in ("controller", "motion", "sensors")},
+        **{key: given[key] for key in ("controller", "motion", "sensors")},
     )
 
 
@@ -247,14 +221,14 @@ def _input(name: str, entry: Any, where: str) -> str | Table:
     if isinstance(entry, str):
         return entry
     if not isinstance(entry, Mapping):
-        return Table(np.zeros(1), np.array([number(entry, where)]))
-    known(entry, ("time", "value", "hold"), where)
+        return Table(np.zeros(1), np.array([finite(entry, where)]))
+    INPUT.check(entry, where)
     columns = [entry.get(key) for key in ("time", "value")]
     if not all(isinstance(column, list) for column in columns):
         raise InputError(
             f"{where}: give a channel's name, a number, or {{ time = [...], value = [...] }}"
         )
-    arrays = [np.array([number(v, where) for v in column or []]) for column in columns]
+    arrays = [np.array([finite(v, where) for v in column or []]) for column in columns]
     try:
         return Table(arrays[0], arrays[1], flag(entry, "hold", where, True))
     except InputError as error:
@@ -267,13 +241,10 @@ def _text(entry: Any, where: str) -> str:
     return entry
 
 
-def _positive(entry: Mapping[str, Any], key: str, where: str) -> float | None:
-    if key not in entry:
-        return None
-    found = number(entry[key], f"{where}: [study] {key}")
-    if found <= 0:
-        raise InputError(f"{where}: [study] {key} = {found:g} is not positive")
-    return found
+def _positive(value: float | None, where: str) -> float | None:
+    if value is not None and value <= 0:
+        raise InputError(f"{where} = {value:g} is not positive")
+    return value
 
 
 def _whole(entry: Mapping[str, Any], key: str, where: str, default: int) -> int:

@@ -11,6 +11,7 @@ from typing import final
 
 import numpy as np
 
+from casadi_models.signals import one_line
 from identification.errors import InputError
 from irj_fmu.host.fmu import Block, Fmu, FmuError, Instance, Number, Wiring, near_names
 from irj_fmu.host.plan import Plan
@@ -24,6 +25,9 @@ class Trajectory:
 
     time: FloatArray
     signals: Mapping[str, FloatArray]
+
+    def __repr__(self) -> str:
+        return one_line(self)
 
     def __getitem__(self, name: str) -> FloatArray:
         return self.signals[name]

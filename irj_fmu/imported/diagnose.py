@@ -18,13 +18,14 @@ from identification.data.record import Record
 from identification.diagnosis.bench import Progress
 from identification.diagnosis.candidates import Candidate, NotTestable, offered
 from identification.diagnosis.claims import Claim, Ranking, rank
+from identification.diagnosis.curve import Curve
 from identification.diagnosis.diagnose import Diagnosis
 from identification.diagnosis.improvement import Improvement, Step, visible_keys
-from identification.diagnosis.learned import LearnedClaim
+from identification.diagnosis.learned import Doubt, Equivalence, LearnedClaim
 from identification.diagnosis.lines import Line
 from identification.diagnosis.locate import Unexplained, locate
 from identification.diagnosis.session import Session, with_held_out
-from identification.diagnosis.trials import Base, Trial, make_base
+from identification.diagnosis.trials import Base, Trial, make_base, span_of
 from identification.errors import InputError
 from identification.fitting.assess import RATIO_LIMIT, BalanceError, Error, assess
 from identification.fitting.engine import (
@@ -338,6 +339,14 @@ class FmuBench:
         """None: a curve cannot ride outside an FMU yet."""
         return ()
 
+    def held_against(self, claims: Sequence[Claim], step: Step) -> Mapping[str, Equivalence]:
+        """None: a curve cannot ride outside an FMU yet."""
+        return {}
+
+    def artefacts(self, step: Step, curves: Sequence[Curve], start: Step) -> tuple[Doubt, ...]:
+        """None: the FMU has its own parameters."""
+        return ()
+
     def same_sign(self, trial: Trial, solution: Solution) -> bool:
         """No minor effects are looked for."""
         return False
@@ -422,8 +431,7 @@ def with_nuisance(base: Base, columns: Sequence[FloatArray], names: Sequence[str
     if not kept:
         return base
     jacobian = np.column_stack([base.jacobian, *extra])
-    left, singular, _ = np.linalg.svd(jacobian, full_matrices=False)
-    orthonormal = left[:, singular > 1e-9 * float(singular[0])]
+    orthonormal = span_of(jacobian)
     return replace(
         base,
         jacobian=jacobian,

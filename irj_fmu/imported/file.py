@@ -1,17 +1,5 @@
-"""A joint file whose model is a user's FMU: ``[model] fmu = "axis.fmu"`` beside ``[joint]``.
-
-::
-
-    [joint]
-    name = "axis 3"
-    gear_ratio = 1.0
-    effects = ["viscous", "coulomb"]     # what the FMU holds already; a diagnosis does not propose
-    it [model] fmu = "axis3.fmu"                    # beside the joint file, or a whole path window
-    = 0.5                         # optional: simulate stretches of 0.5 s, each from its own start
-    [model.channels]                     # record channel = variable of the FMU motor_torque =
-    "torque" motor_position = { variable = "angle", scale = 57.29577951 } [model.parameters]
-    # what a fit may move inertia = { low = 0.1, high = 10.0 } viscous = {} [model.start]
-    # variable of the FMU = record channel, or a number q = "motor_position" w = "motor_velocity"
+"""A joint file whose model is a user's FMU: ``[model] fmu = "axis.fmu"`` beside ``[joint]``; its
+tables are declared in :mod:`irj_fmu.imported.file_schema`.
 """
 
 from __future__ import annotations
@@ -25,18 +13,20 @@ from typing import TYPE_CHECKING, Any, Final
 from casadi_models import JointModel
 from casadi_models.term import TOTAL_INERTIA
 from identification.data.joint_file import Joint, parse_joint, toml_text
+from identification.data.own_effects import TABLE
 from identification.data.plain_text import from_toml, toml_key, toml_string, toml_value
+from identification.data.schema import finite, meant
 from identification.data.typed_laws import LAWS
 from identification.errors import InputError
 from irj_fmu.imported.correction import PREFIX, Correction, correction_of
+from irj_fmu.imported.file_schema import BOUNDS, CHANNEL, MODEL, START
 from irj_fmu.imported.model import Mapped, UserModel, load_user_model
 
 if TYPE_CHECKING:
     from irj_fmu.imported.fit import UserFit
 
-_KEYS: Final = ("fmu", "window", "hold", "kind", "outside", "channels", "parameters", "start")
-_TABLES: Final = ("joint", "model", "columns", "fitted", "provenance", LAWS)
-_ENTRY: Final = {"channels": "variable", "start": "channel"}
+_TABLES: Final = ("joint", "model", "columns", "fitted", "provenance", TABLE, LAWS)
+_ENTRY: Final = {"channels": ("variable", CHANNEL), "start": ("channel", START)}
 
 
 def is_user_joint(path: str | Path) -> bool:
@@ -74,18 +64,14 @@ def load_user_joint(path: str | Path) -> UserModel:
         if key not in _TABLES:
             raise InputError(
                 f"{path}: unknown table [{key}]; with an FMU as the model there are "
-                f"[{'], ['.join(_TABLES)}]"
+                f"[{'], ['.join(_TABLES)}]{meant(key, _TABLES)}"
             )
         if not isinstance(value, Mapping):
             raise InputError(f"{path}: {key} must be a table, as [{key}] on a line of its own")
     table = data.get("model")
     if not isinstance(table, Mapping):
         raise InputError(f'{path}: no [model] table; write [model] with fmu = "file.fmu"')
-    for key in table:
-        if key not in _KEYS:
-            raise InputError(
-                f"{path}: [model] has an unknown key {key!r}; known: {', '.join(_KEYS)}"
-            )
+    MODEL.check(table, f"{path}: [model]")
     if "fmu" not in table:
         raise InputError(f'{path}: [model] has no fmu; write fmu = "file.fmu"')
     if not isinstance(table["fmu"], str) or not table["fmu"].strip():
@@ -93,7 +79,7 @@ def load_user_joint(path: str | Path) -> UserModel:
             f"{path}: [model] fmu = {_shown(table['fmu'])} is not the name of an FMU; write fmu "
             '= "file.fmu"'
         )
-    rest = {k: v for k, v in data.items() if k in ("joint", "columns", LAWS)}
+    rest = {k: v for k, v in data.items() if k in ("joint", "columns", TABLE, LAWS)}
     joint = parse_joint({**rest, "joint": {**rest.get("joint", {}), "model": "hd1"}}, str(path))
     fmu = path.parent / table["fmu"]
     fitted = {str(k): _value(v, f"{path}: [fitted] {k}") for k, v in data.get("fitted", {}).items()}
@@ -104,7 +90,7 @@ def load_user_joint(path: str | Path) -> UserModel:
     )
     window, hold = (
         _number(table.get("window"), f"{path}: [model] window"),
-        _flag(table.get("hold", True), path),
+        MODEL["hold"].read(table, f"{path}: [model]"),
     )
     try:
         model = load_user_model(
@@ -130,26 +116,20 @@ def load_user_joint(path: str | Path) -> UserModel:
 
 
 def _value(entry: Any, where: str) -> float:
-    return _finite(entry.get("value") if isinstance(entry, Mapping) else entry, where)
-
-
-def _finite(value: Any, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(f"{where} = {value!r} is not a finite number")
-    return float(value)
+    return finite(entry.get("value") if isinstance(entry, Mapping) else entry, where)
 
 
 def _number(value: Any, where: str) -> float | None:
     if value is None:
         return None
-    found = _finite(value, where)
+    found = finite(value, where)
     if found <= 0:
         raise InputError(f"{where} = {found:g} must be above 0")
     return found
 
 
 def _scale(value: Any, where: str) -> float:
-    found = _finite(value, where)
+    found = finite(value, where)
     if found == 0:
         raise InputError(
             f"{where} = 0 would leave nothing of it; give variable / channel, or leave the scale "
@@ -163,31 +143,28 @@ def _shown(value: Any) -> str:
     return toml_value(value)
 
 
-def _flag(value: Any, path: Path) -> bool:
-    if not isinstance(value, bool):
-        raise InputError(f"{path}: [model] hold = {value!r}; use true or false")
-    return value
-
-
 def _pairs(table: Mapping[str, Any], name: str, path: Path) -> dict[str, Any]:
     """Entries as names, (name, scale) or numbers."""
     found: dict[str, Any] = {}
+    word, schema = _ENTRY[name]
     for key, entry in _table(table, name, path).items():
         where = f"{path}: [model.{name}] {key}"
         if isinstance(entry, Mapping):
-            other = entry.get(_ENTRY[name])
-            if not isinstance(other, str) or set(entry) - {_ENTRY[name], "scale"}:
-                raise InputError(f"{where} must be a name or a table with {_ENTRY[name]} and scale")
+            other = entry.get(word)
+            if not isinstance(other, str) or set(entry) - set(schema.names):
+                raise InputError(
+                    f"{where} must be a name or a table with {' and '.join(schema.names)}"
+                )
             found[key] = (
                 (other, _scale(entry["scale"], f"{where} scale")) if "scale" in entry else other
             )
         elif isinstance(entry, str) or (name == "start" and isinstance(entry, bool)):
             found[key] = entry
         elif name == "start" and isinstance(entry, int | float):
-            _finite(entry, where)
+            finite(entry, where)
             found[key] = entry
         else:
-            raise InputError(f"{where} = {entry!r}; give the name of a {_ENTRY[name]}")
+            raise InputError(f"{where} = {entry!r}; give the name of a {word}")
     return found
 
 
@@ -204,10 +181,10 @@ def _bounds(table: Mapping[str, Any], path: Path) -> dict[str, tuple[float, floa
     found = {}
     for name, entry in _table(table, "parameters", path).items():
         where = f"{path}: [model.parameters] {name}"
-        if not isinstance(entry, Mapping) or set(entry) - {"low", "high"}:
+        if not isinstance(entry, Mapping) or set(entry) - set(BOUNDS.names):
             raise InputError(f"{where} must be a table with low and high, or {{}}")
         low, high = (
-            _finite(entry[k], f"{where} {k}") if k in entry else v
+            finite(entry[k], f"{where} {k}") if k in entry else v
             for k, v in (("low", -math.inf), ("high", math.inf))
         )
         found[name] = (low, high)

@@ -208,6 +208,7 @@ def simulate_case(
     records: Iterable[str] = RECORDS,
     span: float = SPAN,
     rests: float = 0.0,
+    references: Mapping[str, tuple[FloatArray, FloatArray]] | None = None,
 ) -> Case:
     """Draw a joint, hide the effect in it, record it.
 
@@ -234,6 +235,9 @@ def simulate_case(
         Which records, and how long [s].
     rests
         Share of the time in which the reference stands still; the joint and its path are the same.
+    references
+        Motions of the same joint to record in the place of the drawn ones: record name to position
+        [rad] and velocity [rad/s] at each sample. Their sensors have noise of their own.
     """
     names = names_of(effect)
     if not torque_sensor and NEEDS_TORQUE_SENSOR & set(names):
@@ -253,13 +257,21 @@ def simulate_case(
     if unloaded:
         values["TG"], values["JL"] = 0.0, 0.5 * values["JL"]
     values |= overrides or {}
+    given = dict(references or {})
     exact = _run(
-        _stream(seed, label, "motion", unloaded), values, draws, dirt, tuple(records), span, rests
+        _stream(seed, label, "motion", unloaded),
+        values,
+        draws,
+        dirt,
+        tuple(given or records),
+        span=span,
+        rests=rests,
+        given=given,
     )
     ratio = float(np.sign(values["NKM"])) * TURNS
     for table in exact.values():
         table[:, 2:4] *= ratio
-    noise = _stream(seed, label, "noise", unloaded)
+    noise = _stream(seed, label, "noise", unloaded, *given)
     measured = {name: _sense(noise, table, sensor) for name, table in exact.items()}
     hidden = {n: dict(d.truth) for n, d in draws.items()}
     if "motor_constant_error" in hidden:
@@ -288,8 +300,10 @@ def _run(
     draws: Mapping[str, Draw],
     dirt: bool,
     records: tuple[str, ...],
+    *,
     span: float,
     rests: float,
+    given: Mapping[str, tuple[FloatArray, FloatArray]],
 ) -> dict[str, FloatArray]:
     rows = round(span / DT)
     references = plan(rng, rows, DT)
@@ -297,10 +311,13 @@ def _run(
         references = {
             name: with_rests(rng, reference, DT, rests) for name, reference in references.items()
         }
+    if given:
+        references = dict(given)
+    kept = tuple(references)
     vector = pack(values)
     states: list[FloatArray] = []
     snags: list[FloatArray] = []
-    for name in RECORDS:
+    for name in kept:
         start = references[name][0][0]
         states.append(
             np.array([start - values["TG"] * np.sin(start) / values["K"], 0.0, start, 0.0])
@@ -311,7 +328,7 @@ def _run(
         if "snags" in draws:
             rows_of.append(_snag_rows(rng, float(draws["snags"].truth["snag_Nm"]), 25))
         snags.append(np.concatenate(rows_of))
-    pick = [RECORDS.index(name) for name in records]
+    pick = [kept.index(name) for name in records]
     tables = simulate(
         [vector] * len(pick),
         [references[n] for n in records],

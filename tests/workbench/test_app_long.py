@@ -169,15 +169,16 @@ def test_states_are_made_once_per_record_and_law(monkeypatch: pytest.MonkeyPatch
     assert len(made) == 3
     monkeypatch.setattr(_memory_kept, "MOST", 25)
     states_of(other, "b", make)
-    assert sum(s.size for _, s in _memory_kept._kept.states.values()) <= 25
+    kept = _memory_kept.cache_of("states")
+    assert sum(s.size for _, s, _ in kept.kept.values()) == kept.size <= 25
     assert len(states_of(one, "long", lambda: make(100))[0]) == 100
-    assert not _memory_kept._kept.states
+    assert not kept.kept
+    assert kept.size == 0
     identifier = id(one)
-    kept = _memory_kept._kept.states
     states_of(one, "a", make)
     del one
     gc.collect()
-    assert kept[(identifier, "a")][0]() is None
+    assert kept.kept[(identifier, "a")][0]() is None
 
 
 def test_a_memory_law_is_followed_again_only_where_its_own_values_change(

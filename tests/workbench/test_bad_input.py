@@ -415,7 +415,7 @@ def test_typo_in_the_joint_table(
         ("[known]\nstiffness = -3.0", "[known] stiffness = -3 lies outside its physical bounds"),
         (
             '[known]\nstiffness = { value = 3.0, side = "moon" }',
-            "[known] stiffness has side = 'moon'",
+            "[known] stiffness: side = 'moon' is not known; use one of motor, link",
         ),
         (
             "[knwon]\nstiffness = 3",

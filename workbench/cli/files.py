@@ -6,12 +6,14 @@ import os
 import sys
 from argparse import Namespace
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 from identification.balance.sensing import check_alike
 from identification.data.check.gate import needed, passed
-from identification.data.joint_file import Joint, load_joint
+from identification.data.joint_edit import with_effects
+from identification.data.joint_file import Joint, load_joint, toml_text
 from identification.data.plain_text import from_toml
 from identification.data.read import read
 from identification.data.record import Record
@@ -22,6 +24,15 @@ from irj_fmu.command_line import check_output, is_special, progress_bar, replace
 def open_joint(path: str) -> Joint:
     """A joint file."""
     return load_joint(path)
+
+
+def enlarged(joint: Joint, label: str) -> str:
+    """The joint's own file with one more effect; what else stands in it stays."""
+    larger = replace(joint, effects=(*joint.effects, label))
+    path = Path(joint.source)
+    if is_special(path):  # a pipe is read once
+        return toml_text(larger)
+    return with_effects(path.read_text(encoding="utf-8-sig"), larger)
 
 
 def open_records(paths: Sequence[str], joint: Joint | None) -> tuple[list[Record], list[str]]:
@@ -159,6 +170,7 @@ __all__ = [
     "alike",
     "check_outputs",
     "distinct",
+    "enlarged",
     "named",
     "needed",
     "open_joint",

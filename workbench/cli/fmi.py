@@ -60,17 +60,24 @@ def _kind(rest: list[str], known: Sequence[str]) -> tuple[str | None, list[str]]
     return None, rest
 
 
-def _export_code(rest: Sequence[str]) -> int:
-    parser = OneLineParser(
-        prog=f"irj export {rest[0]}",
+def code_parser(prog: str) -> OneLineParser:
+    """Arguments of ``irj export c`` and ``irj export casadi``."""
+    made = OneLineParser(
+        prog=prog,
         description="Dynamics, regressor, Jacobian, energy and friction compensation of a joint "
         "as code.",
     )
-    parser.add_argument("kind", choices=CODE_KINDS)
-    parser.add_argument("--joint", required=True)
-    parser.add_argument("--out", default="dist", help="folder of the results (default: dist)")
-    parser.add_argument("--json", metavar="FILE")
-    given = parser.parse_args(rest)
+    made.add_argument("kind", choices=CODE_KINDS, help="what is written")
+    made.add_argument("--joint", required=True, metavar="J", help="joint file (TOML)")
+    made.add_argument(
+        "--out", default="dist", metavar="FOLDER", help="folder of the results (default: dist)"
+    )
+    made.add_argument("--json", metavar="FILE", help="write what was built as JSON")
+    return made
+
+
+def _export_code(rest: Sequence[str]) -> int:
+    given = code_parser(f"irj export {rest[0]}").parse_args(rest)
     if given.json is not None:
         check_output(given.json, [given.joint])
     files = export_code(given.kind, given.joint, Path(given.out))

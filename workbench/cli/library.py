@@ -7,16 +7,16 @@ from dataclasses import replace
 
 from casadi_models import EFFECTS
 from casadi_models.text.typed_law import LawError, TypedLaw, derived_key, register
-from identification.data.joint_file import Joint, toml_text
+from identification.data.joint_file import Joint
 from identification.errors import InputError
-from workbench.cli.files import open_joint, write_json, write_text
+from workbench.cli.files import enlarged, open_joint, write_json, write_text
 
 
 def run_effects(arguments: Namespace) -> int:
     """`irj effects [KEY]`."""
-    if arguments.key and arguments.key not in EFFECTS:
+    if arguments.key is not None and arguments.key not in EFFECTS:
         raise InputError(f"no effect {arguments.key!r} in the library; `irj effects` lists it")
-    chosen = [EFFECTS[arguments.key]] if arguments.key else list(EFFECTS.values())
+    chosen = [EFFECTS[arguments.key]] if arguments.key is not None else list(EFFECTS.values())
     data = [
         {
             "key": e.key,
@@ -65,8 +65,7 @@ def run_add(arguments: Namespace) -> int:
         model = joint.model().add(key)
     except (KeyError, ValueError) as error:
         raise InputError(f"{arguments.joint}: {error.args[0]}") from None
-    larger = replace(joint, effects=(*joint.effects, key))
-    write_text(arguments.output, toml_text(larger))
+    write_text(arguments.output, enlarged(joint, key))
     print(f"{arguments.output}: {', '.join(model.effects)}")
     write_json(arguments.json, {"effects": list(model.effects), "file": arguments.output})
     return 0

@@ -10,17 +10,16 @@ from importlib.resources import as_file, files
 from typing import Any
 
 from identification.data.check.gate import gate_warnings
-from identification.data.joint_file import Joint, toml_text
+from identification.data.joint_file import Joint
 from identification.data.record import Record
-from identification.diagnosis.compare import compare
-from identification.diagnosis.diagnose import diagnose
 from identification.diagnosis.improve import Improvement, improve
 from identification.diagnosis.locate import Unexplained
 from identification.fitting.fit import Fit, fit
-from workbench.cli.changed import compared
+from identification.fitting.trust import Trust, trust
 from workbench.cli.files import (
     alike,
     distinct,
+    enlarged,
     open_joint,
     open_records,
     progress_bar,
@@ -43,25 +42,34 @@ def improve_files(
     """
     distinct(training=train, other_payload=other_payload, held_out=held_out)
     joint = open_joint(joint_path)
-    records, _ = _training(train, other_payload, joint)
+    records, _ = training(train, other_payload, joint)
     held, _ = open_records(held_out, joint)
     alike([*train, *other_payload, *held_out], [*records, *held], joint)
-    since = (
-        compared(open_joint(reference), [r for r in records if r.payload != "other"])
-        if reference
-        else None
-    )
-    if since is not None:  # what has moved is not known any more
+    since = None
+    if reference:
+        from workbench.cli.changed import compared
+
+        since = compared(open_joint(reference), [r for r in records if r.payload != "other"])
+        # what has moved is not known any more
         gone = {n for c in since.changes for n in (c.parameter, *c.tied)}
         joint = replace(joint, known={n: k for n, k in joint.known.items() if n not in gone})
     found = improve(records, joint, held, max_additions=max_additions, progress=progress_bar)
     progress_bar("done", 1.0)
-    _print_warnings(found.warnings, [*records, *held])
+    print_warnings(found.warnings, [*records, *held])
     data = found.as_json() if since is None else {**found.as_json(), "changed": since.as_json()}
+    judged = trusted(found)
+    data["trust"] = judged.as_json() if judged is not None else []
     return data, found, [*records, *held]
 
 
-def _print_warnings(warnings: Sequence[str], records: Sequence[Record]) -> None:
+def trusted(found: Improvement) -> Trust | None:
+    """Which number of the last step to trust; None where nothing was fitted."""
+    if not found.steps:
+        return None
+    return trust(found.steps[-1].solution, found.data, profiles=False)
+
+
+def print_warnings(warnings: Sequence[str], records: Sequence[Record]) -> None:
     """Warnings on stderr, without those that were printed when the records were opened."""
     said = gate_warnings(records)
     for text in warnings:
@@ -69,7 +77,7 @@ def _print_warnings(warnings: Sequence[str], records: Sequence[Record]) -> None:
             print(f"irj: {text}", file=sys.stderr)
 
 
-def _training(
+def training(
     paths: Sequence[str], other_payload: Sequence[str], joint: Joint
 ) -> tuple[list[Record], list[str]]:
     """Training records, those with another payload marked, and the warnings."""
@@ -89,9 +97,12 @@ def run_improve(arguments: Namespace) -> int:
         reference=arguments.reference,
     )
     print_improvement(found)
-    _write_improvement(found, records, arguments.report, arguments.output, arguments.command)
-    write_picture(found, arguments.picture)
     write_json(arguments.json, data)
+    if arguments.output:
+        write_text(arguments.output, found.to_joint_file())
+        print(f"joint file: {arguments.output}")
+    write_picture(found, arguments.picture)
+    _write_report(found, records, arguments.report, arguments.command)
     return 0
 
 
@@ -104,8 +115,8 @@ def run_report(arguments: Namespace) -> int:
         other_payload=arguments.other_payload,
     )
     print(found.reason)
-    _write_improvement(found, records, arguments.output, None, arguments.command)
     write_json(arguments.json, data)
+    _write_report(found, records, arguments.output, arguments.command)
     return 0
 
 
@@ -121,26 +132,21 @@ def run_demo(arguments: Namespace) -> int:
             [names["train.npz"]], [names["held_out.npz"]], names["joint.toml"]
         )
     print_improvement(found)
-    _write_improvement(found, records, arguments.report, None, arguments.command)
-    write_picture(found, arguments.picture)
     write_json(arguments.json, data)
+    write_picture(found, arguments.picture)
+    _write_report(found, records, arguments.report, arguments.command)
     return 0
 
 
-def _write_improvement(
-    found: Improvement,
-    records: Sequence[Record],
-    report: str | None,
-    output: str | None,
-    command: str,
+def _write_report(
+    found: Improvement, records: Sequence[Record], report: str | None, command: str
 ) -> None:
+    """The report comes last: what it is drawn from stands on the disk before it is drawn."""
     if report:
         from workbench.show.report import write_report
 
-        print(f"report: {write_report(found, report, records=records, command=command)}")
-    if output:
-        write_text(output, found.to_joint_file())
-        print(f"joint file: {output}")
+        made = write_report(found, report, records=records, command=command, trust=trusted(found))
+        print(f"report: {made}")
 
 
 def write_picture(found: Improvement, path: str | None) -> None:
@@ -168,6 +174,8 @@ def print_improvement(found: Improvement) -> None:
         names = (
             claim.effects[0] if len(claim.effects) == 1 else "{" + ", ".join(claim.effects) + "}"
         )
+        if claim.like:
+            names = claim.like
         said, rest = (
             ("in part", "; structure is left that is not in the library")
             if claim.partial
@@ -238,7 +246,7 @@ def run_fit(arguments: Namespace) -> int:
     """`irj fit`."""
     distinct(training=arguments.records, other_payload=arguments.other_payload)
     joint = open_joint(arguments.joint)
-    records, warnings = _training(arguments.records, arguments.other_payload, joint)
+    records, warnings = training(arguments.records, arguments.other_payload, joint)
     alike([*arguments.records, *arguments.other_payload], records, joint)
     fitted = fit(joint, records)
     if arguments.refine:
@@ -278,6 +286,8 @@ def _print_parameters(parameters: Mapping[str, Mapping[str, Any]]) -> None:
 
 def run_compare(arguments: Namespace) -> int:
     """`irj compare`."""
+    from identification.diagnosis.compare import compare
+
     joint = open_joint(arguments.joint)
     records, _ = open_records(arguments.records, joint)
     basis = open_records(arguments.fit_records, joint)[0] if arguments.fit_records else records
@@ -288,26 +298,30 @@ def run_compare(arguments: Namespace) -> int:
         joint,
         once=False,
     )
-    comparison = compare(fit(joint, basis), records, linear=not arguments.no_linear)
+    fitted = fit(joint, basis)
+    comparison = compare(fitted, records, linear=not arguments.no_linear)
     print(comparison)
     for place in comparison.places[:5]:
         print(
             f"  {place.balance} balance against {place.title}: explains "
             f"{max(place.share_percent, 0):.0f} % of what is left there"
         )
-    write_json(arguments.json, comparison.as_json())
+    judged = trust(fitted.solution, fitted.data, profiles=False)
+    write_json(arguments.json, {**comparison.as_json(), "trust": judged.as_json()})
     return 0
 
 
 def run_diagnose(arguments: Namespace) -> int:
     """`irj diagnose`."""
+    from identification.diagnosis.diagnose import diagnose
+
     distinct(
         training=arguments.records,
         other_payload=arguments.other_payload,
         held_out=arguments.held_out,
     )
     joint = open_joint(arguments.joint)
-    records, _ = _training(arguments.records, arguments.other_payload, joint)
+    records, _ = training(arguments.records, arguments.other_payload, joint)
     held, _ = open_records(arguments.held_out, joint)
     alike(
         [*arguments.records, *arguments.other_payload, *arguments.held_out],
@@ -316,7 +330,7 @@ def run_diagnose(arguments: Namespace) -> int:
     )
     found = diagnose(fit(joint, records), held, progress=progress_bar)
     progress_bar("done", 1.0)
-    _print_warnings(found.warnings, [*records, *held])
+    print_warnings(found.warnings, [*records, *held])
     if found.data.note:
         print(f"note: {found.data.note}")
     print(found)
@@ -326,10 +340,7 @@ def run_diagnose(arguments: Namespace) -> int:
     for key in arguments.why:
         print(found.why(key))
     if arguments.output and found.claims:
-        write_text(
-            arguments.output,
-            toml_text(replace(joint, effects=(*joint.effects, found.claims[0].label))),
-        )
+        write_text(arguments.output, enlarged(joint, found.claims[0].label))
         print(f"joint file with {found.claims[0].label}: {arguments.output}")
     elif arguments.output:
         print(f"nothing is named: {arguments.output} is not written")

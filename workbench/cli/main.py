@@ -18,6 +18,7 @@ from typing import Any, TextIO, cast, final
 
 from identification import __version__
 from identification.errors import InputError
+from identification.scratch import release
 from irj_fmu.command_line import (
     STOPPED,
     OneLineParser,
@@ -54,19 +55,20 @@ def _port(text: str) -> int:
     return value
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = OneLineParser(
+def parser() -> OneLineParser:
+    """Arguments of every verb; those of export, cosim and batch go through to their own."""
+    made = OneLineParser(
         prog="irj", description="Tells which physics a geared joint's model is missing."
     )
-    parser.add_argument("--version", action="version", version=f"irj {__version__}")
-    parser.add_argument(
+    made.add_argument("--version", action="version", version=f"irj {__version__}")
+    made.add_argument(
         "--effects",
         metavar="FILE.py",
         action="append",
         default=[],
         help="register your own effects from a Python file",
     )
-    verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
+    verbs = made.add_subparsers(dest="verb", required=True, metavar="VERB")
 
     def verb(
         name: str, module: str, text: str, *, records: bool = False, joint: bool = False
@@ -198,6 +200,31 @@ def _parser() -> argparse.ArgumentParser:
         metavar="REFERENCE",
         help="fitted joint file: first say what changed since, before any new effect is looked for",
     )
+    explored = verb(
+        "explore",
+        "explore",
+        "hold all variants of the model against each other: error, parameters, ties",
+        records=True,
+        joint=True,
+    )
+    other_payload(explored)
+    explored.add_argument(
+        "--held-out",
+        nargs="+",
+        action="extend",
+        metavar="REC",
+        default=[],
+        help="records the fit must not see",
+    )
+    explored.add_argument(
+        "--picture", metavar="FILE.svg", help="draw the held-out error against the parameters"
+    )
+    explored.add_argument(
+        "--out", metavar="DIR", help="folder for the variants as Parquet, with JSON and picture"
+    )
+    explored.add_argument(
+        "-o", "--output", metavar="FILE", help="write the joint file of the recommended variant"
+    )
     moved = verb("changed", "changed", "which parameters of a fitted joint moved, by how much")
     moved.add_argument("reference", metavar="REFERENCE", help="joint file written by a fit")
     moved.add_argument("records", nargs="+", metavar="REC", help="record files")
@@ -242,8 +269,10 @@ def _parser() -> argparse.ArgumentParser:
     added.add_argument(
         "--key", dest="named", metavar="KEY", help="key of the law (default: one derived from it)"
     )
-    added.add_argument("--joint", metavar="J", required=True)
-    added.add_argument("-o", "--output", metavar="FILE", required=True)
+    added.add_argument("--joint", metavar="J", required=True, help="joint file (TOML)")
+    added.add_argument(
+        "-o", "--output", metavar="FILE", required=True, help="write the larger joint file"
+    )
     displayed = verb(
         "show",
         "show",
@@ -285,12 +314,19 @@ def _parser() -> argparse.ArgumentParser:
         default=[],
         help="true value of a parameter, link-referred SI",
     )
-    simulated.add_argument("--seconds", type=float, default=24.0)
+    simulated.add_argument("--seconds", type=float, default=24.0, help="length [s] (default 24)")
     simulated.add_argument(
         "--rate", type=float, default=500.0, help="samples per second (default 500)"
     )
-    simulated.add_argument("--seed", type=int, default=0)
-    simulated.add_argument("--motion", choices=("multisine", "triangle"), default="multisine")
+    simulated.add_argument(
+        "--seed", type=int, default=0, help="seed of motion and noise (default 0)"
+    )
+    simulated.add_argument(
+        "--motion",
+        choices=("multisine", "triangle"),
+        default="multisine",
+        help="what the controller follows (default multisine)",
+    )
     tracked = verb(
         "track",
         "online",
@@ -344,6 +380,55 @@ def _parser() -> argparse.ArgumentParser:
         default=float("inf"),
         help="drive torque on the link side [Nm]",
     )
+    following = verb(
+        "next",
+        "next_run",
+        "the run that would tell names apart; without records, what a planned run cannot show",
+    )
+    following.add_argument("records", nargs="*", metavar="REC", help="record files")
+    following.add_argument("--joint", metavar="J", required=True, help="joint file (TOML)")
+    other_payload(following)
+    following.add_argument(
+        "--held-out",
+        nargs="+",
+        action="extend",
+        metavar="REC",
+        default=[],
+        help="records the fit must not see",
+    )
+    following.add_argument(
+        "-o", "--output", metavar="FILE", help="the proposed motion as CSV, as `irj plan` writes it"
+    )
+    following.add_argument(
+        "--motion", metavar="FILE", help="without records: the motion that is planned (CSV)"
+    )
+    for option, unit, text in (
+        ("position", "DEG", "half of the link's workspace [deg; m on a linear axis]"),
+        ("speed", "DEG_S", "link speed [deg/s; m/s]"),
+        ("torque", "NM", "drive torque on the link side [Nm; N]"),
+    ):
+        following.add_argument(
+            f"--max-{option}", type=float, metavar=unit, help=f"{text}; default: as in the records"
+        )
+    trusted = verb(
+        "trust",
+        "trust",
+        "which number of a fit to trust: intervals, windows, what it trades with",
+        records=True,
+        joint=True,
+    )
+    other_payload(trusted)
+    joints = verb("joints", "joints", "the library of identified joints")
+    joints.add_argument("what", choices=("list", "show", "compare"))
+    joints.add_argument("names", nargs="*", metavar="NAME", help="names, types or files of joints")
+    joints.add_argument(
+        "--library",
+        nargs="+",
+        action="extend",
+        metavar="PATH",
+        default=[],
+        help="more joints: joint files, folders of them, a table of published parameters (.json)",
+    )
     for name, text in (
         ("export", "export as FMU, C or CasADi function"),
         ("cosim", "co-simulate plant and estimator FMU"),
@@ -351,10 +436,12 @@ def _parser() -> argparse.ArgumentParser:
     ):
         verbs.add_parser(name, help=text, add_help=False).set_defaults(module="fmi", own_effects=[])
     app = verb("app", "page", "the page in your browser")
-    app.add_argument("files", nargs="*", metavar="FILES")
-    app.add_argument("--port", type=_port, default=0)
-    app.add_argument("--no-browser", action="store_true")
-    return parser
+    app.add_argument(
+        "files", nargs="*", metavar="FILES", help="records and a joint file to begin with"
+    )
+    app.add_argument("--port", type=_port, default=0, help="port of the page (0: any free one)")
+    app.add_argument("--no-browser", action="store_true", help="print the address, open nothing")
+    return made
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -366,13 +453,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stdout.reconfigure(
             errors="backslashreplace"
         )  # a terminal that lacks a sign must not cost the results
-    parser = _parser()
-    arguments, rest = parser.parse_known_args(given)
+    if any("\0" in word for word in given):
+        parser().error("an argument holds a zero byte; no name of a file or effect has one")
+    arguments, rest = parser().parse_known_args(given)
     arguments.rest = rest
     if arguments.module == "fmi":
         arguments.rest, arguments.own_effects = _taken(rest)
     if rest and arguments.module != "fmi":
-        parser.error(f"unrecognized arguments: {' '.join(rest)}")
+        parser().error(f"unrecognized arguments: {' '.join(rest)}")
     arguments.command = shlex.join(["irj", *given])
     STOPPED.clear()
     with _watched_interrupt(), _patient_output():
@@ -391,6 +479,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             return crashed(error, arguments.command)
         finally:
             STOPPED.clear()
+            release()
 
 
 def _run(arguments: argparse.Namespace) -> int:

@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 import sys
 from argparse import Namespace
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -30,8 +30,9 @@ from workbench.show.replayed import AFTERMATH, READINGS, UNESTIMATED, Replay
 if TYPE_CHECKING:
     from identification.data.joint_file import Joint
     from identification.data.record import Record
-    from identification.faults.detector import Fault
-    from identification.planning.trajectories import Excitation, Selection
+    from identification.faults.bank import FaultBank
+    from identification.faults.detector import Fault, FaultEvent
+    from identification.planning.trajectories import Selection
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -43,17 +44,20 @@ def run_track(arguments: Namespace) -> int:
     """`irj track`: 1 where ``--fail-on-fault`` was given and a fault was found."""
     joint = open_joint(arguments.joint)
     tried = [parse_fault(text) for text in getattr(arguments, "inject", None) or []]
-    records, warnings = _open_doubtful(arguments.records, joint)
+    records, raw, warnings = _open_doubtful(arguments.records, joint)
     healthy, more = open_records(arguments.healthy, joint)
-    state = limits(
-        joint,
-        records[0],
-        [r.renamed(path) for r, path in zip(healthy, arguments.healthy, strict=True)],
-    )
+    healthy = [r.renamed(path) for r, path in zip(healthy, arguments.healthy, strict=True)]
+    banks = _banks(joint, raw, healthy)
+    plain = [r for r, bank in zip(records, banks, strict=True) if bank is None]
+    state = limits(joint, plain[0], healthy) if plain else None
     found = []
-    for path, record in zip(arguments.records, records, strict=True):
+    for path, record, doubtful, bank in zip(arguments.records, records, raw, banks, strict=True):
         try:
-            found.append(replay(record, joint, state, tried))
+            if bank is None:
+                found.append(replay(record, joint, state, tried))
+            else:
+                watch = (bank, doubtful, _announced(path, bank, healthy[0], joint))
+                found.append(replay(record, joint, None, tried, watch))
         except InputError as error:
             raise named(error, path, record) from None
     results = [made.as_json() for made in found]
@@ -74,9 +78,54 @@ def run_track(arguments: Namespace) -> int:
     return 1 if arguments.fail_on_fault and any(r["events"] for r in results) else 0
 
 
-def _open_doubtful(paths: Sequence[str], joint: Joint) -> tuple[list[Record], list[str]]:
+def _banks(
+    joint: Joint, records: Sequence[Record], healthy: Sequence[Record]
+) -> list[FaultBank | None]:
+    """A fault bank for each record where a velocity is derived; None where both are measured, the
+    record has several runs, or no bank can be made. Records with the same sensors and step share
+    one.
+    """
+    from irj_fmu.estimator.bank import bank_for, measured_sensors
+
+    made: dict[tuple[object, ...], FaultBank | None] = {}
+    out: list[FaultBank | None] = []
+    for record in records:
+        measured = record.has("motor_velocity", "link_velocity")
+        if measured or not healthy or not (np.diff(record.time) >= 0).all():
+            out.append(None)
+            continue
+        limits_fit(record, healthy)
+        key = (*measured_sensors(record), float(f"{record.dt:.3g}"))
+        if key not in made:
+            made[key] = bank_for(joint, record, healthy)
+        out.append(made[key])
+    return out
+
+
+def _announced(
+    path: str, bank: FaultBank, healthy: Record, joint: Joint
+) -> dict[str, tuple[float, float]]:
+    """Print, and give, the smallest offsets that a bank sees on this joint."""
+    from identification.faults.bank_levels import Piece
+    from identification.faults.detector import SENSORS
+
+    longest = max(healthy.segments(), key=lambda s: s.stop - s.start)
+    rows = np.array(online_readings(healthy, joint)[0])[longest]
+    found = bank.smallest(Piece(healthy.time[longest], rows))
+    print(f"{path}: smallest offset of a sensor that is seen, and that is named")
+    for name, (seen, told) in found.items():
+        at = SENSORS.index(name)
+        unit = "rad" if at in (1, 3) else "rad/s" if at in (2, 4) else "N.m"
+        last = f"{told:.2g} {unit}" if math.isfinite(told) else "never"
+        print(f"  {READINGS[at]:<16} {seen:.2g} {unit}, {last}")
+    return found
+
+
+def _open_doubtful(
+    paths: Sequence[str], joint: Joint
+) -> tuple[list[Record], list[Record], list[str]]:
     """Records in SI of which only the head must be sane: what a sensor does later is for the
-    estimator to find.
+    estimator to find. The same as read; sentences about doubts.
 
     Raises
     ------
@@ -88,9 +137,10 @@ def _open_doubtful(paths: Sequence[str], joint: Joint) -> tuple[list[Record], li
     from identification.data.read import read
     from identification.online.estimator import OnlineOptions
 
-    records, warnings = [], []
+    records, raw, warnings = [], [], []
     for path in paths:
         record = read(path, columns=joint.columns, kind=joint.kind)
+        raw.append(record)
         given = (joint.gear_ratio, needed(record, joint), joint.torque_per_current)
         try:
             head = record.time - record.time[0] <= OnlineOptions().warm_up
@@ -111,7 +161,7 @@ def _open_doubtful(paths: Sequence[str], joint: Joint) -> tuple[list[Record], li
         records.append(record)
     for text in warnings:
         sys.stderr.write(f"irj: {text}\n")
-    return records, warnings
+    return records, raw, warnings
 
 
 def parse_fault(text: str) -> Fault:
@@ -159,6 +209,18 @@ def limits(joint: Joint, record: Record, healthy: Sequence[Record]) -> bytes | N
     options = OnlineOptions(
         has_link=record.has("link_position"), has_torque=record.has("link_torque")
     )
+    limits_fit(record, healthy)
+    return detector_state(joint, options, healthy, record.resampled().dt)
+
+
+def limits_fit(record: Record, healthy: Sequence[Record]) -> None:
+    """Check that healthy records can give limits for a record.
+
+    Raises
+    ------
+    InputError
+        A record has another sample time or lacks a channel.
+    """
     for other in healthy:
         if other.dt > 1.01 * record.dt:
             raise InputError(
@@ -171,7 +233,6 @@ def limits(joint: Joint, record: Record, healthy: Sequence[Record]) -> bytes | N
                     f"{other.name}: no {channel}, which {record.name} has; --healthy takes "
                     "records with the same channels"
                 )
-    return detector_state(joint, options, healthy, record.resampled().dt)
 
 
 def track(record: Record, joint: Joint, detector_state: bytes | None = None) -> dict[str, Any]:
@@ -187,7 +248,13 @@ def track(record: Record, joint: Joint, detector_state: bytes | None = None) -> 
 
 
 def replay(
-    record: Record, joint: Joint, detector_state: bytes | None = None, tried: Sequence[Fault] = ()
+    record: Record,
+    joint: Joint,
+    detector_state: bytes | None = None,
+    tried: Sequence[Fault] = (),
+    watch: tuple[FaultBank, Record, dict[str, tuple[float, float]]] | None = None,
+    *,
+    progress: Callable[[str, float], None] = progress_bar,
 ) -> Replay:
     """Replay a record through the online estimator, sample by sample.
 
@@ -201,6 +268,11 @@ def replay(
         Of a detector calibrated with healthy records.
     tried : sequence of Fault
         Faults put into the readings; their times count from the first sample.
+    progress : callable
+        ``progress(text, share)``, some hundred times.
+    watch : tuple, optional
+        A fault bank that looks for faults in place of the estimator's detector, the record as read,
+        and the smallest offsets that it sees.
 
     Raises
     ------
@@ -217,28 +289,46 @@ def replay(
                 f"{even.duration:.4g} s long"
             )
     options = OnlineOptions(
-        has_link=record.has("link_position"), has_torque=record.has("link_torque")
+        has_link=record.has("link_position"),
+        has_torque=record.has("link_torque"),
+        detect=watch is None,
     )
     estimator = OnlineEstimator(joint, even.dt, options, detector_state)
     table, there = online_readings(even, joint)
     healthy = np.array(table)
     readings = np.array(online_readings(even, joint, tried)[0]) if tried else healthy
     valid = (np.isfinite(readings) & np.array(there)).tolist()
-    rows = np.nan_to_num(readings).tolist()
     used, failed = readings.copy(), np.zeros(readings.shape, dtype=bool)
+    judged = None
+    if watch is not None:
+        from irj_fmu.estimator.bank import judgement
+
+        judged = judgement(watch[0], watch[1], even, joint, tried)
+        failed = judged.failed
+        used = np.where(failed, judged.readings, used)
+        valid = (np.array(valid) & ~failed).tolist()
+    rows = np.nan_to_num(readings).tolist()
     every = max(1, len(even) // POINTS)
     course: list[tuple[float, FloatArray, FloatArray, FloatArray]] = []
+    looks: list[tuple[int, list[float]]] = []
     events: list[dict[str, Any]] = []
+    verdicts: list[tuple[float, FaultEvent]] = []
     fault, detector = 0, estimator.detector
     for part in even.segments():
         estimator.reset()
+        told = None
+        worst = [0.0] * len(READINGS)
         before: tuple[bool, ...] = (False,) * len(READINGS)
         quiet = [-math.inf] * len(READINGS)
         for k in range(part.start, part.stop):
             now = float(even.time[k])
             estimator.update(now, rows[k], valid[k])
+            worst = [max(a, b) for a, b in zip(worst, estimator.score, strict=True)]
             codes = []
             if detector is not None:
+                if detector.last_event is not told:
+                    verdicts += [(now, e) for e in _since(detector.events, told)]
+                    told = detector.last_event
                 replaced = detector.replaced
                 used[k], failed[k] = estimator.readings, replaced
                 if replaced != before:
@@ -252,7 +342,7 @@ def replay(
                         for r, b, q in zip(replaced, before, quiet, strict=True)
                     ]
                     before = replaced
-            if estimator.fault != fault:
+            if judged is None and estimator.fault != fault:
                 fault = estimator.fault
                 # a reading that is replaced has been reported when that began
                 known = fault not in (7, 8, 9) and (
@@ -260,11 +350,18 @@ def replay(
                 )
                 codes += [fault] if fault and not known else []
             events += [{"time": now, "fault": code, "text": fault_text(code)} for code in codes]
-            if (k + 1) % every == 0 and not estimator.warming_up:
+            if (k + 1) % every:
+                continue
+            looks.append((k, worst))
+            worst = [0.0] * len(READINGS)
+            if not estimator.warming_up:
                 course.append(
                     (now, estimator.theta.copy(), estimator.sigma.copy(), estimator.ratio.copy())
                 )
-        progress_bar(f"tracking {record.name}", part.stop / len(even))
+            progress(f"tracking {record.name}", (k + 1) / len(even))
+        progress(f"tracking {record.name}", part.stop / len(even))
+    if judged is not None:
+        events = [_bank_event(e) for e in judged.events]
     if not course and not events:
         longest = max(part.stop - part.start for part in even.segments()) * even.dt
         where = (
@@ -287,14 +384,38 @@ def replay(
         values=values,
         sigmas=sigmas,
         ratios=ratios,
+        looks=np.array([k for k, _ in looks], dtype=np.int64),
+        scores=np.array([row for _, row in looks]).reshape(-1, len(READINGS)),
         events=tuple(events),
+        verdicts=tuple(verdicts),
         healthy=healthy,
         readings=readings,
         used=used,
         failed=failed,
         tried=tuple(tried),
-        calibrated=estimator.detector is not None and detector_state is not None,
+        calibrated=watch is not None
+        or (estimator.detector is not None and detector_state is not None),
+        banked=watch is not None,
+        smallest={} if watch is None else watch[2],
     )
+
+
+def _since(events: Sequence[FaultEvent], known: FaultEvent | None) -> Sequence[FaultEvent]:
+    """Events after one that is known; all where the detector has started anew."""
+    places = [k for k, e in enumerate(events) if e is known]
+    return events[places[-1] + 1 :] if places else events
+
+
+def _bank_event(event: dict[str, Any]) -> dict[str, Any]:
+    """An event of a bank with the words of its code."""
+    from identification.faults.detector import SENSORS
+    from identification.faults.types import Verdict
+
+    text = fault_text(event["fault"])
+    if event["verdict"] is Verdict.ONE_OF:
+        names = [READINGS[SENSORS.index(n)] for n in event["sensors"]]
+        text = f"{' or '.join(names)} failed; the readings cannot tell which"
+    return {"time": event["time"], "fault": event["fault"], "text": text, "first": event["first"]}
 
 
 def fault_text(code: int) -> str:
@@ -402,7 +523,7 @@ def run_plan(arguments: Namespace) -> int:
             "--max-speed or --max-torque"
         )
     chosen = select(experiment, [t.motion for t in allowed], limits=limits)
-    _write_motion(arguments.output, chosen.best)
+    write_bytes(arguments.output, chosen.best.motion.text.encode())
     _print_plan(arguments.output, chosen, len(tried) - len(allowed), bool(joint.fitted))
     best = chosen.best
     data = {
@@ -416,17 +537,6 @@ def run_plan(arguments: Namespace) -> int:
     }
     write_json(arguments.json, data)
     return 0
-
-
-def _write_motion(path: str, best: Excitation) -> None:
-    import io
-
-    from identification.planning.trajectories import COLUMNS
-
-    text = io.StringIO()
-    rows = np.column_stack([best.motion.time, best.motion.table])
-    np.savetxt(text, rows, delimiter=",", header=",".join(COLUMNS), comments="", fmt="%.9g")
-    write_bytes(path, text.getvalue().encode())
 
 
 def _print_plan(path: str, chosen: Selection, refused: int, fitted: bool) -> None:

@@ -320,6 +320,29 @@ def run_add(arguments: Namespace) -> int:
     return 0
 
 
+def export_parser() -> OneLineParser:
+    """Arguments of ``irj export`` where the joint file's model is an FMU."""
+    from irj_fmu.imported.export import KINDS
+
+    made = OneLineParser(
+        prog="irj export", description="A user's FMU with the effect that rides outside it."
+    )
+    made.add_argument(
+        "kind", nargs="?", default="pair", help=f"{' or '.join(KINDS)} (default: pair)"
+    )
+    made.add_argument("--joint", required=True, metavar="J", help="joint file (TOML)")
+    made.add_argument(
+        "--out",
+        default=Path("dist"),
+        type=Path,
+        metavar="FOLDER",
+        help="folder of the results (default: dist)",
+    )
+    made.add_argument("--cc", help="C compiler")
+    made.add_argument("--json", metavar="FILE", help="write what was built as JSON")
+    return made
+
+
 @_one_line
 def run_export(arguments: Namespace) -> int:
     """`irj export [pair|ssp] --joint J`: FMU and correction as one FMU, or as a system."""
@@ -328,19 +351,7 @@ def run_export(arguments: Namespace) -> int:
     from irj_fmu.imported.file import load_user_joint
     from irj_fmu.plant.joint import identifier
 
-    parser = OneLineParser(
-        prog="irj export", description="A user's FMU with the effect that rides outside it."
-    )
-    parser.add_argument(
-        "kind", nargs="?", default="pair", help=f"{' or '.join(KINDS)} (default: pair)"
-    )
-    parser.add_argument("--joint", required=True)
-    parser.add_argument(
-        "--out", default=Path("dist"), type=Path, help="folder of the results (default: dist)"
-    )
-    parser.add_argument("--cc", help="C compiler")
-    parser.add_argument("--json", metavar="FILE")
-    given = parser.parse_args(arguments.rest)
+    given = export_parser().parse_args(arguments.rest)
     if given.kind not in KINDS:
         raise InputError(
             f"export {given.kind}: the model of {given.joint} is an FMU, which goes out as "

@@ -12,6 +12,7 @@ from typing import Any, Final
 
 from casadi_models.transmission import MODELS
 from identification.data.joint_file import Joint, parse_joint, toml_text
+from identification.data.joint_schema import JOINT
 from identification.data.plain_text import from_toml
 from identification.errors import InputError
 from workbench.page.live import Live
@@ -19,7 +20,7 @@ from workbench.page.records import guessed_role
 from workbench.page.session import FileEntry, State
 
 LARGEST_JOINT: Final = 1 << 20
-NUMBERS: Final = ("gear_ratio", "motor_constant", "torque_per_current", "torque_per_voltage")
+NUMBERS: Final = tuple(key.name for key in JOINT.keys if key.kind == "number")
 
 
 def add_upload(live: Live, name: str, stored: str, size: int) -> dict[str, Any]:

@@ -13,37 +13,27 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, cast, final
 
 import numpy as np
-import numpy.typing as npt
 
 from identification.data.joint_file import Joint, parse_joint
 from identification.data.record import Record
 from identification.errors import InputError
-from irj_fmu.estimator.healthy import online_readings
-from workbench.cli.online import fault_text
+from irj_fmu.estimator.healthy import detector_state, online_readings
+from workbench.cli.online import replay as followed
 from workbench.page.analysis import Progress, clean
 from workbench.page.live import Live
 from workbench.page.session import StepEntry, write_atomic
+from workbench.show.replayed import READINGS, Replay
 
 if TYPE_CHECKING:
-    from identification.faults.detector import FaultDetector
-    from identification.online.estimator import OnlineEstimator, OnlineOptions
-
-FloatArray = npt.NDArray[np.float64]
+    from identification.faults.detector import Fault
+    from identification.faults.injector import Kind
+    from identification.online.estimator import OnlineOptions
 
 MOST_SECONDS: Final = 60.0
 """Length that is replayed unless another one is asked for [s]."""
 MOST_SAMPLES: Final = 200_000
 HEALTHY_SAMPLES: Final = 20_000
 """Samples of the training records from which the fault detector takes its limits."""
-POINTS: Final = 400
-READINGS: Final = (
-    "motor current",
-    "motor position",
-    "motor velocity",
-    "link position",
-    "link velocity",
-    "torque",
-)
 TRIED: Final = ("none", "stuck", "dropout", "bias", "gain", "noise", "drift", "spike")
 """Faults that can be tried; see `identification.faults.injector`."""
 SHARE: Final = {"bias": 0.1, "noise": 0.1, "spike": 0.3, "drift": 0.02}
@@ -119,7 +109,7 @@ def replay(
     InputError
         Nothing is fitted; the record is too short or lacks a channel.
     """
-    from identification.online.estimator import OnlineEstimator, OnlineOptions
+    from identification.online.estimator import OnlineOptions
 
     if not steps:
         raise InputError("replay: fit first, the estimator starts from the fitted joint")
@@ -134,25 +124,28 @@ def replay(
             f"replay: {part.duration:.3g} s are too short for the first window of "
             f"{options.warm_up:g} s; ask for a longer part"
         )
-    table, note = _readings(part, joint, asked)
+    tried, note = _tried(part, joint, asked)
     progress("taking the limits from the records of the fit", 0.02)
     healthy = [f.id for f in live.state.files if f.status == "ready" and f.role == "train"]
-    mark = (steps[-1].values, steps[-1].effects, healthy, round(part.dt, 9))
+    dt = part.resampled().dt
+    mark = (steps[-1].values, steps[-1].effects, healthy, round(dt, 9))
     known = live.kept.get("limits")
     if known is None or known[0] != mark:
         known = live.kept["limits"] = (
             mark,
-            _limits(joint, options, [live.record(i) for i in healthy], part.dt),
+            _limits(joint, options, [live.record(i) for i in healthy], dt),
         )
     state, why = known[1]
-    estimator = OnlineEstimator(joint, part.dt, options, state)
-    made = _followed(estimator, part, table, progress)
+    made = followed(
+        part, joint, state, tried, progress=lambda text, share: progress(text, 0.05 + 0.9 * share)
+    )
+    estimator = made.estimator
     found = clean(
         {
-            **made,
+            **_result(made),
             "record": whole.name,
             "effects": list(steps[-1].effects),
-            "start": float(part.time[0]),
+            "start": float(made.record.time[0]),
             "note": note,
             "no_detector": why,
             "detector": estimator.detector is not None,
@@ -167,7 +160,7 @@ def replay(
 
 
 def _part(record: Record, asked: Request) -> Record:
-    """The asked part, at even steps."""
+    """The asked part."""
     first = float(record.time[0]) + asked.first
     keep = (record.time >= first) & (record.time <= first + asked.seconds)
     if not keep.any():
@@ -180,7 +173,7 @@ def _part(record: Record, asked: Request) -> Record:
             f"replay: {int(keep.sum())} samples are too many for the page; ask for "
             f"{MOST_SAMPLES * record.dt:.3g} s at most, or use `irj track`"
         )
-    return record.take(keep, "the part that was asked for").resampled()
+    return record.take(keep, "the part that was asked for")
 
 
 def _limits(
@@ -189,7 +182,6 @@ def _limits(
     """State of a fault detector with limits from healthy records; the reason where there is
     none.
     """
-    from identification.faults.detector import FaultDetector
     from identification.online.estimator import prepared
 
     model, _ = prepared(joint, options)
@@ -201,50 +193,39 @@ def _limits(
         )
     if not (options.has_link and options.has_torque):
         return None, "without link position and torque there is no second opinion on a sensor"
-    tables, left = [], HEALTHY_SAMPLES
+    usable, left = [], HEALTHY_SAMPLES
     for record in healthy:
         if left <= 0 or abs(record.dt - dt) > 0.01 * dt:
             continue
-        even = record.take(
-            np.arange(len(record)) < left, "for the limits of the fault detector"
-        ).resampled()
-        table = np.array(online_readings(even, joint)[0])
-        tables += [table[piece] for piece in even.segments()]
-        left -= len(even)
-    if not tables:
+        usable.append(
+            record.take(np.arange(len(record)) < left, "for the limits of the fault detector")
+        )
+        left -= len(usable[-1])
+    if not usable:
         return (
             None,
             "no record of the fit has the sample time of this one, so the detector's limits are "
             "guesses",
         )
-    detector = FaultDetector(model, dt, has_torque=options.has_torque)
-    detector.calibrate(tables)
-    return detector.state(), ""
+    return detector_state(joint, options, usable, dt), ""
 
 
-def _readings(part: Record, joint: Joint, asked: Request) -> tuple[FloatArray, str]:
-    """Readings (n, 6), with the fault that is to be tried; what was done, as a sentence."""
-    from identification.faults.detector import SENSORS
-    from identification.faults.injector import Fault, Kind
+def _tried(part: Record, joint: Joint, asked: Request) -> tuple[list[Fault], str]:
+    """The fault that is to be tried, sized by the range of its reading; what is done, as a
+    sentence.
+    """
+    from identification.faults.detector import SENSORS, Fault
 
-    healthy, _ = online_readings(part, joint)
-    table = np.array(healthy, dtype=np.float64)
     if asked.kind == "none":
-        return table, ""
+        return [], ""
     column = READINGS.index(asked.sensor)
-    span = float(np.ptp(table[:, column]))
+    span = float(np.ptp(np.array(online_readings(part, joint)[0])[:, column]))
     size = GAIN if asked.kind == "gain" else SHARE.get(asked.kind, 0.0) * span
     at = asked.at if math.isfinite(asked.at) else 0.6 * part.duration
     if at >= part.duration:
         raise InputError(
             f"replay: the fault begins at {at:g} s, after the end at {part.duration:.4g} s"
         )
-    table = np.array(
-        online_readings(part, joint, [Fault(SENSORS[column], cast("Kind", asked.kind), at, size)])[
-            0
-        ],
-        dtype=np.float64,
-    )
     shown = {
         "gain": f" of {100 * GAIN:g} %",
         "drift": f" of {100 * SHARE['drift']:g} % of its range per second",
@@ -252,96 +233,47 @@ def _readings(part: Record, joint: Joint, asked: Request) -> tuple[FloatArray, s
         asked.kind, f" of {100 * SHARE[asked.kind]:g} % of its range" if asked.kind in SHARE else ""
     )
     return (
-        table,
+        [Fault(SENSORS[column], cast("Kind", asked.kind), at, size)],
         f"Tried on purpose: {asked.sensor}, {asked.kind}{shown}, from {at:.3g} s on. The record "
         "itself is healthy as far as is known.",
     )
 
 
-def _followed(
-    estimator: OnlineEstimator, part: Record, table: FloatArray, progress: Progress
-) -> dict[str, Any]:
-    """The estimator along the record: histories, and when which reading was doubted."""
-    count, every = len(part), max(1, len(part) // POINTS)
-    rows, valid = (
-        np.nan_to_num(table).tolist(),
-        (np.isfinite(table) & np.array(estimator.present)).tolist(),
-    )
-    origin = float(part.time[0])
-    stamps = (part.time - origin).tolist()
-    drawn: list[tuple[float, list[float], list[float], list[float], list[str]]] = []
-    events: list[dict[str, Any]] = []
-    fault, worst = 0, [0.0] * 6
-    for stretch in part.segments():
-        estimator.reset()
-        for k in range(stretch.start, stretch.stop):
-            estimator.update(stamps[k], rows[k], valid[k])
-            if estimator.fault != fault:
-                fault = estimator.fault
-                events.append(
-                    {
-                        "time": stamps[k],
-                        "fault": fault,
-                        "text": fault_text(fault) if fault else "nothing is doubted any more",
-                    }
-                )
-            worst = [max(a, b) for a, b in zip(worst, estimator.score, strict=True)]
-            if (k + 1) % every == 0:
-                failed = _failed(estimator.detector)
-                warm = estimator.warming_up
-                theta = [math.nan] * len(estimator.names) if warm else estimator.theta.tolist()
-                drawn.append(
-                    (
-                        stamps[k],
-                        theta,
-                        [math.nan] * len(estimator.balances) if warm else estimator.ratio.tolist(),
-                        worst,
-                        failed,
-                    )
-                )
-                worst = [0.0] * 6
-                progress(
-                    f"replaying, {stamps[k]:.0f} of {stamps[-1]:.0f} s", 0.05 + 0.9 * k / count
-                )
-    if estimator.warming_up:
+def _result(made: Replay) -> dict[str, Any]:
+    """A replay as the page draws it: time counts from its begin, NaN while the estimator warms
+    up.
+    """
+    if not len(made.time):
         raise InputError(
-            f"replay: {part.duration:.3g} s are too short for the first window of "
-            f"{estimator.options.warm_up:g} s; ask for a longer part"
+            f"replay: {made.record.duration:.3g} s are too short for the first window of "
+            f"{made.estimator.options.warm_up:g} s; ask for a longer part"
         )
-    return _result(estimator, drawn, events, stamps[-1])
-
-
-def _failed(detector: FaultDetector | None) -> list[str]:
-    from identification.faults.detector import SENSORS
-
-    return [] if detector is None else [READINGS[SENSORS.index(name)] for name in detector.failed]
-
-
-def _result(
-    estimator: OnlineEstimator,
-    drawn: Sequence[tuple[Any, ...]],
-    events: list[dict[str, Any]],
-    end: float,
-) -> dict[str, Any]:
+    estimator, whole = made.estimator, made.record.time
     units = {p.name: p for p in estimator.model.parameters}
-    theta, ratio, score = (np.array([row[i] for row in drawn]) for i in (1, 2, 3))
-    fitted, told = estimator.joint.fitted, estimator.detector.events if estimator.detector else ()
+    at = np.searchsorted(whole[made.looks], made.time)
+    theta, ratio = (
+        np.full((len(made.looks), found.shape[1]), math.nan) for found in (made.values, made.ratios)
+    )
+    theta[at], ratio[at] = made.values, made.ratios
+    fitted, origin = estimator.joint.fitted, float(whole[0])
     return {
-        "time": [row[0] for row in drawn],
-        "end": end,
-        "events": events,
-        "warm": next((row[0] for row in drawn if math.isfinite(row[1][0])), end),
+        "time": whole[made.looks] - origin,
+        "end": float(whole[-1]) - origin,
+        "warm": float(made.time[0]) - origin,
         "ratio": {b: ratio[:, i] for i, b in enumerate(estimator.balances)},
-        "score": {READINGS[i]: score[:, i] for i in range(6) if estimator.present[i]},
-        "failed": [row[4] for row in drawn],
+        "score": {READINGS[i]: made.scores[:, i] for i in range(6) if estimator.present[i]},
+        "failed": [
+            [name for name, failed in zip(READINGS, row, strict=True) if failed]
+            for row in made.failed[made.looks].tolist()
+        ],
         "verdicts": [
-            {"time": e.sample * estimator.dt, "text": str(e.verdict), "about": list(e.sensors)}
-            for e in told
+            {"time": time - origin, "text": str(e.verdict), "about": list(e.sensors)}
+            for time, e in made.verdicts
         ],
         "parameters": {
             name: {
-                "value": float(estimator.theta[i]),
-                "sigma": float(estimator.sigma[i]),
+                "value": float(made.values[-1, i]),
+                "sigma": float(made.sigmas[-1, i]),
                 "fitted": fitted.get(name),
                 "unit": units[name].unit,
                 "side": units[name].side,

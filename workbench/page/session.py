@@ -7,6 +7,7 @@ made from these again.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
@@ -18,6 +19,7 @@ from pathlib import Path
 from typing import Any, Final, final
 
 from identification.errors import InputError
+from identification.scratch import hold, sweep
 
 VERSION: Final = 1
 _ID: Final = re.compile(r"^[0-9a-f]{32}$")
@@ -28,7 +30,7 @@ def write_atomic(path: Path, content: bytes) -> None:
     """Write a file so that a reader, or a crash, sees the old content or the new one, never a
     part.
     """
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
     try:
         with temporary.open("wb") as stream:
             stream.write(content)
@@ -243,6 +245,11 @@ class Store:
     def __init__(self, root: Path) -> None:
         self.root = root
         root.mkdir(parents=True, exist_ok=True, mode=0o700)
+        with contextlib.suppress(InputError):  # another server is at work with these sessions
+            hold(root)
+            for folder in root.iterdir():
+                sweep(folder)
+                sweep(folder / "files")
 
     def create(self) -> Session:
         """A new, empty session with an identifier that cannot be guessed."""

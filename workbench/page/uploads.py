@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 import zipfile
 import zlib
 from collections.abc import AsyncIterator
@@ -54,7 +55,7 @@ async def stream_to(path: Path, chunks: AsyncIterator[bytes], limit: int) -> int
     TooLargeError
         More than `limit` bytes came.
     """
-    part = path.with_name(f".{path.name}.part")
+    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
     size = 0
     try:
         with part.open("wb") as stream:

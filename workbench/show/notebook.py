@@ -12,8 +12,10 @@ from identification.diagnosis.diagnose import Diagnosis
 from identification.diagnosis.improvement import Improvement
 from identification.fitting.fit import Fit
 from identification.linear.frequency import Bode
+from identification.variants.exploration import Exploration
 from workbench.show.bode import bode_html
 from workbench.show.ceiling import ceiling_html
+from workbench.show.front import exploration_html
 from workbench.show.results import (
     comparison_html,
     diagnosis_html,
@@ -67,3 +69,8 @@ def _(result: Improvement) -> str | None:
 @html_of.register
 def _(result: Bode) -> str | None:
     return bode_html(result)
+
+
+@html_of.register
+def _(result: Exploration) -> str | None:
+    return exploration_html(result)

@@ -26,6 +26,9 @@ RIGHT: Final = 12
 TOP: Final = 12
 BOTTOM: Final = 40
 
+MOST_LOG_TICKS: Final = 8
+"""Marks of a logarithmic axis; with more, only the decades are marked."""
+
 BEFORE: Final = "#d55e00"
 AFTER: Final = "#0072b2"
 INK: Final = "#444444"
@@ -73,21 +76,45 @@ def _text(x: float, y: float, text: str, anchor: str = "middle", extra: str = ""
     )
 
 
-def _axes(frame: Frame, x_label: str, y_label: str, *, x_ticks: bool = True) -> str:
+def log_ticks(low: float, high: float) -> list[float]:
+    """Exponents of the round numbers 1, 2 and 5 of each decade inside a range of exponents."""
+    first, last = math.floor(low), math.ceil(high)
+    every = [k + math.log10(m) for k in range(first, last + 1) for m in (1, 2, 5)]
+    inside = [t for t in every if low <= t <= high]
+    if len(inside) > MOST_LOG_TICKS:
+        return [t for t in inside if t == round(t)]
+    return inside if len(inside) > 1 else ticks(low, high, 3)
+
+
+def whole_ticks(low: float, high: float) -> list[float]:
+    """Whole numbers inside a range, at most about ten of them."""
+    step = max(1, math.ceil((high - low) / 10))
+    return [float(k) for k in range(math.ceil(low), math.floor(high) + 1, step)]
+
+
+def _axes(
+    frame: Frame,
+    x_label: str,
+    y_label: str,
+    *,
+    x_ticks: bool = True,
+    logarithmic: bool = False,
+    counted: bool = False,
+) -> str:
     base = frame.height - frame.bottom
     out = [
         f'<path class="s-grid" stroke="{GRID}" fill="none" d="M{LEFT} '
         f'{TOP}V{base}H{WIDTH - RIGHT}"/>'
     ]
-    for t in ticks(*frame.y, 4):
+    for t in log_ticks(*frame.y) if logarithmic else ticks(*frame.y, 4):
         y = frame.up(t)
         out.append(
             f'<path class="s-grid" stroke="{GRID}" stroke-width="0.6" d="M{LEFT} '
             f'{y:.1f}H{WIDTH - RIGHT}"/>'
         )
-        out.append(_text(LEFT - 5, y + 4, number(t, 3), "end"))
+        out.append(_text(LEFT - 5, y + 4, number(10**t if logarithmic else t, 3), "end"))
     if x_ticks:
-        for t in ticks(*frame.x, 5):
+        for t in whole_ticks(*frame.x) if counted else ticks(*frame.x, 5):
             x = frame.across(t)
             out.append(
                 f'<path class="s-grid" stroke="{GRID}" d="M{x:.1f} {base}v4"/>'
@@ -253,6 +280,98 @@ def staircase_picture(
     fall = " to ".join(f"{number(v, 3)} %" for v in values)
     noise = f"; measurement noise alone leaves {number(floor, 3)} %" if floor is not None else ""
     return _svg(f"Held-out error, step by step: {fall}{noise}", body)
+
+
+@final
+@dataclass(frozen=True)
+class Dot:
+    """A variant in the picture of error against parameters.
+
+    Attributes
+    ----------
+    parameters : int
+    error : float
+        On held-out records, in percent of that of the start model.
+    number : int
+        Of its row beside the picture; 0 for none.
+    best, tied, ours : bool
+        Recommended; not to be told from it; the choice of `improve`.
+    """
+
+    parameters: int
+    error: float
+    number: int = 0
+    best: bool = False
+    tied: bool = False
+    ours: bool = False
+
+
+def front_picture(dots: Sequence[Dot], front: Sequence[int], height: int = HEIGHT) -> str:
+    """Held-out error against parameters: every variant a dot, the front as a staircase, the
+    recommended filled, ties ringed, the choice of `improve` a square around it.
+
+    Parameters
+    ----------
+    dots : sequence of Dot
+    front : sequence of int
+        Those on the front, the fewest parameters first.
+    height : int
+    """
+    errors = [math.log10(max(d.error, 1e-12)) for d in dots]
+    few, many = min(d.parameters for d in dots), max(d.parameters for d in dots)
+    room = 0.06 * max(max(errors) - min(errors), 0.1)
+    frame = Frame(
+        (few - 0.6, many + 0.6), (min(errors) - 2 * room, max(errors) + room), height=height
+    )
+    body = _axes(
+        frame, "free parameters", "held-out error [% of start]", logarithmic=True, counted=True
+    )
+    stairs = [(frame.across(dots[k].parameters), frame.up(errors[k])) for k in front]
+    if stairs:
+        line = f"M{stairs[0][0]:.1f} {stairs[0][1]:.1f}" + "".join(
+            f"H{x:.1f}V{y:.1f}" for x, y in stairs[1:]
+        )
+        end = frame.across(many + 0.6)
+        body += (
+            f'<path class="s-after" fill="none" stroke="{AFTER}" stroke-width="1.4" '
+            f'd="{line}H{end:.1f}"/>'
+        )
+    for k in sorted(range(len(dots)), key=lambda i: (dots[i].best, dots[i].number > 0)):
+        body += _dot(dots[k], frame.across(dots[k].parameters), frame.up(errors[k]))
+    lowest: dict[int, float] = {}  # of each column: numbers stand under each other
+    for k in sorted(range(len(dots)), key=lambda i: frame.up(errors[i])):
+        if dots[k].number:
+            column = dots[k].parameters
+            y = max(frame.up(errors[k]) + 4, lowest.get(column, -math.inf) + 11)
+            lowest[column] = y
+            body += _text(frame.across(column) + 10, y, str(dots[k].number), "start")
+    least = min(d.error for d in dots)
+    return _svg(
+        f"Held-out error against free parameters: {len(dots)} variants with {few} to {many} "
+        f"parameters, the lowest error {number(least, 3)} % of that of the start model",
+        body,
+        height,
+    )
+
+
+def _dot(dot: Dot, x: float, y: float) -> str:
+    """One variant."""
+    out = ""
+    if dot.ours:
+        out += (
+            f'<rect class="s-before" fill="none" stroke="{BEFORE}" stroke-width="1.6" '
+            f'x="{x - 8:.1f}" y="{y - 8:.1f}" width="16" height="16"/>'
+        )
+    marked = dot.best or dot.tied
+    colour, kind = (AFTER, "after") if marked or dot.number else (INK, "ink")
+    fill = "#ffffff" if dot.tied and not dot.best else colour
+    opacity = 1 if marked or dot.number else 0.35
+    size = 5 if marked else 3.4 if dot.number else 2.4
+    out += (
+        f'<circle class="s-{kind}" fill="{fill}" stroke="{colour}" stroke-width="1.6" '
+        f'opacity="{opacity}" cx="{x:.1f}" cy="{y:.1f}" r="{size}"/>'
+    )
+    return out
 
 
 def bar(share: float, label: str) -> str:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any, Final, final
 
 import numpy as np
 import numpy.typing as npt
 
 from identification.data.record import Record
-from identification.faults.detector import Fault
+from identification.faults.detector import Fault, FaultEvent
 from identification.online.estimator import OnlineEstimator
 
 FloatArray = npt.NDArray[np.float64]
@@ -46,8 +47,14 @@ class Replay:
     time, values, sigmas, ratios
         Course of the estimate at some hundred points: (m,) [s], (m, parameters) twice, (m,
         balances).
+    looks : (k,) int array
+        Samples at which the course is looked at, those of the warm-up too.
+    scores : (k, 6) array
+        Largest residual of each reading since the look before, as a share of its limit.
     events : tuple of dict
         ``time``, ``fault``, ``text``.
+    verdicts : tuple of (time, FaultEvent)
+        What the fault detector said, and when [s].
     healthy, readings, used : (n, 6) array
         As recorded; with the faults tried on purpose, NaN where there is none; with failed ones
         replaced. Link-referred SI.
@@ -56,6 +63,10 @@ class Replay:
     tried : tuple of Fault
     calibrated : bool
         The detector's limits come from healthy records.
+    banked : bool
+        A fault bank has looked at the readings, not the estimator's own detector.
+    smallest : mapping of str to pair of float
+        Smallest offset of each sensor that the bank sees, and that it names.
     """
 
     record: Record
@@ -64,13 +75,23 @@ class Replay:
     values: FloatArray
     sigmas: FloatArray
     ratios: FloatArray
+    looks: npt.NDArray[np.int64]
+    scores: FloatArray
     events: tuple[dict[str, Any], ...]
+    verdicts: tuple[tuple[float, FaultEvent], ...]
     healthy: FloatArray
     readings: FloatArray
     used: FloatArray
     failed: npt.NDArray[np.bool_]
     tried: tuple[Fault, ...] = ()
     calibrated: bool = False
+    banked: bool = False
+    smallest: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    @property
+    def watched(self) -> bool:
+        """Whether sensor faults were looked for."""
+        return self.banked or self.estimator.detector is not None
 
     def spans(self, reading: int | None = None) -> list[tuple[float, float]]:
         """Times [s] from which to which a reading is replaced; any reading where none is named."""
@@ -89,8 +110,12 @@ class Replay:
         return {
             "record": self.record.name,
             "time": self.time.tolist(),
-            "detector": estimator.detector is not None,
+            "detector": self.watched,
             "calibrated": self.calibrated,
+            "smallest": {
+                name: {"seen": a, "named": b if np.isfinite(b) else None}
+                for name, (a, b) in self.smallest.items()
+            },
             "events": list(self.events),
             "replaced": [
                 {"reading": name, "from": a, "to": b}

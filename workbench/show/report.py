@@ -19,6 +19,7 @@ from identification.data.formats import percent, ratio
 from identification.data.record import Record
 from identification.diagnosis.improve import Improvement
 from identification.errors import InputError
+from identification.fitting.trust import Trust
 from irj_fmu.command_line import replace_file
 from workbench.show import fragments
 from workbench.show.plots import ReportPlots, overlay_json, report_plots
@@ -35,6 +36,7 @@ from workbench.show.results import (
     verdict_html,
     warnings_html,
 )
+from workbench.show.trusted import trusted_html
 
 RANKED_SHOWN: Final = 8
 PACKAGES: Final = ("irj", "casadi", "numpy", "scipy")
@@ -46,6 +48,7 @@ def write_report(
     *,
     records: Sequence[Record] = (),
     command: str | None = None,
+    trust: Trust | None = None,
 ) -> Path:
     """Write the report of an improvement as one HTML file.
 
@@ -60,6 +63,8 @@ def write_report(
         The records as they were read: their file names and digests go into the provenance.
     command : str, optional
         The command that made it, for the provenance.
+    trust : Trust, optional
+        Which number of the last step to trust, for a table.
 
     Returns
     -------
@@ -72,7 +77,7 @@ def write_report(
         The folder does not exist or cannot be written, or the disk is full.
     """
     path = Path(to)
-    page = render_report(improvement, records=records, command=command)
+    page = render_report(improvement, records=records, command=command, trust=trust)
     if path.is_dir():
         raise InputError(f"{path}: is a folder; give the name of a file, as {path / 'report.html'}")
     replace_file(path, lambda stream: stream.write(page.encode("utf-8", "backslashreplace")))
@@ -80,13 +85,19 @@ def write_report(
 
 
 def render_report(
-    improvement: Improvement, *, records: Sequence[Record] = (), command: str | None = None
+    improvement: Improvement,
+    *,
+    records: Sequence[Record] = (),
+    command: str | None = None,
+    trust: Trust | None = None,
 ) -> str:
     """The report as text (see :func:`write_report`)."""
     result = improvement.as_json()
     plots = report_plots(improvement, records)
     name = improvement.joint.name
     sections = [s for s in _sections(improvement, result, plots) if s[2]]
+    if trust is not None:
+        sections.append(("trust", "Which number to trust", trusted_html(trust)))
     made = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
     sections.append(
         (

@@ -182,6 +182,8 @@ def claims_html(result: Mapping[str, Any]) -> str:
         if len(claim["effects"]) > 1:
             how = text(claim["separate_by"] or "a run that moves differently")
             line += f" These records cannot tell these names apart; what would: {how}."
+        if claim.get("like"):
+            line += f" Held against a free curve over its own variable it is {text(claim['like'])}."
         if claim.get("partial"):
             line += (
                 " It explains only part of what is missing: structure is left in this "

@@ -52,7 +52,7 @@ def _headline(replays: Sequence[Replay]) -> tuple[str, str]:
     events = [e for r in replays for e in r.events]
     if events:
         return "unexplained", "Something was wrong with the readings or the joint"
-    if any(r.estimator.detector is not None for r in replays):
+    if any(r.watched for r in replays):
         return "nothing_missing", "No sensor fault and no change of the joint"
     return "not_identifiable", "The parameters were followed; sensor faults were not looked for"
 
@@ -70,7 +70,7 @@ def _verdict(replays: Sequence[Replay], notes: Sequence[str]) -> str:
         if len(r.events) > 12
     ]
     hints = []
-    if any(r.estimator.detector is None for r in replays):
+    if not all(r.watched for r in replays):
         hints.append(
             "Sensor faults need an elastic joint file with fitted values (<code>irj fit -o</code>)."
         )

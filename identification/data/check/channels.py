@@ -15,13 +15,54 @@ if TYPE_CHECKING:
     from identification.data.record import FloatArray, IntArray, Record
 
 _NAN_LIMIT: Final = 0.2
+"""Share of the rows without a number above which a channel is refused: where every fifth row is
+lost, no stretch is left that a kernel fits into.
+"""
+LARGEST: Final = 1e150
+"""Values whose square is no floating-point number any more (1e308)."""
 _BRIDGED: Final = 2
 """Rows of a hole that is bridged, at most."""
 _EFFORT: Final = ("motor_current", "motor_voltage", "motor_torque", "link_torque")
 _SIDE: Final = ("run", "temperature", "reference_position")
 _FEW_LEVELS: Final = 50
+"""Levels of a quantised channel below which it is said to be coarse: one step is then 2 % of the
+motion, the size of the effects looked for.
+"""
 _SATURATED_RUN: Final = 5
+"""Equal extreme values in a row from which a channel rests at a limit: the extreme of a free
+channel lasts one sample or two.
+"""
 _STUCK_RUN: Final = 20
+"""Equal values in a row from which a channel may be stuck."""
+_STUCK_MOTION: Final = 0.1
+"""Share of another position's range covered meanwhile that makes it so: quantised channels stand
+still for 20 rows in slow motion, but not over a tenth of the path.
+"""
+GUESSED_RATIO: Final = 200.0
+"""Gear ratio where none is given: above the usual ones (30 to 160) of harmonic drives, so that no
+motion of the link is made too large.
+"""
+_LOCKED: Final = 5.0
+"""Motion of the motor against a locked link [deg], link-referred: harmonic drives wind up by less
+than one, and compliant transmissions are let pass.
+"""
+# a channel's values count as multiples of one step ...
+_ROUNDING: Final = 1e-9
+"""Share of the largest step below which a step is rounding of the numbers and no quantum."""
+_NEAR_STEP: Final = 1.5
+"""Steps up to so many times the smallest one are one quantum (the next are two)."""
+_OFF_STEP: Final = (0.02, 1e-4)
+"""How far a step may be from a whole number of quanta: digits of the file, and the error of the
+quantum itself that grows with the number.
+"""
+_ALL_STEPS: Final = 0.99
+"""Share of the steps that must be whole: a glitch or a resampled row does not hide a quantum."""
+_FEW_SIZES: Final = 0.2
+"""Different step sizes as a share of the steps up to which numbers are levels of a quantiser, and
+not just printed with few digits.
+"""
+_MANY_LEVELS: Final = 1e6
+"""Levels from which quantisation is not worth a word: twenty bits, below the noise of a drive."""
 
 
 def check_nan(record: Record) -> list[Finding]:
@@ -54,6 +95,21 @@ def check_nan(record: Record) -> list[Finding]:
                 f", in the other {int(left.sum())} {dropped}" if 0 < left.sum() < bad.size else ""
             )
             findings.append(Finding("repair", "nan", f"{where}: {advice}", channel, row))
+    return findings
+
+
+def check_absurd(record: Record) -> list[Finding]:
+    """Refuse finite values with which nothing can be computed."""
+    findings = []
+    for channel, values in (("time", record.time), *record.channels.items()):
+        bad = np.flatnonzero(np.isfinite(values) & (np.abs(values) > LARGEST))
+        if bad.size:
+            row = int(bad[0])
+            message = (
+                f"{record.name}: {channel} is {values[row]:.4g} in row {row + 1}: no sensor reads "
+                "that, export it again"
+            )
+            findings.append(Finding("refuse", "absurd", message, channel, row))
     return findings
 
 
@@ -109,8 +165,8 @@ def check_constant(record: Record, gear_ratio: float | None) -> list[Finding]:
         if channel in _SIDE:
             findings.append(Finding("warn", "constant", f"{where}: it tells nothing", channel, 0))
         elif channel.startswith("link_") and record.has("motor_position"):
-            moved = span(record["motor_position"]) / abs(gear_ratio or 200.0)
-            small = record.kind == "rotary" and moved < np.deg2rad(5.0)
+            moved = span(record["motor_position"]) / abs(gear_ratio or GUESSED_RATIO)
+            small = record.kind == "rotary" and moved < np.deg2rad(_LOCKED)
             advice = (
                 "fine if the link is locked, else check its sensor"
                 if small
@@ -148,7 +204,7 @@ def check_stuck(record: Record) -> list[Finding]:
             if record.segment[piece.start] != record.segment[piece.stop - 1]:
                 continue
             moved = max(span(record[m][piece]) / whole[m] for m in kindred)
-            if moved > 0.1 and (worst is None or moved > worst[0]):
+            if moved > _STUCK_MOTION and (worst is None or moved > worst[0]):
                 worst = (moved, piece.start, piece.stop)
         if worst is not None:
             _, start, stop = worst
@@ -194,13 +250,13 @@ def quantum(values: FloatArray) -> float | None:
     if steps.size < 3:
         return None
     scale = float(steps.max())
-    step = float(steps[steps > 1e-9 * scale].min())
-    near = steps[steps < 1.5 * step]
+    step = float(steps[steps > _ROUNDING * scale].min())
+    near = steps[steps < _NEAR_STEP * step]
     step = float(near.mean())
     ratio = steps / step
-    multiples = np.abs(ratio - np.rint(ratio)) < 0.02 + 1e-4 * ratio
-    few = float(np.unique(np.rint(ratio)).size) < 0.2 * steps.size or steps.size < 100
-    return step if multiples.mean() > 0.99 and few else None
+    multiples = np.abs(ratio - np.rint(ratio)) < _OFF_STEP[0] + _OFF_STEP[1] * ratio
+    few = float(np.unique(np.rint(ratio)).size) < _FEW_SIZES * steps.size or steps.size < 100
+    return step if multiples.mean() > _ALL_STEPS and few else None
 
 
 def check_quantisation(record: Record) -> list[Finding]:
@@ -218,6 +274,6 @@ def check_quantisation(record: Record) -> list[Finding]:
         if levels < _FEW_LEVELS:
             advice = "too coarse: widen the motion or use a finer sensor"
             findings.append(Finding("warn", "quantisation", f"{said}: {advice}", channel))
-        elif levels < 1e6:
+        elif levels < _MANY_LEVELS:
             findings.append(Finding("ok", "quantisation", said, channel))
     return findings

@@ -11,6 +11,7 @@ import numpy as np
 from identification.balance.stamps import cut_at_holes, evened
 from identification.data.check.channels import (
     bridged_rows,
+    check_absurd,
     check_constant,
     check_nan,
     check_quantisation,
@@ -41,6 +42,7 @@ __all__ = ["SEVERITIES", "Finding", "check", "gate", "measured_ratio", "repair",
 SHORTEST_PIECE: Final = 8
 
 
+@np.errstate(invalid="ignore", over="ignore")  # what is not finite is found and said
 def check(
     record: Record,
     gear_ratio: float | None = None,
@@ -79,7 +81,7 @@ def check(
         raise InputError(
             f"gear_ratio is {gear_ratio!r}: give theta_motor / theta_link, signed and not zero"
         )
-    findings = check_size(record)
+    findings = check_size(record) or check_absurd(record)
     if findings:
         return tuple(findings)
     for channel in needs:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from identification.balance.noise import noise_level
-from identification.data.check.channels import quantum, span
+from identification.data.check.channels import GUESSED_RATIO, quantum, span
 from identification.data.check.finding import Finding, at
 
 if TYPE_CHECKING:
@@ -17,14 +17,31 @@ if TYPE_CHECKING:
     from identification.data.record import FloatArray, Record
 
 _BLOCKS: Final = 200
+"""Pieces of time over which velocity and position are compared."""
 _CORRELATION: Final = 0.9
+"""Correlation of the two positions below which they are not of one joint: their difference is the
+wind-up, a few hundredths of the motion in a joint that works.
+"""
 _RATIO_TOLERANCE: Final = 0.02
+"""Difference of the gear ratio up to which it is the given one: the wind-up moves the slope of the
+positions by less; what is finer is told with the torsion taken off (:data:`_RATIO_DOUBT`).
+"""
 _RATIO_DOUBT: Final = 0.003
 """Difference of the gear ratio, torsion taken off, from which a word is said: a harmonic drive
 with a tooth more differs by 0.6 %.
 """
 _WRAP: Final = 0.8
 """Share of a position's range from which one step counts as far."""
+_FAR_IN_TURN: Final = 0.5
+"""The same where the range is one turn: more than half a turn back is less than half a turn on."""
+_ONE_TURN: Final = (0.9, 1.0 + 1e-6)
+"""Range, in turns, of an angle that an encoder wraps: it comes near to the turn on both ends, and
+never over it but for rounding.
+"""
+_QUICK: Final = (0.9, 0.2)
+"""Quantile of the steps, and the share of the range, from which the joint itself moves in such
+steps: a few wraps are rare.
+"""
 _AGAINST: Final = 0.3
 """Share of the far steps that must run against the motion around them: that of a wrap logged
 slowly is near a half.
@@ -40,6 +57,21 @@ _WIND_UP: Final = math.radians(5.0)
 _FEW_VALUES: Final = 8
 """Values of a position that may stand still: a locked link whose encoder toggles."""
 _VELOCITY_TOLERANCE: Final = 0.05
+"""Difference between a velocity and the change of its position up to which its unit is right:
+filters of drives take off a few hundredths, a wrong unit is far away.
+"""
+_FACTOR_TOLERANCE: Final = 0.03
+"""Distance from a known factor within which it is named: the factors lie further apart."""
+_SIGN_TOLERANCE: Final = 0.1
+"""Distance from minus one within which it is the sign alone that is wrong."""
+_REVERSAL: Final = (0.02, 5.0)
+"""Way back that counts as a reversal, as a share of the whole way and in steps of the encoder:
+overshoot and creep at the end of a one-way move are smaller.
+"""
+_PEAK: Final = 0.98
+"""Share of the highest correlation from which a peak is one of several alike: periodic motions
+repeat their peak, and the one nearest zero counts.
+"""
 _SKEWED: Final = 0.3
 """Lag from which on clocks are not in step [samples]: a sampling at once is within half of one, of
 which a parabola through three samples of a correlation finds the place to a tenth.
@@ -78,11 +110,13 @@ def check_wrapped(record: Record) -> list[Finding]:
             continue
         steps = np.where(np.diff(record.segment) == 0, np.diff(record[channel]), 0.0)
         size = np.abs(steps[np.isfinite(steps)])
-        turn = record.kind == "rotary" and 0.9 < whole / (2.0 * math.pi) <= 1.0 + 1e-6
-        far = np.flatnonzero(np.abs(np.nan_to_num(steps)) > (0.5 if turn else _WRAP) * whole)
+        turn = record.kind == "rotary" and _ONE_TURN[0] < whole / (2.0 * math.pi) <= _ONE_TURN[1]
+        far = np.flatnonzero(
+            np.abs(np.nan_to_num(steps)) > (_FAR_IN_TURN if turn else _WRAP) * whole
+        )
         if (
             not far.size
-            or (not turn and float(np.quantile(size, 0.9)) > 0.2 * whole)
+            or (not turn and float(np.quantile(size, _QUICK[0])) > _QUICK[1] * whole)
             or np.unique(record[channel]).size < _FEW_VALUES
         ):
             continue
@@ -146,7 +180,7 @@ def check_motion(record: Record) -> list[Finding]:
         if piece.size:
             forth = max(forth, float(np.max(piece - np.minimum.accumulate(piece))))
             back = max(back, float(np.max(np.maximum.accumulate(piece) - piece)))
-    if min(forth, back) < max(0.02 * whole, 5.0 * (quantum(position) or 0.0)):
+    if min(forth, back) < max(_REVERSAL[0] * whole, _REVERSAL[1] * (quantum(position) or 0.0)):
         message = (
             f"{record.name}: the {side} never reverses: friction cannot be told from "
             "gravity and offset; record a motion in both directions"
@@ -187,15 +221,15 @@ def _slope(record: Record, position: FloatArray, velocity: FloatArray) -> tuple[
 def _explain(factor: float, kind: str, gear_ratio: float | None) -> str:
     size = abs(factor)
     for value, sentence in _FACTORS if kind == "rotary" else _LINEAR_FACTORS:
-        if abs(size / value - 1.0) < 0.03:
+        if abs(size / value - 1.0) < _FACTOR_TOLERANCE:
             return sentence
     if gear_ratio is not None and abs(gear_ratio) > 1.0:
         for value in (abs(gear_ratio), 1.0 / abs(gear_ratio)):
-            if abs(size / value - 1.0) < 0.03:
+            if abs(size / value - 1.0) < _FACTOR_TOLERANCE:
                 return "one of them is on the other side of the gear"
     return (
         "the sign of one is reversed"
-        if abs(size - 1.0) < 0.1 and factor < 0.0
+        if abs(size - 1.0) < _SIGN_TOLERANCE and factor < 0.0
         else "a unit or scale is wrong"
     )
 
@@ -317,7 +351,7 @@ def check_ratio(record: Record, gear_ratio: float | None) -> list[Finding]:
     ratio, correlation = found
     if np.unique(record["link_position"]).size < _FEW_VALUES and span(
         record["motor_position"]
-    ) < _WIND_UP * abs(gear_ratio or 200.0):
+    ) < _WIND_UP * abs(gear_ratio or GUESSED_RATIO):
         return [
             Finding(
                 "warn",
@@ -357,12 +391,13 @@ def check_ratio(record: Record, gear_ratio: float | None) -> list[Finding]:
         doubt = " (the sign is reversed)"
     elif (
         record.kind == "rotary"
-        and min(abs(abs(share) * f - 1.0) for f in (180 / math.pi, math.pi / 180)) < 0.03
+        and min(abs(abs(share) * f - 1.0) for f in (180 / math.pi, math.pi / 180))
+        < _FACTOR_TOLERANCE
     ):
         doubt = " (57.3 apart: one position is in degrees)"
     elif (
         record.kind == "rotary"
-        and min(abs(abs(share) * f - 1.0) for f in (2 * math.pi, 0.5 / math.pi)) < 0.03
+        and min(abs(abs(share) * f - 1.0) for f in (2 * math.pi, 0.5 / math.pi)) < _FACTOR_TOLERANCE
     ):
         doubt = " (2 pi apart: one position is in turns)"
     elif abs(ratio - 1.0) < _RATIO_TOLERANCE:
@@ -419,7 +454,7 @@ def delay(first: FloatArray, second: FloatArray, longest: int = 200) -> tuple[fl
     tops = (
         (inside >= coefficient[:-2])
         & (inside >= coefficient[2:])
-        & (inside > 0.98 * coefficient.max())
+        & (inside > _PEAK * coefficient.max())
     )
     if not tops.any():
         return float("nan"), float(coefficient.max())

@@ -15,11 +15,25 @@ if TYPE_CHECKING:
     from identification.data.record import Record
 
 MINIMUM_SAMPLES: Final = 10
+"""Samples below which nothing can be said of noise: its fourth differences take nine."""
 _WITHOUT_TIME: Final = 0.1
 """Share of rows without a time above which the export is at fault, not a row."""
 _REPEATED_LIMIT: Final = 1 / 3
 """Share of repeated stamps above which the median step may be no period of the clock any more."""
 _REGULAR: Final = 0.2
+"""Spread of the steps, as a share of the median one, up to which a gap of one and a half steps is a
+lost sample; uneven stamps need five.
+"""
+_SLOWEST: Final = 0.5
+"""Sampling step [s] from which time is refused: no motion of a joint is seen at two samples a
+second, and 2 kHz stamped in ms reads so.
+"""
+_FASTEST: Final = 2e-6
+"""Sampling step [s] below which time is doubted: 1 kHz stamped in s and read as ms is at 1e-6, the
+fastest drives log at 1e-5.
+"""
+FASTEST: Final = 1e-9
+"""Step that no logger of a joint has [s]: converters of currents take at least some ten ns."""
 
 
 def check_size(record: Record) -> list[Finding]:
@@ -143,13 +157,18 @@ def check_sampling(record: Record) -> list[Finding]:
         )
         message = f"{record.name}: the stamps of a clock of {dt:.4g} s are {off}; {how}"
         findings.append(Finding("repair", "jitter", message, "time"))
-    if dt >= 0.5 or dt < 2e-6:
-        unit = "ms" if dt >= 0.5 else "s"
+    if dt < FASTEST:
+        message = f"{record.name}: the sampling step is {dt:.4g} s: correct the unit of time"
+        findings.append(Finding("refuse", "time_unit", message, "time"))
+    elif dt >= _SLOWEST or dt < _FASTEST:
+        unit = "ms" if dt >= _SLOWEST else "s"
         message = (
             f"{record.name}: the sampling step is {dt:.4g} s: is time in {unit}? correct "
             "the unit of time"
         )
-        findings.append(Finding("refuse" if dt >= 0.5 else "warn", "time_unit", message, "time"))
+        findings.append(
+            Finding("refuse" if dt >= _SLOWEST else "warn", "time_unit", message, "time")
+        )
     return findings
 
 

@@ -25,7 +25,19 @@ the terms.
 _GIVEN: Final = 0.08
 """Share of the work moved that a passive joint cannot give back over whole cycles."""
 _REFUSE: Final = 20.0
+"""Slope of the drive on the link torque, or one over it, from which the units are refused: no loss
+of a gear is so large.
+"""
 _WARN: Final = 1.5
+"""The same for a word of doubt: that of a gear which loses a third of its torque."""
+_NO_SPRING: Final = 1e-3
+"""Share of the link torque's power that must be left where the spring is not among the terms."""
+_UNIT: Final = (0.75, 1.33)
+"""How far a slope may be from a unit's factor for the unit to be named: losses and the motor
+constant's tolerance, and far from the next factor.
+"""
+_STEADY: Final = (0.05, 0.95)
+"""Speed, as a share of this quantile of the speeds, above which friction has its direction."""
 
 _FACTORS: Final = (
     (1e3, "a factor 1000: N.mm or mA were taken for N.m or A, or kN.m"),
@@ -182,7 +194,7 @@ def _cycles(q: FloatArray) -> slice:
 def _guess(size: float) -> str:
     """The unit that was probably mistaken; empty where the factor is none of the known ones."""
     for value, sentence in _FACTORS:
-        if any(0.75 < size / f < 1.33 for f in (value, 1 / value)):
+        if any(_UNIT[0] < size / f < _UNIT[1] for f in (value, 1 / value)):
             return sentence
     return ""
 
@@ -204,7 +216,7 @@ def _slope(record: Record, drive: FloatArray, position: FloatArray) -> float | N
         used = others if spring else others[:, :-1]
         left = both - used @ np.linalg.lstsq(used, both, rcond=1e-9)[0]
         (dd, td), (_, tt) = (left.T @ left).tolist()
-        if tt <= (_LEFT if spring else 1e-3) * float(both[:, 1] @ both[:, 1]) or dd <= 0.0:
+        if tt <= (_LEFT if spring else _NO_SPRING) * float(both[:, 1] @ both[:, 1]) or dd <= 0.0:
             continue
         partial = td / math.sqrt(tt * dd)
         if abs(partial) >= _PARTIAL:
@@ -235,7 +247,7 @@ def _averages(
         * ((q[2:] - q[1:-1]) / (t[2:] - t[1:-1]) - (q[1:-1] - q[:-2]) / (t[1:-1] - t[:-2]))
         / (t[2:] - t[:-2])
     )
-    moving = np.abs(velocity) > 0.05 * float(np.quantile(np.abs(velocity), 0.95))
+    moving = np.abs(velocity) > _STEADY[0] * float(np.quantile(np.abs(velocity), _STEADY[1]))
     steady = (
         moving
         & np.roll(moving, 1)

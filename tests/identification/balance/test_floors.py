@@ -9,8 +9,10 @@ import numpy.typing as npt
 import pytest
 
 from identification import Record, fit
+from identification.balance.drawn_noise import LONGEST, draws_of, excerpt
 from identification.balance.excitation import attenuation, excitation_warnings
 from identification.balance.noise import noise_level
+from identification.balance.weak import prepare
 from identification.diagnosis.improvement import judged_drop, made_worse
 from identification.fitting.assess import BalanceError, Error, assess
 from identification.fitting.covariance import FEWEST_BLOCKS, block_errors
@@ -148,3 +150,34 @@ def test_an_addition_is_judged_by_what_it_leaves_and_not_by_its_floor() -> None:
     assert "motor" in made_worse(error(1.0, 0.01), error(1.3, 0.5))
     assert made_worse(error(0.1, 1.0), error(0.1, 1.0)) == ""
     assert made_worse(error(1.0, 0.5), error(1.05, 0.5)).startswith("the held-out error rises")
+
+
+def test_pieces_of_a_long_record_have_its_rows_and_its_floor() -> None:
+    """Noise of a long record is drawn in pieces: their rows are rows of the record, and what drawn
+    noise leaves in them is what it leaves in all.
+    """
+    rng, dt, count = np.random.default_rng(3), 2e-3, 120_000
+    time = dt * np.arange(count)
+    q = np.sin(1.3 * time) + 0.2 * np.sin(7 * time) + 1e-5 * rng.standard_normal(count)
+    signals = {"motor_position": q, "link_position": q, "torque": np.cos(time)}
+    segments = (slice(0, 40_003), slice(40_003, 40_020), slice(40_020, count))
+    whole = prepare(time, signals, segments, length=0.06)
+    part = excerpt(whole)
+    assert whole.rows > 1.5 * LONGEST
+    assert 0.9 * LONGEST < part.rows < 1.1 * LONGEST
+    index = np.searchsorted(whole.time, part.time)
+    assert np.array_equal(whole.time[index], part.time)
+    for name in ("motor_velocity", "motor_acceleration", "torque"):
+        assert np.array_equal(whole.averaged[name][index], part.averaged[name])
+        law = np.tanh(whole.average(np.tanh(3 * whole.points[name])))[index]
+        again = np.tanh(part.average(np.tanh(3 * part.points[name])))
+        assert np.allclose(again, law, rtol=0, atol=1e-12), name
+    short = prepare(time[:40_000], {n: x[:40_000] for n, x in signals.items()}, (slice(0, 40_000),))
+    assert excerpt(short) is short
+
+    noise = {"motor_position": 1e-5, "torque": 0.01}
+    drawn = draws_of(whole, noise)[0]
+    assert drawn.record.rows == part.rows
+    plain = prepare(time, {"torque": 0.01 * rng.standard_normal(count)}, segments, length=0.06)
+    left = rms(drawn.noisy.averaged["torque"] - drawn.calm.averaged["torque"])
+    assert left == pytest.approx(rms(plain.averaged["torque"]), rel=0.03)

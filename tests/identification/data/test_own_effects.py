@@ -5,13 +5,9 @@ the user allowed it.
 from __future__ import annotations
 
 import json
-import os
 import re
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
-from zipfile import ZipFile
 
 import pytest
 
@@ -225,83 +221,3 @@ def test_an_effect_that_names_an_unknown_one_is_refused_as_a_whole(
         capsys, "--effects", str(own), "effects"
     )
     assert KEY not in EFFECTS
-
-
-def test_it_is_hidden_named_and_exported_like_any_other(
-    own: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    records = []
-    for seed in (1, 2):
-        records.append(str(tmp_path / f"{seed}.npz"))
-        command = [
-            "--effects",
-            str(own),
-            "simulate",
-            "--joint",
-            str(DEMO / "joint.toml"),
-            "--hide",
-            f"{KEY}@motor",
-        ]
-        assert (
-            main(
-                [
-                    *command,
-                    "--seconds",
-                    "10",
-                    "--rate",
-                    "250",
-                    "--seed",
-                    str(seed),
-                    "-o",
-                    records[-1],
-                ]
-            )
-            == 0
-        )
-    better = tmp_path / "better.toml"
-    command = [
-        "improve",
-        records[0],
-        "--held-out",
-        records[1],
-        "--joint",
-        str(DEMO / "joint.toml"),
-        "--max-steps",
-        "1",
-    ]
-    assert (
-        main(
-            [
-                *command,
-                "--effects",
-                str(own),
-                "--json",
-                str(tmp_path / "out.json"),
-                "-o",
-                str(better),
-            ]
-        )
-        == 0
-    )
-    claims = json.loads((tmp_path / "out.json").read_text())["claims"]
-    assert claims[0]["effects"][0] == KEY
-    found = load_joint(better)
-    assert found.fitted["motor_seal_torque"] == pytest.approx(9.0, rel=0.1)
-    assert found.fitted["motor_seal_width"] == pytest.approx(0.15, rel=0.1)
-    forget()
-    environment = {**os.environ, "PYTHONPATH": str(DEMO.parents[1])}
-    code = "import sys; from workbench.cli.main import main; sys.exit(main(sys.argv[1:]))"
-    words = ["export", "estimator", "--joint", str(better), "--out", str(tmp_path / "fmus")]
-    done = subprocess.run(
-        [sys.executable, "-c", code, *words],
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert "smoke run passed" in done.stdout
-    with ZipFile(next((tmp_path / "fmus").glob("*_estimator.fmu"))) as archive:
-        described = archive.read("modelDescription.xml").decode()
-        assert archive.read("resources/bundle/casadi_models/effects/own_1.py").decode() == OWN
-    assert "motor_seal_torque" in described

@@ -294,8 +294,14 @@ def test_doubtful_headers_are_refused(tmp_path: Path, header: str, said: str) ->
         ({"motor_current": {"column": "iq"}}, "no unit"),
         ({"motor_current": {"column": "iq", "unit": "A", "sign": 2}}, "1 or -1"),
         ({"motor_current": {"column": "iq", "unit": "A", "scale": 0}}, "not zero"),
-        ({"motor_current": {"column": "iq", "unit": "A", "scale": "2"}}, "give a number"),
-        ({"motor_current": {"column": "iq", "unit": "A", "factor": 2}}, "unknown key factor"),
+        (
+            {"motor_current": {"column": "iq", "unit": "A", "scale": "2"}},
+            "scale = '2' is not a finite number",
+        ),
+        (
+            {"motor_current": {"column": "iq", "unit": "A", "factor": 2}},
+            "unknown key 'factor'; known: column",
+        ),
         ({"motor_current": 3}, "not a table"),
         ({"motor_amps": {"column": "iq", "unit": "A"}}, "motor_amps"),
         ({"link_position": {"column": "phi", "unit": "counts"}}, "counts_per_turn"),

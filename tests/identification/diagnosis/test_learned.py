@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from smooth_laws import LAWS, Law, Run, nothing, run
+from smooth_laws import LAWS, Law, Run, nothing, record, run
 
-from identification.data.joint_file import load_joint
+from identification.data.joint_file import Joint, load_joint
 from identification.diagnosis.claims import Claim
-from identification.diagnosis.improve import RATIO_LIMIT
+from identification.diagnosis.improve import RATIO_LIMIT, Improvement, improve
 from identification.diagnosis.learned import (
     Equivalence,
     artefacts,
@@ -68,18 +68,50 @@ def test_dry_friction_outside_the_curve_is_an_artefact() -> None:
     found = run(34, LAWS["tanh"][1])
     reasons = artefacts(found.solution, found.data, found.found.curves)
     assert len(reasons) == 1
-    assert "artefact" in reasons[0]
+    assert reasons[0].place == "motor"
+    assert "artefact" in reasons[0].sentence
 
 
 def test_an_amplitude_held_at_its_bound_is_told() -> None:
     found = run(35, LAWS["tanh"][1], ("viscous", "coulomb", "stribeck@motor"))
-    assert any("stands at its bound" in r for r in artefacts(found.solution, found.data))
+    reasons = artefacts(found.solution, found.data)
+    assert any("stands at its bound" in r.sentence for r in reasons)
 
 
 @pytest.mark.parametrize("seed", [36, 37])
 def test_nothing_forbids_complete_where_the_model_is_right(seed: int) -> None:
     found = run(seed, nothing)
     assert artefacts(found.solution, found.data, found.found.curves) == ()
+
+
+def asked(seed: int, law: Law) -> Improvement:
+    rng = np.random.default_rng(seed)
+    train, held = record(rng, 40, law), record(rng, 20, law)
+    joint = Joint("axis", gear_ratio=1.0, model_name="hd1", effects=("viscous", "coulomb"))
+    return improve(train, joint, [held])
+
+
+@pytest.mark.parametrize("key", ["stribeck", "quadratic_drag"])
+def test_the_loop_leaves_a_true_name_plain(key: str) -> None:
+    found = asked(38, NAMES[key])
+    assert [(c.effects, c.like) for c in found.claims] == [((key,), "")]
+    assert found.verdict == "complete"
+
+
+@pytest.mark.parametrize(
+    "law",
+    [
+        lambda q, v: 8 * v / (np.abs(v) + 0.15),  # quadratic and Stribeck together imitate it
+        lambda q, v: 25 * np.logaddexp(0.0, (np.abs(v) - 1.2) / 0.1) * 0.1 * np.sign(v),
+    ],
+    ids=["rational", "knee"],
+)
+def test_the_loop_marks_names_that_imitate_another_law(law: Law) -> None:
+    found = asked(39, law)
+    assert all("like" in c.like or c.partial for c in found.claims)
+    assert found.claims or found.learned
+    assert found.verdict == "unexplained"
+    assert all("like" in c.as_json() for c in found.claims)
 
 
 def test_where_a_balance_fails_the_curve_is_a_claim(snag: Run) -> None:
@@ -111,9 +143,9 @@ def test_improve_writes_a_joint_file_that_every_door_takes(
     snag: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     names = []
-    for name, record in zip(("train", "held"), snag.records, strict=True):
+    for name, given in zip(("train", "held"), snag.records, strict=True):
         names.append(str(tmp_path / f"{name}.csv"))
-        columns = np.column_stack([record.time, record["motor_torque"], record["motor_position"]])
+        columns = np.column_stack([given.time, given["motor_torque"], given["motor_position"]])
         np.savetxt(
             names[-1],
             columns,

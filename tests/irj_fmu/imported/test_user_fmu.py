@@ -99,10 +99,11 @@ def axis(
     h: float = 2e-3,
     noise: float = 1e-5,
     seed: int = 2,
+    motion: Callable[[FloatArray], FloatArray] = swing,
 ) -> Record:
     """An axis under a controller, integrated here: its torque is held between samples."""
     t = h * np.arange(round(seconds / h))
-    reference, rate = swing(t), np.gradient(swing(t), h)
+    reference, rate = motion(t), np.gradient(motion(t), h)
 
     def slope(q: float, w: float, u: float) -> tuple[float, float]:
         resist = (
@@ -480,10 +481,10 @@ w = "motor_velocity"
 
 def irj(*arguments: str) -> int:
     """`irj`, with the module that the joint file asks for."""
-    from workbench.cli.main import _parser
+    from workbench.cli.main import parser as made
     from workbench.cli.user_fmu import module_of
 
-    parser = _parser()
+    parser = made()
     given, rest = parser.parse_known_args(arguments)
     if given.verb == "diagnose" and rest[:1] == ["-o"]:
         given.output, rest = rest[1], rest[2:]

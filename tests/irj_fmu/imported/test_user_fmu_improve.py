@@ -54,9 +54,12 @@ def test_no_all_clear_where_an_output_stands_above_its_floor(place: Path, plain:
     wrong = plain.with_channel("motor_position", q + 1e-3 * np.sin(20 * q))
     train, held = wrong.window(0, 6), wrong.window(6, 10)
     fitted = fit(load_user_joint(place / "user.toml"), train)
-    assert compare(fitted, held).outputs["motor_position"].ratio > RATIO_LIMIT
-    assert diagnose(fitted, train, held).diagnosis.outcome == "unexplained"
+    compared, diagnosed = compare(fitted, held), diagnose(fitted, train, held)
+    assert compared.outputs["motor_position"].ratio > RATIO_LIMIT
+    assert diagnosed.diagnosis.outcome == "unexplained"
     found = improve(fitted.model, train, held, max_additions=1)
+    for result in (fitted.model, fitted, compared, diagnosed, found):  # they print on a screen
+        assert max(len(f(result).splitlines()) for f in (str, repr)) <= 25, type(result)
     assert found.outcome == "unexplained"
     assert found.found.verdict == "unexplained"
 

@@ -1,7 +1,7 @@
 """The same loop as a NiceGUI page, for comparison: load a record, plot it, fit, add an effect, see
 the new error.
 
-Run by ``benchmarks/app.py``; by itself: ``python benchmarks/peer_page.py --port 8100``.  It needs
+Run by ``benchmarks/app.py``; by itself: ``python benchmarks/peer/page.py --port 8100``.  It needs
 ``pip install nicegui`` (extra ``bench``), which is no dependency of the project.  It is what one
 writes with the framework's own elements: an upload, a chart with the smallest and the largest value
 per pixel, buttons, and the library's verbs in a thread.

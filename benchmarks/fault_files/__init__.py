@@ -1,0 +1,1 @@
+"""Sensor faults in files without velocities, judged by the fault bank."""

@@ -1,0 +1,252 @@
+"""Sensor faults in files: what the fault bank sees and names where no velocity is measured.
+
+    python -m benchmarks.fault_files --cases 140 [--joints 3] [--first 100] [--keep results.json]
+
+Every joint is another one, drawn by the generator of `tests/hidden_effect` (true sticking,
+unmodelled bump, snags, kinematic error of an odd order and a stiff link mode in every record).
+Files have time, motor current, both positions and the link torque. `irj improve` makes the model
+from two training files of 24 s; limits come from two other healthy files; faults are put into files
+of a motion that nobody has seen. Case numbers decide sensor, kind, sign, and time. `--keep` adds to
+what is there, so that a campaign can be run in pieces. Printed: share detected, share in which the
+failed sensor is named and nothing else, alarms per healthy hour.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, Final, final
+
+import numpy as np
+import numpy.typing as npt
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from identification.data.joint_file import Joint, load_joint
+from identification.data.read import read
+from identification.data.record import Record
+from identification.faults.bank import FaultBank
+from identification.faults.injector import Fault, inject
+from identification.faults.types import FaultEvent, Verdict
+from irj_fmu.estimator.bank import bank_for, judged
+from tests.hidden_effect.generator import COLUMNS, DT, KM, simulate_case
+from workbench.cli.main import main as irj
+
+FloatArray = npt.NDArray[np.float64]
+
+KEPT: Final = (0, 1, 2, 4, 6)
+"""Columns of the files: time, current, motor position, link position, torque."""
+SENSORS: Final = {
+    "current": 1,
+    "motor_position": 2,
+    "link_position": 4,
+    "torque": 6,
+}
+HIDDEN: Final = (None, "stribeck", "kinematic_error", "torque_ripple", "cubic_stiffness")
+"""What `improve` has to find; joints take turns."""
+SIZES: Final[dict[str, tuple[float, float]]] = {
+    "bias": (15.0, 0.010),
+    "drift": (5.0, 0.005),
+    "gain": (0.30, 0.05),
+    "noise": (50.0, 0.1),
+    "spike": (60.0, 0.010),
+    "stuck": (0.0, 0.0),
+    "dropout": (0.0, 0.0),
+}
+"""Size for the two torques [N.m, N.m/s, share] and for the two positions, link-referred [rad,
+rad/s, share]."""
+SPAN: Final = 120.0
+"""Length of the healthy files and of those that faults are put into [s]."""
+PIECE: Final = 16.0
+"""Length of a file with a fault [s]."""
+LOOK: Final = 6.0
+"""Seconds after the beginning of a fault in which it has to be seen."""
+
+
+@final
+@dataclass(frozen=True)
+class Bench:
+    """One joint: its model from `improve`, its bank, and an unseen healthy record."""
+
+    folder: Path
+    joint: Joint
+    bank: FaultBank
+    table: FloatArray
+    ratio: float
+
+
+def _file(path: Path, table: FloatArray) -> Path:
+    columns: dict[str, Any] = {COLUMNS[i]: table[:, i] for i in KEPT}
+    np.savez(path, **columns)
+    return path
+
+
+def opened(path: Path, joint: Joint) -> Record:
+    """A file as `irj track` reads it, holes and all."""
+    return read(path, columns=joint.columns, kind=joint.kind)
+
+
+@cache
+def bench(seed: int, folder: Path) -> Bench:
+    """The joint of a seed."""
+    hidden = HIDDEN[seed % len(HIDDEN)]
+    here = folder / str(seed)
+    here.mkdir(parents=True, exist_ok=True)
+    short = simulate_case(hidden, seed, dirt=True)
+    train = [_file(here / f"{n}.npz", short.measured[n]) for n in ("train", "train2")]
+    held = [_file(here / f"{n}.npz", short.measured[n]) for n in ("test", "test2")]
+    (here / "joint.toml").write_text(
+        f'[joint]\nname = "joint {seed}"\ngear_ratio = {short.gear_ratio}\n'
+        f"motor_constant = {KM}   # Nm/A on the motor shaft\n"
+        'model = "hd3"\neffects = ["viscous", "coulomb", "gravity"]\n',
+        encoding="utf-8",
+    )
+    better = here / "better.toml"
+    if not better.is_file():
+        given = ["improve", *map(str, train), "--held-out", *map(str, held)]
+        irj([*given, "--joint", str(here / "joint.toml"), "-o", str(better)])
+    long = simulate_case(hidden, seed, dirt=True, span=SPAN, records=("train", "test", "test2"))
+    healthy = [_file(here / f"healthy_{n}.npz", long.measured[n]) for n in ("train", "test")]
+    joint = load_joint(better)
+    records = [opened(p, joint) for p in healthy]
+    unseen = long.measured["test2"]
+    bank = bank_for(joint, records[0], records)
+    if bank is None:
+        raise SystemExit(f"{better}: no bank: the joint is rigid or not fitted")
+    return Bench(here, joint, bank, unseen, short.gear_ratio)
+
+
+def faulty(at: Bench, number: int) -> tuple[FloatArray, Fault]:
+    """A piece of the unseen record with a fault; the number of the case decides which."""
+    rng = np.random.default_rng([7, number])
+    names, kinds = list(SENSORS), list(SIZES)
+    sensor, kind = names[number % len(names)], kinds[(number // len(names)) % len(kinds)]
+    count = round(PIECE / DT)
+    first = int(rng.integers(0, len(at.table) - count))
+    table = at.table[first : first + count].copy()
+    table[:, 0] -= table[0, 0]
+    size = SIZES[kind][int(sensor.endswith("position"))]
+    size *= float(rng.choice([-1.0, 1.0])) if kind in ("bias", "drift", "gain") else 1.0
+    begin = DT * round(rng.uniform(5.0, 8.0) / DT)
+    fault = Fault(sensor, kind, begin, size)  # type: ignore[arg-type]
+    column = SENSORS[sensor]
+    referred = {"current": at.ratio * KM, "motor_position": 1.0 / at.ratio}.get(sensor, 1.0)
+    rows = np.zeros((count, 6))
+    place = {"current": 0, "motor_position": 1, "link_position": 3, "torque": 5}[sensor]
+    rows[:, place] = referred * table[:, column]
+    table[:, column] = inject(rows, DT, [fault], seed=number)[:, place] / referred
+    return table, fault
+
+
+def judge(at: Bench, number: int) -> dict[str, Any]:
+    """One case."""
+    table, fault = faulty(at, number)
+    path = _file(at.folder / "case.npz", table)
+    record = opened(path, at.joint)
+    track = judged(at.bank, record, at.joint)
+    late = [e for e in track.events if record.time[e.sample] >= fault.start - DT / 2]
+    late = [
+        e
+        for e in late
+        if record.time[e.first] <= fault.start + LOOK and e.verdict is not Verdict.RECOVERED
+    ]
+    said = {n for e in late if names_sensor(e) for n in e.sensors}
+    return {
+        "seed": int(at.folder.name),
+        "case": number,
+        "sensor": fault.sensor,
+        "kind": fault.kind,
+        "early": sum(bool(record.time[e.sample] < fault.start - DT / 2) for e in track.events),
+        "detected": bool(late),
+        "right": said == {fault.sensor} and all(names_sensor(e) for e in late),
+        "delay": min((float(record.time[e.first]) for e in late), default=np.nan) - fault.start,
+        "said": [
+            [round(float(record.time[e.sample]) - fault.start, 3), e.verdict.name, *e.sensors]
+            for e in late
+        ][:4],
+    }
+
+
+def names_sensor(event: FaultEvent) -> bool:
+    """True where an event names one sensor (the pair current or friction counts as the current)."""
+    return event.verdict in (Verdict.SENSOR, Verdict.DROPOUT, Verdict.CURRENT_OR_FRICTION)
+
+
+def healthy_alarms(at: Bench) -> tuple[float, list[str]]:
+    """Hours of the unseen healthy record, and what was said about it."""
+    path = _file(at.folder / "healthy_test2.npz", at.table)
+    record = opened(path, at.joint)
+    track = judged(at.bank, record, at.joint)
+    return record.duration / 3600.0, [
+        f"{record.time[e.sample]:.2f} s {e.verdict.name} {' '.join(e.sensors)}"
+        for e in track.events
+    ]
+
+
+def report(results: dict[str, Any]) -> None:
+    """Print the figures of all cases so far."""
+    cases = results["cases"]
+    if cases:
+        count = len(cases)
+        print(
+            f"{count} cases on {len({c['seed'] for c in cases})} joints: detected "
+            f"{100 * sum(c['detected'] for c in cases) / count:.1f} %, the sensor named and "
+            f"nothing else {100 * sum(c['right'] for c in cases) / count:.1f} %"
+        )
+        for key in ("sensor", "kind"):
+            total = Counter(c[key] for c in cases)
+            right = Counter(c[key] for c in cases if c["right"])
+            print(f"  {key}: " + ", ".join(f"{n} {right[n]}/{total[n]}" for n in total))
+        early = sum(c["early"] for c in cases)
+        print(f"  said before the fault: {early}")
+    hours = sum(h for h, _ in results["healthy"].values())
+    said = [f"{seed}: {text}" for seed, (_, texts) in results["healthy"].items() for text in texts]
+    print(f"healthy: {len(said)} reports in {hours:.2f} h" + "".join(f"\n  {t}" for t in said))
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--cases", type=int, default=140)
+    parser.add_argument("--joints", type=int, default=3)
+    parser.add_argument("--first", type=int, default=100, help="seed of the first joint")
+    parser.add_argument("--start", type=int, default=0, help="number of the first case")
+    parser.add_argument("--seconds", type=float, default=330.0, help="stop after so many seconds")
+    parser.add_argument("--folder", type=Path, help="keep joints and files here")
+    parser.add_argument("--keep", type=Path)
+    options = parser.parse_args(arguments)
+    folder = options.folder or Path(tempfile.mkdtemp(prefix="fault-files-"))
+    results: dict[str, Any] = {"cases": [], "healthy": {}}
+    if options.keep and options.keep.is_file():
+        results = json.loads(options.keep.read_text(encoding="utf-8"))
+    done = {(c["seed"], c["case"]) for c in results["cases"]}
+    begin = time.monotonic()
+    for number in range(options.start, options.start + options.cases):
+        seed = options.first + number % options.joints
+        if (seed, number) in done:
+            continue
+        if time.monotonic() - begin > options.seconds:
+            print("time is up; run again with --keep to go on")
+            break
+        at = bench(seed, folder)
+        if str(seed) not in results["healthy"]:
+            results["healthy"][str(seed)] = healthy_alarms(at)
+        found = judge(at, number)
+        results["cases"].append(found)
+        if not found["right"]:
+            print({k: v for k, v in found.items() if k != "delay"}, flush=True)
+    if options.keep:
+        options.keep.write_text(json.dumps(results), encoding="utf-8")
+    report(results)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,186 @@
+"""Are the stated intervals and names true?  ``python -m benchmarks.trust --joints 40 --names 12``.
+
+Joints of the independent generator (tests/hidden_effect) with known values.  First part: the true
+model is fitted to 48 s of records, and the 95 % intervals of `irj trust` are held against the
+truth, by class of parameter.  Second part: `improve` runs on joints with one hidden effect, and how
+often an answer of one name is right is told by how far the error fell.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Final, final
+
+import numpy as np
+
+from benchmarks.next_run import record_of
+from identification import Joint, improve
+from identification.fitting.engine import load_dataset, prepared_model, solve
+from identification.fitting.trust import CLASSES, trust
+from tests.hidden_effect.generator import KM, Case, simulate_case
+from tests.hidden_effect.hidden import LIBRARY
+
+PLAIN: Final = MappingProxyType(
+    {
+        "motor_inertia": "JM",
+        "link_inertia": "JL",
+        "gravity_torque": "TG",
+        "stiffness": "K",
+        "structural_damping": "C",
+        "motor_viscous": "M_B",
+        "motor_coulomb": "M_TC",
+        "link_viscous": "L_B",
+        "link_coulomb": "L_TC",
+    }
+)
+"""Parameters of every joint, by their name in the generator."""
+HIDDEN: Final[Mapping[str, tuple[str, Mapping[str, str]]]] = MappingProxyType(
+    {
+        "stribeck": (
+            "stribeck@motor",
+            {"motor_stribeck_extra": "M_TS", "motor_stribeck_velocity": "M_VS"},
+        ),
+        "backlash": ("backlash", {"backlash": "GAP"}),
+        "cubic_stiffness": ("cubic_stiffness", {"cubic_stiffness": "K3"}),
+        "quadratic_drag": ("quadratic_drag@motor", {"motor_quadratic_drag": "M_B2"}),
+        "added_spring": ("added_spring@motor", {"motor_added_spring": "M_KA"}),
+    }
+)
+"""Effects that are put into the fitted model, with their parameters by the generator's names."""
+DROPS: Final = (0.0, 20.0, 50.0, 80.0, 100.0)
+"""Bounds of the rows of the second table: fall of the held-out RMS [%]."""
+
+
+@final
+@dataclass(frozen=True)
+class Seen:
+    """One interval against the truth."""
+
+    name: str
+    kind: str
+    inside: bool
+    deviate: float
+
+
+def joint_of(case: Case, effects: tuple[str, ...] = ()) -> Joint:
+    """The joint file of a case."""
+    return Joint(
+        name="case",
+        gear_ratio=case.gear_ratio,
+        torque_per_current=case.gear_ratio * KM,
+        model_name="hd3",
+        effects=("viscous", "coulomb", "gravity", *effects),
+    )
+
+
+def intervals(effect: str, seed: int, *, dirt: bool, size: float) -> list[Seen]:
+    """Fit the true model of one joint and hold every interval against its value."""
+    case = simulate_case(effect, seed, size=size, dirt=dirt, records=("train", "train2"))
+    label, names = HIDDEN[effect]
+    joint = joint_of(case, (label,))
+    records = [record_of(table, name, "same") for name, table in case.measured.items()]
+    model = prepared_model(joint, records[0])
+    data = load_dataset(records, [], joint, model)
+    out = []
+    for p in trust(solve(model, data), data).parameters:
+        key = {**PLAIN, **names}.get(p.name)
+        if key is None or p.low is None or p.high is None or p.stderr is None:
+            continue
+        true = float(case.parameters[key])
+        out.append(Seen(p.name, p.kind, p.low <= true <= p.high, (p.value - true) / p.stderr))
+    return out
+
+
+def wilson(right: int, count: int) -> tuple[float, float]:
+    """95 % interval of a share [%]."""
+    if not count:
+        return 0.0, 100.0
+    z, share = 1.96, right / count
+    centre = (share + z**2 / (2 * count)) / (1 + z**2 / count)
+    half = z * math.sqrt(share * (1 - share) / count + (z / (2 * count)) ** 2) / (1 + z**2 / count)
+    return 100 * (centre - half), 100 * (centre + half)
+
+
+def coverage(given: argparse.Namespace) -> None:
+    """First table."""
+    seen: list[Seen] = []
+    for k in range(given.joints):
+        effect = list(HIDDEN)[k % len(HIDDEN)]
+        small = given.size if k % 3 else 0.4 * given.size
+        seen += intervals(effect, given.start + k, dirt=given.dirt, size=small)
+    print(f"95 % intervals of {given.joints} joints{' with disturbances' * given.dirt}")
+    print("class          intervals  cover  95 % range of it  mean deviate")
+    for kind in CLASSES:
+        own = [s for s in seen if s.kind == kind]
+        if own:
+            inside = sum(s.inside for s in own)
+            low, high = wilson(inside, len(own))
+            print(
+                f"{kind:<14} {len(own):9d}  {100 * inside / len(own):4.0f} %  "
+                f"{low:3.0f} to {high:3.0f} %       {np.mean([s.deviate for s in own]):+.2f}"
+            )
+    print("lowest by parameter:")
+    names = sorted({s.name for s in seen})
+    shares = {n: [s.inside for s in seen if s.name == n] for n in names}
+    for n in sorted(names, key=lambda n: float(np.mean(shares[n])))[:5]:
+        deviates = [s.deviate for s in seen if s.name == n]
+        print(
+            f"  {n:<28} {sum(shares[n])} of {len(shares[n])}, deviates {np.mean(deviates):+.2f} "
+            f"+- {np.std(deviates):.2f}"
+        )
+
+
+def names(given: argparse.Namespace) -> None:
+    """Second table."""
+    rows: list[tuple[float, bool]] = []
+    sets: list[bool] = []
+    missed = 0
+    effects = list(LIBRARY)
+    for k in range(given.names):
+        # a stride without a common factor with the number of effects: a few joints see all kinds
+        effect = effects[(7 * k) % len(effects)]
+        case = simulate_case(effect, given.start + 500 + k, size=given.size, dirt=given.dirt)
+        records = [record_of(table, name, "same") for name, table in case.measured.items()]
+        found = improve(records[:2], joint_of(case), records[2:])
+        whole = [c for c in found.claims if not c.partial]
+        missed += not whole
+        for claim in whole:
+            right = effect in claim.effects
+            if len(claim.effects) == 1:
+                rows.append((claim.held_out_drop_percent, right))
+            else:
+                sets.append(right)
+    print(f"names over {given.names} joints with one hidden effect; {missed} without a claim")
+    print("fall of the held-out RMS   one-name answers  right  95 % range of it")
+    for low, high in zip(DROPS[:-1], DROPS[1:], strict=True):
+        own = [right for drop, right in rows if low <= drop < high]
+        if own:
+            span = wilson(sum(own), len(own))
+            print(
+                f"{low:3.0f} to {high:3.0f} %               {len(own):9d}         "
+                f"{100 * sum(own) / len(own):4.0f} %  {span[0]:.0f} to {span[1]:.0f} %"
+            )
+    print(
+        f"one name: {sum(r for _, r in rows)} of {len(rows)} right; sets: {sum(sets)} of "
+        f"{len(sets)} hold the truth"
+    )
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Print both tables."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("--joints", type=int, default=40, help="joints of the first table")
+    parser.add_argument("--names", type=int, default=12, help="joints of the second table")
+    parser.add_argument("--start", type=int, default=9000, help="first seed")
+    parser.add_argument("--size", type=float, default=1.0, help="factor on the effects")
+    parser.add_argument("--dirt", action="store_true", help="small disturbances in every record")
+    given = parser.parse_args(argv)
+    if given.joints:
+        coverage(given)
+    if given.names:
+        names(given)
+    return 0

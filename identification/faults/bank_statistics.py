@@ -1,0 +1,107 @@
+"""What a filter's innovations and disturbances say, over windows, as shares of limits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from identification.online.filter import Course
+
+FloatArray = npt.NDArray[np.float64]
+
+WINDOWS: Final = (0.004, 0.03, 0.2, 1.5)
+"""Lengths over which innovations are averaged [s]: from single wrong samples to slow drifts."""
+BLOCK: Final = 2.0
+"""Length of the blocks whose largest values tell the tail [s]: longer than every window."""
+ALARMS: Final = 0.05
+"""False alarms per hour for which a limit is extrapolated."""
+MARGIN: Final = 1.25
+"""Limits over what healthy records say: on other motions the model errs more."""
+LARGEST: Final = 1.3
+"""The same over the largest healthy value, which some minutes see once."""
+SIGMAS: Final = 5.5
+"""No limit lies below this many standard deviations of white noise (as in
+:data:`identification.faults.calibrate.SIGMAS`)."""
+UNSURE: Final = 3.0
+"""Standard deviations by which a disturbance may be off: while an encoder's zero is not known yet,
+a disturbance of the transmission is not either."""
+EULER: Final = 0.5772156649
+"""Mean of the standard Gumbel distribution."""
+
+
+def statistics(course: Course, which: int, dt: float, begin: int = 0) -> FloatArray:
+    """Energies and means of the innovations over all windows, and the disturbances, (n, count).
+
+    Parameters
+    ----------
+    course : Course
+    which : int
+        Number of the filter.
+    dt : float
+        Sample time [s].
+    begin : int
+        First sample whose innovations count: those before tell how the filter was started.
+
+    Returns
+    -------
+    array
+        Root mean square (5 readings x 4 windows), size of the mean (the same), size of the three
+        disturbances beyond what they are unsure by [N.m]. Before a window is full, what is missing
+        counts as expected.
+    """
+    e = np.clip(course.innovation[which], -1e6, 1e6)
+    e[:begin] = 0.0
+    rows = len(e)
+    squares = np.concatenate([np.zeros((1, 5)), np.cumsum(e**2, axis=0)])
+    sums = np.concatenate([np.zeros((1, 5)), np.cumsum(e, axis=0)])
+    energy, mean = [], []
+    for length in lengths(dt):
+        at = np.arange(1, rows + 1)
+        before = np.maximum(at - length, 0)
+        missing = np.clip(length - (at - begin), 0, length)[:, None]
+        energy.append(np.sqrt(np.maximum(squares[at] - squares[before] + missing, 0.0) / length))
+        mean.append(np.abs(sums[at] - sums[before]) / length)
+    known = np.maximum(np.abs(course.disturbance[which]) - UNSURE * course.deviation[which], 0.0)
+    return np.concatenate([*energy, *mean, known], axis=1)
+
+
+def lengths(dt: float) -> list[int]:
+    """Windows in samples."""
+    return [max(1, round(w / dt)) for w in WINDOWS]
+
+
+def floors(dt: float, disturbance: Sequence[float]) -> FloatArray:
+    """Limits that noise alone would need, one per statistic; levels of the disturbances [N.m]."""
+    out: list[float] = []
+    for n in lengths(dt):
+        out += [math.sqrt(1 + SIGMAS * math.sqrt(2 / n) + SIGMAS**2 / n)] * 5
+    for n in lengths(dt):
+        out += [SIGMAS / math.sqrt(n)] * 5
+    return np.array([*out, *((SIGMAS - UNSURE) * d for d in disturbance)])
+
+
+def limits(healthy: Sequence[FloatArray], dt: float, disturbance: Sequence[float]) -> FloatArray:
+    """Limits of all statistics from those of healthy stretches, each (n, count), and from the
+    levels of the three disturbances [N.m].
+
+    The larger of :data:`LARGEST` times the largest value and of the Gumbel quantile of the largest
+    values of blocks, times :data:`MARGIN`.
+    """
+    size = max(1, round(BLOCK / dt))
+    blocks = np.array(
+        [
+            part[k : k + size].max(axis=0)
+            for part in healthy
+            for k in range(0, max(len(part) - size + 1, 1), size)
+        ]
+    )
+    scale = np.std(blocks, axis=0) * math.sqrt(6) / math.pi
+    rare = -math.log(-math.log1p(-ALARMS * BLOCK / 3600.0))
+    quantile = np.mean(blocks, axis=0) + (rare - EULER) * scale
+    found = MARGIN * np.maximum(LARGEST * blocks.max(axis=0), quantile)
+    kept: FloatArray = np.maximum(found, floors(dt, disturbance))
+    return kept

@@ -1,0 +1,79 @@
+"""What rows of the balances say about parameters: normal matrices with the zeros of sensors
+eliminated."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from identification.balance.balances import balances_of
+from identification.balance.calibration import bare, names_of_runs, settled
+from identification.balance.dataset import Dataset
+from identification.balance.stacked import INDEPENDENT_SHARE
+from identification.fitting.covariance import RANK
+from identification.fitting.engine import Solution
+from identification.fitting.weak_form import WeakForm
+
+FloatArray = npt.NDArray[np.float64]
+
+
+def form_of(
+    solution: Solution,
+    data: Dataset,
+    free: Sequence[str],
+    weights: Mapping[str, FloatArray],
+    moved: Mapping[str, float] | None = None,
+) -> WeakForm:
+    """The rows of a fitted model on records, the unknowns of their sensors behind its own.
+
+    Parameters
+    ----------
+    solution : Solution
+    data : Dataset
+        `train` are the records.
+    free : sequence of str
+        Parameters of the model that move.
+    weights : mapping of str to (rows,) array
+    moved : mapping of str to float, optional
+        Values that differ from the fitted ones; unknowns of sensors that are not among them are
+        fitted on their record.
+    """
+    model = solution.model
+    names = (*free, *names_of_runs(model, data.train))
+    values = settled(model, data.sensing, data.train, {**solution.values, **(moved or {})})
+    return WeakForm(balances_of(model, data.sensing, wrt=bare(names)), data, values, names, weights)
+
+
+def eliminated(gram: FloatArray, count: int) -> FloatArray:
+    """Normal matrix of the first `count` unknowns, whatever the others do."""
+    own, across = gram[count:, count:], gram[:count, count:]
+    if not own.size:
+        return gram
+    inside = across @ np.linalg.pinv(own, rcond=RANK, hermitian=True) @ across.T
+    return np.asarray(gram[:count, :count] - inside)
+
+
+def information(form: WeakForm, count: int) -> FloatArray:
+    """Normal matrix of the first `count` unknowns of weighted rows at their values."""
+    j = form.jacobian(np.array([form.values[n] for n in form.free]))
+    return eliminated(j.T @ j, count)
+
+
+def white_errors(gram: FloatArray) -> FloatArray:
+    """Standard errors if only the overlap of the kernels tied the rows together; infinite in
+    directions of which the rows say nothing.
+
+    Parameters
+    ----------
+    gram : (p, p) array
+        Normal matrix of rows in units of their scatter.
+    """
+    size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    value, vector = np.linalg.eigh(gram / np.outer(size, size))
+    weak = value <= RANK * max(float(value[-1]), 1e-300)
+    variance = (vector[:, ~weak] ** 2 / value[~weak]).sum(axis=1)
+    hidden = (vector[:, weak] ** 2).sum(axis=1) > math.sqrt(RANK)
+    return np.where(hidden, math.inf, np.sqrt(variance / INDEPENDENT_SHARE) / size)

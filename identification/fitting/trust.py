@@ -1,0 +1,400 @@
+"""Which number of a fit to trust: interval, windows, what it trades with, what it does to the
+prediction."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final, final
+
+import numpy as np
+import numpy.typing as npt
+
+from casadi_models import JointModel
+from casadi_models.parameter import Parameter
+from identification.balance.balances import balances_of
+from identification.balance.calibration import bare
+from identification.balance.dataset import HOLD_NAME, Dataset
+from identification.balance.stacked import INDEPENDENT_SHARE, references
+from identification.data.formats import words
+from identification.fitting.covariance import NORMAL, correlations
+from identification.fitting.engine import Solution
+from identification.fitting.information import eliminated, form_of, white_errors
+from identification.fitting.start_values import bounds_of
+from identification.fitting.weak_form import WeakForm
+
+FloatArray = npt.NDArray[np.float64]
+
+KNOWN: Final = 0.1
+"""Standard error over value up to which a parameter stands by itself, as in `irj plan`."""
+TIED: Final = 0.8
+"""Correlation from which two parameters are told together: one explains 64 % of the other's
+variance."""
+WORTH_SAYING: Final = 0.5
+"""Correlation from which a partner is named at all: a quarter of the variance."""
+WINDOWS: Final = 4
+"""Windows of equal time over all training rows."""
+PROFILE_STEPS: Final = 4
+"""Refits on each side of a shape: its interval is wanted to some percent of its width."""
+REFITS: Final = 4
+"""Gauss-Newton steps of the others in such a refit."""
+CLASSES: Final = ("inertia", "stiffness", "friction", "shape", "other")
+
+
+@final
+@dataclass(frozen=True)
+class Trusted:
+    """What is known about one parameter.
+
+    Attributes
+    ----------
+    name, unit, kind : str
+        `kind` is one of `CLASSES`.
+    value : float
+    stderr : float or None
+        As the fit states it, from blocks.
+    low, high : float or None
+        95 % interval: from the standard error; for shapes from a profile, with the larger of the
+        errors from blocks and from white rows.
+    records, windows : tuple of (float or None)
+        Value on each training record and in each of `WINDOWS` windows, where these tell it.
+    partner : str or None
+        The parameter it trades with.
+    trade : str
+        How, in words; empty without a partner.
+    prediction_percent : float
+        Change of the predicted torque over half the interval, in percent of the measured one, all
+        others adapted.
+    verdict : {"trust", "only in combination", "not"}
+    why : str
+    """
+
+    name: str
+    unit: str
+    kind: str
+    value: float
+    stderr: float | None
+    low: float | None
+    high: float | None
+    records: tuple[float | None, ...]
+    windows: tuple[float | None, ...]
+    partner: str | None
+    trade: str
+    prediction_percent: float
+    verdict: str
+    why: str
+
+    def as_json(self) -> dict[str, Any]:
+        """The shape of `trust --json`."""
+        return {
+            "name": self.name,
+            "unit": self.unit,
+            "class": self.kind,
+            "value": self.value,
+            "stderr": self.stderr,
+            "interval": None if self.low is None or self.high is None else [self.low, self.high],
+            "by_record": list(self.records),
+            "by_window": list(self.windows),
+            "trades_with": self.partner,
+            "trade": self.trade,
+            "prediction_percent": self.prediction_percent,
+            "verdict": self.verdict,
+            "why": self.why,
+        }
+
+
+@final
+@dataclass(frozen=True)
+class Trust:
+    """Every parameter of a fit, judged.
+
+    Attributes
+    ----------
+    parameters : tuple of Trusted
+    """
+
+    parameters: tuple[Trusted, ...]
+
+    def as_json(self) -> list[dict[str, Any]]:
+        """The shape of `trust --json`."""
+        return [p.as_json() for p in self.parameters]
+
+    def __str__(self) -> str:
+        lines = []
+        for p in self.parameters:
+            band = (
+                f"{p.low:.4g} to {p.high:.4g}"
+                if p.low is not None and p.high is not None
+                else "no interval"
+            )
+            lines.append(
+                f"{p.name:<28} {p.value:.5g} {p.unit} ({band}): {p.verdict}"
+                + (f"; {p.why}" if p.why else "")
+            )
+            if p.trade:
+                lines.append(f"    {p.trade}")
+        return "\n".join(lines)
+
+    def __repr__(self) -> str:
+        trusted = sum(p.verdict == "trust" for p in self.parameters)
+        return f"Trust({trusted} of {len(self.parameters)} parameters stand by themselves)"
+
+
+def kind_of(model: JointModel, parameter: Parameter) -> str:
+    """Class of a parameter (one of `CLASSES`), from its declaration."""
+    if parameter.name in model.inertias:
+        return "inertia"
+    if parameter.name == model.stiffness_name:
+        return "stiffness"
+    if parameter.is_shape:
+        return "shape"
+    friction = any(parameter.name in t.names and t.effect.family == "friction" for t in model.terms)
+    return "friction" if friction else "other"
+
+
+def trust(solution: Solution, data: Dataset, *, profiles: bool = True) -> Trust:
+    """Judge every free parameter of a fit.
+
+    Parameters
+    ----------
+    solution : Solution
+    data : Dataset
+        The records of the fit.
+    profiles : bool
+        Intervals of shapes from refits on either side; without, from standard errors.
+    """
+    return _Judge(solution, data).all(profiles=profiles)
+
+
+@final
+class _Judge:
+    """Rows, information and covariance of one fit."""
+
+    def __init__(self, solution: Solution, data: Dataset) -> None:
+        self.solution, self.data = solution, data
+        self.model = solution.model
+        smoothing = self.model.named("smoothing")
+        self.moving = tuple(n for n in solution.free if n not in solution.at_bound)
+        self.form = form_of(solution, data, self.moving, solution.weights)
+        x = np.array([self.form.values[n] for n in self.form.free])
+        stacked = self.form.stacked(x)
+        names = self.form.balances.balances
+        weights = solution.weights
+        self.j = np.concatenate([stacked.jacobian[b] * weights[b][:, None] for b in names])
+        self.r = np.concatenate([stacked.residual[b] * weights[b] for b in names])
+        self.plain = np.concatenate([stacked.jacobian[b] for b in names])
+        self.block = np.tile(stacked.block, len(names))
+        self.record = np.tile(
+            np.repeat(np.arange(len(data.train)), [w.rows for w in data.train]), len(names)
+        )
+        self.measured = float(
+            np.linalg.norm(np.concatenate(list(references(data, data.train).values())))
+        )
+        count = len(self.moving)
+        self.gram = eliminated(self.j.T @ self.j, count)
+        self.white = white_errors(self.gram)
+        self.together = correlations(self.gram)[1]
+        self.nuisance = {*smoothing, HOLD_NAME, *self.model.calibration}
+        self.limits = bounds_of(self.model, data.joint.known, data)
+
+    def all(self, *, profiles: bool) -> Trust:
+        """Every free parameter that is no nuisance."""
+        by_record = [self._on(self.record == k) for k in range(len(self.data.train))]
+        parts = self._windows()
+        by_window = [self._on(parts == k) for k in range(WINDOWS)]
+        out = []
+        for p in self.model.parameters:
+            if p.name in self.nuisance or p.name not in self.solution.free:
+                continue
+            out.append(self._judged(p, by_record, by_window, profiles=profiles))
+        return Trust(tuple(out))
+
+    def _windows(self) -> npt.NDArray[np.int64]:
+        """Number of the window of each row, -1 for rows of no block."""
+        last = max(int(self.block.max(initial=0)) + 1, 1)
+        return np.where(self.block >= 0, self.block * WINDOWS // last, -1)
+
+    def _on(self, rows: npt.NDArray[np.bool_]) -> dict[str, float | None]:
+        """Values that some of the rows alone give: one Gauss-Newton step; None where these do not
+        tell a parameter to `KNOWN`."""
+        j, r = self.j[rows], self.r[rows]
+        gram = j.T @ j
+        size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+        scaled = gram / np.outer(size, size)
+        step = -np.linalg.pinv(scaled, rcond=1e-9, hermitian=True) @ ((j.T @ r) / size) / size
+        errors = white_errors(eliminated(gram, len(self.moving)))
+        out: dict[str, float | None] = {}
+        for k, n in enumerate(self.moving):
+            value = self.solution.values[n]
+            known = math.isfinite(errors[k]) and errors[k] < KNOWN * abs(value)
+            out[n] = value + float(step[k]) if known else None
+        return out
+
+    def _judged(
+        self,
+        p: Parameter,
+        by_record: Sequence[Mapping[str, float | None]],
+        by_window: Sequence[Mapping[str, float | None]],
+        *,
+        profiles: bool,
+    ) -> Trusted:
+        value = float(self.solution.values[p.name])
+        bare_one = _unknown(p, self.model, value)
+        if p.name not in self.moving:
+            return replace(bare_one, why="at its bound")
+        k = self.moving.index(p.name)
+        from_blocks = self.solution.stderr.get(p.name)
+        white = float(self.white[k])
+        if not math.isfinite(white):
+            return replace(bare_one, why="flat: no value of it is worse than another")
+        stated = white if from_blocks is None else from_blocks
+        # few blocks tell of a shape and may agree by chance; of all others white rows say too
+        # little: the noise of accelerations has no slow part
+        error = max(stated, white) if p.is_shape else stated
+        low, high = value - NORMAL * error, value + NORMAL * error
+        if p.is_shape and profiles and error < abs(value):
+            low, high = self._profiled(p.name, error, error / white)
+        bound = self.limits[p.name]
+        low, high = max(low, bound[0]), min(high, bound[1])
+        partner, rho = self._partner(k)
+        share = error / abs(value) if value else math.inf
+        verdict, why = self._verdict(p, value, share, rho)
+        return replace(
+            bare_one,
+            stderr=stated,
+            low=low,
+            high=high,
+            records=tuple(v[p.name] for v in by_record),
+            windows=tuple(v[p.name] for v in by_window),
+            partner=partner,
+            trade=self._trade(p.name, partner, error, rho) if partner else "",
+            prediction_percent=self._prediction(k, NORMAL * error),
+            verdict=verdict,
+            why=why,
+        )
+
+    def _partner(self, k: int) -> tuple[str | None, float]:
+        """The parameter with the largest correlation, and that correlation."""
+        seen = [i for i, n in enumerate(self.moving) if n not in self.nuisance and i != k]
+        if not seen:
+            return None, 0.0
+        i = max(seen, key=lambda i: abs(self.together[k, i]))
+        rho = float(self.together[k, i])
+        return (self.moving[i], rho) if abs(rho) >= WORTH_SAYING else (None, rho)
+
+    def _trade(self, name: str, partner: str, error: float, rho: float) -> str:
+        """One standard error up, and what its partner does then."""
+        i = self.moving.index(partner)
+        k = self.moving.index(name)
+        other = float(self.solution.values[partner])
+        moves = rho * float(self.white[i]) * error / float(self.white[k])
+        value = float(self.solution.values[name])
+        if not value or not other:
+            return f"{words(name)} trades with {words(partner)} (correlation {rho:.2f})"
+        up = (moves > 0) == (other > 0)
+        return (
+            f"{words(name)} goes up {100 * error / abs(value):.2g} % where {words(partner)} goes "
+            f"{'up' if up else 'down'} {100 * abs(moves / other):.2g} %"
+        )
+
+    def _prediction(self, k: int, shift: float) -> float:
+        """Change of the prediction where one parameter moves and all others adapt."""
+        gram = self.j.T @ self.j
+        others = [i for i in range(gram.shape[0]) if i != k]
+        size = np.sqrt(np.maximum(np.diag(gram)[others], 1e-300))
+        inside = gram[np.ix_(others, others)] / np.outer(size, size)
+        follow = -np.linalg.pinv(inside, rcond=1e-12, hermitian=True) @ (gram[others, k] / size)
+        direction = np.zeros(gram.shape[0])
+        direction[k] = 1.0
+        direction[others] = follow / size
+        moved = self.plain @ (direction * shift)
+        return 100 * float(np.linalg.norm(moved)) / max(self.measured, 1e-300)
+
+    def _verdict(self, p: Parameter, value: float, share: float, rho: float) -> tuple[str, str]:
+        if p.is_shape and p.scale != "absolute":
+            low, high = (g * self.data.ranges[p.scale] for g in (p.grid[0], p.grid[-1]))
+            if not low / 2 <= value <= 2 * high:
+                return "not", f"extrapolated: the motion's {p.scale} does not reach it"
+        if share * NORMAL >= 1:
+            tied = abs(rho) >= TIED
+            return (
+                ("only in combination", "its interval contains zero")
+                if tied
+                else ("not", "its interval contains zero")
+            )
+        if p.name in self.solution.unidentified:
+            return "only in combination", "not identifiable by itself"
+        if share > KNOWN and abs(rho) >= TIED:
+            return "only in combination", "known to less than 10 % and tied to another"
+        return "trust", ""
+
+    def _profiled(self, name: str, error: float, wider: float) -> tuple[float, float]:
+        """Ends of the 95 % interval by refits of all others: where the sum of squares, in units of
+        its scatter over blocks, has risen by the square of the normal bound."""
+        value = float(self.solution.values[name])
+        zero = self._refitted(name, value)
+        ends = []
+        for sign in (-1.0, 1.0):
+            # a shape is a scale: on a logarithm its profile is nearly a parabola
+            reach = NORMAL * error / abs(value)
+            inside, outside = 0.0, math.inf
+            for _ in range(PROFILE_STEPS):
+                at = value * math.exp(sign * reach)
+                low, high = self.limits[name]
+                clipped = min(max(at, low), high)
+                rise = INDEPENDENT_SHARE * (self._refitted(name, clipped) - zero)
+                root = math.sqrt(max(rise, 0.0)) / max(wider, 1e-300)
+                if root >= NORMAL:
+                    outside = min(outside, reach)
+                else:
+                    inside = max(inside, reach)
+                if clipped != at and root < NORMAL:
+                    break
+                guess = reach * NORMAL / root if root > 0 else 2 * reach
+                if math.isfinite(outside):
+                    middle = (inside + outside) / 2
+                    reach = guess if inside < guess < outside else middle
+                else:
+                    reach = min(max(guess, 1.2 * reach), 3 * reach)
+                if abs(root / NORMAL - 1) < 0.03:
+                    break
+            ends.append(value * math.exp(sign * reach))
+        return ends[0], ends[1]
+
+    def _refitted(self, name: str, value: float) -> float:
+        """Weighted sum of squares with one parameter held and all others fitted."""
+        free = tuple(n for n in self.form.free if n != name)
+        form = WeakForm(
+            balances_of(self.model, self.data.sensing, wrt=bare(free)),
+            self.data,
+            {**self.form.values, name: value},
+            free,
+            self.solution.weights,
+        )
+        fitted, _ = form.fitted(self.limits, REFITS)
+        left = form.residual(np.array([fitted[n] for n in free]))
+        return float(left @ left)
+
+
+def _unknown(p: Parameter, model: JointModel, value: float) -> Trusted:
+    """A parameter of which nothing is known but its value."""
+    return Trusted(
+        p.name,
+        p.unit,
+        kind_of(model, p),
+        value,
+        stderr=None,
+        low=None,
+        high=None,
+        records=(),
+        windows=(),
+        partner=None,
+        trade="",
+        prediction_percent=0.0,
+        verdict="not",
+        why="",
+    )
+
+
+__all__ = ["CLASSES", "Trust", "Trusted", "kind_of", "trust"]

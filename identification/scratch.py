@@ -1,0 +1,165 @@
+"""What a run leaves on the disk while it works: a temporary folder of its own, locks on its
+results, and nothing of either after a kill once the next run has started.
+
+The system gives a lock free when its process ends, however it ends. So what lies under a lock that
+can be taken belongs to nobody any more. Where the system has no such locks (Windows) a run cleans
+up behind itself only.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import re
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, Final
+
+from identification.errors import InputError
+
+_PREFIX: Final = "irj-run-"
+_LOCK: Final = ".lock"
+_HELD: Final[dict[str, IO[bytes]]] = {}
+"""Locks of this process, by what they stand for."""
+_OUTER: Final[list[str]] = []
+"""The folder for temporary files outside that of the run."""
+_LEFT: Final = re.compile(
+    r"\.(?:.*\.[0-9a-f]{8}\.part|.*-[a-z0-9_]{8}\.part|build-[a-z0-9_]{8}|write-[a-z0-9_]{8})"
+)
+"""Names of what is half written beside results: parts of files, folders of a build."""
+
+
+def outer_folder() -> Path:
+    """Folder for temporary files that outlive the run."""
+    return Path(_OUTER[0] if _OUTER else tempfile.gettempdir())
+
+
+@contextlib.contextmanager
+def own_folder() -> Iterator[None]:
+    """Keep all temporary files of the run, and of its children, in one folder that is removed at
+    its end; remove those of runs that were killed.
+    """
+    outer = Path(tempfile.gettempdir())
+    before = tempfile.tempdir, os.environ.get("TMPDIR")
+    try:
+        _swept_runs(outer)
+        made = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=outer))
+        lock = _taken(made / _LOCK)
+    except OSError:  # no room for temporary files: whoever needs one says so
+        yield
+        return
+    _OUTER.append(str(outer))
+    tempfile.tempdir = str(made)
+    os.environ["TMPDIR"] = str(made)
+    owner = os.getpid()
+    try:
+        yield
+    finally:
+        if os.getpid() == owner:  # not in a fork
+            tempfile.tempdir = before[0]
+            _OUTER.clear()
+            if before[1] is None:
+                os.environ.pop("TMPDIR", None)
+            else:
+                os.environ["TMPDIR"] = before[1]
+            shutil.rmtree(made, ignore_errors=True)
+            if lock is not None:
+                lock.close()
+
+
+def hold(target: Path) -> None:
+    """Hold a result, a file or a folder, until `release` or the end of the process, and remove
+    what a killed run left half written beside (in) it.
+
+    Raises
+    ------
+    InputError
+        Another process holds it.
+    """
+    place = os.path.realpath(target)
+    if place in _HELD:
+        return
+    lock = _lock_of(place)
+    if lock is None:
+        return
+    _HELD[place] = lock
+    folder = Path(place)
+    if folder.is_dir():
+        sweep(folder)
+    else:
+        sweep(folder.parent, f".{folder.name[:100]}.")
+
+
+def release() -> None:
+    """Give all results free."""
+    while _HELD:
+        _HELD.popitem()[1].close()
+
+
+def sweep(folder: Path, start: str = "") -> None:
+    """Remove what is half written in a folder that is held, and begins so."""
+    with contextlib.suppress(OSError):
+        for left in folder.iterdir():
+            if left.name.startswith(start) and _LEFT.fullmatch(left.name):
+                if left.is_dir() and not left.is_symlink():
+                    shutil.rmtree(left, ignore_errors=True)
+                else:
+                    left.unlink(missing_ok=True)
+
+
+def _swept_runs(outer: Path) -> None:
+    """Remove the temporary folders of runs that are no more."""
+    for left in outer.glob(f"{_PREFIX}*"):
+        with contextlib.suppress(OSError):
+            if not left.is_symlink() and (lock := _taken(left / _LOCK, new=False)) is not None:
+                shutil.rmtree(left, ignore_errors=True)
+                lock.close()
+
+
+def _lock_of(place: str) -> IO[bytes] | None:
+    """The lock of a result; None where there are no locks, or no folder for them."""
+    user = os.getuid() if hasattr(os, "getuid") else 0
+    folder = outer_folder() / f"irj-locks-{user}"
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        about = folder.lstat()
+        if about.st_uid != user or folder.is_symlink() or about.st_mode & 0o022:
+            return None  # somebody else's folder
+        lock = folder / hashlib.sha256(os.fsencode(place)).hexdigest()[:32]
+        return _taken(lock)
+    except BlockingIOError:
+        raise InputError(
+            f"{place}: another irj is writing it; wait for it or write somewhere else"
+        ) from None
+    except OSError:
+        return None
+
+
+def _taken(path: Path, new: bool = True) -> IO[bytes] | None:
+    """An open file under a lock; None where the system has no locks.
+
+    Raises
+    ------
+    BlockingIOError
+        Another process has it.
+    OSError
+        It cannot be opened.
+    """
+    try:
+        import fcntl
+    except ImportError:
+        return None
+    handle = os.open(path, os.O_RDWR | os.O_NOFOLLOW | (os.O_CREAT if new else 0), 0o600)
+    stream = os.fdopen(handle, "r+b")
+    try:
+        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        stream.close()
+        raise
+    return stream
+
+
+__all__ = ["hold", "outer_folder", "own_folder", "release", "sweep"]

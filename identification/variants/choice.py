@@ -1,0 +1,158 @@
+"""Which variant the records speak for, which they cannot tell from it, and how sure that is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, final
+
+import numpy as np
+import numpy.typing as npt
+
+from identification.variants.refit import Refit
+from identification.variants.screen import PER_PARAMETER
+
+FloatArray = npt.NDArray[np.float64]
+
+DRAWS: Final = 300
+"""Resamplings of the blocks: enough for a 5 % quantile to a percent."""
+SEED: Final = 14
+"""Of these resamplings: the same records give the same answer."""
+TIE_QUANTILE: Final = 0.05
+"""A variant ties with the best where it does better in this share of the resamplings."""
+TIE_MARGIN: Final = 0.5 * PER_PARAMETER
+"""Difference of the scores below which variants tie however certain it is: 5 % of a balance's RMS,
+below which one effect counts as good as two elsewhere
+(:data:`identification.diagnosis.session.SAME_WITH_ONE_LESS`); what no model holds shifts the RMS of
+laws that are one column on the records by as much."""
+WINDOWS: Final = 4
+"""Parts of the records, one after the other, in which the choice is made again."""
+FRONT_LEAST: Final = 0.01
+"""Fall of the held-out error by which a variant with more parameters is on the front: less is not
+seen in a picture."""
+
+
+@final
+@dataclass(frozen=True)
+class Judged:
+    """Scores of all variants, and what resampled blocks make of them.
+
+    Attributes
+    ----------
+    best : int
+        The variant with the lowest score of those with every effect of the joint's own model.
+    score : (variants,) array
+        Sum over balances of ln RMS of blocks that the fit did not see, held-out records among
+        them, and .10 per parameter.
+    behind : (variants,) array
+        The 5 % quantile of score less that of the best, over resampled blocks: a tie up to 0.
+    chosen : (variants,) array
+        Share of the resamplings in which the variant is the best.
+    windows : tuple of int
+        The best variant of each part of the records.
+    """
+
+    best: int
+    score: FloatArray
+    behind: FloatArray
+    chosen: FloatArray
+    windows: tuple[int, ...]
+
+
+def score_of(squares: FloatArray, rows: FloatArray, parameters: FloatArray) -> FloatArray:
+    """Score of variants on some blocks.
+
+    Parameters
+    ----------
+    squares, rows : (..., balances) arrays
+        Sums over the blocks.
+    parameters : (...) array
+    """
+    mean = np.maximum(squares, 1e-300) / np.maximum(rows, 1.0)
+    return np.asarray(
+        0.5 * np.where(rows > 0, np.log(mean), 0.0).sum(axis=-1) + PER_PARAMETER * parameters
+    )
+
+
+def judged(refits: Sequence[Refit], whole: Sequence[bool]) -> Judged:
+    """Hold variants against each other on the same blocks.
+
+    Parameters
+    ----------
+    refits : sequence of Refit
+    whole : sequence of bool
+        Which of them have every effect of the joint's own model: one of these is the best.
+    """
+    squares = np.array([r.squares for r in refits])
+    rows = np.array([r.rows for r in refits])
+    parameters = np.array([r.parameters for r in refits], dtype=np.float64)
+    score = score_of(squares.sum(axis=1), rows.sum(axis=1), parameters)
+    used = np.flatnonzero(rows[0].sum(axis=1) > 0)
+    draws = np.random.default_rng(SEED).integers(0, len(used), (DRAWS, len(used)))
+    count = np.zeros((DRAWS, squares.shape[1]))
+    for k, drawn in enumerate(draws):
+        count[k] = np.bincount(used[drawn], minlength=squares.shape[1])
+    drawn_scores = score_of(
+        np.einsum("dk,vkb->dvb", count, squares), np.einsum("dk,vkb->dvb", count, rows), parameters
+    )
+    aside = np.where(whole, 0.0, np.inf)
+    best = int(np.argmin(score + aside))
+    behind = np.quantile(drawn_scores - drawn_scores[:, [best]], TIE_QUANTILE, axis=0)
+    chosen = np.bincount((drawn_scores + aside).argmin(axis=1), minlength=len(refits)) / DRAWS
+    windows = tuple(
+        int(np.argmin(aside + _on(part, squares, rows, parameters)))
+        for part in np.array_split(used, min(WINDOWS, len(used)))
+        if len(part)
+    )
+    return Judged(best, score, behind, chosen, windows)
+
+
+def _on(
+    blocks: npt.NDArray[np.int64], squares: FloatArray, rows: FloatArray, parameters: FloatArray
+) -> FloatArray:
+    """Scores on some of the blocks."""
+    return score_of(squares[:, blocks].sum(axis=1), rows[:, blocks].sum(axis=1), parameters)
+
+
+def tied_with_best(
+    scores: Judged, whole: Sequence[bool], parts: Sequence[frozenset[str]]
+) -> list[bool]:
+    """Which variants the records do not tell from the best one, itself among them.
+
+    One that holds all parts of another tie and more, and is no better, says nothing beside it.
+
+    Parameters
+    ----------
+    scores : Judged
+    whole : sequence of bool
+        Which variants have every effect of the joint's own model.
+    parts : sequence of frozenset of str
+        Labels of each.
+    """
+    behind = scores.score - scores.score[scores.best]
+    alike = [
+        w and bool(q <= 0 or d <= TIE_MARGIN)
+        for w, q, d in zip(whole, scores.behind, behind, strict=True)
+    ]
+    return [
+        k == scores.best
+        or (
+            alike[k]
+            and not any(
+                alike[j] and parts[j] < parts[k] and behind[j] <= behind[k]
+                for j in range(len(parts))
+            )
+        )
+        for k in range(len(parts))
+    ]
+
+
+def front_of(parameters: Sequence[int], error: Sequence[float]) -> list[int]:
+    """Variants on the front of error against parameters, the fewest parameters first."""
+    out: list[int] = []
+    lowest = np.inf
+    for k in sorted(range(len(error)), key=lambda i: (parameters[i], error[i])):
+        if error[k] < lowest * (1 - FRONT_LEAST):
+            out.append(k)
+            lowest = error[k]
+    return out

@@ -1,0 +1,359 @@
+"""Explore: score all variants of a joint's model, fit the best of them, and hold them against
+each other.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Final, final
+
+import numpy as np
+
+from casadi_models import JointModel
+from casadi_models.transmission import MODELS
+from identification.balance.calibration import unknowns_of
+from identification.balance.dataset import visible_labels, without
+from identification.balance.sensing import sense
+from identification.data.joint_file import Joint
+from identification.data.record import Record
+from identification.diagnosis.bench import Progress
+from identification.diagnosis.candidates import NotTestable
+from identification.diagnosis.improvement import Improvement
+from identification.diagnosis.session import Session
+from identification.errors import InputError
+from identification.fitting.engine import Solution, reweighed
+from identification.variants.choice import front_of, judged, tied_with_best
+from identification.variants.exploration import Exploration, StandIn, Variant, agreement_of
+from identification.variants.lattice import (
+    Node,
+    added_to,
+    assembled,
+    droppable,
+    missing_from,
+    nodes_of,
+)
+from identification.variants.refit import Refit, Weighting, physical, refitted, with_size
+from identification.variants.screen import LARGEST, PER_PARAMETER, Scored, Screen
+
+SHOWN: Final = 40
+"""Variants of the screen that are fitted: on simulated joints the best after the fit was among the
+first thirty."""
+OF_EACH_SIZE: Final = 3
+"""Variants of each number of effects among them: the front needs the small ones too."""
+SWAPS: Final = 8
+"""Exchanges of a part of the best variant among them."""
+FIRST: Final = 3
+"""Variants that are fitted to find the point about which the screen is made again."""
+ROUNDS: Final = 2
+"""Expansions about a fitted variant with further parts."""
+FURTHER: Final = 2
+"""Parts that are tried at once beside the best variant."""
+
+
+def explore(
+    records: Sequence[Record] | Record,
+    joint: Joint,
+    held_out: Sequence[Record] | Record = (),
+    *,
+    progress: Progress | None = None,
+) -> Exploration:
+    """Score all variants of a joint's model and fit the best of them.
+
+    Parameters
+    ----------
+    records : Record or sequence of Record
+        Training records.
+    joint : Joint
+        What is known, and the model about which variants are made.
+    held_out : Record or sequence of Record
+        Records that no fit sees; without them blocks of the training records are held out.
+    progress : callable, optional
+        ``progress(text, share)``.
+
+    Raises
+    ------
+    InputError
+        Unusable records or joint, in one line; records that cannot carry the question.
+    """
+    session = Session.opened(records, joint, held_out, progress=_part(progress, 0.0, 0.3))
+    start = session.start()
+    improvement = session.run(start)
+    if improvement.ranking is None:
+        raise InputError(improvement.reason)
+    given = [records] if isinstance(records, Record) else list(records)
+    return _Search(session, start, given[0], _part(progress, 0.3, 0.7)).result(improvement)
+
+
+def _part(progress: Progress | None, low: float, span: float) -> Progress:
+    told: Progress = progress or (lambda text, share: None)
+    return lambda text, share: told(text, low + span * share)
+
+
+@final
+class _Search:
+    """The fitted variants of one search, each once."""
+
+    def __init__(
+        self, session: Session, start: Solution, record: Record, progress: Progress
+    ) -> None:
+        self.session, self.start, self.record = session, start, record
+        self.data, self.progress = session.data, progress
+        self.names: dict[object, str] = {}
+        self.found: dict[object, Refit] = {}
+        self.apart: dict[str, str] = {}
+        self.screened = 0
+        self.last: object = None
+        self.weighting = Weighting.of(start, self.data)
+
+    def result(self, improvement: Improvement) -> Exploration:
+        """The whole search."""
+        nodes, refused = nodes_of(self.start.model, self.data)
+        last = improvement.steps[-1].solution
+        last = replace(last, model=with_size(last, added_to(self.start.model, last.model)))
+        self.last = self._mark(last.model)
+        first = self._screen(self.start, nodes, {}, 0.0)
+        ranked = first.search()
+        self._fit(self.start.model, self.start.values)
+        self._fit(last.model, last.values)
+        for scored in itertools.islice(first.worth(ranked), FIRST):
+            self._fit_scored(first, scored, ())
+        best = self._best()
+        screen = first
+        if best.solution.model.structure != self.start.model.structure:
+            # once more about the best, on its weights: what was fitted so far is fitted again
+            like = reweighed(best.solution, self.data)
+            self.weighting = Weighting.of(like, self.data)
+            self.found.clear()
+            screen = self._screen(_restricted(self.start, like), nodes, _shapes(like), 0.3)
+            ranked = screen.search()
+            self._fit(self.start.model, {**like.values, **self.start.values})
+            self._fit(last.model, {**like.values, **last.values})
+        self._fit_chosen(screen, ranked, best.solution.values)
+        for _ in range(ROUNDS):
+            if not self._grown():
+                break
+        self._neighbours()
+        self._rungs()
+        self.screened = max(self.screened, len(self.found))
+        return self._told(improvement, refused)
+
+    # --- steps ------------------------------------------------------------------------------------
+
+    def _screen(
+        self,
+        solution: Solution,
+        nodes: Sequence[Node],
+        more: Mapping[str, Mapping[str, float]],
+        share: float,
+    ) -> Screen:
+        base = self.session.bench.base(solution)
+        return Screen(base, nodes, more, lambda text, part: self.progress(text, share + 0.2 * part))
+
+    def _fit(self, model: JointModel, *starts: Mapping[str, float], name: str = "") -> None:
+        """Fit a variant once; one whose parts are none is passed over."""
+        mark = (frozenset(visible_labels(model)), model.inertias)
+        if mark in self.found:
+            return
+        refit = refitted(model, self.data, starts, self.weighting)
+        added = added_to(self.start.model, model)
+        if not np.all(np.isfinite(refit.held)) or physical(refit, added, self.data):
+            return
+        self.found[mark] = refit
+        if name:
+            self.names[mark] = name
+
+    def _fit_scored(
+        self, screen: Screen, scored: Scored, also: Sequence[Mapping[str, float]]
+    ) -> None:
+        model = assembled(screen.base.solution.model, screen.parts(scored.options))
+        if model is None:
+            return
+        start = screen.start_of(scored.options)
+        amplitudes = {
+            n: start[n] for p in screen.parts(scored.options) for n in p.candidate.amplitudes
+        } | {n: x for k in scored.options for n, x in screen.options[k].shapes.items()}
+        self._fit(model, start, *({**values, **amplitudes} for values in also))
+
+    def _fit_chosen(
+        self, screen: Screen, ranked: Sequence[Scored], best: Mapping[str, float]
+    ) -> None:
+        """Fit the first variants of the screen, the first of each size, and exchanges in the
+        best.
+        """
+        self.screened = max(self.screened, len(ranked))
+        chosen = list(itertools.islice(screen.worth(ranked), SHOWN))
+        for size in range(1, LARGEST + 1):
+            here = (s for s in ranked if len(s.options) == size and screen.real(s.options))
+            chosen += itertools.islice(here, OF_EACH_SIZE)
+        if chosen[0].options:
+            swaps = (s for s in screen.swapped(chosen[0].options) if screen.real(s.options))
+            chosen += itertools.islice(swaps, SWAPS)
+        for k, scored in enumerate(chosen):
+            self.progress("fitting variants", 0.5 + 0.3 * k / len(chosen))
+            self._fit_scored(screen, scored, (best,))
+
+    def _grown(self) -> bool:
+        """Whether parts beside the best variant make a better one."""
+        now = self._best()
+        nodes, _ = nodes_of(now.solution.model, self.data)
+        screen = self._screen(now.solution, nodes, {}, 0.8)
+        ranked = [s for s in screen.search(FURTHER) if s.options]
+        for scored in itertools.islice((s for s in ranked if screen.real(s.options)), FIRST):
+            self._fit_scored(screen, scored, ())
+        return self._best() is not now
+
+    def _neighbours(self) -> None:
+        """The best variant with one part less."""
+        now = self._best().solution
+        for label in droppable(now.model):
+            self._fit(without(now.model, label), now.values)
+
+    def _rungs(self) -> None:
+        """The models by name, with the joint's own effects, where the channels show the same
+        balances.
+        """
+        joint = self.session.joint
+        sensing = self.data.sensing
+        own = visible_labels(self.start.model)
+        for name in MODELS:
+            model = JointModel.by_name(
+                name, joint.gear_ratio, kind=joint.kind, effects=joint.effects
+            )
+            if set(visible_labels(model)) == set(own):
+                continue
+            try:
+                shows = set(sense(self.record, model).balances)
+            except InputError as error:
+                self.apart[name] = str(error)
+                continue
+            if not shows <= set(sensing.balances):
+                self.apart[name] = (
+                    "shows other balances of these records: give it as the model of the joint file"
+                )
+                continue
+            prepared = replace(
+                self.start.model,
+                terms=(
+                    *model.terms,
+                    *(t for t in self.start.model.terms if t.label not in own),
+                ),
+                inertias=self.start.model.inertias,
+                values={**self.start.model.values, **model.values},
+            )
+            prepared = replace(prepared, calibration=unknowns_of(prepared, sensing))
+            try:
+                self._fit(prepared, {**self.start.values, **model.values}, name=name)
+            except (InputError, ValueError, np.linalg.LinAlgError):
+                continue
+
+    def _mark(self, model: JointModel) -> object:
+        return frozenset(visible_labels(model)), model.inertias
+
+    def _best(self) -> Refit:
+        every = list(self.found.values())
+        return every[judged(every, [self._whole(r) for r in every]).best]
+
+    def _whole(self, refit: Refit) -> bool:
+        """Whether a variant has every effect of the joint's own model: what the joint file says is
+        there is no question here.
+        """
+        return not missing_from(self.start.model, refit.solution.model)
+
+    # --- what is told -----------------------------------------------------------------------------
+
+    def _told(self, improvement: Improvement, refused: tuple[NotTestable, ...]) -> Exploration:
+        refits, marks = list(self.found.values()), list(self.found)
+        own = self.found[self._mark(self.start.model)]
+        whole = [self._whole(r) for r in refits]
+        scores = judged(refits, whole)
+        best = scores.best
+        parts = [frozenset(visible_labels(r.solution.model)) for r in refits]
+        tied = tied_with_best(scores, whole, parts)
+        variants = [
+            Variant(
+                self._name(refit, self.names.get(mark, "")),
+                visible_labels(refit.solution.model),
+                added=added_to(self.start.model, refit.solution.model),
+                dropped=missing_from(self.start.model, refit.solution.model),
+                parameters=refit.parameters,
+                relative_error_percent=refit.relative_error_percent,
+                error_percent=100 * float(np.exp(np.mean(np.log(refit.held / own.held)))),
+                score=float(scores.score[k] - scores.score[best]),
+                tied=tied[k],
+                chosen_percent=100 * float(scores.chosen[k]),
+                solution=refit.solution,
+            )
+            for k, (mark, refit) in enumerate(zip(marks, refits, strict=True))
+        ]
+        front = front_of([v.parameters for v in variants], [v.error_percent for v in variants])
+        order = sorted(range(len(variants)), key=lambda k: (not whole[k], scores.score[k]))
+        balances = refits[0].held.size
+        recommended = variants[best]
+        stand_ins = []
+        for k in order:
+            gone = parts[best] - parts[k]
+            came = parts[k] - parts[best]
+            if len(gone) == 1 and len(came) == 1 and gone <= set(recommended.added):
+                plain = variants[k].score - PER_PARAMETER * (
+                    variants[k].parameters - recommended.parameters
+                )
+                lost = 100 * (math.exp(plain / balances) - 1)
+                (effect,), (by,) = gone, came
+                stand_ins.append(StandIn(effect, by, lost, tied[k]))
+        improved = next((variants[k] for k, m in enumerate(marks) if m == self.last), None)
+        return Exploration(
+            self.session.joint,
+            self.data,
+            variants=tuple(variants[k] for k in order),
+            screened=self.screened,
+            front=tuple(variants[k] for k in front),
+            recommended=recommended,
+            ties=tuple(variants[k] for k in order if tied[k]),
+            windows=tuple(variants[k].name for k in scores.windows),
+            stand_ins=tuple(stand_ins),
+            improvement=improvement,
+            improved=improved,
+            agreement=agreement_of(improvement, improved, recommended, self.start.model),
+            not_testable=refused,
+            apart=self.apart,
+            spare=tuple(
+                v.dropped[0]
+                for v in variants
+                if v.added == recommended.added and len(v.dropped) == 1 and v.score < 0
+            ),
+        )
+
+    def _name(self, refit: Refit, name: str) -> str:
+        model = refit.solution.model
+        if name:
+            return name
+        added = added_to(self.start.model, model)
+        dropped = missing_from(self.start.model, model)
+        told = [f"+ {label}" for label in added] + [f"- {label}" for label in dropped]
+        return " ".join(told) or "start model"
+
+
+def _restricted(start: Solution, like: Solution) -> Solution:
+    """The joint's own model at the values, and with the weights, that a bigger one has."""
+    values = {n: like.values.get(n, x) for n, x in start.values.items()}
+    return replace(
+        start,
+        values=values,
+        weights=like.weights,
+        sigma=like.sigma,
+        at_bound=tuple(n for n in like.at_bound if n in start.free),
+    )
+
+
+def _shapes(solution: Solution) -> dict[str, dict[str, float]]:
+    """By label, the shapes that a fit has found."""
+    out = {}
+    for term in solution.model.terms:
+        pairs = zip(term.names, term.effect.parameters, strict=True)
+        shapes = {n: float(solution.values[n]) for n, p in pairs if p.is_shape}
+        if shapes:
+            out[term.label] = shapes
+    return out

@@ -1,0 +1,166 @@
+"""A variant fitted with its shapes free, on the weighting that all variants share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final, final
+
+import numpy as np
+import numpy.typing as npt
+
+from casadi_models import JointModel
+from casadi_models.term import Term
+from identification.balance.balances import balances_of
+from identification.balance.calibration import settled
+from identification.balance.dataset import HOLD_NAME, Dataset, without
+from identification.balance.stacked import references, rms, row_weights, stack, taking_part
+from identification.diagnosis.trials import make_base
+from identification.fitting.engine import Solution, stepped
+
+FloatArray = npt.NDArray[np.float64]
+
+STEPS: Final = 8
+"""Gauss-Newton steps of a variant from its place on the grid at most; they bring its error to
+within 1 % of a converged fit (`python -m benchmarks.explore`)."""
+LEAST_DELAY: Final = 1.0
+"""Samples up to which a late channel is no effect: a logger reads its channels, and holds its
+commands, somewhere within a sample."""
+
+
+@final
+@dataclass(frozen=True)
+class Weighting:
+    """What makes variants comparable: the weights of one fit, on training and held-out rows.
+
+    Attributes
+    ----------
+    like : Solution
+    held : mapping of str to (rows,) array
+    """
+
+    like: Solution
+    held: Mapping[str, FloatArray]
+
+    @classmethod
+    def of(cls, like: Solution, data: Dataset) -> Weighting:
+        """The weighting of a fit."""
+        balances = balances_of(like.model, data.sensing, wrt=())
+        values = settled(like.model, data.sensing, data.held_out, like.values)
+        return cls(like, row_weights(balances, data, values, like.sigma, data.held_out))
+
+
+@final
+@dataclass(frozen=True)
+class Refit:
+    """A fitted variant and its errors.
+
+    Attributes
+    ----------
+    solution : Solution
+    cost : float
+        Weighted sum of squares of the training rows.
+    squares, rows : (blocks, balances) arrays
+        Squares of each block that the fit did not see, and how many rows it has: of the training
+        records by cross-validation, then those of the held-out records.
+    held : (balances,) array
+        RMS on held-out records, in the units of the weights.
+    relative_error_percent : float
+        100 norm(residual) / norm(measured) on held-out records.
+    """
+
+    solution: Solution
+    cost: float
+    squares: FloatArray
+    rows: FloatArray
+    held: FloatArray
+    relative_error_percent: float
+
+    @property
+    def parameters(self) -> int:
+        """Free parameters, without nuisances."""
+        model = self.solution.model
+        aside = {HOLD_NAME, *model.named("smoothing"), *model.calibration}
+        return sum(n not in aside for n in self.solution.free)
+
+
+def refitted(
+    model: JointModel,
+    data: Dataset,
+    starts: tuple[Mapping[str, float], ...],
+    weighting: Weighting,
+    *,
+    steps: int = STEPS,
+) -> Refit:
+    """A variant from the best of some starts: shapes near zero velocity have several valleys."""
+    found = min(
+        (stepped(model, data, s, weighting.like, iterations=steps) for s in starts),
+        key=lambda f: f[1],
+    )
+    solution, cost = found
+    base = make_base(solution, data)
+    own = base.crossed, base.numbers.astype(np.float64)
+    balances = balances_of(solution.model, data.sensing, wrt=())
+    values = settled(model, data.sensing, [*data.train, *data.held_out], solution.values)
+    residual = stack(balances, data.held_out, values).residual
+    taking = {b: taking_part(b, data.held_out) for b in balances.balances}
+    measured = references(data, data.held_out)
+    left = np.concatenate([residual[b][taking[b]] for b in balances.balances])
+    size = np.concatenate([measured[b][taking[b]] for b in balances.balances])
+    seen = _by_block(data, residual, weighting)
+    return Refit(
+        solution,
+        cost,
+        np.vstack([own[0], seen[0]]),
+        np.vstack([own[1], seen[1]]),
+        np.array(
+            [rms((residual[b] * weighting.held[b])[taking[b]]) for b in balances.balances],
+            dtype=np.float64,
+        ),
+        100 * float(np.linalg.norm(left)) / (float(np.linalg.norm(size)) or 1e-300),
+    )
+
+
+def _by_block(
+    data: Dataset, residual: Mapping[str, FloatArray], weighting: Weighting
+) -> tuple[FloatArray, FloatArray]:
+    """Weighted squares of each held-out block and balance, and how many rows it has."""
+    number = np.concatenate([w.block for w in data.held_out])
+    inside = number >= 0
+    which, place = np.unique(number[inside], return_inverse=True)
+    squares, rows = [], []
+    for b, r in residual.items():
+        taking = taking_part(b, data.held_out)[inside].astype(np.float64)
+        weighted = (r * weighting.held[b])[inside]
+        squares.append(np.bincount(place, taking * weighted**2, len(which)))
+        rows.append(np.bincount(place, taking, len(which)))
+    return np.array(squares, dtype=np.float64).T, np.array(rows, dtype=np.float64).T
+
+
+def with_size(solution: Solution, added: tuple[str, ...]) -> JointModel:
+    """The model of a fit without those of the added parts that came out with no size."""
+    model = solution.model
+    for term in solution.model.terms:
+        if term.label in added and not any(_sizes(term, solution.values)):
+            model = without(model, term.label)
+    return model
+
+
+def _sizes(term: Term, values: Mapping[str, float]) -> list[float]:
+    """Sizes of the amplitudes of a part."""
+    pairs = zip(term.names, term.effect.parameters, strict=True)
+    return [abs(values[n]) for n, p in pairs if not p.is_shape]
+
+
+def physical(refit: Refit, added: tuple[str, ...], data: Dataset) -> str:
+    """Why a part that was added to a variant is none; empty where every part is one."""
+    values = refit.solution.values
+    for term in refit.solution.model.terms:
+        if term.label not in added:
+            continue
+        sizes = _sizes(term, values)
+        if not any(sizes):
+            return f"{term.label} has the size 0"
+        if term.effect.is_delay and max(sizes) <= LEAST_DELAY * data.train[0].grid.dt:
+            return f"{term.label} is shorter than a sample"
+    return ""

@@ -1,0 +1,155 @@
+"""A fault bank for records: which sensors a record has, healthy records for the limits, verdicts
+on a file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, final
+
+import numpy as np
+import numpy.typing as npt
+
+from identification.data.joint_file import Joint
+from identification.data.record import Record
+from identification.errors import InputError
+from identification.online.options import OnlineOptions, prepared
+from identification.online.verdict import CURRENT_OR_FRICTION, HELD, MISSING, PLANT
+from irj_fmu.estimator.healthy import online_readings
+
+if TYPE_CHECKING:
+    from identification.faults.bank import BankTrack, FaultBank
+    from identification.faults.detector import Fault
+
+FloatArray = npt.NDArray[np.float64]
+
+DERIVED: Final = {2: 1, 4: 3}
+"""Velocities and the positions that they are derived from where they are not measured."""
+
+
+def measured_sensors(record: Record) -> tuple[bool, ...]:
+    """Which of :data:`identification.faults.core.SENSORS` a record has; a velocity that would be
+    derived is none.
+    """
+    return (
+        True,
+        record.has("motor_position"),
+        record.has("motor_velocity"),
+        record.has("link_position"),
+        record.has("link_velocity"),
+        record.has("link_torque"),
+    )
+
+
+def bank_for(joint: Joint, record: Record, healthy: Sequence[Record]) -> FaultBank | None:
+    """A bank for a record's sensors with levels and limits from healthy records.
+
+    None where a bank cannot work: a rigid joint, one without fitted values, one encoder only, no
+    healthy records.
+
+    Raises
+    ------
+    InputError
+        A healthy record lacks a reading that the record has.
+    """
+    from identification.faults.bank import FaultBank
+    from identification.faults.bank_levels import Piece
+
+    options = OnlineOptions(
+        has_link=record.has("link_position"), has_torque=record.has("link_torque")
+    )
+    there = measured_sensors(record)
+    if not (healthy and joint.fitted and there[1] and there[3]):
+        return None
+    model, _ = prepared(joint, options)
+    if not model.is_elastic:
+        return None
+    pieces = []
+    for other in healthy:
+        if any(a and not b for a, b in zip(there, measured_sensors(other), strict=True)):
+            raise InputError(
+                f"{other.name}: has not all readings that {record.name} has; --healthy takes "
+                "records with the same channels"
+            )
+        table = np.array(online_readings(other, joint)[0])
+        pieces += [Piece(other.time[part], table[part]) for part in other.segments()]
+    bank = FaultBank(model, record.dt, there)
+    bank.calibrate(pieces)
+    return bank
+
+
+def judged(
+    bank: FaultBank, record: Record, joint: Joint, faults: Sequence[Fault] = ()
+) -> BankTrack:
+    """What a bank says about a record, stamps and missing readings as they are."""
+    return bank.run(record.time, np.array(online_readings(record, joint, faults)[0]))
+
+
+@final
+@dataclass(frozen=True)
+class Judgement:
+    """A bank's verdicts on the samples of an evenly sampled record.
+
+    Attributes
+    ----------
+    events : tuple of dict
+        ``time`` [s], ``fault`` (code as the estimator's), ``text``.
+    failed : (n, 6) bool array
+        Where a reading is not to be used.
+    readings : (n, 6) array
+        Readings with failed ones replaced.
+    """
+
+    events: tuple[dict[str, Any], ...]
+    failed: npt.NDArray[np.bool_]
+    readings: FloatArray
+
+
+def judgement(
+    bank: FaultBank, record: Record, even: Record, joint: Joint, faults: Sequence[Fault] = ()
+) -> Judgement:
+    """What a bank says about a record, brought to the samples of its even form.
+
+    Parameters
+    ----------
+    bank : FaultBank
+    record : Record
+        As read, missing readings and uneven stamps as they are.
+    even : Record
+        What the estimator replays.
+    joint : Joint
+    faults : sequence of Fault
+        Tried on purpose.
+    """
+    from identification.faults.core import SENSORS
+    from identification.faults.types import Verdict
+
+    track = judged(bank, record, joint, faults)
+    at = np.clip(np.searchsorted(record.time, even.time + 1e-9) - 1, 0, len(record) - 1)
+    failed, readings = track.failed[at], track.readings[at]
+    for velocity, position in DERIVED.items():
+        if velocity not in bank.sensors:
+            failed[:, velocity] = failed[:, position]
+            change = np.gradient(readings[:, position], even.time)
+            readings[:, velocity] = change
+    events = []
+    for event in track.events:
+        first = SENSORS.index(event.sensors[0]) + 1 if event.sensors else 0
+        code = {
+            Verdict.SENSOR: first,
+            Verdict.DROPOUT: MISSING + first,
+            Verdict.CURRENT_OR_FRICTION: CURRENT_OR_FRICTION,
+            Verdict.PLANT: PLANT,
+        }.get(event.verdict, HELD)
+        if event.verdict is not Verdict.RECOVERED:
+            events.append(
+                {
+                    "time": float(record.time[event.sample]),
+                    "first": float(record.time[event.first]),
+                    "fault": code,
+                    "sensors": list(event.sensors),
+                    "verdict": event.verdict,
+                }
+            )
+    return Judgement(tuple(events), failed, readings)

@@ -1,0 +1,116 @@
+"""Every set of sensors with a balance of its own is fitted and diagnosed; what it cannot show is
+said.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Final
+
+import pytest
+
+from identification import Joint, Record, improve
+from identification.errors import InputError
+from tests.recorded_world import sensors, world
+
+CHANNELS: Final = {
+    "current": "motor_current",
+    "motor": "motor_position",
+    "link": "link_position",
+    "torque": "link_torque",
+}
+SETS: Final[dict[tuple[str, ...], str]] = {
+    ("current", "motor"): "both",
+    ("current", "link"): "both",
+    ("current", "motor", "link"): "both",
+    ("current", "motor", "torque"): "motor",
+    ("current", "link", "torque"): "both",
+    ("motor", "link", "torque"): "link",
+    ("link", "torque"): "link",
+    ("current", "motor", "link", "torque"): "both",
+}
+"""Sets of sensors, and the side whose friction they show."""
+BLIND: Final = [("current", "torque"), ("motor", "link"), ("current",), ("motor",)]
+"""Sets without a balance: no position, or no torque."""
+
+
+@cache
+def case(hidden: tuple[str, ...]) -> world.Case:
+    """One joint, recorded without any trouble."""
+    return world.make_case(
+        11,
+        without=world.TROUBLES,
+        seconds=12.0,
+        names=hidden,
+        kind="single" if hidden else "none",
+        size=1.0,
+        make="cobot100",
+        motion="multisine",
+    )
+
+
+def records(given: tuple[str, ...], hidden: tuple[str, ...]) -> list[Record]:
+    made = case(hidden)
+    return [
+        Record.from_channels(
+            made.time[name],
+            {
+                CHANNELS[s]: made.measured[name][:, sensors.CHANNELS.index(CHANNELS[s])]
+                for s in given
+            },
+            name=name,
+        )
+        for name in world.RECORDS
+    ]
+
+
+def joint(given: tuple[str, ...], effects: tuple[str, ...]) -> Joint:
+    plain = case(()).joint
+    return Joint(
+        name="bench",
+        gear_ratio=plain.gear_ratio,
+        torque_per_current=plain.make.per_current * plain.sign,
+        model_name="hd3" if {"motor", "link"} <= set(given) else "hd1",
+        effects=effects,
+    )
+
+
+@pytest.mark.parametrize("given", SETS, ids="+".join)
+def test_nothing_is_named_where_nothing_is_hidden(given: tuple[str, ...]) -> None:
+    train, held = records(given, ())
+    found = improve(train, joint(given, ("viscous", "coulomb", "gravity")), [held])
+    assert found.claims == ()
+    # without the motor's position its twist against the link is structure that nobody sees
+    hidden_twist = "motor" not in given and "current" in given
+    unseen_link = "link" not in given and "torque" not in given
+    clean = {"unexplained"} if hidden_twist or unseen_link else {"nothing_missing"}
+    assert found.verdict in clean
+
+
+@pytest.mark.parametrize("given", SETS, ids="+".join)
+def test_coulomb_friction_is_named(given: tuple[str, ...]) -> None:
+    """The joint file lacks it on both sides; the motor has next to all of it."""
+    train, held = records(given, ("coulomb",))
+    found = improve(train, joint(given, ("viscous", "gravity")), [held])
+    assert found.claims
+    assert {c.effects for c in found.claims if len(c.effects) == 1} == {("coulomb",)}
+
+
+def test_what_stands_in_no_balance_keeps_its_value_and_is_said() -> None:
+    given = ("current", "motor", "torque")
+    train, held = records(given, ())
+    found = improve(train, joint(given, ("viscous", "coulomb", "gravity")), [held])
+    table = found.as_json()["steps"][-1]["parameters"]
+    assert not table["link_inertia"]["identifiable"]
+    assert table["link_inertia"]["value"] == 1.0
+    assert table["motor_inertia"]["identifiable"]
+    true = case(()).joint.values["JM"]
+    assert table["motor_inertia"]["value"] == pytest.approx(true, rel=0.02)
+    assert any(w.startswith("link_inertia, ") and "keep" in w for w in found.warnings)
+
+
+@pytest.mark.parametrize("given", BLIND, ids="+".join)
+def test_a_set_without_a_balance_is_refused_with_what_is_missing(given: tuple[str, ...]) -> None:
+    train, held = records(given, ())
+    with pytest.raises(InputError, match=r"record one|measure it|add one|needs one"):
+        improve(train, joint(given, ("viscous",)), [held])

@@ -1,0 +1,302 @@
+"""Trials of candidates against the same sums written out plainly, and against known truths."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.stats import f as fisher
+
+from casadi_models import EFFECTS
+from identification.balance.balances import balances_of
+from identification.data.joint_file import Joint
+from identification.diagnosis.candidates import Candidate, NotTestable
+from identification.diagnosis.trials import (
+    FOLDS,
+    KERNEL_SHARE,
+    Base,
+    Trial,
+    _refined,
+    columns,
+    effective_share,
+    make_base,
+    span_of,
+    try_candidate,
+)
+from identification.fitting.engine import load_dataset, prepared_model, solve
+from tests.smooth_laws import COULOMB, Law, record
+
+FloatArray = npt.NDArray[np.float64]
+SIZE, PHASE = 6.0, 0.7
+
+
+def wave(q: FloatArray, v: FloatArray) -> FloatArray:
+    """`cyclic_torque` of the library."""
+    return SIZE * np.sin(q + PHASE)
+
+
+def made(
+    law: Law,
+    seconds: float = 12.0,
+    held: bool = True,
+    seed: int = 0,
+    effects: tuple[str, ...] = ("viscous", "coulomb"),
+) -> Base:
+    joint = Joint(model_name="hd1", effects=effects)
+    runs = [record(np.random.default_rng([seed, k]), seconds, law) for k in (0, 1)]
+    model = prepared_model(joint, runs[0])
+    data = load_dataset(runs[:1], runs[1:] if held else [], joint, model)
+    return make_base(solve(model, data), data)
+
+
+@pytest.fixture(scope="module")
+def base() -> Base:
+    return made(wave)
+
+
+def candidate(base: Base, key: str, place: str = "motor") -> Candidate:
+    label = f"{key}@{place}"
+    model = base.solution.model.add(label)
+    (term,) = (t for t in model.terms if t.effect.key == key and t.place == place)
+    shapes = {p.name for p in term.parameters if p.is_shape}
+    names = tuple(n for n in term.names if n not in shapes)
+    return Candidate(label, EFFECTS[key], place, model, names, tuple(shapes))  # type: ignore[arg-type]
+
+
+def tried(base: Base, key: str, place: str = "motor") -> Trial:
+    found = try_candidate(candidate(base, key, place), base)
+    assert isinstance(found, Trial)
+    return found
+
+
+def raw_columns(base: Base, found: Trial) -> FloatArray:
+    """Weighted columns of a trial at its shape."""
+    balances = balances_of(
+        found.candidate.model,
+        base.data.sensing,
+        wrt=found.candidate.amplitudes,
+        columns_only=True,
+    )
+    shapes = {n: found.values[n] for n in found.candidate.shapes}
+    raw = columns(found.candidate, base, shapes, base.data.train, balances)
+    return raw * base.weight[:, None]
+
+
+# --- small parts ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.5, 0.8])
+def test_rows_that_count_in_a_process_of_first_order(rho: float) -> None:
+    """Of n samples of such a process n (1 - rho)/(1 + rho) count for its mean."""
+    rng = np.random.default_rng(0)
+    x = np.zeros(200_000)
+    noise = rng.standard_normal(len(x))
+    for k in range(1, len(x)):
+        x[k] = rho * x[k - 1] + noise[k]
+    assert effective_share(x + 3.0) == pytest.approx((1 - rho) / (1 + rho), rel=0.15)
+
+
+def test_rows_that_count_where_nothing_is_left() -> None:
+    assert effective_share(np.zeros(100)) == 1.0
+    assert effective_share(np.full(100, 2.0)) == 1.0
+
+
+def test_a_span_leaves_out_what_is_there_twice() -> None:
+    rng = np.random.default_rng(1)
+    a = rng.standard_normal((50, 3))
+    q = span_of(np.column_stack([a, a @ [1.0, 2.0, 3.0]]))
+    assert q.shape == (50, 3)
+    assert q.T @ q == pytest.approx(np.eye(3), abs=1e-12)
+    assert q @ (q.T @ a) == pytest.approx(a, abs=1e-12)
+    assert span_of(np.zeros((50, 0))).shape == (50, 0)
+
+
+def test_the_best_shape_lies_between_the_points_of_the_grid() -> None:
+    def projected(shapes: dict[str, float]) -> tuple[float, FloatArray, float]:
+        gap = math.log(shapes["a"] / 0.37) ** 2 + 2 * math.log(shapes["b"] / 5.3) ** 2
+        return 10.0 - gap, np.zeros((1, 1)), 1.0
+
+    start = {"a": 0.25, "b": 7.0}
+    best = _refined(
+        projected, (*projected(start)[:1], start, np.zeros((1, 1))), {"a": (0.1, 1), "b": (1, 9)}
+    )
+    assert best[1]["a"] == pytest.approx(0.37, rel=0.1)
+    assert best[1]["b"] == pytest.approx(5.3, rel=0.1)
+    bound = _refined(projected, (*projected(start)[:1], start, np.zeros((1, 1))), {"a": (0.1, 0.3)})
+    assert bound[1] == {"a": 0.3, "b": 7.0}
+
+
+# --- the base -------------------------------------------------------------------------------------
+
+
+def test_the_base_leaves_nothing_that_its_own_columns_explain(base: Base) -> None:
+    q = base.orthonormal
+    assert q.T @ q == pytest.approx(np.eye(q.shape[1]), abs=1e-10)
+    assert np.abs(q.T @ base.residual).max() < 1e-9 * np.linalg.norm(base.residual)
+    assert np.linalg.norm(base.jacobian, axis=0) == pytest.approx(1.0)
+    assert len(base.names) == base.jacobian.shape[1] == len(base.norms)
+    assert {"motor_viscous", "motor_coulomb"} <= set(base.names)
+
+
+def test_blocks_and_balances_are_counted_once(base: Base) -> None:
+    used = base.block >= 0
+    assert sorted(base.order.tolist()) == np.flatnonzero(used).tolist()
+    assert base.numbers.sum() == used.sum()
+    for b in range(base.blocks):
+        for k in range(len(base.balances)):
+            assert base.numbers[b, k] == np.sum((base.block == b) & (base.balance == k))
+    assert base.folds == (FOLDS if base.blocks >= 32 else min(base.blocks, 10))
+    held = np.array(base.held_out_folds())
+    assert (held.sum(axis=0) == 1).all()
+
+
+def test_what_the_base_leaves_of_blocks_that_it_was_not_fitted_to(base: Base) -> None:
+    """The same by a fit of the rows themselves, fold by fold."""
+    assert base.inward.shape[1] == 0
+    used = base.block >= 0
+    for out in base.held_out_folds():
+        inside = used & ~np.isin(base.block, np.flatnonzero(out))
+        fit = np.linalg.lstsq(base.jacobian[inside], -base.residual[inside], rcond=None)[0]
+        for b in np.flatnonzero(out):
+            rows = base.block == b
+            left = base.residual[rows] + base.jacobian[rows] @ fit
+            assert base.crossed[b].sum() == pytest.approx(left @ left, rel=1e-6)
+
+
+# --- a trial --------------------------------------------------------------------------------------
+
+
+def test_the_law_that_is_there_is_found_with_its_size(base: Base) -> None:
+    found = tried(base, "cyclic_torque")
+    amplitudes = [found.values[n] for n in found.candidate.amplitudes]
+    assert math.hypot(*amplitudes) == pytest.approx(SIZE, rel=0.05)
+    assert found.contribution == pytest.approx(SIZE / math.sqrt(2), rel=0.15)
+    assert found.cv_drop_percent > 70
+    assert found.held_out_drop_percent > 70
+    assert found.p_value < 1e-6
+    assert found.balance == base.balances[0]
+    assert found.score > 0.9 * max(
+        t.score
+        for key in ("stribeck", "added_spring", "quadratic_drag")
+        if isinstance(t := try_candidate(candidate(base, key), base), Trial)
+    )
+
+
+def test_the_figures_of_a_trial_by_plain_sums(base: Base) -> None:
+    found = tried(base, "cyclic_torque")
+    c = raw_columns(base, found)
+    both = np.column_stack([base.jacobian, c])
+    used = base.block >= 0
+    before, after = np.zeros(base.blocks), np.zeros(base.blocks)
+    for out in base.held_out_folds():
+        inside = used & ~np.isin(base.block, np.flatnonzero(out))
+        plain = np.linalg.lstsq(base.jacobian[inside], -base.residual[inside], rcond=None)[0]
+        more = np.linalg.lstsq(both[inside], -base.residual[inside], rcond=None)[0]
+        for b in np.flatnonzero(out):
+            rows = base.block == b
+            before[b] = np.sum((base.residual + base.jacobian @ plain)[rows] ** 2)
+            after[b] = np.sum((base.residual + both @ more)[rows] ** 2)
+    rows_in = int(used.sum())
+    falls = math.log(before.sum() / after.sum())
+    assert found.cv_drop_percent == pytest.approx(
+        100 * (1 - math.sqrt(after.sum() / before.sum())), rel=1e-4
+    )
+    assert found.score == pytest.approx(KERNEL_SHARE * rows_in / 2 * falls, rel=1e-4)
+    assert found.gain == pytest.approx(base.share[0] * rows_in / 2 * falls, rel=1e-4)
+    assert found.rms[0] == pytest.approx(math.sqrt(after.sum() / rows_in), rel=1e-4)
+    score = (before - after) / (2 * after.sum() / rows_in) * base.share[0]
+    assert found.block_score == pytest.approx(score, rel=1e-3, abs=1e-3)
+
+
+def test_the_size_by_one_fit_of_all_rows(base: Base) -> None:
+    found = tried(base, "cyclic_torque")
+    used = base.block >= 0
+    both = np.column_stack([base.jacobian, raw_columns(base, found)])[used]
+    fit = np.linalg.lstsq(both, -base.residual[used], rcond=None)[0]
+    sizes = [found.values[n] for n in found.candidate.amplitudes]
+    assert sizes == pytest.approx(fit[base.jacobian.shape[1] :], rel=1e-4)
+
+
+def test_the_chance_of_a_size_by_scores_of_blocks(base: Base) -> None:
+    """Arellano's sandwich over blocks, F with blocks minus amplitudes degrees of freedom."""
+    weak = made(lambda q, v: 0.12 * np.sin(q + PHASE))
+    found = tried(weak, "cyclic_torque")
+    c = raw_columns(weak, found)
+    used = weak.block >= 0
+    q = np.linalg.qr(weak.jacobian)[0]
+    c = c - q @ (q.T @ c)
+    fit = np.linalg.lstsq(
+        np.column_stack([weak.jacobian, raw_columns(weak, found)])[used],
+        -weak.residual[used],
+        rcond=None,
+    )[0]
+    own = fit[weak.jacobian.shape[1] :]
+    left = weak.residual + np.column_stack([weak.jacobian, raw_columns(weak, found)]) @ fit
+    marks = [b for b in range(weak.blocks) if (weak.block == b).any()]
+    s = np.array([(c * left[:, None])[weak.block == b].sum(axis=0) for b in marks])
+    inverse = np.linalg.inv(c.T @ c)
+    n = len(marks)
+    covariance = inverse @ s.T @ s @ inverse * n / (n - 1)
+    statistic = own @ np.linalg.solve(covariance, own) / len(own)
+    expected = fisher.sf(statistic, len(own), n - len(own))
+    assert 1e-12 < expected < 0.5
+    assert found.p_value == pytest.approx(expected, rel=0.05)
+    del base
+
+
+def test_the_fall_on_records_that_the_fit_never_saw(base: Base) -> None:
+    found = tried(base, "cyclic_torque")
+    balances = balances_of(
+        found.candidate.model, base.data.sensing, wrt=found.candidate.amplitudes, columns_only=True
+    )
+    used = base.block >= 0
+    both = np.column_stack([base.jacobian, raw_columns(base, found)])
+    fit = np.linalg.lstsq(both[used], -base.residual[used], rcond=None)[0]
+    shapes = {n: found.values[n] for n in found.candidate.shapes}
+    c = columns(found.candidate, base, shapes, base.data.held_out, balances)
+    held = np.column_stack([base.held_jacobian, c * base.held_weight[:, None]])
+    after = base.held_residual + held @ fit
+    ratio = np.linalg.norm(after) / np.linalg.norm(base.held_residual)
+    assert found.held_out_drop_percent == pytest.approx(100 * (1 - ratio), rel=1e-4)
+    alone = made(wave, held=False)
+    assert math.isnan(tried(alone, "cyclic_torque").held_out_drop_percent)
+
+
+def test_what_the_model_has_already_is_not_testable(base: Base) -> None:
+    twin = replace(candidate(base, "cyclic_torque"), label="again")
+    found = tried(base, "cyclic_torque")
+    c = raw_columns(base, found)
+    wider = np.column_stack([base.jacobian, c / np.linalg.norm(c, axis=0)])
+    with_it = replace(base, jacobian=wider, orthonormal=span_of(wider))
+    said = try_candidate(replace(twin, shapes=()), with_it)
+    assert isinstance(said, NotTestable)
+    assert said.effect == "cyclic_torque"
+    assert said.why.startswith("on these records it cannot be told from ")
+    assert said.why.endswith(f"{EFFECTS['cyclic_torque'].separate_by} would separate them")
+
+
+def test_nothing_is_found_where_nothing_is_hidden() -> None:
+    """Of 24 trials on joints without a hidden law hardly one has a chance under a hundredth."""
+    chances = []
+    for seed in (1, 2, 3):
+        plain = made(lambda q, v: 0 * q, seed=seed)
+        for key in ("cyclic_torque", "added_spring", "quadratic_drag", "cyclic_friction"):
+            found = try_candidate(candidate(plain, key), plain)
+            if isinstance(found, Trial):
+                chances.append(found.p_value)
+                assert found.cv_drop_percent < 2.0
+                assert found.held_out_drop_percent < 2.0
+    assert len(chances) >= 8
+    assert min(chances) > 1e-4
+    assert np.median(chances) > 0.05
+
+
+def test_an_amplitude_of_the_wrong_sign_is_no_trial() -> None:
+    """Friction that drives is no friction."""
+    driven = made(lambda q, v: -2 * COULOMB * np.sign(v), effects=("viscous",))
+    assert try_candidate(candidate(driven, "coulomb"), driven) is None
+    braked = made(lambda q, v: 0 * q, effects=("viscous",))
+    assert tried(braked, "coulomb").values["motor_coulomb"] == pytest.approx(COULOMB, rel=0.1)

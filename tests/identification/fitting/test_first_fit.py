@@ -1,0 +1,104 @@
+"""What is kept between the verbs is what would be worked out anew, and nothing else is taken for
+it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from identification import Joint, Record, load_joint, read
+from identification.balance import balances as evaluated
+from identification.balance.balances import Balances
+from identification.data.joint_file import Known
+from identification.fitting.assess import assess
+from identification.fitting.engine import Dataset, load_dataset, prepared_model, solve
+from identification.fitting.first_fit import first_fit
+
+DEMO = Path(str(files("workbench"))) / "demo"
+
+
+@cache
+def demo() -> tuple[Joint, Record, Record]:
+    """Joint, training and held-out record."""
+    joint = load_joint(DEMO / "joint.toml")
+    train, held = (read(DEMO / n, joint=joint) for n in ("train.npz", "held_out.npz"))
+    return joint, train, held
+
+
+def prepared(joint: Joint, train: Record, held: Record) -> Dataset:
+    """Rows of both."""
+    return load_dataset([train], [held], joint, prepared_model(joint, train))
+
+
+def test_the_fit_that_is_kept_is_the_one_that_would_be_made() -> None:
+    joint, train, held = demo()
+    data, model = prepared(joint, train, held), prepared_model(joint, train)
+    first = first_fit(model, data)
+    again = prepared(joint, train, held)
+    assert again.train[0] is data.train[0]  # prepared once
+    assert first_fit(model, again) is first
+    anew = solve(model, data)
+    assert anew.values == first.values
+    assert anew.stderr == first.stderr
+
+
+def test_another_model_another_knowledge_and_other_rows_are_fitted_anew() -> None:
+    joint, train, held = demo()
+    data, model = prepared(joint, train, held), prepared_model(joint, train)
+    first = first_fit(model, data)
+    name = model.inertias[0]
+    fixed = 1.1 * first.values[name]
+    told = replace(joint, known={**joint.known, name: Known(value=fixed)})
+    assert first_fit(model, replace(data, joint=told)).values[name] == fixed
+    half = train.take(np.arange(len(train)) < len(train) // 2, "the first half")
+    other = first_fit(model, prepared(joint, half, held))
+    assert other.values[name] != first.values[name]
+    smaller = first_fit(model.drop(model.effects[-1]), data)
+    assert len(smaller.free) < len(first.free)
+
+
+def test_an_assessment_evaluates_no_rows_twice_at_the_same_values(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    joint, train, held = demo()
+    data, model = prepared(joint, train, held), prepared_model(joint, train)
+    values = first_fit(model, data).values
+    assess(model, data, data.held_out, values)
+    made: list[object] = []
+    kept = evaluated.residuals_of
+
+    def counted(record: object, law: object, make: object) -> object:
+        def told() -> object:
+            made.append(law)
+            return make()  # type: ignore[operator]
+
+        return kept(record, law, told)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(evaluated, "residuals_of", counted)
+    again = assess(model, data, data.held_out, values)
+    assert made == []  # all of it is known, noise that was drawn included
+    moved = {**values, model.inertias[0]: 1.01 * values[model.inertias[0]]}
+    other = assess(model, data, data.held_out, moved)
+    assert made
+    assert other.relative_error_percent != again.relative_error_percent
+
+
+def test_values_that_are_kept_are_those_of_the_balances() -> None:
+    joint, train, held = demo()
+    data, model = prepared(joint, train, held), prepared_model(joint, train)
+    values = dict(first_fit(model, data).values)
+    bare = Balances(model, data.sensing, wrt=())
+    whole = Balances(model, data.sensing)
+    for _ in range(2):  # the second time from memory
+        for record in data.train:
+            plain, full = bare.evaluate(record, values), whole.evaluate(record, values)
+            for balance, (residual, _) in full.items():
+                assert np.allclose(plain[balance][0], residual, rtol=1e-9, atol=1e-9)
+    with pytest.raises(ValueError, match="read-only"):
+        plain[balance][0][0] = 0.0

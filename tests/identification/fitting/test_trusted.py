@@ -1,0 +1,144 @@
+"""Which number to trust: intervals against known values, trades, bounds, flat directions."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.next_run import record_of
+from benchmarks.trust import PLAIN, joint_of
+from identification import Joint
+from identification.balance.dataset import Dataset
+from identification.data.joint_file import Known
+from identification.fitting.engine import Solution, load_dataset, prepared_model, solve
+from identification.fitting.information import white_errors
+from identification.fitting.trust import Trusted, trust
+from tests.hidden_effect.generator import Case, generate_case, simulate_case
+from workbench.cli.main import main
+
+
+@cache
+def case() -> Case:
+    return simulate_case("stribeck", 9106, records=("train", "train2"))
+
+
+def fitted(joint: Joint, seconds: float = 24.0) -> tuple[Solution, Dataset]:
+    records = [
+        record_of(table[: round(seconds / 2e-3)], name, "same")
+        for name, table in case().measured.items()
+    ]
+    model = prepared_model(joint, records[0])
+    data = load_dataset(records, [], joint, model)
+    return solve(model, data), data
+
+
+@cache
+def judged() -> dict[str, Trusted]:
+    solution, data = fitted(joint_of(case(), ("stribeck@motor",)))
+    return {p.name: p for p in trust(solution, data).parameters}
+
+
+def test_most_intervals_hold_the_truth_and_none_is_far_off() -> None:
+    truth = {**PLAIN, "motor_stribeck_extra": "M_TS", "motor_stribeck_velocity": "M_VS"}
+    inside = []
+    for name, key in truth.items():
+        p, true = judged()[name], case().parameters[key]
+        assert p.low is not None
+        assert p.high is not None
+        assert p.low < p.value < p.high
+        inside.append(p.low <= true <= p.high)
+        # three times the interval's half width
+        assert abs(p.value - true) < 3 * max(p.high - p.value, p.value - p.low)
+    assert sum(inside) >= len(inside) - 2
+
+
+def test_classes_come_from_the_declarations() -> None:
+    kinds = {n: judged()[n].kind for n in ("motor_inertia", "stiffness", "motor_coulomb")}
+    assert kinds == {
+        "motor_inertia": "inertia",
+        "stiffness": "stiffness",
+        "motor_coulomb": "friction",
+    }
+    assert judged()["motor_stribeck_velocity"].kind == "shape"
+    assert judged()["gravity_torque"].kind == "other"
+
+
+def test_a_trade_is_what_the_fit_does_when_one_of_the_two_is_held() -> None:
+    p = judged()["motor_viscous"]
+    assert p.partner is not None
+    assert p.stderr is not None
+    joint = joint_of(case(), ("stribeck@motor",))
+    solution, _ = fitted(joint)
+    moved = p.value + 10 * p.stderr
+    other, _ = fitted(replace(joint, known={p.name: Known(moved)}))
+    change = other.values[p.partner] / solution.values[p.partner] - 1
+    assert (change < 0) == ("goes down" in p.trade)
+    up, down = (float(text.split()[1]) for text in p.trade.split("goes ")[1:])
+    # the same proportion as in the words, which have two digits
+    assert abs(change) / (moved / p.value - 1) == pytest.approx(down / up, rel=0.1)
+
+
+def test_values_by_record_and_window_lie_around_the_whole() -> None:
+    for name in ("motor_inertia", "stiffness", "gravity_torque"):
+        p = judged()[name]
+        assert len(p.records) == 2
+        assert len(p.windows) == 4
+        known = [v for v in (*p.records, *p.windows) if v is not None]
+        assert len(known) >= 4
+        np.testing.assert_allclose(known, p.value, rtol=0.05)
+
+
+def test_what_the_motion_does_not_tell_is_not_trusted() -> None:
+    joint = joint_of(case(), ("stribeck@motor", "current_offset", "asymmetric_coulomb@motor"))
+    solution, data = fitted(joint, 12.0)
+    found = {p.name: p for p in trust(solution, data, profiles=False).parameters}
+    # one column on every motion
+    for name in ("current_offset", "motor_asymmetric_coulomb"):
+        assert found[name].verdict != "trust"
+    assert {found["current_offset"].partner, found["motor_asymmetric_coulomb"].partner} == {
+        "current_offset",
+        "motor_asymmetric_coulomb",
+    }
+    assert found["motor_inertia"].verdict == "trust"
+
+
+def test_what_is_not_there_is_not_trusted_and_what_it_does_to_the_prediction() -> None:
+    joint = joint_of(case(), ("stribeck@motor", "added_spring@link"))
+    solution, data = fitted(joint, 12.0)
+    found = {p.name: p for p in trust(solution, data, profiles=False).parameters}
+    spring = found["link_added_spring"]
+    assert spring.verdict != "trust"  # gravity stands in for it, and there is none
+    for p in judged().values():
+        assert 0.0 <= p.prediction_percent < 5.0
+
+
+def test_white_errors_are_those_of_the_normal_equations() -> None:
+    rng = np.random.default_rng(1)
+    j = rng.standard_normal((400, 3)) @ np.diag([1.0, 1e3, 1e-3])
+    expected = np.sqrt(np.diag(np.linalg.inv(j.T @ j)) / 0.4)
+    np.testing.assert_allclose(white_errors(j.T @ j), expected, rtol=1e-6)
+    twice = np.column_stack([j, j[:, 0]])
+    errors = white_errors(twice.T @ twice)
+    assert np.isinf(errors[[0, 3]]).all()
+    np.testing.assert_allclose(errors[1:3], expected[1:], rtol=1e-3)
+
+
+def test_the_verb_prints_a_line_for_every_parameter(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = generate_case(None, 9107, folder=tmp_path / "case")
+    out = tmp_path / "trust.json"
+    words = [str(folder / "train.csv"), "--joint", str(folder / "joint.toml")]
+    assert main(["trust", *words, "--json", str(out)]) == 0
+    found = json.loads(out.read_text())["trust"]
+    printed = capsys.readouterr().out
+    for p in found:
+        assert f"{p['name']} " in printed
+        assert p["verdict"] in ("trust", "only in combination", "not")
+        if p["interval"] is not None:
+            assert p["interval"][0] <= p["value"] <= p["interval"][1]

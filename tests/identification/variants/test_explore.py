@@ -1,0 +1,234 @@
+"""`explore`: the true structure among all variants, and what the screen says against the fits."""
+
+from __future__ import annotations
+
+import json
+import math
+import xml.etree.ElementTree as ET
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from identification import Exploration, InputError, explore, load_joint, read
+from identification.diagnosis.session import Session
+from identification.diagnosis.trials import Trial, try_candidate
+from identification.variants.choice import front_of, score_of
+from identification.variants.lattice import assembled, nodes_of, together
+from identification.variants.refit import Weighting, refitted
+from identification.variants.screen import PER_PARAMETER, Screen
+from tests.hidden_effect.generator import generate_case
+from workbench.cli.main import main
+from workbench.show.front import exploration_picture
+
+DEMO = Path(str(files("workbench"))) / "demo"
+HIDDEN = "stribeck"
+"""What the demo's records hide."""
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with the results of one run of the command on the demo's records."""
+    folder = tmp_path_factory.mktemp("explored")
+    given = [str(DEMO / "train.npz"), "--held-out", str(DEMO / "held_out.npz")]
+    with (folder / "out.txt").open("w") as out, pytest.MonkeyPatch.context() as patched:
+        patched.setattr("sys.stdout", out)
+        code = main(
+            [
+                *("explore", *given, "--joint", str(DEMO / "joint.toml")),
+                *("--json", str(folder / "found.json"), "--out", str(folder / "all")),
+                *("-o", str(folder / "better.toml")),
+            ]
+        )
+    assert code == 0
+    return folder
+
+
+@cache
+def session() -> Session:
+    joint = load_joint(DEMO / "joint.toml")
+    return Session.opened(read(DEMO / "train.npz"), joint, [read(DEMO / "held_out.npz")])
+
+
+def explored(hidden: Any, seed: int, folder: Path) -> Exploration:
+    case = generate_case(hidden, seed, folder=folder)
+    return explore(
+        read(case / "train.csv"), load_joint(case / "joint.toml"), read(case / "test.csv")
+    )
+
+
+# --- the answer -----------------------------------------------------------------------------------
+
+
+def test_what_the_demo_hides_is_recommended_alone_and_improve_agrees(demo: Path) -> None:
+    found = json.loads((demo / "found.json").read_text())
+    assert [label.partition("@")[0] for label in found["added"]] == [HIDDEN]
+    assert found["ties"] == [found["recommended"]]
+    assert found["recommended"] in found["pareto"]
+    assert found["improve"]["labels"] == found["recommended"]
+    assert "the same" in found["agreement"]
+    assert found["screened"] > 1000
+    best = found["variants"][0]
+    assert best["labels"] == found["recommended"]
+    assert best["tied"] and best["score"] == 0
+    start = next(v for v in found["variants"] if not v["added"] and not v["dropped"])
+    assert best["held_out"]["relative_error_percent"] < (
+        0.5 * start["held_out"]["relative_error_percent"]
+    )
+    assert best["parameters"] == start["parameters"] + 3
+
+
+def test_every_model_by_name_is_a_variant_or_said_to_be_none(demo: Path) -> None:
+    found = json.loads((demo / "found.json").read_text())
+    names = {v["name"] for v in found["variants"]} | {n["model"] for n in found["not_compared"]}
+    assert {"hd1", "hd4", "irj1a", "irj1b", "irj2a", "irj2b", "irj_ts"} <= names
+    rigid = next(v for v in found["variants"] if v["name"] == "hd1")
+    assert rigid["held_out"]["of_start_percent"] > 300  # the demo's gear twists
+
+
+def test_both_of_two_hidden_effects_are_recommended(tmp_path: Path) -> None:
+    found = explored(("cubic_stiffness", "cyclic_friction"), 8101, tmp_path / "pair")
+    assert {"cubic_stiffness", "cyclic_friction"} <= set(found.recommended.effects)
+    assert found.recommended in found.front
+    assert len(found.ties) <= 3
+
+
+def test_where_nothing_is_hidden_the_joint_as_it_stands_is_recommended_or_tied(
+    tmp_path: Path,
+) -> None:
+    found = explored(None, 8102, tmp_path / "none")
+    assert found.start.tied
+    assert len(repr(found).splitlines()) <= 25
+    assert max(len(line) for line in repr(found).splitlines()[:-2]) <= 100
+    root = ET.fromstring(exploration_picture(found))
+    words = " ".join(t.text or "" for t in root.iter("{http://www.w3.org/2000/svg}text"))
+    assert "start model" in words
+
+
+# --- the screen against other ways to the same number ---------------------------------------------
+
+
+def test_a_screened_score_is_that_of_the_trial_of_a_diagnosis() -> None:
+    """The same squares by another way: base and candidate solved together, fold by fold."""
+    base = session().bench.base(session().start())
+    nodes, _ = nodes_of(base.solution.model, base.data)
+    own = [n for n in nodes if not n.beside and not n.candidate.shapes][:12]
+    screen = Screen(base, own, {})
+    compared = 0
+    for k, option in enumerate(screen.options):
+        node = screen.nodes[option.node]
+        trial = try_candidate(node.candidate, base)
+        if isinstance(trial, Trial):
+            score = float(np.log(trial.rms).sum()) + PER_PARAMETER * node.parameters
+            assert float(screen.scores([(k,)])[0]) == pytest.approx(score, abs=2e-3), node.label
+            compared += 1
+    assert compared >= 4
+
+
+def test_a_variant_is_within_one_percent_of_its_converged_fit() -> None:
+    solution = session().start()
+    base = session().bench.base(solution)
+    data = session().data
+    nodes = [n for n in nodes_of(base.solution.model, data)[0] if n.candidate.place == "motor"]
+    screen = Screen(base, nodes, {})
+    weighting = Weighting.of(solution, data)
+    ranked = [s for s in screen.search(2) if s.options][:4]
+    for scored in ranked:
+        model = assembled(solution.model, screen.parts(scored.options))
+        assert model is not None
+        start = (screen.start_of(scored.options),)
+        few = refitted(model, data, start, weighting)
+        many = refitted(model, data, start, weighting, steps=40)
+        np.testing.assert_allclose(few.held, many.held, rtol=0.01)
+
+
+def test_parts_that_do_not_go_together_are_never_in_one_variant() -> None:
+    base = session().bench.base(session().start())
+    nodes, _ = nodes_of(base.solution.model, base.data)
+    late = next(n for n in nodes if n.beside)
+    parent = next(n for n in nodes if n.label == late.beside)
+    assert not together([late])
+    assert together([parent, late])
+    assert assembled(base.solution.model, [late]) is None
+    assert assembled(base.solution.model, [late, parent]) is not None
+    assert not together([parent, parent])
+
+
+def test_front_holds_what_no_variant_with_as_few_parameters_beats() -> None:
+    assert front_of([5, 6, 6, 7, 8], [10.0, 4.0, 3.0, 2.99, 1.0]) == [0, 2, 4]
+
+
+def test_a_parameter_costs_ten_percent_of_one_balance() -> None:
+    rows = np.array([10.0, 10.0])
+    plain = score_of(np.array([10.0, 10.0]), rows, np.array(3.0))
+    better = score_of(np.array([10.0 * math.exp(-0.2), 10.0]), rows, np.array(4.0))
+    assert float(better) == pytest.approx(float(plain))
+
+
+# --- the command ----------------------------------------------------------------------------------
+
+
+def test_table_fits_a_terminal_and_says_what_json_says(demo: Path) -> None:
+    text = (demo / "out.txt").read_text()
+    found = json.loads((demo / "found.json").read_text())
+    rows = [line for line in text.splitlines() if line.startswith(("*", "=", " "))]
+    assert rows and max(len(line) for line in rows) <= 100
+    best = next(line for line in rows if line.startswith("*i"))
+    assert f"{found['variants'][0]['held_out']['relative_error_percent']:.3f}" in best
+    assert found["reason"] in text
+    assert found["agreement"] in text
+
+
+def test_parquet_holds_every_variant(demo: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    rows = parquet.read_table(demo / "all" / "variants.parquet").to_pylist()
+    found = json.loads((demo / "found.json").read_text())
+    assert [r["labels"] for r in rows] == [v["labels"] for v in found["variants"]]
+    assert [r["relative_error_percent"] for r in rows] == [
+        v["held_out"]["relative_error_percent"] for v in found["variants"]
+    ]
+
+
+def test_picture_names_the_recommended_variant(demo: Path) -> None:
+    root = ET.fromstring((demo / "all" / "explore.svg").read_text())
+    words = " ".join(t.text or "" for t in root.iter("{http://www.w3.org/2000/svg}text"))
+    assert HIDDEN in words
+    assert "(recommended, improve)" in words
+
+
+def test_joint_file_of_the_recommended_variant_is_a_joint_file(demo: Path) -> None:
+    better = load_joint(demo / "better.toml")
+    assert any(label.partition("@")[0] == HIDDEN for label in better.effects)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["no.npz", "--joint", "joint.toml"], "no.npz"),
+        (["train.npz", "--joint", "no.toml"], "no.toml"),
+        (["train.npz", "--held-out", "train.npz", "--joint", "joint.toml"], "one role only"),
+        (["train.npz", "--joint", "joint.toml", "--out", "joint.toml"], "is a file"),
+        (["train.npz", "--joint", "joint.toml", "--picture", "train.npz"], "input"),
+        (["train.npz", "--joint", "joint.toml", "-o", "joint.toml"], "input"),
+    ],
+)
+def test_unusable_input_is_one_line(
+    arguments: list[str],
+    says: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(DEMO)
+    assert main(["explore", *arguments]) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1 and says in lines[0]
+
+
+def test_records_that_cannot_carry_the_question_are_refused_in_a_sentence() -> None:
+    record = read(DEMO / "train.npz")
+    joint = load_joint(DEMO / "joint.toml")
+    with pytest.raises(InputError):
+        explore(record.window(0.0, 0.4), joint)

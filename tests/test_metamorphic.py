@@ -1,0 +1,99 @@
+"""A joint told in other units, signs, orders, formats: the same answer (a short form of the command
+``python -m tests.metamorphic``, which runs the whole loop on seven joints).
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from identification import improve
+from identification.errors import InputError
+from identification.fitting.fit import fit
+from tests.metamorphic import (
+    HIDDEN,
+    NOTATION,
+    SHARED,
+    TRANSFORMS,
+    Case,
+    Result,
+    Told,
+    case_of,
+    result_of,
+    told,
+)
+
+if not SHARED.exists() and not os.environ.get("CI"):
+    pytest.skip("../shared is not there", allow_module_level=True)
+
+ROWS = 3000
+
+
+@cache
+def short(name: str) -> Case:
+    """6 s of each record."""
+    return case_of(name).tables(lambda t: {k: v[:ROWS] for k, v in t.items()})
+
+
+def values(given: Told) -> dict[str, float]:
+    return {n: p["value"] for n, p in fit(given.joint, given.train).parameters.items()}
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory: pytest.TempPathFactory) -> Told:
+    return told(short("stribeck"), tmp_path_factory.mktemp("base"))
+
+
+@pytest.fixture(scope="module")
+def fitted(base: Told) -> dict[str, float]:
+    return values(base)
+
+
+@pytest.fixture(scope="module")
+def result(base: Told) -> Result:
+    return result_of(base)
+
+
+@pytest.mark.parametrize(
+    "name", [n for n, (notation, _) in TRANSFORMS.items() if notation and n != "mirrored"]
+)
+def test_another_notation_is_the_same_joint(
+    name: str, base: Told, fitted: dict[str, float], tmp_path: Path
+) -> None:
+    other = TRANSFORMS[name][1](short("stribeck"))
+    assert other is not None
+    given = told(other, tmp_path)
+    if not given.same(base):
+        assert values(given) == pytest.approx(fitted, rel=NOTATION, abs=0)
+
+
+@pytest.mark.parametrize("name", ["mirrored", "records reversed", "two runs each"])
+def test_the_same_is_named(name: str, result: Result, tmp_path: Path) -> None:
+    other = TRANSFORMS[name][1](short("stribeck"))
+    assert other is not None
+    found = result_of(told(other, tmp_path))
+    assert found.verdict == result.verdict
+    assert found.sets == result.sets
+    if name == "mirrored":
+        assert result.differences(found, signs=False)[0] <= NOTATION
+
+
+def test_a_run_given_twice_is_refused(base: Told) -> None:
+    with pytest.raises(InputError, match="holds the same samples"):
+        improve([*base.train, base.train[0]], base.joint, base.held)
+
+
+def test_the_table_would_see_a_difference(base: Told, result: Result, tmp_path: Path) -> None:
+    wrong = short("stribeck").scaled(["motor_current"], 1 + 1e-6)
+    given = told(wrong, tmp_path)
+    assert not given.same(base)
+    assert values(given) != pytest.approx(values(base), rel=NOTATION, abs=0)
+    changed = replace(
+        result, parameters={n: (a * 1.01, e) for n, (a, e) in result.parameters.items()}
+    )
+    assert result.differences(changed)[0] == pytest.approx(0.01, rel=0.2)
+    assert set(HIDDEN) <= {p.name for p in (SHARED / "hidden_effect").iterdir()}

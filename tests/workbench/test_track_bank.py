@@ -1,0 +1,66 @@
+"""`irj track` where no velocity is measured: the fault bank looks at the sensors that there are."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.fault_plant import plant
+from workbench.cli.main import main
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A simulated joint: records without velocities, and its exact joint file."""
+    from benchmarks.online_filter import recorded
+
+    here = tmp_path_factory.mktemp("bank")
+    ratio, constant = -160.0, 0.05
+    for name, seed in (("healthy", 51), ("unseen", 52)):
+        found = recorded(seed, 16.0).every(2)
+        np.savez(
+            here / f"{name}.npz",
+            time_s=found.time,
+            motor_current_A=found.rows[:, 0] / (ratio * constant),
+            motor_position_rad=found.rows[:, 1] * ratio,
+            link_position_rad=found.rows[:, 3],
+            link_torque_Nm=found.rows[:, 5],
+        )
+    true = dict(zip(plant().parameter_names, plant().value_vector(), strict=True))
+    effects = [t for t in plant().effects if t not in ("transmission_compliance",)]
+    lines = [
+        "[joint]",
+        'name = "bank"',
+        f"gear_ratio = {ratio}",
+        f"motor_constant = {constant}",
+        'model = "hd3"',
+        f"effects = {json.dumps(effects)}",
+        "[fitted]",
+        *(f"{n} = {{value = {v!r}}}" for n, v in true.items()),
+    ]
+    (here / "joint.toml").write_text("\n".join(lines) + "\n")
+    return here
+
+
+@pytest.mark.parametrize(
+    ("fault", "said"),
+    [("link_position:bias:10:0.01", 4), (None, None)],
+)
+def test_the_sensor_is_named(
+    folder: Path, fault: str | None, said: int | None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = folder / "out.json"
+    tried = ["--inject", fault] if fault else []
+    given = ["track", str(folder / "unseen.npz"), "--joint", str(folder / "joint.toml")]
+    assert main([*given, "--healthy", str(folder / "healthy.npz"), *tried, "--json", str(out)]) == 0
+    result = json.loads(out.read_text())["records"][0]
+    assert [e["fault"] for e in result["events"]] == ([] if said is None else [said])
+    assert result["detector"]
+    assert result["calibrated"]
+    # announced for what is measured, and for nothing else
+    assert list(result["smallest"]) == ["current", "motor_position", "link_position", "torque"]
+    assert all(s["seen"] > 0 for s in result["smallest"].values())
+    assert "smallest offset of a sensor" in capsys.readouterr().out
