@@ -23,6 +23,15 @@ KEPT: Final = 0.95
 CUT_DEVIATION: Final = 0.87
 """Standard deviation of a unit normal variable that is cut at that quantile of its size (0.871)."""
 
+LONGEST_LAG: Final = 60
+"""Rows up to which correlation is followed: fifteen kernel lengths, longer than any block holds
+together.
+"""
+UNCORRELATED: Final = 0.05
+"""Autocorrelation below which rows count as independent: twice its own scatter over 1600 rows, the
+rows of 40 s.
+"""
+
 
 def noise_level(
     values: FloatArray, segments: tuple[slice, ...], time: FloatArray | None = None
@@ -106,3 +115,20 @@ def _fourth(x: FloatArray, time: FloatArray | None) -> FloatArray:
         total += x[i : i + count] / weight
         power += weight**-2
     return np.asarray(total / np.sqrt(power), dtype=np.float64)
+
+
+def effective_share(residual: FloatArray) -> float:
+    """Share of rows that count as independent (initial positive sequence of the
+    autocorrelation).
+    """
+    x = residual - residual.mean()
+    power = float(x @ x)
+    if power <= 0:
+        return 1.0
+    total = 1.0
+    for lag in range(1, min(LONGEST_LAG, len(x) - 1)):
+        rho = float(x[:-lag] @ x[lag:]) / power
+        if rho < UNCORRELATED:
+            break
+        total += 2 * rho
+    return 1.0 / total
