@@ -434,7 +434,7 @@ def placed_laws(
     ----------
     model : Structure
     symbols : Symbols
-    torsion, torsion_rate : symbols
+    torsion, torsion_rate : expression
         Stand for the twist of the transmission and its rate in the laws outside ``torsion``.
     """
     builder, s = _Builder(model, symbols), symbols.signals
@@ -450,7 +450,9 @@ def placed_laws(
     }
     found = []
     gap = builder.beyond(outside)
-    slope = 1 - ca.jacobian(gap.taken, torsion)
+    twist = ca.SX.sym("twist")  # where the laws are asked at a number, a derivative needs a symbol
+    taken = builder.beyond(replace(outside, torsion=twist)).taken
+    slope = ca.substitute(1 - ca.jacobian(taken, twist), twist, torsion)
     for term in model.terms:
         view = views.get(term.place, replace(outside, load=load))
         behind = builder.seen(term, view, gap) is gap and gap is not outside
