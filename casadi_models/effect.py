@@ -153,6 +153,10 @@ class Effect:
         fall.
     several_valleys : bool
         True where a fit of its shapes has several minima: it starts from several points.
+    takes_up : callable or None
+        ``takes_up(signals, parameters)``: twist that a law of the transmission takes up before its
+        other laws feel any, the linear stiffness and laws with memory apart; 0 where the law is
+        absent.
     of_displacement : bool
         True for a law of the torsion that also makes sense on the position of an axis without gear.
     shapes_reversal : bool
@@ -209,6 +213,7 @@ class Effect:
     stage: Stage = "law"
     common: bool = False
     several_valleys: bool = False
+    takes_up: Law | None = None
     of_displacement: bool = False
     shapes_reversal: bool = False
     everywhere: bool = False
@@ -536,6 +541,7 @@ def effect(
     stage: Stage = "law",
     common: bool = False,
     several_valleys: bool = False,
+    takes_up: Law | None = None,
     of_displacement: bool = False,
     shapes_reversal: bool = False,
     everywhere: bool = False,
@@ -577,6 +583,7 @@ def effect(
                 stage=stage,
                 common=common,
                 several_valleys=several_valleys,
+                takes_up=takes_up,
                 of_displacement=of_displacement,
                 shapes_reversal=shapes_reversal,
                 everywhere=everywhere,

@@ -43,7 +43,7 @@ def _stored(model: Solvable, term: Term, e: Equations) -> Expression:
         speed = s.link_velocity if link else s.motor_velocity
         return _slope(model, term, "acceleration") * speed**2 / 2
     if term.place == "transmission" and model.is_elastic:
-        return _potential(model, term, e.torsion)
+        return _potential(model, term, e.beyond[term])
     if term.place == "torsion" and model.is_elastic:
         return _slope(model, term, "torque") * s.torque**2 / 2
     if effect.family == "torque" and term.place in ("motor", "link"):

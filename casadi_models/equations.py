@@ -8,7 +8,7 @@ are the true ones (simulation).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import Any, Final, Protocol, final
 
@@ -83,6 +83,8 @@ class Equations:
         What the sensors say, corrected [N.m, rad, rad].
     torsion : expression
         Twist of the transmission, kinematic error taken off [rad].
+    beyond : mapping of Term to expression
+        Twist that each law of the transmission feels: less what a gap takes up [rad].
     motor_lever, link_lever : expression
         Share of the transmitted torque that motor and link feel (1 without kinematic error).
     inertia : mapping of str to expression
@@ -107,6 +109,7 @@ class Equations:
     transmitted: Expression
     torque: Expression
     torsion: Expression
+    beyond: Mapping[Term, Expression]
     true_motor_position: Expression
     true_link_position: Expression
     motor_lever: Expression
@@ -173,6 +176,7 @@ class _View:
     load: Expression
     reading: Expression
     reading_rate: Expression
+    taken: Expression = field(default_factory=lambda: ca.SX(0))
 
 
 @final
@@ -187,8 +191,31 @@ class _Builder:
         """Rate of what twists the gear's damping; made once for all laws of a view."""
         # the approximation (2.58) lets the kinematic error wind up the stiffness only, not the
         # damping
-        twist = view.torsion if self.model.virtual_work else bare_twist(self.model, view.signals)
+        twist = view.torsion
+        if not self.model.virtual_work:
+            twist = bare_twist(self.model, view.signals) - view.taken
         return time_derivative(twist, self.symbols.signals)
+
+    def beyond(self, view: _View) -> _View:
+        """What the laws of the transmission see that act beyond those that take up twist."""
+        taken = _zero()
+        for t in self.model.terms:
+            if t.effect.takes_up is not None:
+                local = self.local(t, view, rate=_zero())
+                taken = taken + t.effect.takes_up(local, t.bound(self.symbols.parameters))
+        if taken.is_zero():
+            return view
+        return replace(view, torsion=view.torsion - taken, taken=taken)
+
+    def seen(self, term: Term, view: _View, beyond: _View) -> _View:
+        """The view of a term: beyond what others take up, if it is a law of the transmission.
+
+        Friction between the two sides (a law with memory) acts whether they touch or not.
+        """
+        effect = term.effect
+        spring = any(p.role == "stiffness" for p in effect.parameters)
+        whole = spring or effect.takes_up is not None or effect.memory is not None
+        return view if whole or term.place != "transmission" else beyond
 
     def local(self, term: Term, view: _View, rate: Expression | None = None) -> LocalSignals:
         """What the law of a term sees; `rate` from :meth:`torsion_rate` where it is at hand."""
@@ -222,9 +249,13 @@ class _Builder:
         found = _zero()
         terms = [t for t in self.model.terms if t.place == place]
         rate = self.torsion_rate(view) if terms else None
+        beyond = self.beyond(view) if place == "transmission" else view
+        further = rate if beyond is view else self.torsion_rate(beyond)
         for t in terms:
+            own = self.seen(t, view, beyond)
             found = found + t.effect.law(
-                self.local(t, view, rate), t.bound(self.symbols.parameters)
+                self.local(t, own, rate if own is view else further),
+                t.bound(self.symbols.parameters),
             )
         return found
 
@@ -323,10 +354,11 @@ def build_equations(model: Structure, symbols: Symbols, *, sensors: bool) -> Equ
     load = s.torque if model.load_from == "torque" else builder.gravity(unloaded)
     view = _View(s, torsion, load, _zero(), _zero())
     motor_lever, link_lever = builder.levers(error)
+    beyond_gap = builder.beyond(view)
     terms: list[MemoryTerm] = []
     for t in model.terms:
         if t.effect.memory is not None:
-            local = builder.local(t, view)
+            local = builder.local(t, builder.seen(t, view, beyond_gap))
             terms.append((t, local.position, symbols.memory[t], local, t.bound(symbols.parameters)))
     states = [z for zs in symbols.memory.values() for z in zs]
     drive = s.drive + builder.total("drive", drive_view)
@@ -354,6 +386,11 @@ def build_equations(model: Structure, symbols: Symbols, *, sensors: bool) -> Equ
         transmitted=builder.total("transmission", view),
         torque=s.torque,
         torsion=torsion,
+        beyond={
+            t: builder.seen(t, view, beyond_gap).torsion
+            for t in model.terms
+            if t.place == "transmission"
+        },
         true_motor_position=s.motor_position,
         true_link_position=s.link_position,
         motor_lever=motor_lever,
@@ -412,13 +449,19 @@ def placed_laws(
         "torque_sensor": _View(s, zero, zero, s.torque, s.torque_rate),
     }
     found = []
+    gap = builder.beyond(outside)
+    slope = 1 - ca.jacobian(gap.taken, torsion)
     for term in model.terms:
         view = views.get(term.place, replace(outside, load=load))
+        behind = builder.seen(term, view, gap) is gap and gap is not outside
+        if behind:
+            view = replace(gap, load=load)
         local = builder.local(term, view)
+        rate = torsion_rate * slope if behind else torsion_rate
         if term.place not in views:
-            local = replace(local, torsion_rate=torsion_rate)
+            local = replace(local, torsion_rate=rate)
         if term.place == "transmission":
-            local = replace(local, velocity=torsion_rate)
+            local = replace(local, velocity=rate)
         values, step = term.bound(symbols.parameters), ca.SX.sym("step")
         memory = term.effect.memory
         moved = () if memory is None else memory(local.memory, step, local, values)
@@ -473,7 +516,8 @@ def jointly_linear(rows: Expression, p: Expression) -> tuple[int, ...]:
     """
     edges: dict[int, set[int]] = {i: set() for i in range(p.numel())}
     for row in ca.vertsplit(rows):
-        sparsity = ca.hessian(row, p)[0].sparsity()
+        # a comparison has a derivative that is zero everywhere: no edge
+        sparsity = ca.sparsify(ca.hessian(row, p)[0]).sparsity()
         for i, j in zip(*sparsity.get_triplet(), strict=True):
             edges[i].add(j)
     present = set(ca.jacobian(rows, p).sparsity().get_triplet()[1])

@@ -23,7 +23,9 @@ if TYPE_CHECKING:
     from identification.errors import InputError
     from identification.faults.detector import FaultDetector
     from identification.fitting.fit import Fit, fit
+    from identification.fitting.trust import trust
     from identification.linear.subspace import moesp
+    from identification.planning.next_run import next_run
     from identification.recursive.estimator import RecursiveLeastSquares
     from identification.search.mcs import mcs
     from identification.two_step.algorithm import TwoStep
@@ -54,7 +56,9 @@ _HOMES: Final = {
     "load_joint": "data.joint_file",
     "mcs": "search.mcs",
     "moesp": "linear.subspace",
+    "next_run": "planning.next_run",
     "read": "data.read",
+    "trust": "fitting.trust",
 }
 """Module of every public name, below this package."""
 
@@ -80,7 +84,9 @@ __all__ = [
     "load_joint",
     "mcs",
     "moesp",
+    "next_run",
     "read",
+    "trust",
 ]
 
 

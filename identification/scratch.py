@@ -22,6 +22,8 @@ from identification.errors import InputError
 
 _PREFIX: Final = "irj-run-"
 _LOCK: Final = ".lock"
+TRIES: Final = 10
+"""Times a lock is tried whose file goes just then."""
 _HELD: Final[dict[str, IO[bytes]]] = {}
 """Locks of this process, by what they stand for."""
 _OUTER: Final[list[str]] = []
@@ -96,7 +98,7 @@ def hold(target: Path) -> None:
 def release() -> None:
     """Give all results free."""
     while _HELD:
-        _HELD.popitem()[1].close()
+        _given_back(_HELD.popitem()[1])
 
 
 def sweep(folder: Path, start: str = "") -> None:
@@ -111,7 +113,11 @@ def sweep(folder: Path, start: str = "") -> None:
 
 
 def _swept_runs(outer: Path) -> None:
-    """Remove the temporary folders of runs that are no more."""
+    """Remove the temporary folders and locks of runs that are no more."""
+    for place in _lock_folder(outer).glob("*"):
+        with contextlib.suppress(OSError):
+            if (free := _taken(place, new=False)) is not None:
+                _given_back(free)
     for left in outer.glob(f"{_PREFIX}*"):
         with contextlib.suppress(OSError):
             if not left.is_symlink() and (lock := _taken(left / _LOCK, new=False)) is not None:
@@ -121,8 +127,7 @@ def _swept_runs(outer: Path) -> None:
 
 def _lock_of(place: str) -> IO[bytes] | None:
     """The lock of a result; None where there are no locks, or no folder for them."""
-    user = os.getuid() if hasattr(os, "getuid") else 0
-    folder = outer_folder() / f"irj-locks-{user}"
+    user, folder = _user(), _lock_folder(outer_folder())
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
         about = folder.lstat()
@@ -136,6 +141,24 @@ def _lock_of(place: str) -> IO[bytes] | None:
         ) from None
     except OSError:
         return None
+
+
+def _user() -> int:
+    return os.getuid() if hasattr(os, "getuid") else 0
+
+
+def _lock_folder(outer: Path) -> Path:
+    return outer / f"irj-locks-{_user()}"
+
+
+def _given_back(lock: IO[bytes]) -> None:
+    """Remove a lock of a result; `_taken` looks whether its file is still there."""
+    path = Path(os.fsdecode(lock.name))
+    with contextlib.suppress(OSError):
+        path.unlink()
+    lock.close()
+    with contextlib.suppress(OSError):  # others hold results
+        path.parent.rmdir()
 
 
 def _taken(path: Path, new: bool = True) -> IO[bytes] | None:
@@ -152,14 +175,25 @@ def _taken(path: Path, new: bool = True) -> IO[bytes] | None:
         import fcntl
     except ImportError:
         return None
-    handle = os.open(path, os.O_RDWR | os.O_NOFOLLOW | (os.O_CREAT if new else 0), 0o600)
-    stream = os.fdopen(handle, "r+b")
-    try:
-        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        stream.close()
-        raise
-    return stream
+    for _ in range(TRIES):
+        stream = open(path, "r+b", opener=_opener if new else _opener_of_old)  # noqa: SIM115
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if path.exists() and os.path.samestat(os.fstat(stream.fileno()), path.stat()):
+                return stream
+        except OSError:
+            stream.close()
+            raise
+        stream.close()  # its owner has removed it in between
+    return None
+
+
+def _opener(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NOFOLLOW | os.O_CREAT, 0o600)
+
+
+def _opener_of_old(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NOFOLLOW)
 
 
 __all__ = ["hold", "outer_folder", "own_folder", "release", "sweep"]

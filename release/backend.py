@@ -1,7 +1,5 @@
-"""Setuptools, with a source archive that is the same on every machine and at every time.
-
-The wheel of setuptools is reproducible already where SOURCE_DATE_EPOCH is set; its source archive
-holds the owner, the rights and the moment of every file.
+"""Setuptools, with a source archive and a wheel that are the same on every machine and at every
+time: those of setuptools hold the owner, the rights and the moment of every file.
 """
 
 from __future__ import annotations
@@ -10,6 +8,8 @@ import gzip
 import io
 import os
 import tarfile
+import time
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +44,23 @@ def normalised(archive: bytes) -> bytes:
     return out.getvalue()
 
 
+def normalised_wheel(archive: bytes) -> bytes:
+    """A wheel with its files in order, without rights and moment."""
+    out = io.BytesIO()
+    when = time.gmtime(max(moment(), 315_532_800))[:6]  # a zip file begins in 1980
+    with (
+        zipfile.ZipFile(io.BytesIO(archive)) as source,
+        zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as target,
+    ):
+        for name in sorted(source.namelist()):
+            entry = zipfile.ZipInfo(name, when)
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            entry.create_system = 3
+            entry.external_attr = 0o100644 << 16
+            target.writestr(entry, source.read(name))
+    return out.getvalue()
+
+
 def build_sdist(sdist_directory: str, config_settings: Any = None) -> str:
     """As setuptools does, then in order."""
     name = _build_sdist(sdist_directory, config_settings)
@@ -55,6 +72,8 @@ def build_sdist(sdist_directory: str, config_settings: Any = None) -> str:
 def build_wheel(
     wheel_directory: str, config_settings: Any = None, metadata_directory: str | None = None
 ) -> str:
-    """As setuptools does, with one moment for all files."""
-    os.environ.setdefault("SOURCE_DATE_EPOCH", str(EPOCH))
-    return _build_wheel(wheel_directory, config_settings, metadata_directory)
+    """As setuptools does, then in order."""
+    name = _build_wheel(wheel_directory, config_settings, metadata_directory)
+    path = Path(wheel_directory) / name
+    path.write_bytes(normalised_wheel(path.read_bytes()))
+    return name

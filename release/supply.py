@@ -138,13 +138,8 @@ def pins() -> str:
     return "\n".join(lines) + "\n"
 
 
-def built(folder: Path) -> Mapping[str, str]:
-    """SHA-256 of the source archive and of the wheels made from the tree and from the archive."""
-    environment = {
-        k: v for k, v in os.environ.items() if k not in ("SOURCE_DATE_EPOCH", "PYTHONPATH")
-    }
-    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check"]
-    tree = folder / "tree"
+def copied(tree: Path) -> None:
+    """The files under version control, as they are now."""
     names = subprocess.run(
         ["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True
     ).stdout.decode()
@@ -152,6 +147,16 @@ def built(folder: Path) -> Mapping[str, str]:
         if (ROOT / name).is_file():
             (tree / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(ROOT / name, tree / name)
+
+
+def built(files: Path, folder: Path) -> Mapping[str, str]:
+    """SHA-256 of the source archive and of the wheels made from the tree and from the archive."""
+    environment = {
+        k: v for k, v in os.environ.items() if k not in ("SOURCE_DATE_EPOCH", "PYTHONPATH")
+    }
+    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check"]
+    tree = folder / "tree"
+    shutil.copytree(files, tree, copy_function=shutil.copyfile)
     code = (
         "import sys; sys.path.insert(0, 'release'); import backend; "
         f"backend.build_sdist({str(folder)!r})"
@@ -178,13 +183,16 @@ def built(folder: Path) -> Mapping[str, str]:
 def build() -> int:
     """Build twice, at different times and in different folders; 1 where anything differs."""
     found = []
-    for mask in (0o022, 0o077):
-        before = os.umask(mask)
-        try:
-            with tempfile.TemporaryDirectory() as folder:
-                found.append(built(Path(folder)))
-        finally:
-            os.umask(before)
+    with tempfile.TemporaryDirectory() as place:
+        files = Path(place) / "files"
+        copied(files)
+        for mask in (0o022, 0o077):
+            before = os.umask(mask)
+            try:
+                with tempfile.TemporaryDirectory() as folder:
+                    found.append(built(files, Path(folder)))
+            finally:
+                os.umask(before)
     for name, digest in found[0].items():
         print(f"{digest} {name}{'' if found[1][name] == digest else ' DIFFERS'}")
     wheels = {digest for name, digest in found[0].items() if ".whl" in name}

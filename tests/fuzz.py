@@ -29,8 +29,9 @@ import numpy as np
 
 SECONDS: Final = 5.0
 MEGABYTES: Final = 500.0
-BATCH: Final = 100
-"""Inputs of one process; a death costs the rest of none, the next process goes on behind it."""
+BATCH: Final = 2000
+"""Inputs of one process, whose decoder starts once; after a death the next process goes on behind
+it."""
 DEMO: Final = Path(__file__).resolve().parents[1] / "workbench" / "demo"
 JOINT: Final = """[joint]
 name = "axis"

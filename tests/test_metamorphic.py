@@ -30,12 +30,12 @@ from tests.metamorphic import (
 if not SHARED.exists() and not os.environ.get("CI"):
     pytest.skip("../shared is not there", allow_module_level=True)
 
-ROWS = 3000
+ROWS = 6000
 
 
 @cache
 def short(name: str) -> Case:
-    """6 s of each record."""
+    """12 s of each record."""
     return case_of(name).tables(lambda t: {k: v[:ROWS] for k, v in t.items()})
 
 

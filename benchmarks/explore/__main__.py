@@ -75,7 +75,7 @@ def near(found: Exploration, sample: int, seed: int) -> tuple[int, int, int, flo
         solution = every[k].solution
         shown = refitted(solution.model, data, (solution.values,), weighting, steps=0)
         whole = refitted(solution.model, data, (solution.values,), weighting, steps=CONVERGED)
-        close += bool(np.all(np.abs(shown.held / whole.held - 1) < NEAR))
+        close += bool(np.all(np.abs(shown.held.rms / whole.held.rms - 1) < NEAR))
         scores = [
             float(score_of(r.squares.sum(axis=0), r.rows.sum(axis=0), np.array(0.0)))
             for r in (shown, whole)

@@ -19,7 +19,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -34,9 +34,11 @@ from identification.data.joint_file import Joint, load_joint
 from identification.data.read import read
 from identification.data.record import Record
 from identification.faults.bank import FaultBank
+from identification.faults.bank_levels import Piece
 from identification.faults.injector import Fault, inject
 from identification.faults.types import FaultEvent, Verdict
 from irj_fmu.estimator.bank import bank_for, judged
+from irj_fmu.estimator.healthy import online_readings
 from tests.hidden_effect.generator import COLUMNS, DT, KM, simulate_case
 from workbench.cli.main import main as irj
 
@@ -65,6 +67,14 @@ SIZES: Final[dict[str, tuple[float, float]]] = {
 rad/s, share]."""
 SPAN: Final = 120.0
 """Length of the healthy files and of those that faults are put into [s]."""
+CHANGES: Final[Mapping[str, Mapping[str, float]]] = {
+    "payload +30 %": {"JL": 1.3, "TG": 1.3},
+    "motor Coulomb x 1.3": {"M_TC": 1.3},
+    "stiffness -20 %": {"K": 0.8},
+}
+"""Changes of the joint, by the generator's names: no sensor fails there."""
+CHANGED_SPAN: Final = 40.0
+"""Length of a record of a changed joint [s]."""
 PIECE: Final = 16.0
 """Length of a file with a fault [s]."""
 LOOK: Final = 6.0
@@ -79,7 +89,10 @@ class Bench:
     folder: Path
     joint: Joint
     bank: FaultBank
+    smallest: Mapping[str, tuple[float, float]]
     table: FloatArray
+    more: FloatArray
+    changed: Mapping[str, FloatArray]
     ratio: float
 
 
@@ -113,15 +126,35 @@ def bench(seed: int, folder: Path) -> Bench:
     if not better.is_file():
         given = ["improve", *map(str, train), "--held-out", *map(str, held)]
         irj([*given, "--joint", str(here / "joint.toml"), "-o", str(better)])
-    long = simulate_case(hidden, seed, dirt=True, span=SPAN, records=("train", "test", "test2"))
+    long = simulate_case(hidden, seed, dirt=True, span=SPAN)
     healthy = [_file(here / f"healthy_{n}.npz", long.measured[n]) for n in ("train", "test")]
     joint = load_joint(better)
     records = [opened(p, joint) for p in healthy]
-    unseen = long.measured["test2"]
     bank = bank_for(joint, records[0], records)
     if bank is None:
         raise SystemExit(f"{better}: no bank: the joint is rigid or not fitted")
-    return Bench(here, joint, bank, unseen, short.gear_ratio)
+    changed = {
+        text: simulate_case(
+            hidden,
+            seed,
+            dirt=True,
+            span=CHANGED_SPAN,
+            records=("test2",),
+            overrides={name: factor * long.parameters[name] for name, factor in change.items()},
+        ).measured["test2"]
+        for text, change in CHANGES.items()
+    }
+    rows = np.array(online_readings(records[1], joint)[0])
+    return Bench(
+        here,
+        joint,
+        bank,
+        smallest=bank.smallest(Piece(records[1].time, rows)),
+        table=long.measured["test2"],
+        more=long.measured["train2"],
+        changed=changed,
+        ratio=short.gear_ratio,
+    )
 
 
 def faulty(at: Bench, number: int) -> tuple[FloatArray, Fault]:
@@ -129,11 +162,18 @@ def faulty(at: Bench, number: int) -> tuple[FloatArray, Fault]:
     rng = np.random.default_rng([7, number])
     names, kinds = list(SENSORS), list(SIZES)
     sensor, kind = names[number % len(names)], kinds[(number // len(names)) % len(kinds)]
+    size = SIZES[kind][int(sensor.endswith("position"))]
+    return piece(at, rng, sensor, kind, size)
+
+
+def piece(
+    at: Bench, rng: np.random.Generator, sensor: str, kind: str, size: float
+) -> tuple[FloatArray, Fault]:
+    """A piece of the unseen record with a fault of either sign at some time."""
     count = round(PIECE / DT)
     first = int(rng.integers(0, len(at.table) - count))
     table = at.table[first : first + count].copy()
     table[:, 0] -= table[0, 0]
-    size = SIZES[kind][int(sensor.endswith("position"))]
     size *= float(rng.choice([-1.0, 1.0])) if kind in ("bias", "drift", "gain") else 1.0
     begin = DT * round(rng.uniform(5.0, 8.0) / DT)
     fault = Fault(sensor, kind, begin, size)  # type: ignore[arg-type]
@@ -142,7 +182,9 @@ def faulty(at: Bench, number: int) -> tuple[FloatArray, Fault]:
     rows = np.zeros((count, 6))
     place = {"current": 0, "motor_position": 1, "link_position": 3, "torque": 5}[sensor]
     rows[:, place] = referred * table[:, column]
-    table[:, column] = inject(rows, DT, [fault], seed=number)[:, place] / referred
+    table[:, column] = (
+        inject(rows, DT, [fault], seed=int(rng.integers(1 << 30)))[:, place] / referred
+    )
     return table, fault
 
 
@@ -180,15 +222,40 @@ def names_sensor(event: FaultEvent) -> bool:
     return event.verdict in (Verdict.SENSOR, Verdict.DROPOUT, Verdict.CURRENT_OR_FRICTION)
 
 
-def healthy_alarms(at: Bench) -> tuple[float, list[str]]:
-    """Hours of the unseen healthy record, and what was said about it."""
-    path = _file(at.folder / "healthy_test2.npz", at.table)
-    record = opened(path, at.joint)
+def said_about(at: Bench, table: FloatArray) -> tuple[float, list[str]]:
+    """Hours of a record, and what was said about it."""
+    record = opened(_file(at.folder / "healthy.npz", table), at.joint)
     track = judged(at.bank, record, at.joint)
     return record.duration / 3600.0, [
-        f"{record.time[e.sample]:.2f} s {e.verdict.name} {' '.join(e.sensors)}"
+        f"{record.time[e.sample]:.2f} s {e.verdict.name} {' '.join(e.sensors)}".strip()
         for e in track.events
     ]
+
+
+def aside(at: Bench) -> dict[str, Any]:
+    """Healthy time, changes of the joint, and offsets of the announced sizes, of one joint."""
+    hours = 0.0
+    said: list[str] = []
+    for table in (at.table, at.more):
+        more, texts = said_about(at, table)
+        hours, said = hours + more, said + texts
+    changes = {text: said_about(at, table)[1] for text, table in at.changed.items()}
+    sizes = []
+    rng = np.random.default_rng([8, int(at.folder.name)])
+    for sensor, (seen, named) in at.smallest.items():
+        for what, size in (("seen", seen), ("quarter", seen / 4), ("named", named)):
+            for _ in range(3 if np.isfinite(size) else 0):
+                table, fault = piece(at, rng, sensor, "bias", size)
+                record = opened(_file(at.folder / "size.npz", table), at.joint)
+                events = [
+                    e
+                    for e in judged(at.bank, record, at.joint).events
+                    if record.time[e.sample] >= fault.start - DT / 2
+                ]
+                first = events[0] if events else None
+                right = first is not None and names_sensor(first) and first.sensors == (sensor,)
+                sizes.append([sensor, what, bool(events), right])
+    return {"hours": hours, "said": said, "changes": changes, "sizes": sizes}
 
 
 def report(results: dict[str, Any]) -> None:
@@ -207,9 +274,25 @@ def report(results: dict[str, Any]) -> None:
             print(f"  {key}: " + ", ".join(f"{n} {right[n]}/{total[n]}" for n in total))
         early = sum(c["early"] for c in cases)
         print(f"  said before the fault: {early}")
-    hours = sum(h for h, _ in results["healthy"].values())
-    said = [f"{seed}: {text}" for seed, (_, texts) in results["healthy"].items() for text in texts]
+    joints = results["healthy"]
+    hours = sum(j["hours"] for j in joints.values())
+    said = [f"{seed}: {text}" for seed, j in joints.items() for text in j["said"]]
     print(f"healthy: {len(said)} reports in {hours:.2f} h" + "".join(f"\n  {t}" for t in said))
+    for text in CHANGES:
+        told = Counter(
+            " or ".join(dict.fromkeys(t.split(" s ")[1] for t in j["changes"][text])) or "nothing"
+            for j in joints.values()
+        )
+        print(f"{text}: " + ", ".join(f"{n} {t}" for t, n in told.items()))
+    sizes = [entry for j in joints.values() for entry in j["sizes"]]
+    for what, text, place in (
+        ("seen", "offset announced as seen: seen", 2),
+        ("quarter", "a quarter of it: seen", 2),
+        ("named", "offset announced as named: named", 3),
+    ):
+        of = [entry[place] for entry in sizes if entry[1] == what]
+        if of:
+            print(f"{text} in {sum(of)} of {len(of)}")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -238,7 +321,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             break
         at = bench(seed, folder)
         if str(seed) not in results["healthy"]:
-            results["healthy"][str(seed)] = healthy_alarms(at)
+            results["healthy"][str(seed)] = aside(at)
         found = judge(at, number)
         results["cases"].append(found)
         if not found["right"]:

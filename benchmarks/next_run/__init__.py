@@ -18,10 +18,11 @@ from typing import Final, final
 import numpy as np
 import numpy.typing as npt
 
-from identification import Joint, Record
+from identification import Joint, Record, improve
+from identification.balance.dataset import without
 from identification.data.joint_file import Known
 from identification.fitting.engine import load_dataset, prepared_model, solve
-from identification.planning.rivals import Contest, Rival, enough, rivals_of
+from identification.planning.rivals import Contest, enough, rivals_of
 from identification.planning.runs import (
     SIMULATED,
     Plant,
@@ -108,7 +109,9 @@ def judged(contest: Contest, truth: str) -> tuple[float, bool, bool]:
     likelihood = dict(zip(names, contest.likelihood, strict=True))
     if truth not in likelihood:
         return -np.inf, False, False
-    found = likelihood[truth] - max(v for n, v in likelihood.items() if n != truth)
+    # a name that does not help at all on both records has no fit: the truth is alone
+    others = [v for n, v in likelihood.items() if n != truth]
+    found = likelihood[truth] - max(others, default=-np.inf)
     left = [r.name for r in contest.alive]
     return float(found), left == [truth], truth in left
 
@@ -168,14 +171,9 @@ def one_joint(
         )
         fresh = record_of(new.measured[kind], kind, "same" if run.load == 1 else "none", **more)
         both = load_dataset([old, fresh], [], joint, model)
-        again = Contest(
-            [
-                Rival(r.name, r.label, solve(r.solution.model, both, start=r.solution.values))
-                for r in rivals
-            ],
-            both,
-        )
-        after, one, within = judged(again, truth)
+        tied = [r.name for r in rivals]
+        left = rivals_of(tied, balance, solve(model, both), both)
+        after, one, within = judged(Contest(left, both), truth) if left else (-np.inf, False, False)
         expected = _expected(contest, truth, apart)
         out.append((kind, Outcome(expected, after, one, within), run))
     return out
@@ -197,6 +195,38 @@ def rank_correlation(one: Sequence[float], other: Sequence[float]) -> float:
     return float(np.corrcoef(first, second)[0, 1])
 
 
+def sets_of_improve(count: int, start: int, *, dirt: bool) -> None:
+    """Sets that `improve` claims on whole records, and what whole fits leave of them."""
+    effects = tuple(dict.fromkeys(n for _, names, _ in SETS.values() for n in names))
+    before = after = kept = sets = 0
+    for k in range(count):
+        truth = effects[k % len(effects)]
+        case = simulate_case(truth, start + k, dirt=dirt)
+        records = [record_of(table, name, "same") for name, table in case.measured.items()]
+        joint = Joint(
+            name=truth,
+            gear_ratio=case.gear_ratio,
+            torque_per_current=case.gear_ratio * KM,
+            model_name="hd3",
+            effects=("viscous", "coulomb", "gravity"),
+        )
+        found = improve(records[:2], joint, records[2:])
+        for claim in found.claims:
+            if len(claim.effects) < 2:
+                continue
+            last = found.steps[-1].solution
+            bare = solve(without(last.model, claim.label), found.data, start=last.values)
+            rivals = rivals_of(claim.effects, claim.balance, bare, found.data)
+            alive = [r.name for r in Contest(rivals, found.data).alive]
+            sets, before, after = sets + 1, before + len(claim.effects), after + len(alive)
+            kept += truth in alive
+            print(f"{truth:<25} {', '.join(claim.effects)} -> {', '.join(alive)}", flush=True)
+    print(
+        f"{sets} sets on {count} joints: {before} names, {after} after whole fits, truth left in "
+        f"{kept}"
+    )
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Print the table and the rank correlation."""
     parser = argparse.ArgumentParser(description=main.__doc__)
@@ -204,7 +234,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--start", type=int, default=8000, help="first seed")
     parser.add_argument("--size", type=float, default=1.0, help="factor on the hidden effects")
     parser.add_argument("--sets", nargs="*", choices=list(SETS), default=list(SETS))
+    parser.add_argument(
+        "--claims", type=int, default=0, help="instead: joints on which `improve` claims sets"
+    )
+    parser.add_argument("--dirt", action="store_true", help="with --claims: small disturbances")
     given = parser.parse_args(argv)
+    if given.claims:
+        sets_of_improve(given.claims, given.start, dirt=given.dirt)
+        return 0
     print("set       truth                     run       expected     found  one right name")
     expected: list[float] = []
     found: list[float] = []

@@ -13,6 +13,11 @@ def _inside(s: LocalSignals, p: SimpleNamespace) -> Expression:
     return ca.fmin(ca.fmax(s.torsion, -p.backlash), p.backlash)
 
 
+def _taken(s: LocalSignals, p: SimpleNamespace) -> Expression:
+    # in the gap nothing touches: neither damping nor a stiffening spring feels it
+    return _inside(s, p) * (p.backlash_stiffness_loss > 0)
+
+
 def _stored(s: LocalSignals, p: SimpleNamespace) -> Expression:
     inside = _inside(s, p)
     return -p.backlash_stiffness_loss * (inside * s.torsion - inside**2 / 2)
@@ -44,6 +49,7 @@ def _stored(s: LocalSignals, p: SimpleNamespace) -> Expression:
     ),
     of_displacement=True,
     several_valleys=True,
+    takes_up=_taken,
     absence="the transmission carries nothing near zero torque; knocks when it is crossed",
     excitation="torque reversals at low load",
     source="field knowledge",

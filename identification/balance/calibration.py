@@ -29,6 +29,7 @@ from identification.balance.clocks import (
     one_way,
 )
 from identification.balance.memory import numbers_of
+from identification.balance.noise import effective_share
 from identification.balance.sensing import Sensing
 from identification.balance.weak import WeakRecord
 from identification.data.prepare import shift_channel
@@ -288,12 +289,13 @@ def _fitted_on_itself(
     turning = ~one_way(record) if any(n in CLOCKS for n in names) else np.False_
     rows = {b: record.taking(b) & ~turning for b in balances.balances}
     size = USUAL_SKEW * record.grid.dt
-    known = np.diag([1 / size if n in CLOCKS else 0.0 for n in names])
     usually, limits = dict(now), limits_of_runs(balances.model, [record])
     seen = [b for b in balances.balances if rows[b].any()]
     for _ in range(ROUNDS):
         found = balances.evaluate(record, at_stamps(balances.model, record, {**values, **now}))
         scale = {b: max(float(np.sqrt(np.mean(found[b][0][rows[b]] ** 2))), 1e-300) for b in seen}
+        share = min(effective_share(found[b][0][rows[b]]) for b in seen)
+        known = np.diag([1 / (size * share**0.5) if n in CLOCKS else 0.0 for n in names])
         moved = np.array([now[n] - usually[n] for n in names])
         r = np.concatenate([*(found[b][0][rows[b]] / scale[b] for b in seen), known @ moved])
         j = np.concatenate([*(found[b][1][rows[b]] / scale[b] for b in seen), known])

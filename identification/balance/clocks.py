@@ -49,8 +49,8 @@ ONE_WAY: Final = 1e-3
 """Share of a row's kernel in which the joint may move the other way."""
 FEW: Final = 0.1
 """Share of such rows below which a motion turns all the time: then its turns tell the clocks."""
-INDEPENDENT: Final = 0.4
-"""Share of the rows that count as independent: four rows to a kernel length."""
+STRETCHES: Final = 8
+"""Stretches of a record whose slopes are compared."""
 
 
 def carrier(model: JointModel, place: str) -> str | None:
@@ -187,15 +187,28 @@ def lateness(made: WeakRecord, place: str, *, torque: bool) -> tuple[float, floa
 
 
 def _slope(values: FloatArray, others: list[FloatArray], column: FloatArray) -> tuple[float, float]:
-    """Slope over a column beside others, with its standard error."""
+    """Slope over a column beside others, with its standard error: rows depend on each other, so it
+    is that of leaving one of a few stretches out.
+    """
     basis, _ = np.linalg.qr(_scaled(np.column_stack(others)))
     own = column - basis @ (basis.T @ column)
-    power = float(own @ own)
-    if power <= 1e-18 * float(column @ column):
-        return 0.0, np.inf
-    slope = float(own @ values) / power
-    left = values - basis @ (basis.T @ values) - slope * own
-    return slope, float(np.sqrt(left @ left / (INDEPENDENT * len(values)) / power))
+    rest = values - basis @ (basis.T @ values)
+    powers = np.array([float(x @ x) for x in np.array_split(own, STRETCHES)])
+    products = np.array(
+        [
+            float(x @ y)
+            for x, y in zip(
+                np.array_split(own, STRETCHES), np.array_split(rest, STRETCHES), strict=True
+            )
+        ]
+    )
+    power = float(powers.sum())
+    if power - powers.max() <= 1e-18 * float(column @ column):
+        return 0.0, math.inf
+    slope = float(products.sum()) / power
+    without = (products.sum() - products) / (power - powers)
+    error = math.sqrt((STRETCHES - 1) / STRETCHES * float(np.sum((without - without.mean()) ** 2)))
+    return slope, error
 
 
 def _scaled(matrix: FloatArray) -> FloatArray:

@@ -25,6 +25,7 @@ from identification.balance.weak import (
     differentiated_kernel,
     kernel,
     prepare,
+    whole,
 )
 from identification.data.joint_file import Joint
 from identification.data.record import Record
@@ -323,7 +324,7 @@ def _with_rests(made: WeakRecord, noise: Mapping[str, float]) -> WeakRecord:
         slow = np.abs(made.points[f"{side}_velocity"]) <= STILL * noise[
             source
         ] * made.grid.velocity_gain(source)
-        shortest = max(1, round(made.grid.pointwise[source] / (made.grid.step * made.grid.dt)))
+        shortest = max(1, whole(made.grid.pointwise[source] / (made.grid.step * made.grid.dt)))
         still, held = np.zeros(len(slow)), made.smooth[source].copy()
         for first, last in zip(made.starts[:-1], made.starts[1:], strict=True):
             edges = np.flatnonzero(np.diff(np.concatenate([[False], slow[first:last], [False]])))
@@ -356,7 +357,7 @@ def pointwise_kernel(
 
     A long kernel rounds off reversals, and the laws of friction at low speed then fit the rounding.
     """
-    lag = max(1, round(POINTWISE_KERNELS[-1] / dt))
+    lag = max(1, whole(POINTWISE_KERNELS[-1] / dt))
     change = np.concatenate(
         [np.abs(position[s][lag:] - position[s][:-lag]) for s in segments if s.stop - s.start > lag]
         or [np.zeros(1)]

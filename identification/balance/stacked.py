@@ -17,7 +17,7 @@ from identification.balance.balances import Balances, balances_of
 from identification.balance.calibration import bare, of_run, settled, values_on
 from identification.balance.dataset import Dataset
 from identification.balance.drawn_noise import draws_of
-from identification.balance.weak import Grid, WeakRecord
+from identification.balance.weak import Grid, WeakRecord, whole
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -298,7 +298,7 @@ def _either_direction(
     slow = np.abs(velocity) < 3 * noise * grid.velocity_gain(source)
     turns = np.diff(np.sign(velocity), append=velocity[-1]) != 0
     reach = max(
-        0, round(TURN_SHARE * (grid.pointwise[source] - TURN_KERNEL) / (grid.step * grid.dt))
+        0, whole(TURN_SHARE * (grid.pointwise[source] - TURN_KERNEL) / (grid.step * grid.dt))
     )
     near = (
         np.convolve(turns, np.ones(2 * reach), "same") > 0

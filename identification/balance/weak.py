@@ -7,6 +7,7 @@ nonlinear are evaluated at the samples (velocities from a shorter kernel) and th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -59,6 +60,17 @@ STRETCH: Final = 4096
 """Windows multiplied at a time: some hundred kilobytes."""
 
 
+HALF: Final = 1e-6
+"""Samples by which the last digits of a clock may miss a half: 60 ms hold 7.5 times 4 samples of
+2 ms, and a median step that is 1e-11 off would make 7 rows of 8.
+"""
+
+
+def whole(samples: float) -> int:
+    """Nearest whole number of samples, halves upwards."""
+    return math.floor(samples + 0.5 + HALF)
+
+
 def kernel(length: float, dt: float, order: int = 0) -> FloatArray:
     """Samples of the cos^4 kernel or of a derivative of it, for correlation with a signal.
 
@@ -76,7 +88,7 @@ def kernel(length: float, dt: float, order: int = 0) -> FloatArray:
     (k,) array, k odd
         Weights that reproduce the derivative of polynomials up to `order` + 1 exactly.
     """
-    half = max(order + 2, round(length / dt / 2))
+    half = max(order + 2, whole(length / dt / 2))
     t = np.arange(-half, half + 1) * dt
     width = (2 * half + 2) * dt
     window = np.cos(np.pi * t / width) ** 4
@@ -99,7 +111,7 @@ def differentiated_kernel(length: float, dt: float, order: int) -> FloatArray:
 
     Shapes and units as in :func:`kernel`; exact for polynomials of degree `order`.
     """
-    half = max(order + 2, round(length / dt / 2))
+    half = max(order + 2, whole(length / dt / 2))
     t = np.arange(-half, half + 1) * dt
     width = (2 * half + 2) * dt
     phase = np.pi * t / width
@@ -414,10 +426,10 @@ def prepare(
         if isinstance(pointwise, int | float)
         else {**dict.fromkeys(POSITION_CHAINS, 0.03), **pointwise}
     )
-    step = max(1, round(0.002 / dt))
-    stride = max(step, round(length / dt / overlap / step) * step)
-    half = step * (max(2, round(length / (dt * step) / 2)) + 1)
-    reach = max(half, round(length / dt / 2) + 3, round(max(short.values()) / dt / 2) + 5)
+    step = max(1, whole(0.002 / dt))
+    stride = max(step, whole(length / dt / overlap / step) * step)
+    half = step * (max(2, whole(length / (dt * step) / 2)) + 1)
+    reach = max(half, whole(length / dt / 2) + 3, whole(max(short.values()) / dt / 2) + 5)
     half = step * int(np.ceil(reach / step))
     long_enough = tuple(s for s in segments if s.stop - s.start > 2 * half + stride)
     grid = Grid(

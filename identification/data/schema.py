@@ -87,13 +87,14 @@ class Key:
         value = table.get(self.name)
         if value is None:
             return self.default
-        value = _READ[self.kind](value, self, where)
-        if self.choices and value not in self.choices:
+        if not self.choices:
+            return _READ[self.kind](value, self, where)
+        if value not in self.choices:
             raise InputError(
                 f"{where}: {self.name} = {value!r} is not known; use one of "
                 f"{', '.join(self.choices)}"
             )
-        return value
+        return str(value)
 
     def text(self, value: Any) -> str:
         """``name = value`` as TOML."""
@@ -206,6 +207,8 @@ def _text(value: Any, key: Key, where: str) -> str:
 
 
 def _label(value: Any, key: Key, where: str) -> str:
+    if isinstance(value, Mapping | list):
+        raise InputError(f'{where}: {key.name} must be a text, as {key.name} = "axis 3"')
     return str(value)
 
 

@@ -22,12 +22,12 @@ from casadi_models.term import LINK_INERTIA, TOTAL_INERTIA
 from identification.balance.balances import balances_of
 from identification.balance.calibration import names_of_runs
 from identification.balance.dataset import HOLD_NAME, Dataset, load_dataset, prepared_model
+from identification.balance.noise import effective_share
 from identification.data.joint_file import Joint
 from identification.data.prepare import STANDARD_GRAVITY
 from identification.data.record import Record
 from identification.diagnosis.candidates import observable
 from identification.diagnosis.claims import FALSE_DISCOVERY, GAIN, LARGEST_SET
-from identification.diagnosis.trials import effective_share
 from identification.errors import InputError
 from identification.fitting.assess import Error, assess
 from identification.fitting.covariance import FEWEST_BLOCKS, errors_of_blocks, inverse

@@ -27,11 +27,12 @@ from casadi_models.table import SHARP, SLOW
 from casadi_models.term import Term
 from identification.balance.balances import balances_of
 from identification.balance.dataset import Dataset
+from identification.balance.noise import effective_share
 from identification.balance.stacked import stack
 from identification.balance.weak import WeakRecord
 from identification.diagnosis.candidates import OBSERVED_BY, Candidate
 from identification.diagnosis.places import student
-from identification.diagnosis.trials import Base, columns, effective_share, make_base, span_of
+from identification.diagnosis.trials import Base, columns, make_base, span_of
 from identification.fitting.covariance import NORMAL
 
 FloatArray = npt.NDArray[np.float64]

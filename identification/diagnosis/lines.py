@@ -27,7 +27,7 @@ from identification.balance.clocks import shifted
 from identification.balance.dataset import Dataset, run_name
 from identification.balance.sensing import Sensing, signals_of
 from identification.balance.stamps import EVEN
-from identification.balance.weak import POSITION_CHAINS, Grid, WeakRecord, kernel
+from identification.balance.weak import POSITION_CHAINS, Grid, WeakRecord, kernel, whole
 from identification.data.joint_file import Joint
 from identification.data.record import Record
 from identification.diagnosis.candidates import observable
@@ -192,7 +192,7 @@ def at_every_sample(
     if inside.any() and np.ptp(steps[inside]) > EVEN * float(np.median(steps[inside])):
         record = record.resampled()
     signals, dt = signals_of(record, joint, sensing), record.dt
-    long = max(7, 2 * round(SLOW_KERNEL / dt / 2) + 1)
+    long = max(7, 2 * whole(SLOW_KERNEL / dt / 2) + 1)
     late = {} if like is None else {p: x / dt for p, x in like.shifts.items()}
     signals, parts = shifted(signals, tuple(record.segments()), late)
     segments = tuple(s for s in parts if s.stop - s.start > 2 * max(long, SMOOTHED[-1]))

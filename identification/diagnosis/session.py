@@ -504,31 +504,31 @@ class Session:
         relatives = [
             t
             for t in ranking.trials
-            if t.balance == best.balance
-            and t.key not in names
+            if t.key != best.key
+            and t.balance == best.balance
             and (t.key in best.effect.confused_with or best.key in t.effect.confused_with)
             and t.candidate.label in ranking.significant
             and t.candidate.label not in refused
-            and t.score >= RELATIVE_SHARE * best.score
+            and (t.key in names or t.score >= RELATIVE_SHARE * best.score)
         ][:MOST_RELATIVES]
         if not relatives:
             return best, names
         fitted = {t.key: self.bench.added(t, now).train for t in (best, *relatives)}
         left = {k: common_rms(fitted[best.key], e, best.balance)[1] for k, e in fitted.items()}
-        least = min(left.values())
-        near = 1 + SAME_WITH_ONE_LESS / 100
-        alike = [t for t in (best, *relatives) if left[t.key] <= near * least]
-        found = min(alike, key=lambda t: (len(t.values), left[t.key]))
-        if found.key == best.key:
-            return best, names
-        for key, rms in left.items():
-            if key != found.key and rms > SET_RMS * left[found.key]:
-                self._doubted[key] = (
-                    f"leaves {100 * (rms / left[found.key] - 1):.3g} % more than "
-                    f"{found.effect.title} once both are fitted with the rest"
+        near = (1 + SAME_WITH_ONE_LESS / 100) * min(left.values())
+        alike = [t for t in (best, *relatives) if left[t.key] <= near]
+        found = min(alike, key=lambda t: (not t.effect.common, len(t.values), left[t.key]))
+        for t in (best, *relatives):
+            if left[t.key] > SET_RMS * left[found.key]:
+                more = 100 * (left[t.key] / left[found.key] - 1)
+                self._doubted[t.candidate.label] = (
+                    f"leaves {more:.3g} % more than {found.effect.title} once both are fitted with "
+                    "the rest"
                 )
-        kept = [t.key for t in alike if left[t.key] <= SET_RMS * left[found.key]]
-        return found, (found.key, *(k for k in kept if k != found.key))
+        kept = {k for k, rms in left.items() if rms <= SET_RMS * left[found.key]}
+        others = names if found.key in names else tuple(t.key for t in alike)
+        kept |= set(others) - set(left)
+        return found, (found.key, *(k for k in others if k in kept and k != found.key))
 
     def _told_apart(self, new: Claim, standing: _Standing) -> _Standing | None:
         """A name of an earlier set that asks to be added beside it: where it alone does better,

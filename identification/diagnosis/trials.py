@@ -17,6 +17,7 @@ from casadi_models import Effect
 from identification.balance.balances import Balances, balances_of
 from identification.balance.calibration import bare, names_of_runs, settled, within_limits
 from identification.balance.dataset import HOLD_NAME
+from identification.balance.noise import effective_share
 from identification.balance.weak import WeakRecord
 from identification.diagnosis.candidates import Candidate, NotTestable, shape_grid
 from identification.fitting.covariance import wald
@@ -42,15 +43,6 @@ REFINE_SHARE: Final = 0.1
 KERNEL_SHARE: Final = 0.4
 """Share of rows that count as independent under white noise: four rows per kernel length."""
 
-UNCORRELATED: Final = 0.05
-"""Autocorrelation below which rows count as independent: twice its own scatter over 1600 rows, the
-rows of 40 s.
-"""
-
-LONGEST_LAG: Final = 60
-"""Rows up to which correlation is followed: fifteen kernel lengths, longer than any block holds
-together.
-"""
 
 NO_COLUMN: Final = 1e-12
 """Size of a column, as a share of the largest one, below which it is rounding."""
@@ -312,23 +304,6 @@ def flatten(
     size = len(stacked.block)
     block = np.concatenate([np.where(stacked.taking[b], stacked.block, -1) for b in balances])
     return r, j, block, np.repeat(np.arange(len(balances)), size)
-
-
-def effective_share(residual: FloatArray) -> float:
-    """Share of rows that count as independent (initial positive sequence of the
-    autocorrelation).
-    """
-    x = residual - residual.mean()
-    power = float(x @ x)
-    if power <= 0:
-        return 1.0
-    total = 1.0
-    for lag in range(1, min(LONGEST_LAG, len(x) - 1)):
-        rho = float(x[:-lag] @ x[lag:]) / power
-        if rho < UNCORRELATED:
-            break
-        total += 2 * rho
-    return 1.0 / total
 
 
 def columns(

@@ -21,7 +21,8 @@ from identification.faults.bank_levels import SETTLE, Piece, first_levels, likel
 from identification.faults.bank_statistics import WINDOWS, limits, statistics
 from identification.faults.core import ABSURD, CURRENT, SENSORS
 from identification.faults.types import FaultEvent, Verdict
-from identification.online.filter import FilterState, JointFilter, Levels
+from identification.online.filter import TWIST, FilterState, JointFilter, Levels
+from identification.online.filter_step import BALANCES
 from identification.online.pulse import Pulse
 
 FloatArray = npt.NDArray[np.float64]
@@ -37,8 +38,16 @@ RECOVER: Final = 1.1
 """A failed sensor must agree with the others for this long to be read again [s]."""
 PLANT_REST: Final = 5.0
 """No second report about the joint itself for this long [s]."""
-BLIND: Final = 1.0
-"""Seconds after a start whose innovations do not count: they tell what was not known then."""
+HEAD: Final = 1.0
+"""Seconds at the beginning in which every reading is believed."""
+FIRST: Final = 0.5
+"""Seconds after which velocities are known and the calibration is found anew."""
+OPENED: Final = 0.1 * TWIST
+"""Standard deviation of the calibration there [rad]: ten times what these seconds leave wrong."""
+LINK_STATE: Final = 2
+"""The link position in the joint's state."""
+CHUNK: Final = 60.0
+"""Stretches in which a record is worked on, so that hours of it need no more memory [s]."""
 GAP: Final = 0.05
 """A gap between stamps beyond this starts the filters anew [s]."""
 LOST: Final = 0.03
@@ -109,8 +118,6 @@ class FaultBank:
     ----------
     sensors : tuple of int
         Numbers of the sensors there are; filter k + 1 leaves out the k-th.
-    blind : int
-        Samples after a start whose innovations do not count.
     """
 
     def __init__(
@@ -131,7 +138,6 @@ class FaultBank:
         self.dt = dt
         self.joint = JointFilter(replace(model, calibration=CALIBRATION), dt, CALIBRATION)
         self.tuning = tuning
-        self.blind = round(BLIND / dt)
 
     # --- before the run ---------------------------------------------------------------------------
 
@@ -143,7 +149,13 @@ class FaultBank:
         InputError
             The records are too short.
         """
-        long = [p for p in healthy if p.time[-1] - p.time[0] > 2 * SETTLE]
+        size = max(round(CHUNK / self.dt), 1)
+        cut = [
+            Piece(p.time[k : k + size], p.rows[k : k + size])
+            for p in healthy
+            for k in range(0, len(p.time), size)
+        ]
+        long = [p for p in cut if p.time[-1] - p.time[0] > 2 * SETTLE]
         if not long:
             raise InputError(f"fault bank: give healthy records longer than {2 * SETTLE:g} s")
         first = first_levels(long, self.dt, self.measured)
@@ -154,10 +166,16 @@ class FaultBank:
             parts = []
             for piece in long:
                 table = np.broadcast_to(flags[k], (1, len(piece.time), 6))
-                state = self.started(piece.time, piece.rows, levels)[k : k + 1]
-                course = self.joint.run(state, piece.time, piece.rows, table, levels=levels)
-                late = piece.time - piece.time[0] > SETTLE
-                parts.append(statistics(course, 0, self.dt, self.blind)[late])
+                states, at = self.begun(piece.time, piece.rows, levels)
+                course = self.joint.run(
+                    states[k : k + 1],
+                    piece.time[at:],
+                    piece.rows[at:],
+                    table[:, at:],
+                    levels=levels,
+                )
+                late = piece.time[at:] - piece.time[0] > SETTLE
+                parts.append(statistics(course, 0, self.dt)[late])
             motor, *others = levels.disturbance
             motor = motor if flags[k, CURRENT] else levels.unknown_drive
             found.append(limits(parts, self.dt, (motor, *others)))
@@ -255,13 +273,41 @@ class FaultBank:
             table[k + 1, sensor] = 0.0
         return np.repeat(table[:, None, :], count, axis=1)
 
-    def started(self, time: FloatArray, rows: FloatArray, levels: Levels) -> list[FilterState]:
-        """All filters at the first sample of a stretch."""
-        first = np.nan_to_num(rows[0]).tolist()
-        return [
-            self.joint.start(float(time[0]), first, used.tolist(), levels=levels)
-            for used in self.flags(1)[:, 0]
-        ]
+    def begun(
+        self, time: FloatArray, rows: FloatArray, levels: Levels
+    ) -> tuple[list[FilterState], int]:
+        """All filters after the first :data:`HEAD` seconds of a stretch, and how many samples that
+        took.
+
+        They go their own ways from there: up to there all readings are believed, so that each knows
+        the encoders' zero and where the motor stands. Velocities are not known at the first sample,
+        and a filter that is linearised at wrong ones is too sure of what it found: disturbances and
+        calibration are opened again after :data:`FIRST` seconds.
+        """
+        flags, at = self.flags(1)[0, 0], 0
+        state = self.joint.start(
+            float(time[0]), np.nan_to_num(rows[0]).tolist(), flags.tolist(), levels=levels
+        )
+        for seconds in (FIRST, HEAD):
+            end = min(round(seconds / self.dt), len(time))
+            if end > at:
+                table = np.broadcast_to(flags, (1, end - at, 6))
+                run = self.joint.run([state], time[at:end], rows[at:end], table, levels=levels)
+                state = self._opened(run.last[0], levels) if at == 0 else run.last[0]
+                at = end
+        return [state] * (1 + len(self.sensors)), at
+
+    def _opened(self, state: FilterState, levels: Levels) -> FilterState:
+        """A filter whose disturbances, encoders' zero and so the link are unsure again."""
+        joint, at = self.joint, self.joint.states
+        own = slice(at, at + BALANCES)
+        mean, covariance = state.mean.copy(), state.covariance.copy()
+        mean[own] = 0.0
+        covariance[own, :] = covariance[:, own] = 0.0
+        covariance[own, own] = np.diag(np.square(levels.disturbance))
+        way = np.zeros(joint.size)
+        way[-1], way[LINK_STATE] = OPENED, -OPENED
+        return replace(state, mean=mean, covariance=covariance + np.outer(way, way))
 
 
 def told(worst: FloatArray) -> int | None:
@@ -282,14 +328,13 @@ class _Probe:
         self.bank = bank
         back, ahead = round(WINDOWS[-1] / bank.dt), round(WAITS[0] / bank.dt)
         first = max(place - back, 0)
-        states = bank.started(time, rows, bank.tuned.levels)
-        if first > 0:
-            flags = bank.flags(first)
-            states = list(
-                bank.joint.run(
-                    states, time[:first], rows[:first], flags, levels=bank.tuned.levels
-                ).last
-            )
+        levels = bank.tuned.levels
+        states, at = bank.begun(time, rows, levels)
+        first = max(first, at)
+        if first > at:
+            part, flags = slice(at, first), bank.flags(first - at)
+            run = bank.joint.run(states, time[part], rows[part], flags, levels=levels)
+            states = list(run.last)
         self.states, self.begin = states, place - first
         self.time, self.rows = time[first : place + ahead], rows[first : place + ahead]
 
@@ -348,21 +393,33 @@ class _Work:
         """Filters from a fresh start up to a gap."""
         bank, levels = self.bank, self.tuning.levels
         part = slice(first, last)
-        states = bank.started(self.time[part], self.rows[part], levels)
-        at, armed, blind = first, self.time[first] + SETTLE, bank.blind
+        armed = self.time[first] + SETTLE
+        states, taken = bank.begun(self.time[part], self.rows[part], levels)
+        at, skip, history = first + taken, 0, round(WINDOWS[-1] / bank.dt)
+        length = chunk = round(CHUNK / bank.dt)
         while at < last:
-            part = slice(at, last)
-            scores = self._scored(states, part, blind)
-            self.scores[part] = scores
-            over = np.flatnonzero((scores[:, 0] > 1) & (self.time[part] > armed))
-            alarm = at + int(over[0]) if len(over) else last
-            gone, missing = self._lost(at, last)
-            if min(alarm, gone) >= last:
-                return
+            end = min(at + length, last)
+            scores = self._scored(states, slice(at, end))
+            self.scores[at + skip : end] = scores[skip:]
+            over = (scores[:, 0] > 1) & (self.time[at:end] > armed)
+            over[:skip] = False
+            alarm = at + int(np.argmax(over)) if over.any() else end
+            gone, missing = self._lost(at + skip, end)
+            if min(alarm, gone) >= end:
+                if end == last:
+                    return
+                back = max(end - history, at)
+                states = self._moved(states, at, back)
+                skip, at, length = end - back, back, chunk
+                continue
+            if alarm < gone and end < last and self.time[end - 1] - self.time[alarm] < WAITS[-1]:
+                length += chunk  # a verdict may need what comes
+                continue
+            length, skip = chunk, 0
             if gone <= alarm:
                 decided, sensor = gone, missing
             else:
-                decided, verdict, sensors = self._decide(alarm, last)
+                decided, verdict, sensors = self._decide(alarm, end)
                 self._report(alarm, decided, verdict, sensors)
                 sensor = SENSORS.index(sensors[0]) if verdict in ONE else -1
             if sensor >= 0:
@@ -377,13 +434,24 @@ class _Work:
                 if at >= last:
                     return
                 self._say(at, at, Verdict.RECOVERED, (SENSORS[sensor],))
-                states, armed, blind = [state] * (1 + len(bank.sensors)), self.time[at], 0
+                states, armed = [state] * (1 + len(bank.sensors)), self.time[at]
             else:
                 at = min(decided + 1, last)
                 if at < last:
                     rest = slice(at, last)
-                    states = bank.started(self.time[rest], self.rows[rest], levels)
-                    armed, blind = self.time[at] + SETTLE, bank.blind
+                    armed = self.time[at] + SETTLE
+                    states, taken = bank.begun(self.time[rest], self.rows[rest], levels)
+                    at += taken
+
+    def _moved(self, states: Sequence[FilterState], first: int, last: int) -> list[FilterState]:
+        """All filters after the samples of a stretch."""
+        if last <= first:
+            return list(states)
+        bank, part = self.bank, slice(first, last)
+        flags = bank.flags(last - first)
+        levels = self.tuning.levels
+        run = bank.joint.run(states, self.time[part], self.rows[part], flags, levels=levels)
+        return list(run.last)
 
     def _lost(self, first: int, last: int) -> tuple[int, int]:
         """First sample of a stretch from which a reading is missing for long, and its sensor."""
@@ -395,16 +463,15 @@ class _Work:
                     break
         return found
 
-    def _scored(self, states: Sequence[FilterState], part: slice, blind: int = 0) -> FloatArray:
-        """Scores of all filters over a stretch; its first samples may count for nothing."""
+    def _scored(self, states: Sequence[FilterState], part: slice) -> FloatArray:
+        """Scores of all filters over a stretch."""
         bank, tuning = self.bank, self.tuning
         time, rows = self.time[part], self.rows[part]
         course = bank.joint.run(states, time, rows, bank.flags(len(time)), levels=tuning.levels)
         out = np.zeros((len(time), len(states)))
         for k in range(len(states)):
-            shares = statistics(course, k, bank.dt, blind) / tuning.limits[k]
+            shares = statistics(course, k, bank.dt) / tuning.limits[k]
             out[:, k] = np.nan_to_num(shares.max(axis=1), nan=np.inf)
-        out[:blind] = 0.0
         return out
 
     def _advanced(

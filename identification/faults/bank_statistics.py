@@ -33,7 +33,7 @@ EULER: Final = 0.5772156649
 """Mean of the standard Gumbel distribution."""
 
 
-def statistics(course: Course, which: int, dt: float, begin: int = 0) -> FloatArray:
+def statistics(course: Course, which: int, dt: float) -> FloatArray:
     """Energies and means of the innovations over all windows, and the disturbances, (n, count).
 
     Parameters
@@ -43,8 +43,6 @@ def statistics(course: Course, which: int, dt: float, begin: int = 0) -> FloatAr
         Number of the filter.
     dt : float
         Sample time [s].
-    begin : int
-        First sample whose innovations count: those before tell how the filter was started.
 
     Returns
     -------
@@ -54,7 +52,6 @@ def statistics(course: Course, which: int, dt: float, begin: int = 0) -> FloatAr
         counts as expected.
     """
     e = np.clip(course.innovation[which], -1e6, 1e6)
-    e[:begin] = 0.0
     rows = len(e)
     squares = np.concatenate([np.zeros((1, 5)), np.cumsum(e**2, axis=0)])
     sums = np.concatenate([np.zeros((1, 5)), np.cumsum(e, axis=0)])
@@ -62,7 +59,7 @@ def statistics(course: Course, which: int, dt: float, begin: int = 0) -> FloatAr
     for length in lengths(dt):
         at = np.arange(1, rows + 1)
         before = np.maximum(at - length, 0)
-        missing = np.clip(length - (at - begin), 0, length)[:, None]
+        missing = np.maximum(length - at, 0)[:, None]
         energy.append(np.sqrt(np.maximum(squares[at] - squares[before] + missing, 0.0) / length))
         mean.append(np.abs(sums[at] - sums[before]) / length)
     known = np.maximum(np.abs(course.disturbance[which]) - UNSURE * course.deviation[which], 0.0)

@@ -17,6 +17,7 @@ from casadi_models.term import HANGING, LOAD_COMPLIANCE
 from identification.balance.balances import Balances, balances_of
 from identification.balance.calibration import bare, is_of_run, names_of_runs, usual
 from identification.balance.dataset import Dataset, load_dataset, prepared_model, weak_record
+from identification.balance.noise import effective_share
 from identification.balance.stacked import (
     Stacked,
     floor_rows,
@@ -203,16 +204,19 @@ def _fitted(
         tell(("first pass", "second pass")[number], 0.2 + 0.35 * number)
         sigma = _sigmas(model, data, values)
         weights = row_weights(balances, data, values, sigma, data.train)
-        values, used = WeakForm(balances, data, values, tuple(free), weights, known_before).fitted(
+        before = _beside(known_before, _independent(balances, data, values))
+        values, used = WeakForm(balances, data, values, tuple(free), weights, before).fitted(
             limits, iterations
         )
     sigma = _sigmas(model, data, values)
     weights = row_weights(balances, data, values, sigma, data.train)
     tell("standard errors", 0.9)
-    problem = WeakForm(balances, data, values, tuple(free), weights, known_before)
+    share = _independent(balances, data, values)
+    before = _beside(known_before, share)
+    problem = WeakForm(balances, data, values, tuple(free), weights, before)
     values, noise = unbiased(problem, limits)
     problem = replace(problem, values=values)
-    found = _with_errors(problem, limits, sigma, used, noise)
+    found = _with_errors(problem, limits, sigma, used, noise=noise, share=share)
     return replace(found, unidentified=(*found.unidentified, *unseen))
 
 
@@ -286,7 +290,9 @@ def stepped(
     values, free, limits, _ = _posed(model, data, start, held)
     balances = balances_of(model, data.sensing, wrt=bare(free))
     known_before = usual(model, data.train, torque=data.sensing.has_torque)
-    problem = WeakForm(balances, data, values, tuple(free), like.weights, known_before)
+    theirs = balances_of(like.model, data.sensing, wrt=())
+    before = _beside(known_before, _independent(theirs, data, like.values))
+    problem = WeakForm(balances, data, values, tuple(free), like.weights, before)
     values, used = problem.fitted(limits, iterations)
     rows = problem.residual(np.array([values[n] for n in free]))
     own = {n: x for n, x in values.items() if not is_of_run(n)}
@@ -330,6 +336,22 @@ def _at_bound(
         )
         and n not in smoothing
     )
+
+
+def _independent(balances: Balances, data: Dataset, values: Mapping[str, float]) -> float:
+    """Share of the rows that count as independent beside what is known beforehand: a residual with
+    structure repeats itself from row to row.
+    """
+    bare_ones = balances_of(balances.model, data.sensing, wrt=())
+    residual = stack(bare_ones, data.train, values).residual
+    return min(effective_share(r[taking_part(b, data.train)]) for b, r in residual.items())
+
+
+def _beside(
+    known: Mapping[str, tuple[float, float]], share: float
+) -> dict[str, tuple[float, float]]:
+    """What is known beforehand, as heavy as that share of the rows makes it."""
+    return {n: (middle, size * math.sqrt(share)) for n, (middle, size) in known.items()}
 
 
 def _sigmas(model: JointModel, data: Dataset, values: Mapping[str, float]) -> dict[str, float]:
@@ -421,7 +443,9 @@ def _with_errors(
     limits: Mapping[str, tuple[float, float]],
     sigma: Mapping[str, float],
     used: int,
+    *,
     noise: NoiseProducts,
+    share: float,
 ) -> Solution:
     """Standard errors from blocks of time, without what noise adds to the columns; what cannot be
     identified is said.
@@ -466,7 +490,8 @@ def _with_errors(
         grams, scores = noise.by_block(weights, stacked.block)
         apart = (grams[:, index][:, :, index] / unit, scores[:, index] / norms[index])
         errors = block_errors(scaled, r, block, apart, whole)
-        unsure = known_errors(whole, prior[:, index] / norms[index])
+        # rows of the prior were made heavier by the share; they scatter as the prior itself does
+        unsure = known_errors(whole, prior[:, index] / norms[index]) / math.sqrt(share)
         size = None if errors is None else np.hypot(errors, unsure) / norms[index]
         spread, corr = correlations(scaled.T @ scaled)
         corr[:, [is_of_run(free[i]) for i in index.tolist()]] = 0.0

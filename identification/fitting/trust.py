@@ -55,8 +55,8 @@ class Trusted:
     stderr : float or None
         As the fit states it, from blocks.
     low, high : float or None
-        95 % interval: from the standard error; for shapes from a profile, with the larger of the
-        errors from blocks and from white rows.
+        95 % interval, from the larger of the errors from blocks and from white rows; for shapes
+        from a profile.
     records, windows : tuple of (float or None)
         Value on each training record and in each of `WINDOWS` windows, where these tell it.
     partner : str or None
@@ -249,9 +249,8 @@ class _Judge:
         if not math.isfinite(white):
             return replace(bare_one, why="flat: no value of it is worse than another")
         stated = white if from_blocks is None else from_blocks
-        # few blocks tell of a shape and may agree by chance; of all others white rows say too
-        # little: the noise of accelerations has no slow part
-        error = max(stated, white) if p.is_shape else stated
+        # blocks may agree by chance, and what the model's form takes off shows in none of them
+        error = max(stated, white)
         low, high = value - NORMAL * error, value + NORMAL * error
         if p.is_shape and profiles and error < abs(value):
             low, high = self._profiled(p.name, error, error / white)

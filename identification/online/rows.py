@@ -44,7 +44,8 @@ def linear_parameters(
     names = model.parameter_names
     edges: dict[int, set[int]] = {i: set() for i in range(len(names))}
     for row in ca.vertsplit(stacked):
-        for i, j in zip(*ca.hessian(row, p)[0].sparsity().get_triplet(), strict=True):
+        # a comparison has a derivative that is zero everywhere: no edge
+        for i, j in zip(*ca.sparsify(ca.hessian(row, p)[0]).sparsity().get_triplet(), strict=True):
             edges[i].add(j)
     present = set(ca.jacobian(stacked, p).sparsity().get_triplet()[1])
     chosen = {i for i in present if i not in edges[i] and names[i] not in held}

@@ -7,7 +7,7 @@ from typing import Final, final
 
 import numpy as np
 
-from identification.balance.weak import differentiated_kernel, kernel
+from identification.balance.weak import differentiated_kernel, kernel, whole
 
 _LENGTH: Final = 0.06
 _OVERLAP: Final = 4
@@ -48,8 +48,8 @@ class Timing:
         """The lengths that the off-line fit uses at this sample time."""
         length = max(_LENGTH, 8 * dt)
         pointwise = max(length / 2 if length <= _LENGTH else 0.06, 6 * dt)
-        step = max(1, round(_POINT_STEP / dt))
-        stride = max(step, round(length / dt / _OVERLAP / step) * step)
+        step = max(1, whole(_POINT_STEP / dt))
+        stride = max(step, whole(length / dt / _OVERLAP / step) * step)
         half = len(differentiated_kernel(length, dt, 3)) // 2
         point_half = len(differentiated_kernel(length, dt * step, 0)) // 2
         own = len(kernel(pointwise, dt, 3)) // 2

@@ -15,7 +15,7 @@ from casadi_models import EFFECTS
 from identification.balance.balances import balances_of
 from identification.balance.calibration import names_of_runs
 from identification.balance.dataset import Dataset
-from identification.balance.stacked import INDEPENDENT_SHARE, row_weights
+from identification.balance.stacked import INDEPENDENT_SHARE, row_weights, stack
 from identification.balance.weak import REST_SHARE, RESTING_SIDES, WeakRecord
 from identification.diagnosis.candidates import offered
 from identification.diagnosis.trials import Trial, make_base, try_candidate
@@ -105,13 +105,24 @@ class Contest:
 
     def __init__(self, rivals: Sequence[Rival], data: Dataset) -> None:
         self.rivals, self.data = tuple(rivals), data
-        leader = min(self.rivals, key=lambda r: self._cost(r.solution))
-        self.leader = leader
-        self._old = [self._rows(r, data, leader.solution.weights) for r in self.rivals]
+        # each row by the largest scatter that one of them allows it, to find who fits best
+        common = {
+            b: np.minimum.reduce([r.solution.weights[b] for r in self.rivals])
+            for b in self.rivals[0].solution.weights
+        }
+        costs = [self._cost(r, common) for r in self.rivals]
+        self.leader = self.rivals[int(np.argmin(costs))]
+        self._old = [self._rows(r, data, self.leader.solution.weights) for r in self.rivals]
 
-    def _cost(self, solution: Solution) -> float:
-        rows = {b: len(w) for b, w in solution.weights.items()}
-        return sum(n * math.log(max(solution.sigma[b], 1e-300)) for b, n in rows.items())
+    def _cost(self, rival: Rival, weights: Mapping[str, FloatArray]) -> float:
+        """Log-likelihood of the balances but for its sign, each with a scatter of its own."""
+        model = rival.solution.model
+        balances = balances_of(model, self.data.sensing, wrt=())
+        left = stack(balances, self.data.train, rival.solution.values).residual
+        return sum(
+            len(r) * math.log(max(float(np.linalg.norm(r * weights[b])), 1e-300))
+            for b, r in left.items()
+        )
 
     def _rows(
         self, rival: Rival, data: Dataset, weights: Mapping[str, FloatArray]

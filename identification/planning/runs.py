@@ -137,12 +137,17 @@ def _rounded(path: FloatArray, width: int) -> FloatArray:
 
 def _multisine(time: FloatArray, half: float, speed: float) -> FloatArray:
     """Eight sines from one period of the run to 2 Hz, amplitude falling with frequency."""
-    lowest = 1.0 / max(float(time[-1]), 1.0)
-    frequency = np.geomspace(1.3 * lowest, 2.0, 8)
+    count, dt = len(time), float(time[1] - time[0])
+    frequency = np.geomspace(1.3 / max(count * dt, 1.0), 2.0, 8)
     phase = 2.399963 * np.arange(8) ** 2  # the golden angle: no two phases alike
-    path = np.sin(2 * np.pi * frequency[:, None] * time + phase[:, None]).T @ (1 / frequency)
-    path = path - path[0]
-    rate = float(np.abs(np.diff(path)).max()) / float(time[1] - time[0])
+    # twice as long, to begin where it crosses the middle of its range
+    longer = np.arange(2 * count) * dt
+    path = np.sin(2 * np.pi * frequency[:, None] * longer + phase[:, None]).T @ (1 / frequency)
+    path = path - (float(path.max()) + float(path.min())) / 2
+    crossings = np.flatnonzero(np.diff(np.sign(path[: count + 1])))
+    begin = int(crossings[0]) if len(crossings) else 0
+    path = path[begin : begin + count]
+    rate = float(np.abs(np.diff(path)).max()) / dt
     return np.asarray(path * min(half / float(np.abs(path).max()), speed / rate))
 
 

@@ -13,6 +13,7 @@ from identification.variants.refit import Refit
 from identification.variants.screen import PER_PARAMETER
 
 FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
 
 DRAWS: Final = 300
 """Resamplings of the blocks: enough for a 5 % quantile to a percent."""
@@ -48,8 +49,8 @@ class Judged:
         The 5 % quantile of score less that of the best, over resampled blocks: a tie up to 0.
     chosen : (variants,) array
         Share of the resamplings in which the variant is the best.
-    windows : tuple of int
-        The best variant of each part of the records.
+    windows, records : tuple of int
+        The best variant of each part of the records, and of each record alone.
     """
 
     best: int
@@ -57,6 +58,7 @@ class Judged:
     behind: FloatArray
     chosen: FloatArray
     windows: tuple[int, ...]
+    records: tuple[int, ...] = ()
 
 
 def score_of(squares: FloatArray, rows: FloatArray, parameters: FloatArray) -> FloatArray:
@@ -74,7 +76,9 @@ def score_of(squares: FloatArray, rows: FloatArray, parameters: FloatArray) -> F
     )
 
 
-def judged(refits: Sequence[Refit], whole: Sequence[bool]) -> Judged:
+def judged(
+    refits: Sequence[Refit], whole: Sequence[bool], records: Sequence[IntArray] = ()
+) -> Judged:
     """Hold variants against each other on the same blocks.
 
     Parameters
@@ -82,6 +86,8 @@ def judged(refits: Sequence[Refit], whole: Sequence[bool]) -> Judged:
     refits : sequence of Refit
     whole : sequence of bool
         Which of them have every effect of the joint's own model: one of these is the best.
+    records : sequence of (blocks,) int array
+        Blocks of each record.
     """
     squares = np.array([r.squares for r in refits])
     rows = np.array([r.rows for r in refits])
@@ -104,11 +110,12 @@ def judged(refits: Sequence[Refit], whole: Sequence[bool]) -> Judged:
         for part in np.array_split(used, min(WINDOWS, len(used)))
         if len(part)
     )
-    return Judged(best, score, behind, chosen, windows)
+    alone = tuple(int(np.argmin(aside + _on(part, squares, rows, parameters))) for part in records)
+    return Judged(best, score, behind, chosen, windows, alone)
 
 
 def _on(
-    blocks: npt.NDArray[np.int64], squares: FloatArray, rows: FloatArray, parameters: FloatArray
+    blocks: IntArray, squares: FloatArray, rows: FloatArray, parameters: FloatArray
 ) -> FloatArray:
     """Scores on some of the blocks."""
     return score_of(squares[:, blocks].sum(axis=1), rows[:, blocks].sum(axis=1), parameters)
@@ -148,11 +155,17 @@ def tied_with_best(
 
 
 def front_of(parameters: Sequence[int], error: Sequence[float]) -> list[int]:
-    """Variants on the front of error against parameters, the fewest parameters first."""
+    """Variants on the front of error against parameters, the fewest parameters first.
+
+    Each is better than all with fewer parameters; those that are as good with as many parameters
+    stand side by side.
+    """
     out: list[int] = []
     lowest = np.inf
-    for k in sorted(range(len(error)), key=lambda i: (parameters[i], error[i])):
-        if error[k] < lowest * (1 - FRONT_LEAST):
-            out.append(k)
-            lowest = error[k]
+    for count in sorted(set(parameters)):
+        here = sorted((k for k, p in enumerate(parameters) if p == count), key=lambda k: error[k])
+        best = error[here[0]]
+        if best < lowest * (1 - FRONT_LEAST):
+            out += [k for k in here if error[k] <= best * (1 + FRONT_LEAST)]
+            lowest = best
     return out

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -44,7 +45,7 @@ class Variant:
     added, dropped : tuple of str
         Labels beyond those of the joint's own model, and those of it that it lacks.
     parameters : int
-        Free parameters, without nuisances.
+        Free parameters, without nuisances; of a learned curve its effective number, rounded up.
     relative_error_percent : float
         On held-out records, as `compare` gives it.
     error_percent : float
@@ -53,7 +54,8 @@ class Variant:
     score : float
         On blocks that its fit did not see, those of the held-out records among them (see
         :data:`identification.variants.screen.PER_PARAMETER`), less that of the recommended one;
-        below 0 for a variant that lacks an effect of the joint's own model.
+        below 0 for one that lacks an effect of the joint's own model; NaN for one with learned
+        curves, which are chosen by a cross-validation of their own.
     tied : bool
         Recommended, or not to be told from it with every effect of the joint's own model in it.
     chosen_percent : float
@@ -157,6 +159,8 @@ class Exploration:
         Not to be told from it on these records, the best first.
     windows : tuple of str
         Name of the best variant in each part of the records, one after the other.
+    by_record : tuple of (str, str)
+        Each record, and the name of the variant that is the best on it alone.
     stand_ins : tuple of StandIn
     improvement : Improvement
         What `improve` decides on the same records.
@@ -179,6 +183,7 @@ class Exploration:
     recommended: Variant
     ties: tuple[Variant, ...]
     windows: tuple[str, ...]
+    by_record: tuple[tuple[str, str], ...]
     stand_ins: tuple[StandIn, ...]
     improvement: Improvement
     improved: Variant | None
@@ -235,6 +240,7 @@ class Exploration:
             "ties": [list(v.labels) for v in self.ties],
             "stability": {
                 "windows": list(self.windows),
+                "records": [{"record": r, "best": name} for r, name in self.by_record],
                 "resampled_percent": self.recommended.chosen_percent,
             },
             "stand_ins": [s.as_json() for s in self.stand_ins],
@@ -327,6 +333,10 @@ def agreement_of(
     )
 
 
+def _score(v: Variant) -> str:
+    return "-" if math.isnan(v.score) else f"{v.score:.2f}"
+
+
 def table_of(found: Exploration, most: int = PRINTED) -> list[str]:
     """The result as lines: a table 100 characters wide, then sentences.
 
@@ -337,7 +347,10 @@ def table_of(found: Exploration, most: int = PRINTED) -> list[str]:
         Variants of the table, beside the start model and the choice of `improve`.
     """
     chosen = list(found.variants[:most])
-    chosen += [v for v in (found.improved, found.start) if v is not None and v not in chosen]
+    curves = [v for v in found.variants if math.isnan(v.score)]
+    chosen += [
+        v for v in (found.improved, found.start, *curves) if v is not None and v not in chosen
+    ]
     lines = [
         f"{'':3}{'variant':<{NAME}}{'par.':>5}{'held-out %':>11}{'of start':>9}"
         f"{'score':>7}{'best in':>8}"
@@ -348,7 +361,7 @@ def table_of(found: Exploration, most: int = PRINTED) -> list[str]:
         name, *more = textwrap.wrap(v.name, NAME - 1, break_on_hyphens=False)
         lines.append(
             f"{mark:<3}{name:<{NAME}}{v.parameters:>5}{v.relative_error_percent:>11.3f}"
-            f"{v.error_percent:>7.1f} %{v.score:>7.2f}{v.chosen_percent:>6.0f} %"
+            f"{v.error_percent:>7.1f} %{_score(v):>7}{v.chosen_percent:>6.0f} %"
         )
         lines += [f"{'':5}{line}" for line in more]
     lines += [

@@ -14,6 +14,7 @@ import numpy as np
 
 from casadi_models import JointModel
 from casadi_models.transmission import MODELS
+from identification.balance.balances import Balances
 from identification.balance.calibration import unknowns_of
 from identification.balance.dataset import visible_labels, without
 from identification.balance.sensing import sense
@@ -22,6 +23,7 @@ from identification.data.record import Record
 from identification.diagnosis.bench import Progress
 from identification.diagnosis.candidates import NotTestable
 from identification.diagnosis.improvement import Improvement
+from identification.diagnosis.learned import with_curves
 from identification.diagnosis.session import Session
 from identification.errors import InputError
 from identification.fitting.engine import Solution, reweighed
@@ -35,7 +37,16 @@ from identification.variants.lattice import (
     missing_from,
     nodes_of,
 )
-from identification.variants.refit import Refit, Weighting, physical, refitted, with_size
+from identification.variants.refit import (
+    Held,
+    Refit,
+    Weighting,
+    blocks_of,
+    held_of,
+    physical,
+    refitted,
+    with_size,
+)
 from identification.variants.screen import LARGEST, PER_PARAMETER, Scored, Screen
 
 SHOWN: Final = 40
@@ -50,7 +61,7 @@ FIRST: Final = 3
 ROUNDS: Final = 2
 """Expansions about a fitted variant with further parts."""
 FURTHER: Final = 2
-"""Parts that are tried at once beside the best variant."""
+"""Parts that are tried at once to find the point of expansion, and beside the best variant."""
 
 
 def explore(
@@ -114,8 +125,9 @@ class _Search:
         last = improvement.steps[-1].solution
         last = replace(last, model=with_size(last, added_to(self.start.model, last.model)))
         self.last = self._mark(last.model)
-        first = self._screen(self.start, nodes, {}, 0.0)
-        ranked = first.search()
+        laws: dict[tuple[str, bool | None], Balances] = {}
+        first = self._screen(self.start, nodes, {}, 0.0, laws=laws)
+        ranked = first.search(FURTHER)
         self._fit(self.start.model, self.start.values)
         self._fit(last.model, last.values)
         for scored in itertools.islice(first.worth(ranked), FIRST):
@@ -127,11 +139,12 @@ class _Search:
             like = reweighed(best.solution, self.data)
             self.weighting = Weighting.of(like, self.data)
             self.found.clear()
-            screen = self._screen(_restricted(self.start, like), nodes, _shapes(like), 0.3)
-            ranked = screen.search()
+            screen = self._screen(
+                _restricted(self.start, like), nodes, _shapes(like), 0.3, laws=laws
+            )
             self._fit(self.start.model, {**like.values, **self.start.values})
             self._fit(last.model, {**like.values, **last.values})
-        self._fit_chosen(screen, ranked, best.solution.values)
+        self._fit_chosen(screen, screen.search(), best.solution.values)
         for _ in range(ROUNDS):
             if not self._grown():
                 break
@@ -148,9 +161,17 @@ class _Search:
         nodes: Sequence[Node],
         more: Mapping[str, Mapping[str, float]],
         share: float,
+        *,
+        laws: dict[tuple[str, bool | None], Balances] | None = None,
     ) -> Screen:
         base = self.session.bench.base(solution)
-        return Screen(base, nodes, more, lambda text, part: self.progress(text, share + 0.2 * part))
+        return Screen(
+            base,
+            nodes,
+            more,
+            laws=laws,
+            progress=lambda text, part: self.progress(text, share + 0.2 * part),
+        )
 
     def _fit(self, model: JointModel, *starts: Mapping[str, float], name: str = "") -> None:
         """Fit a variant once; one whose parts are none is passed over."""
@@ -159,7 +180,7 @@ class _Search:
             return
         refit = refitted(model, self.data, starts, self.weighting)
         added = added_to(self.start.model, model)
-        if not np.all(np.isfinite(refit.held)) or physical(refit, added, self.data):
+        if not np.all(np.isfinite(refit.held.rms)) or physical(refit, added, self.data):
             return
         self.found[mark] = refit
         if name:
@@ -268,7 +289,7 @@ class _Search:
         refits, marks = list(self.found.values()), list(self.found)
         own = self.found[self._mark(self.start.model)]
         whole = [self._whole(r) for r in refits]
-        scores = judged(refits, whole)
+        scores = judged(refits, whole, blocks_of(self.data))
         best = scores.best
         parts = [frozenset(visible_labels(r.solution.model)) for r in refits]
         tied = tied_with_best(scores, whole, parts)
@@ -279,8 +300,8 @@ class _Search:
                 added=added_to(self.start.model, refit.solution.model),
                 dropped=missing_from(self.start.model, refit.solution.model),
                 parameters=refit.parameters,
-                relative_error_percent=refit.relative_error_percent,
-                error_percent=100 * float(np.exp(np.mean(np.log(refit.held / own.held)))),
+                relative_error_percent=refit.held.relative_error_percent,
+                error_percent=_of_start(refit.held, own.held),
                 score=float(scores.score[k] - scores.score[best]),
                 tied=tied[k],
                 chosen_percent=100 * float(scores.chosen[k]),
@@ -288,9 +309,11 @@ class _Search:
             )
             for k, (mark, refit) in enumerate(zip(marks, refits, strict=True))
         ]
-        front = front_of([v.parameters for v in variants], [v.error_percent for v in variants])
+        curve = self._curved(improvement, own)
+        shown = [*variants, *([curve] if curve is not None else [])]
+        front = front_of([v.parameters for v in shown], [v.error_percent for v in shown])
         order = sorted(range(len(variants)), key=lambda k: (not whole[k], scores.score[k]))
-        balances = refits[0].held.size
+        balances = own.held.rms.size
         recommended = variants[best]
         stand_ins = []
         for k in order:
@@ -307,12 +330,20 @@ class _Search:
         return Exploration(
             self.session.joint,
             self.data,
-            variants=tuple(variants[k] for k in order),
+            variants=(*(variants[k] for k in order), *shown[len(variants) :]),
             screened=self.screened,
-            front=tuple(variants[k] for k in front),
+            front=tuple(shown[k] for k in front),
             recommended=recommended,
             ties=tuple(variants[k] for k in order if tied[k]),
             windows=tuple(variants[k].name for k in scores.windows),
+            by_record=tuple(
+                (name, variants[k].name)
+                for name, k in zip(
+                    (*self.data.train_names, *self.data.held_out_names),
+                    scores.records,
+                    strict=True,
+                )
+            ),
             stand_ins=tuple(stand_ins),
             improvement=improvement,
             improved=improved,
@@ -326,6 +357,34 @@ class _Search:
             ),
         )
 
+    def _curved(self, improvement: Improvement, own: Refit) -> Variant | None:
+        """The last model of `improve` with its learned curves, where they lower the error: what no
+        name explains.
+        """
+        last = improvement.steps[-1].solution
+        refit = self.found.get(self.last)
+        if not improvement.learned or refit is None:
+            return None
+        solution = with_curves(last, improvement.learned)
+        held = held_of(solution, self.data, self.weighting)
+        if not _of_start(held, refit.held) < 100:  # no curve beyond the steady rows it was drawn on
+            return None
+        freedom = sum(c.curve.freedom for c in improvement.learned)
+        added = added_to(self.start.model, solution.model)
+        return Variant(
+            " ".join(f"+ {label}" for label in added),
+            visible_labels(solution.model),
+            added=added,
+            dropped=(),
+            parameters=refit.parameters + math.ceil(freedom),
+            relative_error_percent=held.relative_error_percent,
+            error_percent=_of_start(held, own.held),
+            score=math.nan,
+            tied=False,
+            chosen_percent=0.0,
+            solution=solution,
+        )
+
     def _name(self, refit: Refit, name: str) -> str:
         model = refit.solution.model
         if name:
@@ -334,6 +393,13 @@ class _Search:
         dropped = missing_from(self.start.model, model)
         told = [f"+ {label}" for label in added] + [f"- {label}" for label in dropped]
         return " ".join(told) or "start model"
+
+
+def _of_start(held: Held, start: Held) -> float:
+    """Held-out error in percent of that of the joint's own model, mean of the balances'
+    logarithms.
+    """
+    return 100 * float(np.exp(np.mean(np.log(held.rms / start.rms))))
 
 
 def _restricted(start: Solution, like: Solution) -> Solution:

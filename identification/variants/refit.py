@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final, final
+from typing import Any, Final, final
 
 import numpy as np
 import numpy.typing as npt
@@ -52,6 +52,27 @@ class Weighting:
 
 @final
 @dataclass(frozen=True)
+class Held:
+    """Errors on the held-out records.
+
+    Attributes
+    ----------
+    squares, rows : (blocks, balances) arrays
+        Weighted squares of each block, and how many rows it has.
+    rms : (balances,) array
+        In the units of the weights.
+    relative_error_percent : float
+        100 norm(residual) / norm(measured).
+    """
+
+    squares: FloatArray
+    rows: FloatArray
+    rms: FloatArray
+    relative_error_percent: float
+
+
+@final
+@dataclass(frozen=True)
 class Refit:
     """A fitted variant and its errors.
 
@@ -63,18 +84,14 @@ class Refit:
     squares, rows : (blocks, balances) arrays
         Squares of each block that the fit did not see, and how many rows it has: of the training
         records by cross-validation, then those of the held-out records.
-    held : (balances,) array
-        RMS on held-out records, in the units of the weights.
-    relative_error_percent : float
-        100 norm(residual) / norm(measured) on held-out records.
+    held : Held
     """
 
     solution: Solution
     cost: float
     squares: FloatArray
     rows: FloatArray
-    held: FloatArray
-    relative_error_percent: float
+    held: Held
 
     @property
     def parameters(self) -> int:
@@ -99,24 +116,36 @@ def refitted(
     )
     solution, cost = found
     base = make_base(solution, data)
-    own = base.crossed, base.numbers.astype(np.float64)
-    balances = balances_of(solution.model, data.sensing, wrt=())
+    seen = held_of(solution, data, weighting)
+    return Refit(
+        solution,
+        cost,
+        np.vstack([_padded(base.crossed, data.blocks), seen.squares]),
+        np.vstack([_padded(base.numbers, data.blocks), seen.rows]),
+        seen,
+    )
+
+
+def _padded(found: npt.NDArray[Any], blocks: int) -> FloatArray:
+    """With a row of zeros for each of the last blocks in which no row takes part."""
+    return np.vstack([found, np.zeros((blocks - len(found), found.shape[1]))])
+
+
+def held_of(solution: Solution, data: Dataset, weighting: Weighting) -> Held:
+    """Errors of a model with its values on the held-out records."""
+    model = solution.model
+    balances = balances_of(model, data.sensing, wrt=())
     values = settled(model, data.sensing, [*data.train, *data.held_out], solution.values)
     residual = stack(balances, data.held_out, values).residual
     taking = {b: taking_part(b, data.held_out) for b in balances.balances}
     measured = references(data, data.held_out)
     left = np.concatenate([residual[b][taking[b]] for b in balances.balances])
     size = np.concatenate([measured[b][taking[b]] for b in balances.balances])
-    seen = _by_block(data, residual, weighting)
-    return Refit(
-        solution,
-        cost,
-        np.vstack([own[0], seen[0]]),
-        np.vstack([own[1], seen[1]]),
-        np.array(
-            [rms((residual[b] * weighting.held[b])[taking[b]]) for b in balances.balances],
-            dtype=np.float64,
-        ),
+    squares, rows = _by_block(data, residual, weighting)
+    return Held(
+        squares,
+        rows,
+        np.array([rms((residual[b] * weighting.held[b])[taking[b]]) for b in balances.balances]),
         100 * float(np.linalg.norm(left)) / (float(np.linalg.norm(size)) or 1e-300),
     )
 
@@ -135,6 +164,15 @@ def _by_block(
         squares.append(np.bincount(place, taking * weighted**2, len(which)))
         rows.append(np.bincount(place, taking, len(which)))
     return np.array(squares, dtype=np.float64).T, np.array(rows, dtype=np.float64).T
+
+
+def blocks_of(data: Dataset) -> tuple[npt.NDArray[np.int64], ...]:
+    """The blocks of each record, training and held-out, as :class:`Refit` counts them."""
+    first = data.blocks
+    held = np.unique(np.concatenate([w.block[w.block >= 0] for w in data.held_out]))
+    out = [np.unique(w.block[w.block >= 0]) for w in data.train]
+    out += [first + np.searchsorted(held, np.unique(w.block[w.block >= 0])) for w in data.held_out]
+    return tuple(out)
 
 
 def with_size(solution: Solution, added: tuple[str, ...]) -> JointModel:

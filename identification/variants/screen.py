@@ -18,7 +18,7 @@ from typing import Final, final
 import numpy as np
 import numpy.typing as npt
 
-from identification.balance.balances import balances_of
+from identification.balance.balances import Balances, balances_of
 from identification.diagnosis.candidates import shape_grid
 from identification.diagnosis.trials import COLLINEAR, Base, columns
 from identification.fitting.signed_fit import part_inverse
@@ -99,6 +99,8 @@ class Screen:
         Parts that may be added.
     more : mapping of (str, str) to float
         Shapes beside those of the grids, by label of the part: where a refined fit found them.
+    laws : dict of (str, bool or None) to Balances, optional
+        Laws of the parts, compiled once for several screens; filled here.
     progress : callable, optional
         ``progress(text, share)``.
     """
@@ -108,6 +110,8 @@ class Screen:
         base: Base,
         nodes: Sequence[Node],
         more: Mapping[str, Mapping[str, float]],
+        *,
+        laws: dict[tuple[str, bool | None], Balances] | None = None,
         progress: Callable[[str, float], None] | None = None,
     ) -> None:
         self.base = base
@@ -122,7 +126,8 @@ class Screen:
             points = list(shape_grid(node.candidate, base.data))
             if node.label in more:
                 points.append(dict(more[node.label]))
-            found = [(p, c) for p in points if (c := _columns(node, base, p)) is not None]
+            law = _law(node, base, {} if laws is None else laws)
+            found = [(p, c) for p in points if (c := _columns(node, base, p, law)) is not None]
             if not found:
                 continue
             low = {p.name: p.low for p in node.candidate.model.parameters}
@@ -345,14 +350,24 @@ class Screen:
         return sorted(out, key=lambda s: s.score)
 
 
-def _columns(node: Node, base: Base, shapes: Mapping[str, float]) -> FloatArray | None:
+def _law(node: Node, base: Base, laws: dict[tuple[str, bool | None], Balances]) -> Balances:
+    """Balances of the model with a part, with columns of its amplitudes."""
+    mark = node.label, node.form
+    if mark not in laws:
+        candidate = node.candidate
+        laws[mark] = balances_of(
+            candidate.model, base.data.sensing, wrt=candidate.amplitudes, columns_only=True
+        )
+    return laws[mark]
+
+
+def _columns(
+    node: Node, base: Base, shapes: Mapping[str, float], balances: Balances
+) -> FloatArray | None:
     """Weighted columns of a part at one point of its grid; None where nothing of them lies outside
     the base.
     """
     candidate = node.candidate
-    balances = balances_of(
-        candidate.model, base.data.sensing, wrt=candidate.amplitudes, columns_only=True
-    )
     raw = columns(candidate, base, shapes, base.data.train, balances) * base.weight[:, None]
     size = np.linalg.norm(raw, axis=0)
     if not np.all(np.isfinite(raw)) or size.max(initial=0.0) <= 0:

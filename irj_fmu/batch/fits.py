@@ -32,16 +32,14 @@ from identification import __version__
 from identification.data.plain_text import from_toml
 from identification.data.schema import refuse_unknown
 from identification.errors import InputError
-from irj_fmu.batch.checks import flag, names, table
+from irj_fmu.batch.checks import names, table
 from irj_fmu.batch.fit_worker import Answer, Parcel, answered
+from irj_fmu.batch.study_schema import FIT_JOINT, FIT_STUDY
 from irj_fmu.batch.worker import enter
 from irj_fmu.command_line import finite, replace_file
 
-TASKS: Final = ("fit", "improve", "explore")
 SUMMARY: Final = "summary.csv"
 PARAMETERS: Final = "parameters.csv"
-_STUDY_KEYS: Final = ("name", "task")
-_JOINT_KEYS: Final = ("name", "joint", "records", "held_out", "each")
 DIED: Final = "the process that did this job died, each time it was tried"
 
 Progress = Callable[[int, int], None]
@@ -140,10 +138,7 @@ def load_fit_study(path: str | Path) -> FitStudy:
     data = from_toml(source.read_text(encoding="utf-8-sig"), where)
     refuse_unknown(data, ("study", "joint"), f"{where}: a study with a task")
     study = table(data, "study", where)
-    refuse_unknown(study, _STUDY_KEYS, f"{where}: [study]")
-    task = study.get("task")
-    if task not in TASKS:
-        raise InputError(f"{where}: [study] task = {task!r}; use one of {', '.join(TASKS)}")
+    given = FIT_STUDY.read(study, f"{where}: [study]")
     entries = data.get("joint")
     if not isinstance(entries, list) or not entries:
         raise InputError(
@@ -156,7 +151,7 @@ def load_fit_study(path: str | Path) -> FitStudy:
             f"{where}: two joints are called {min(twice)!r}; give each a name of its own"
         )
     return FitStudy(
-        source, " ".join(str(study.get("name", source.stem)).split()), str(task), tuple(jobs)
+        source, " ".join((given["name"] or source.stem).split()), given["task"], tuple(jobs)
     )
 
 
@@ -164,8 +159,8 @@ def _jobs(entry: Any, number: int, source: Path) -> Iterator[Job]:
     where = f"{source}: [[joint]] {number}"
     if not isinstance(entry, Mapping):
         raise InputError(f"{where}: must be a table; write [[joint]] on a line of its own")
-    refuse_unknown(entry, _JOINT_KEYS, where)
-    file = entry.get("joint")
+    given = FIT_JOINT.read(entry, where)
+    file = given["joint"]
     if not isinstance(file, str) or not (source.parent / file).is_file():
         raise InputError(f"{where}: joint = {file!r}; give the path of a joint file")
     records = _files(entry, "records", where, source.parent)
@@ -177,9 +172,9 @@ def _jobs(entry: Any, number: int, source: Path) -> Iterator[Job]:
         raise InputError(
             f"{where}: {both[0]} is among records and held_out; a record can have one role only"
         )
-    name = str(entry.get("name", Path(file).stem))
+    name = given["name"] or Path(file).stem
     joint = source.parent / file
-    if not flag(entry, "each", where, False):
+    if not given["each"]:
         yield Job(name, joint, records, held)
         return
     for record in records:

@@ -10,6 +10,7 @@ FORMATS: Final = ("npz", "csv", "none")
 KINDS: Final = ("plant", "estimator")
 METHODS: Final = ("independent", "latin")
 SPACINGS: Final = ("linear", "log")
+TASKS: Final = ("fit", "improve", "explore")
 
 STUDY: Final = Schema(
     "[study]",
@@ -129,7 +130,40 @@ DRAW: Final = Schema(
     ),
 )
 
-PAGES: Final = (STUDY, MODEL, RECORDS, INPUT, COMPARE, AXIS, CASE, RANDOM, DRAW)
+FIT_STUDY: Final = Schema(
+    "[study] with a task",
+    "Joints are fitted to records in place of being simulated. Beside it only [[joint]] may stand.",
+    (
+        Key("name", "label", "name in the messages", absent="the file's name"),
+        Key("task", "text", "what is done with each joint", choices=TASKS, required=True),
+    ),
+)
+
+FIT_JOINT: Final = Schema(
+    "[[joint]]",
+    "One joint with its records, as often as there are joints.",
+    (
+        Key("name", "label", "name in the table", absent="the file's name"),
+        Key("joint", "any", "the joint file", form="text", required=True),
+        Key("records", "any", "training records, `*` and `?` too", form="list", required=True),
+        Key("held_out", "any", "records that the fit must not see", form="list of texts"),
+        Key("each", "flag", "each record is a job of its own", default=False),
+    ),
+)
+
+PAGES: Final = (
+    STUDY,
+    MODEL,
+    RECORDS,
+    INPUT,
+    COMPARE,
+    AXIS,
+    CASE,
+    RANDOM,
+    DRAW,
+    FIT_STUDY,
+    FIT_JOINT,
+)
 """The tables in the order of the reference page."""
 TABLES: Final = ("study", "model", "records", "inputs", "compare", "grid", "case", "random")
 
@@ -138,6 +172,8 @@ __all__ = [
     "CASE",
     "COMPARE",
     "DRAW",
+    "FIT_JOINT",
+    "FIT_STUDY",
     "FORMATS",
     "INPUT",
     "KINDS",
@@ -149,4 +185,5 @@ __all__ = [
     "SPACINGS",
     "STUDY",
     "TABLES",
+    "TASKS",
 ]

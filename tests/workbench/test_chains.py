@@ -22,6 +22,8 @@ import pytest
 
 from casadi_models import EFFECTS
 from tests.identification.data.test_own_effects import KEY, OWN
+from tests.irj_fmu.imported.test_user_fmu import FILE, axis
+from tests.user_fmus.make import Make, build
 
 pytest.importorskip("starlette")
 
@@ -151,8 +153,9 @@ def test_a_motion_is_planned_for_the_improved_joint(demo: Folder) -> None:
     demo.run("plan", "--joint", "better.toml", "-o", "next.csv")
     motion = np.genfromtxt(demo.path / "next.csv", delimiter=",", names=True)
     position = motion["reference_position_rad"]
-    assert np.ptp(position) > 0.5
-    assert np.max(np.abs(position)) <= np.deg2rad(85.0) + 1e-9
+    speed = np.gradient(position, motion["time_s"])
+    assert 0.0 < np.max(np.abs(position)) <= np.deg2rad(85.0) + 1e-9
+    assert np.deg2rad(3.0) < np.max(np.abs(speed)) <= np.deg2rad(60.0) + 1e-9
 
 
 # --- an own effect through every command ----------------------------------------------------------
@@ -225,6 +228,30 @@ def test_the_page_opens_a_joint_with_an_own_effect(own: Folder) -> None:
     config = own.asked("/api/config", "better.toml", "held_out.npz")
     keys = [e["key"] for e in config["effects"]]  # type: ignore[attr-defined]
     assert KEY in keys
+
+
+def test_an_own_effect_rides_outside_a_foreign_fmu(tmp_path: Path) -> None:
+    """add -> compare: the file of the FMU's joint remembers the effect's file, too."""
+    folder = Folder(tmp_path)
+    (tmp_path / "seal.py").write_text(OWN)
+    build("Axis", tmp_path, Make(2, ("CoSimulation",))).replace(tmp_path / "axis.fmu")
+    (tmp_path / "user.toml").write_text(FILE.format(fmu="axis.fmu"))
+    record = axis(seconds=3.0, h=5e-3)
+    np.savez(
+        tmp_path / "run.npz",
+        time_s=record.time,
+        motor_position_rad=record["motor_position"],
+        motor_torque_Nm=record["motor_torque"],
+    )
+    folder.run(
+        *("add", f"{KEY}@motor", "--joint", "user.toml", "--effects", "seal.py"),
+        *("-o", "larger.toml"),
+    )
+    said = [
+        folder.run("compare", "run.npz", "--joint", name) for name in ("user.toml", "larger.toml")
+    ]
+    assert "motor_position" in said[1]
+    assert said[0] == said[1], "an effect of size 0 changes nothing"
 
 
 # --- a new effect of the library is one file ------------------------------------------------------

@@ -194,3 +194,17 @@ def test_sessions_are_swept_where_no_other_server_works(tmp_path: Path) -> None:
 
 def test_a_killed_export(tmp_path: Path) -> None:
     assert kills.campaign(1, 1, tmp_path, ("export",)) == 0
+
+
+def test_a_lock_that_is_given_back_leaves_nothing(tmp_path: Path) -> None:
+    outer = Path(tempfile.gettempdir())
+    for name in ("a", "b"):
+        scratch.hold(tmp_path / name)
+    assert len(list(outer.rglob("*"))) == 3
+    scratch.release()
+    assert list(outer.rglob("*")) == []
+    process = other(f"scratch.hold(Path({str(tmp_path / 'a')!r}))")
+    end(process)
+    assert len(list(outer.rglob("*"))) == 2, "killed"
+    with scratch.own_folder():
+        assert list(outer.glob("irj-locks-*")) == []

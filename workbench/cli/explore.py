@@ -106,6 +106,8 @@ def print_exploration(found: Exploration) -> None:
         f"stability: best in {found.recommended.chosen_percent:.0f} % of resampled records; in "
         f"{len(found.windows)} parts of them one after the other: {_counted(found.windows)}"
     )
+    for record, name in found.by_record:
+        print(f"  {record} alone: {name}")
     for s in found.stand_ins:
         if s.tied:
             print(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
 import importlib
 import io
 import os
@@ -55,6 +56,7 @@ def _port(text: str) -> int:
     return value
 
 
+@functools.cache
 def parser() -> OneLineParser:
     """Arguments of every verb; those of export, cosim and batch go through to their own."""
     made = OneLineParser(
@@ -419,7 +421,11 @@ def parser() -> OneLineParser:
     )
     other_payload(trusted)
     joints = verb("joints", "joints", "the library of identified joints")
-    joints.add_argument("what", choices=("list", "show", "compare"))
+    joints.add_argument(
+        "what",
+        choices=("list", "show", "compare"),
+        help="list them, show values and where they come from, or put several side by side",
+    )
     joints.add_argument("names", nargs="*", metavar="NAME", help="names, types or files of joints")
     joints.add_argument(
         "--library",

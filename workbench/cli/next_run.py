@@ -62,6 +62,12 @@ def _before(arguments: Namespace, limits: Limits) -> dict[str, Any]:
         speed = min(UNPLANNED.speed, limits.speed)
         motion = Run("multisine", 0.0, half, speed).motion(UNPLANNED_SECONDS, 2e-3)
     found = blind_spots(joint, motion)
+    unit = "rad" if joint.kind == "rotary" else "m"
+    low, high = float(motion.position.min()), float(motion.position.max())
+    print(
+        f"planned: {motion.family}, {low:.3g} to {high:.3g} {unit}, up to "
+        f"{float(abs(motion.velocity).max()):.3g} {unit}/s"
+    )
     print(found)
     if arguments.output:
         write_text(arguments.output, motion.text)

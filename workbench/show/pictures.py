@@ -326,7 +326,8 @@ def front_picture(dots: Sequence[Dot], front: Sequence[int], height: int = HEIGH
     body = _axes(
         frame, "free parameters", "held-out error [% of start]", logarithmic=True, counted=True
     )
-    stairs = [(frame.across(dots[k].parameters), frame.up(errors[k])) for k in front]
+    treads = {dots[k].parameters: errors[k] for k in reversed(front)}  # the best of each column
+    stairs = [(frame.across(n), frame.up(treads[n])) for n in sorted(treads)]
     if stairs:
         line = f"M{stairs[0][0]:.1f} {stairs[0][1]:.1f}" + "".join(
             f"H{x:.1f}V{y:.1f}" for x, y in stairs[1:]
@@ -342,9 +343,9 @@ def front_picture(dots: Sequence[Dot], front: Sequence[int], height: int = HEIGH
     for k in sorted(range(len(dots)), key=lambda i: frame.up(errors[i])):
         if dots[k].number:
             column = dots[k].parameters
-            y = max(frame.up(errors[k]) + 4, lowest.get(column, -math.inf) + 11)
+            y = max(frame.up(errors[k]) - 5, lowest.get(column, -math.inf) + 11)
             lowest[column] = y
-            body += _text(frame.across(column) + 10, y, str(dots[k].number), "start")
+            body += _text(frame.across(column) + 9, y, str(dots[k].number), "start")
     least = min(d.error for d in dots)
     return _svg(
         f"Held-out error against free parameters: {len(dots)} variants with {few} to {many} "

@@ -32,6 +32,8 @@ _FASTEST: Final = 2e-6
 """Sampling step [s] below which time is doubted: 1 kHz stamped in s and read as ms is at 1e-6, the
 fastest drives log at 1e-5.
 """
+MOST_SLOTS: Final = 2.0**53
+"""Samples that may be missing at one place: numbers that can be counted one by one."""
 FASTEST: Final = 1e-9
 """Step that no logger of a joint has [s]: converters of currents take at least some ten ns."""
 
@@ -86,6 +88,15 @@ def check_stamps(record: Record) -> list[Finding]:
             "the file by time"
         )
         return [Finding("refuse", "time_decreases", message, "time", row)]
+    usual = steps[inside & (steps > 0.0)]
+    far = np.flatnonzero(inside & (steps > MOST_SLOTS * np.median(usual))) if usual.size else usual
+    if far.size:
+        row = int(far[0]) + 1
+        message = (
+            f"{record.name}: time jumps by {steps[row - 1]:.4g} s at {at(record, row)}: no record "
+            "pauses so long, export it again"
+        )
+        return [Finding("refuse", "time_jumps", message, "time", row)]
     repeated = np.flatnonzero(inside & (steps == 0.0))
     if not repeated.size:
         return [

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ import pytest
 from casadi_models import EFFECTS, JointModel
 from casadi_models.vectorised import Vectorised
 from identification.balance.noise import noise_level
-from identification.balance.weak import differentiated_kernel, kernel, prepare
+from identification.balance.weak import differentiated_kernel, kernel, prepare, whole
 
 
 @pytest.mark.parametrize("order", [0, 1, 2, 3])
@@ -87,3 +89,22 @@ def test_kernel_of_the_points_is_exact_for_polynomials() -> None:
         weights = kernel(0.03, 1e-3, order)
         t = (np.arange(len(weights)) - len(weights) // 2) * 1e-3
         assert weights @ t**order == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("step", [1e-3, 2e-3, 4e-3, 5e-3])
+def test_the_last_digit_of_a_clock_makes_no_row_more_or_less(step: float) -> None:
+    """Kernels of 10 to 200 ms hold halves of a sample at usual rates."""
+    rng = np.random.default_rng(0)
+    for length in (0.01, 0.014, 0.02, 0.03, 0.06, 0.2):
+        for parts in (2, 4):
+            exact = length / step / parts
+            near = [length / (step * (1 + e)) / parts for e in 1e-9 * rng.standard_normal(50)]
+            assert {whole(x) for x in near} == {math.floor(exact + 0.5 + 1e-6)}
+    count = 3000
+    shapes = set()
+    for begin in (0.0, 1234.5, 0.1):
+        time = begin + np.arange(count) * step
+        signals = {"motor_position": np.sin(3 * time), "drive": np.cos(time)}
+        made = prepare(time, signals, (slice(0, count),), length=0.06)
+        shapes.add((made.rows, made.grid.stride, made.grid.half))
+    assert len(shapes) == 1

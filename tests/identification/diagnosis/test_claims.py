@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from casadi_models import EFFECTS
-from identification.balance.dataset import HOLD_NAME
+from identification.balance.dataset import HOLD_DELAY, HOLD_NAME
 from identification.data.joint_file import Joint
 from identification.diagnosis.candidates import Candidate, NotTestable
 from identification.diagnosis.claims import (
@@ -158,9 +158,9 @@ def test_a_delay_must_be_longer_than_half_a_sample(base: Base) -> None:
 
 def test_a_delay_of_the_drive_counts_from_the_hold_that_is_there(base: Base) -> None:
     dt = base.data.train[0].grid.dt
-    held = replace(
-        base, solution=replace(base.solution, values={**base.solution.values, HOLD_NAME: 0.3 * dt})
-    )
+    model = base.solution.model.add(HOLD_DELAY)
+    values = {**base.solution.values, HOLD_NAME: 0.3 * dt}
+    held = replace(base, solution=replace(base.solution, model=model, values=values))
     for delay, place, expected in (
         (0.25, "drive", True),
         (-0.25, "drive", False),

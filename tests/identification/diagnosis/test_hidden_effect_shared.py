@@ -45,7 +45,7 @@ def truth(case: str) -> dict[str, float]:
 @pytest.mark.parametrize("case", CASES)
 def test_hidden_effect_is_named_alone(case: str) -> None:
     found = improved(case)
-    assert [c.effects for c in found.claims] == [(case,)]
+    assert [(c.effects, c.like) for c in found.claims] == [((case,), "")]
     assert found.verdict == "complete"
     assert found.ranking is not None
     assert found.ranking.trials[0].key == case

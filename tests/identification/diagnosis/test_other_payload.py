@@ -147,9 +147,9 @@ def test_the_names_left_out_of_the_set_fit_worse_on_held_out_records() -> None:
             .balances["motor"]
             .ratio
         )
-    assert (
-        found.claims[0].effects[0] == min(errors, key=errors.__getitem__) == "motor_constant_error"
-    )
+    assert min(errors, key=errors.__getitem__) == "motor_constant_error"
+    # the gain of either torque explains the same: which of the two leads the set is chance
+    assert set(found.claims[0].effects) == {"motor_constant_error", "torque_sensor_gain"}
     assert all(
         errors[name] > 1.5 * errors["motor_constant_error"]
         for name in errors
@@ -193,9 +193,13 @@ def test_the_links_parameters_are_those_of_the_first_payload() -> None:
         improve(loaded, JOINT, max_additions=0),
         improve([loaded, unloaded], JOINT, max_additions=0),
     )
+    # the skew of the loaded run is what both share: it moves them within their bands
     for name in ("link_inertia", "gravity_torque"):
+        error = alone.steps[0].solution.stderr[name]
+        assert error is not None
+        assert both.steps[0].solution.values[name] == pytest.approx(TRUE[name], rel=0.02)
         assert both.steps[0].solution.values[name] == pytest.approx(
-            alone.steps[0].solution.values[name], rel=1e-3
+            alone.steps[0].solution.values[name], abs=0.1 * error
         )
 
 

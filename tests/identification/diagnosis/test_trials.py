@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -12,7 +13,9 @@ from scipy.stats import f as fisher
 
 from casadi_models import EFFECTS
 from identification.balance.balances import balances_of
-from identification.data.joint_file import Joint
+from identification.data.check.gate import passed
+from identification.data.joint_file import Joint, load_joint
+from identification.data.read import read
 from identification.diagnosis.candidates import Candidate, NotTestable
 from identification.diagnosis.trials import (
     FOLDS,
@@ -300,3 +303,54 @@ def test_an_amplitude_of_the_wrong_sign_is_no_trial() -> None:
     assert try_candidate(candidate(driven, "coulomb"), driven) is None
     braked = made(lambda q, v: 0 * q, effects=("viscous",))
     assert tried(braked, "coulomb").values["motor_coulomb"] == pytest.approx(COULOMB, rel=0.1)
+
+
+def test_an_amplitude_at_its_bound_may_leave_it_when_a_candidate_is_tried() -> None:
+    driven = made(lambda q, v: -2 * COULOMB * np.sign(v))
+    assert "motor_coulomb" in driven.solution.at_bound
+    assert driven.inward.shape[1] == 1
+    assert np.linalg.norm(driven.inward, axis=0) == pytest.approx(1.0)
+    p, own = driven.parts
+    assert (p, own) == (driven.jacobian.shape[1], driven.jacobian.shape[1] + 1)
+
+
+@pytest.fixture(scope="module")
+def elastic() -> Base:
+    """7.5 s of the demo's joint: three balances."""
+    folder = Path(__file__).resolve().parents[3] / "workbench" / "demo"
+    joint = load_joint(folder / "joint.toml")
+    train, held = (
+        passed(read(folder / f"{n}.npz", joint.columns, joint.kind), joint)[0].take(slice(0, 3000))
+        for n in ("train", "held_out")
+    )
+    model = prepared_model(joint, train)
+    data = load_dataset([train], [held], joint, model)
+    return make_base(solve(model, data), data)
+
+
+@pytest.mark.parametrize("key", ["stribeck", "torque_sensor_gain", "cubic_stiffness"])
+def test_an_effect_belongs_to_the_balance_that_it_helps_most(key: str, elastic: Base) -> None:
+    base, place = elastic, EFFECTS[key].acts_on[0]
+    found = try_candidate(candidate(base, key, place), base)
+    assert isinstance(found, Trial)
+    own = np.column_stack([base.jacobian, base.inward])
+    assert base.inward.shape[1] == 0
+    both = np.column_stack([own, raw_columns(base, found)])
+    used = base.block >= 0
+    before, after = base.residual.copy(), base.residual.copy()
+    for out in base.held_out_folds():
+        inside = used & ~np.isin(base.block, np.flatnonzero(out))
+        tested = np.isin(base.block, np.flatnonzero(out))
+        plain = np.linalg.lstsq(own[inside], -base.residual[inside], rcond=None)[0]
+        more = np.linalg.lstsq(both[inside], -base.residual[inside], rcond=None)[0]
+        if found.effect.amplitudes[0].low == 0 and more[-1] < 0:
+            more = np.append(plain, 0.0)
+        before[tested] += (own @ plain)[tested]
+        after[tested] += (both @ more)[tested]
+    falls = []
+    for k in range(len(base.balances)):
+        rows = used & (base.balance == k)
+        falls.append(rows.sum() * math.log(np.sum(before[rows] ** 2) / np.sum(after[rows] ** 2)))
+    best = falls[base.balances.index(found.balance)]
+    assert best == pytest.approx(max(falls), abs=1e-6)
+    assert found.score == pytest.approx(KERNEL_SHARE / 2 * sum(falls), rel=1e-3, abs=1e-3)

@@ -1,0 +1,171 @@
+"""What a session decides, on axes whose hidden laws are known."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from identification import Improvement, Record, improve
+from identification.data.joint_file import Joint
+from identification.diagnosis.improvement import held_drop
+from identification.diagnosis.session import (
+    LEAST_ADDED_DROP,
+    MAX_ADDITIONS,
+    Session,
+    refuse_unlike,
+    with_held_out,
+)
+from identification.errors import InputError
+from tests.smooth_laws import COULOMB, INERTIA, LAWS, VISCOUS, Law, nothing, record
+
+FloatArray = npt.NDArray[np.float64]
+JOINT = Joint(model_name="hd1", effects=("viscous", "coulomb"))
+
+
+def wave(q: FloatArray, v: FloatArray) -> FloatArray:
+    """`gravity` of the library, of any zero."""
+    return 6 * np.sin(q + 0.7)
+
+
+def drag(q: FloatArray, v: FloatArray) -> FloatArray:
+    """`quadratic_drag` of the library."""
+    return 15 * v * np.abs(v)
+
+
+def both(q: FloatArray, v: FloatArray) -> FloatArray:
+    return wave(q, v) + drag(q, v)
+
+
+@cache
+def runs(law: Law) -> tuple[Record, Record]:
+    train, held = (record(np.random.default_rng([7, k]), 10.0, law) for k in (0, 1))
+    return train.renamed("train"), held.renamed("held")
+
+
+@cache
+def improved(law: Law, most: int = MAX_ADDITIONS) -> Improvement:
+    train, held = runs(law)
+    return improve(train, JOINT, [held], max_additions=most)
+
+
+def test_two_hidden_laws_are_both_named_and_the_error_falls_with_each() -> None:
+    found = improved(both)
+    assert sorted(c.effects[0] for c in found.claims) == ["gravity", "quadratic_drag"]
+    assert found.verdict == "complete"
+    assert len(found.steps) == 1 + len(found.claims) == 3
+    assert [s.added for s in found.steps] == [None, *(c.effects[0] for c in found.claims)]
+    errors = [s.held_out.relative_error_percent for s in found.steps]
+    assert errors == sorted(errors, reverse=True)
+    for before, after, claim in zip(found.steps, found.steps[1:], found.claims, strict=False):
+        drop = held_drop(before.held_out, after.held_out, claim.balance)
+        assert drop == pytest.approx(claim.held_out_drop_percent)
+        assert drop > LEAST_ADDED_DROP
+    assert not any(c.partial for c in found.claims)
+    values = found.steps[-1].solution.values
+    assert values["inertia"] == pytest.approx(INERTIA, rel=0.02)
+    assert values["motor_viscous"] == pytest.approx(VISCOUS, rel=0.1)
+    assert values["motor_coulomb"] == pytest.approx(COULOMB, rel=0.05)
+    assert all(e.ratio < 1.5 for e in found.final_ratios.values())
+    assert found.unexplained == ()
+    assert found.learned == ()
+
+
+def test_no_more_is_added_than_asked_for_and_that_is_said() -> None:
+    one = improved(both, 1)
+    assert len(one.claims) == 1
+    assert one.claims[0].effects[0] == improved(both).claims[0].effects[0]
+    assert one.verdict == "unexplained"
+    assert "Stopped at the limit of additions (1)" in one.reason
+    assert "would be the next" in one.reason
+    none = improved(both, 0)
+    assert none.claims == ()
+    assert len(none.steps) == 1
+    assert none.verdict == "unexplained"
+    assert "Stopped at the limit of additions (0)" in none.reason
+    assert none.learned == ()
+
+
+def test_nothing_is_named_where_nothing_is_hidden() -> None:
+    found = improved(nothing)
+    assert found.claims == ()
+    assert found.minor == ()
+    assert found.verdict == "nothing_missing"
+    assert len(found.steps) == 1
+    assert found.ranking is not None
+    tried = {t.key for t in found.ranking.trials}
+    assert tried <= {r.effect for r in found.refused}, "each is refused with its reason"
+    assert all(r.why for r in found.refused)
+    assert tried.isdisjoint(n.effect for n in found.not_testable)
+
+
+def test_a_law_without_a_name_is_no_claim_but_a_curve() -> None:
+    found = improved(LAWS["bump"][1])
+    assert found.verdict == "unexplained"
+    assert all(c.partial for c in found.claims) or not found.claims
+    assert found.unexplained
+    assert found.unexplained[0].axis is not None
+    assert found.unexplained[0].axis.endswith("position")
+
+
+def test_a_diagnosis_is_the_first_decision_of_the_loop() -> None:
+    train, held = runs(both)
+    session = Session.opened(train, JOINT, held)
+    found = session.diagnose(session.start())
+    whole = improved(both)
+    assert len(found.claims) == 1
+    assert found.claims[0].effects[0] == whole.decided[0].effects[0]
+    assert found.claims[0].held_out_drop_percent == pytest.approx(
+        whole.decided[0].held_out_drop_percent
+    )
+    assert found.minor == (), "what comes after is not looked for"
+
+
+def test_progress_goes_from_its_start_to_its_end() -> None:
+    told: list[tuple[str, float]] = []
+    train, held = runs(wave)
+    improve(train, JOINT, [held], progress=lambda text, share: told.append((text, share)))
+    shares = [share for _, share in told]
+    assert min(shares) == shares[0] == 0.05
+    assert max(shares) <= 1.0
+    texts = [text for text, _ in told]
+    for word in ("fitting the start model", "ranking the library", "adding gravity"):
+        assert word in texts
+    assert texts[-1] == "looking at what is left"
+    tries = [share for text, share in told if text.startswith("trying ")]
+    assert min(tries) == 0.15
+    assert shares[-1] == 0.85
+
+
+def test_without_held_out_records_a_part_of_each_is_held_out() -> None:
+    train, held = runs(wave)
+    first, apart, note = with_held_out([train, held], [])
+    assert "the last 30 %" in note
+    for whole, a, b in zip((train, held), first, apart, strict=True):
+        assert len(a) + len(b) == len(whole)
+        assert len(a) == pytest.approx(0.7 * len(whole), rel=0.01)
+        assert a.time[-1] < b.time[0]
+    assert with_held_out([train], [held]) == ([train], [held], "")
+    found = improve(train, JOINT)
+    assert found.data.note == note
+    assert [c.effects[0] for c in found.claims] == ["gravity"]
+
+
+def test_a_session_needs_a_record() -> None:
+    with pytest.raises(InputError, match="no training record"):
+        Session.opened([], JOINT)
+
+
+def test_records_in_unlike_units_are_refused_only_where_the_model_fails() -> None:
+    train, held = runs(nothing)
+    turned = held.with_channel("motor_position", np.rad2deg(held["motor_position"]))
+    session = Session.opened(train, JOINT, turned)
+    for error in (50.0, 51.0, float("nan")):
+        with pytest.raises(InputError):
+            refuse_unlike(session.data, error)
+    refuse_unlike(session.data, 49.9)
+    refuse_unlike(Session.opened(train, JOINT, held).data, 90.0)
+    with pytest.raises(InputError):
+        session.run(session.start())
