@@ -15,7 +15,7 @@ import numpy.typing as npt
 from .energy import total_energy
 from .equations import Equations, Solvable, inverse_dynamics
 from .signals import Expression
-from .solve import affine_solution, carried_torque, rigid_solution
+from .solve import affine_solution, carried_torque, rigid_solution, runge_kutta
 
 MEMORY_STEP: Final = 1e-6
 """Time over which a memory without a rate of its own is differentiated to its continuous form
@@ -233,14 +233,10 @@ class JointFunctions:
             steps = ca.vertsplit(where(at, z, u, p) - where(x, z, u, p))
             return self._moved_memory(steps, duration)
 
-        def stage(at: Expression, duration: Expression) -> Expression:
-            return rate(at, moved(at, duration) if has_memory else z, u, p)
+        def slope(share: float, at: Expression) -> Expression:
+            return rate(at, moved(at, share * h) if has_memory and share else z, u, p)
 
-        k1 = rate(x, z, u, p)
-        k2 = stage(x + h / 2 * k1, h / 2)
-        k3 = stage(x + h / 2 * k2, h / 2)
-        k4 = stage(x + h * k3, h)
-        new = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        new = runge_kutta(slope, x, h)
         if has_memory:
             new = ca.vertcat(new, moved(new, h))
         return ca.Function(

@@ -1,10 +1,11 @@
 """Accelerations and carried torque where the laws refer to them: affine, or by a few Newton
-steps.
+steps; one step in time.
 """
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Callable
+from typing import Any, Final
 
 import casadi as ca
 
@@ -15,6 +16,25 @@ NEWTON_STEPS: Final = 8
 """Steps of the unrolled Newton iteration; it converges quadratically and is exact after one
 where the law is affine.
 """
+
+
+def runge_kutta(slope: Callable[[float, Any], Any], x: Any, h: Any) -> Any:
+    """State after one Runge-Kutta step of 4th order (W. Kutta 1901), symbols or numbers alike.
+
+    Parameters
+    ----------
+    slope : callable
+        ``slope(share, x)``: rates of the state x at that share (0, 0.5, 1) of the step.
+    x : expression or array
+        State at the begin.
+    h : expression or float
+        Step [s].
+    """
+    k1 = slope(0.0, x)
+    k2 = slope(0.5, x + h / 2 * k1)
+    k3 = slope(0.5, x + h / 2 * k2)
+    k4 = slope(1.0, x + h * k3)
+    return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
 
 
 def affine_solution(right: Expression, acceleration: Expression, inertia: Expression) -> Expression:

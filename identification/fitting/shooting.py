@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from casadi_models import JointModel
+from casadi_models.solve import runge_kutta
 from identification.balance.noise import noise_level
 from identification.balance.sensing import Sensing, signals_of
 from identification.balance.stamps import EVEN
@@ -307,13 +308,8 @@ def _sample(
         return ca.vertcat(expression, ca.vec(ca.jacobian(expression, x) @ slopes + own))
 
     h = dt / substeps
-    rate = functions.dynamics
-    middle = applied(share + 0.5 / substeps)
-    k1 = rate(x, applied(share), p)
-    k2 = rate(x + h / 2 * k1, middle, p)
-    k3 = rate(x + h / 2 * k2, middle, p)
-    k4 = rate(x + h * k3, applied(share + 1 / substeps), p)
-    new = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    inputs = {at: applied(share + at / substeps) for at in (0.0, 0.5, 1.0)}
+    new = runge_kutta(lambda at, state: functions.dynamics(state, inputs[at], p), x, h)
     whole = ca.vertcat(x, ca.vec(slopes)) if k else x
     step = ca.Function("step", [whole, u, p, share], ca.cse([with_slopes(new)]))
     y = functions.outputs(x, applied(ca.SX(0)), p)[list(rows)]

@@ -96,6 +96,9 @@ class UserDiagnosis:
             "balance": self.error.as_json()["balances"],
         }
 
+    def __repr__(self) -> str:
+        return f"UserDiagnosis({self.diagnosis!r})"
+
     def __str__(self) -> str:
         return str(self.diagnosis)
 

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Final, final
 
 import numpy as np
 
+from casadi_models.solve import runge_kutta
 from irj_fmu.host.run import FmuError
 from irj_fmu.host.signals import FloatArray
 from irj_fmu.imported.library import UserFmu, UserInstance
@@ -224,11 +225,7 @@ class Imported:
 
         z = z0
         for _ in range(substeps):
-            k1 = slopes(z)
-            k2 = slopes(z + h / 2 * k1)
-            k3 = slopes(z + h / 2 * k2)
-            k4 = slopes(z + h * k3)
-            z = z + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+            z = runge_kutta(lambda _, at: slopes(at), z, h)
         if moving:
             _, y, _, _, c, d = self._j(z0[:nx], u, p)
             dy = c @ ca.reshape(z0[nx:], nx, n_s) + d @ seed

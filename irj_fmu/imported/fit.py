@@ -68,6 +68,10 @@ class UserFit:
     train: UserComparison
     records: tuple[Record, ...]
 
+    def __repr__(self) -> str:
+        fmu = self.model.fmu.path.name
+        return f"UserFit({fmu!r}, {len(self.values)} parameters, {self.iterations} steps)"
+
     @property
     def values(self) -> dict[str, float]:
         """Fitted values by name."""

@@ -63,6 +63,9 @@ class UserImprovement:
             "values": self.model.values,
         }
 
+    def __repr__(self) -> str:
+        return f"UserImprovement({self.found!r})"
+
     def __str__(self) -> str:
         return str(self.found)
 

@@ -71,6 +71,10 @@ class UserComparison:
     measured: tuple[FloatArray, ...]
     simulated: tuple[FloatArray, ...]
 
+    def __repr__(self) -> str:
+        ratios = ", ".join(f"{c} {e.ratio:.3g}" for c, e in self.outputs.items())
+        return f"UserComparison({self.name!r}, over the floor: {ratios})"
+
     def as_json(self) -> dict[str, Any]:
         """Errors as data."""
         return {

@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Final, Protocol, final
 
 import numpy as np
 
+from casadi_models.solve import runge_kutta
 from identification.errors import InputError
 from irj_fmu.host.exchange import Stepper
 from irj_fmu.host.run import Number
@@ -203,13 +205,12 @@ class Runner:
         if not self.substeps:
             return stepper.advance(slope, now, end, x)
         h = (end - now) / self.substeps
+
+        def rates(share: float, at: FloatArray, begin: float) -> FloatArray:
+            return slope(begin + share * h, at)
+
         for i in range(self.substeps):
-            at = now + i * h
-            k1 = slope(at, x)
-            k2 = slope(at + h / 2, x + (h / 2) * k1)
-            k3 = slope(at + h / 2, x + (h / 2) * k2)
-            k4 = slope(at + h, x + h * k3)
-            x = x + (h / 6) * (k1 + 2 * (k2 + k3) + k4)
+            x = runge_kutta(partial(rates, begin=now + i * h), x, h)
         slope(end, x)
         instance.accept(end, x)
         return x
