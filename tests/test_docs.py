@@ -23,7 +23,7 @@ ROOT: Final = Path(__file__).resolve().parents[1]
 DEMO: Final = Path(str(files("workbench"))) / "demo"
 PAGES: Final = {  # blocks that are not run
     "README.md": 2,
-    "docs/guide.md": 3,
+    "docs/guide.md": 5,
     "docs/explore.md": 1,
     "docs/extending.md": 0,
     "docs/batch.md": 1,

@@ -101,21 +101,28 @@ import numpy as np
 from casadi_models import JointModel
 
 model = JointModel.harmonic_drive("hd3", gear_ratio=-160.0).add("coulomb@motor")
-model = model.with_values({"motor_inertia": 4.4, "link_inertia": 10.0, "stiffness": 2e4,
-                           "structural_damping": 40.0, "motor_coulomb": 20.0})
-p = model.value_vector()                    # in the order of model.parameter_names
-x = [0.011, 0.30, 0.010, 0.29]              # motor position, motor velocity, link position, link velocity
-u = [60.0, 0.0, 0.0]                        # drive N.m, temperature K, time s
+model = model.with_values(
+    {
+        "motor_inertia": 4.4,
+        "link_inertia": 10.0,
+        "stiffness": 2e4,
+        "structural_damping": 40.0,
+        "motor_coulomb": 20.0,
+    }
+)
+p = model.value_vector()  # in the order of model.parameter_names
+x = [0.011, 0.30, 0.010, 0.29]  # motor position, motor velocity, link position, link velocity
+u = [60.0, 0.0, 0.0]  # drive N.m, temperature K, time s
 
 dx = np.array(model.dynamics(x, u, p)).ravel()
 print("dx/dt    ", dx.round(3))
 
-a = dx[[1, 3]]                              # accelerations of motor and link
+a = dx[[1, 3]]  # accelerations of motor and link
 Y, rest = (np.array(m) for m in model.regressor(x, a, u, p))
 theta = [p[model.parameter_names.index(n)] for n in model.linear_parameters]
 print("columns  ", *model.linear_parameters)
 print(Y.round(3))
-print("Y theta  ", (Y @ theta + rest.ravel()).round(9))   # the drive, and 0 on the link
+print("Y theta  ", (Y @ theta + rest.ravel()).round(9))  # the drive, and 0 on the link
 
 dx_x, dx_u, dx_p = (np.array(m) for m in model.jacobian(x, u, p))
 print("shapes   ", dx_x.shape, dx_u.shape, dx_p.shape)

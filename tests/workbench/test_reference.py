@@ -138,7 +138,10 @@ ERRORS: dict[str, tuple[dict[str, Any], str]] = {
     "key": ({"joint": {"gear_ration": 3.0}}, "[joint] has an unknown key 'gear_ration'; known: "),
     "meant": ({"joint": {"gear_ration": 3.0}}, "; did you mean 'gear_ratio'?"),
     "table": ({"joint": {}, "colums": {}}, "; did you mean 'columns'?"),
-    "text": ({"joint": {"model": 3}}, "[joint]: model = 3 is not a text; write it in quotes"),
+    "text": (
+        {"joint": {"model": "hd3"}, "known": {"stiffness": {"value": 1.0, "unit": 3}}},
+        "[known] stiffness: unit = 3 is not a text; write it in quotes",
+    ),
     "choice": ({"joint": {"kind": "round"}}, "kind = 'round' is not known; use one of rotary,"),
     "number": ({"joint": {"gear_ratio": True}}, "gear_ratio = True is not a finite number"),
     "fitted": (
