@@ -518,6 +518,8 @@ class Session:
         near = (1 + SAME_WITH_ONE_LESS / 100) * min(left.values())
         alike = [t for t in (best, *relatives) if left[t.key] <= near]
         found = min(alike, key=lambda t: (not t.effect.common, len(t.values), left[t.key]))
+        if best in alike:  # the trials have told these two apart already
+            found = best
         for t in (best, *relatives):
             if left[t.key] > SET_RMS * left[found.key]:
                 more = 100 * (left[t.key] / left[found.key] - 1)
