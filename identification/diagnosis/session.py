@@ -509,7 +509,8 @@ class Session:
             and (t.key in best.effect.confused_with or best.key in t.effect.confused_with)
             and t.candidate.label in ranking.significant
             and t.candidate.label not in refused
-            and (t.key in names or t.score >= RELATIVE_SHARE * best.score)
+            and t.key not in names
+            and t.score >= RELATIVE_SHARE * best.score
         ][:MOST_RELATIVES]
         if not relatives:
             return best, names
