@@ -509,7 +509,8 @@ class Session:
             and (t.key in best.effect.confused_with or best.key in t.effect.confused_with)
             and t.candidate.label in ranking.significant
             and t.candidate.label not in refused
-            and (t.key in names or t.score >= RELATIVE_SHARE * best.score)
+            and t.key not in names
+            and t.score >= RELATIVE_SHARE * best.score
         ][:MOST_RELATIVES]
         if not relatives:
             return best, names
@@ -518,6 +519,8 @@ class Session:
         near = (1 + SAME_WITH_ONE_LESS / 100) * min(left.values())
         alike = [t for t in (best, *relatives) if left[t.key] <= near]
         found = min(alike, key=lambda t: (not t.effect.common, len(t.values), left[t.key]))
+        if best in alike:  # the trials have told these two apart already
+            found = best
         for t in (best, *relatives):
             if left[t.key] > SET_RMS * left[found.key]:
                 more = 100 * (left[t.key] / left[found.key] - 1)
