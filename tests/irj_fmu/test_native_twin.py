@@ -266,6 +266,21 @@ def test_equals_python_for_other_joints_and_sensors(case: str, tmp_path: Path) -
     )
 
 
+def test_equals_python_on_whole_encoder_steps(spec: NativeSpec, fmu: Path, tmp_path: Path) -> None:
+    """Fourth differences of a counted position are whole steps: both sides keep as many of the
+    equal ones, and neither floor nor noise depends on which.
+    """
+    readings = readings_of("hd3", 5.0)
+    step = 2 * np.pi / 2**14
+    readings[:, [1, 3]] = np.round(readings[:, [1, 3]] / step) * step
+    found, expected, names = both(spec, fmu, tmp_path, readings, {"warm_up": 1.5})
+    reals = len(names["Real"])
+    assert largest(found, expected, reals) <= 1e-9
+    np.testing.assert_array_equal(found[:, reals:], expected[:, reals:])
+    running = expected[:, reals + names["Integer"].index("health")] != 1
+    assert running.any()
+
+
 @pytest.mark.parametrize("column", [1, 3])
 def test_stuck_encoder_of_a_rigid_joint(column: int, tmp_path: Path) -> None:
     """Derivatives of a reading that stands still are zero on both sides, not the rounding of
