@@ -24,35 +24,19 @@ static double select_value(double v[], int n, int k) {
     return v[k];
 }
 
-static double smallest(const double v[], int n) {
-    double found = v[0];
-    int i;
-    for (i = 1; i < n; i++) found = fmin(found, v[i]);
-    return found;
-}
-
-/* Standard deviation of white noise from fourth differences; identification.balance.noise.noise_level. */
+/* White noise from the smallest fourth differences; identification.balance.noise.noise_level. Kept by number and not by
+ * value: equal ones are told apart by rounding only. */
 static double noise_level(Twin *m, int sensor) {
-    const int n = WATCH - 4;
-    double *d = m->fourth, cut, gamma, below, above, mean = 0, variance = 0;
-    int i, pass, at, kept = 0;
+    const int n = WATCH - 4, last = (int)(NOISE_KEPT * (n - 1));
+    double *d = m->sorted, square = 0;
+    int i, pass;
     for (i = 0; i < WATCH; i++) d[i] = m->s.watch.rows[i][sensor];
     for (pass = 1; pass <= 4; pass++)
         for (i = 0; i < WATCH - pass; i++) d[i] = d[i + 1] - d[i];
-    for (i = 0; i < n; i++) m->sorted[i] = fabs(d[i]);
-    cut = (n - 1) * 0.95;
-    at = (int)floor(cut);
-    gamma = cut - at;
-    below = select_value(m->sorted, n, at);
-    above = smallest(m->sorted + at + 1, n - at - 1);
-    cut = gamma >= 0.5 ? above - (above - below) * (1 - gamma) : below + (above - below) * gamma;
-    for (i = 0; i < n; i++)
-        if (fabs(d[i]) <= cut) { mean += d[i]; kept++; }
-    if (!kept) return 0;
-    mean /= kept;
-    for (i = 0; i < n; i++)
-        if (fabs(d[i]) <= cut) variance += (d[i] - mean) * (d[i] - mean);
-    return sqrt(variance / kept) / 0.87 / sqrt(70.0);
+    for (i = 0; i < n; i++) d[i] = fabs(d[i]);
+    select_value(d, n, last);
+    for (i = 0; i <= last; i++) square += d[i] * d[i];
+    return sqrt(square / (last + 1) / 70.0) / NOISE_CUT_DEVIATION;
 }
 
 /* Least-squares slope of x against y about their means. */

@@ -20,6 +20,7 @@ from typing import Any, Final, final
 import numpy as np
 import numpy.typing as npt
 
+from identification.balance.noise import CUT_DEVIATION, KEPT
 from identification.data.joint_file import Joint
 from identification.errors import InputError
 from identification.faults.detector import MOVED, PARITY_SENSORS, DetectorTables
@@ -307,6 +308,8 @@ def _watch_tables(header: _Header, made: OnlineEstimator) -> None:
         header.define(name, float(getattr(watch_settings, f"_{name}")))
     header.define("SCALE_ERROR", float(watch_settings.SCALE))
     header.define("NOISE_MEMORY", watch_settings.MEMORY)
+    header.define("NOISE_KEPT", KEPT)
+    header.define("NOISE_CUT_DEVIATION", CUT_DEVIATION)
     header.whole("present", made.present, "unsigned char")
     header.whole("needs", made.needs, "unsigned char")
     header.define("RECENT_SAMPLES", round(_RECENT / made.dt))
