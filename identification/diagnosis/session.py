@@ -653,6 +653,9 @@ class Session:
             if without(last.model, claim.label).terms == last.model.terms:
                 continue
             base, ranking = self._lacking(claim, standing)
+            # the model that lacks the claim may fit held-out records badly for reasons of its own,
+            # as a law that took over its work beyond the path: no linear form shows a fall there
+            ranking = self._confirmed(ranking, base, self.bench.step(None, None, base.solution))
             same = next((t for t in ranking.everything if t.candidate.label == claim.label), None)
             best = ranking.best(frozenset(self._refused))
             position = current.index(claim)

@@ -7,6 +7,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -511,15 +512,7 @@ def test_bad_arguments_are_one_line(folder: Path, capsys: pytest.CaptureFixture[
 def test_the_study_in_the_docs_is_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The example of docs/batch.md, its number of runs, and its tables of parameters."""
     text = (ROOT / "docs" / "batch.md").read_text(encoding="utf-8")
-    blocks = [[]] if text.startswith("    ") else []
-    for line in text.splitlines():
-        if line.startswith("    "):
-            blocks[-1].append(line[4:])
-        elif line.strip() or not blocks or not blocks[-1]:
-            blocks.append([])
-        else:
-            blocks[-1].append("")
-    found = ["\n".join(block) for block in blocks if block]
+    found = re.findall(r"^```toml\n(.*?)^```", text, flags=re.MULTILINE | re.DOTALL)
     example = next(block for block in found if block.startswith("[study]"))
     (tmp_path / "study.toml").write_text(example)
     assert main([str(tmp_path / "study.toml"), "--dry-run"]) == 0

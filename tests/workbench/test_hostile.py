@@ -277,6 +277,13 @@ ARGUMENTS: dict[str, tuple[str, str]] = {
 
 
 @pytest.fixture(autouse=True)
+def library(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Laws and effects of these files do not stay in the library of the other tests."""
+    for name in ("_effects", "_typed"):
+        monkeypatch.setattr(EFFECTS, name, type(getattr(EFFECTS, name))(getattr(EFFECTS, name)))
+
+
+@pytest.fixture(autouse=True)
 def _kept_away(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(FOLDER, str(tmp_path / "crashes"))
     monkeypatch.setenv(STORE, str(tmp_path / "allowed"))

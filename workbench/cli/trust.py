@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 from argparse import Namespace
 
+from identification.fitting.assess import RATIO_LIMIT
 from identification.fitting.fit import fit
 from identification.fitting.trust import trust
 from workbench.cli.files import alike, distinct, open_joint, write_json
@@ -18,6 +20,15 @@ def run_trust(arguments: Namespace) -> int:
     alike([*arguments.records, *arguments.other_payload], records, joint)
     fitted = fit(joint, records)
     found = trust(fitted.solution, fitted.data)
+    over = {b: e.ratio for b, e in fitted.train.balances.items() if e.ratio > RATIO_LIMIT}
+    if over:  # an interval is one of this model, and says nothing of another
+        said = ", ".join(f"{b} {ratio:.3g}" for b, ratio in over.items())
+        warnings = [
+            *warnings,
+            f"the model leaves more than the measurement noise ({said} times its floor): its "
+            "values may make up for what is missing; irj improve says what",
+        ]
+        print(f"irj: {warnings[-1]}", file=sys.stderr)
     print(f"relative error {fitted.train.relative_error_percent:.3f} %; 95 % intervals in brackets")
     print(found)
     write_json(

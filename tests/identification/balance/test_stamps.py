@@ -4,6 +4,7 @@ jumps.
 
 from __future__ import annotations
 
+import math
 import shutil
 from pathlib import Path
 
@@ -193,17 +194,22 @@ def test_runs_are_laid_end_to_end_and_no_curve_joins_them(
     assert len(both.segments()) == 2
     joined, apart = fit(joint, [both]), fit(joint, parts)
     for name, value in apart.solution.values.items():
-        if is_of_run(name):
-            continue
-        assert joined.solution.values[name] == pytest.approx(value, rel=0.01, abs=1e-6), (
-            "the noise level of a file is one"
-        )
-    # a file has one zero of the link encoder; both parts were logged with the same one
-    zeros = [v for n, v in apart.solution.values.items() if is_of_run(n)]
-    one = [v for n, v in joined.solution.values.items() if is_of_run(n)]
-    assert len(zeros) == len(parts)
-    assert len(one) == 1
-    assert min(zeros) <= one[0] <= max(zeros)
+        if is_of_run(name) or name in apart.model.calibration:
+            continue  # a file has its own
+        # the noise level of a file is one, and so are its clocks
+        error = (apart.solution.stderr[name] or 0.0) / 10
+        assert joined.solution.values[name] == pytest.approx(value, rel=0.01, abs=error), name
+    # a file has one set of calibration unknowns; both parts were logged with the same sensors
+    for unknown in apart.model.calibration:
+        found = [n for n in apart.solution.values if n.startswith(f"{unknown}[")]
+        one = [n for n in joined.solution.values if n.startswith(f"{unknown}[")]
+        assert len(found) == len(parts)
+        assert len(one) == 1
+        errors = [apart.solution.stderr[n] for n in found] + [joined.solution.stderr[one[0]]]
+        spread = math.hypot(*(e for e in errors if e is not None))
+        for n in found:
+            off = joined.solution.values[one[0]] - apart.solution.values[n]
+            assert abs(off) < 3 * spread
     w = joined.data.train[0]
     assert sorted(w.block[w.stretch == 0].tolist())[-1] < min(
         b for b in w.block[w.stretch == 1].tolist() if b >= 0

@@ -199,7 +199,7 @@ def test_the_links_parameters_are_those_of_the_first_payload() -> None:
         assert error is not None
         assert both.steps[0].solution.values[name] == pytest.approx(TRUE[name], rel=0.02)
         assert both.steps[0].solution.values[name] == pytest.approx(
-            alone.steps[0].solution.values[name], abs=0.1 * error
+            alone.steps[0].solution.values[name], abs=error
         )
 
 

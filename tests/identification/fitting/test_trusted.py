@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import workbench
 from benchmarks.next_run import record_of
 from benchmarks.trust import PLAIN, joint_of
 from identification import Joint
@@ -140,9 +141,21 @@ def test_the_verb_prints_a_line_for_every_parameter(
     words = [str(folder / "train.csv"), "--joint", str(folder / "joint.toml")]
     assert main(["trust", *words, "--json", str(out)]) == 0
     found = json.loads(out.read_text())["trust"]
-    printed = capsys.readouterr().out
+    printed, doubts = capsys.readouterr()
+    assert "make up for what is missing" not in doubts  # nothing is hidden in these records
     for p in found:
         assert f"{p['name']} " in printed
         assert p["verdict"] in ("trust", "only in combination", "not")
         if p["interval"] is not None:
             assert p["interval"][0] <= p["value"] <= p["interval"][1]
+
+
+def test_values_of_a_model_that_lacks_something_are_doubted(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    folder = Path(workbench.__file__).parent / "demo"
+    words = [str(folder / "train.npz"), "--joint", str(folder / "joint.toml")]
+    assert main(["trust", *words]) == 0
+    doubts = capsys.readouterr().err
+    assert "motor" in doubts
+    assert "may make up for what is missing" in doubts
