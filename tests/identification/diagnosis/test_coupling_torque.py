@@ -100,7 +100,7 @@ def test_on_the_link_balance_the_channel_takes_it_away() -> None:
     ]
     for balance, rows in left[0].residual.items():
         np.testing.assert_allclose(left[1].residual[balance], rows, rtol=0, atol=1e-9)
-    # the level of noise is drawn from what the sensors read, and the clock that is fitted shifts it:
+    # the level of noise is drawn from what the sensors read, and the fitted clock shifts it:
     # that is no tenth of what the data tell
     for name, value in plain.items():
         stderr = whole.solution.stderr[name]
