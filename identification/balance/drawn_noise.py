@@ -48,10 +48,13 @@ class Draw:
     ----------
     record : WeakRecord
         The record itself, or pieces of it where it is long.
+    rows : (n,) int array
+        Rows of the whole record that these are.
     calm, noisy : WeakRecord
     """
 
     record: WeakRecord
+    rows: IntArray
     calm: WeakRecord
     noisy: WeakRecord
 
@@ -80,21 +83,25 @@ def draws_of(record: WeakRecord, noise: Mapping[str, float]) -> tuple[Draw, ...]
         cache.move_to_end(key)
         return found[1]
     rng = np.random.default_rng(SEED)
-    seen = excerpt(record)
-    made = tuple(_drawn(seen, noise, rng) for _ in range(max(1, -(-ROWS // max(seen.rows, 1)))))
+    seen, rows = excerpt(record)
+    made = tuple(
+        _drawn(seen, rows, noise, rng) for _ in range(max(1, -(-ROWS // max(seen.rows, 1))))
+    )
     cache[key] = (weakref.ref(record), made)
     while len(cache) > MOST:
         cache.popitem(last=False)
     return made
 
 
-def excerpt(record: WeakRecord) -> WeakRecord:
-    """The record, or about :data:`LONGEST` rows of it in pieces spread evenly where it has more."""
+def excerpt(record: WeakRecord) -> tuple[WeakRecord, IntArray]:
+    """The record, or about :data:`LONGEST` rows of it in pieces spread evenly where it has more;
+    and which of its rows these are.
+    """
     if record.rows <= LONGEST:
-        return record
+        return record, np.arange(record.rows)
     grid = record.grid
     period = round(PIECE * record.rows / LONGEST)
-    rows: list[IntArray] = []
+    found_rows: list[IntArray] = []
     points: list[IntArray] = []
     segments: list[slice] = []
     first_row = first_point = 0
@@ -105,17 +112,17 @@ def excerpt(record: WeakRecord) -> WeakRecord:
             begin = segments[-1].stop if segments else 0
             samples = 2 * grid.half + (taken - 1) * grid.stride + 1
             segments.append(slice(begin, begin + samples))
-            rows.append(first_row + row + np.arange(taken))
+            found_rows.append(first_row + row + np.arange(taken))
             at = first_point + row * grid.stride // grid.step
             points.append(at + np.arange(len(range(0, samples, grid.step))))
         first_row += count
         first_point += len(range(0, s.stop - s.start, grid.step))
-    which, where = np.concatenate(rows), np.concatenate(points)
+    which, where = np.concatenate(found_rows), np.concatenate(points)
 
     def of(signals: Mapping[str, FloatArray], index: IntArray) -> dict[str, FloatArray]:
         return {n: x[index] for n, x in signals.items()}
 
-    return replace(
+    pieces = replace(
         record,
         grid=replace(grid, segments=tuple(segments)),
         averaged=of(record.averaged, which),
@@ -128,9 +135,12 @@ def excerpt(record: WeakRecord) -> WeakRecord:
         rest=of(record.rest, which),
         support=None if record.support is None else record.support[which],
     )
+    return pieces, which
 
 
-def _drawn(record: WeakRecord, noise: Mapping[str, float], rng: np.random.Generator) -> Draw:
+def _drawn(
+    record: WeakRecord, rows: IntArray, noise: Mapping[str, float], rng: np.random.Generator
+) -> Draw:
     grid = record.grid
     count = max((s.stop for s in grid.segments), default=0)
     present = [c for c in POSITION_CHAINS if noise.get(c, 0.0) > 0 and c in record.points]
@@ -139,8 +149,9 @@ def _drawn(record: WeakRecord, noise: Mapping[str, float], rng: np.random.Genera
     calm = replace(record, points={**record.points, **record.smooth})
     return Draw(
         record,
-        calm,
-        replace(
+        rows,
+        calm=calm,
+        noisy=replace(
             record,
             averaged=_plus(record.averaged, averaged),
             points=_plus(calm.points, points),

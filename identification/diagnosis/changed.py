@@ -20,7 +20,7 @@ import numpy.typing as npt
 from casadi_models import EFFECTS, JointModel
 from casadi_models.term import LINK_INERTIA, TOTAL_INERTIA
 from identification.balance.balances import balances_of
-from identification.balance.calibration import names_of_runs
+from identification.balance.calibration import names_of_runs, of_run
 from identification.balance.dataset import HOLD_NAME, Dataset, load_dataset, prepared_model
 from identification.balance.noise import effective_share
 from identification.data.joint_file import Joint
@@ -32,6 +32,7 @@ from identification.errors import InputError
 from identification.fitting.assess import Error, assess
 from identification.fitting.covariance import FEWEST_BLOCKS, errors_of_blocks, inverse
 from identification.fitting.engine import Solution, solve, stack
+from identification.fitting.errors_in_variables import noise_products, unbiased, whole_without
 from identification.fitting.start_values import bounds_of
 from identification.fitting.weak_form import WeakForm
 
@@ -330,6 +331,7 @@ def _prepared(reference: Joint, records: Sequence[Record], tell: Progress) -> _S
         refit=refit,
         form=form,
         spread=_prior(reference, model, values),
+        unsure=_unsure(refit, data, names),
         inexact=inexact,
         shares=shares,
         refitted=error,
@@ -400,6 +402,19 @@ def _prior(reference: Joint, model: JointModel, values: dict[str, float]) -> Flo
     return np.array(out)
 
 
+def _unsure(refit: Solution, data: Dataset, names: Sequence[str]) -> FloatArray:
+    """Standard error of what is taken as the refit has it, (p,); not a number where it has none.
+
+    An unknown of single runs stands in one column for all of them: its error is that of their mean.
+    """
+    out = []
+    for name in names:
+        runs = [of_run(name, w) for w in data.train] if name in refit.model.calibration else [name]
+        found = [e for e in (refit.stderr.get(n) for n in runs) if e is not None]
+        out.append(float(np.linalg.norm(found)) / len(found) if found else math.nan)
+    return np.array(out)
+
+
 @final
 @dataclass(frozen=True)
 class _Search:
@@ -411,6 +426,8 @@ class _Search:
         Every parameter in the order of the model, weighted so that its rows count as independent.
     spread : (p,) array
         Standard error of each reference value; not a number for a nuisance.
+    unsure : (p,) array
+        Standard error of each value of the refit, not a number where it has none.
     inexact : (balances,) array
         Squares that the model leaves over the noise with every parameter fitted anew.
     shares : (balances,) array
@@ -425,6 +442,7 @@ class _Search:
     refit: Solution
     form: WeakForm
     spread: FloatArray
+    unsure: FloatArray
     inexact: FloatArray
     shares: FloatArray
     refitted: Error
@@ -437,6 +455,13 @@ class _Search:
     def start(self) -> FloatArray:
         """Values of the reference, (p,)."""
         return np.array([self.form.values[n] for n in self.names])
+
+    @cached_property
+    def held_errors(self) -> FloatArray:
+        """Standard errors of what is held, (p,): of the reference, or of the refit for what is
+        taken from there; not a number where neither has one.
+        """
+        return np.where(np.isfinite(self.spread), self.spread, self.unsure)
 
     @cached_property
     def _limits(self) -> dict[str, tuple[float, float]]:
@@ -465,6 +490,8 @@ class _Search:
             names = tuple(self.names[i] for i in free)
             form = replace(self.form, values=self.form.at(x), free=names)
             values, _ = form.fitted(self._limits, STEPS)
+            # the reference was fitted so too: noise left in on one side only would be a change
+            values, _ = unbiased(replace(form, values=values), self._limits)
             x = np.array([values[n] for n in self.names])
         return _Point.at(self, x, tuple(moved))
 
@@ -581,8 +608,9 @@ class _Point:
     x : (p,) array
     moved : tuple of int
         Places of the parameters that are let go.
-    grams : (blocks, balances, p + 1, p + 1) array
-        Products of the columns and, last, the residual.
+    grams, noise : (blocks, balances, p + 1, p + 1) array
+        Products of the columns and, last, the residual; and what noise adds to them, beyond what it
+        adds to the squares that the reference leaves.
     rows : (balances,) array
         Rows of each balance.
     """
@@ -591,6 +619,7 @@ class _Point:
     x: FloatArray
     moved: tuple[int, ...]
     grams: FloatArray
+    noise: FloatArray
     rows: FloatArray
 
     @classmethod
@@ -601,8 +630,14 @@ class _Point:
         count = int(stacked.block.max()) + 1
         names = form.balances.balances
         grams = np.zeros((count, len(names), len(x) + 1, len(x) + 1))
-        rows = np.zeros(len(names))
+        rows, noise = np.zeros(len(names)), np.zeros_like(grams)
+        drawn, back = noise_products(form.moved(x)), search.start - x
         for k, b in enumerate(names):
+            score, added = drawn.score[b], drawn.gram[b]
+            own = -back @ (2 * score + added @ back)
+            whole = np.block([[added, score[:, None]], [score[None, :], np.full((1, 1), own)]])
+            power = np.asarray(form.weights[b]) ** 2
+            taken = float(power[stacked.taking[b]].sum())
             used = stacked.taking[b] & (stacked.block >= 0)
             full = (
                 np.column_stack([stacked.jacobian[b], stacked.residual[b]])
@@ -611,8 +646,10 @@ class _Point:
             for block in range(count):
                 part = full[used & (stacked.block == block)]
                 grams[block, k] = part.T @ part
+                here = used & (stacked.block == block)
+                noise[block, k] = whole * float(power[here].sum() / max(taken, 1e-300))
             rows[k] = float(np.sum(used))
-        return cls(search, x, moved, grams, rows)
+        return cls(search, x, moved, grams, noise, rows)
 
     @property
     def away(self) -> FloatArray:
@@ -620,26 +657,44 @@ class _Point:
         return self.x - self.search.start
 
     @staticmethod
-    def _step(total: FloatArray, free: Sequence[int]) -> FloatArray:
-        """Step to the minimum of rows with these normal equations, the others held; (p,)."""
+    def _normal(total: FloatArray, noise: FloatArray, free: Sequence[int]) -> FloatArray:
+        """Normal matrix of what is free without what noise adds to it, (free, free)."""
+        raw, added = (x[np.ix_(free, free)] for x in (total, noise))
+        size = np.sqrt(np.maximum(np.diag(raw), 1e-300))
+        unit = np.outer(size, size)
+        return np.asarray(whole_without(raw / unit, added / unit) * unit)
+
+    @classmethod
+    def _step(cls, total: FloatArray, noise: FloatArray, free: Sequence[int]) -> FloatArray:
+        """Step to the minimum of rows with these normal equations and this noise in them, the
+        others held; (p,).
+        """
         step = np.zeros(len(total) - 1)
         if len(free):
-            step[list(free)] = -inverse(total[np.ix_(free, free)]) @ total[list(free), -1]
+            score = (total - noise)[list(free), -1]
+            step[list(free)] = -inverse(cls._normal(total, noise, free)) @ score
         return step
+
+    @cached_property
+    def _total(self) -> tuple[FloatArray, FloatArray]:
+        """Normal equations over all blocks and balances, and the noise in them."""
+        return self.grams.sum(axis=(0, 1)), self.noise.sum(axis=(0, 1))
 
     def squares(self, moved: Sequence[int]) -> FloatArray:
         """Sum of squares of each block and balance under the step that the other folds give,
         (blocks, balances).
         """
         free = self.search.free(moved)
-        total = self.grams.sum(axis=(0, 1))
+        total, noise = self._total
         count = len(self.grams)
         folds = min(FOLDS, count)
         out = np.zeros(self.grams.shape[:2])
         for k in range(folds):
             test = np.arange(count) % folds == k
-            whole = np.append(self._step(total - self.grams[test].sum(axis=(0, 1)), free), 1.0)
-            out[test] = np.einsum("i,bkij,j->bk", whole, self.grams[test], whole)
+            seen = total - self.grams[test].sum(axis=(0, 1))
+            added = noise - self.noise[test].sum(axis=(0, 1))
+            whole = np.append(self._step(seen, added, free), 1.0)
+            out[test] = np.einsum("i,bkij,j->bk", whole, (self.grams - self.noise)[test], whole)
         return out
 
     @cached_property
@@ -675,7 +730,7 @@ class _Point:
 
     def sizes(self, moved: Sequence[int]) -> FloatArray:
         """Change of each parameter with those of `moved` let go, (p,)."""
-        return self.away + self._step(self.grams.sum(axis=(0, 1)), self.search.free(moved))
+        return self.away + self._step(*self._total, self.search.free(moved))
 
     def free_errors(self, moved: Sequence[int], turned: FloatArray | None = None) -> FloatArray:
         """Standard errors of the changes of all that is free, in their order (see
@@ -688,27 +743,23 @@ class _Point:
         free = self.search.free(moved)
         if not free:
             return np.zeros(0)
-        held = [
-            i for i in range(len(self.x)) if i not in free and np.isfinite(self.search.spread[i])
-        ]
-        total = self.grams.sum(axis=(0, 1))
-        step = self._step(total, free)
-        grams = self.grams.sum(axis=1)
+        errors = self.search.held_errors
+        held = [i for i in range(len(self.x)) if i not in free and np.isfinite(errors[i])]
+        total, noise = self._total
+        step = self._step(total, noise, free)
+        grams = (self.grams - self.noise).sum(axis=1)
         scores = (grams[:, :-1, -1] + grams[:, :-1, :-1] @ step)[:, free]
         grams = grams[:, :-1, :-1]
-        pulled = (
-            -inverse(total[np.ix_(free, free)])
-            @ total[np.ix_(free, held)]
-            * self.search.spread[held]
-        )
+        normal = self._normal(total, noise, free)
+        pulled = -inverse(normal) @ (total - noise)[np.ix_(free, held)] * errors[held]
         own = np.where(np.isin(free, moved), self.search.spread[free], 0.0)
         grams = grams[:, free][:, :, free]
         if turned is not None:
             back = np.linalg.inv(turned)
             grams, scores = np.einsum("ia,bij,jc->bac", turned, grams, turned), scores @ turned
-            pulled = back @ pulled
+            pulled, normal = back @ pulled, turned.T @ normal @ turned
             own = np.sqrt((back**2) @ own**2)
-        blocks = errors_of_blocks(grams, scores)
+        blocks = errors_of_blocks(grams, scores, normal)
         found = np.zeros(len(free)) if blocks is None else blocks
         return np.asarray(np.sqrt(found**2 + own**2 + np.sum(pulled**2, axis=1)))
 

@@ -276,10 +276,16 @@ class _Pointwise:
         expressions = residual_expressions(model, sensing)
         self.balances = tuple(expressions)
         moved = ca.vertcat(e.signals.motor_acceleration, e.signals.link_acceleration)
-        self.at_rest_too = frozenset(
-            b for b, r in expressions.items() if not ca.depends_on(r, moved)
-        )
         self.names = model.parameter_names
+        # a clock brings an acceleration into every balance, but no more of it than it is late
+        clocks: Any = ca.vertcat(
+            *(e.parameters[i] for i, n in enumerate(self.names) if n in model.calibration)
+        )
+        self.at_rest_too = frozenset(
+            b
+            for b, r in expressions.items()
+            if not ca.depends_on(ca.substitute(r, clocks, ca.DM.zeros(clocks.shape)), moved)
+        )
         self.wrt = tuple(wrt)
         columns = [self.names.index(n) for n in wrt]
         out: list[Any] = []

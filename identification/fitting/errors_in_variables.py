@@ -99,7 +99,10 @@ def noise_products(problem: WeakForm) -> NoiseProducts:
             )
             for b in balances.balances:
                 weight = np.broadcast_to(problem.weights[b], (problem.rows,))[rows]
-                weight = weight * (believed[b] / np.sqrt(len(drawn)))
+                squares = weight**2 * record.taking(b)
+                # pieces of a long record stand for all of it
+                whole = np.sum(squares) / max(float(np.sum(squares[draw.rows])), 1e-300)
+                weight = weight[draw.rows] * (believed[b] * np.sqrt(whole / len(drawn)))
                 moved = (noisy.jacobian[b] - calm.jacobian[b]) * weight[:, None] * straight
                 gram[b] += moved.T @ moved
                 score[b] += moved.T @ ((noisy.residual[b] - calm.residual[b]) * weight)

@@ -162,10 +162,9 @@ def test_pieces_of_a_long_record_have_its_rows_and_its_floor() -> None:
     signals = {"motor_position": q, "link_position": q, "torque": np.cos(time)}
     segments = (slice(0, 40_003), slice(40_003, 40_020), slice(40_020, count))
     whole = prepare(time, signals, segments, length=0.06)
-    part = excerpt(whole)
+    part, index = excerpt(whole)
     assert whole.rows > 1.5 * LONGEST
     assert 0.9 * LONGEST < part.rows < 1.1 * LONGEST
-    index = np.searchsorted(whole.time, part.time)
     assert np.array_equal(whole.time[index], part.time)
     for name in ("motor_velocity", "motor_acceleration", "torque"):
         assert np.array_equal(whole.averaged[name][index], part.averaged[name])
@@ -173,11 +172,12 @@ def test_pieces_of_a_long_record_have_its_rows_and_its_floor() -> None:
         again = np.tanh(part.average(np.tanh(3 * part.points[name])))
         assert np.allclose(again, law, rtol=0, atol=1e-12), name
     short = prepare(time[:40_000], {n: x[:40_000] for n, x in signals.items()}, (slice(0, 40_000),))
-    assert excerpt(short) is short
+    assert excerpt(short)[0] is short
 
     noise = {"motor_position": 1e-5, "torque": 0.01}
     drawn = draws_of(whole, noise)[0]
     assert drawn.record.rows == part.rows
+    assert np.array_equal(drawn.rows, index)
     plain = prepare(time, {"torque": 0.01 * rng.standard_normal(count)}, segments, length=0.06)
     left = rms(drawn.noisy.averaged["torque"] - drawn.calm.averaged["torque"])
     assert left == pytest.approx(rms(plain.averaged["torque"]), rel=0.03)

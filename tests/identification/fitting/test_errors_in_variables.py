@@ -9,6 +9,7 @@ import pytest
 
 from identification import Joint, Record, fit
 from identification.balance.dataset import load_dataset, prepared_model
+from identification.balance.drawn_noise import LONGEST
 from identification.balance.excitation import attenuation
 from identification.fitting.errors_in_variables import MOST_NOISE, whole_without
 
@@ -17,13 +18,13 @@ NAMES = ("link_inertia", "link_viscous", "gravity_torque")
 JOINT = Joint(name="arm", gear_ratio=1.0, model_name="hd1", effects=("viscous@link", "gravity"))
 
 
-def run(seed: int) -> tuple[Record, dict[str, float]]:
-    """A link under a measured torque, 30 s; the truth is known in closed form."""
+def run(seed: int, seconds: float = 30.0) -> tuple[Record, dict[str, float]]:
+    """A link under a measured torque; the truth is known in closed form."""
     rng = np.random.default_rng(880_000 + seed)
     true = dict(
         zip(NAMES, np.array([3.0, 4.0, 30.0]) * np.exp(rng.uniform(-0.5, 0.5, 3)), strict=True)
     )
-    t = np.arange(round(30.0 / DT)) * DT
+    t = np.arange(round(seconds / DT)) * DT
     w = 2 * np.pi * np.array([0.17, 0.45, 1.1, 1.9]) * np.exp(rng.uniform(-0.1, 0.1, 4))
     a, phase = np.array([0.5, 0.2, 0.1, 0.05]), rng.uniform(0, 2 * np.pi, (4, 1))
     angle = w[:, None] * t + phase
@@ -58,6 +59,21 @@ def test_an_inertia_has_no_bias_where_noise_would_take_percents_off() -> None:
     assert attenuation(data)["link inertia"] > 0.02
     off, size = errors()["link_inertia"].T
     assert abs(off.mean()) < 3 * float(np.sqrt(np.mean(size**2) / JOINTS))
+
+
+def test_noise_of_a_record_that_is_drawn_in_pieces_is_taken_off_too() -> None:
+    record, true = run(1, 150.0)
+    data = load_dataset([record], [], JOINT, prepared_model(JOINT, record))
+    assert data.train[0].rows > LONGEST
+    solution = fit(JOINT, [record]).solution
+    for n in NAMES:
+        error = solution.stderr[n]
+        assert error is not None
+        assert abs(solution.values[n] - true[n]) < 3 * error, n
+    # plain least squares would leave far more off the inertia than its band
+    error = solution.stderr["link_inertia"]
+    assert error is not None
+    assert attenuation(data)["link inertia"] * true["link_inertia"] > 6 * error
 
 
 @pytest.mark.parametrize("name", NAMES)
