@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 CHROMIUM = Path(os.environ.get("IRJ_CHROMIUM", "/usr/bin/chromium"))
@@ -51,7 +52,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
         problems: list[str] = []
         context.on("weberror", lambda e: problems.append(str(e.error)))
         made = context.new_page()
-        made.set_default_timeout(30_000)
+        made.set_default_timeout(15_000)
         yield made
         chromium.close()
     assert problems == []
@@ -161,3 +162,66 @@ def test_no_move_loses_a_fit(address: str, page: Any, tmp_path: Path) -> None:
     page.reload()
     idle(page, "parameters")
     assert page.inner_text("#headline strong") == first
+
+
+def write_two_joints(path: Path) -> None:
+    """Two joints side by side, degrees in a column that says nothing of its unit, a supply."""
+    t = np.arange(4000) * 0.002
+    columns = {"t": t, "vbus_V": np.full_like(t, 48.0) + 0.1 * np.sin(50.0 * t)}
+    for k, turns in ((1, 80.0), (2, 35.0)):
+        columns[f"q{k}"] = turns * np.sin((1.0 + k) * t)
+        columns[f"iq{k}_A"] = np.cos((1.0 + k) * t)
+        columns[f"defl{k}"] = 0.5 * np.cos((1.0 + k) * t)
+    table = np.column_stack(list(columns.values()))
+    np.savetxt(path, table, delimiter=",", header=",".join(columns), comments="", fmt="%.9g")
+
+
+def test_the_import_shows_what_would_be_odd_before_it_is_used(
+    address: str, page: Any, tmp_path: Path
+) -> None:
+    page.goto(address)
+    page.click("#fresh")
+    page.wait_for_selector("#demo")
+    write_two_joints(tmp_path / "rig.csv")
+    page.set_input_files("#files", str(tmp_path / "rig.csv"))
+    page.wait_for_selector(".import .odd")
+    said = " ".join(page.locator(".import .odd").all_inner_texts())
+    assert "columns of 2 joints, 1 to 2: this is joint 1" in said.replace("Columns", "columns")
+    assert "a supply voltage?" in said
+    assert "turns: degrees" in said
+    assert page.locator(".import svg.spark polyline").count() == 8
+    shot(page, "import")
+
+    page.select_option("select[aria-label='Joint']", "2")
+    page.wait_for_function(
+        "() => document.querySelector('select[aria-label=\"Channel of column q2\"]').value"
+        " === 'motor_position'"
+    )
+    page.fill("input[aria-label='Unit of column q2']", "deg")
+    page.press("input[aria-label='Unit of column q2']", "Tab")
+    page.wait_for_function("() => !document.querySelector('.import').innerText.includes('swing')")
+    page.select_option("select[aria-label='Channel of column vbus_V']", "")
+    page.wait_for_function("() => !document.querySelector('.import').innerText.includes('supply')")
+    page.fill("input[aria-label^='Formula']", "q2 - defl2")
+    page.fill("input[aria-label='Unit of the formula']", "deg")
+    page.select_option("select[aria-label='Channel of the formula']", "link_position")
+    page.wait_for_function(
+        "() => document.querySelector('.import').innerText.includes('formula')"
+        " && document.querySelectorAll('.import .si').length === 4"
+    )
+    page.click("button.primary:has-text('Use these columns')")
+    page.wait_for_function("() => app.state.files[0].status === 'ready'")
+    columns = page.evaluate("app.state.files[0].columns")
+    assert columns["link_position"] == {"formula": "q2 - defl2", "unit": "deg"}
+    assert columns["motor_position"] == {"column": "q2", "unit": "deg"}
+
+    # the map can be changed later
+    page.click("button[aria-label='Columns of rig.csv']")
+    page.wait_for_selector("select[aria-label='Sign of column iq2_A']")
+    page.select_option("select[aria-label='Sign of column iq2_A']", "-1")
+    page.wait_for_function(
+        "() => document.querySelector('select[aria-label=\"Sign of column iq2_A\"]').value === '-1'"
+    )
+    shot(page, "import-later")
+    page.click("button.primary:has-text('Use these columns')")
+    page.wait_for_function("() => app.state.files[0].columns.motor_current.sign === -1")

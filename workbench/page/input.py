@@ -11,12 +11,13 @@ from pathlib import Path
 from typing import Any, Final
 
 from casadi_models.transmission import MODELS
+from identification.data.channels import KINDS
 from identification.data.joint_file import parse_joint
 from identification.data.joint_schema import JOINT
 from identification.data.plain_text import from_toml, tables_text
 from identification.errors import InputError
 from workbench.page.live import Live
-from workbench.page.records import guessed_role
+from workbench.page.records import guessed_role, surveyed
 from workbench.page.session import FileEntry, State
 from workbench.page.tree import LONGEST_NAME, given, opened, remarked, used_files
 
@@ -77,10 +78,15 @@ def put_upload(live: Live, identifier: str, body: Mapping[str, Any]) -> dict[str
             f
             for f in live.state.files
             if f.id == identifier
-            or (body.get("all") and f.status == "columns" and set(_used(columns)) <= set(f.names))
+            or (body.get("all") and f.status == "columns" and _used(columns) <= set(f.names))
         ]
+        kind = str(body.get("kind") or entry.kind)
+        if kind not in ("", *KINDS):
+            raise InputError(f"kind is {kind!r}; give one of {', '.join(KINDS)}")
         made = {
-            f.id: live.examine(replace(entry if f.id == identifier else f, columns=columns))
+            f.id: live.examine(
+                replace(entry if f.id == identifier else f, columns=columns, kind=kind)
+            )
             for f in everywhere
         }
         live.change_input(lambda s: replace(s, files=tuple(made.get(f.id, f) for f in s.files)))
@@ -116,9 +122,9 @@ def _columns(given: Any) -> dict[str, Any]:
     for channel, spec in given.items():
         if not isinstance(spec, Mapping):
             raise InputError(f"columns: {channel} must be a table")
-        entry = {k: spec[k] for k in ("column", "unit") if spec.get(k)}
-        for key in ("scale", "counts_per_turn"):
-            if spec.get(key) not in (None, "", 1, 1.0):
+        entry = {k: spec[k] for k in ("column", "formula", "unit") if spec.get(k)}
+        for key in ("scale", "counts_per_turn", "step"):
+            if spec.get(key) not in (None, "", *((1, 1.0) if key != "step" else ())):
                 entry[key] = _number(spec[key], f"{channel}: {key}")
         if spec.get("sign") == -1:
             entry["sign"] = -1
@@ -126,8 +132,35 @@ def _columns(given: Any) -> dict[str, Any]:
     return out
 
 
-def _used(columns: Mapping[str, Any]) -> list[str]:
-    return [str(c.get("column")) for c in columns.values()]
+def _used(columns: Mapping[str, Any]) -> set[str]:
+    return {str(c["column"]) for c in columns.values() if "column" in c}
+
+
+def look(live: Live, identifier: str, body: Mapping[str, Any]) -> dict[str, Any]:
+    """What a record's file holds (see `identification.data.survey`): with the map in the body, the
+    map in use (``now``), or the guess for one of several joints (``number``).
+
+    Raises
+    ------
+    InputError
+        Unknown record; a map that does not fit.
+    """
+    entry = _entry(live.state, identifier)
+    given_map: Mapping[str, Any] | None = None
+    if body.get("columns"):
+        given_map = _columns(body["columns"])
+    number = body.get("number")
+    if number is not None and (isinstance(number, bool) or not isinstance(number, int)):
+        raise InputError(f"number is {number!r}; give a whole number")
+    kind = str(body.get("kind") or "") or (live.kind_of(entry) if live.has_joint else entry.kind)
+    if body.get("now") and given_map is None and number is None:
+        given_map = live.columns_of(entry) or {}
+    path = live.session.path_of(entry)
+    found = surveyed(entry, path, kind or None, given_map, number)
+    others = [
+        f.id for f in live.state.files if f.status == "columns" and set(entry.names) <= set(f.names)
+    ]
+    return {**found, "same": len(others) if entry.status == "columns" else 0}
 
 
 def _number(value: Any, what: str) -> float:

@@ -189,10 +189,8 @@ class Live:
             it can be looked at.
         """
         joint = self._joint_or_none()
-        columns = entry.columns or (joint.columns if joint else None)
-        made, record = opened(
-            entry, self.session.path_of(entry), joint.kind if joint else "rotary", columns
-        )
+        path = self.session.path_of(entry)
+        made, record = opened(entry, path, self.kind_of(entry), self.columns_of(entry))
         if record is not None and not (soon and len(record) > SOON):
             made, record = checked(made, record, self.session.path_of(entry), joint)
         with self.lock:
@@ -280,6 +278,21 @@ class Live:
             if self.job is None:
                 self._analysis = None
                 self._records.clear()
+
+    @property
+    def has_joint(self) -> bool:
+        """Whether there is a valid joint."""
+        return self._joint_or_none() is not None
+
+    def columns_of(self, entry: FileEntry) -> Mapping[str, Any] | None:
+        """The column map of a record: its own, else that of the joint file, where there is one."""
+        joint = self._joint_or_none()
+        return entry.columns or (joint.columns if joint else None)
+
+    def kind_of(self, entry: FileEntry) -> str:
+        """Kind of the axis: of the joint, else as the record's columns say it."""
+        joint = self._joint_or_none()
+        return joint.kind if joint else entry.kind or "rotary"
 
     def _joint_or_none(self) -> Joint | None:
         try:

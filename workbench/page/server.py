@@ -40,6 +40,7 @@ from workbench.page.input import (
     add_upload,
     change_tree,
     drop_upload,
+    look,
     put_upload,
     set_joint,
     start_demo,
@@ -62,6 +63,7 @@ PAGE: Final = {
     "/app.js": (WEB / "app.js", "text/javascript; charset=utf-8"),
     "/views.js": (WEB / "views.js", "text/javascript; charset=utf-8"),
     "/more.js": (WEB / "more.js", "text/javascript; charset=utf-8"),
+    "/import.js": (WEB / "import.js", "text/javascript; charset=utf-8"),
     "/tree.js": (WEB / "tree.js", "text/javascript; charset=utf-8"),
     "/preview.js": (WEB / "preview.js", "text/javascript; charset=utf-8"),
     "/plots.js": (WEB / "plots.js", "text/javascript; charset=utf-8"),
@@ -229,6 +231,11 @@ async def _change_file(request: Request, live: Live) -> Response:
     return _json(await run_in_threadpool(put_upload, live, request.path_params["fid"], body))
 
 
+async def _look(request: Request, live: Live) -> Response:
+    body = await _body(request)
+    return _json(await run_in_threadpool(look, live, request.path_params["fid"], body))
+
+
 async def _delete_file(request: Request, live: Live) -> Response:
     await run_in_threadpool(drop_upload, live, request.path_params["fid"])
     return _json({})
@@ -320,6 +327,7 @@ def create_app(
         at("/files/{name}", upload, "PUT"),
         at("/file/{fid}", _change_file, "POST"),
         at("/file/{fid}", _delete_file, "DELETE"),
+        at("/look/{fid}", _look, "POST"),
         at("/joint", _joint, "POST"),
         at("/tree", _tree, "POST"),
         at("/demo", _demo, "POST"),

@@ -69,6 +69,8 @@ class FileEntry:
     message : str
     columns : mapping or None
         Column map that the user confirmed.
+    kind : {"", "rotary", "linear"}
+        Kind of the axis as its columns say it, until there is a joint.
     names, guess : what the file holds and which map is proposed.
     findings, summary : result of the check gate; size, channels and where they come from.
     """
@@ -82,6 +84,7 @@ class FileEntry:
     status: str = "ready"
     message: str = ""
     columns: Mapping[str, Any] | None = None
+    kind: str = ""
     names: tuple[str, ...] = ()
     guess: tuple[Mapping[str, Any], ...] = ()
     findings: tuple[Mapping[str, Any], ...] = ()
