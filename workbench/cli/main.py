@@ -113,6 +113,27 @@ def parser() -> OneLineParser:
     demo.add_argument(
         "--picture", metavar="FILE.svg", help="draw the falling error and the place of the residual"
     )
+    taken = verb(
+        "import", "importing", "look at a measurement file and write the joint file that reads it"
+    )
+    taken.add_argument("records", nargs=1, metavar="FILE", help="record file")
+    taken.add_argument("-o", "--output", metavar="FILE", help="the joint file to write (TOML)")
+    taken.add_argument("--name", metavar="NAME", help="name of the joint (default: the file's)")
+    taken.add_argument(
+        "--kind", choices=("rotary", "linear"), help="kind of the axis (default: as it looks)"
+    )
+    taken.add_argument(
+        "--joint-number",
+        type=int,
+        metavar="N",
+        help="where columns of several joints stand side by side: which (default: the first)",
+    )
+    taken.add_argument(
+        "--gear-ratio", type=float, metavar="R", help="motor angle over link angle (default 1)"
+    )
+    taken.add_argument(
+        "--motor-constant", type=float, metavar="K", help="torque on the motor shaft per ampere"
+    )
     checked = verb("check", "records", "check records before a fit", records=True)
     checked.add_argument("--joint", metavar="J", help="joint file: column map and gear ratio")
     resampled = verb(

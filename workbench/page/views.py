@@ -19,6 +19,7 @@ from identification.errors import InputError
 from workbench.page import export as app_export
 from workbench.page import plan as app_plan
 from workbench.page import replay as app_replay
+from workbench.page import tree
 from workbench.page.input import folder_of, joint_form
 from workbench.page.live import Live
 from workbench.page.pattern import pattern
@@ -164,6 +165,14 @@ def _library(live: Live, query: Query) -> list[dict[str, Any]]:
     return addable(live)
 
 
+def _tree(live: Live, query: Query) -> dict[str, Any]:
+    return {"branches": tree.shown(live.state), "name": live.state.name}
+
+
+def _fits(live: Live, query: Query) -> dict[str, Any]:
+    return tree.compared(live.state, str(query.get("a", "")), str(query.get("b", "")))
+
+
 def _joint(live: Live, query: Query) -> dict[str, Any]:
     return {"text": live.state.joint_text, "form": joint_form(live.state.joint_text)}
 
@@ -226,6 +235,8 @@ VIEWS: Final[Mapping[str, Callable[[Any, Query], Any]]] = {
     "compare": _compare,
     "parameters": _parameters,
     "library": _library,
+    "tree": _tree,
+    "fits": _fits,
     "joint": _joint,
     "code": _code,
     "joint.toml": _joint_file,
