@@ -181,7 +181,9 @@ def lateness(made: WeakRecord, place: str, *, torque: bool) -> tuple[float, floa
     if place == "drive":
         load = [a["torque"]] if torque else []
         return *_slope(a["drive"], [*motion("motor"), *load], -a["drive_rate"]), 0.0
-    effort, twist = a["torque" if torque else "drive"], a["motor_position"] - a["link_position"]
+    effort, twist = a.get("torque" if torque else "drive"), a["motor_position"] - a["link_position"]
+    if effort is None:  # nothing tells friction of the link from lateness
+        return 0.0, math.inf, 0.0
     one, v, _, bend, *_ = motion("link")
     late, error = _slope(twist, [one, effort, bend, np.sign(v)], v)
     if torque:

@@ -44,6 +44,7 @@ RESTING_SIDES: Final[Mapping[str, tuple[str, ...]]] = {
     "link": ("link",),
     "sum": ("motor", "link"),
     "axis": ("motor", "link"),
+    "kinematic": ("link",),
 }
 """Sides whose dry friction acts in a balance. At rest it is any torque up to its limit: such a row
 is an inequality, no equation. The transmission has no friction against the ground."""

@@ -255,6 +255,8 @@ def run_fit(arguments: Namespace) -> int:
         f"relative error {fitted.train.relative_error_percent:.3f} %, fit "
         f"{fitted.train.fit_percent:.2f} %"
     )
+    if fitted.scale:
+        print(f"note: {fitted.scale}")
     _print_parameters(fitted.parameters)
     if arguments.output:
         write_text(arguments.output, fitted.to_joint_file())

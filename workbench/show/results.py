@@ -37,6 +37,7 @@ BALANCES: Final = {
     "sum": "drive torque against everything that moves (no torque sensor)",
     "deflection": "drive torque against motor side and twist of the gear (no torque sensor)",
     "axis": "drive torque against everything that moves, seen from one side",
+    "kinematic": "twist of the gear against what the link's own motion asks for (no torque)",
 }
 STRONG_CORRELATION: Final = 0.95
 SHOWN_PLACES: Final = 4
