@@ -110,14 +110,18 @@ def _moved(x: FloatArray, late: float) -> FloatArray:
     f = late - whole
     if f == 0:
         return np.roll(x, -whole)
-    weights = (
+    parts = (w * np.roll(x, 1 - whole - i) for i, w in enumerate(cubic(f)))
+    return np.asarray(sum(parts), dtype=np.float64)
+
+
+def cubic(f: float) -> tuple[float, float, float, float]:
+    """Weights of four readings, of a point `f` of a sample behind the second one."""
+    return (
         -f * (f - 1) * (f - 2) / 6,
         (f + 1) * (f - 1) * (f - 2) / 2,
         -(f + 1) * f * (f - 2) / 2,
         (f + 1) * f * (f - 1) / 6,
     )
-    parts = (w * np.roll(x, 1 - whole - i) for i, w in enumerate(weights))
-    return np.asarray(sum(parts), dtype=np.float64)
 
 
 def in_time(
@@ -230,6 +234,7 @@ __all__ = [
     "USUAL_SKEW",
     "at_stamps",
     "carrier",
+    "cubic",
     "in_time",
     "lateness",
     "one_way",
