@@ -266,6 +266,10 @@ def parser() -> OneLineParser:
     report.add_argument(
         "-o", "--output", metavar="FILE", default="irj-report.html", help="the HTML file"
     )
+    report.add_argument("--author", metavar="NAME", help="for the first page")
+    report.add_argument(
+        "--notes", metavar="TEXT", help="for the first page, as what was changed before"
+    )
     listed = verb("effects", "library", "list the effect library, or one effect")
     listed.add_argument("key", nargs="?", help="key of one effect")
     added = verb("add", "library", "add an effect to a joint file")
