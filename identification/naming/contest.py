@@ -11,9 +11,11 @@ from typing import Final, final
 import numpy as np
 import numpy.typing as npt
 
+from casadi_models import EFFECTS
 from identification.balance.balances import balances_of
 from identification.balance.dataset import Dataset
 from identification.balance.stacked import INDEPENDENT_SHARE, stack
+from identification.balance.weak import REST_SHARE, RESTING_SIDES, WeakRecord
 from identification.diagnosis.candidates import offered
 from identification.diagnosis.trials import Trial, make_base, try_candidate
 from identification.fitting.engine import Solution, solve
@@ -23,6 +25,8 @@ FloatArray = npt.NDArray[np.float64]
 
 FEWEST: Final = 3.0
 """Log-likelihood from which a name counts as better: odds of twenty to one [nats]."""
+TURN_WIDTHS: Final = 3.0
+"""Smoothing velocities up to which friction has not yet reached its level (to 1 %)."""
 DECIDED: Final = 2.0
 """Normal deviate over blocks of a difference of log-likelihoods from which a name is behind."""
 
@@ -142,12 +146,17 @@ class Contest:
     def ahead(self) -> FloatArray:
         """By how much the leader is ahead of each rival on the old records, and how sure that is
         over blocks, as a normal deviate: by their mean or by their signs.  (rivals, 2)
+
+        Rows at a turn count only where one of the two laws says what happens there.
         """
-        first = self.rivals.index(self.leader)
-        squares = [_by_block(r, block) for r, _, block in self._old]
+        names = self.data.sensing.balances
+        calm = np.concatenate([~turning(self.leader.solution, self.data.train, b) for b in names])
+        best, _, block = self._old[self.rivals.index(self.leader)]
         out = np.zeros((len(self.rivals), 2))
-        for k, own in enumerate(squares):
-            difference = 0.5 * INDEPENDENT_SHARE * (own - squares[first])
+        for k, (rival, (own, _, _)) in enumerate(zip(self.rivals, self._old, strict=True)):
+            counted = np.ones_like(calm) if about_turns(rival) or about_turns(self.leader) else calm
+            apart = _by_block(own * counted, block) - _by_block(best * counted, block)
+            difference = 0.5 * INDEPENDENT_SHARE * apart
             count = len(difference)
             spread = float(np.std(difference, ddof=1)) * math.sqrt(count) if count > 1 else 0.0
             mean = float(difference.sum()) / spread if spread > 0 else 0.0
@@ -184,7 +193,7 @@ class Contest:
         rows = np.count_nonzero(self._old[0][2] >= 0) / len(self.data.sensing.balances)
         price = 0.5 * math.log(max(INDEPENDENT_SHARE * rows / tempering, 1.0))
         count = np.array([len(r.solution.free) for r in self.rivals])
-        log = self.likelihood / tempering - price * count
+        log = -self.ahead[:, 0] / tempering - price * count
         odds = np.exp(log - log.max())
         return np.asarray(odds / odds.sum())
 
@@ -197,6 +206,31 @@ class Contest:
             eliminated(j.T @ j, len(self.free(rival)))
             for rival, (_, j, _) in zip(self.rivals, self._old, strict=True)
         ]
+
+
+def about_turns(rival: Rival) -> bool:
+    """Whether a law says what happens while the motion turns round."""
+    effect = EFFECTS.get(rival.name)
+    return effect is not None and (effect.memory is not None or effect.shapes_reversal)
+
+
+def turning(
+    solution: Solution, records: Sequence[WeakRecord], balance: str
+) -> npt.NDArray[np.bool_]:
+    """Rows that touch a turn of a side whose friction acts in the balance: there dry friction is an
+    inequality, and the width of its change a stand-in.
+    """
+    parts = []
+    for rows in records:
+        out = np.zeros(rows.rows, dtype=np.bool_)
+        for side in RESTING_SIDES.get(balance, ()):
+            velocity = rows.points[f"{side}_velocity"]
+            widths = [solution.values[n] for n in solution.model.named("smoothing", side)]
+            slow = np.abs(velocity) < TURN_WIDTHS * max(widths, default=0.0)
+            turns = np.diff(np.sign(velocity), append=velocity[-1]) != 0
+            out |= rows.average((slow | turns).astype(np.float64)) > REST_SHARE
+        parts.append(out)
+    return np.concatenate(parts)
 
 
 def _by_block(residual: FloatArray, block: npt.NDArray[np.int64]) -> FloatArray:

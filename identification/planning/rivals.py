@@ -10,23 +10,19 @@ from typing import Final, final
 import numpy as np
 import numpy.typing as npt
 
-from casadi_models import EFFECTS
 from identification.balance.balances import balances_of
 from identification.balance.calibration import names_of_runs
 from identification.balance.dataset import Dataset
 from identification.balance.stacked import INDEPENDENT_SHARE, row_weights
-from identification.balance.weak import REST_SHARE, RESTING_SIDES, WeakRecord
+from identification.balance.weak import WeakRecord
 from identification.fitting.covariance import RANK
-from identification.fitting.engine import Solution
 from identification.fitting.information import form_of
-from identification.naming.contest import FEWEST, Contest, Rival
+from identification.naming.contest import FEWEST, Contest, Rival, about_turns, turning
 
 FloatArray = npt.NDArray[np.float64]
 
 ROUNDS: Final = 3
 """Gauss-Newton steps in which a rival adapts to a run of another: shapes are no straight lines."""
-TURN_WIDTHS: Final = 3.0
-"""Smoothing velocities up to which friction has not yet reached its level (to 1 %)."""
 SURE: Final = 1.6449
 """Normal quantile of 95 %: a run is long enough where so many of them come out above `FEWEST`."""
 
@@ -55,14 +51,14 @@ class Foreseen:
         values = {**leader.values, **dict.fromkeys(names_of_runs(leader.model, [rows]), 0.0)}
         balances = balances_of(leader.model, new.sensing, wrt=())
         whole = row_weights(balances, new, values, leader.sigma, [rows])
-        calm = {b: w * ~_turning(leader, rows, b) for b, w in whole.items()}
+        calm = {b: w * ~turning(leader, [rows], b) for b, w in whole.items()}
         out = np.full((len(self._contest.rivals), len(self._contest.rivals)), math.inf)
         for weights, at_turns in ((whole, True), (calm, False)):
             pairs = [
                 (i, j)
                 for i, one in enumerate(self._contest.rivals)
                 for j, other in enumerate(self._contest.rivals)
-                if i != j and (_about_turns(one) or _about_turns(other)) == at_turns
+                if i != j and (about_turns(one) or about_turns(other)) == at_turns
             ]
             here = {k: self._rest(self._contest.rivals[k], new, weights) for p in pairs for k in p}
             for i, j in pairs:
@@ -123,26 +119,6 @@ class Foreseen:
                 break
             x, left, best = moved, after, reached
         return best
-
-
-def _about_turns(rival: Rival) -> bool:
-    """Whether a law says what happens while the motion turns round."""
-    effect = EFFECTS[rival.name]
-    return effect.memory is not None or effect.shapes_reversal
-
-
-def _turning(solution: Solution, rows: WeakRecord, balance: str) -> npt.NDArray[np.bool_]:
-    """Rows that touch a turn of a side whose friction acts in the balance: there dry friction is an
-    inequality, and the width of its change a stand-in.
-    """
-    out = np.zeros(rows.rows, dtype=np.bool_)
-    for side in RESTING_SIDES.get(balance, ()):
-        velocity = rows.points[f"{side}_velocity"]
-        widths = [solution.values[n] for n in solution.model.named("smoothing", side)]
-        slow = np.abs(velocity) < TURN_WIDTHS * max(widths, default=0.0)
-        turns = np.diff(np.sign(velocity), append=velocity[-1]) != 0
-        out |= rows.average((slow | turns).astype(np.float64)) > REST_SHARE
-    return out
 
 
 def power(nats: float) -> float:

@@ -59,7 +59,7 @@ def test_the_hidden_name_leads_and_the_chances_add_up(drags: Contest) -> None:
         assert int(np.argmax(share)) == 1
     # both names have one amplitude: their odds are those of the likelihoods alone
     share, nats = drags.probability(), drags.likelihood
-    assert np.log(share[1] / share[0]) == pytest.approx(nats[1] - nats[0])
+    assert np.log(share[1] / share[0]) == pytest.approx(drags.ahead[0, 0])
     assert nats[2] < min(nats[:2]), "a law that imitates is better than none"
 
 
@@ -70,13 +70,13 @@ def test_a_name_falls_out_by_more_than_what_is_unmodelled(drags: Contest) -> Non
     names = {allow: {r.name for r in drags.alive(allow)} for allow in (0.0, 1.01 * nats)}
     assert names[0.0] == {"quadratic_drag"}
     assert names[1.01 * nats] == set(NAMES) | ({""} if drags.ahead[2, 0] <= 1.01 * nats else set())
-    share = drags.probability(4 * FEWEST)
-    assert share[1] < drags.probability()[1], "what is unmodelled makes every name less sure"
+    unsure = drags.probability(2 * nats)[1]
+    assert 0.5 < unsure < 0.9, "what is unmodelled makes a name less sure"
 
 
 def test_what_the_true_law_leaves_holds_no_other(drags: Contest) -> None:
     allowance = unmodelled(left_by(drags), "axis")
-    assert allowance < FEWEST
+    assert allowance < 0.05 * drags.ahead[0, 0]
     odds = odds_of(drags, allowance)
     assert odds.names == ("quadratic_drag",)
     assert odds.probability["quadratic_drag"] > 0.99
