@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
@@ -19,6 +20,8 @@ zeros behind it.
 """
 SPACE: Final = "\u00a0"
 """Between a number and its sign of unit: no line break."""
+CERTAIN: Final = 0.01
+"""Chance below which, and below 1 by which, no figure is told: a library is not all there is."""
 
 
 def number(value: float | None, digits: int = 4) -> str:
@@ -109,3 +112,16 @@ def value_range(values: npt.NDArray[np.float64]) -> str:
     """Smallest and largest finite value of a channel."""
     finite = values[np.isfinite(values)]
     return f"{finite.min():.5g} to {finite.max():.5g}" if finite.size else "no finite value"
+
+
+def chances(confidence: Mapping[str, float]) -> str:
+    """Chances of names in words: "97 % stribeck, under 1 % lugre".
+
+    Parameters
+    ----------
+    confidence : mapping of str to float
+    """
+    return ", ".join(
+        f"{'under 1' if p < CERTAIN else 'over 99' if p > 1 - CERTAIN else f'{100 * p:.0f}'} % {n}"
+        for n, p in confidence.items()
+    )

@@ -10,6 +10,7 @@ from typing import Protocol, final
 
 from casadi_models import JointModel
 from identification.balance.calibration import settled
+from identification.balance.dataset import without
 from identification.balance.sensing import Sensing
 from identification.data.joint_file import Joint
 from identification.data.record import Record
@@ -31,6 +32,8 @@ from identification.diagnosis.trials import Base, Trial, make_base, try_candidat
 from identification.fitting.assess import RATIO_LIMIT, VERDICT_KERNELS, BalanceError, Error, assess
 from identification.fitting.engine import Dataset, Solution, load_dataset, prepared_model, solve
 from identification.fitting.first_fit import first_fit
+from identification.naming.contest import Rival
+from identification.naming.odds import Odds, contenders, contest_of, odds_of, unmodelled
 
 Progress = Callable[[str, float], None]
 
@@ -96,6 +99,16 @@ class Bench(Protocol):
 
     def same_sign(self, trial: Trial, solution: Solution) -> bool:
         """Whether a small effect has the same sign at half and at double kernel."""
+
+    def odds(
+        self, claim: Claim, near: Mapping[str, float], now: Step, last: Ranking
+    ) -> Odds | None:
+        """Whole fits of the names of a claim of a step's model, and of those that came near it;
+        None where they cannot be fitted.
+
+        `near`: by how much the trial of a name was behind that of the claim [nats]; `last`: the
+        ranking on the step's model.
+        """
 
 
 @final
@@ -266,6 +279,22 @@ class JointBench:
             if trial.values[name] * found.values[name] <= 0:
                 return False
         return True
+
+    def odds(
+        self, claim: Claim, near: Mapping[str, float], now: Step, last: Ranking
+    ) -> Odds | None:
+        """See :mod:`identification.naming.odds`."""
+        whole = now.solution
+        less = without(whole.model, claim.label)
+        if less.terms == whole.model.terms or claim.effect.stage == "structure":
+            return None
+        names = contenders(claim.effects, near, unmodelled(last, claim.balance))
+        first = Rival(claim.effects[0], claim.label, whole)
+        bare = self.fitted(less, whole.values, again=True)
+        contest = contest_of(names, claim.balance, first, bare, self.data)
+        if contest.leader is not first:  # what a wrong name leaves is not what is unmodelled
+            last = self.ranking(self.base(contest.leader.solution))
+        return odds_of(contest, unmodelled(last, claim.balance))
 
     def _at_kernel(self, length: float) -> Dataset:
         """The same records with another kernel, prepared once."""

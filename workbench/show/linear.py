@@ -8,7 +8,8 @@ from identification.linear.models import LinearModels
 from identification.linear.spectra import Response
 from workbench.show.bode import HEIGHT as BODE_HEIGHT
 from workbench.show.bode import bode_picture
-from workbench.show.pictures import BEFORE, HEIGHT, INK, WIDTH, pole_picture
+from workbench.show.chart import BEFORE, HEIGHT, INK, WIDTH
+from workbench.show.pictures import pole_picture
 
 _HEAD = 24
 
