@@ -13,8 +13,8 @@ from typing import Any, Final, final
 import numpy as np
 import numpy.typing as npt
 
-from identification.balance.kinematic import residual_unit
 from identification.balance.balances import balances_of
+from identification.balance.kinematic import residual_unit
 from identification.balance.weak import WeakRecord
 from identification.data.record import Record
 from identification.diagnosis.improve import Improvement
