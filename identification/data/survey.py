@@ -272,9 +272,9 @@ def _column(name: str, unit: str, values: Any) -> Seen:
         unit,
         float(finite.min()),
         float(finite.max()),
-        1.0 - finite.size / numbers.size,
-        bool(np.all(finite == np.round(finite))),
-        tuple((float(p.min()), float(p.max())) for p in pieces),
+        lost=1.0 - finite.size / numbers.size,
+        whole=bool(np.all(finite == np.round(finite))),
+        spark=tuple((float(p.min()), float(p.max())) for p in pieces),
     )
 
 
