@@ -206,6 +206,8 @@ def print_improvement(found: Improvement) -> None:
             f"{said}: {names}, {claim.balance} balance, held-out RMS falls by "
             f"{claim.held_out_drop_percent:.1f} %{rest}"
         )
+        if claim.confidence:
+            print(f"  by the likelihoods of whole fits: {claim.surety}")
         if claim.separate_by:
             print(
                 f"  these cannot be told apart on these records; {claim.separate_by} would "
@@ -276,6 +278,8 @@ def run_fit(arguments: Namespace) -> int:
         f"relative error {fitted.train.relative_error_percent:.3f} %, fit "
         f"{fitted.train.fit_percent:.2f} %"
     )
+    if fitted.scale:
+        print(f"note: {fitted.scale}")
     _print_parameters(fitted.parameters)
     if arguments.output:
         write_text(arguments.output, fitted.to_joint_file())

@@ -60,6 +60,8 @@ PATTERNS: Final[Mapping[frozenset[str], str]] = {
         ("sum", "deflection")
     ): "a physical effect on the motor side, the current, or a position sensor, which look alike "
     "without a torque sensor",
+    frozenset(("kinematic",)): "the transmission (backlash, lost motion, kinematic error), a load "
+    "on the link, or a position sensor",
     frozenset(("axis",)): "physics or sensor alike: a single balance cannot tell the two apart",
 }
 

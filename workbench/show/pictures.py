@@ -26,6 +26,7 @@ from workbench.show.chart import (
     LEFT,
     LETTER,
     RIGHT,
+    TOP,
     WIDTH,
     Chart,
     Curve,
@@ -39,6 +40,7 @@ from workbench.show.chart import (
 
 if TYPE_CHECKING:
     from identification.diagnosis.places import Place
+    from identification.linear.poles import Pole
 
 REFERRED: Final = "referred to the link"
 AT_THE_LINK: Final = "at the link"
@@ -318,6 +320,53 @@ def _dot(dot: Dot, x: float, y: float) -> str:
         f'opacity="{opacity}" cx="{x:.1f}" cy="{y:.1f}" r="{size}"/>'
     )
     return out
+
+
+def pole_picture(poles: Sequence[Pole], title: str) -> str:
+    """Poles in the upper half of the plane of z: a cross each, an ellipse of two standard
+    deviations where they are known, and the circle that stable poles stay inside.
+
+    Parameters
+    ----------
+    poles : sequence of Pole
+    title : str
+        Whose poles they are.
+    """
+    # one length is one length either way, so that the circle is round
+    wide, high = WIDTH - LEFT - RIGHT, HEIGHT - TOP - BOTTOM
+    frame = Frame((-1.05, 1.05), (-0.06, 2.1 * high / wide - 0.06))
+    body = axes(frame, "real part", "imaginary part")
+    turn = np.linspace(0.0, math.pi, 91)
+    circle = "L".join(
+        f"{frame.across(float(a)):.1f} {frame.up(float(b)):.1f}"
+        for a, b in zip(np.cos(turn), np.sin(turn), strict=True)
+    )
+    body += f'<path class="s-ink" fill="none" stroke="{INK}" d="M{circle}"/>'
+    for one in poles:
+        x, y = frame.across(max(min(one.value.real, 1.05), -1.05)), frame.up(one.value.imag)
+        body += _ellipse(one, frame)
+        body += (
+            f'<path class="s-after" fill="none" stroke="{AFTER}" stroke-width="1.8" '
+            f'd="M{x - 4:.1f} {y - 4:.1f}l8 8m0 -8l-8 8"/>'
+        )
+    said = ", ".join(f"{number(p.value.real, 4)} {number(p.value.imag, 4)}i" for p in poles)
+    return svg(f"Poles of {title}, upper half: {said or 'none'}", body)
+
+
+def _ellipse(one: Pole, frame: Frame) -> str:
+    if not np.isfinite(one.covariance).all():
+        return ""
+    size, main = np.linalg.eigh(one.covariance)
+    turn = np.linspace(0.0, 2.0 * math.pi, 37)
+    round_ = 2.0 * np.sqrt(np.maximum(size, 0.0))[:, None] * np.array([np.cos(turn), np.sin(turn)])
+    path = "L".join(
+        f"{frame.across(one.value.real + float(a)):.1f} {frame.up(one.value.imag + float(b)):.1f}"
+        for a, b in (main @ round_).T
+    )
+    return (
+        f'<path class="s-after band" fill="{AFTER}" fill-opacity="0.22" stroke="none" '
+        f'd="M{path}z"/>'
+    )
 
 
 def bar(share: float, label: str) -> str:

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from identification.balance.balances import balances_of
+from identification.balance.kinematic import residual_unit
 from identification.balance.weak import WeakRecord
 from identification.data.record import Record
 from identification.diagnosis.improve import Improvement
@@ -194,7 +195,6 @@ def overlays(
         Residuals of the two models on all the records.
     """
     measured = references(data, records)
-    unit = "N" if data.joint.kind == "linear" else "N.m"
     out: list[tuple[float, Overlay]] = []
     first = 0
     for w, name in zip(records, names, strict=True):
@@ -214,7 +214,7 @@ def overlays(
                     Overlay(
                         balance,
                         name,
-                        unit=unit,
+                        unit=residual_unit(balance, data.joint.kind),
                         time=time,
                         measured=m,
                         start=m - before,

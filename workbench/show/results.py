@@ -13,7 +13,15 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
-from identification.data.formats import number, percent, pretty_unit, ratio, with_error, words
+from identification.data.formats import (
+    chances,
+    number,
+    percent,
+    pretty_unit,
+    ratio,
+    with_error,
+    words,
+)
 from workbench.show.pictures import bar, place_picture, staircase_picture
 from workbench.show.words import headline
 from workbench.show.words import title_of as effect_title
@@ -33,6 +41,7 @@ BALANCES: Final = {
     "sum": "drive torque against everything that moves (no torque sensor)",
     "deflection": "drive torque against motor side and twist of the gear (no torque sensor)",
     "axis": "drive torque against everything that moves, seen from one side",
+    "kinematic": "twist of the gear against what the link's own motion asks for (no torque)",
 }
 STRONG_CORRELATION: Final = 0.95
 SHOWN_PLACES: Final = 4
@@ -169,6 +178,9 @@ def claims_html(result: Mapping[str, Any]) -> str:
         )
         if "curve" in claim:
             line = f"{names}: {text(claim['sentence'])}"
+        if claim.get("confidence"):
+            by_title = {title_of(k): p for k, p in claim["confidence"].items()}
+            line += f" By the likelihoods of whole fits: {chances(by_title)}."
         if len(claim["effects"]) > 1:
             how = text(claim["separate_by"] or "a run that moves differently")
             line += f" These records cannot tell these names apart; what would: {how}."
