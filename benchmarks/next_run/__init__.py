@@ -19,10 +19,11 @@ import numpy as np
 import numpy.typing as npt
 
 from identification import Joint, Record, improve
-from identification.balance.dataset import without
 from identification.data.joint_file import Known
 from identification.fitting.engine import load_dataset, prepared_model, solve
-from identification.planning.rivals import Contest, enough, rivals_of
+from identification.naming.contest import Contest, Rival, rivals_of
+from identification.naming.odds import unmodelled_by
+from identification.planning.rivals import Foreseen, enough
 from identification.planning.runs import (
     SIMULATED,
     Plant,
@@ -102,7 +103,12 @@ def record_of(
     return replace(made, payload=payload)
 
 
-def judged(contest: Contest, truth: str) -> tuple[float, bool, bool]:
+def alive(contest: Contest, balance: str) -> tuple[Rival, ...]:
+    """Names that `improve` would leave."""
+    return contest.alive(unmodelled_by(contest, balance))
+
+
+def judged(contest: Contest, balance: str, truth: str) -> tuple[float, bool, bool]:
     """Log-likelihood of the truth over its closest rival; whether it is the one name left; whether
     it is left."""
     names = [r.name for r in contest.rivals]
@@ -112,7 +118,7 @@ def judged(contest: Contest, truth: str) -> tuple[float, bool, bool]:
     # a name that does not help at all on both records has no fit: the truth is alone
     others = [v for n, v in likelihood.items() if n != truth]
     found = likelihood[truth] - max(others, default=-np.inf)
-    left = [r.name for r in contest.alive]
+    left = [r.name for r in alive(contest, balance)]
     return float(found), left == [truth], truth in left
 
 
@@ -138,20 +144,21 @@ def one_joint(
     model = prepared_model(joint, old)
     data = load_dataset([old], [], joint, model)
     rivals = rivals_of(names, balance, solve(model, data), data)
-    rivals = list(Contest(rivals, data).alive)
+    rivals = list(alive(Contest(rivals, data), balance)) if rivals else []
     if len(rivals) < 2 or truth not in {r.name for r in rivals}:
         return []
     contest = Contest(rivals, data)
+    foreseen = Foreseen(contest)
     space = workspace_of(data, MAY)
     plant = Plant(contest.leader.solution.model, DT)
     scored = []
     for run in candidate_runs(space, possible_loads(model, data)):
         followed = plant.run(run)
         if followed is not None and not space.broken(followed):
-            apart = contest.distances(predicted(followed, run, data)) * SECONDS / SIMULATED
+            apart = foreseen.distances(predicted(followed, run, data)) * SECONDS / SIMULATED
             scored.append((float(apart.min()), run, apart))
     scored.sort(key=lambda s: -s[0])
-    found, one, within = judged(contest, truth)
+    found, one, within = judged(contest, balance, truth)
     out = [("before", Outcome(found, found, one, within), scored[0][1])]
     other = np.random.default_rng(seed).integers(1, len(scored))
     for kind, (_, run, apart) in (("proposed", scored[0]), ("random", scored[int(other)])):
@@ -173,7 +180,9 @@ def one_joint(
         both = load_dataset([old, fresh], [], joint, model)
         tied = [r.name for r in rivals]
         left = rivals_of(tied, balance, solve(model, both), both)
-        after, one, within = judged(Contest(left, both), truth) if left else (-np.inf, False, False)
+        after, one, within = (
+            judged(Contest(left, both), balance, truth) if left else (-np.inf, False, False)
+        )
         expected = _expected(contest, truth, apart)
         out.append((kind, Outcome(expected, after, one, within), run))
     return out
@@ -196,7 +205,7 @@ def rank_correlation(one: Sequence[float], other: Sequence[float]) -> float:
 
 
 def sets_of_improve(count: int, start: int, *, dirt: bool) -> None:
-    """Sets that `improve` claims on whole records, and what whole fits leave of them."""
+    """Sets that the trials of `improve` make, and what its whole fits leave of them."""
     effects = tuple(dict.fromkeys(n for _, names, _ in SETS.values() for n in names))
     before = after = kept = sets = 0
     for k in range(count):
@@ -212,15 +221,14 @@ def sets_of_improve(count: int, start: int, *, dirt: bool) -> None:
         )
         found = improve(records[:2], joint, records[2:])
         for claim in found.claims:
-            if len(claim.effects) < 2:
+            first = next((c for c in found.decided if claim.effects[0] in c.effects), claim)
+            if len(first.effects) < 2:
                 continue
-            last = found.steps[-1].solution
-            bare = solve(without(last.model, claim.label), found.data, start=last.values)
-            rivals = rivals_of(claim.effects, claim.balance, bare, found.data)
-            alive = [r.name for r in Contest(rivals, found.data).alive]
-            sets, before, after = sets + 1, before + len(claim.effects), after + len(alive)
-            kept += truth in alive
-            print(f"{truth:<25} {', '.join(claim.effects)} -> {', '.join(alive)}", flush=True)
+            sets, before, after = sets + 1, before + len(first.effects), after + len(claim.effects)
+            kept += truth in claim.effects
+            print(
+                f"{truth:<25} {', '.join(first.effects)} -> {', '.join(claim.effects)}", flush=True
+            )
     print(
         f"{sets} sets on {count} joints: {before} names, {after} after whole fits, truth left in "
         f"{kept}"

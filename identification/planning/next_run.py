@@ -23,14 +23,10 @@ from identification.diagnosis.improvement import Improvement
 from identification.fitting.covariance import correlations
 from identification.fitting.engine import Solution, solve
 from identification.fitting.information import form_of, information, white_errors
+from identification.naming.contest import FEWEST, Contest, rivals_of
+from identification.naming.odds import unmodelled_by
 from identification.planning.motion import Motion
-from identification.planning.rivals import (
-    FEWEST,
-    Contest,
-    enough,
-    power,
-    rivals_of,
-)
+from identification.planning.rivals import Foreseen, enough, power
 from identification.planning.runs import (
     SIMULATED,
     Plant,
@@ -320,7 +316,8 @@ def _for_set(
     if len(rivals) < 2:
         return [], [], []
     contest = Contest(rivals, data)
-    alive = contest.alive
+    allowance = unmodelled_by(contest, claim.balance)
+    alive = contest.alive(allowance)
     told = [
         f"{contest.leader.name} fits better than {rival.name} by {nats:.3g} nats over blocks "
         f"(deviate {deviate:.2g})"
@@ -334,7 +331,8 @@ def _for_set(
         listed = " / ".join(r.name for r in alive)
         return [], told, [f"{listed}: no motion keeps the limits; widen them"]
     contest = Contest(alive, data)
-    apart = [contest.distances(rows) for _, rows in runs]
+    foreseen = Foreseen(contest)
+    apart = [foreseen.distances(rows) for _, rows in runs]
     simple, same = _one_law(contest, _most(apart))
     told += same
     kept = [k for k, r in enumerate(contest.rivals) if r.name in simple]

@@ -44,6 +44,7 @@ EXAMPLES: Final[Mapping[str, tuple[str, ...]]] = {
     "track": ("irj track run2.csv --joint fitted.toml --healthy run1.csv --report track.html",),
     "plan": ("irj plan --joint fitted.toml --max-speed 90 -o motion.csv",),
     "next": ("irj next run1.csv --joint joint.toml -o motion.csv",),
+    "linear": ("irj linear run1.csv --held-out run2.csv --joint joint.toml",),
     "trust": ("irj trust run1.csv --joint joint.toml",),
     "joints": ("irj joints list", "irj joints compare axis1.toml axis2.toml"),
     "app": ("irj app", "irj app run1.csv run2.csv joint.toml"),

@@ -268,6 +268,10 @@ def parser() -> OneLineParser:
     report.add_argument(
         "-o", "--output", metavar="FILE", default="irj-report.html", help="the HTML file"
     )
+    report.add_argument("--author", metavar="NAME", help="for the first page")
+    report.add_argument(
+        "--notes", metavar="TEXT", help="for the first page, as what was changed before"
+    )
     listed = verb("effects", "library", "list the effect library, or one effect")
     listed.add_argument("key", nargs="?", help="key of one effect")
     added = verb("add", "library", "add an effect to a joint file")
@@ -443,6 +447,60 @@ def parser() -> OneLineParser:
         joint=True,
     )
     other_payload(trusted)
+    plain = verb(
+        "linear",
+        "linear",
+        "linear models without physics: subspace and black boxes, orders, poles, held-out VAF",
+        records=True,
+    )
+    plain.add_argument("--joint", metavar="J", help="joint file: column map, gear ratio, drive")
+    plain.add_argument(
+        "--held-out",
+        nargs="+",
+        action="extend",
+        metavar="REC",
+        default=[],
+        help="records the fit must not see (default: the last quarter of every stretch)",
+    )
+    plain.add_argument(
+        "--from",
+        dest="inputs",
+        nargs="+",
+        action="extend",
+        metavar="CHANNEL",
+        default=[],
+        help="inputs (default: the drive)",
+    )
+    plain.add_argument(
+        "--to",
+        dest="outputs",
+        nargs="+",
+        action="extend",
+        metavar="CHANNEL",
+        default=[],
+        help="outputs (default: motor_velocity, and torsion = q_m - q_l where --joint and both "
+        "positions are there)",
+    )
+    plain.add_argument(
+        "--family",
+        nargs="+",
+        action="extend",
+        metavar="FAMILY",
+        default=[],
+        help="moesp fir arx arma armax ararx ararmax oe bj (default: all)",
+    )
+    plain.add_argument(
+        "--max-order", type=_count, default=6, metavar="N", help="highest order tried (default 6)"
+    )
+    plain.add_argument(
+        "--every",
+        type=_count,
+        metavar="N",
+        help="keep every Nth sample (default: from the band in which outputs answer the input)",
+    )
+    plain.add_argument(
+        "--picture", metavar="FILE.svg", help="draw Bode plots and poles of the best model"
+    )
     joints = verb("joints", "joints", "the library of identified joints")
     joints.add_argument(
         "what",

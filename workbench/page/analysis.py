@@ -43,7 +43,7 @@ from identification.fitting.parameters import parameter_table
 from workbench.page.first import first_look
 from workbench.page.records import thinned
 from workbench.page.session import StepEntry
-from workbench.show.results import headline
+from workbench.show.words import headline
 
 FloatArray = npt.NDArray[np.float64]
 Progress = Callable[[str, float], None]

@@ -17,7 +17,7 @@ from workbench.page.analysis import Progress, clean
 from workbench.page.input import folder_of
 from workbench.page.live import Change, Live, hint_for
 from workbench.page.session import State, StepEntry
-from workbench.show.results import headline
+from workbench.show.words import headline
 
 PREPARED: Final = 6
 """Best candidates that are fitted ahead of the click after a diagnosis."""

@@ -14,6 +14,7 @@ from starlette.responses import FileResponse, Response
 
 from casadi_models import EFFECTS
 from casadi_models.transmission import MODELS
+from identification.balance.kinematic import residual_unit
 from identification.data.channels import CHANNELS
 from identification.errors import InputError
 from workbench.page import export as app_export
@@ -92,7 +93,7 @@ def _balance(live: Live, query: Query) -> dict[str, Any]:
     stamps, columns, full = decimated(
         time, [measured, model, measured - model], _points(query), _window(query)
     )
-    unit = "N" if analysis.joint.kind == "linear" else "N.m"
+    unit = residual_unit(str(query.get("balance", "")), analysis.joint.kind)
     return _drawn(stamps, ("measured", "model", "residual"), [unit] * 3, columns, full)
 
 
