@@ -79,9 +79,7 @@ def with_examples(parser: OneLineParser) -> None:
 
 def run_completion(arguments: Namespace) -> int:
     """`irj completion bash`: a script for the shell, made from the declared verbs and options."""
-    from workbench.cli.main import parser
-
-    sys.stdout.write(bash(parser()))
+    sys.stdout.write(bash(arguments.parser))
     return 0
 
 

@@ -530,7 +530,7 @@ def parser() -> OneLineParser:
     app.add_argument("--no-browser", action="store_true", help="print the address, open nothing")
     text = "completion of verbs and options for your shell"
     completed = verbs.add_parser("completion", help=text, description=text)
-    completed.set_defaults(module="help", own_effects=[])
+    completed.set_defaults(module="help", own_effects=[], parser=made)
     completed.add_argument("shell", choices=("bash",), help="the shell")
     for judged in (demo, diagnosed, improved):
         judged.add_argument(
