@@ -270,8 +270,8 @@ def _column(name: str, unit: str, values: Any) -> Seen:
     return Seen(
         name,
         unit,
-        float(finite.min()),
-        float(finite.max()),
+        low=float(finite.min()),
+        high=float(finite.max()),
         lost=1.0 - finite.size / numbers.size,
         whole=bool(np.all(finite == np.round(finite))),
         spark=tuple((float(p.min()), float(p.max())) for p in pieces),

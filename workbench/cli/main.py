@@ -18,6 +18,7 @@ from types import FrameType
 from typing import Any, TextIO, cast, final
 
 from identification import __version__
+from identification.data.schema import meant
 from identification.errors import InputError
 from identification.scratch import release
 from irj_fmu.command_line import (
@@ -31,6 +32,7 @@ from irj_fmu.command_line import (
     terminable,
 )
 from workbench.cli.files import check_outputs
+from workbench.cli.help import welcome, with_examples
 from workbench.cli.user_fmu import module_of
 
 
@@ -526,6 +528,15 @@ def parser() -> OneLineParser:
     )
     app.add_argument("--port", type=_port, default=0, help="port of the page (0: any free one)")
     app.add_argument("--no-browser", action="store_true", help="print the address, open nothing")
+    text = "completion of verbs and options for your shell"
+    completed = verbs.add_parser("completion", help=text, description=text)
+    completed.set_defaults(module="help", own_effects=[], parser=made)
+    completed.add_argument("shell", choices=("bash",), help="the shell")
+    for judged in (demo, diagnosed, improved):
+        judged.add_argument(
+            "-v", "--verbose", action="store_true", help="list what is not testable, and why"
+        )
+    with_examples(made)
     return made
 
 
@@ -540,12 +551,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         )  # a terminal that lacks a sign must not cost the results
     if any("\0" in word for word in given):
         parser().error("an argument holds a zero byte; no name of a file or effect has one")
+    if not given:
+        return welcome()
     arguments, rest = parser().parse_known_args(given)
     arguments.rest = rest
     if arguments.module == "fmi":
         arguments.rest, arguments.own_effects = _taken(rest)
     if rest and arguments.module != "fmi":
-        parser().error(f"unrecognized arguments: {' '.join(rest)}")
+        own = parser().verbs[arguments.verb]
+        options = [o for a in own.arguments for o in a.option_strings]
+        close = meant(next((r for r in rest if r.startswith("-")), ""), options)
+        own.error(f"unrecognized arguments: {' '.join(rest)}{close}")
     arguments.command = shlex.join(["irj", *given])
     STOPPED.clear()
     with _watched_interrupt(), _patient_output():
