@@ -120,9 +120,11 @@ def load_dataset(
     *,
     kernel: float | None = None,
     like: Sensing | None = None,
+    shifts: Sequence[Mapping[str, float]] | None = None,
 ) -> Dataset:
     """Prepare records for the balances that their common channels allow (`like`: temperature counts
-    as in the records of a fit).
+    as in the records of a fit; `shifts`: by which the channels of each record are late [s], by
+    place, where another kernel has told it).
 
     Raises
     ------
@@ -139,7 +141,7 @@ def load_dataset(
     length = kernel or (ONE_SIDED_KERNEL if alone else CLAIM_KERNEL)
     prepared: list[WeakRecord] = []
     first = 0
-    for record in (*train, *held_out):
+    for number, record in enumerate((*train, *held_out)):
         other = record.payload != train[0].payload
         masked = _of_the_link(record, sensing) if other else frozenset[str]()
         made = _once(
@@ -150,6 +152,7 @@ def load_dataset(
             first,
             curved=model.lagging_load,
             late=places_of(model),
+            known=None if shifts is None else shifts[number],
         )
         if masked:
             made = replace(made, masked=masked)
@@ -196,20 +199,24 @@ def _once(
     *,
     curved: bool,
     late: Sequence[str],
+    known: Mapping[str, float] | None,
 ) -> WeakRecord:
     """:func:`weak_record` by its name, prepared once for the verbs that follow each other on a
     record.
     """
 
     def make() -> tuple[WeakRecord, int]:
-        made = weak_record(record, joint, sensing, length, first_block, curved=curved, late=late)
+        made = weak_record(
+            record, joint, sensing, length, first_block, curved=curved, late=late, known=known
+        )
         tables = (made.averaged, made.points, made.smooth, made.curved)
         return replace(made, name=run_name(record)), sum(
             x.size for table in tables for x in table.values()
         )
 
     scales = (joint.gear_ratio, joint.torque_per_current, joint.torque_per_voltage)
-    law = (scales, sensing, length, first_block, curved, tuple(late))
+    told = None if known is None else tuple(sorted(known.items()))
+    law = (scales, sensing, length, first_block, curved, tuple(late), told)
     found: WeakRecord = cache_of("prepared").get(record, law, make, PREPARED)
     return found
 
@@ -254,9 +261,10 @@ def weak_record(
     *,
     curved: bool = False,
     late: Sequence[str] = (),
+    known: Mapping[str, float] | None = None,
 ) -> WeakRecord:
     """One record, resampled to uniform time where needed, averaged with the kernel; the channels
-    of the places `late` are shifted by whole samples where they are late.
+    of the places `late` are shifted where they are late (`known`: by these times [s]).
     """
     noise = measured_noise(record, joint, sensing)
     record = evened(record)
@@ -289,7 +297,10 @@ def weak_record(
         last.append((dict(shifts), made))
         return made
 
-    made = in_time(made_with, late, sensing.has_torque) if late else made_with({})
+    if known is not None:
+        made = made_with({p: round(k / record.dt, 9) for p, k in known.items()})
+    else:
+        made = in_time(made_with, late, sensing.has_torque) if late else made_with({})
     made = _with_rests(made, noise)
     if record.measured is not None and not record.measured.all():
         made = replace(

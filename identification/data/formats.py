@@ -14,6 +14,10 @@ import numpy.typing as npt
 
 _SUPERSCRIPT: Final = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 MINUS: Final = "−"
+PLAIN: Final = (1e-4, 1e6)
+"""Spans whose ends are written without a power of ten: at most six digits before the point or four
+zeros behind it.
+"""
 SPACE: Final = "\u00a0"
 """Between a number and its sign of unit: no line break."""
 CERTAIN: Final = 0.01
@@ -97,7 +101,7 @@ def ratio(value: float | None) -> str:
 def interval(low: float, high: float) -> str:
     """Two ends to the same decimal place, as 0.35 to 0.75: a hundredth of the span or so."""
     span = abs(high - low)
-    if not (math.isfinite(span) and 1e-4 <= span < 1e6):
+    if not (math.isfinite(span) and PLAIN[0] <= span < PLAIN[1]):
         return f"{number(low, 3)} to {number(high, 3)}"
     places = max(1 - math.floor(math.log10(span / 3)), 0)
     ends = (round(v, places) + 0.0 for v in (low, high))

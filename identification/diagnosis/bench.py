@@ -9,6 +9,7 @@ from dataclasses import replace
 from typing import Protocol, final
 
 from casadi_models import JointModel
+from identification.balance.calibration import settled
 from identification.balance.dataset import without
 from identification.balance.sensing import Sensing
 from identification.data.joint_file import Joint
@@ -220,10 +221,17 @@ class JointBench:
         mark = (id(solution), held_out)
         if mark not in self._ratios:
             out: dict[str, BalanceError] = {}
+            # zero and clocks of a record, too, are its own and found at the kernel of the claims
+            values = settled(
+                solution.model,
+                self.data.sensing,
+                [*self.data.train, *self.data.held_out],
+                solution.values,
+            )
             for length in sorted({VERDICT_KERNELS[b] for b in self.data.sensing.balances}):
                 data = self._at_kernel(length)
                 error = assess(
-                    solution.model, data, data.held_out if held_out else data.train, solution.values
+                    solution.model, data, data.held_out if held_out else data.train, values
                 )
                 out.update(
                     {b: e for b, e in error.balances.items() if VERDICT_KERNELS[b] == length}
@@ -293,7 +301,14 @@ class JointBench:
         mark = round(length, 9)
         if mark not in self._kernels:
             model = prepared_model(self.joint, self._train[0])
+            # clocks are the records' own: how late a channel is does not hang on the kernel
             self._kernels[mark] = load_dataset(
-                self._train, self._held, self.joint, model, kernel=length, like=self._like
+                self._train,
+                self._held,
+                self.joint,
+                model,
+                kernel=length,
+                like=self._like,
+                shifts=[w.shifts for w in (*self.data.train, *self.data.held_out)],
             )
         return self._kernels[mark]

@@ -22,6 +22,7 @@ from identification.balance.excitation import (
     not_identifiable,
     unlike_units,
 )
+from identification.balance.kinematic import without_scale
 from identification.data.check.gate import gate_warnings, gated
 from identification.data.joint_file import Joint
 from identification.data.record import Record
@@ -406,6 +407,7 @@ class Session:
                 *hardly_a_model(steps[0]),
                 *excitation_warnings(self.data),
                 *self._about_temperature(judged),
+                *([scale] if (scale := self._scale(solution)) else []),
                 *unseen(solution),
                 *without_link(solution),
                 *without_motor(self.data),
@@ -421,6 +423,10 @@ class Session:
         )
 
     # --- inside -----------------------------------------------------------------------------------
+
+    def _scale(self, solution: Solution) -> str:
+        """What torques are worth where none was recorded."""
+        return without_scale(solution.model, self.data.sensing, self.joint.known)
 
     def _within(self, low: float, span: float) -> Progress:
         """Progress of a part of the run."""

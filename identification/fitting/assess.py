@@ -13,6 +13,7 @@ import numpy.typing as npt
 from casadi_models import JointModel
 from identification.balance.balances import balances_of
 from identification.balance.calibration import settled
+from identification.balance.kinematic import residual_unit
 from identification.balance.weak import WeakRecord
 from identification.fitting.engine import (
     Dataset,
@@ -33,6 +34,7 @@ VERDICT_KERNELS: Final = {
     "sum": 0.06,
     "deflection": 0.06,
     "axis": 0.2,
+    "kinematic": 0.06,
 }
 """Kernel at which a balance is compared with its floor: where records without a hidden effect
 read 1 [s].
@@ -122,13 +124,12 @@ def assess(
     )
     weights = {b: w[rows[b]] for b, w in weights.items()}
     floor = {b: f[rows[b]] for b, f in floor.items()}
-    unit = "N.m" if model.kind == "rotary" else "N"
     errors = {
         b: BalanceError(
             rms(residual[b] * weights[b]) / max(rms(weights[b]), 1e-300),
             rms(floor[b] * weights[b]) / max(rms(weights[b]), 1e-300),
             rms(residual[b] * weights[b]) if np.any(floor[b] > 0) else math.inf,
-            unit,
+            residual_unit(b, model.kind),
             residual[b],
             weights[b],
         )

@@ -170,6 +170,23 @@ class Subspace:
         state = None if x0 is None else np.asarray(x0, dtype=np.float64)
         return simulate(self.system.A, self.system.B, self.system.C, self.system.D, inputs, state)
 
+    def vaf_on(
+        self,
+        u: npt.ArrayLike | Sequence[npt.NDArray[np.generic]],
+        y: npt.ArrayLike | Sequence[npt.NDArray[np.generic]],
+    ) -> FloatArray:
+        """Variance of each output that a simulation accounts for [%], initial state and mean of
+        each record its own; of a stable model only.
+        """
+        source = ArraySource(u, y)
+        b, d = (np.asarray(m, dtype=np.float64) for m in (self.system.B, self.system.D))
+        fit = ResponseFit(np.asarray(self.system.A), np.asarray(self.system.C), len(b.T))
+        for index, length in enumerate(source.lengths):
+            for one, other in source.pieces(index, 0, length):
+                fit.add(one, other)
+            fit.end_record()
+        return fit.vaf_percent(b, d, fit.initial_states(b, d))
+
 
 def moesp(
     u: npt.ArrayLike | Sequence[npt.NDArray[np.generic]],

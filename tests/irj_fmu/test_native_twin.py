@@ -231,6 +231,15 @@ CASES: dict[str, tuple[str, OnlineOptions, Callable[[Joint], Joint]]] = {
     "rigid, not fitted": ("irj1b", PLAIN, start_of),
     "motor side only": ("irj1b", replace(PLAIN, has_link=False, has_torque=False), lambda j: j),
     "no torque sensor": ("irj2a", replace(PLAIN, has_torque=False), lambda j: j),
+    "late channels": (
+        "hd3",
+        PLAIN,
+        lambda j: replace(
+            j,
+            effects=(*j.effects, "channel_delay@drive", "channel_delay@link_position_sensor"),
+            fitted=dict(j.fitted) | {"drive_delay": 2.3e-3, "link_position_sensor_delay": 4.4e-3},
+        ),
+    ),
     "internal states": ("irj2a", PLAIN, lambda j: replace(j, effects=(*j.effects, "lugre"))),
 }
 

@@ -116,7 +116,14 @@ def run_report(arguments: Namespace) -> int:
     )
     print(found.reason)
     write_json(arguments.json, data)
-    _write_report(found, records, arguments.output, arguments.command)
+    _write_report(
+        found,
+        records,
+        arguments.output,
+        arguments.command,
+        author=arguments.author or "",
+        notes=arguments.notes or "",
+    )
     return 0
 
 
@@ -139,13 +146,27 @@ def run_demo(arguments: Namespace) -> int:
 
 
 def _write_report(
-    found: Improvement, records: Sequence[Record], report: str | None, command: str
+    found: Improvement,
+    records: Sequence[Record],
+    report: str | None,
+    command: str,
+    *,
+    author: str = "",
+    notes: str = "",
 ) -> None:
     """The report comes last: what it is drawn from stands on the disk before it is drawn."""
     if report:
         from workbench.show.report import write_report
 
-        made = write_report(found, report, records=records, command=command, trust=trusted(found))
+        made = write_report(
+            found,
+            report,
+            records=records,
+            command=command,
+            trust=trusted(found),
+            author=author,
+            notes=notes,
+        )
         print(f"report: {made}")
 
 
@@ -257,6 +278,8 @@ def run_fit(arguments: Namespace) -> int:
         f"relative error {fitted.train.relative_error_percent:.3f} %, fit "
         f"{fitted.train.fit_percent:.2f} %"
     )
+    if fitted.scale:
+        print(f"note: {fitted.scale}")
     _print_parameters(fitted.parameters)
     if arguments.output:
         write_text(arguments.output, fitted.to_joint_file())

@@ -233,7 +233,14 @@ def _improved(arguments: Namespace, report: str | None, most: int) -> UserImprov
         from workbench.show.report import write_report
 
         every = [*records, *held]
-        made = write_report(found.found, report, records=every, command=arguments.command)
+        made = write_report(
+            found.found,
+            report,
+            records=every,
+            command=arguments.command,
+            author=getattr(arguments, "author", None) or "",
+            notes=getattr(arguments, "notes", None) or "",
+        )
         print(f"report: {made}")
     return found
 

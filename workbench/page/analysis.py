@@ -5,6 +5,7 @@ again.
 from __future__ import annotations
 
 import math
+import secrets
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -42,7 +43,7 @@ from identification.fitting.parameters import parameter_table
 from workbench.page.first import first_look
 from workbench.page.records import thinned
 from workbench.page.session import StepEntry
-from workbench.show.results import headline
+from workbench.show.words import headline
 
 FloatArray = npt.NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -195,7 +196,7 @@ class Analysis:
         made = solve(now.model, self.data, start=now.values)
         entry = self._entry(step.action, step.label, self.data, began, made)
         self.solution = made
-        return replace(entry, names=step.names, separate_by=step.separate_by)
+        return replace(entry, names=step.names, separate_by=step.separate_by, id=step.id)
 
     def remove(self, label: str) -> StepEntry:
         """Take an effect out of the model: a first look, as `add`."""
@@ -310,7 +311,8 @@ class Analysis:
         )
         made = self._entry(step.action, step.label, data, began)
         self.restore(made)
-        return replace(made, exact=True)
+        said = replace(made, names=step.names, separate_by=step.separate_by)
+        return replace(said, exact=True, id=step.id)
 
     # --- views ------------------------------------------------------------------------------------
 
@@ -452,6 +454,7 @@ class Analysis:
             exact=self.whole,
             seconds=round(time.perf_counter() - began, 3),
             settled=whole,
+            id=secrets.token_hex(4),
         )
         if data is self.data:
             self._solved[_mark(entry)] = now

@@ -14,11 +14,13 @@ from starlette.responses import FileResponse, Response
 
 from casadi_models import EFFECTS
 from casadi_models.transmission import MODELS
+from identification.balance.kinematic import residual_unit
 from identification.data.channels import CHANNELS
 from identification.errors import InputError
 from workbench.page import export as app_export
 from workbench.page import plan as app_plan
 from workbench.page import replay as app_replay
+from workbench.page import tree
 from workbench.page.input import folder_of, joint_form
 from workbench.page.live import Live
 from workbench.page.pattern import pattern
@@ -91,7 +93,7 @@ def _balance(live: Live, query: Query) -> dict[str, Any]:
     stamps, columns, full = decimated(
         time, [measured, model, measured - model], _points(query), _window(query)
     )
-    unit = "N" if analysis.joint.kind == "linear" else "N.m"
+    unit = residual_unit(str(query.get("balance", "")), analysis.joint.kind)
     return _drawn(stamps, ("measured", "model", "residual"), [unit] * 3, columns, full)
 
 
@@ -164,6 +166,14 @@ def _library(live: Live, query: Query) -> list[dict[str, Any]]:
     return addable(live)
 
 
+def _tree(live: Live, query: Query) -> dict[str, Any]:
+    return {"branches": tree.shown(live.state), "name": live.state.name}
+
+
+def _fits(live: Live, query: Query) -> dict[str, Any]:
+    return tree.compared(live.state, str(query.get("a", "")), str(query.get("b", "")))
+
+
 def _joint(live: Live, query: Query) -> dict[str, Any]:
     return {"text": live.state.joint_text, "form": joint_form(live.state.joint_text)}
 
@@ -226,6 +236,8 @@ VIEWS: Final[Mapping[str, Callable[[Any, Query], Any]]] = {
     "compare": _compare,
     "parameters": _parameters,
     "library": _library,
+    "tree": _tree,
+    "fits": _fits,
     "joint": _joint,
     "code": _code,
     "joint.toml": _joint_file,

@@ -32,12 +32,13 @@ const views = {
     return [
       h("div", { class: "row between head" }, h("div", {}, heading("Records")), next),
       state.joint_text ? h("p", { class: "soft" }, "Joint: ", h("strong", {}, jointLine(state)), " ", h("button", { type: "button", class: "quiet", onclick: () => open("model") }, "Change")) : h("p", { class: "soft" }, "No joint described yet: gear ratio, motor constant and start model come next."),
-      state.files.map(fileCard), ready.length ? seriesCard(ready) : null, drop,
+      state.files.map(fileCard), ready.length ? seriesCard(ready) : null, drop, state.fits ? treeCard(state) : null,
     ];
   },
 
   async model(state) {
-    const { text, form } = await get("/view/joint");
+    const { text, form } = await get("/view/joint"), seen = state.files.find((f) => f.kind);
+    if (!form.kind && seen) form.kind = seen.kind;
     const own = (m) => app.config.models[m] || [];
     const side = (k) => { /* the units of the drive, for a rotary or a linear axis */
       const force = k === "linear";
@@ -146,6 +147,7 @@ const views = {
       ),
       h("div", { class: "card scroll", tabindex: "0", role: "region", "aria-label": "Ledger" }, h("table", {}, h("caption", {}, "Ledger"), h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Step"), h("th", { scope: "col", class: "num" }, "Held-out error"), h("th", { scope: "col", class: "num" }, "Fit"), h("th", { scope: "col", class: "num" }, "VAF"), Object.keys(last.held_out.balances).map((b) => h("th", { scope: "col", class: "num" }, `${b}: × floor`)))),
         h("tbody", {}, steps.map((s, k) => h("tr", { class: k === steps.length - 1 ? "now" : null }, h("td", {}, stepName(s)), h("td", { class: "num" }, `${digits(s.held_out.relative_error_percent)} %`), h("td", { class: "num" }, `${digits(s.held_out.fit_percent)} %`), h("td", { class: "num" }, `${vaf(s.held_out.vaf_percent)} %`), Object.keys(last.held_out.balances).map((b) => h("td", { class: "num" }, s.held_out.balances[b] ? digits(s.held_out.balances[b].ratio) : "–"))))))),
+      treeCard(state),
       h("div", { class: "card" }, h("h2", {}, "By hand"), h("div", { class: "row" }, add, button("Add", () => run("add", { label: $("add-label").value }), { id: "add-by-hand", label: "Add the chosen effect" }), button("Run the whole loop", () => run("improve", {}, "ledger"), { id: "improve" })), h("p", { class: "small soft" }, "The whole loop diagnoses and adds until nothing is left to name; it starts from the start model again.")),
     ];
   },
@@ -190,33 +192,13 @@ function fileCard(f) {
   const role = h("select", { id: `role-${f.id}`, "aria-label": `Role of ${f.name}`, onchange: (e) => act(async () => { await post(`/file/${f.id}`, { role: e.target.value }); await refresh(); }) }, [["train", "Fit"], ["held_out", "Held out"]].map(([v, t]) => h("option", { value: v, selected: f.role === v }, t)));
   return h("section", { class: "card", "aria-label": f.name }, h("div", { class: "row between" },
     h("div", {}, h("h2", {}, f.name), shown ? h("p", { class: "soft small" }, `${plural(s.samples, "sample")}, ${digits(s.duration, 4)} s, every ${digits(1000 * s.dt, 3)} ms${s.segments > 1 ? `, ${s.segments} stretches` : ""}. ${f.role_reason.charAt(0).toUpperCase()}${f.role_reason.slice(1)}.`) : null),
-    h("div", { class: "row" }, shown ? role : null, button("Remove", () => act(async () => { await call("DELETE", `${base()}/file/${f.id}`); await refresh(); }), { kind: "quiet", label: `Remove ${f.name}` }))),
+    h("div", { class: "row" }, shown ? role : null, f.status === "columns" ? null : button("Columns", () => { app.drafts[`map-${f.id}`] = app.drafts[`map-${f.id}`] ? null : { now: true }; render(false); }, { kind: "quiet", work: false, id: `columns-${f.id}`, label: `Columns of ${f.name}` }), button("Remove", () => act(async () => { await call("DELETE", `${base()}/file/${f.id}`); await refresh(); }), { kind: "quiet", label: `Remove ${f.name}` }))),
     f.status === "refused" ? h("p", { class: "bad" }, f.message) : null,
     f.status === "checking" ? h("p", { class: "small soft", role: "status" }, "Going through the check gate …") : null,
     f.status === "columns" ? columnMap(f) : null,
     bad.length ? h("ul", { class: "findings" }, bad.map((x) => h("li", {}, h("span", { class: `tag ${SEVERITY[x.severity][0]}` }, SEVERITY[x.severity][1]), " ", x.message))) : null,
+    f.status !== "columns" && app.drafts[`map-${f.id}`] ? columnMap(f) : null,
     f.status === "ready" ? h("details", {}, h("summary", {}, bad.length ? `Checked: ${fine.length} fine; columns` : "Checked, nothing to repair; columns"), h("ul", { class: "findings" }, s.columns.map((c) => h("li", {}, c)), s.notes.map((n) => h("li", {}, n)), fine.map((x) => h("li", {}, x.message)))) : null);
-}
-
-/* The guess is shown; it is used when the user confirms it. */
-function columnMap(f) {
-  const guessed = Object.fromEntries(f.guess.map((g) => [g.column, g])), used = f.guess.map((g) => g.column), same = app.state.files.filter((o) => o.status === "columns" && used.every((c) => o.names.includes(c))).length;
-  const rows = f.names.map((name, k) => {
-    const g = guessed[name] || {}, id = `map-${f.id}-${k}`;
-    const channel = h("select", { id: `${id}-channel`, "aria-label": `Channel of column ${name}` }, h("option", { value: "" }, "not used"), app.config.channels.map((c) => h("option", { value: c, selected: c === g.channel }, c.replace(/_/g, " "))));
-    const box = (part, value, label) => h("input", { id: `${id}-${part}`, value, size: "9", placeholder: label, "aria-label": `${label} of column ${name}`, autocomplete: "off" });
-    const parts = { channel, unit: box("unit", g.unit || "", "Unit"), scale: box("scale", g.scale && g.scale !== 1 ? String(g.scale) : "", "Scale"), sign: h("select", { id: `${id}-sign`, "aria-label": `Sign of column ${name}` }, h("option", { value: "1" }, "+"), h("option", { value: "-1", selected: g.sign === -1 }, "−")), counts: box("counts", "", "Counts per turn") };
-    return { name, parts, node: h("tr", {}, h("td", {}, h("strong", {}, name)), h("td", {}, parts.channel), h("td", {}, parts.unit), h("td", {}, parts.scale), h("td", {}, parts.sign), h("td", {}, parts.counts), h("td", { class: "small soft" }, g.reason || "no guess")) };
-  });
-  const confirm = () => act(async () => {
-    const columns = {};
-    for (const { name, parts } of rows) if (parts.channel.value) columns[parts.channel.value] = { column: name, unit: parts.unit.value.trim(), scale: parts.scale.value, sign: Number(parts.sign.value), counts_per_turn: parts.counts.value };
-    const made = await post(`/file/${f.id}`, { columns, all: true });
-    await refresh();
-    if (made.status !== "ready") throw new Error(made.message);
-  });
-  return h("div", {}, h("p", { class: "note" }, f.message.includes("no column is recognised") ? "The headers do not say which channel they are" : f.message, ". This is a guess by name and unit: check it, then use it."), h("div", { class: "scroll" }, h("table", { class: "map-table" }, h("thead", {}, h("tr", {}, ["Column", "Channel", "Unit", "Scale", "Sign", "Counts/turn", "Why"].map((t) => h("th", { scope: "col" }, t)))), h("tbody", {}, rows.map((r) => r.node)))),
-    h("div", { class: "row gap" }, button(same > 1 ? `Use for all ${same} files with these columns` : "Use these columns", confirm, { kind: "primary", id: `use-${f.id}` })));
 }
 
 function seriesCard(files) {
