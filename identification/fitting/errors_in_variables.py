@@ -92,7 +92,7 @@ def noise_products(problem: WeakForm) -> NoiseProducts:
     for record in data.train:
         rows = slice(first, first + record.rows)
         first = rows.stop
-        drawn = draws_of(record, data.noise)
+        drawn = draws_of(record, data.sources)
         for draw in drawn:
             calm, noisy = (
                 stack(balances, [w], problem.values, free) for w in (draw.calm, draw.noisy)
