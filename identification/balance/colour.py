@@ -52,6 +52,8 @@ wanders with its motion."""
 LOWEST_LINE: Final = 33.0
 """Lowest frequency of a hum [Hz]: two periods to a kernel of the claims; the joint's own modes are
 slower."""
+CLEAN: Final = 0.1
+"""Share of a reading that must be no hum: the amplitude of a line is known within 5 %."""
 MOST_LINES: Final = 4
 """Lines of one channel: mains and three harmonics."""
 FEWEST_SPACINGS: Final = 4
@@ -160,7 +162,7 @@ def coloured(values: FloatArray, part: slice, dt: float, levels: Sequence[float]
     heard = hum > (COLOURED - 1) * power
     lines = lines if heard.any() else ()
     rest = power - hum if lines else power
-    use = rest > 0.1 * power
+    use = rest > CLEAN * power
     if use.sum() < FEWEST_SPACINGS or not use[0]:
         return ChannelNoise(level, ((level, 0.0),), lines)
     # readings next to a line's own frequency are mostly that line
