@@ -22,7 +22,12 @@ from casadi_models import EFFECTS, load_library
 from identification.data.joint_file import Joint
 from identification.data.typical import true_values
 from identification.errors import InputError
-from identification.online.estimator import OnlineEstimator, OnlineOptions, estimated_parameters
+from identification.online.estimator import (
+    OnlineEstimator,
+    OnlineOptions,
+    estimated_parameters,
+    prepared,
+)
 from identification.online.identifiable import identifiable
 from irj_fmu.command_line import OneLineParser, check_output, fail, run_alone, write_json
 from irj_fmu.convergence import NOISE, STEP, STOP
@@ -183,8 +188,8 @@ def run(label: str, seeds: Sequence[int | None], sides: Sequence[Side]) -> Itera
     names = estimated_parameters(known)
     model = joint.model()
     true = dict(zip(model.parameter_names, model.value_vector(), strict=True))
-    units = {p.name: p.unit for p in model.parameters}
-    plant = np.array([true[n] for n in names])
+    units = {p.name: p.unit for p in prepared(known, _PLAIN)[0].parameters}
+    plant = np.array([true.get(n, 0.0) for n in names])  # no skew of a clock
     for seed in seeds:
         noise = np.abs(np.array(NOISE) * link_referred(joint)) * (seed is not None)
         readings = (

@@ -52,6 +52,10 @@ _PLACES: Final = [
     tuple(i for i, bit in enumerate(_BITS) if bits & bit) for bits in range(1 << len(_BITS))
 ]
 """Places of the bits that are set, for each set of bits."""
+WELL_OVER: Final = 1.5
+"""Largest torsion residual over its limit that is no noise: a limit is passed by noise by a few
+percent.
+"""
 LARGEST: Final = 1e6
 """A reading beyond this is no place to start an estimate from."""
 OTHERS: Final = (
@@ -327,7 +331,11 @@ class StructuredRule:
                 (self._age(b) for b in (LINK, MOTOR, LINK_JUMP, MOTOR_JUMP) if latched & b),
                 default=-1,
             )
-            gone = self.peak > 1.5 and 2 <= self._since(TORSION) <= 10 and self._age(TORSION) < 20
+            gone = (
+                self.peak > WELL_OVER
+                and 2 <= self._since(TORSION) <= 10
+                and self._age(TORSION) < 20
+            )
             if (
                 moving
                 and age >= waits["torque_wait"]

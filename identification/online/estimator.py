@@ -13,6 +13,8 @@ from typing import Any, Final, final
 import numpy as np
 import numpy.typing as npt
 
+from casadi_models.hold import CLOCKS
+from identification.balance.clocks import MOST_SKEW
 from identification.data.joint_file import Joint
 from identification.errors import InputError
 from identification.faults.detector import ABSURD
@@ -20,7 +22,7 @@ from identification.linear.triangle import single_thread
 from identification.online.first_window import (
     fast_recursion,
     first_estimate,
-    least_range,
+    prior_range,
     reversal_weights,
 )
 from identification.online.grid import Grid
@@ -125,12 +127,13 @@ class OnlineEstimator:
         self.needs = [False] * 6
         for k, reading in enumerate(SAMPLED):
             self.needs[reading] = used[k] and self.present[reading]
-        self.samples = Samples(self.rows.timing, self.needs)
+        self.samples = Samples(self.rows.timing, self.needs, self.rows.alignment)
         self.watch = Watch(dt, self.present)
         self.grid = Grid(dt, max(GAP * self.rows.timing.length, 1.5 * dt))
         self.pulse = Pulse(dt, self.rows.timing.length, self.present)
         own = {p.name: (p.low, p.high) for p in self.model.parameters}
         start = dict(zip(self.model.parameter_names, self.model.value_vector(), strict=True))
+        own |= dict.fromkeys(CLOCKS, (-MOST_SKEW * dt, MOST_SKEW * dt))
         self.low = np.array([min(own[n][0], start[n]) for n in self.names])
         self.high = np.array([max(own[n][1], start[n]) for n in self.names])
         self._margin = 1.0
@@ -269,7 +272,7 @@ class OnlineEstimator:
     @property
     def is_fitted(self) -> bool:
         """True where the joint file has a value for every estimated parameter."""
-        return all(n in self.joint.fitted for n in self.names)
+        return all(n in self.joint.fitted or n in CLOCKS for n in self.names)
 
     @property
     def held(self) -> bool:
@@ -418,7 +421,7 @@ class OnlineEstimator:
     # --- rows -------------------------------------------------------------------------------------
 
     def _row(self, time: float, enable: bool) -> bool:
-        found = self.rows.make(self.samples.window, time)
+        found = self.rows.make(self.samples.window, time - self.samples.lag)
         if found is None:
             return False
         y, h = found
@@ -511,8 +514,7 @@ class OnlineEstimator:
         first, weight = first_estimate(y, h, least, partial(self._weight_of, shares))
         least = np.maximum(least, self.rows.floor(first.tolist(), self.watch.noise[list(SAMPLED)]))
         y, h = y * weight, h * weight[:, :, None]
-        size = np.maximum(np.abs(first), np.abs(self.theta))
-        self._set(scale=np.maximum(size, least_range(h, y)))
+        self._set(scale=prior_range(first, self.theta, h, y, self.rows.usual))
         self.estimator = self.recursion(self.theta)
         started = self.estimator.begin(y, h, least, overlap=self.rows.timing.overlap)
         if started.undetermined:

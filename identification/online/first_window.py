@@ -39,6 +39,26 @@ def least_range(h: FloatArray, y: FloatArray) -> FloatArray:
     return found
 
 
+def prior_range(
+    first: FloatArray, before: FloatArray, h: FloatArray, y: FloatArray, usual: FloatArray
+) -> FloatArray:
+    """Prior range of each parameter, (parameters,): the usual one where there is one, else its size
+    in the first estimate or before, and never under :func:`least_range`.
+
+    Parameters
+    ----------
+    first, before : (parameters,) array
+        Estimates of the window, and from before it.
+    h, y
+        As in :func:`least_range`.
+    usual : (parameters,) array
+        :attr:`identification.online.rows.RowMaker.usual`.
+    """
+    size = np.maximum(np.abs(first), np.abs(before))
+    found: FloatArray = np.where(usual > 0, usual, np.maximum(size, least_range(h, y)))
+    return found
+
+
 def least_squares(y: FloatArray, h: FloatArray, least: FloatArray) -> FloatArray:
     """Least squares with columns of equal size and balances of equal residual; what no row shows
     stays at zero.

@@ -17,10 +17,12 @@ import numpy as np
 import numpy.typing as npt
 
 from casadi_models import JointModel, Signals
+from casadi_models.hold import CLOCKS
 from identification.balance.balances import residual_expressions
+from identification.balance.clocks import USUAL_SKEW
 from identification.balance.sensing import Sensing
 from identification.balance.weak import POSITION_CHAINS, differentiated_kernel, kernel
-from identification.online.timing import Timing
+from identification.online.timing import Alignment, Timing
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
@@ -78,6 +80,11 @@ class RowMaker:
     names : tuple of str
         Parameters that are estimated.
     balances, shapes : tuple of str
+    usual : (parameters,) array
+        Prior range of parameters that have one whatever the joint: skews of clocks; 0 for others.
+    alignment : Alignment
+        What :class:`identification.online.samples.Samples` does to late channels; :attr:`model` has
+        only what it leaves of their delays.
     uses : (balances, sources) bool array
         Which sampled signals enter which balance.
     """
@@ -90,11 +97,14 @@ class RowMaker:
         held: Container[str] = (),
         shapes: Sequence[str] = (),
     ) -> None:
-        self.model, self.sensing, self.timing = model, sensing, Timing.of(dt)
+        self.sensing, self.timing = sensing, Timing.of(dt)
+        self.alignment = Alignment.of(model, SOURCES, dt)
+        self.model = model = model.with_values(self.alignment.left)
         self.shapes = tuple(shapes)
         self.eta = ca.SX.sym("eta", len(self.shapes))
         self.shape_values = np.array([self._value(n) for n in self.shapes])
         self.names = linear_parameters(model, sensing, held)
+        self.usual = np.array([USUAL_SKEW * dt if n in CLOCKS else 0.0 for n in self.names])
         expressions = residual_expressions(model, sensing)
         self.balances = tuple(expressions)
         e = model.equations

@@ -290,7 +290,7 @@ static void push(State *s, const int good[SENSORS], int counts) {
     append_sample(&s->rows, sample);
     for (k = 0; k < SOURCES; k++) {
         const int i = reading[k], bad = (!(good[i] && counts) && needs[i]) || (s->detect && s->detector.failed[i]);
-        if (bad || s->watch.constant[i] || s->watch.scaled[i]) s->lost[k] = WINDOW + STRIDE;
+        if (bad || s->watch.constant[i] || s->watch.scaled[i]) s->lost[k] = LOST_SAMPLES;
         else if (s->lost[k]) s->lost[k]--;
     }
 }

@@ -4,8 +4,22 @@ static void clear_rows(Twin *m) {
     memset(&m->s.rows, 0, sizeof m->s.rows);
 }
 
-static void append_sample(Rows *r, const double sample[SOURCES]) {
+/* Take late channels at their true time: identification.online.timing.Alignment. */
+static void align(Rows *r, const double reading[SOURCES], double sample[SOURCES]) {
+    int i, k;
+    if (!r->any)
+        for (i = 0; i < TAPS; i++) memcpy(r->recent[i], reading, sizeof r->recent[i]);
+    memmove(r->recent[0], r->recent[1], (TAPS - 1) * sizeof r->recent[0]);
+    memcpy(r->recent[TAPS - 1], reading, sizeof r->recent[0]);
+    for (k = 0; k < SOURCES; k++)
+        for (i = 0, sample[k] = 0; i < TAPS; i++) sample[k] += tap[k][i] * r->recent[i][k];
+}
+
+static void append_sample(Rows *r, const double reading[SOURCES]) {
+    double sample[SOURCES];
     int i;
+    if (TAPS > 1) align(r, reading, sample);
+    else memcpy(sample, reading, sizeof sample);
     if (!r->any) { /* before the first sample stands the first sample */
         for (i = 0; i < 2 * WINDOW; i++) memcpy(r->history[i], sample, sizeof r->history[i]);
         r->any = 1;

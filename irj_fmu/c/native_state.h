@@ -18,6 +18,7 @@ typedef long long Count;
 
 typedef struct { /* the last samples and the points of the nonlinear laws; RowMaker */
     double history[2 * WINDOW][SOURCES]; /* each sample twice, so that the last WINDOW lie in one piece */
+    double recent[TAPS][SOURCES]; /* readings not yet in the history, oldest first; Alignment */
     double ring[POINTS][DIM(N_NEEDED)], speed[POINTS][2];
     double before[DIM(N_COORDINATES)], held[DIM(N_MEMORY)], started;
     double signals[N_SIGNALS];

@@ -239,7 +239,8 @@ static int begin_recursion(Twin *m) {
     noise_floor(m, first, floor);
     for (b = 0; b < N_BALANCES; b++) least[b] = fmax(least[b], floor[b]);
     least_range(m, range);
-    for (i = 0; i < N_THETA; i++) s->scale[i] = fmax(fmax(fabs(first[i]), fabs(s->theta[i])), range[i]);
+    for (i = 0; i < N_THETA; i++)
+        s->scale[i] = usual_range[i] > 0 ? usual_range[i] : fmax(fmax(fabs(first[i]), fabs(s->theta[i])), range[i]);
     clear_recursion(s);
     undetermined = start_values(m, s->rls.config + CONFIG_THETA0, s->scale, least, s->theta);
     estimate_of(s, &s->rls, first);

@@ -29,7 +29,7 @@ from identification.online.estimator import _RESIDUAL_SECONDS, _STRAIN, OnlineEs
 from identification.online.first_window import ABSENT, RIDGE
 from identification.online.grid import ON_GRID
 from identification.online.row_check import LEAST
-from identification.online.rows import _NAMES, SOURCES, RowMaker
+from identification.online.rows import _NAMES, SOURCES
 from identification.online.verdict import _RECENT, FAULT_TEXT, HELD, SCALED
 from identification.online.watch import DRIVE, READINGS, TAU
 from identification.recursive.prior_start import PRIOR_PASSES, UNDETERMINED
@@ -70,7 +70,7 @@ def generate(joint: Joint, made: OnlineEstimator, variables: Sequence[Variable],
     header = _Header()
     header.define("NATIVE_GUID", f'"{guid}"')
     _variable_tables(header, joint, made, variables)
-    _row_tables(header, made.rows)
+    _row_tables(header, made)
     _watch_tables(header, made)
     _recursion_tables(header, made)
     _fault_tables(header, made)
@@ -227,7 +227,8 @@ def _access(variable: Variable) -> int:
     )
 
 
-def _row_tables(header: _Header, rows: RowMaker) -> None:
+def _row_tables(header: _Header, made: OnlineEstimator) -> None:
+    rows = made.rows
     t, (count, width) = rows.timing, (len(rows.balances), rows.width)
     centre = t.window - 1 - t.reach
     header.define("N_THETA", len(rows.names))
@@ -237,7 +238,11 @@ def _row_tables(header: _Header, rows: RowMaker) -> None:
     header.define("WINDOW", t.window)
     header.define("STRIDE", t.stride)
     header.define("CENTRE", centre)
-    header.define("DELAY", float(t.delay))
+    header.define("DELAY", float(t.delay + made.samples.lag))
+    header.define("LOST_SAMPLES", made.samples.memory)
+    taps = rows.alignment.taps
+    header.define("TAPS", taps.shape[1])
+    header.doubles("tap", taps)
     header.define("SAMPLE_TIME", float(t.dt))
     header.define("ROW_PERIOD", float(t.stride * t.dt))
     new = t.stride // t.step
@@ -364,6 +369,7 @@ def _recursion_tables(header: _Header, made: OnlineEstimator) -> None:
     for key, value in made.guard.figures().items():
         header.define(f"GUARD_{key}", value)
     header.whole("is_inertia", (int(i in made.guard.inertias) for i in range(n)), "unsigned char")
+    header.doubles("usual_range", made.rows.usual)
     header.doubles("lowest", made.low)
     header.doubles("highest", made.high)
     for key, number in made.pulse.figures().items():
