@@ -20,6 +20,7 @@ import casadi as ca
 from casadi_models import JointModel
 from casadi_models.equations import carried
 from casadi_models.quantities import linear_unit
+from casadi_models.term import LINK_INERTIA
 from identification.balance.sensing import Sensing
 from identification.errors import InputError
 
@@ -78,7 +79,7 @@ def _sized(model: JointModel) -> tuple[str, ...]:
     """Torques and inertias that stand in the balance, the stiffness aside."""
     held = (str(model.stiffness_name), *model.named("softening"))
     own = {n for t in model.terms if t.place in ("link", "transmission") for n in t.names}
-    own |= set(model.inertias)
+    own.add(LINK_INERTIA)
     return tuple(
         p.name
         for p in model.parameters
@@ -142,7 +143,7 @@ def kinematic_law(model: JointModel) -> KinematicLaw:
         ca.vertcat(torque - still), ca.vertcat(twist, rate), ca.vertcat(e.torsion, measured_rate)
     )
     load = (
-        e.inertia.get("link_inertia", ca.SX(0)) * e.link_acceleration
+        e.inertia[LINK_INERTIA] * e.link_acceleration
         + e.link_resistance
         - e.signals.coupling_torque
     ) / e.link_lever - damping

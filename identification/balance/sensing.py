@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from casadi_models import JointModel
 from casadi_models.joint import TWIST
-from casadi_models.term import LINK_INERTIA, SIDE_INERTIAS, TOTAL_INERTIA
+from casadi_models.term import SIDE_INERTIAS, TOTAL_INERTIA
 from identification.data.joint_file import Joint
 from identification.data.record import Record
 from identification.errors import InputError
@@ -299,9 +299,8 @@ def adapt(
         # torque against twist shows the transmission, whatever else the model has or has not
         model = replace(model if model.is_elastic else model.add(TWIST), inertias=())
     elif sensing.kinematic:
-        # the twist is all that is seen of the joint: what loads it is the link, nothing of the
-        # motor
-        model = replace(model if model.is_elastic else model.add(TWIST), inertias=(LINK_INERTIA,))
+        # the twist is all that is seen of the joint; what is of the motor keeps its values
+        model = model if model.is_elastic else model.add(TWIST)
     elif sensing.balances == ("axis",) and not set(SIDE_INERTIAS) & set(known or ()):
         model = replace(model, inertias=TOTAL_INERTIA)
     if sensing.one_sided:
