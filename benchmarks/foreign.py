@@ -3,12 +3,12 @@
 ``python -m benchmarks.foreign [--seeds 2] [--only backlash,nothing] [--no-fit]``
 
 The plant is a joint with motor, gear and link; its foreign model is an FMU of the same equations
-less what is hidden, in C, without model exchange, without FMU state, its parameters fixed. Training and held-out records are of different motions. The FMU is fitted by its outputs
-first (``--no-fit``: it starts at the true values less what is hidden), then effects are looked for
-until nothing is left to name. Printed for each run: what is named, whether the hidden effect is
-named alone or in a set, the largest residual over its noise floor before and after on held-out
-records, how many parameters of the FMU and of the effect are within 95 % of the truth after the
-last whole fit of the outputs, and the processor time.
+less what is hidden, in C, without model exchange, without FMU state, its parameters fixed. Training
+and held-out records are of different motions. The FMU is fitted by its outputs first (``--no-fit``:
+it starts at the true values less what is hidden), then effects are looked for until nothing is left
+to name. Printed for each run: how the hidden effect is named, the largest residual over its noise
+floor before and after on held-out records, how many parameters of the FMU are within 95 % of the
+truth after the last whole fit of the outputs, the processor time and what is named.
 """
 
 from __future__ import annotations
