@@ -11,8 +11,8 @@ from workbench.cli.files import open_joint, open_records, write_json, write_text
 
 def run_joint(arguments: Namespace) -> int:
     """`irj joint new MODEL.fmu --record REC`."""
+    from irj_fmu.first_joint import first_joint
     from irj_fmu.host.fmu import FmuError
-    from irj_fmu.imported.first import first_joint
 
     known = open_joint(arguments.like) if arguments.like else None
     records, _ = open_records([arguments.record], known)

@@ -11,9 +11,9 @@ import pytest
 from identification.data.joint_file import Joint
 from identification.data.record import Record
 from identification.errors import InputError
+from irj_fmu.first_joint import first_joint
 from irj_fmu.imported.compare import compare
 from irj_fmu.imported.file import load_user_joint
-from irj_fmu.imported.first import first_joint
 from irj_fmu.imported.fit import fit
 from tests.irj_fmu.imported.test_user_fmu import START, TRUTH, axis
 from tests.user_fmus.make import Make, build
@@ -26,11 +26,12 @@ def test_a_file_from_the_command_line_fits_as_it_stands(
 ) -> None:
     fmu = build("Axis", tmp_path, Make(2, ("CoSimulation",)))
     record = axis(seconds=4.0, h=4e-3)
-    columns = {"time_s": record.time, "motor_position_rad": record["motor_position"]}
-    np.savez(tmp_path / "run.npz", **columns, **{"motor_torque_N.m": record["motor_torque"]})
+    header = "time_s,motor_position_rad,motor_torque_N.m"
+    rows = np.column_stack([record.time, record["motor_position"], record["motor_torque"]])
+    np.savetxt(tmp_path / "run.csv", rows, fmt="%.12g", delimiter=",", header=header, comments="")
     out = tmp_path / "first.toml"
     assert (
-        main(["joint", "new", str(fmu), "--record", str(tmp_path / "run.npz"), "-o", str(out)]) == 0
+        main(["joint", "new", str(fmu), "--record", str(tmp_path / "run.csv"), "-o", str(out)]) == 0
     )
     said = capsys.readouterr().out
     assert "motor_torque = " in said
