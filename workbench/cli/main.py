@@ -501,6 +501,16 @@ def parser() -> OneLineParser:
     plain.add_argument(
         "--picture", metavar="FILE.svg", help="draw Bode plots and poles of the best model"
     )
+    first = verb("joint", "first_joint", "a first joint file for somebody else's FMU")
+    first.add_argument("what", choices=("new",), help="write a new one")
+    first.add_argument("fmu", metavar="MODEL.fmu", help="the FMU")
+    first.add_argument(
+        "--record", metavar="REC", required=True, help="a record of the joint: its channels"
+    )
+    first.add_argument(
+        "--like", metavar="J", help="joint file with the gear ratio and the motor constant"
+    )
+    first.add_argument("-o", "--output", metavar="J", help="where to write (default: print)")
     joints = verb("joints", "joints", "the library of identified joints")
     joints.add_argument(
         "what",
