@@ -56,3 +56,11 @@ def test_hysteresis_is_found_first_behind_a_gear_too() -> None:
     assert found.claims[0].effects[0] == "hysteresis"
     first, last = found.steps[0].held_out, found.steps[-1].held_out
     assert last.relative_error_percent < 0.3 * first.relative_error_percent
+
+
+def test_nothing_hidden_stands_at_its_floor_although_stamps_are_uneven() -> None:
+    # cubics between the stamps smooth the noise: its level is not that of neighbouring samples
+    joint = Joint(name="test", gear_ratio=100.0, model_name="hd1")
+    found = improve(record(50, 0.0, 100.0), joint, [record(60, 0.0, 100.0)])
+    assert found.verdict == "nothing_missing"
+    assert 0.85 < found.final_ratios["transmission"].ratio < 1.2
