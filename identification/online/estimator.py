@@ -23,7 +23,6 @@ from identification.online.first_window import (
     fast_recursion,
     first_estimate,
     prior_range,
-    reversal_weights,
 )
 from identification.online.grid import Grid
 from identification.online.guard import Guard
@@ -169,7 +168,7 @@ class OnlineEstimator:
             ]
         )
         rate = self.rows.timing.stride * dt / _RESIDUAL_SECONDS
-        self._check = RowCheck(
+        self.check = RowCheck(
             len(self.balances),
             len(self.names),
             self.friction,
@@ -439,7 +438,7 @@ class OnlineEstimator:
                     with single_thread():
                         self._begin()
             return True
-        check = self._check
+        check = self.check
         check(
             *(
                 y,
@@ -501,10 +500,7 @@ class OnlineEstimator:
         """Weights (rows, balances) from the shares (rows, 2) and the size of the residuals
         (balances,).
         """
-        level = np.array(
-            [float(np.abs(theta[which]).sum()) if which else 0.0 for which in self.friction]
-        )
-        return reversal_weights(shares * level, self.feels, size)
+        return self.check.weights(shares, theta, size)
 
     def _begin(self) -> None:
         """Start the recursion from the collected rows."""

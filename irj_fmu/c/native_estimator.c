@@ -132,18 +132,13 @@ static void floors(Twin *m) {
     ratios(&m->s);
 }
 
-static void shares(const State *s, double out[2]) {
-    out[0] = standstill(&s->rows, 0, s->watch.noise[Q_M]);
-    out[1] = standstill(&s->rows, 1, s->watch.noise[Q_L]);
-}
-
 static void collect_row(Twin *m) {
     State *s = &m->s;
     FirstWindow *f = &s->window;
     int b;
     memcpy(f->y[f->count], m->y, sizeof m->y);
     memcpy(f->h[f->count], m->h, sizeof m->h);
-    shares(s, f->shares[f->count]);
+    standstill(m, f->shares[f->count]);
     for (b = 0; b < N_BALANCES; b++) s->torque[b] += s->rows.signals[reference_signal[b]] * s->rows.signals[reference_signal[b]];
     if (++f->count < s->collect) return;
     if (begin_recursion(m)) tell(m, TELL_WINDOW, "the first window does not determine every parameter");
@@ -151,17 +146,35 @@ static void collect_row(Twin *m) {
     for (b = 0; b < N_BALANCES; b++) s->first_level[b] = sqrt(s->square[b]);
 }
 
-static void recursive_step(Twin *m, const double weight[N_BALANCES], const int on[N_BALANCES], double theta[N_THETA]) {
+/* Residuals, weights and mean squares of the row: identification.online.row_check.RowCheck. Gives 1 where one is over its limit. */
+static int check_row(Twin *m, const int on[N_BALANCES]) {
+    State *s = &m->s;
+    Checked *c = &m->checked;
+    double share[2], use[N_BALANCES], reference[N_BALANCES], over[N_BALANCES];
+    const double *const into[] = {m->y, m->h, s->theta, share, use, s->floor, s->first_level, reference, s->square, s->torque, &s->floor_share};
+    double *const out[] = {c->error, c->weighted, c->square, c->torque, c->least, s->ratio, over, c->y, c->h};
+    int b, any = 0;
+    standstill(m, share);
+    for (b = 0; b < N_BALANCES; b++) {
+        use[b] = on[b];
+        reference[b] = s->rows.signals[reference_signal[b]];
+    }
+    memcpy(m->arg, into, sizeof into);
+    memcpy(m->res, out, sizeof out);
+    row_check(m->arg, m->res, m->iw, m->w, 0);
+    memcpy(s->residual, c->error, sizeof s->residual);
+    memcpy(s->square, c->square, sizeof s->square);
+    memcpy(s->torque, c->torque, sizeof s->torque);
+    for (b = 0; b < N_BALANCES; b++) any |= over[b] != 0;
+    return any;
+}
+
+static void recursive_step(Twin *m, const int on[N_BALANCES], double theta[N_THETA]) {
     State *s = &m->s;
     Recursion *r = &s->rls;
-    double row[N_BALANCES * N_THETA], y[N_BALANCES];
-    int b, i;
-    for (b = 0; b < N_BALANCES; b++) {
-        r->config[CONFIG_ENABLED + b] = on[b];
-        y[b] = m->y[b] * weight[b];
-        for (i = 0; i < N_THETA; i++) row[b * N_THETA + i] = m->h[b * N_THETA + i] * weight[b];
-    }
-    m->arg[0] = r->fast; m->arg[1] = r->slow; m->arg[2] = r->config; m->arg[3] = y; m->arg[4] = row;
+    int b;
+    for (b = 0; b < N_BALANCES; b++) r->config[CONFIG_ENABLED + b] = on[b];
+    m->arg[0] = r->fast; m->arg[1] = r->slow; m->arg[2] = r->config; m->arg[3] = m->checked.y; m->arg[4] = m->checked.h;
     m->res[0] = m->fast_next; m->res[1] = m->theta_next; m->res[2] = NULL; m->res[3] = NULL;
     rls_step(m->arg, m->res, m->iw, m->w, 0);
     if (m->fast_next[FAST_DUE] != 0) {
@@ -173,23 +186,14 @@ static void recursive_step(Twin *m, const double weight[N_BALANCES], const int o
         memcpy(r->fast, m->fast_next, sizeof r->fast);
     }
     memcpy(theta, m->theta_next, sizeof s->theta);
-    for (b = 0; b < N_BALANCES; b++) r->fast[FAST_NOISE + b] = fmax(r->fast[FAST_NOISE + b], least(s, b) * least(s, b));
-}
-
-/* Errors that stay over their limit for longer than the linear parameters need to follow ask for the optimiser. */
-static void watch_strain(State *s, const int on[N_BALANCES]) {
-    int b, over = 0;
-    for (b = 0; b < N_BALANCES; b++)
-        if (on[b] && sqrt(s->square[b]) > ERROR_LIMIT * fmax(least(s, b), s->first_level[b])) over = 1;
-    s->strained = over ? s->strained + 1 : 0;
-    s->reoptimise = s->strained >= CONFIRM_ROWS;
+    for (b = 0; b < N_BALANCES; b++) r->fast[FAST_NOISE + b] = fmax(r->fast[FAST_NOISE + b], m->checked.least[b] * m->checked.least[b]);
 }
 
 /* Take a row; 0 until there is one. */
 static int take_row(Twin *m, double time, int enable) {
     State *s = &m->s;
-    double error[N_BALANCES], weight[N_BALANCES], size[N_BALANCES], share[2], theta[N_THETA];
-    int on[N_BALANCES], any = 0, all = 1, b, k;
+    double size[N_BALANCES], theta[N_THETA];
+    int on[N_BALANCES], any = 0, all = 1, over, b, k;
     if (!make_row(m, time)) return 0;
     s->n_rows++;
     for (b = 0; b < N_BALANCES; b++) {
@@ -203,32 +207,18 @@ static int take_row(Twin *m, double time, int enable) {
         if (enable && all) collect_row(m);
         return 1;
     }
-    for (b = 0; b < N_BALANCES; b++) {
-        s->residual[b] = error[b] = error_of(m->y[b], m->h + b * N_THETA, s->theta);
-        size[b] = fmax(fmax(s->floor[b], sqrt(s->square[b])), LEAST);
-    }
-    shares(s, share);
-    weight_of(share, s->theta, size, weight);
-    for (b = 0; b < N_BALANCES; b++) {
-        const double reference = s->rows.signals[reference_signal[b]], left = weight[b] * error[b];
-        if (!on[b]) continue;
-        s->square[b] += RESIDUAL_RATE * (left * left - s->square[b]);
-        s->torque[b] += RESIDUAL_RATE / 5 * (reference * reference - s->torque[b]);
-    }
-    ratios(s);
+    over = check_row(m, on);
     if (!enable) return 1;
     if (!any) {
         guard_blind(s);
         show(s, s->guard.theta);
         return 1;
     }
-    recursive_step(m, weight, on, theta);
-    watch_strain(s, on);
-    for (b = 0; b < N_BALANCES; b++) {
-        error[b] *= weight[b];
-        size[b] = fmax(least(s, b), s->first_level[b]);
-    }
-    if (guard_step(s, theta, error, size, on) == BACK) {
+    recursive_step(m, on, theta);
+    s->strained = over ? s->strained + 1 : 0;
+    s->reoptimise = s->strained >= CONFIRM_ROWS;
+    for (b = 0; b < N_BALANCES; b++) size[b] = fmax(m->checked.least[b], s->first_level[b]);
+    if (guard_step(s, theta, m->checked.weighted, size, on) == BACK) {
         for (b = 0; b < N_BALANCES; b++) s->square[b] = s->first_level[b] * s->first_level[b];
         s->strained = 0;
     }

@@ -99,8 +99,14 @@ typedef struct {
     Fault detector;
 } State;
 
+typedef struct { /* RowCheck: what a row says before the recursion takes it */
+    double error[N_BALANCES], weighted[N_BALANCES], square[N_BALANCES], torque[N_BALANCES], least[N_BALANCES];
+    double y[N_BALANCES], h[N_BALANCES * N_THETA];
+} Checked;
+
 typedef struct {
     State s;
+    Checked checked;
     fmi2CallbackFunctions host;
     char *name;
     int logging;

@@ -24,8 +24,9 @@ from identification.balance.noise import CUT_DEVIATION, KEPT
 from identification.data.joint_file import Joint
 from identification.errors import InputError
 from identification.faults.detector import MOVED, PARITY_SENSORS, DetectorTables
+from identification.online import first_window
 from identification.online import watch as watch_settings
-from identification.online.estimator import _RESIDUAL_SECONDS, _STRAIN, OnlineEstimator
+from identification.online.estimator import OnlineEstimator
 from identification.online.first_window import ABSENT, RIDGE
 from identification.online.grid import ON_GRID
 from identification.online.row_check import LEAST
@@ -89,6 +90,7 @@ def _functions(made: OnlineEstimator) -> list[Any]:
 
     engine = made.recursion(made.theta).engine_for("generate")
     found = [engine.formulas.step, engine.formulas.check, made.rows.point, made.rows.slopes]
+    own = [made.check.function, made.check.weight, made.rows.still]
     if made.detector is not None:
         found.append(made.detector.tables().function)
     recursion = []
@@ -96,7 +98,7 @@ def _functions(made: OnlineEstimator) -> list[Any]:
         arguments = function.sx_in()
         recursion.append(ca.Function(name, arguments, function.call(arguments)))
     laws = zip(("points", "slopes", "sample_observer"), found[2:], strict=False)
-    return [*recursion, *(cheaper(function, name) for name, function in laws)]
+    return [*recursion, *own, *(cheaper(function, name) for name, function in laws)]
 
 
 def _model(functions: Sequence[Any]) -> bytes:
@@ -280,9 +282,6 @@ def _row_tables(header: _Header, made: OnlineEstimator) -> None:
     header.doubles("smooth_kernel", smoothing)
     header.doubles("point_weight", rows.weights)
     header.doubles("sharp", rows.sharp)
-    header.doubles(
-        "velocity_gain", np.broadcast_to(np.asarray(rows.velocity_gain, dtype=np.float64), (2,))
-    )
     linear = [
         (i, j)
         for i, j in itertools.product(range(count * width), range(len(_NAMES)))
@@ -347,7 +346,8 @@ def _recursion_tables(header: _Header, made: OnlineEstimator) -> None:
     header.define("UNDETERMINED", UNDETERMINED)
     header.define("PRIOR_PASSES", PRIOR_PASSES)
     header.define("OVERLAP", float(made.rows.timing.overlap))
-    header.define("RESIDUAL_RATE", period / _RESIDUAL_SECONDS)
+    for name in ("RANGE", "PASSES", "DEVIATION"):
+        header.define(f"FIRST_{name}", getattr(first_window, name))
     for name, block, parts in (
         ("FAST", layout.fast, ("d", "u", "theta", "noise", "error", "learned", "alarm", "due")),
         ("SLOW", layout.slow, ()),
@@ -360,11 +360,6 @@ def _recursion_tables(header: _Header, made: OnlineEstimator) -> None:
     header.doubles("start_slow", slow)
     header.doubles("start_config", engine.config)
     header.doubles("fixed_theta", made.theta)
-    friction = [[i in where for i in range(n)] for where in made.friction]
-    feels = ", ".join("{" + ", ".join(str(int(v)) for v in line) + "}" for line in made.feels)
-    marks = ", ".join("{" + ", ".join(str(int(v)) for v in line) + "}" for line in friction)
-    header.raw(f"static const unsigned char is_friction[2][N_THETA] = {{{marks}}};")
-    header.raw(f"static const unsigned char feels[N_BALANCES][2] = {{{feels}}};")
     header.whole("reference_signal", (11 if from_link else 1 for from_link in made.from_link))
     for key, value in made.guard.figures().items():
         header.define(f"GUARD_{key}", value)
@@ -377,7 +372,6 @@ def _recursion_tables(header: _Header, made: OnlineEstimator) -> None:
     header.define("HELD_CODE", HELD)
     header.define("ON_GRID", ON_GRID)
     header.define("GRID_GAP", float(made.grid.gap))
-    header.define("ERROR_LIMIT", float(_STRAIN.error_limit))
     header.define("CONFIRM_ROWS", made.confirm)
 
 
