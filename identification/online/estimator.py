@@ -176,7 +176,7 @@ class OnlineEstimator:
             rate,
             _STRAIN.error_limit,
         )
-        self._reference = [11 if from_link else 1 for from_link in self.from_link]
+        self.reference = [11 if from_link else 1 for from_link in self.from_link]
         self.reset()
         self.recursion(self.theta)  # its functions are made here and not inside a step
 
@@ -432,7 +432,7 @@ class OnlineEstimator:
         if self.estimator is None:
             if enable and on.all():
                 self._collected.append((y, h, shares))
-                power = self.rows.signals[self._reference] ** 2
+                power = self.rows.signals[self.reference] ** 2
                 self._set(torque=self._now.torque + power)
                 if len(self._collected) >= self.collect:
                     with single_thread():
@@ -448,7 +448,7 @@ class OnlineEstimator:
                 on,
                 self.floor,
                 self.level,
-                self.rows.signals[self._reference],
+                self.rows.signals[self.reference],
                 self._now.square,
                 self._now.torque,
                 self.options.floor_share,

@@ -23,7 +23,6 @@ static void tell(Twin *m, int once, const char *format, ...) { /* a text once pe
     va_end(values);
 }
 
-#define UNEVEN_HOLD 200 /* samples for which health remembers a gap */
 enum { HEALTH_OK, WARMING_UP, NUMERIC_TROUBLE, STEP_MISMATCH, INTERNAL_ERROR };
 enum { TELL_STEP = N_VARIABLES, TELL_SETUP, TELL_WINDOW, TELL_UNEVEN, TELL_FAULT }; /* places in `told` after those of the variables */
 
@@ -85,7 +84,7 @@ static int configure(Twin *m) { /* take the parameters over; 0 where they ask fo
     const double dt = s->real[V_SAMPLE_TIME], warm_up = s->real[V_WARM_UP];
     double rows;
     s->changed = 0;
-    if (!(fabs(dt - SAMPLE_TIME) <= 1e-9 * SAMPLE_TIME)) {
+    if (!(fabs(dt - SAMPLE_TIME) <= GRID_SLACK * SAMPLE_TIME)) {
         tell(m, TELL_SETUP, "sample_time %g s: this native estimator was built for %g s; build it again with --sample-time", dt, SAMPLE_TIME);
         return 0;
     }
@@ -230,22 +229,22 @@ static int take_row(Twin *m, double time, int enable) {
 
 static int plant_verdict(const Fault *f) {
     if (f->k - f->event_sample >= RECENT_SAMPLES) return 0;
-    return f->event == CURRENT_OR_FRICTION ? 7 : f->event == PLANT ? 8 : 0;
+    return f->event == CURRENT_OR_FRICTION ? CODE_CURRENT_OR_FRICTION : f->event == PLANT ? CODE_PLANT : 0;
 }
 
 static int implausible(const State *s) { /* an inertia far from that of the fitted joint: a wrong scale of torque or current */
     int i;
     for (i = 0; i < N_INERTIAS; i++) {
         const double before = inertia_before[i], now = s->theta[inertia_theta[i]], spread = s->sigma[inertia_theta[i]];
-        if (!(before / 3 < now && now < 3 * before) && fabs(now - before) > 5 * spread) return inertia_code[i];
+        if (!(before / WRONG_SCALE < now && now < WRONG_SCALE * before) && fabs(now - before) > WRONG_SIGMAS * spread) return inertia_code[i];
     }
     return 0;
 }
 
 static void judge(State *s, const int good[SENSORS]) {
-    int found = s->pulse.failed && s->rls.running ? HELD_CODE : 0, i;
+    int found = s->pulse.failed && s->rls.running ? CODE_HELD : 0, i;
     for (i = 0; i < SENSORS && !found; i++)
-        if (!good[i] && (needs[i] || (s->detect && present[i]))) found = 11 + i;
+        if (!good[i] && (needs[i] || (s->detect && present[i]))) found = CODE_MISSING + 1 + i;
     if (s->detect) {
         for (i = 0; i < SENSORS && !found; i++)
             if (s->detector.failed[i]) found = 1 + i;
@@ -253,12 +252,12 @@ static void judge(State *s, const int good[SENSORS]) {
         scores(&s->detector, s->score);
     }
     for (i = 0; i < SENSORS && !found; i++)
-        if (s->watch.constant[i]) found = 21 + i;
+        if (s->watch.constant[i]) found = CODE_CONSTANT + 1 + i;
     for (i = 0; i < SENSORS && !found; i++)
-        if (s->watch.scaled[i]) found = 31 + i;
+        if (s->watch.scaled[i]) found = CODE_SCALED + 1 + i;
     if (!found && s->rls.running) found = implausible(s);
     if (!found) found = s->plant_alarm;
-    if (!found && s->guard.on_probation) found = HELD_CODE;
+    if (!found && s->guard.on_probation) found = CODE_HELD;
     s->fault = found;
 }
 
@@ -363,7 +362,7 @@ static int process(Twin *m, double time) { /* gives the health */
         s->whole[V_FAULT] = s->fault;
         if (s->fault) tell(m, TELL_FAULT + s->fault, "fault %d at t = %g s (%s)", s->fault, time, FAULT_TEXT);
     }
-    if (lost || s->fault > 8 || is_held(s)) return NUMERIC_TROUBLE;
+    if (lost || s->fault > CODE_PLANT || is_held(s)) return NUMERIC_TROUBLE;
     return s->rls.running ? HEALTH_OK : WARMING_UP;
 }
 
@@ -373,8 +372,8 @@ static void sample(Twin *m, double time, double length) {
     int too_long, health;
     double apart;
     if (isnan(s->start)) s->start = time;
-    too_long = length > GRID_GAP * (1 + 1e-6);
-    if (length <= SAMPLE_TIME * (1 + 1e-6) && time < s->start + s->samples * SAMPLE_TIME - SAMPLE_TIME * 1e-5) return;
+    too_long = length > GRID_GAP * (1 + GRID_SLACK);
+    if (length <= SAMPLE_TIME * (1 + GRID_SLACK) && time < s->start + s->samples * SAMPLE_TIME - SAMPLE_TIME * GRID_EARLY) return;
     if ((s->changed || !s->configured) && !configure(m)) {
         s->whole[V_HEALTH] = INTERNAL_ERROR;
         return;
@@ -383,17 +382,17 @@ static void sample(Twin *m, double time, double length) {
         s->whole[V_HEALTH] = INTERNAL_ERROR;
         return;
     }
-    s->samples = (Count)floor((time - s->start) / SAMPLE_TIME + 1e-3) + 1;
+    s->samples = (Count)floor((time - s->start) / SAMPLE_TIME + GRID_ROUNDED) + 1;
     apart = time - s->last;
     s->last = time;
     if (too_long) {
         tell(m, TELL_STEP, "the host's step %g s is too long for sample_time %g s; steps up to %g s are followed", length, SAMPLE_TIME, GRID_GAP);
-    } else if (s->expected > 0 && apart > GRID_GAP * (1 + 1e-6)) {
+    } else if (s->expected > 0 && apart > GRID_GAP * (1 + GRID_SLACK)) {
         s->uneven = time;
         tell(m, TELL_UNEVEN, "the host's steps of %g s put samples %g s apart, sample_time is %g s; use steps that divide it", length, apart, SAMPLE_TIME);
     }
     s->expected = fmax(SAMPLE_TIME, length);
-    too_long |= time < s->uneven + UNEVEN_HOLD * SAMPLE_TIME;
+    too_long |= time < s->uneven + GRID_HOLD * SAMPLE_TIME;
     health = process(m, time);
     s->whole[V_HEALTH] = too_long && health < STEP_MISMATCH ? STEP_MISMATCH : health;
     s->whole[V_N_SAMPLES]++;

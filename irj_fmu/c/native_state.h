@@ -6,9 +6,7 @@
 #define DIM(n) ((n) > 0 ? (n) : 1)
 #define MAX_TEXT 512
 #define SENSORS 6
-#define RESIDUALS 19 /* four parities at four lags, then r1 and two means of it */
 #define BITS 7
-#define ABSURD 1e9   /* a reading beyond this (SI) counts as missing, as NaN and infinity do */
 
 enum { DRIVE, Q_M, W_M, Q_L, W_L, TAU };
 enum { NO_EVENT, ARMED, SENSOR, DROPOUT, CURRENT_OR_FRICTION, PLANT, RECOVERED };

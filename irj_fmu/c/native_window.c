@@ -140,7 +140,7 @@ static void factorise(double p[N_THETA][N_THETA], double d[N_THETA], double u[])
         for (i = j; i >= 0; i--) {
             double sum = p[i][j];
             for (k = j + 1; k < N_THETA; k++) sum -= p[i][k] * p[j][k] * d[k];
-            if (i == j) { d[j] = fmax(sum, 1e-300); p[j][j] = 1; }
+            if (i == j) { d[j] = fmax(sum, TINY); p[j][j] = 1; }
             else { p[i][j] = sum / d[j]; u[j * (j - 1) / 2 + i] = p[i][j]; }
         }
     }
