@@ -327,6 +327,14 @@ def parser() -> OneLineParser:
     report.add_argument(
         "-o", "--output", metavar="FILE", default="irj-report.html", help="the HTML file"
     )
+    report.add_argument(
+        "--beside",
+        nargs="+",
+        action="extend",
+        metavar="RESULT",
+        default=[],
+        help="results of `irj improve --json` of another date or joint, for a comparison",
+    )
     report.add_argument("--author", metavar="NAME", help="for the first page")
     report.add_argument(
         "--notes", metavar="TEXT", help="for the first page, as what was changed before"

@@ -240,6 +240,7 @@ def _improved(arguments: Namespace, report: str | None, most: int) -> UserImprov
         if text not in said:
             print(f"irj: {text}", file=sys.stderr)
     if report:
+        from workbench.cli.loop import results_beside
         from workbench.show.report import write_report
 
         every = [*records, *held]
@@ -250,6 +251,7 @@ def _improved(arguments: Namespace, report: str | None, most: int) -> UserImprov
             command=arguments.command,
             author=getattr(arguments, "author", None) or "",
             notes=getattr(arguments, "notes", None) or "",
+            beside=results_beside(getattr(arguments, "beside", [])),
         )
         print(f"report: {made}")
     return found
