@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
@@ -13,7 +14,7 @@ import pytest
 pytest.importorskip("starlette")
 
 from identification.errors import InputError
-from workbench.page import tree
+from workbench.page import home, tree
 from workbench.page.input import change_tree, joint_form, set_joint
 from workbench.page.live import Live
 from workbench.page.session import FileEntry, State, StepEntry, Store
@@ -156,3 +157,37 @@ def test_notes_and_names_stay_with_their_step_and_a_wrong_one_is_said(live: Live
     found = tree.compared(live.state, "None", "coulomb")
     assert found["only"] == [[], ["coulomb"]]
     assert found["values"] == [{"name": "x", "first": 9.0, "second": 5.0}]
+
+
+def test_the_quota_refuses_an_upload_and_names_the_way_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = Store(tmp_path)
+    session = store.create()
+    (session.files / "a.csv").write_bytes(bytes(900_000))
+    monkeypatch.setenv("IRJ_QUOTA_GB", "0.001")
+    home.refuse_over(store, "b.csv", 50_000)
+    with pytest.raises(InputError, match=r"b\.csv: .* more than 1 MB; delete some"):
+        home.refuse_over(store, "b.csv", 200_000)
+    monkeypatch.setenv("IRJ_QUOTA_GB", "much")
+    with pytest.raises(InputError, match="give a number of gigabytes"):
+        home.quota()
+
+
+def test_only_empty_sessions_that_are_old_are_swept(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    old, used, young = store.create(), store.create(), store.create()
+    for session in (old, used):
+        state = session.load()
+        (session.folder / "state.json").write_text(
+            json.dumps({**state.as_json(), "created": state.created - 2 * home.STALE})
+        )
+    (used.files / "a.csv").write_text("t\n")
+    home.sweep_empty(store)
+    left = {folder.name for folder in tmp_path.iterdir()}
+    assert left >= {used.id, young.id}
+    assert old.id not in left
+    home.delete(store, used.id)
+    assert not used.folder.exists()
+    with pytest.raises(KeyError):
+        home.delete(store, used.id)

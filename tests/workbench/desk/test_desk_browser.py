@@ -25,14 +25,19 @@ pytestmark = pytest.mark.skipif(
 
 
 @pytest.fixture(scope="module")
-def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("sessions")
+
+
+@pytest.fixture(scope="module")
+def address(root: Path) -> Iterator[str]:
     import uvicorn
 
     from workbench.page.server import _listen, create_app
 
     listening = _listen(0)
     port = int(listening.getsockname()[1])
-    app = create_app(tmp_path_factory.mktemp("sessions"), port=port)
+    app = create_app(root, port=port)
     server = uvicorn.Server(
         uvicorn.Config(app, log_level="error", ws="none", timeout_graceful_shutdown=1)
     )
@@ -225,3 +230,39 @@ def test_the_import_shows_what_would_be_odd_before_it_is_used(
     shot(page, "import-later")
     page.click("button.primary:has-text('Use these columns')")
     page.wait_for_function("() => app.state.files[0].columns.motor_current.sign === -1")
+
+
+def test_sessions_are_found_named_and_deleted(address: str, page: Any, root: Path) -> None:
+    page.goto(address)
+    page.click("#fresh")
+    page.wait_for_selector("#demo")
+    page.click("#demo")
+    idle(page, "load")
+    page.click("#fresh")
+    page.wait_for_selector("#demo")
+    write_two_joints(root / "rig.csv")
+    page.set_input_files("#files", str(root / "rig.csv"))
+    page.wait_for_selector(".import svg")
+    page.click("#home")
+    page.wait_for_selector(".note")
+    assert "irj app printed" in page.inner_text(".note")  # no list without the key
+    key = (root / "home.key").read_text()
+    page.goto(f"{address}#home={key}")
+    page.reload()
+    page.wait_for_selector("#demo, #fit, #staircase, .drop")
+    page.click("#home")
+    page.wait_for_selector(".session")
+    before = page.locator(".session").count()
+    page.get_by_label("Name of rig").first.fill("left bench")
+    page.keyboard.press("Tab")
+    page.wait_for_selector("h2:has-text('left bench')")
+    page.fill("#search", "bench")
+    assert page.locator(".session").count() == 1
+    page.fill("#search", "")
+    shot(page, "home")
+    page.get_by_label("Delete left bench", exact=True).click()
+    page.get_by_label("Delete left bench for good").click()
+    page.wait_for_function(
+        "n => document.querySelectorAll('.session').length === n", arg=before - 1
+    )
+    assert "left bench" not in page.inner_text("#main")
