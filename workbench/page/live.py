@@ -15,9 +15,9 @@ from identification.data.plain_text import from_toml
 from identification.data.record import Record
 from identification.errors import InputError
 from workbench.page.analysis import Analysis, Progress
+from workbench.page.desk.tree import after_input, given
 from workbench.page.records import checked, opened
 from workbench.page.session import FileEntry, Session, State
-from workbench.page.tree import after_input, given
 from workbench.page.work import CancelledError, Task, Worker
 
 Change = Callable[[State], State]

@@ -34,8 +34,8 @@ from identification.crash import internal_error
 from identification.data.plain_text import from_json
 from identification.errors import InputError
 from irj_fmu.command_line import system_refusal
-from workbench.page import home, tree
 from workbench.page import verbs as app_verbs
+from workbench.page.desk import home, tree
 from workbench.page.input import (
     add_upload,
     change_tree,

@@ -12,8 +12,8 @@ from typing import Any, Final
 from identification.diagnosis.improve import HOLD_DELAY, Improvement, improve
 from identification.errors import InputError
 from workbench.page import export as app_export
-from workbench.page import tree
 from workbench.page.analysis import Progress, clean
+from workbench.page.desk import tree
 from workbench.page.input import folder_of
 from workbench.page.live import Change, Live, hint_for
 from workbench.page.session import State, StepEntry

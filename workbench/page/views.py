@@ -20,7 +20,7 @@ from identification.errors import InputError
 from workbench.page import export as app_export
 from workbench.page import plan as app_plan
 from workbench.page import replay as app_replay
-from workbench.page import tree
+from workbench.page.desk import tree
 from workbench.page.input import folder_of, joint_form
 from workbench.page.live import Live
 from workbench.page.pattern import pattern

@@ -14,7 +14,7 @@ import pytest
 pytest.importorskip("starlette")
 
 from identification.errors import InputError
-from workbench.page import home, tree
+from workbench.page.desk import home, tree
 from workbench.page.input import change_tree, joint_form, set_joint
 from workbench.page.live import Live
 from workbench.page.session import FileEntry, State, StepEntry, Store
