@@ -18,11 +18,14 @@ from typing import Final, final
 import numpy as np
 import numpy.typing as npt
 
+from casadi_models import JointModel
 from identification import Joint, Record, improve
+from identification.balance.dataset import Dataset
 from identification.data.joint_file import Known
 from identification.fitting.engine import load_dataset, prepared_model, solve
-from identification.naming.contest import Contest, Rival, rivals_of
+from identification.naming.contest import Contest, Rival, from_every_valley, rivals_of
 from identification.naming.odds import unmodelled_by
+from identification.planning.next_run import worth
 from identification.planning.rivals import Foreseen, enough
 from identification.planning.runs import (
     SIMULATED,
@@ -46,14 +49,18 @@ SETS: Final[Mapping[str, tuple[str, tuple[str, ...], float]]] = MappingProxyType
             2.0,
         ),
         "viscous": ("motor", ("quadratic_drag", "cubic_viscous"), 0.0),
-        "gap": ("transmission", ("backlash", "piecewise_stiffness", "soft_windup"), 0.0),
+        "gap": ("transmission", ("backlash", "piecewise_stiffness", "soft_windup"), 1.0),
         "load": ("motor", ("load_dependent_friction", "cyclic_friction"), 0.0),
     }
 )
 """Names that often tie: the balance in which they show, the names, and the noise of drive and
-torque sensor beyond the generator's [N.m].  With its fine sensors any record tells a gain apart."""
+torque sensor beyond the generator's [N.m].  With its fine sensors any record tells a gain or the
+laws of a gap apart."""
 OLD: Final = Run("multisine", 0.6, 0.3, 0.35)
 """The record on which they tie: narrow and slow, on one side of upright."""
+CROSSING: Final = Run("multisine", 0.0, 0.3, 0.35)
+"""The same about upright, for laws that act where the torque goes through zero: on the other record
+nothing of them is seen, and their fits say nothing."""
 SPAN: Final = 10.0
 """Its length [s]."""
 SECONDS: Final = 15.0
@@ -103,16 +110,25 @@ def record_of(
     return replace(made, payload=payload)
 
 
-def alive(contest: Contest, balance: str) -> tuple[Rival, ...]:
+def fitted(names: Sequence[str], balance: str, model: JointModel, data: Dataset) -> Contest | None:
+    """Names of a set fitted whole, as `irj next` does; None where no name helps."""
+    bare = solve(model, data)
+    rivals = rivals_of(names, balance, bare, data)
+    return Contest(from_every_valley(rivals, bare, data), data) if rivals else None
+
+
+def alive(contest: Contest | None, balance: str) -> tuple[Rival, ...]:
     """Names that `improve` would leave."""
+    if contest is None:
+        return ()
     return contest.alive(unmodelled_by(contest, balance))
 
 
-def judged(contest: Contest, balance: str, truth: str) -> tuple[float, bool, bool]:
+def judged(contest: Contest | None, balance: str, truth: str) -> tuple[float, bool, bool]:
     """Log-likelihood of the truth over its closest rival; whether it is the one name left; whether
     it is left."""
-    names = [r.name for r in contest.rivals]
-    likelihood = dict(zip(names, contest.likelihood, strict=True))
+    names = [r.name for r in contest.rivals] if contest else []
+    likelihood = dict(zip(names, contest.likelihood, strict=True)) if contest else {}
     if truth not in likelihood:
         return -np.inf, False, False
     # a name that does not help at all on both records has no fit: the truth is alone
@@ -127,7 +143,7 @@ def one_joint(
 ) -> list[tuple[str, Outcome, Run]]:
     """Before, after the proposed run, after a random one; empty where no names tie."""
     balance, names, noise = SETS[which]
-    narrow = OLD.motion(SPAN, DT)
+    narrow = (CROSSING if balance == "transmission" else OLD).motion(SPAN, DT)
     given = {"old": (narrow.position, narrow.velocity)}
     case = simulate_case(truth, seed, size=size, references=given)
     joint = Joint(
@@ -143,8 +159,7 @@ def one_joint(
     old = record_of(case.measured["old"], "old", "same", **more)
     model = prepared_model(joint, old)
     data = load_dataset([old], [], joint, model)
-    rivals = rivals_of(names, balance, solve(model, data), data)
-    rivals = list(alive(Contest(rivals, data), balance)) if rivals else []
+    rivals = list(alive(fitted(names, balance, model, data), balance))
     if len(rivals) < 2 or truth not in {r.name for r in rivals}:
         return []
     contest = Contest(rivals, data)
@@ -156,7 +171,7 @@ def one_joint(
         followed = plant.run(run)
         if followed is not None and not space.broken(followed):
             apart = foreseen.distances(predicted(followed, run, data)) * SECONDS / SIMULATED
-            scored.append((float(apart.min()), run, apart))
+            scored.append((worth(apart), run, apart))
     scored.sort(key=lambda s: -s[0])
     found, one, within = judged(contest, balance, truth)
     out = [("before", Outcome(found, found, one, within), scored[0][1])]

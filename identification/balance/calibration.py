@@ -289,7 +289,9 @@ def _fitted_on_itself(
     """
     now = {n: float(values[n]) for n in names}
     turning = ~one_way(record) if any(n in CLOCKS for n in names) else np.False_
-    rows = {b: record.taking(b) & ~turning for b in balances.balances}
+    # inside a gap the twist says nothing of its zero
+    touching = balances.flight(record, values) == 0
+    rows = {b: record.taking(b) & ~turning & touching for b in balances.balances}
     size = USUAL_SKEW * record.grid.dt
     usually, limits = dict(now), limits_of_runs(balances.model, [record])
     seen = [b for b in balances.balances if rows[b].any()]

@@ -150,7 +150,7 @@ def _drawn_floors(
     """RMS of what drawn noise changes in each balance of one record."""
     balances = balances_of(model, data.sensing, wrt=())
     power = dict.fromkeys(balances.balances, 0.0)
-    drawn = draws_of(record, data.noise)
+    drawn = draws_of(record, data.sources)
     seen = drawn[0].record
     either = _unsure(balances, data, values, [seen])
     values = values_on(model, record, values)

@@ -525,7 +525,7 @@ def _with_errors(
         unit = np.outer(norms[index], norms[index])
         within = np.ix_(index, index)
         whole = whole_without(scaled.T @ scaled, noise.whole[0][within] / unit)
-        grams, scores = noise.by_block(weights, stacked.block)
+        grams, scores = noise.by_block(weights, stacked.block, stacked.taking)
         apart = (grams[:, index][:, :, index] / unit, scores[:, index] / norms[index])
         errors = block_errors(scaled, r, block, apart, whole)
         # rows of the prior were made heavier by the share; they scatter as the prior itself does

@@ -465,7 +465,7 @@ class _Bench:
         u, y = _lists(self._train)
         weights = tuple(float(w) for w in 1.0 / self._size)
         rows = min(BLOCK_ROWS, max(max(len(one) for one in u) // 8, 2))
-        options = MoespOptions(output_weights=weights, max_order=self._max_order + 2)
+        options = MoespOptions(output_weights=weights, max_order=self._max_order + 2, noise=True)
 
         def made(order: int | None) -> Subspace:
             with warnings.catch_warnings():
@@ -496,13 +496,21 @@ class _Bench:
             vaf_percent=found.vaf_on(*_lists(self._test))
             if stable
             else np.full(len(weights), np.nan),
-            prediction_vaf_percent=np.full(len(weights), np.nan),
+            prediction_vaf_percent=self._ahead(found),
             spectral_radius=found.spectral_radius,
             poles=(poles_of_matrix(a, self._dt, known),),
             tried=tried,
             note=note,
             pieces_vaf_percent=pieces,
         )
+
+    def _ahead(self, found: Subspace) -> FloatArray:
+        error = total = np.zeros(len(self._size))
+        for p in self._test:
+            left = p.y - found.predict(p.u, p.y)
+            error = error + np.sum((left - left.mean(axis=0)) ** 2, axis=0)
+            total = total + np.sum((p.y - p.y.mean(axis=0)) ** 2, axis=0)
+        return np.asarray(100.0 * (1.0 - error / total), dtype=np.float64)
 
     def _pieces(self, found: Subspace, weights: FloatArray) -> FloatArray:
         source = ArraySource(*_lists(self._test))

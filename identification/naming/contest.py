@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final, final
 
@@ -16,15 +16,17 @@ from identification.balance.balances import balances_of
 from identification.balance.dataset import Dataset
 from identification.balance.stacked import INDEPENDENT_SHARE, stack
 from identification.balance.weak import REST_SHARE, RESTING_SIDES, WeakRecord
-from identification.diagnosis.candidates import offered
+from identification.diagnosis.candidates import offered, shape_grid
 from identification.diagnosis.trials import Trial, make_base, try_candidate
-from identification.fitting.engine import Solution, solve
+from identification.fitting.engine import Solution, reweighed, solve, stepped
 from identification.fitting.information import eliminated, form_of
 
 FloatArray = npt.NDArray[np.float64]
 
 FEWEST: Final = 3.0
 """Log-likelihood from which a name counts as better: odds of twenty to one [nats]."""
+VALLEY_STEPS: Final = 5
+"""Gauss-Newton steps from each point of a grid, to see which valley is the deepest."""
 TURN_WIDTHS: Final = 3.0
 """Smoothing velocities up to which friction has not yet reached its level (to 1 %)."""
 DECIDED: Final = 2.0
@@ -84,6 +86,49 @@ def rivals_of(names: Sequence[str], balance: str, start: Solution, data: Dataset
         for key in names
         if key in best
     ]
+
+
+def from_every_valley(rivals: Sequence[Rival], start: Solution, data: Dataset) -> list[Rival]:
+    """Rivals of which those behind the best were fitted again from every point of the grid of their
+    shapes.
+
+    A name must not fall out because its fit ended in another valley: a law with one knot more than
+    the best one can do all that this does.
+
+    Parameters
+    ----------
+    rivals : sequence of Rival
+    start : Solution
+        The fit of the model without any of them.
+    data : Dataset
+    """
+    contest = Contest(rivals, data)
+    known = {c.label: c for c in offered(start.model, data, late=True)[0]}
+    out = []
+    for rival, (nats, _) in zip(contest.rivals, contest.ahead, strict=True):
+        candidate = known.get(rival.label)
+        if nats <= FEWEST or candidate is None or not candidate.shapes:
+            out.append(rival)
+            continue
+        like = contest.leader.solution
+        tried = []
+        for shapes in shape_grid(candidate, data):
+            begun = {**start.values, **_common(like, start), **shapes}
+            found, cost = stepped(candidate.model, data, begun, like, iterations=VALLEY_STEPS)
+            if math.isfinite(cost):
+                tried.append((cost, found))
+        if tried:
+            best = min(tried, key=lambda t: t[0])[1]
+            whole = solve(candidate.model, data, start=best.values)
+            again = [replace(rival, solution=x) for x in (reweighed(best, data), whole)]
+            rival = Contest([rival, *again], data).leader
+        out.append(rival)
+    return out
+
+
+def _common(like: Solution, start: Solution) -> dict[str, float]:
+    """What a fit says of the parameters of a smaller model."""
+    return {n: v for n, v in like.values.items() if n in start.values}
 
 
 @final

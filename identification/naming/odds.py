@@ -12,7 +12,7 @@ from identification.balance.dataset import Dataset
 from identification.diagnosis.claims import Ranking, rank
 from identification.diagnosis.trials import make_base
 from identification.fitting.engine import Solution
-from identification.naming.contest import FEWEST, Contest, Rival, rivals_of
+from identification.naming.contest import FEWEST, Contest, Rival, from_every_valley, rivals_of
 
 NOTHING: Final = ""
 """Name of the rival without any effect in the place of the claim."""
@@ -111,8 +111,10 @@ def contest_of(
     data : Dataset
     """
     others = [n for n in names if n != first.name]
-    fitted = rivals_of(others, balance, bare, data) if others else []
-    return Contest([first, *fitted, Rival(NOTHING, NOTHING, bare)], data)
+    fitted = [first]
+    if others:
+        fitted = from_every_valley([first, *rivals_of(others, balance, bare, data)], bare, data)
+    return Contest([*fitted, Rival(NOTHING, NOTHING, bare)], data)
 
 
 def odds_of(contest: Contest, allowance: float) -> Odds:

@@ -22,8 +22,7 @@ from identification.balance.balances import residual_expressions
 from identification.balance.clocks import USUAL_SKEW
 from identification.balance.sensing import Sensing
 from identification.balance.weak import POSITION_CHAINS, differentiated_kernel, kernel
-from identification.online.alignment import Alignment
-from identification.online.timing import Timing
+from identification.online.timing import Alignment, Timing
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]

@@ -10,9 +10,8 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
-from identification.online.alignment import Alignment
 from identification.online.rows import SOURCES
-from identification.online.timing import Timing
+from identification.online.timing import Alignment, Timing
 from identification.online.watch import SAMPLED, Watch
 
 FloatArray = npt.NDArray[np.float64]

@@ -4,7 +4,7 @@ static void clear_rows(Twin *m) {
     memset(&m->s.rows, 0, sizeof m->s.rows);
 }
 
-/* Take late channels at their true time: identification.online.alignment.Alignment. */
+/* Take late channels at their true time: identification.online.timing.Alignment. */
 static void align(Rows *r, const double reading[SOURCES], double sample[SOURCES]) {
     int i, k;
     if (!r->any)

@@ -126,11 +126,10 @@ class TableSlave(Fmi2Slave):  # type: ignore[misc, unused-ignore]
         self._reported: set[str] = set()
         self._forget_path()
 
-    @classmethod
-    def _standard(cls) -> tuple[Variable, ...]:
+    def _standard(self) -> tuple[Variable, ...]:
         from dataclasses import replace
 
-        return (replace(STANDARD[0], start=cls.default_sample_time), *STANDARD[1:])
+        return (replace(STANDARD[0], start=self.default_sample_time), *STANDARD[1:])
 
     def _forget_path(self) -> None:
         """Take the FMU's folder off the import path again, where the library has put it at each

@@ -32,7 +32,8 @@ from identification.online.estimator import (
 from irj_fmu.build import main
 from irj_fmu.estimator.native import NativeSpec, build_native, native_sources, native_variables
 from irj_fmu.estimator.native_expressions import cheaper
-from irj_fmu.estimator.slave import DETECTOR_FILE, JOINT_FILE, OPTIONS_FILE, Estimator, options_text
+from irj_fmu.estimator.packed import options_text
+from irj_fmu.estimator.slave import DETECTOR_FILE, JOINT_FILE, OPTIONS_FILE, Estimator
 from irj_fmu.fmi.compiler import find_compiler, has_zig, header_folder
 from irj_fmu.fmi.targets import native_targets
 from irj_fmu.host.run import Fmu, Instance
@@ -87,7 +88,9 @@ class Python:
 
     def __init__(self, spec: NativeSpec, folder: Path, parameters: Mapping[str, Any]) -> None:
         write(folder, spec.joint)
-        (folder / OPTIONS_FILE).write_text(options_text(spec.options), encoding="utf-8")
+        (folder / OPTIONS_FILE).write_text(
+            options_text(spec.options, spec.sample_time), encoding="utf-8"
+        )
         if spec.detector_state is not None:
             (folder / DETECTOR_FILE).write_bytes(spec.detector_state)
         self.slave = Estimator(instance_name="python", resources=str(folder))
@@ -514,13 +517,32 @@ def test_equals_python_through_common_failures(
 
 
 @pytest.mark.parametrize(
-    "steps", [(2e-3,), (5e-3,), (3e-4, 1.7e-3, 1.1e-3, 6e-4)], ids=["2 ms", "5 ms", "jitter"]
+    ("built", "steps"),
+    [
+        (STEP, (2e-3,)),
+        (STEP, (4e-3,)),
+        (STEP, (8e-3,)),
+        (16e-3, (16e-3,)),
+        (STEP, (3e-4, 1.7e-3, 1.1e-3, 6e-4)),
+        (4e-3, (3e-3, 5e-3, 4.4e-3)),
+    ],
+    ids=["2 ms", "4 ms", "8 ms", "16 ms", "jitter", "coarse jitter"],
 )
 def test_equals_python_at_coarse_and_uneven_steps(
-    steps: tuple[float, ...], spec: NativeSpec, fmu: Path, table: FloatArray, tmp_path: Path
+    built: float,
+    steps: tuple[float, ...],
+    spec: NativeSpec,
+    fmu: Path,
+    table: FloatArray,
+    tmp_path: Path,
 ) -> None:
-    """All outputs to 1e-9 and right values, with a dropout and a stuck current on the way."""
+    """All outputs to 1e-9 and right values, with a dropout and a stuck current on the way; steps
+    of the host beside that of the estimator.
+    """
     given = {"warm_up": 4.0}
+    if built != STEP:
+        spec = replace(spec, sample_time=built, detector_state=None)
+        fmu = build_native(spec, tmp_path / "native.fmu")
     python = Python(spec, tmp_path, given).slave
     names = estimated_parameters(spec.joint, PLAIN)
     true = dict(
@@ -653,6 +675,21 @@ def test_command_line(tmp_path: Path) -> None:
         )
         assert "compliant with FMI-2.0" in done.stdout + done.stderr
         assert "No semantic error" in done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("kind", ["estimator", "native"])
+def test_the_step_is_that_of_the_records_of_the_fit(kind: str, tmp_path: Path) -> None:
+    """The joint file says it; a file without it has the usual one."""
+    joint = start_of(replace(reference_joint("irj1b"), name="axis"))
+    for told, step in ((0.0025, b"0.0025"), (None, b"0.001")):
+        path = write(tmp_path / str(told), replace(joint, sample_time=told))
+        assert load_joint(path).sample_time == told
+        out = tmp_path / "dist"
+        assert main([kind, "--joint", str(path), "--out", str(out)]) == 0
+        with zipfile.ZipFile(out / f"axis_{kind}.fmu") as archive:
+            description = archive.read("modelDescription.xml")
+        assert b'stepSize="%s"' % step in description
+        assert b'start="%s"' % step in description.split(b'name="sample_time"')[1][:400]
 
 
 def test_unusable_requests(tmp_path: Path) -> None:

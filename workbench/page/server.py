@@ -67,6 +67,7 @@ PAGE: Final = {
     "/import.js": (WEB / "import.js", "text/javascript; charset=utf-8"),
     "/tree.js": (WEB / "tree.js", "text/javascript; charset=utf-8"),
     "/preview.js": (WEB / "preview.js", "text/javascript; charset=utf-8"),
+    "/charts.js": (WEB / "charts.js", "text/javascript; charset=utf-8"),
     "/plots.js": (WEB / "plots.js", "text/javascript; charset=utf-8"),
     "/uPlot.js": (ASSETS / "uPlot.iife.min.js", "text/javascript; charset=utf-8"),
     "/uPlot.css": (ASSETS / "uPlot.min.css", "text/css; charset=utf-8"),

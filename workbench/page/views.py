@@ -20,6 +20,7 @@ from identification.errors import InputError
 from workbench.page import export as app_export
 from workbench.page import plan as app_plan
 from workbench.page import replay as app_replay
+from workbench.page.charts.asked import CHART_VIEWS, along, run_starts, said, side_of
 from workbench.page.desk import tree
 from workbench.page.input import folder_of, joint_form
 from workbench.page.live import Live
@@ -42,6 +43,7 @@ def _config(live: Any, query: Query) -> dict[str, Any]:
             {"key": e.key, "title": e.title, "family": e.family, "places": list(e.acts_on)}
             for e in EFFECTS.values()
         ],
+        "words": said(),
         "report": app_export.report_available(),
         "fmu": app_export.fmu_available(),
     }
@@ -59,7 +61,10 @@ def _decimated(live: Live, query: Query) -> dict[str, Any]:
     names = [n for n in str(query.get("channels", "")).split(",") if n] or list(record.channels)[:1]
     values = [record[n] for n in names]
     stamps, columns, full = decimated(plot_time(record), values, _points(query), _window(query))
-    return _drawn(stamps, names, [record.unit(n) for n in names], columns, full)
+    made = _drawn(stamps, names, [record.unit(n) for n in names], columns, full)
+    for one in made["series"]:
+        one["side"] = side_of(one["name"])
+    return {**made, "runs": run_starts(record)}
 
 
 def first_plot(live: Live, file: str, query: Query) -> dict[str, Any] | None:
@@ -94,7 +99,8 @@ def _balance(live: Live, query: Query) -> dict[str, Any]:
         time, [measured, model, measured - model], _points(query), _window(query)
     )
     unit = residual_unit(str(query.get("balance", "")), analysis.joint.kind)
-    return _drawn(stamps, ("measured", "model", "residual"), [unit] * 3, columns, full)
+    drawn = _drawn(stamps, ("measured", "model", "residual"), [unit] * 3, columns, full)
+    return {**drawn, "along": along(analysis, stamps)}
 
 
 def _drawn(
@@ -248,4 +254,5 @@ VIEWS: Final[Mapping[str, Callable[[Any, Query], Any]]] = {
     "replay": _replay,
     "plan": _plan,
     "motion.csv": _motion,
+    **CHART_VIEWS,
 }

@@ -33,6 +33,8 @@ MOST_LOG_TICKS: Final = 8
 BEFORE: Final = "#d55e00"
 AFTER: Final = "#0072b2"
 LAW: Final = "#00795c"
+LETTER: Final = 5.9
+"""Width of a letter of a label, on the safe side."""
 INK: Final = "#444444"
 GRID: Final = "#cccccc"
 
@@ -123,9 +125,19 @@ def axes(
                 f'<path class="s-grid" stroke="{GRID}" d="M{x:.1f} {base}v4"/>'
                 + word(min(x, frame.width - 16), base + 16, number(t, 3))
             )
-    out.append(word((LEFT + right) / 2, frame.height - 6, x_label))
-    out.append(word(4, 13, y_label, "start"))
+    out.append(
+        word((LEFT + right) / 2, frame.height - 6, x_label, "middle", _fitted(x_label, frame))
+    )
+    out.append(word(4, 13, y_label, "start", _fitted(y_label, frame)))
     return "".join(out)
+
+
+def _fitted(said: str, frame: Frame) -> str:
+    """A label that is longer than the picture is squeezed into it: its side must not be cut."""
+    room = frame.width - 8
+    if len(said) * LETTER <= room:
+        return ""
+    return f' textLength="{room}" lengthAdjust="spacingAndGlyphs"'
 
 
 def svg(label: str, body: str, height: int = HEIGHT, width: int = WIDTH) -> str:

@@ -24,6 +24,7 @@ from workbench.show.chart import (
     HEIGHT,
     INK,
     LEFT,
+    LETTER,
     RIGHT,
     TOP,
     WIDTH,
@@ -60,8 +61,6 @@ SIDES: Final = {
 """Each signal in the field's words, with its side."""
 LABEL_LINES: Final = 3
 LINE: Final = 13
-LETTER: Final = 6.2
-"""Width of a letter of a label, for breaking it into lines."""
 
 
 def axis_label(axis: str, title: str, unit: str) -> Label:

@@ -33,7 +33,7 @@ class Outcome:
 OUTCOME_WORDS: Final[Mapping[str, Outcome]] = {
     "found": Outcome(
         "Found what was missing",
-        "Use the joint file with the effect in it, and check it on a record of another motion, "
+        "Take the effect into the model, and check the joint file on a record of another motion, "
         "payload or temperature.",
     ),
     "set": Outcome(

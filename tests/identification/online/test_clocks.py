@@ -13,9 +13,9 @@ from benchmarks.native import PLAIN, STEP
 from casadi_models.hold import HOLD_NAME
 from casadi_models.simulate import simulate
 from identification.data.joint_file import Joint
-from identification.online.alignment import Alignment
 from identification.online.estimator import OnlineEstimator
 from identification.online.rows import SOURCES
+from identification.online.timing import Alignment
 from irj_fmu.plant.reference import reference_joint, start_of
 
 FloatArray = npt.NDArray[np.float64]

@@ -213,7 +213,7 @@ def test_every_answer_carries_the_policy(client: Client, path: str) -> None:
 
 
 def test_the_page_has_nothing_inline_and_no_network() -> None:
-    web = Path(__file__).parents[2] / "workbench" / "web"
+    web = Path(__file__).parents[3] / "workbench" / "web"
     page = (web / "index.html").read_text(encoding="utf-8")
     assert not re.search(r"<script(?![^>]*src=)|\sstyle=|\son\w+=|<style", page)
     for file in web.iterdir():
@@ -325,7 +325,7 @@ def test_two_gigabytes_are_streamed_and_cut_at_the_limit(tmp_path: Path) -> None
         "from pathlib import Path\nfrom workbench.page.server import serve\nserve([], 0, "
         f"False, root=Path({str(tmp_path)!r}))"
     )
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
     process = subprocess.Popen(
         [sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, text=True
     )
@@ -508,7 +508,7 @@ def test_copied_code_gives_the_same_errors(client: Client, fitted: str, tmp_path
     for name, content in demo_files().items():
         (tmp_path / name).write_bytes(content)
     (tmp_path / "session.py").write_text(client.get(f"{fitted}/view/code")["code"])
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
     done = subprocess.run(
         [sys.executable, "session.py"],
         cwd=tmp_path,
@@ -697,7 +697,7 @@ def test_a_killed_server_loses_nothing(tmp_path: Path) -> None:
         "from pathlib import Path\nfrom workbench.page.server import serve\nserve([], 0, "
         f"False, root=Path({str(tmp_path)!r}))"
     )
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
 
     def started() -> tuple[subprocess.Popen[str], Client]:
         process = subprocess.Popen(
@@ -840,7 +840,7 @@ def test_roles_are_guessed_from_names(name: str, role: str) -> None:
 
 
 def test_the_demo_is_that_of_the_command_line() -> None:
-    folder = Path(__file__).parents[2] / "workbench" / "demo"
+    folder = Path(__file__).parents[3] / "workbench" / "demo"
     assert {
         name: (folder / name).read_bytes() for name in ("joint.toml", "train.npz", "held_out.npz")
     } == demo_files()
