@@ -180,7 +180,8 @@ def _public(live: Live) -> dict[str, Any]:
         entry.pop("stored")
     state["can"] = {"undo": live.can(tree.undone), "redo": live.can(tree.redone)}
     state["fits"] = len(state.pop("branches"))
-    state.pop("found")
+    last = state["steps"][-1]["id"] if state["steps"] else ""
+    state["laws"] = state.pop("found").get(last, {}).get("laws", [])
     return state
 
 

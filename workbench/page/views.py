@@ -13,6 +13,7 @@ import numpy as np
 from starlette.responses import FileResponse, Response
 
 from casadi_models import EFFECTS
+from casadi_models.effect import PLACE_SIDE
 from casadi_models.transmission import MODELS
 from identification.balance.kinematic import residual_unit
 from identification.data.channels import CHANNELS
@@ -38,6 +39,7 @@ def _config(live: Any, query: Query) -> dict[str, Any]:
     return {
         "max_upload": query["max_upload"],
         "channels": ["time", *CHANNELS],
+        "places": list(PLACE_SIDE),
         "models": {name: list(own) for name, own in MODELS.items()},
         "effects": [
             {"key": e.key, "title": e.title, "family": e.family, "places": list(e.acts_on)}

@@ -266,3 +266,39 @@ def test_sessions_are_found_named_and_deleted(address: str, page: Any, root: Pat
         "n => document.querySelectorAll('.session').length === n", arg=before - 1
     )
     assert "left bench" not in page.inner_text("#main")
+
+
+def test_a_law_of_ones_own_is_tried_at_once_and_saved(address: str, page: Any) -> None:
+    page.goto(address)
+    page.click("#fresh")
+    page.wait_for_selector("#demo")
+    page.click("#demo")
+    page.click("#fit")
+    idle(page, "compare")
+    page.click("#nav-ledger")
+    idle(page, "ledger")
+    start = float(page.inner_text("#headline strong").split()[0])
+    page.fill("#law-law", "a*tanh(v/b")
+    page.fill("#law-parameters", "a=0..100 N.m, b=0.001..1 rad/s")
+    page.click("#try-law")
+    page.wait_for_selector("#error:not([hidden])")
+    assert "law: " in page.inner_text("#error-text")
+    idle(page, "ledger")
+    page.fill("#law-law", "a*exp(-abs(v)/b)*sign(v)")
+    page.click("#try-law")
+    page.wait_for_selector("#tried-laws")
+    idle(page, "ledger")
+    tried = page.evaluate("app.state.laws[0]")
+    assert tried["after"] < 0.5 * tried["before"]
+    assert tried["before"] == pytest.approx(start, rel=0.01)
+    shot(page, "law")
+    page.click("#tried-laws button")
+    page.wait_for_function("() => app.state.steps.length === 2")
+    idle(page, "ledger")
+    assert float(page.inner_text("#headline strong").split()[0]) == pytest.approx(
+        tried["after"], rel=0.01
+    )
+    assert "law_" in page.evaluate("app.state.joint_text")
+    taken = page.evaluate("fetch(base() + '/view/joint.toml').then((r) => r.text())")
+    assert 'law = "a*exp(-abs(v)/b)*sign(v)"' in taken
+    assert page.evaluate("app.state.fits") == 0  # no branch by a law that is only there
