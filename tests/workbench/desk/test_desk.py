@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import random
 import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
@@ -191,3 +193,54 @@ def test_only_empty_sessions_that_are_old_are_swept(tmp_path: Path) -> None:
     assert not used.folder.exists()
     with pytest.raises(KeyError):
         home.delete(store, used.id)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_random_moves_lose_no_fit_no_note_and_no_record(seed: int) -> None:
+    draw = random.Random(seed)
+    state, made, files = tree.continued(START, (step(None, 9.0, "s0"),)), {"s0"}, {"a", "b"}
+    state = tree.remarked(state, "s0", "first", "kept")
+
+    def add(s: State) -> State:
+        name = f"s{len(made)}"
+        made.add(name)
+        new = step(name if s.steps else None, 9.0 / len(made), name)
+        return tree.continued(s, (*s.steps, new))
+
+    def again(s: State) -> State:  # Fit once more: the same values under a new identifier
+        return tree.continued(s, (replace(s.steps[0], id="new"),)) if s.steps else s
+
+    def role(s: State) -> State:
+        k = draw.randrange(len(s.files))
+        roles = ["train", "held_out"]
+        changed = replace(s.files[k], role=draw.choice(roles))
+        return tree.after_input(s, replace(s, files=(*s.files[:k], changed, *s.files[k + 1 :])))
+
+    def upload(s: State) -> State:
+        name = f"f{len(files)}"
+        files.add(name)
+        status = draw.choice(["ready", "refused", "checking"])
+        return tree.after_input(s, replace(s, files=(*s.files, record(name, status=status))))
+
+    def drop(s: State) -> State:
+        return tree.after_input(s, replace(s, files=s.files[1:])) if len(s.files) > 1 else s
+
+    def rename(s: State) -> State:
+        text = JOINT.replace("elbow", f"joint{draw.randrange(9)}")
+        return tree.after_input(s, replace(s, joint_text=text))
+
+    def go(s: State) -> State:
+        branch = draw.choice(tree.shown(s))
+        steps = [t["id"] for t in branch["steps"]]
+        return tree.opened(s, branch["id"], draw.choice(steps) if steps else "")
+
+    moves = (add, add, again, role, upload, drop, rename, go, go, tree.undone, tree.redone)
+    for _ in range(60):
+        with contextlib.suppress(InputError):
+            state = draw.choice(moves)(state)
+        assert {s for path in paths(state) for s in path} == made
+        assert state.remarks["s0"] == {"name": "first", "note": "kept"}
+        every: tuple[Any, ...] = (state, *state.branches)
+        fitted = {f.stored for b in every if b.steps for f in b.files if f.status == "ready"}
+        assert fitted <= tree.used_files(state)
+        assert len({b.id for b in state.branches} | {state.branch}) == len(state.branches) + 1

@@ -104,6 +104,10 @@ def put_away(before: State, after: State | None = None) -> State:
 def continued(state: State, steps: tuple[StepEntry, ...]) -> State:
     """The state on another path of the same input: a path that it leaves is kept as a branch."""
     path = (*state.steps, *state.undone)
+    for k, (old, new) in enumerate(zip(path, steps, strict=False)):
+        if not _same(old, new):
+            break  # below here a step that was made before keeps its identifier, and its notes
+        steps = (*steps[:k], replace(new, id=old.id), *steps[k + 1 :])
     if _begins(path, steps):
         return on(state, steps, ())
     if _begins(steps, path):
