@@ -568,7 +568,7 @@ def parser() -> OneLineParser:
     plain.add_argument(
         "--picture", metavar="FILE.svg", help="draw Bode plots and poles of the best model"
     )
-    first = verb("joint", "first_joint", "a first joint file for somebody else's FMU")
+    first = verb("joint", "joints", "a first joint file for somebody else's FMU")
     first.add_argument("what", choices=("new",), help="write a new one")
     first.add_argument("fmu", metavar="MODEL.fmu", help="the FMU")
     first.add_argument(
