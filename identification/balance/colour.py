@@ -89,6 +89,13 @@ class Part:
     memory: float = 0.0
     stages: int = 1
 
+    def covariance(self, apart: FloatArray) -> FloatArray:
+        """Of two samples so far apart [s], the shape of `apart`."""
+        if self.memory <= 0:
+            return np.asarray(self.size**2 * (apart == 0))
+        lags = np.abs(apart) / self.memory
+        return np.asarray(self.size**2 * np.exp(-lags) * (1 + (lags if self.stages > 1 else 0.0)))
+
     def draw(self, rng: np.random.Generator, count: int, dt: float) -> FloatArray:
         """A course of this noise, shape (count,), at steps of `dt` seconds."""
         if self.memory <= 0:
@@ -136,6 +143,20 @@ class ChannelNoise:
             tuple(replace(part, size=factor * part.size) for part in self.parts),
             tuple((factor * size, frequency) for size, frequency in self.lines),
         )
+
+    def after(self, weights: FloatArray, dt: float) -> float:
+        """Standard deviation of what a filter with these weights (k,), at steps of `dt` seconds,
+        makes of this noise.
+        """
+        if not self.lines and all(part.memory <= 0 for part in self.parts):
+            return math.hypot(*(p.size for p in self.parts)) * float(np.linalg.norm(weights))
+        apart = np.asarray(dt * np.arange(len(weights)), dtype=np.float64)
+        alike = sum((part.covariance(apart) for part in self.parts), np.zeros(len(weights)))
+        for size, frequency in self.lines:
+            alike = alike + size**2 / 2 * np.cos(2 * np.pi * frequency * apart)
+        pairs = np.correlate(weights, weights, "full")[len(weights) - 1 :]
+        power = float(pairs[0] * alike[0] + 2 * (pairs[1:] @ alike[1:]))
+        return math.sqrt(max(power, 0.0))
 
     def draw(self, rng: np.random.Generator, count: int, dt: float) -> FloatArray:
         """A course of this noise, shape (count,), at steps of `dt` seconds."""

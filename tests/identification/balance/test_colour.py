@@ -10,6 +10,7 @@ from identification import Joint, Record, fit
 from identification.balance.colour import ChannelNoise, Part, white
 from identification.balance.noise import noise_of
 from identification.balance.spikes import without_spikes
+from identification.balance.weak import kernel
 from identification.fitting.assess import assess
 from identification.fitting.engine import load_dataset, prepared_model
 from tests.noise_bench import KINDS, filtered
@@ -130,3 +131,21 @@ def test_noise_through_two_filters_in_a_row_is_read_too() -> None:
     assert any(p.stages == 2 for p in found.parts)
     slow = sum(p.size**2 * max(2 * p.stages * p.memory, DT) for p in found.parts)
     assert np.sqrt(slow) == pytest.approx(TORQUE * np.sqrt(4 * 0.003), rel=0.15)
+
+
+@pytest.mark.parametrize(
+    "noise",
+    [
+        white(0.4),
+        ChannelNoise(0.2, (Part(0.2), Part(0.4, 0.003))),
+        ChannelNoise(0.2, (Part(0.4, 0.004, 2),), ((0.3, 50.0),)),
+    ],
+)
+def test_what_a_filter_leaves_of_a_noise_is_what_it_leaves_of_its_draws(
+    noise: ChannelNoise,
+) -> None:
+    weights = kernel(0.02, DT, 1)
+    drawn = noise.draw(np.random.default_rng(2), 100_000, DT)
+    assert noise.after(weights, DT) == pytest.approx(
+        np.std(np.convolve(drawn, weights, "valid")), rel=0.02
+    )
