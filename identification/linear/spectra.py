@@ -151,7 +151,8 @@ class Stretch:
 
 def stretches(records: Sequence[Record], joint: Joint, sensing: Sensing) -> list[Stretch]:
     """Contiguous stretches of the records."""
-    if sensing.clamped_link:
+    if sensing.clamped_link or sensing.kinematic:
+        # nothing moves, or nothing says how heavy it is: there is no model to draw beside it
         return []
     out: list[Stretch] = []
     for given in records:

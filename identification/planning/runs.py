@@ -420,13 +420,18 @@ def recorded(
 
 
 def refuse_clamped(data: Dataset) -> None:
-    """Refuse records of a torque-against-torsion test.
+    """Refuse records of a torque-against-torsion test, and positions without any torque.
 
     Raises
     ------
     InputError
-        The link is clamped: no motion can be planned.
+        The link is clamped, or no torque has a size: no motion can be planned.
     """
+    if data.sensing.kinematic:
+        raise InputError(
+            f"{data.train_names[0]}: two positions without any torque do not say what drives the "
+            "joint, and no motion can be planned; record motor_current or motor_torque too"
+        )
     if data.sensing.clamped_link:
         raise InputError(
             f"{data.train_names[0]}: a torque-against-torsion test has no motion to plan; give "
