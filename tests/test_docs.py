@@ -25,6 +25,7 @@ PAGES: Final = {  # blocks that are not run
     "README.md": 2,
     "docs/guide.md": 5,
     "docs/explore.md": 1,
+    "docs/linear.md": 0,
     "docs/extending.md": 0,
     "docs/batch.md": 1,
     "docs/user-fmu.md": 0,

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from casadi_models import JointModel
 from casadi_models.joint import TWIST
-from casadi_models.term import SIDE_INERTIAS, TOTAL_INERTIA
+from casadi_models.term import LINK_INERTIA, SIDE_INERTIAS, TOTAL_INERTIA
 from identification.data.joint_file import Joint
 from identification.data.record import Record
 from identification.errors import InputError
@@ -26,6 +26,7 @@ BALANCE_TITLES: Final = {
     "sum": "sum of motor and link balance (no torque sensor)",
     "deflection": "motor balance with the torsion in place of a torque sensor",
     "axis": "balance of the axis",
+    "kinematic": "twist against what the link's own motion asks for (no torque, no drive)",
 }
 
 
@@ -67,6 +68,11 @@ class Sensing:
         """True where one balance of one side carries everything."""
         return self.balances == ("axis",) or self.clamped_link
 
+    @property
+    def kinematic(self) -> bool:
+        """True where both positions are recorded and no torque at all."""
+        return self.balances == ("kinematic",)
+
 
 TEMPERATURE_CHANGE: Final = 2.0
 """Change of the temperature over the records that is worth the name [K]."""
@@ -105,10 +111,10 @@ def _sensed(record: Record, elastic: bool) -> Sensing:
             f"{record.name}: no motor_position and no link_position; add one of them or map it "
             "in [columns]"
         )
-    if not (drive or torque):
+    if not (drive or torque or (motor and link)):
         raise InputError(
             f"{record.name}: no motor_current, motor_torque, motor_voltage or link_torque; a "
-            "balance needs one of them"
+            "balance needs one of them, or both motor_position and link_position"
         )
     common = {
         "has_torque": torque,
@@ -118,6 +124,8 @@ def _sensed(record: Record, elastic: bool) -> Sensing:
         "has_coupling": record.has("coupling_torque"),
     }
     moving = "motor_position" if motor else "link_position"
+    if not (drive or torque):
+        return Sensing(("kinematic",), moving=moving, **common)
     if not drive and not (motor and link):
         if link and not motor and not elastic:
             return Sensing(("link",), moving=moving, **common)
@@ -267,6 +275,10 @@ def adapt(
     if sensing.clamped_link:
         # torque against twist shows the transmission, whatever else the model has or has not
         model = replace(model if model.is_elastic else model.add(TWIST), inertias=())
+    elif sensing.kinematic:
+        # the twist is all that is seen of the joint: what loads it is the link, nothing of the
+        # motor
+        model = replace(model if model.is_elastic else model.add(TWIST), inertias=(LINK_INERTIA,))
     elif sensing.balances == ("axis",) and not set(SIDE_INERTIAS) & set(known or ()):
         model = replace(model, inertias=TOTAL_INERTIA)
     if sensing.one_sided:

@@ -52,14 +52,17 @@ _PLACES: Final = [
     tuple(i for i, bit in enumerate(_BITS) if bits & bit) for bits in range(1 << len(_BITS))
 ]
 """Places of the bits that are set, for each set of bits."""
+WELL_OVER: Final = 1.5
+"""Largest torsion residual over its limit that is no noise: a limit is passed by noise by a few
+percent.
+"""
 LARGEST: Final = 1e6
 """A reading beyond this is no place to start an estimate from."""
 WIDER: Final = 1.5
 """Factor on the limits for every further reading that is replaced: estimates lean on fewer."""
-SHORT_PEAK: Final = 1.5
 SHORT: Final = (2, 10, 20)
-"""A torque sensor that failed for a moment: peak of r1 over its limit; samples for which it is back
-(from, to) and since it began (below)."""
+"""A torque sensor that failed for a moment: samples for which r1 is back (from, to) and since it
+began (below)."""
 FRESH: Final = 5
 """Samples within which a residual must have been over its limit to count for a verdict."""
 SHOWS: Final = 2.0
@@ -339,7 +342,7 @@ class StructuredRule:
             )
             back, longest, young = SHORT
             gone = (
-                self.peak > SHORT_PEAK
+                self.peak > WELL_OVER
                 and back <= self._since(TORSION) <= longest
                 and self._age(TORSION) < young
             )

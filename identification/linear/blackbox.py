@@ -1,4 +1,4 @@
-"""ARX, ARMAX, output-error and Box-Jenkins models by prediction error.
+"""FIR, ARX, ARMA, ARMAX, ARARX, ARARMAX, output-error and Box-Jenkins models by prediction error.
 
 They know nothing of the joint. What they explain on held-out data is the share
 of the output that any linear model of that size can explain: a ceiling to hold a
@@ -18,12 +18,15 @@ import numpy as np
 import numpy.typing as npt
 
 from identification.errors import InputError
+from identification.linear.poles import Pole, poles_of
 from identification.linear.prediction_error import (
     FloatArray,
     Orders,
     Polynomials,
     Records,
+    coefficient_spread,
     held_out_error,
+    prediction_error,
     prediction_error_fit,
     rows_needed,
 )
@@ -41,8 +44,8 @@ __all__ = [
     "linear_ceiling",
 ]
 
-Structure = Literal["arx", "armax", "oe", "bj"]
-Tried = Literal["static", "arx", "armax", "oe", "bj", "moesp"]
+Structure = Literal["fir", "arx", "arma", "armax", "ararx", "ararmax", "oe", "bj"]
+Tried = Literal["static", "fir", "arx", "armax", "ararx", "ararmax", "oe", "bj", "moesp"]
 # time constants of a model's free motion in a test record, at least
 _FADES = 10.0
 _Arrays = npt.ArrayLike | Sequence[npt.NDArray[np.generic]]
@@ -69,7 +72,7 @@ class BlackBox:
     ----------
     system : control.TransferFunction
         From the inputs to the outputs, discrete time.
-    structure : {"arx", "armax", "oe", "bj"}
+    structure : {"fir", "arx", "arma", "armax", "ararx", "ararmax", "oe", "bj"}
     order : int
     polynomials : tuple of Polynomials
         A, B, C, D, F of every output, in powers of the backward shift.
@@ -79,6 +82,10 @@ class BlackBox:
     spectral_radius : float
         Largest pole modulus.
     outcome : BlackBoxOutcome
+    prediction_vaf_percent : ndarray, shape (outputs,)
+        Variance accounted for by the prediction one sample ahead, on the same samples.
+    poles : tuple of tuple of Pole
+        Of every output, with the deviation that the noise gives them.
     """
 
     system: control.TransferFunction
@@ -88,6 +95,20 @@ class BlackBox:
     vaf_percent: FloatArray
     spectral_radius: float
     outcome: BlackBoxOutcome
+    prediction_vaf_percent: FloatArray
+    poles: tuple[tuple[Pole, ...], ...]
+
+    def simulate(self, u: _Arrays, y: _Arrays) -> list[FloatArray]:
+        """Response to `u`, one array (samples, outputs) per record, with the initial conditions and
+        means that fit `y` best.
+        """
+        return [
+            other
+            - np.column_stack(
+                [held_out_error(one, other[:, k], p) for k, p in enumerate(self.polynomials)]
+            )
+            for one, other in whole_records(ArraySource(u, y))
+        ]
 
 
 @final
@@ -128,8 +149,10 @@ def blackbox(
     ----------
     u, y : array_like, shape (samples, channels), or lists of such arrays
         Inputs and outputs; a list holds one array per record. Remove offsets before.
-    structure : {"arx", "armax", "oe", "bj"}
-        ``A y = B u + e``, ``A y = B u + C e``, ``y = B/F u + e``, ``y = B/F u + C/D e``.
+    structure : {"fir", "arx", "arma", "armax", "ararx", "ararmax", "oe", "bj"}
+        ``y = B u + e``, ``A y = B u + e``, ``A y = C e``, ``A y = B u + C e``,
+        ``A y = B u + 1/D e``, ``A y = B u + C/D e``, ``y = B/F u + e``, ``y = B/F u + C/D e``.
+        "arma" has no input: it predicts one sample ahead, and simulates nothing.
     order : int
         Order of every polynomial, 1 to 20; B has ``order + 1`` coefficients.
     dt : float
@@ -191,8 +214,9 @@ def linear_ceiling(
         Inputs and outputs; a list holds one array per record. Remove offsets before.
     dt : float
         Sampling time in s.
-    structures : sequence of {"static", "arx", "armax", "oe", "bj", "moesp"}
-        Model families tried; "static" is ``y = B u``, of no order.
+    structures : sequence of str
+        Model families tried: those of `blackbox` but "arma", which has no input; "moesp"; and
+        "static", ``y = B u`` of no order.
     orders : sequence of int
         Orders tried, each 1 to 20.
     fit_samples : int
@@ -259,8 +283,8 @@ def _try(
     polynomials = tuple(fit[0] for fit in _fits(train, (*parts[0], *parts[1]), orders))
     if max(one.spectral_radius for one in polynomials) >= slowest:
         return np.full(len(polynomials), np.nan), np.full(len(polynomials), np.nan)
-    chosen_by = _vaf(parts[0], polynomials)
-    return chosen_by, chosen_by if parts[0] is parts[1] else _vaf(parts[1], polynomials)
+    chosen_by = simulated_vaf(parts[0], polynomials)
+    return chosen_by, chosen_by if parts[0] is parts[1] else simulated_vaf(parts[1], polynomials)
 
 
 def _try_moesp(
@@ -317,10 +341,14 @@ def _fit_all(
     import control
 
     inputs = train[0][0].shape[1]
-    fits = _fits(train, test, Orders(structure, order, delay, inputs))
+    orders = Orders(structure, order, delay, 0 if structure == "arma" else inputs)
+    fits = _fits(train, test, orders)
     polynomials = tuple(fit[0] for fit in fits)
     radius = max(polynomial.spectral_radius for polynomial in polynomials)
-    numerators = [[list(row) for row in polynomial.b] for polynomial in polynomials]
+    numerators = [
+        [list(row) for row in polynomial.b] or [[0.0] for _ in range(inputs)]
+        for polynomial in polynomials
+    ]
     denominators = [[list(polynomial.denominator)] * inputs for polynomial in polynomials]
     for rows, others in zip(numerators, denominators, strict=True):
         for k, row in enumerate(rows):
@@ -338,19 +366,44 @@ def _fit_all(
         structure=structure,
         order=order,
         polynomials=polynomials,
-        vaf_percent=_vaf(test, polynomials),
+        vaf_percent=simulated_vaf(test, polynomials),
         spectral_radius=radius,
         outcome=outcome,
+        prediction_vaf_percent=simulated_vaf(test, polynomials, ahead=True),
+        poles=tuple(_poles(train, orders, k, one, dt) for k, one in enumerate(polynomials)),
     )
 
 
-def _vaf(records: Records, polynomials: tuple[Polynomials, ...]) -> FloatArray:
+def _poles(
+    train: Records, orders: Orders, output: int, model: Polynomials, dt: float
+) -> tuple[Pole, ...]:
+    if not orders.poles:
+        return ()
+    spread = coefficient_spread([(u, y[:, output]) for u, y in train], orders, model)
+    return poles_of(model.denominator, dt, spread.denominator)
+
+
+def simulated_vaf(
+    records: Records, polynomials: tuple[Polynomials, ...], *, ahead: bool = False
+) -> FloatArray:
+    """VAF of the simulation, or of the prediction one sample ahead, per output [%].
+
+    Parameters
+    ----------
+    records : list of (u, y)
+        Arrays (samples, channels); initial conditions and means of each are fitted.
+    polynomials : tuple of Polynomials
+        One per output.
+    ahead : bool
+        Predict one sample ahead in place of a simulation.
+    """
     vaf = np.full(len(polynomials), np.nan)
+    of = prediction_error if ahead else held_out_error
     for k, polynomial in enumerate(polynomials):
-        if polynomial.spectral_radius < 1.0:
+        if ahead or polynomial.spectral_radius < 1.0:
             error = total = 0.0
             for u, y in records:
-                error += float(np.sum((held_out_error(u, y[:, k], polynomial)) ** 2))
+                error += float(np.sum(of(u, y[:, k], polynomial) ** 2))
                 total += float(np.sum((y[:, k] - y[:, k].mean()) ** 2))
             vaf[k] = 100.0 * (1.0 - error / total) if total > 0 else np.nan
     return vaf

@@ -250,7 +250,7 @@ def _physical_curve(
         )
 
     held = slice(2, 4) if measured.title == ACROSS and elastic else slice(0, len(a))
-    return _curve(PHYSICAL, response, np.linalg.eigvals(a[held, held]), measured, grid)
+    return curve_of(PHYSICAL, response, np.linalg.eigvals(a[held, held]), measured, grid)
 
 
 def _subspace_curve(parts: Sequence[Pair], measured: Response, grid: FloatArray) -> Curve:
@@ -298,16 +298,29 @@ def _subspace_curve(parts: Sequence[Pair], measured: Response, grid: FloatArray)
         )
 
     poles = np.log(np.linalg.eigvals(matrices[0]).astype(complex)) / dt
-    return _curve(SUBSPACE, response, poles, measured, grid[grid < 0.45 / dt])
+    return curve_of(SUBSPACE, response, poles, measured, grid[grid < 0.45 / dt])
 
 
-def _curve(
+def curve_of(
     name: str,
     response: Callable[[FloatArray], ComplexArray],
     poles: npt.NDArray[Any],
     measured: Response,
     grid: FloatArray,
 ) -> Curve:
+    """A model's curve with its distance to a measured response.
+
+    Parameters
+    ----------
+    name : str
+    response : callable
+        From frequencies [Hz] to the complex response.
+    poles : (n,) complex array
+        In the plane of s [rad/s].
+    measured : Response
+    grid : (points,) array
+        Frequencies of the curve [Hz].
+    """
     trusted = measured.trusted & (measured.frequency <= grid[-1])
     gap_db = gap_degrees = math.nan
     if trusted.any():

@@ -15,7 +15,9 @@ from identification.errors import InputError
 from identification.linear.records import check_finite, check_varies
 from identification.linear.triangle import FloatArray, Triangle, single_thread
 
-Method = Literal["ordinary", "past_output"]
+Method = Literal["ordinary", "past_output", "past_input", "cva"]
+# smallest diagonal of a triangle, relative to the largest, that still holds half the digits
+_DIGITS = 1e-8
 
 
 @final
@@ -26,10 +28,10 @@ class HankelFactor:
     Attributes
     ----------
     triangle : ndarray, shape (columns, columns)
-        R of the tall matrix [U | Y] (ordinary) or [Uf | Up | Yp | Yf] (past_output).
+        R of the tall matrix [U | Y] (ordinary) or [Uf | Up | Yp | Yf] (the others).
     inputs, outputs, block_rows : int
         Number of inputs m, of outputs p and of block rows i.
-    method : {"ordinary", "past_output"}
+    method : {"ordinary", "past_output", "past_input", "cva"}
     """
 
     triangle: FloatArray
@@ -42,16 +44,59 @@ class HankelFactor:
         """Left singular vectors, shape (p i, p i), and singular values, shape (p i,).
 
         They belong to the part of the future outputs that the future inputs do
-        not explain (ordinary), or that the past explains beyond them (past_output).
+        not explain (ordinary), that the past explains beyond them (past_output), that the past
+        inputs alone do (past_input), or to the canonical correlations of past and future (cva;
+        Larimore, Amer. Control Conf. 1983; Van Overschee and De Moor, Subspace Identification for
+        Linear Systems, 1996, chapter 4).
         """
         first = self.inputs * self.block_rows
         future = len(self.triangle) - self.outputs * self.block_rows
-        last = len(self.triangle) if self.method == "ordinary" else future
+        last = {"ordinary": len(self.triangle), "past_input": 2 * first}.get(self.method, future)
+        explained = self.triangle[first:last, future:].T
         with single_thread():
-            left, values, _ = np.linalg.svd(
-                self.triangle[first:last, future:].T, full_matrices=True
-            )
+            if self.method != "cva":
+                left, values, _ = np.linalg.svd(explained, full_matrices=True)
+            else:
+                # the triangle of all that is left of the future outputs is the root of their
+                # covariance; left of it stands what the past explains of them
+                root = np.asarray(np.linalg.qr(self.triangle[first:, future:])[1]).T
+                size = max(float(np.abs(np.diag(root)).max()), 1e-300)
+                if float(np.abs(np.diag(root)).min()) < _DIGITS * size:
+                    raise InputError(
+                        "the future outputs depend on each other to the last digit, which leaves "
+                        'no canonical correlations: use method "past_output"'
+                    )
+                whitened, values, _ = np.linalg.svd(
+                    np.linalg.solve(root, explained), full_matrices=True
+                )
+                left = np.linalg.qr(root @ whitened)[0]
+        # fewer past inputs than future outputs leave directions without a singular value
+        values = np.concatenate((values, np.zeros(len(left) - len(values))))
         return np.asarray(left, dtype=np.float64), values
+
+    def state_map(self, observability: FloatArray) -> FloatArray | None:
+        """Matrix from the past to the state; None where the factor holds no past (ordinary).
+
+        Parameters
+        ----------
+        observability : ndarray, shape (p i, order)
+            C, C A, C A^2 ... of the model, in weighted outputs.
+
+        Returns
+        -------
+        ndarray, shape (order, (m + p) i)
+            For the vector of the i samples before: inputs sample by sample, then weighted outputs.
+        """
+        if self.method == "ordinary":
+            return None
+        first = self.inputs * self.block_rows
+        future = len(self.triangle) - self.outputs * self.block_rows
+        with single_thread():
+            known = self.triangle[:future, :future]
+            size = np.maximum(np.linalg.norm(known, axis=0), 1e-300)
+            solved = np.linalg.lstsq(known / size, self.triangle[:future, future:], rcond=_DIGITS)
+            from_past = (solved[0] / size[:, None])[first:]
+            return np.asarray(np.linalg.lstsq(observability, from_past.T, rcond=None)[0])
 
     def realise(self, left: FloatArray, order: int) -> tuple[FloatArray, FloatArray]:
         """State and output matrix of the given order.
@@ -103,8 +148,8 @@ class HankelQR:
         Channels of u and y.
     block_rows : int
         Block rows i of past and of future; larger than the order of the system.
-    method : {"ordinary", "past_output"}
-        "past_output" uses past inputs and outputs as instruments.
+    method : {"ordinary", "past_output", "past_input", "cva"}
+        "past_output" and "cva" use past inputs and outputs as instruments, "past_input" the inputs.
     weights : array_like, shape (outputs,), optional
         Factors on the outputs; 1 where not given.
     """

@@ -29,6 +29,13 @@ _RATIO, _RATIO_CLEAR, _PERCENT = 1.1, 1.5, 0.05
 _CLEAR_GAP = 3.0
 
 
+def integrates(radius: float) -> bool:
+    """Whether a spectral radius is 1 as far as shots can tell: over one of them a response changes
+    by less than a hundredth.
+    """
+    return abs(radius - 1.0) < 0.01 / JUDGED
+
+
 @final
 @dataclass(frozen=True)
 class OrderCandidate:
@@ -62,6 +69,11 @@ class OrderCandidate:
         it integrates or is unstable.
         """
         return self.spectral_radius >= 1.0 - 1.0 / JUDGED
+
+    @property
+    def integrates(self) -> bool:
+        """Whether the largest pole is 1 as far as shots can tell."""
+        return integrates(self.spectral_radius)
 
     @property
     def unexplained_percent(self) -> float:
@@ -170,10 +182,12 @@ def choose_marginal(
         return (
             min(candidates, key=lambda one: one.spectral_radius).order if stable is None else stable
         ), candidates
-    good = [
-        one.order for one in judged if one.unexplained_percent <= _RATIO_CLEAR * best + _PERCENT
-    ]
-    return (stable, candidates) if stable in good and stable is not None else (good[0], judged)
+    good = [one for one in judged if one.unexplained_percent <= _RATIO_CLEAR * best + _PERCENT]
+    if stable not in [one.order for one in good] or stable is None:
+        return good[0].order, judged
+    # a higher order may be stable where that of the plant integrates with a pole just beyond 1
+    lower = [one.order for one in good if one.order < stable and one.clear_gap and one.integrates]
+    return (lower[0], judged) if lower else (stable, candidates)
 
 
 def choose(candidates: tuple[OrderCandidate, ...], radius: Callable[[int], float]) -> int | None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import final
+from typing import Final, final
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +14,21 @@ from identification.fitting.least_squares import Outcome, least_squares
 FloatArray = npt.NDArray[np.float64]
 Records = list[tuple[FloatArray, FloatArray]]
 
+FREE: Final[Mapping[str, tuple[str, ...]]] = {
+    "fir": (),
+    "arx": ("a",),
+    "arma": ("a", "c"),
+    "armax": ("a", "c"),
+    "ararx": ("a", "d"),
+    "ararmax": ("a", "c", "d"),
+    "oe": ("f",),
+    "bj": ("f", "c", "d"),
+}
+"""The monic polynomials that each structure estimates besides B (Ljung 1999, table 4.1); ``arma``
+has no B.
+"""
+_LINEAR: Final = ("fir", "arx")
+"""Structures whose prediction error is linear in the coefficients."""
 _STEPS = 60
 # relative fall of the prediction error that ends a search
 _ENOUGH = 1e-8
@@ -33,9 +49,12 @@ class Orders:
     @property
     def free(self) -> tuple[str, ...]:
         """The monic polynomials that are estimated besides B."""
-        return {"arx": ("a",), "armax": ("a", "c"), "oe": ("f",), "bj": ("f", "c", "d")}[
-            self.structure
-        ]
+        return FREE[self.structure]
+
+    @property
+    def poles(self) -> int:
+        """Coefficients of the denominator from u to y."""
+        return self.order if {"a", "f"} & set(self.free) else 0
 
     @property
     def initial(self) -> int:
@@ -100,12 +119,64 @@ def prediction_error_fit(records: Records, orders: Orders) -> tuple[Polynomials,
     of every record. Returns the polynomials and whether a minimum was reached.
     """
     start = _arx(records, orders)
-    if orders.structure == "arx":
+    if orders.structure in _LINEAR:
         return start, True
     problem = _Problem(records, orders)
     begin = min((problem.pack(one) for one in _starts(records, orders, start)), key=problem.cost)
     solved = least_squares(problem, begin, iterations=_STEPS, tolerance=_ENOUGH)
     return problem.unpack(solved.x)[0], solved.outcome in (Outcome.SETTLED, Outcome.EXACT)
+
+
+@final
+@dataclass(frozen=True)
+class Spread:
+    """How well the coefficients of a model are known.
+
+    Attributes
+    ----------
+    denominator : ndarray, shape (order, order)
+        Covariance of the coefficients of A or F after the leading one.
+    noise_variance : float
+        Of the prediction error.
+    """
+
+    denominator: FloatArray
+    noise_variance: float
+
+
+def coefficient_spread(records: Records, orders: Orders, model: Polynomials) -> Spread:
+    """Covariance of a fitted model: noise variance times the inverse of J'J (Ljung 1999, eq. 9.17).
+
+    It holds where the structure holds the plant; what a model lacks shows as a larger noise
+    variance only.
+    """
+    problem = _Problem(records, orders)
+    x = problem.settled(model)
+    residual, jacobian = problem.residual(x), problem.jacobian(x)
+    scales = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
+    triangle = np.linalg.qr(jacobian / scales, mode="r")
+    inverse = np.linalg.pinv(triangle) / scales[:, None]
+    spare = max(len(residual) - len(x), 1)
+    variance = float(residual @ residual) / spare
+    covariance = variance * (inverse @ inverse.T)
+    first = orders.inputs * (orders.order + 1)
+    own = slice(first, first + orders.poles)
+    total = sum(float(y @ y) for _, y in records)
+    return Spread(covariance[own, own], variance * total)
+
+
+def prediction_error(u: FloatArray, y: FloatArray, model: Polynomials) -> FloatArray:
+    """One-step prediction error with the initial conditions fitted and the mean removed."""
+    forced = _filter(model.a, np.ones(1), y)
+    for channel in range(len(model.b)):
+        forced = forced - _filter(model.b[channel], model.f, u[:, channel])
+    error = _filter(model.d, model.c, forced)
+    lags = len(model.denominator) + len(model.d) + model.b.shape[1] - 2
+    basis = _filter(np.ones(1), np.convolve(model.c, model.f), _delayed(_impulse(len(y)), 0, lags))
+    if basis.shape[1]:
+        error = error - basis @ np.linalg.lstsq(basis, error, rcond=None)[0]
+    centred: FloatArray = error - error.mean()
+    return centred
 
 
 def held_out_error(u: FloatArray, y: FloatArray, model: Polynomials) -> FloatArray:
@@ -135,6 +206,15 @@ class _Problem:
         monic = [getattr(model, name)[1:] for name in self._orders.free]
         initial = np.zeros(self._orders.initial * len(self._records))
         return np.concatenate((model.b[:, self._orders.delay :].ravel(), *monic, initial))
+
+    def settled(self, model: Polynomials) -> FloatArray:
+        """Parameter vector of a model with its initial conditions fitted."""
+        x = self.pack(model)
+        own = x.size - self._orders.initial * len(self._records)
+        if own < x.size:
+            slopes = self.jacobian(x)[:, own:]
+            x[own:] = -np.linalg.lstsq(slopes, self.residual(x), rcond=None)[0]
+        return x
 
     def unpack(self, x: FloatArray) -> tuple[Polynomials, FloatArray]:
         """Model and initial conditions, shape (records, initial), of a parameter vector."""
@@ -200,7 +280,7 @@ class _Problem:
         one = np.ones(1)
         impulse = _delayed(_impulse(count), 0, free)
         driven = impulse @ initial
-        for channel in range(u.shape[1]):
+        for channel in range(len(model.b)):
             driven += _filter(model.b[channel], one, u[:, channel])
         driven = _filter(one, model.f, driven)
         disturbance = _filter(model.a, one, y) - driven
@@ -209,7 +289,7 @@ class _Problem:
             return error, np.empty((0, 0))
         through = np.convolve(model.c, model.f)
         blocks = []
-        for channel in range(u.shape[1]):
+        for channel in range(len(model.b)):
             filtered = _filter(-model.d, through, u[:, channel])
             blocks.append(_delayed(filtered, self._orders.delay, self._coefficients))
         for name in self._orders.free:
@@ -239,20 +319,23 @@ def _arx_rows(
     if prefilter is not None:
         u, y = _filter(np.ones(1), prefilter, u), _filter(np.ones(1), prefilter, y)
     skip = orders.order + orders.delay
-    columns = [_delayed(-y, 1, orders.order)]
+    columns = [_delayed(-y, 1, orders.poles)]
     columns += [
-        _delayed(u[:, channel], orders.delay, orders.order + 1) for channel in range(u.shape[1])
+        _delayed(u[:, channel], orders.delay, orders.order + 1) for channel in range(orders.inputs)
     ]
     return np.hstack(columns)[skip:], y[skip:]
 
 
 def _from_linear(theta: FloatArray, orders: Orders) -> Polynomials:
-    n, one = orders.order, np.ones(1)
+    n, one = orders.poles, np.ones(1)
     poles = np.concatenate((one, theta[:n]))
     b = np.hstack(
-        (np.zeros((orders.inputs, orders.delay)), theta[n:].reshape(orders.inputs, n + 1))
+        (
+            np.zeros((orders.inputs, orders.delay)),
+            theta[n:].reshape(orders.inputs, orders.order + 1),
+        )
     )
-    on_noise = "a" in orders.free
+    on_noise = "f" not in orders.free
     return Polynomials(
         a=poles if on_noise else one, b=b, c=one, d=one, f=one if on_noise else poles
     )
@@ -262,11 +345,12 @@ def _starts(records: Records, orders: Orders, arx: Polynomials) -> list[Polynomi
     """Start values for the search: ARX, instrumental variables, Steiglitz-McBride."""
     models = [arx]
     poles = _stable(arx.denominator)
-    models.append(
-        _instrumental(
-            records, orders, Polynomials(np.ones(1), arx.b, np.ones(1), np.ones(1), poles)
+    if orders.inputs:  # the simulated output is no instrument where nothing drives it
+        models.append(
+            _instrumental(
+                records, orders, Polynomials(np.ones(1), arx.b, np.ones(1), np.ones(1), poles)
+            )
         )
-    )
     for _ in range(10):
         models.append(_arx(records, orders, _stable(models[-1].denominator)))
     return [_padded(model, orders) for model in models]
@@ -309,10 +393,9 @@ def _stable(polynomial: FloatArray) -> FloatArray:
 
 
 def _response(u: FloatArray, model: Polynomials) -> FloatArray:
-    columns = [
-        _filter(model.b[channel], model.denominator, u[:, channel]) for channel in range(u.shape[1])
-    ]
-    response: FloatArray = np.sum(columns, axis=0)
+    response = np.zeros(len(u))
+    for channel in range(len(model.b)):
+        response += _filter(model.b[channel], model.denominator, u[:, channel])
     return response
 
 

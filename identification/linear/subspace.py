@@ -22,10 +22,12 @@ import numpy.typing as npt
 from identification.errors import InputError
 from identification.linear.hankel_gram import HankelGram, TooFewDigits
 from identification.linear.hankel_qr import HankelFactor, HankelQR, Method
+from identification.linear.kalman import NoiseModel, noise_model, predictions
 from identification.linear.order_choice import (
     OrderCandidate,
     choose,
     choose_marginal,
+    integrates,
     judge,
     judge_by_shots,
     shortlist,
@@ -41,6 +43,7 @@ if TYPE_CHECKING:
 __all__ = [
     "HankelQR",
     "MoespOptions",
+    "NoiseModel",
     "OrderCandidate",
     "Subspace",
     "SubspaceOutcome",
@@ -74,6 +77,10 @@ class SubspaceOutcome(Enum):
         "The model is stable, but the singular values show no clear gap: its order "
         "rests on the simulation of held-out samples."
     )
+    INTEGRATES = (
+        "The model integrates: its spectral radius is 1 as far as the records tell. Simulate it "
+        "over times like theirs, not beyond."
+    )
     UNSTABLE = (
         "The model is unstable (spectral radius 1 or more): do not simulate it; take "
         "another order, more block rows or more data."
@@ -105,6 +112,8 @@ class MoespOptions:
         correlations, some twenty times faster, at half the digits; where those do not suffice, as
         with position, velocity and acceleration as inputs, QR is used after all and the result says
         so.
+    noise : bool
+        Estimate the noise covariances and the Kalman gain too; not with the ordinary method.
     """
 
     input_names: tuple[str, ...] = ()
@@ -114,6 +123,7 @@ class MoespOptions:
     held_out: float = 0.25
     max_order: int = 12
     compression: Compression = "qr"
+    noise: bool = False
 
 
 @final
@@ -129,7 +139,8 @@ class Subspace:
     singular_values : ndarray, shape (block_rows * outputs,)
         Their gap shows the order.
     x0 : tuple of ndarray, shape (order,)
-        Initial state of every record; NaN where an unstable model left none.
+        Initial state of every record; of a model that grows too far over a record, from its first
+        samples.
     vaf_percent : ndarray, shape (outputs,)
         Variance of each output that the simulated model accounts for, on the
         records it was fitted on; NaN where an unstable model was not simulated.
@@ -143,6 +154,8 @@ class Subspace:
     outcome : SubspaceOutcome
     compression : {"qr", "fast"}
         How the data were compressed in the end.
+    noise : NoiseModel or None
+        Noise covariances and Kalman gain, where they were asked for.
     """
 
     system: control.StateSpace
@@ -155,6 +168,7 @@ class Subspace:
     candidates: tuple[OrderCandidate, ...]
     outcome: SubspaceOutcome
     compression: Compression = "qr"
+    noise: NoiseModel | None = None
 
     def simulate(self, u: npt.ArrayLike, x0: npt.ArrayLike | None = None) -> FloatArray:
         """Output of the model, shape (samples, outputs), for `u` of shape (samples, inputs)
@@ -169,6 +183,46 @@ class Subspace:
             )
         state = None if x0 is None else np.asarray(x0, dtype=np.float64)
         return simulate(self.system.A, self.system.B, self.system.C, self.system.D, inputs, state)
+
+    def predict(self, u: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
+        """Outputs one sample ahead, shape (samples, outputs), from the samples before each, by the
+        Kalman gain; the initial state is that which fits best.
+
+        Raises
+        ------
+        InputError
+            A model without a noise model.
+        """
+        if self.noise is None:
+            raise InputError(
+                "the model holds no Kalman gain: identify with MoespOptions(noise=True)"
+            )
+        source = ArraySource(u, y)
+        (inputs, outputs) = zip(*source.pieces(0, 0, source.lengths[0]), strict=True)
+        a, b, c, d = (
+            np.asarray(m, dtype=np.float64)
+            for m in (self.system.A, self.system.B, self.system.C, self.system.D)
+        )
+        return predictions(
+            (a, b, c, d), self.noise, np.concatenate(inputs), np.concatenate(outputs)
+        )
+
+    def vaf_on(
+        self,
+        u: npt.ArrayLike | Sequence[npt.NDArray[np.generic]],
+        y: npt.ArrayLike | Sequence[npt.NDArray[np.generic]],
+    ) -> FloatArray:
+        """Variance of each output that a simulation accounts for [%], initial state and mean of
+        each record its own; of a stable model only.
+        """
+        source = ArraySource(u, y)
+        b, d = (np.asarray(m, dtype=np.float64) for m in (self.system.B, self.system.D))
+        fit = ResponseFit(np.asarray(self.system.A), np.asarray(self.system.C), len(b.T))
+        for index, length in enumerate(source.lengths):
+            for one, other in source.pieces(index, 0, length):
+                fit.add(one, other)
+            fit.end_record()
+        return fit.vaf_percent(b, d, fit.initial_states(b, d))
 
 
 def moesp(
@@ -197,10 +251,13 @@ def moesp(
         of held-out samples, among stable models.
     dt : float
         Sampling time in s.
-    method : {"ordinary", "past_output"}
+    method : {"ordinary", "past_output", "past_input", "cva"}
         "ordinary" is unbiased where the only noise is white noise on the outputs.
         "past_output" uses past inputs and outputs as instruments: unbiased under
-        white process noise too, at two to four times the cost.
+        white process noise too, at two to four times the cost. "cva" is the same with
+        the weights of canonical correlations: directions count by how well they are known.
+        "past_input" uses past inputs alone: unbiased under any noise on the outputs in open
+        loop, and of no use on smooth inputs.
     options : MoespOptions, optional
         Names, weights, the way to B and D, limits of the order choice.
 
@@ -265,6 +322,11 @@ def _identify(
     inputs, outputs = source.channels
     accumulator = HankelQR(inputs, outputs, block_rows, method, weights)
     highest = (block_rows - 1) * outputs
+    if options.noise and method == "ordinary":
+        raise InputError(
+            "the ordinary method keeps no past, from which the noise would follow: take "
+            '"past_output"'
+        )
     if order is not None and not 1 <= order <= highest:
         raise InputError(f"order is {order}: give 1 to {highest} = (block_rows - 1) * outputs")
     for index, length in enumerate(source.lengths):
@@ -325,9 +387,14 @@ def _finish(
     vaf = np.full(factor.outputs, np.nan)
     if grows and options.input_matrices == "simulation":
         spans = [(index, 0, length) for index, length in enumerate(source.lengths)]
-        b, d = fit_shots(
-            source, spans, (a, c), weights, shot_length(radius, order + factor.inputs)
-        ) or (b, d)
+        length = shot_length(radius, order + factor.inputs)
+        b, d = fit_shots(source, spans, (a, c), weights, length) or (b, d)
+        first = ResponseFit(a, c, factor.inputs)  # the beginning of every record alone
+        for index, total in enumerate(source.lengths):
+            for u, y in source.pieces(index, 0, min(length, total)):
+                first.add(u, y * weights)
+            first.end_record()
+        x0 = first.initial_states(b, d)
     if not grows:
         fit = ResponseFit(a, c, factor.inputs)
         for index, length in enumerate(source.lengths):
@@ -342,6 +409,7 @@ def _finish(
         vaf = fit.vaf_percent(b, d, x0)
     chosen = [candidate for candidate in candidates if candidate.order == order]
     scale = 1.0 / weights[:, None]
+    noise = noise_model(source, factor, (a, b, c, d), weights) if options.noise else None
     return Subspace(
         system=_system((a, b, c * scale, d * scale), dt, options),
         order=order,
@@ -353,17 +421,18 @@ def _finish(
         candidates=candidates,
         outcome=_outcome(radius, chosen[0] if chosen else None),
         compression=options.compression,
+        noise=noise,
     )
 
 
 def _outcome(radius: float, chosen: OrderCandidate | None) -> SubspaceOutcome:
     if radius >= 1.0:
+        marginal = SubspaceOutcome.INTEGRATES
+        said = marginal if integrates(radius) else SubspaceOutcome.UNSTABLE
         warnings.warn(
-            f"spectral radius {radius:.6g}: {SubspaceOutcome.UNSTABLE.value}",
-            UnstableModelWarning,
-            stacklevel=5,
+            f"spectral radius {radius:.6g}: {said.value}", UnstableModelWarning, stacklevel=5
         )
-        return SubspaceOutcome.UNSTABLE
+        return said
     if chosen is None:
         return SubspaceOutcome.ORDER_GIVEN
     return SubspaceOutcome.ORDER_CHOSEN if chosen.clear_gap else SubspaceOutcome.NO_CLEAR_ORDER

@@ -36,6 +36,7 @@ from identification.fitting.engine import (
     solve,
     weak_record,
 )
+from identification.naming.odds import Odds
 from irj_fmu.host.signals import FloatArray
 from irj_fmu.imported.compare import compare
 from irj_fmu.imported.correction import Correction, correction_of
@@ -353,6 +354,12 @@ class FmuBench:
     def same_sign(self, trial: Trial, solution: Solution) -> bool:
         """No minor effects are looked for."""
         return False
+
+    def odds(
+        self, claim: Claim, near: Mapping[str, float], now: Step, last: Ranking
+    ) -> Odds | None:
+        """None: nothing is fitted whole outside an FMU, and its trials have told what there is."""
+        return None
 
 
 def _fallen(error: Error, balance: str, percent: float) -> Error:

@@ -18,6 +18,7 @@ from types import FrameType
 from typing import Any, TextIO, cast, final
 
 from identification import __version__
+from identification.data.schema import meant
 from identification.errors import InputError
 from identification.scratch import release
 from irj_fmu.command_line import (
@@ -31,6 +32,7 @@ from irj_fmu.command_line import (
     terminable,
 )
 from workbench.cli.files import check_outputs
+from workbench.cli.help import welcome, with_examples
 from workbench.cli.user_fmu import module_of
 
 
@@ -112,6 +114,27 @@ def parser() -> OneLineParser:
     )
     demo.add_argument(
         "--picture", metavar="FILE.svg", help="draw the falling error and the place of the residual"
+    )
+    taken = verb(
+        "import", "importing", "look at a measurement file and write the joint file that reads it"
+    )
+    taken.add_argument("records", nargs=1, metavar="FILE", help="record file")
+    taken.add_argument("-o", "--output", metavar="FILE", help="the joint file to write (TOML)")
+    taken.add_argument("--name", metavar="NAME", help="name of the joint (default: the file's)")
+    taken.add_argument(
+        "--kind", choices=("rotary", "linear"), help="kind of the axis (default: as it looks)"
+    )
+    taken.add_argument(
+        "--joint-number",
+        type=int,
+        metavar="N",
+        help="where columns of several joints stand side by side: which (default: the first)",
+    )
+    taken.add_argument(
+        "--gear-ratio", type=float, metavar="R", help="motor angle over link angle (default 1)"
+    )
+    taken.add_argument(
+        "--motor-constant", type=float, metavar="K", help="torque on the motor shaft per ampere"
     )
     checked = verb("check", "records", "check records before a fit", records=True)
     checked.add_argument("--joint", metavar="J", help="joint file: column map and gear ratio")
@@ -244,6 +267,10 @@ def parser() -> OneLineParser:
     )
     report.add_argument(
         "-o", "--output", metavar="FILE", default="irj-report.html", help="the HTML file"
+    )
+    report.add_argument("--author", metavar="NAME", help="for the first page")
+    report.add_argument(
+        "--notes", metavar="TEXT", help="for the first page, as what was changed before"
     )
     listed = verb("effects", "library", "list the effect library, or one effect")
     listed.add_argument("key", nargs="?", help="key of one effect")
@@ -420,6 +447,60 @@ def parser() -> OneLineParser:
         joint=True,
     )
     other_payload(trusted)
+    plain = verb(
+        "linear",
+        "linear",
+        "linear models without physics: subspace and black boxes, orders, poles, held-out VAF",
+        records=True,
+    )
+    plain.add_argument("--joint", metavar="J", help="joint file: column map, gear ratio, drive")
+    plain.add_argument(
+        "--held-out",
+        nargs="+",
+        action="extend",
+        metavar="REC",
+        default=[],
+        help="records the fit must not see (default: the last quarter of every stretch)",
+    )
+    plain.add_argument(
+        "--from",
+        dest="inputs",
+        nargs="+",
+        action="extend",
+        metavar="CHANNEL",
+        default=[],
+        help="inputs (default: the drive)",
+    )
+    plain.add_argument(
+        "--to",
+        dest="outputs",
+        nargs="+",
+        action="extend",
+        metavar="CHANNEL",
+        default=[],
+        help="outputs (default: motor_velocity, and torsion = q_m - q_l where --joint and both "
+        "positions are there)",
+    )
+    plain.add_argument(
+        "--family",
+        nargs="+",
+        action="extend",
+        metavar="FAMILY",
+        default=[],
+        help="moesp fir arx arma armax ararx ararmax oe bj (default: all)",
+    )
+    plain.add_argument(
+        "--max-order", type=_count, default=6, metavar="N", help="highest order tried (default 6)"
+    )
+    plain.add_argument(
+        "--every",
+        type=_count,
+        metavar="N",
+        help="keep every Nth sample (default: from the band in which outputs answer the input)",
+    )
+    plain.add_argument(
+        "--picture", metavar="FILE.svg", help="draw Bode plots and poles of the best model"
+    )
     joints = verb("joints", "joints", "the library of identified joints")
     joints.add_argument(
         "what",
@@ -447,6 +528,15 @@ def parser() -> OneLineParser:
     )
     app.add_argument("--port", type=_port, default=0, help="port of the page (0: any free one)")
     app.add_argument("--no-browser", action="store_true", help="print the address, open nothing")
+    text = "completion of verbs and options for your shell"
+    completed = verbs.add_parser("completion", help=text, description=text)
+    completed.set_defaults(module="help", own_effects=[], parser=made)
+    completed.add_argument("shell", choices=("bash",), help="the shell")
+    for judged in (demo, diagnosed, improved):
+        judged.add_argument(
+            "-v", "--verbose", action="store_true", help="list what is not testable, and why"
+        )
+    with_examples(made)
     return made
 
 
@@ -461,12 +551,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         )  # a terminal that lacks a sign must not cost the results
     if any("\0" in word for word in given):
         parser().error("an argument holds a zero byte; no name of a file or effect has one")
+    if not given:
+        return welcome()
     arguments, rest = parser().parse_known_args(given)
     arguments.rest = rest
     if arguments.module == "fmi":
         arguments.rest, arguments.own_effects = _taken(rest)
     if rest and arguments.module != "fmi":
-        parser().error(f"unrecognized arguments: {' '.join(rest)}")
+        own = parser().verbs[arguments.verb]
+        options = [o for a in own.arguments for o in a.option_strings]
+        close = meant(next((r for r in rest if r.startswith("-")), ""), options)
+        own.error(f"unrecognized arguments: {' '.join(rest)}{close}")
     arguments.command = shlex.join(["irj", *given])
     STOPPED.clear()
     with _watched_interrupt(), _patient_output():

@@ -18,6 +18,7 @@ from identification.data.record import Record
 from identification.errors import InputError
 from irj_fmu.command_line import OneLineParser, check_output, keep_inputs
 from workbench.cli.files import distinct, open_records, progress_bar, write_json, write_text
+from workbench.cli.help import print_untested
 from workbench.cli.library import with_law
 from workbench.cli.records import checked
 
@@ -207,8 +208,7 @@ def run_diagnose(arguments: Namespace) -> int:
         f"data, noise {balance.floor:.3g} {balance.unit}"
     )
     print(found)
-    for item in found.ranking.not_testable:
-        print(f"not testable: {item.effect}: {item.why}")
+    print_untested(found.ranking.not_testable, verbose=arguments.verbose)
     if found.claims:
         _offer(found, arguments)
     for key in arguments.why:
@@ -233,7 +233,14 @@ def _improved(arguments: Namespace, report: str | None, most: int) -> UserImprov
         from workbench.show.report import write_report
 
         every = [*records, *held]
-        made = write_report(found.found, report, records=every, command=arguments.command)
+        made = write_report(
+            found.found,
+            report,
+            records=every,
+            command=arguments.command,
+            author=getattr(arguments, "author", None) or "",
+            notes=getattr(arguments, "notes", None) or "",
+        )
         print(f"report: {made}")
     return found
 
@@ -246,7 +253,7 @@ def run_improve(arguments: Namespace) -> int:
 
     found = _improved(arguments, arguments.report, arguments.max_steps)
     print("balance at the drive:")
-    print_improvement(found.found)
+    print_improvement(found.found, verbose=arguments.verbose)
     print("outputs on held-out data:")
     for step, outputs in zip(found.found.steps, found.outputs, strict=True):
         print(f"{'+ ' + step.added if step.added else 'start model'}")

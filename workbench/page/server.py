@@ -34,8 +34,17 @@ from identification.crash import internal_error
 from identification.data.plain_text import from_json
 from identification.errors import InputError
 from irj_fmu.command_line import system_refusal
+from workbench.page import tree
 from workbench.page import verbs as app_verbs
-from workbench.page.input import add_upload, drop_upload, put_upload, set_joint, start_demo
+from workbench.page.input import (
+    add_upload,
+    change_tree,
+    drop_upload,
+    look,
+    put_upload,
+    set_joint,
+    start_demo,
+)
 from workbench.page.live import BusyError, Live
 from workbench.page.security import Guard, loopback_hosts
 from workbench.page.session import Store, safe_name
@@ -54,7 +63,10 @@ PAGE: Final = {
     "/app.js": (WEB / "app.js", "text/javascript; charset=utf-8"),
     "/views.js": (WEB / "views.js", "text/javascript; charset=utf-8"),
     "/more.js": (WEB / "more.js", "text/javascript; charset=utf-8"),
+    "/import.js": (WEB / "import.js", "text/javascript; charset=utf-8"),
+    "/tree.js": (WEB / "tree.js", "text/javascript; charset=utf-8"),
     "/preview.js": (WEB / "preview.js", "text/javascript; charset=utf-8"),
+    "/charts.js": (WEB / "charts.js", "text/javascript; charset=utf-8"),
     "/plots.js": (WEB / "plots.js", "text/javascript; charset=utf-8"),
     "/uPlot.js": (ASSETS / "uPlot.iife.min.js", "text/javascript; charset=utf-8"),
     "/uPlot.css": (ASSETS / "uPlot.min.css", "text/css; charset=utf-8"),
@@ -82,6 +94,7 @@ class Service:
         with self.lock:
             if identifier not in self.lives:
                 self.lives[identifier] = Live(self.store.open(identifier))
+                app_verbs.resume(self.lives[identifier])
             self.lives.move_to_end(identifier)
             spare = [
                 k
@@ -148,6 +161,9 @@ def _public(live: Live) -> dict[str, Any]:
         step.pop("values")
     for entry in state["files"]:
         entry.pop("stored")
+    state["can"] = {"undo": live.can(tree.undone), "redo": live.can(tree.redone)}
+    state["fits"] = len(state.pop("branches"))
+    state.pop("found")
     return state
 
 
@@ -216,6 +232,11 @@ async def _change_file(request: Request, live: Live) -> Response:
     return _json(await run_in_threadpool(put_upload, live, request.path_params["fid"], body))
 
 
+async def _look(request: Request, live: Live) -> Response:
+    body = await _body(request)
+    return _json(await run_in_threadpool(look, live, request.path_params["fid"], body))
+
+
 async def _delete_file(request: Request, live: Live) -> Response:
     await run_in_threadpool(drop_upload, live, request.path_params["fid"])
     return _json({})
@@ -224,6 +245,11 @@ async def _delete_file(request: Request, live: Live) -> Response:
 async def _joint(request: Request, live: Live) -> Response:
     body = await _body(request)
     return _json(await run_in_threadpool(set_joint, live, body))
+
+
+async def _tree(request: Request, live: Live) -> Response:
+    body = await _body(request)
+    return _json(await run_in_threadpool(change_tree, live, body))
 
 
 async def _demo(request: Request, live: Live) -> Response:
@@ -302,7 +328,9 @@ def create_app(
         at("/files/{name}", upload, "PUT"),
         at("/file/{fid}", _change_file, "POST"),
         at("/file/{fid}", _delete_file, "DELETE"),
+        at("/look/{fid}", _look, "POST"),
         at("/joint", _joint, "POST"),
+        at("/tree", _tree, "POST"),
         at("/demo", _demo, "POST"),
         at("/run", _run, "POST"),
         at("/cancel", _cancel, "POST"),

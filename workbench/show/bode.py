@@ -18,7 +18,7 @@ import numpy.typing as npt
 from identification.data.formats import number, pretty_unit
 from identification.linear.frequency import PHYSICAL, Bode
 from identification.linear.spectra import SHOWN_COHERENCE, TRUSTED_COHERENCE, Curve, Response
-from workbench.show.pictures import AFTER, BEFORE, GRID, INK, LEFT, RIGHT, WIDTH, ticks
+from workbench.show.chart import AFTER, BEFORE, GRID, INK, LEFT, RIGHT, WIDTH, ticks
 from workbench.show.results import table, text
 
 FloatArray = npt.NDArray[np.float64]

@@ -8,7 +8,8 @@ from typing import Final
 
 from identification.data.formats import number
 from identification.variants.exploration import Exploration, Variant
-from workbench.show.pictures import AFTER, BEFORE, INK, WIDTH, Dot, front_picture
+from workbench.show.chart import AFTER, BEFORE, INK, WIDTH
+from workbench.show.pictures import Dot, front_picture
 from workbench.show.results import spaced, table, text
 
 ROWS: Final = 11

@@ -6,15 +6,8 @@ from __future__ import annotations
 
 from identification.diagnosis.improve import Improvement
 from identification.errors import InputError
-from workbench.show.pictures import (
-    AFTER,
-    BEFORE,
-    HEIGHT,
-    INK,
-    WIDTH,
-    place_picture,
-    staircase_picture,
-)
+from workbench.show.chart import AFTER, BEFORE, HEIGHT, INK, WIDTH
+from workbench.show.pictures import place_picture, staircase_picture
 from workbench.show.plots import report_plots
 from workbench.show.results import floor_percent
 

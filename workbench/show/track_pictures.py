@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from identification.data.formats import number, pretty_unit
 from identification.faults.detector import SENSORS
-from workbench.show.pictures import AFTER, BEFORE, GRID, INK, ticks
+from workbench.show.chart import AFTER, BEFORE, GRID, INK, ticks
 from workbench.show.plots import decimated
 from workbench.show.replayed import READINGS, Replay
 from workbench.show.results import text

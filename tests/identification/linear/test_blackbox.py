@@ -169,7 +169,7 @@ def test_ceiling_of_the_robot_arm() -> None:
 
 
 BAD: list[tuple[str, dict[str, object]]] = [
-    ("structure 'fir' is unknown", {"structure": "fir"}),
+    ("structure 'tree' is unknown", {"structure": "tree"}),
     ("order is 0", {"order": 0}),
     ("delay is -1", {"delay": -1}),
     ("held_out is 0.8", {"held_out": 0.8}),
@@ -194,8 +194,8 @@ def test_ceiling_refuses_bad_settings() -> None:
     u, y = record("oe", 300, 0.1)
     with pytest.raises(InputError, match="no structure"):
         linear_ceiling(u, y, structures=())
-    with pytest.raises(InputError, match="'fir' is unknown"):
-        linear_ceiling(u, y, structures=("fir",))  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="'arma' is unknown"):
+        linear_ceiling(u, y, structures=("arma",))  # type: ignore[arg-type]
     with pytest.raises(InputError, match="orders are"):
         linear_ceiling(u, y, orders=(0,))
     with pytest.raises(InputError, match="every linear model tried is unstable"):
