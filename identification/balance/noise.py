@@ -123,7 +123,8 @@ def _spaced(x: FloatArray, m: int) -> FloatArray:
     """Fourth differences over m samples, scaled to unit noise gain."""
     second = x[: -2 * m] - 2 * x[m:-m] + x[2 * m :]
     return np.asarray(
-        (second[: -2 * m] - 2 * second[m:-m] + second[2 * m :]) / np.sqrt(70), dtype=np.float64
+        (second[: -2 * m] - 2 * second[m:-m] + second[2 * m :]) / np.sqrt(FOURTH_GAIN),
+        dtype=np.float64,
     )
 
 

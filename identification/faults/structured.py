@@ -56,10 +56,9 @@ LARGEST: Final = 1e6
 """A reading beyond this is no place to start an estimate from."""
 WIDER: Final = 1.5
 """Factor on the limits for every further reading that is replaced: estimates lean on fewer."""
-SHORT_PEAK: Final = 1.5
 SHORT: Final = (2, 10, 20)
-"""A torque sensor that failed for a moment: peak of r1 over its limit; samples for which it is back
-(from, to) and since it began (below)."""
+"""A torque sensor that failed for a moment: samples for which r1 is back (from, to) and since it
+began (below)."""
 FRESH: Final = 5
 """Samples within which a residual must have been over its limit to count for a verdict."""
 SHOWS: Final = 2.0
@@ -339,7 +338,7 @@ class StructuredRule:
             )
             back, longest, young = SHORT
             gone = (
-                self.peak > SHORT_PEAK
+                self.peak > WELL_OVER
                 and back <= self._since(TORSION) <= longest
                 and self._age(TORSION) < young
             )

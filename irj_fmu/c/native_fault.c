@@ -166,7 +166,7 @@ static int torque_failed(const Fault *f) {
             const Count own = age_of(f, 1 << i);
             if (age < 0 || own < age) age = own;
         }
-    if (f->peak > FAULT_SHORT_PEAK && since(f, TORSION) >= fault_short[0] && since(f, TORSION) <= fault_short[1] && age_of(f, TORSION) < fault_short[2]) return 1;
+    if (f->peak > FAULT_WELL_OVER && since(f, TORSION) >= fault_short[0] && since(f, TORSION) <= fault_short[1] && age_of(f, TORSION) < fault_short[2]) return 1;
     return moving && age >= WAIT_TORQUE && age_of(f, TORSION) >= WAIT_TORQUE;
 }
 

@@ -398,7 +398,7 @@ def _fault_tables(header: _Header, made: OnlineEstimator) -> None:
         "settle_seconds",
         "plant_rest_seconds",
     )
-    for name in ("LARGEST", "WIDER", "SHORT_PEAK", "FRESH", "SHOWS"):
+    for name in ("LARGEST", "WIDER", "WELL_OVER", "FRESH", "SHOWS"):
         header.define(f"FAULT_{name}", getattr(structured, name))
     header.define("ABSURD", ABSURD)
     header.define("FAULT_OPEN", OPEN)
