@@ -11,6 +11,7 @@ import ast
 import io
 import json
 import os
+import re
 import subprocess
 import sys
 import tokenize
@@ -212,6 +213,29 @@ def lines(root: Path, parts: tuple[str, ...]) -> tuple[int, int]:
     return total, comments
 
 
+MARKS: Final = {
+    "Runge-Kutta steps of 4th order": r"\(k1 \+ 2(\.0)? ?\* ?k2 \+ 2(\.0)? ?\* ?k3 \+ k4\)",
+    "readers of TOML": r"(?<!\w)tomllib\.loads?\b",
+    "chart frames": r"<svg [^>]*(viewBox|aria-label)",
+    "position controllers": r"bandwidth ?\*\* ?2",
+    "bounded least-squares solvers": (
+        r"optimize import [^\n]*(least_squares|lsq_linear)|^def least_squares\(\s*problem"
+    ),
+}
+"""Ideas of which one is enough, each by a text that whoever builds it must write."""
+
+
+def built(root: Path = ROOT) -> dict[str, list[str]]:
+    """Modules in which each idea of :data:`MARKS` is built, tests and generated code apart."""
+    out: dict[str, list[str]] = {name: [] for name in MARKS}
+    for file in modules(root).values():
+        text = file.read_text(encoding="utf-8")
+        for name, mark in MARKS.items():
+            if re.search(mark, text, re.MULTILINE):
+                out[name].append(str(file.relative_to(root)))
+    return out
+
+
 METHODS: Final = ("search", "two_step", "linear", "recursive", "faults", "planning", "online")
 """Rooms of identification that hold methods of their own, which no verb of the loop needs."""
 _LOADED: Final = """
@@ -331,6 +355,7 @@ def main() -> None:
         ("comments per 100 library lines", f"{100 * comments / library:.2f}"),
         ("test lines : library lines", f"{tests / library:.2f}"),
     ]
+    rows[-3:-3] = [(f"modules with {name}", str(len(at))) for name, at in built(root).items()]
     print("| what | figure |\n|---|---|")
     for name, value in rows:
         print(f"| {name} | {value} |")

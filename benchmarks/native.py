@@ -28,7 +28,8 @@ from identification.data.joint_file import toml_text
 from identification.faults.detector import FaultDetector
 from identification.online.estimator import OnlineOptions, prepared
 from irj_fmu.estimator.native import NativeSpec, build_native
-from irj_fmu.estimator.slave import DETECTOR_FILE, JOINT_FILE, OPTIONS_FILE, Estimator, options_text
+from irj_fmu.estimator.packed import options_text
+from irj_fmu.estimator.slave import DETECTOR_FILE, JOINT_FILE, OPTIONS_FILE, Estimator
 from irj_fmu.fmi.compiler import find_compiler, header_folder
 from irj_fmu.plant.reference import reference_joint
 

@@ -244,13 +244,16 @@ class _Builder:
             clock=self.symbols.clock,
         )
 
-    def total(self, place: str, view: _View) -> Expression:
-        """Sum of the laws of one place."""
+    def total(self, place: str, view: _View, rate: Expression | None = None) -> Expression:
+        """Sum of the laws of one place; `rate` of the torsion where that is a symbol of its own."""
         found = _zero()
         terms = [t for t in self.model.terms if t.place == place]
-        rate = self.torsion_rate(view) if terms else None
         beyond = self.beyond(view) if place == "transmission" else view
-        further = rate if beyond is view else self.torsion_rate(beyond)
+        if rate is not None:
+            further = rate * ca.jacobian(beyond.torsion, view.torsion)
+        else:
+            rate = self.torsion_rate(view) if terms else None
+            further = rate if beyond is view else self.torsion_rate(beyond)
         for t in terms:
             own = self.seen(t, view, beyond)
             found = found + t.effect.law(
@@ -399,6 +402,28 @@ def build_equations(model: Structure, symbols: Symbols, *, sensors: bool) -> Equ
         load_lag=lag,
         memory_terms=tuple(terms),
     )
+
+
+def carried(
+    model: Structure, symbols: Symbols, twist: Expression, rate: Expression
+) -> tuple[Expression, Expression]:
+    """Torque of the transmission at a twist and a rate that are symbols, everything else as read;
+    and the rate as read.
+
+    Parameters
+    ----------
+    model : Structure
+    symbols : Symbols
+    twist, rate : SX
+        Symbols that stand for the torsion and its rate.
+    """
+    builder = _Builder(model, symbols)
+    s = builder.true_signals()
+    bare = bare_twist(model, s)
+    error = builder.total("torsion", _View(s, bare, s.torque, _zero(), _zero()))
+    view = _View(s, bare - error, _zero(), _zero(), _zero())
+    torque = builder.total("transmission", replace(view, torsion=twist), rate)
+    return torque, builder.torsion_rate(view)
 
 
 @final

@@ -16,6 +16,7 @@ Role = Literal[
     "inertia",
     "stiffness",
     "stiffening",
+    "softening",
     "weight",
     "static",
     "delay",
@@ -56,7 +57,8 @@ class Parameter:
     role : str
         What the library may ask the parameter for, whatever its name:
         ``inertia`` (a joint without it does not move), ``stiffness`` (linear stiffness of the
-        transmission), ``stiffening`` (of its cube), ``weight`` (gravity torque at 90 degrees,
+        transmission), ``stiffening`` (of its cube), ``softening`` (stiffness that is missing over a
+        range: no more than there is), ``weight`` (gravity torque at 90 degrees,
         upright positive), ``static`` (friction torque that holds a joint at rest, in either
         direction), ``delay`` (time by which a channel is late), ``smoothing`` (velocity over which
         friction changes its sign, a nuisance), ``compliance`` (between motor and a link that is

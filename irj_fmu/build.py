@@ -29,7 +29,7 @@ from irj_fmu.command_line import (
 from irj_fmu.fmi.compiler import find_compiler
 
 if TYPE_CHECKING:
-    from identification.online.estimator import OnlineOptions
+    from identification.data.record import Record
 
 KINDS: Final = ("estimator", "plant", "native", "ssp", "all")
 _TRY: Final = (
@@ -78,8 +78,9 @@ class Request:
         Records of the healthy joint, from which the estimator's fault detector takes its limits.
     has_link, has_torque : bool
         Sensors of the joint.
-    sample_time : float
-        Of a native estimator, built in [s].
+    sample_time : float or None
+        Of a native estimator, built in [s]; by default that of the records of the fit, as the joint
+        file says, or of the healthy records.
     say : callable
         Called with one sentence per doubt about a record.
     """
@@ -94,7 +95,7 @@ class Request:
     healthy: tuple[Path, ...] = ()
     has_link: bool = True
     has_torque: bool = True
-    sample_time: float = 1e-3
+    sample_time: float | None = None
     say: Callable[[str], object] = lambda _text: None
 
 
@@ -265,13 +266,9 @@ def _one_plant(
 
 def _estimator(request: Request, folder: Path) -> list[tuple[Path, str]]:
     from identification.online.estimator import OnlineOptions, prepared
-    from irj_fmu.estimator.slave import (
-        DETECTOR_FILE,
-        JOINT_FILE,
-        OPTIONS_FILE,
-        Estimator,
-        options_text,
-    )
+    from irj_fmu.estimator.healthy import detector_state
+    from irj_fmu.estimator.packed import options_text
+    from irj_fmu.estimator.slave import DETECTOR_FILE, JOINT_FILE, OPTIONS_FILE
     from irj_fmu.fmi.package import SlaveSpec, package_slave
 
     name = f"{_base(request)}_estimator"
@@ -279,9 +276,10 @@ def _estimator(request: Request, folder: Path) -> list[tuple[Path, str]]:
     prepared(request.joint, options)
     texts = folder / "texts"
     texts.mkdir(exist_ok=True)
-    (texts / OPTIONS_FILE).write_text(options_text(options), encoding="utf-8")
+    healthy, step = _healthy(request)
+    (texts / OPTIONS_FILE).write_text(options_text(options, step), encoding="utf-8")
     files = {JOINT_FILE: request.source, OPTIONS_FILE: texts / OPTIONS_FILE}
-    state = _limits(request, options, Estimator.default_sample_time)
+    state = detector_state(request.joint, options, healthy, step, request.say)
     if state is not None:
         (texts / DETECTOR_FILE).write_bytes(state)
         files[DETECTOR_FILE] = texts / DETECTOR_FILE
@@ -297,30 +295,33 @@ def _estimator(request: Request, folder: Path) -> list[tuple[Path, str]]:
     return [(packaged.path, f"FMI 2.0 co-simulation; {packaged.message}")]
 
 
-def _limits(request: Request, options: OnlineOptions, dt: float) -> bytes | None:
-    """State of a fault detector that was calibrated with the healthy records; None without any."""
-    from irj_fmu.estimator.healthy import detector_state, read_healthy
+def _healthy(request: Request) -> tuple[list[Record], float]:
+    """The healthy records, and the step of an estimator [s]: what is asked for, else that of the
+    records of the fit, else that of the finest healthy record that serves a fault detector.
+    """
+    from identification.faults.detector import FaultSettings
+    from irj_fmu.estimator.healthy import read_healthy
+    from irj_fmu.estimator.packed import STEP
 
-    return detector_state(
-        request.joint,
-        options,
-        read_healthy(request.healthy, request.joint, request.say),
-        dt,
-        request.say,
-    )
+    records = read_healthy(request.healthy, request.joint, request.say)
+    told = request.sample_time or request.joint.sample_time
+    fine = [float(f"{r.dt:.6g}") for r in records if r.dt <= FaultSettings().lags[0]]
+    return records, told or min(fine, default=STEP)
 
 
 def _native(request: Request, folder: Path) -> list[tuple[Path, str]]:
     from identification.online.estimator import OnlineOptions
+    from irj_fmu.estimator.healthy import detector_state
     from irj_fmu.estimator.native import NativeSpec, build_native
 
     targets = _compiler(request)
     name = f"{_base(request)}_native"
     options = OnlineOptions(has_link=request.has_link, has_torque=request.has_torque)
-    state = _limits(request, options, request.sample_time)
-    spec = NativeSpec(request.joint, name, options, state, request.sample_time)
+    healthy, step = _healthy(request)
+    state = detector_state(request.joint, options, healthy, step, request.say)
+    spec = NativeSpec(request.joint, name, options, state, step)
     path = build_native(spec, folder / f"{name}.fmu", cc=request.cc, target=targets)
-    return [(path, f"FMI 2.0 co-simulation without Python, sample time {request.sample_time:g} s")]
+    return [(path, f"FMI 2.0 co-simulation without Python, sample time {step:g} s")]
 
 
 def _ssp(request: Request, folder: Path) -> list[tuple[Path, str]]:
@@ -354,6 +355,7 @@ def _ssp(request: Request, folder: Path) -> list[tuple[Path, str]]:
         {"source": source, "plant": plant, "estimator": estimator},
         connections,
         name=base,
+        step=float(_step(estimator)),
         stop=40.0,
     )
     path = write_ssp(system, folder / f"{base}.ssp")
@@ -445,7 +447,7 @@ def parser(prog: str = "build_fmu.py") -> OneLineParser:
         "--sample-time",
         type=float,
         metavar="S",
-        help="native: time between two samples, built in (default: 0.001)",
+        help="native: time between two samples, built in (default: that of the records of the fit)",
     )
     made.add_argument(
         "--controller", action="store_true", help="plant: drive it by a position controller"
@@ -513,7 +515,7 @@ def _request(given: argparse.Namespace) -> Request:
         healthy=tuple(given.healthy),
         has_link=not given.no_link,
         has_torque=not given.no_torque,
-        sample_time=1e-3 if given.sample_time is None else given.sample_time,
+        sample_time=given.sample_time,
         say=lambda text: sys.stderr.write(f"irj: {text}\n"),
     )
     if given.json is not None:

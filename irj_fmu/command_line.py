@@ -9,6 +9,7 @@ import contextlib
 import json
 import math
 import os
+import re
 import secrets
 import shlex
 import signal
@@ -21,6 +22,7 @@ from types import FrameType
 from typing import IO, Any, Final, NoReturn, final
 
 from identification.crash import internal_error
+from identification.data.schema import meant
 from identification.errors import InputError
 from identification.scratch import hold, release
 
@@ -41,7 +43,10 @@ class OneLineParser(argparse.ArgumentParser):
     """Says what is wrong with the arguments in one line."""
 
     def error(self, message: str) -> NoReturn:
-        """Print the line and exit with 2."""
+        """Print the line, with the verb that may be meant, and exit with 2."""
+        wrong = re.search(r"invalid choice: '([^']*)'", message)
+        if wrong and self.verbs:
+            message += meant(wrong[1], self.verbs)
         self.exit(2, f"{one_line(message)}; see `{self.prog} --help`\n")
 
     @property

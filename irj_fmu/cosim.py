@@ -31,7 +31,8 @@ from irj_fmu.command_line import (
     write_json,
 )
 from irj_fmu.estimator.healthy import detector_state, read_healthy
-from irj_fmu.estimator.slave import DETECTOR_FILE, JOINT_FILE, OPTIONS_FILE, Estimator, options_text
+from irj_fmu.estimator.packed import STEP, options_text
+from irj_fmu.estimator.slave import DETECTOR_FILE, JOINT_FILE, OPTIONS_FILE
 from irj_fmu.fmi.compiler import find_compiler
 from irj_fmu.host.run import Fmu, FmuError, Instance, Trajectory, Wiring, simulate_cs
 from irj_fmu.host.signals import Fault
@@ -159,7 +160,7 @@ class Setting:
     """
 
     stop: float = 40.0
-    step: float = 1e-3
+    step: float = STEP
     parameters: Mapping[str, float | str | bool] = field(default_factory=dict)
     faults: Mapping[str, Fault] = field(default_factory=dict)
     record: Sequence[str] = ()
@@ -217,9 +218,7 @@ def make_pair(
     (texts / JOINT_FILE).write_text(toml_text(model, values), encoding="utf-8")
     (texts / OPTIONS_FILE).write_text(options_text(options), encoding="utf-8")
     files = {n: texts / n for n in (JOINT_FILE, OPTIONS_FILE)}
-    state = detector_state(
-        model, options, read_healthy(healthy, model), Estimator.default_sample_time
-    )
+    state = detector_state(model, options, read_healthy(healthy, model), STEP)
     if state is not None:
         (texts / DETECTOR_FILE).write_bytes(state)
         files[DETECTOR_FILE] = texts / DETECTOR_FILE

@@ -18,11 +18,15 @@ from typing import Final, final
 import numpy as np
 import numpy.typing as npt
 
+from casadi_models import JointModel
 from identification import Joint, Record, improve
-from identification.balance.dataset import without
+from identification.balance.dataset import Dataset
 from identification.data.joint_file import Known
 from identification.fitting.engine import load_dataset, prepared_model, solve
-from identification.planning.rivals import Contest, enough, rivals_of
+from identification.naming.contest import Contest, Rival, from_every_valley, rivals_of
+from identification.naming.odds import unmodelled_by
+from identification.planning.next_run import worth
+from identification.planning.rivals import Foreseen, enough
 from identification.planning.runs import (
     SIMULATED,
     Plant,
@@ -45,14 +49,18 @@ SETS: Final[Mapping[str, tuple[str, tuple[str, ...], float]]] = MappingProxyType
             2.0,
         ),
         "viscous": ("motor", ("quadratic_drag", "cubic_viscous"), 0.0),
-        "gap": ("transmission", ("backlash", "piecewise_stiffness", "soft_windup"), 0.0),
+        "gap": ("transmission", ("backlash", "piecewise_stiffness", "soft_windup"), 1.0),
         "load": ("motor", ("load_dependent_friction", "cyclic_friction"), 0.0),
     }
 )
 """Names that often tie: the balance in which they show, the names, and the noise of drive and
-torque sensor beyond the generator's [N.m].  With its fine sensors any record tells a gain apart."""
+torque sensor beyond the generator's [N.m].  With its fine sensors any record tells a gain or the
+laws of a gap apart."""
 OLD: Final = Run("multisine", 0.6, 0.3, 0.35)
 """The record on which they tie: narrow and slow, on one side of upright."""
+CROSSING: Final = Run("multisine", 0.0, 0.3, 0.35)
+"""The same about upright, for laws that act where the torque goes through zero: on the other record
+nothing of them is seen, and their fits say nothing."""
 SPAN: Final = 10.0
 """Its length [s]."""
 SECONDS: Final = 15.0
@@ -102,17 +110,31 @@ def record_of(
     return replace(made, payload=payload)
 
 
-def judged(contest: Contest, truth: str) -> tuple[float, bool, bool]:
+def fitted(names: Sequence[str], balance: str, model: JointModel, data: Dataset) -> Contest | None:
+    """Names of a set fitted whole, as `irj next` does; None where no name helps."""
+    bare = solve(model, data)
+    rivals = rivals_of(names, balance, bare, data)
+    return Contest(from_every_valley(rivals, bare, data), data) if rivals else None
+
+
+def alive(contest: Contest | None, balance: str) -> tuple[Rival, ...]:
+    """Names that `improve` would leave."""
+    if contest is None:
+        return ()
+    return contest.alive(unmodelled_by(contest, balance))
+
+
+def judged(contest: Contest | None, balance: str, truth: str) -> tuple[float, bool, bool]:
     """Log-likelihood of the truth over its closest rival; whether it is the one name left; whether
     it is left."""
-    names = [r.name for r in contest.rivals]
-    likelihood = dict(zip(names, contest.likelihood, strict=True))
+    names = [r.name for r in contest.rivals] if contest else []
+    likelihood = dict(zip(names, contest.likelihood, strict=True)) if contest else {}
     if truth not in likelihood:
         return -np.inf, False, False
     # a name that does not help at all on both records has no fit: the truth is alone
     others = [v for n, v in likelihood.items() if n != truth]
     found = likelihood[truth] - max(others, default=-np.inf)
-    left = [r.name for r in contest.alive]
+    left = [r.name for r in alive(contest, balance)]
     return float(found), left == [truth], truth in left
 
 
@@ -121,7 +143,7 @@ def one_joint(
 ) -> list[tuple[str, Outcome, Run]]:
     """Before, after the proposed run, after a random one; empty where no names tie."""
     balance, names, noise = SETS[which]
-    narrow = OLD.motion(SPAN, DT)
+    narrow = (CROSSING if balance == "transmission" else OLD).motion(SPAN, DT)
     given = {"old": (narrow.position, narrow.velocity)}
     case = simulate_case(truth, seed, size=size, references=given)
     joint = Joint(
@@ -137,21 +159,21 @@ def one_joint(
     old = record_of(case.measured["old"], "old", "same", **more)
     model = prepared_model(joint, old)
     data = load_dataset([old], [], joint, model)
-    rivals = rivals_of(names, balance, solve(model, data), data)
-    rivals = list(Contest(rivals, data).alive)
+    rivals = list(alive(fitted(names, balance, model, data), balance))
     if len(rivals) < 2 or truth not in {r.name for r in rivals}:
         return []
     contest = Contest(rivals, data)
+    foreseen = Foreseen(contest)
     space = workspace_of(data, MAY)
     plant = Plant(contest.leader.solution.model, DT)
     scored = []
     for run in candidate_runs(space, possible_loads(model, data)):
         followed = plant.run(run)
         if followed is not None and not space.broken(followed):
-            apart = contest.distances(predicted(followed, run, data)) * SECONDS / SIMULATED
-            scored.append((float(apart.min()), run, apart))
+            apart = foreseen.distances(predicted(followed, run, data)) * SECONDS / SIMULATED
+            scored.append((worth(apart), run, apart))
     scored.sort(key=lambda s: -s[0])
-    found, one, within = judged(contest, truth)
+    found, one, within = judged(contest, balance, truth)
     out = [("before", Outcome(found, found, one, within), scored[0][1])]
     other = np.random.default_rng(seed).integers(1, len(scored))
     for kind, (_, run, apart) in (("proposed", scored[0]), ("random", scored[int(other)])):
@@ -173,7 +195,9 @@ def one_joint(
         both = load_dataset([old, fresh], [], joint, model)
         tied = [r.name for r in rivals]
         left = rivals_of(tied, balance, solve(model, both), both)
-        after, one, within = judged(Contest(left, both), truth) if left else (-np.inf, False, False)
+        after, one, within = (
+            judged(Contest(left, both), balance, truth) if left else (-np.inf, False, False)
+        )
         expected = _expected(contest, truth, apart)
         out.append((kind, Outcome(expected, after, one, within), run))
     return out
@@ -196,7 +220,7 @@ def rank_correlation(one: Sequence[float], other: Sequence[float]) -> float:
 
 
 def sets_of_improve(count: int, start: int, *, dirt: bool) -> None:
-    """Sets that `improve` claims on whole records, and what whole fits leave of them."""
+    """Sets that the trials of `improve` make, and what its whole fits leave of them."""
     effects = tuple(dict.fromkeys(n for _, names, _ in SETS.values() for n in names))
     before = after = kept = sets = 0
     for k in range(count):
@@ -212,15 +236,14 @@ def sets_of_improve(count: int, start: int, *, dirt: bool) -> None:
         )
         found = improve(records[:2], joint, records[2:])
         for claim in found.claims:
-            if len(claim.effects) < 2:
+            first = next((c for c in found.decided if claim.effects[0] in c.effects), claim)
+            if len(first.effects) < 2:
                 continue
-            last = found.steps[-1].solution
-            bare = solve(without(last.model, claim.label), found.data, start=last.values)
-            rivals = rivals_of(claim.effects, claim.balance, bare, found.data)
-            alive = [r.name for r in Contest(rivals, found.data).alive]
-            sets, before, after = sets + 1, before + len(claim.effects), after + len(alive)
-            kept += truth in alive
-            print(f"{truth:<25} {', '.join(claim.effects)} -> {', '.join(alive)}", flush=True)
+            sets, before, after = sets + 1, before + len(first.effects), after + len(claim.effects)
+            kept += truth in claim.effects
+            print(
+                f"{truth:<25} {', '.join(first.effects)} -> {', '.join(claim.effects)}", flush=True
+            )
     print(
         f"{sets} sets on {count} joints: {before} names, {after} after whole fits, truth left in "
         f"{kept}"

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from identification.data.formats import number
-from workbench.show.pictures import (
+from workbench.show.chart import (
     AFTER,
     BEFORE,
     HEIGHT,
@@ -20,8 +20,9 @@ from workbench.show.pictures import (
     RIGHT,
     WIDTH,
     Frame,
-    _axes,
-    _text,
+    axes,
+    sheet,
+    word,
 )
 from workbench.show.plots import min_max
 
@@ -133,10 +134,10 @@ def picture(
     rows = -(-len(panels) // columns)
     head = _LEGEND if legend else 4
     wide, high = columns * WIDTH, rows * (HEIGHT + _LEGEND) + head
-    body = [f'<rect width="{wide}" height="{high}" fill="#fff"/>']
+    body: list[str] = []
     for i, (kind, words) in enumerate(legend):
         x = LEFT + 150 * i
-        body.append(_line([(x, 13.0), (x + 22.0, 13.0)], kind) + _text(x + 28, 17, words, "start"))
+        body.append(_line([(x, 13.0), (x + 22.0, 13.0)], kind) + word(x + 28, 17, words, "start"))
     for i, panel in enumerate(panels):
         x, y = i % columns * WIDTH, i // columns * (HEIGHT + _LEGEND) + head
         inner = _map(panel) if isinstance(panel, Map) else _panel(panel)
@@ -146,7 +147,7 @@ def picture(
             if isinstance(panel, Map)
             else ""
         )
-        title = _text((LEFT + WIDTH - RIGHT) / 2, 15, panel.title + scale)
+        title = word((LEFT + WIDTH - RIGHT) / 2, 15, panel.title + scale)
         body.append(
             f'<g transform="translate({x} {y})">{title}<g transform="translate(0 '
             f'{_LEGEND - 6})">{inner}</g></g>'
@@ -154,12 +155,8 @@ def picture(
     inside = "".join(body)
     for long, short in _SHORTER:
         inside = inside.replace(long, short)
-    return (
-        '<svg xmlns="http://www.w3.org/2000/svg" role="img" '
-        f'aria-label="{html.escape(label, quote=True)}" viewBox="0 0 {wide} {high}" '
-        f'width="{wide}" height="{high}" font-family="system-ui, sans-serif" font-size="11" '
-        f'fill="{INK}">{inside}</svg>\n'
-    )
+    said = f'role="img" aria-label="{html.escape(label, quote=True)}"'
+    return sheet(inside, wide, high, f' {said} font-size="11" fill="{INK}"')
 
 
 def _panel(panel: Panel) -> str:
@@ -169,7 +166,7 @@ def _panel(panel: Panel) -> str:
     low, high = panel.y_range or (float(y.min()), float(y.max()))
     room = 0.0 if panel.y_range else 0.06 * (high - low) or max(abs(high), 1.0) * 0.1
     frame = Frame((float(x.min()), float(x.max())), (low - room, high + room))
-    out = [_axes(frame, panel.x_label, panel.y_label)]
+    out = [axes(frame, panel.x_label, panel.y_label)]
     for c in panel.curves:
         kept = min_max(len(c.x), [c.y], panel.points)
         rows = np.arange(len(c.x)) if kept is None else kept[0]
@@ -219,7 +216,7 @@ def _map(panel: Map) -> str:
         f'<path fill="{AFTER}" fill-opacity="{n / _LEVELS:.2f}" d="{"".join(d)}"/>'
         for n, d in sorted(cells.items())
     ]
-    out.append(_axes(frame, panel.x_label, panel.y_label))
+    out.append(axes(frame, panel.x_label, panel.y_label))
     return "".join(out)
 
 

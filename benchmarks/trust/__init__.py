@@ -3,7 +3,7 @@
 Joints of the independent generator (tests/hidden_effect) with known values.  First part: the true
 model is fitted to 48 s of records, and the 95 % intervals of `irj trust` are held against the
 truth, by class of parameter.  Second part: `improve` runs on joints with one hidden effect, and how
-often an answer of one name is right is told by how far the error fell.
+often a name is right is held against the chance that was stated for it.
 """
 
 from __future__ import annotations
@@ -51,8 +51,9 @@ HIDDEN: Final[Mapping[str, tuple[str, Mapping[str, str]]]] = MappingProxyType(
     }
 )
 """Effects that are put into the fitted model, with their parameters by the generator's names."""
-DROPS: Final = (0.0, 20.0, 50.0, 80.0, 100.0)
-"""Bounds of the rows of the second table: fall of the held-out RMS [%]."""
+SIZES: Final = (1.0, 0.3, 0.15)
+"""Sizes of the hidden effects of the second table, in turn: large ones have one name, and nothing
+to learn from."""
 
 
 @final
@@ -134,39 +135,84 @@ def coverage(given: argparse.Namespace) -> None:
         )
 
 
+@final
+@dataclass(frozen=True)
+class Stated:
+    """A name that `improve` claimed.
+
+    Attributes
+    ----------
+    chance : float
+        As it stated it.
+    right : bool
+    first, alone : bool
+        It is the first of its set; the only one.
+    """
+
+    chance: float
+    right: bool
+    first: bool
+    alone: bool
+
+
+def claimed(effect: str, seed: int, *, dirt: bool, size: float) -> list[Stated]:
+    """What `improve` says of one joint with one hidden effect."""
+    case = simulate_case(effect, seed, size=size, dirt=dirt)
+    records = [record_of(table, name, "same") for name, table in case.measured.items()]
+    found = improve(records[:2], joint_of(case), records[2:])
+    return [
+        Stated(p, name == effect, name == claim.effects[0], len(claim.effects) == 1)
+        for claim in found.claims
+        if not claim.partial
+        for name, p in claim.confidence.items()
+    ]
+
+
+def skill(stated: Sequence[Stated]) -> float:
+    """Brier skill over a constant: 1 less the mean square error over that of the share that is
+    right [%]."""
+    chance = np.array([s.chance for s in stated])
+    right = np.array([s.right for s in stated], dtype=np.float64)
+    constant = float(np.mean((right - right.mean()) ** 2))
+    error = float(np.mean((chance - right) ** 2))
+    return 100 * (1 - error / constant) if constant > 0 else math.nan
+
+
 def names(given: argparse.Namespace) -> None:
     """Second table."""
-    rows: list[tuple[float, bool]] = []
-    sets: list[bool] = []
+    stated: list[Stated] = []
     missed = 0
     effects = list(LIBRARY)
     for k in range(given.names):
         # a stride without a common factor with the number of effects: a few joints see all kinds
         effect = effects[(7 * k) % len(effects)]
-        case = simulate_case(effect, given.start + 500 + k, size=given.size, dirt=given.dirt)
-        records = [record_of(table, name, "same") for name, table in case.measured.items()]
-        found = improve(records[:2], joint_of(case), records[2:])
-        whole = [c for c in found.claims if not c.partial]
-        missed += not whole
-        for claim in whole:
-            right = effect in claim.effects
-            if len(claim.effects) == 1:
-                rows.append((claim.held_out_drop_percent, right))
-            else:
-                sets.append(right)
-    print(f"names over {given.names} joints with one hidden effect; {missed} without a claim")
-    print("fall of the held-out RMS   one-name answers  right  95 % range of it")
-    for low, high in zip(DROPS[:-1], DROPS[1:], strict=True):
-        own = [right for drop, right in rows if low <= drop < high]
-        if own:
-            span = wilson(sum(own), len(own))
-            print(
-                f"{low:3.0f} to {high:3.0f} %               {len(own):9d}         "
-                f"{100 * sum(own) / len(own):4.0f} %  {span[0]:.0f} to {span[1]:.0f} %"
-            )
+        size = given.size * SIZES[k % len(SIZES)]
+        found = claimed(effect, given.start + 500 + k, dirt=given.dirt, size=size)
+        missed += not found
+        stated += found
     print(
-        f"one name: {sum(r for _, r in rows)} of {len(rows)} right; sets: {sum(sets)} of "
-        f"{len(sets)} hold the truth"
+        f"names over {given.names} joints with one hidden effect of "
+        f"{', '.join(f'{given.size * s:g}' for s in SIZES)} times its size"
+        f"{', with disturbances' * given.dirt}; {missed} without a name"
+    )
+    print("chance stated   names  mean stated  right  95 % range of it")
+    for low in np.arange(0.0, 0.95, 0.1):
+        own = [s for s in stated if low <= s.chance < low + 0.1 + 1e-9 * (low > 0.85)]
+        if own:
+            right = sum(s.right for s in own)
+            span = wilson(right, len(own))
+            mean = 100 * np.mean([s.chance for s in own])
+            print(
+                f"{100 * low:3.0f} to {100 * low + 10:3.0f} %   {len(own):5d}       "
+                f"{mean:5.1f} %  {100 * right / len(own):3.0f} %  "
+                f"{span[0]:.0f} to {span[1]:.0f} %"
+            )
+    first = [s for s in stated if s.first]
+    alone = [s for s in stated if s.alone]
+    print(f"Brier skill: all names {skill(stated):.0f} %, first names {skill(first):.0f} %")
+    print(
+        f"one name: {sum(s.right for s in alone)} of {len(alone)} right, of {len(first)} claims; "
+        f"claims that hold the truth: {sum(s.right for s in stated)}"
     )
 
 

@@ -33,6 +33,7 @@ def _stored(s: LocalSignals, p: SimpleNamespace) -> Expression:
             "backlash_stiffness_loss",
             "N.m/rad",
             "stiffness that is missing inside the gap",
+            role="softening",
             typical=1.5e4,
         ),
         shape(

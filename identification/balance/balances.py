@@ -14,6 +14,7 @@ import numpy.typing as npt
 from casadi_models import JointModel, Signals
 from casadi_models.affine import AffineParts
 from casadi_models.vectorised import Vectorised
+from identification.balance.kinematic import kinematic_law
 from identification.balance.memory import Law, residuals_of, states_of
 from identification.balance.sensing import Sensing
 from identification.balance.weak import WeakRecord
@@ -28,7 +29,9 @@ UNROLLED: Final = 200
 
 
 def residual_expressions(model: JointModel, sensing: Sensing) -> dict[str, Expression]:
-    """Symbolic residual of every balance: what drives minus what the model explains [N.m]."""
+    """Symbolic residual of every balance: what drives minus what the model explains [N.m]; without
+    any torque, what the twist is over what the model explains [rad].
+    """
     e = model.equations
     motor_inertia = e.inertia.get("motor_inertia", ca.SX(0))
     link_inertia = e.inertia.get("link_inertia", ca.SX(0))
@@ -40,7 +43,9 @@ def residual_expressions(model: JointModel, sensing: Sensing) -> dict[str, Expre
     torque_gain = ca.jacobian(e.torque, e.signals.torque)
     coupling = e.signals.coupling_torque
     for balance in sensing.balances:
-        if balance == "motor":
+        if balance == "kinematic":
+            out[balance] = kinematic_law(model).residual
+        elif balance == "motor":
             out[balance] = (e.drive - e.torque * e.motor_lever - motor) / drive_gain
         elif balance == "link":
             out[balance] = (e.torque * e.link_lever + coupling - link) / torque_gain
@@ -204,6 +209,7 @@ class Balances:
         self._plain = _Part(model, expressions, columns, columns_only=columns_only)
         self._curved = _Part(model, curved, columns, columns_only=columns_only) if curved else None
         self._memory = Memory(model) if self._plain.remembers else None
+        self._flight = Flight(model) if sensing.kinematic else None
         self._law = Law(model.structure)
         self.law = Law(model.structure, sensing, columns_only)
 
@@ -243,6 +249,17 @@ class Balances:
             for i, b in enumerate(self.balances)
         }
 
+    @property
+    def has_gap(self) -> bool:
+        """True where the link may fly free between the sides of a gap."""
+        return self._flight is not None and self._flight.anywhere
+
+    def flight(self, data: WeakRecord, values: Mapping[str, float]) -> FloatArray:
+        """Angle by which each row may be off where the link flies free in a gap, (rows,) [rad]."""
+        if self._flight is None:
+            return np.zeros(data.rows)
+        return self._flight.rows(data, [float(values[n]) for n in self.names])
+
     def entering(self, values: Mapping[str, float]) -> dict[str, frozenset[str]]:
         """By balance, the signals that its residual depends on at the given parameter values."""
         p = [float(values[n]) for n in self.names]
@@ -250,6 +267,33 @@ class Balances:
             b: frozenset(self._plain.slopes(self.balances, p)[b]) | self._plain.bent(i)
             for i, b in enumerate(self.balances)
         }
+
+
+@final
+class Flight:
+    """Where the two sides of a gap do not touch: the twist is then anywhere in it, and a row is an
+    inequality, no equation.
+    """
+
+    def __init__(self, model: JointModel) -> None:
+        e, law = model.equations, kinematic_law(model)
+        self._gap = Vectorised(
+            ca.Function(
+                "gap",
+                [e.signals.vector(), e.memory, e.parameters],
+                [ca.densify(law.free * law.gap)],
+            )
+        )
+        self.anywhere = not law.free.is_zero()
+        self._states = int(e.memory.shape[0])
+
+    def rows(self, data: WeakRecord, p: Sequence[float]) -> FloatArray:
+        """Half the gap times the share of a row's kernel without touch, (rows,) [rad]."""
+        if not self.anywhere:
+            return np.zeros(data.rows)
+        count = len(data.points["motor_position"])
+        memory = np.zeros((self._states, count))
+        return data.average(self._gap(count, data.table(_NAMES), memory, p).T)[:, 0]
 
 
 _KEPT: Final = 96

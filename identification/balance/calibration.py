@@ -219,9 +219,10 @@ def start_values(
         a = w.averaged
         twist = a["motor_position"] - a["link_position"]
         v = a["link_velocity"]
+        effort = a.get("torque" if torque else "drive")
         columns = [
             np.ones(w.rows),
-            a["torque" if torque else "drive"],
+            *([] if effort is None else [effort]),
             v,
             a["link_acceleration"],
             np.sign(v),
@@ -230,9 +231,10 @@ def start_values(
         norms = np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
         found = np.linalg.lstsq(matrix / norms, twist, rcond=1e-9)[0] / norms
         out[of_run("link_encoder_zero", w)] = -float(found[0])
-        if "link_encoder_skew" in model.calibration:
+        # without any torque nothing tells friction of the link from lateness
+        if "link_encoder_skew" in model.calibration and effort is not None:
             most = MOST_SKEW * w.grid.dt
-            start = late["link_position_sensor"] + float(found[2])
+            start = late["link_position_sensor"] + float(found[len(columns) - 3])
             out[of_run("link_encoder_skew", w)] = min(max(start, -most), most)
     return out
 
@@ -287,7 +289,9 @@ def _fitted_on_itself(
     """
     now = {n: float(values[n]) for n in names}
     turning = ~one_way(record) if any(n in CLOCKS for n in names) else np.False_
-    rows = {b: record.taking(b) & ~turning for b in balances.balances}
+    # inside a gap the twist says nothing of its zero
+    touching = balances.flight(record, values) == 0
+    rows = {b: record.taking(b) & ~turning & touching for b in balances.balances}
     size = USUAL_SKEW * record.grid.dt
     usually, limits = dict(now), limits_of_runs(balances.model, [record])
     seen = [b for b in balances.balances if rows[b].any()]

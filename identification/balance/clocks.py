@@ -91,10 +91,17 @@ def shifted(
     late : mapping of str to float
         Samples by which the sensor of a place is late; a part of a sample by the cubic through four
         readings.
+
+    Notes
+    -----
+    The stretches are those of the largest skew whatever the shifts are: rows stay where they are
+    while shifts are looked for, and what no shift changes is not made again.
     """
+    if not late:
+        return dict(signals), segments
     out = {**signals, **{SIGNAL[p]: _moved(signals[SIGNAL[p]], k) for p, k in late.items()}}
-    first = math.ceil(max((0.0, *(1 - k for k in late.values()))))
-    last = math.ceil(max((0.0, *(2 + k for k in late.values()))))
+    most = max(MOST_SKEW, *(abs(k) for k in late.values()))
+    first, last = math.ceil(1 + most), math.ceil(2 + most)
     return out, tuple(slice(s.start + first, max(s.stop - last, s.start + first)) for s in segments)
 
 
@@ -103,14 +110,18 @@ def _moved(x: FloatArray, late: float) -> FloatArray:
     f = late - whole
     if f == 0:
         return np.roll(x, -whole)
-    weights = (
+    parts = (w * np.roll(x, 1 - whole - i) for i, w in enumerate(cubic(f)))
+    return np.asarray(sum(parts), dtype=np.float64)
+
+
+def cubic(f: float) -> tuple[float, float, float, float]:
+    """Weights of four readings, of a point `f` of a sample behind the second one."""
+    return (
         -f * (f - 1) * (f - 2) / 6,
         (f + 1) * (f - 1) * (f - 2) / 2,
         -(f + 1) * f * (f - 2) / 2,
         (f + 1) * f * (f - 1) / 6,
     )
-    parts = (w * np.roll(x, 1 - whole - i) for i, w in enumerate(weights))
-    return np.asarray(sum(parts), dtype=np.float64)
 
 
 def in_time(
@@ -174,7 +185,9 @@ def lateness(made: WeakRecord, place: str, *, torque: bool) -> tuple[float, floa
     if place == "drive":
         load = [a["torque"]] if torque else []
         return *_slope(a["drive"], [*motion("motor"), *load], -a["drive_rate"]), 0.0
-    effort, twist = a["torque" if torque else "drive"], a["motor_position"] - a["link_position"]
+    effort, twist = a.get("torque" if torque else "drive"), a["motor_position"] - a["link_position"]
+    if effort is None:  # nothing tells friction of the link from lateness
+        return 0.0, math.inf, 0.0
     one, v, _, bend, *_ = motion("link")
     late, error = _slope(twist, [one, effort, bend, np.sign(v)], v)
     if torque:
@@ -221,6 +234,7 @@ __all__ = [
     "USUAL_SKEW",
     "at_stamps",
     "carrier",
+    "cubic",
     "in_time",
     "lateness",
     "one_way",

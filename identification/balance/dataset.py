@@ -13,9 +13,11 @@ import numpy.typing as npt
 from casadi_models import JointModel, hold
 from identification.balance.calibration import named_late, unknowns_of
 from identification.balance.clocks import SIGNAL, in_time, places_of, shifted
+from identification.balance.colour import ChannelNoise, white
 from identification.balance.memory import cache_of
-from identification.balance.noise import level_of
+from identification.balance.noise import noise_of
 from identification.balance.sensing import Sensing, adapt, check_alike, sense, signals_of
+from identification.balance.spikes import without_spikes
 from identification.balance.stamps import evened
 from identification.balance.weak import (
     CLAIM_KERNEL,
@@ -67,6 +69,8 @@ class Dataset:
     orders : mapping of str to tuple of float
         By effect, orders per motor turn at which a line carries its name: start values of its
         shape.
+    colours : mapping of str to ChannelNoise
+        Noise of each measured signal that is not white, in the proportions of its parts.
     """
 
     joint: Joint
@@ -79,12 +83,21 @@ class Dataset:
     held_out_names: tuple[str, ...] = ()
     note: str = ""
     orders: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    colours: Mapping[str, ChannelNoise] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return (
             f"Dataset({self.joint.name!r}, train: {list(self.train_names)}, held out: "
             f"{list(self.held_out_names)}, balances: {self.sensing.balances})"
         )
+
+    @property
+    def sources(self) -> dict[str, ChannelNoise]:
+        """Noise of each measured signal, as it is drawn."""
+        return {
+            c: self.colours[c].scaled(level) if c in self.colours else white(level)
+            for c, level in self.noise.items()
+        }
 
     @property
     def kernel(self) -> float:
@@ -120,9 +133,11 @@ def load_dataset(
     *,
     kernel: float | None = None,
     like: Sensing | None = None,
+    shifts: Sequence[Mapping[str, float]] | None = None,
 ) -> Dataset:
     """Prepare records for the balances that their common channels allow (`like`: temperature counts
-    as in the records of a fit).
+    as in the records of a fit; `shifts`: by which the channels of each record are late [s], by
+    place, where another kernel has told it).
 
     Raises
     ------
@@ -139,7 +154,7 @@ def load_dataset(
     length = kernel or (ONE_SIDED_KERNEL if alone else CLAIM_KERNEL)
     prepared: list[WeakRecord] = []
     first = 0
-    for record in (*train, *held_out):
+    for number, record in enumerate((*train, *held_out)):
         other = record.payload != train[0].payload
         masked = _of_the_link(record, sensing) if other else frozenset[str]()
         made = _once(
@@ -150,6 +165,7 @@ def load_dataset(
             first,
             curved=model.lagging_load,
             late=places_of(model),
+            known=None if shifts is None else shifts[number],
         )
         if masked:
             made = replace(made, masked=masked)
@@ -173,8 +189,10 @@ def load_dataset(
                 f"{held_out[0].name}: the joint stands still in every held-out record; give one "
                 "in which it moves"
             )
-    levels = [measured_noise(r, joint, sensing) for r in train]
-    noise = {c: float(np.median([level[c] for level in levels])) for c in levels[0]}
+    found = [measured_sources(r, joint, sensing) for r in train]
+    noise = {c: float(np.median([one[c].level for one in found])) for c in found[0]}
+    # colours are those of the record in the middle
+    colours = {c: sorted((one[c] for one in found), key=_loudness)[len(found) // 2] for c in noise}
     return Dataset(
         joint,
         sensing,
@@ -184,6 +202,7 @@ def load_dataset(
         noise=noise,
         train_names=tuple(r.name for r in train),
         held_out_names=tuple(r.name for r in held_out),
+        colours={c: x for c, x in colours.items() if x != white(x.level)},
     )
 
 
@@ -196,20 +215,24 @@ def _once(
     *,
     curved: bool,
     late: Sequence[str],
+    known: Mapping[str, float] | None,
 ) -> WeakRecord:
     """:func:`weak_record` by its name, prepared once for the verbs that follow each other on a
     record.
     """
 
     def make() -> tuple[WeakRecord, int]:
-        made = weak_record(record, joint, sensing, length, first_block, curved=curved, late=late)
+        made = weak_record(
+            record, joint, sensing, length, first_block, curved=curved, late=late, known=known
+        )
         tables = (made.averaged, made.points, made.smooth, made.curved)
         return replace(made, name=run_name(record)), sum(
             x.size for table in tables for x in table.values()
         )
 
     scales = (joint.gear_ratio, joint.torque_per_current, joint.torque_per_voltage)
-    law = (scales, sensing, length, first_block, curved, tuple(late))
+    told = None if known is None else tuple(sorted(known.items()))
+    law = (scales, sensing, length, first_block, curved, tuple(late), told)
     found: WeakRecord = cache_of("prepared").get(record, law, make, PREPARED)
     return found
 
@@ -254,13 +277,18 @@ def weak_record(
     *,
     curved: bool = False,
     late: Sequence[str] = (),
+    known: Mapping[str, float] | None = None,
 ) -> WeakRecord:
     """One record, resampled to uniform time where needed, averaged with the kernel; the channels
-    of the places `late` are shifted by whole samples where they are late.
+    of the places `late` are shifted where they are late (`known`: by these times [s]).
     """
     noise = measured_noise(record, joint, sensing)
     record = evened(record)
-    signals, segments = signals_of(record, joint, sensing), tuple(record.segments())
+    segments = tuple(record.segments())
+    signals = {
+        c: without_spikes(x, segments, noise[c]) if c in noise else x
+        for c, x in signals_of(record, joint, sensing).items()
+    }
     length = max(length, KERNEL_SAMPLES * record.dt)
     longest = length / 2 if length <= CLAIM_KERNEL else 0.06
     pointwise = {
@@ -289,7 +317,10 @@ def weak_record(
         last.append((dict(shifts), made))
         return made
 
-    made = in_time(made_with, late, sensing.has_torque) if late else made_with({})
+    if known is not None:
+        made = made_with({p: round(k / record.dt, 9) for p, k in known.items()})
+    else:
+        made = in_time(made_with, late, sensing.has_torque) if late else made_with({})
     made = _with_rests(made, noise)
     if record.measured is not None and not record.measured.all():
         made = replace(
@@ -338,13 +369,23 @@ def _with_rests(made: WeakRecord, noise: Mapping[str, float]) -> WeakRecord:
     return replace(made, rest=out, smooth=smooth)
 
 
+def _loudness(noise: ChannelNoise) -> float:
+    """Deviation of all parts of a noise, which is what a slow row sees most of."""
+    return sum(part.size**2 for part in noise.parts)
+
+
 def measured_noise(record: Record, joint: Joint, sensing: Sensing) -> dict[str, float]:
     """White-noise level of each measured signal, from samples that were measured: bridges are
     smoother than a reading.
     """
+    return {c: x.level for c, x in measured_sources(record, joint, sensing).items()}
+
+
+def measured_sources(record: Record, joint: Joint, sensing: Sensing) -> dict[str, ChannelNoise]:
+    """Noise of each measured signal, as :func:`measured_noise`."""
     signals = signals_of(record, joint, sensing)
     return {
-        c: level_of(record, c, x, joint.gear_ratio)
+        c: noise_of(record, c, x, joint.gear_ratio)
         for c, x in signals.items()
         if c in POSITION_CHAINS
     }

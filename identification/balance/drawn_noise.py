@@ -14,6 +14,7 @@ from typing import Final, final
 import numpy as np
 import numpy.typing as npt
 
+from identification.balance.colour import ChannelNoise
 from identification.balance.weak import POSITION_CHAINS, WeakRecord, filtered
 
 FloatArray = npt.NDArray[np.float64]
@@ -59,15 +60,15 @@ class Draw:
     noisy: WeakRecord
 
 
-def draws_of(record: WeakRecord, noise: Mapping[str, float]) -> tuple[Draw, ...]:
-    """Draws of white noise on the channels of a record, kept for the records that asked last.
+def draws_of(record: WeakRecord, noise: Mapping[str, ChannelNoise]) -> tuple[Draw, ...]:
+    """Draws of the noise on the channels of a record, kept for the records that asked last.
 
     Parameters
     ----------
     record : WeakRecord
         Held weakly, known by identity.
-    noise : mapping of str to float
-        Standard deviation of each measured signal, per sample, in its unit.
+    noise : mapping of str to ChannelNoise
+        Of each measured signal.
 
     Returns
     -------
@@ -77,7 +78,7 @@ def draws_of(record: WeakRecord, noise: Mapping[str, float]) -> tuple[Draw, ...]
     cache: OrderedDict[Hashable, tuple[weakref.ref[WeakRecord], tuple[Draw, ...]]] = (
         _kept.__dict__.setdefault("draws", OrderedDict())
     )
-    key = (id(record), tuple(sorted(noise.items())))
+    key = (id(record), tuple(sorted(noise.items(), key=lambda item: item[0])))
     found = cache.get(key)
     if found is not None and found[0]() is record:
         cache.move_to_end(key)
@@ -139,12 +140,14 @@ def excerpt(record: WeakRecord) -> tuple[WeakRecord, IntArray]:
 
 
 def _drawn(
-    record: WeakRecord, rows: IntArray, noise: Mapping[str, float], rng: np.random.Generator
+    record: WeakRecord, rows: IntArray, noise: Mapping[str, ChannelNoise], rng: np.random.Generator
 ) -> Draw:
     grid = record.grid
     count = max((s.stop for s in grid.segments), default=0)
-    present = [c for c in POSITION_CHAINS if noise.get(c, 0.0) > 0 and c in record.points]
-    drawn = {c: noise[c] * rng.standard_normal(count) for c in present}
+    present = [
+        c for c in POSITION_CHAINS if c in noise and noise[c].level > 0 and c in record.points
+    ]
+    drawn = {c: noise[c].draw(rng, count, grid.dt) for c in present}
     averaged, points, smooth, curved = filtered(grid, drawn, curved=bool(record.curved))
     calm = replace(record, points={**record.points, **record.smooth})
     return Draw(

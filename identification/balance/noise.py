@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
 
+from identification.balance.colour import ChannelNoise, coloured, spacings_of, white
 from identification.data.record import Record
 
 FloatArray = npt.NDArray[np.float64]
@@ -20,8 +22,15 @@ stamps written with few digits.
 
 KEPT: Final = 0.95
 """Share of the fourth differences that counts: the rest may be jumps of the motion and spikes."""
+FOURTH_GAIN: Final = 70.0
+"""Variance of a fourth difference of unit noise: 1 + 16 + 36 + 16 + 1."""
 CUT_DEVIATION: Final = 0.87
 """Standard deviation of a unit normal variable that is cut at that quantile of its size (0.871)."""
+
+JUMP: Final = 5.0
+"""Noise levels over which a fourth difference is a jump: one in two million by chance."""
+FEWEST_LEFT: Final = 0.2
+"""Share of the samples around which no jump must be: from fewer their level is no level of all."""
 
 LONGEST_LAG: Final = 60
 """Rows up to which correlation is followed: fifteen kernel lengths, longer than any block holds
@@ -69,12 +78,79 @@ def noise_level(
     return float(np.sqrt(np.mean(smallest**2)) / CUT_DEVIATION)
 
 
-_LEVELS: Final[WeakKeyDictionary[Record, dict[tuple[str, float], float]]] = WeakKeyDictionary()
+def spaced_levels(
+    values: FloatArray, segments: Sequence[slice], level: float, spacings: Sequence[int]
+) -> list[float]:
+    """`noise_level` of even samples from fourth differences over several spacings.
+
+    The longer they are, the more of them hold a jump of the motion: what stands far out over one
+    spacing is left out over all longer ones.
+
+    Parameters
+    ----------
+    values : (n,) array
+    segments : sequence of slice
+    level : float
+        Over one sample.
+    spacings : sequence of int
+        Increasing.
+
+    Returns
+    -------
+    list of float
+        Zero from the spacing on over which too few are left.
+    """
+    jumps = np.zeros(len(values))
+    _mark(jumps, values, segments, 1, JUMP * level)
+    out = []
+    for spacing in spacings:
+        left = [
+            _spaced(values[s], spacing)[_clear(jumps[s], 4 * spacing)]
+            for s in segments
+            if s.stop - s.start > 8 * spacing
+        ]
+        squares = np.concatenate([*left, np.empty(0)]) ** 2
+        if len(squares) < FEWEST_LEFT * len(values):
+            break
+        count = int(KEPT * (len(squares) - 1)) + 1
+        smallest = np.partition(squares, count - 1)[:count]
+        out.append(float(np.sqrt(np.mean(smallest)) / CUT_DEVIATION))
+        _mark(jumps, values, segments, spacing, JUMP * out[-1])
+    return out + [0.0] * (len(spacings) - len(out))
 
 
-def level_of(record: Record, signal: str, values: FloatArray, ratio: float) -> float:
-    """`noise_level` of a signal made from a record, computed once per record, signal and gear
-    ratio.
+def _spaced(x: FloatArray, m: int) -> FloatArray:
+    """Fourth differences over m samples, scaled to unit noise gain."""
+    second = x[: -2 * m] - 2 * x[m:-m] + x[2 * m :]
+    return np.asarray(
+        (second[: -2 * m] - 2 * second[m:-m] + second[2 * m :]) / np.sqrt(70), dtype=np.float64
+    )
+
+
+def _mark(
+    jumps: FloatArray, values: FloatArray, segments: Sequence[slice], m: int, limit: float
+) -> None:
+    """Mark the middle of the differences over m samples that stand over a limit."""
+    for s in segments:
+        if s.stop - s.start > 8 * m:
+            over = np.abs(_spaced(values[s], m)) > limit
+            jumps[s.start + 2 * m : s.stop - 2 * m][over] = 1.0
+
+
+def _clear(jumps: FloatArray, length: int) -> npt.NDArray[np.bool_]:
+    """Which stretches of so many steps hold no mark."""
+    total = np.concatenate([[0.0], np.cumsum(jumps)])
+    return np.asarray(total[length + 1 :] == total[: -length - 1])
+
+
+_LEVELS: Final[WeakKeyDictionary[Record, dict[tuple[str, float], ChannelNoise]]] = (
+    WeakKeyDictionary()
+)
+
+
+def noise_of(record: Record, signal: str, values: FloatArray, ratio: float) -> ChannelNoise:
+    """Noise of a signal made from a record, estimated once per record, signal and gear ratio; its
+    colour is read where the stamps are even.
 
     Parameters
     ----------
@@ -95,7 +171,15 @@ def level_of(record: Record, signal: str, values: FloatArray, ratio: float) -> f
             ).tolist()
             segments = tuple(slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True))
             values, time = values[record.measured], time[record.measured]
-        known[signal, ratio] = noise_level(values, segments, time)
+        level = noise_level(values, segments, time)
+        steps = np.concatenate([np.diff(time[s]) for s in segments] or [np.empty(0)])
+        even = len(steps) > 0 and np.ptp(steps) <= EVEN * float(np.median(steps))
+        known[signal, ratio] = white(level)
+        if even and level > 0:
+            dt = float(np.median(steps))
+            further = spaced_levels(values, segments, level, spacings_of(dt)[1:])
+            longest = max(segments, key=lambda s: s.stop - s.start)
+            known[signal, ratio] = coloured(values, longest, dt, [level, *further])
     return known[signal, ratio]
 
 
@@ -103,7 +187,7 @@ def _fourth(x: FloatArray, time: FloatArray | None) -> FloatArray:
     """Fourth differences, scaled to unit noise gain: zero for a cubic course over the stamps."""
     steps = np.ones(1) if time is None else np.diff(time)
     if time is None or np.ptp(steps) <= EVEN * float(np.median(steps)) or steps.min() <= 0:
-        return np.asarray(np.diff(x, 4) / np.sqrt(70), dtype=np.float64)
+        return np.asarray(np.diff(x, 4) / np.sqrt(FOURTH_GAIN), dtype=np.float64)
     count = len(x) - 4
     stamps = [time[i : i + count] for i in range(5)]
     total, power = np.zeros(count), np.zeros(count)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, final
@@ -12,7 +13,7 @@ import numpy.typing as npt
 
 from casadi_models import JointModel
 from casadi_models.joint import TWIST
-from casadi_models.term import SIDE_INERTIAS, TOTAL_INERTIA
+from casadi_models.term import LINK_INERTIA, SIDE_INERTIAS, TOTAL_INERTIA
 from identification.data.joint_file import Joint
 from identification.data.record import Record
 from identification.errors import InputError
@@ -26,6 +27,7 @@ BALANCE_TITLES: Final = {
     "sum": "sum of motor and link balance (no torque sensor)",
     "deflection": "motor balance with the torsion in place of a torque sensor",
     "axis": "balance of the axis",
+    "kinematic": "twist against what the link's own motion asks for (no torque, no drive)",
 }
 
 
@@ -67,15 +69,24 @@ class Sensing:
         """True where one balance of one side carries everything."""
         return self.balances == ("axis",) or self.clamped_link
 
+    @property
+    def kinematic(self) -> bool:
+        """True where both positions are recorded and no torque at all."""
+        return self.balances == ("kinematic",)
+
 
 TEMPERATURE_CHANGE: Final = 2.0
 """Change of the temperature over the records that is worth the name [K]."""
+CLAMPED_TRAVEL: Final = math.radians(5.0)
+"""Motion of one side, link-referred, that a clamped other side allows: some twenty times what a
+strain-wave gear twists at its rated torque, twice what a soft belt or spring behind a gear does
+[rad]."""
 DRIVES: Final = ("motor_torque", "motor_current", "motor_voltage")
 
 
-_SENSED: Final[WeakKeyDictionary[Record, dict[bool, Sensing]]] = WeakKeyDictionary()
-"""What each record lets one see, by whether the model is elastic: all that is asked of the
-model.
+_SENSED: Final[WeakKeyDictionary[Record, dict[tuple[bool, float], Sensing]]] = WeakKeyDictionary()
+"""What each record lets one see, by whether the model is elastic and its gear ratio: all that is
+asked of the model.
 """
 
 
@@ -88,12 +99,13 @@ def sense(record: Record, model: JointModel) -> Sensing:
         No position; nothing to balance; an elastic model on one-sided data (says what is missing).
     """
     known = _SENSED.setdefault(record, {})
-    if model.is_elastic not in known:
-        known[model.is_elastic] = _sensed(record, model.is_elastic)
-    return known[model.is_elastic]
+    asked = (model.is_elastic, abs(model.gear_ratio))
+    if asked not in known:
+        known[asked] = _sensed(record, *asked)
+    return known[asked]
 
 
-def _sensed(record: Record, elastic: bool) -> Sensing:
+def _sensed(record: Record, elastic: bool, gear_ratio: float) -> Sensing:
     drive = any(record.has(c) for c in DRIVES)
     torque = record.has("link_torque")
     motor, link = record.has("motor_position"), record.has("link_position")
@@ -105,10 +117,10 @@ def _sensed(record: Record, elastic: bool) -> Sensing:
             f"{record.name}: no motor_position and no link_position; add one of them or map it "
             "in [columns]"
         )
-    if not (drive or torque):
+    if not (drive or torque or (motor and link)):
         raise InputError(
             f"{record.name}: no motor_current, motor_torque, motor_voltage or link_torque; a "
-            "balance needs one of them"
+            "balance needs one of them, or both motor_position and link_position"
         )
     common = {
         "has_torque": torque,
@@ -118,9 +130,17 @@ def _sensed(record: Record, elastic: bool) -> Sensing:
         "has_coupling": record.has("coupling_torque"),
     }
     moving = "motor_position" if motor else "link_position"
+    if not (drive or torque):
+        return Sensing(("kinematic",), moving=moving, **common)
     if not drive and not (motor and link):
-        if link and not motor and not elastic:
+        if not elastic and (link or _travels(record, gear_ratio)):
             return Sensing(("link",), moving=moving, **common)
+        if gear_ratio != 1.0 and _travels(record, gear_ratio):
+            raise InputError(
+                f"{record.name}: model is elastic, the joint moves, and "
+                f"{'motor' if link else 'link'}_position is missing; add it or use model = "
+                '"hd1"'
+            )
         return Sensing(("transmission",), clamped_link=True, moving=moving, **common)
     if torque:
         found: list[str] = []
@@ -245,6 +265,17 @@ def _difference(record: Record, first: Record, label: str) -> str:
     return f"shows another torsion under its link_torque than {label}"
 
 
+def _travels(record: Record, gear_ratio: float) -> bool:
+    """True where the one position of a geared joint moves further than a gear twists: the link is
+    not clamped. Without gear the position may be a displacement of any size.
+    """
+    if gear_ratio == 1.0 or record.kind != "rotary":
+        return False
+    motor = record.has("motor_position")
+    position = record["motor_position"] / gear_ratio if motor else record["link_position"]
+    return bool(np.ptp(position[np.isfinite(position)]) > CLAMPED_TRAVEL)
+
+
 def _twists(record: Record) -> bool:
     """True where torsion can be told from rigid motion at all."""
     q, link = record["motor_position"], record["link_position"]
@@ -267,6 +298,10 @@ def adapt(
     if sensing.clamped_link:
         # torque against twist shows the transmission, whatever else the model has or has not
         model = replace(model if model.is_elastic else model.add(TWIST), inertias=())
+    elif sensing.kinematic:
+        # the twist is all that is seen of the joint: what loads it is the link, nothing of the
+        # motor
+        model = replace(model if model.is_elastic else model.add(TWIST), inertias=(LINK_INERTIA,))
     elif sensing.balances == ("axis",) and not set(SIDE_INERTIAS) & set(known or ()):
         model = replace(model, inertias=TOTAL_INERTIA)
     if sensing.one_sided:

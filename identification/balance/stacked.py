@@ -150,7 +150,7 @@ def _drawn_floors(
     """RMS of what drawn noise changes in each balance of one record."""
     balances = balances_of(model, data.sensing, wrt=())
     power = dict.fromkeys(balances.balances, 0.0)
-    drawn = draws_of(record, data.noise)
+    drawn = draws_of(record, data.sources)
     seen = drawn[0].record
     either = _unsure(balances, data, values, [seen])
     values = values_on(model, record, values)
@@ -176,6 +176,17 @@ def _sure_rms(change: FloatArray, either: FloatArray) -> float:
         weight = 1 / np.hypot(level, either)
         level = rms(change * weight) / rms(weight)
     return level
+
+
+def sure_levels(model: JointModel, data: Dataset, values: Mapping[str, float]) -> dict[str, float]:
+    """RMS of what each balance leaves on the training rows, in which rows that may go either way
+    count by how sure they are.
+    """
+    balances = balances_of(model, data.sensing, wrt=())
+    residual = stack(balances, data.train, values).residual
+    either = _unsure(balances, data, values, data.train)
+    rows = {b: taking_part(b, data.train) for b in residual}
+    return {b: _sure_rms(r[rows[b]], either[b][rows[b]]) for b, r in residual.items()}
 
 
 def noise_believed(
@@ -205,12 +216,18 @@ def noise_believed(
 
 
 def references(data: Dataset, records: Sequence[WeakRecord]) -> dict[str, FloatArray]:
-    """The measured torque of each balance, averaged: what the relative error refers to."""
-    names = {"link": "torque", "transmission": "torque"}
-    return {
-        b: np.concatenate([w.averaged[names.get(b, "drive")] for w in records])
-        for b in data.sensing.balances
-    }
+    """The measured torque of each balance, averaged: what the relative error refers to; where no
+    torque is measured, the twist about its middle.
+    """
+    return {b: np.concatenate([measured(b, w) for w in records]) for b in data.sensing.balances}
+
+
+def measured(balance: str, record: WeakRecord) -> FloatArray:
+    """What :func:`references` says of one record."""
+    if balance == "kinematic":
+        twist = record.averaged["motor_position"] - record.averaged["link_position"]
+        return np.asarray(twist - np.median(twist), dtype=np.float64)
+    return record.averaged[{"link": "torque", "transmission": "torque"}.get(balance, "drive")]
 
 
 def _unsure(
@@ -221,6 +238,10 @@ def _unsure(
     """
     names = balances.model.named("smoothing")
     either = _either_way(balances.model, data, values, records)
+    if data.sensing.kinematic:
+        settled_values = settled(balances.model, data.sensing, records, values)
+        flying = [balances.flight(w, values_on(balances.model, w, settled_values)) for w in records]
+        either = {b: np.hypot(x, np.concatenate(flying)) for b, x in either.items()}
     if not names:
         return either
     bare = balances_of(balances.model, data.sensing, wrt=())
@@ -258,7 +279,7 @@ def _either_way(
     out = dict.fromkeys(data.sensing.balances, zero)
     for place, balances in (
         ("motor", ("motor", "sum", "deflection", "axis")),
-        ("link", ("link", "sum", "axis")),
+        ("link", ("link", "sum", "axis", "kinematic")),
     ):
         level = sticking_torque(model, values, place)
         source = f"{place}_position"

@@ -435,7 +435,7 @@ class _Kept:
             numbers.append(np.full(len(grid), k, dtype=np.int64))
             measured.append(there >= 0)
             values.append(
-                _bridged(
+                bridged(
                     self.slots.time[own],
                     table[own],
                     grid,
@@ -495,7 +495,7 @@ class _Kept:
         ).astype(np.int64)
 
 
-def _bridged(time: FloatArray, table: FloatArray, grid: FloatArray, there: IntArray) -> FloatArray:
+def bridged(time: FloatArray, table: FloatArray, grid: FloatArray, there: IntArray) -> FloatArray:
     """Values on a grid: those of the samples that are there, cubics through their neighbours for
     the others.
 

@@ -12,6 +12,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Final, final
+from weakref import WeakValueDictionary
 
 import numpy as np
 import numpy.typing as npt
@@ -43,6 +44,7 @@ RESTING_SIDES: Final[Mapping[str, tuple[str, ...]]] = {
     "link": ("link",),
     "sum": ("motor", "link"),
     "axis": ("motor", "link"),
+    "kinematic": ("link",),
 }
 """Sides whose dry friction acts in a balance. At rest it is any torque up to its limit: such a row
 is an inequality, no equation. The transmission has no friction against the ground."""
@@ -349,30 +351,47 @@ class WeakRecord:
         return {}
 
     def _sparse(self, order: int) -> Any:
-        from scipy.sparse import csr_array
-
         grid = self.grid
-        half = grid.half // grid.step
-        stride = grid.stride // grid.step
-        weights = differentiated_kernel(grid.length, grid.dt * grid.step, order)
-        own = len(weights) // 2
-        centres = np.concatenate(
-            [
-                np.arange(half, last - first - half, stride) + first
-                for first, last in zip(self.starts[:-1], self.starts[1:], strict=True)
-            ]
-        )
-        columns = (centres[:, None] + np.arange(-own, own + 1)).ravel()
-        pointers = np.arange(0, len(columns) + 1, len(weights))
-        return csr_array(
-            (np.tile(weights, len(centres)), columns, pointers),
-            shape=(len(centres), int(self.starts[-1])),
+        half, stride = grid.half // grid.step, grid.stride // grid.step
+        return _averages(
+            grid.length, grid.dt * grid.step, order, half, stride, tuple(self.starts.tolist())
         )
 
     @property
     def rows(self) -> int:
         """Number of rows of each balance."""
         return len(self.time)
+
+
+def _averages(
+    length: float, dt: float, order: int, half: int, stride: int, starts: tuple[int, ...]
+) -> Any:
+    """Matrix (rows, points) of the kernel averages; one for all records of the same grid, as long
+    as one of them lives: a record is made again for each shift of its clocks that is tried.
+    """
+    key = (length, dt, order, half, stride, starts)
+    found = _matrices.get(key)
+    if found is None:
+        from scipy.sparse import csr_array
+
+        weights = differentiated_kernel(length, dt, order)
+        own = len(weights) // 2
+        centres = np.concatenate(
+            [
+                np.arange(half, last - first - half, stride) + first
+                for first, last in zip(starts[:-1], starts[1:], strict=True)
+            ]
+        )
+        columns = (centres[:, None] + np.arange(-own, own + 1)).ravel()
+        pointers = np.arange(0, len(columns) + 1, len(weights))
+        found = _matrices[key] = csr_array(
+            (np.tile(weights, len(centres)), columns, pointers),
+            shape=(len(centres), starts[-1]),
+        )
+    return found
+
+
+_matrices: Final[WeakValueDictionary[tuple[object, ...], Any]] = WeakValueDictionary()
 
 
 def prepare(

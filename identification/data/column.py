@@ -6,7 +6,7 @@ import itertools
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Final, final
+from typing import Any, Final, final
 
 from identification.data.formula import Formula
 from identification.data.joint_schema import COLUMN
@@ -75,17 +75,23 @@ class Column:
             text += f", {self.counts_per_turn:g} counts per turn"
         return text
 
-    def toml(self) -> str:
-        """Return ``channel = { column = ..., unit = ... }``."""
+    def entry(self) -> dict[str, Any]:
+        """Return the keys of the column in a column map, without those that say nothing."""
+        plain = self.formula is None and self.step is None
         values = {
-            "column": self.column if self.formula is None else None,
+            "column": self.column if plain else None,
             "formula": self.formula.text if self.formula is not None else None,
+            "step": self.step,
             "unit": self.unit if self.channel != "run" else None,
             "scale": self.scale if self.scale != 1.0 else None,
             "sign": self.sign if self.sign != 1 else None,
             "counts_per_turn": self.counts_per_turn,
         }
-        return f"{self.channel} = {COLUMN.inline(values)}"
+        return {k: v for k, v in values.items() if v is not None}
+
+    def toml(self) -> str:
+        """Return ``channel = { column = ..., unit = ... }``."""
+        return f"{self.channel} = {COLUMN.inline(self.entry())}"
 
 
 @final

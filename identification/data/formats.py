@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
@@ -13,8 +14,14 @@ import numpy.typing as npt
 
 _SUPERSCRIPT: Final = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 MINUS: Final = "−"
+PLAIN: Final = (1e-4, 1e6)
+"""Spans whose ends are written without a power of ten: at most six digits before the point or four
+zeros behind it.
+"""
 SPACE: Final = "\u00a0"
 """Between a number and its sign of unit: no line break."""
+CERTAIN: Final = 0.01
+"""Chance below which, and below 1 by which, no figure is told: a library is not all there is."""
 
 
 def number(value: float | None, digits: int = 4) -> str:
@@ -94,7 +101,7 @@ def ratio(value: float | None) -> str:
 def interval(low: float, high: float) -> str:
     """Two ends to the same decimal place, as 0.35 to 0.75: a hundredth of the span or so."""
     span = abs(high - low)
-    if not (math.isfinite(span) and 1e-4 <= span < 1e6):
+    if not (math.isfinite(span) and PLAIN[0] <= span < PLAIN[1]):
         return f"{number(low, 3)} to {number(high, 3)}"
     places = max(1 - math.floor(math.log10(span / 3)), 0)
     ends = (round(v, places) + 0.0 for v in (low, high))
@@ -105,3 +112,16 @@ def value_range(values: npt.NDArray[np.float64]) -> str:
     """Smallest and largest finite value of a channel."""
     finite = values[np.isfinite(values)]
     return f"{finite.min():.5g} to {finite.max():.5g}" if finite.size else "no finite value"
+
+
+def chances(confidence: Mapping[str, float]) -> str:
+    """Chances of names in words: "97 % stribeck, under 1 % lugre".
+
+    Parameters
+    ----------
+    confidence : mapping of str to float
+    """
+    return ", ".join(
+        f"{'under 1' if p < CERTAIN else 'over 99' if p > 1 - CERTAIN else f'{100 * p:.0f}'} % {n}"
+        for n, p in confidence.items()
+    )

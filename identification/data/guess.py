@@ -163,8 +163,56 @@ def _guess_one(name: str, file_unit: str | None, kind: str) -> tuple[str, str, s
     )
 
 
+def numbered(names: Sequence[str]) -> dict[int, tuple[str, ...]]:
+    """Columns of several joints side by side, told by a number in their names: ``q1 .. q6``,
+    ``axis1_torque .. axis6_torque``.
+
+    Parameters
+    ----------
+    names : sequence of str
+
+    Returns
+    -------
+    dict of int to tuple of str
+        By number, the columns of that joint; columns of every joint (the time) are in none. Empty
+        where the names do not count on from 0 or 1.
+    """
+    families: dict[tuple[str, str], dict[int, str]] = {}
+    for name in names:
+        for found in re.finditer(r"\d+", name):
+            ends = name[: found.start()], name[found.end() :]
+            families.setdefault(ends, {})[int(found.group())] = name
+    real = [f for f in families.values() if len(f) > 1 and min(f) <= 1 and max(f) - min(f) < len(f)]
+    if not real:
+        return {}
+    most = max(real, key=len)
+    return {k: tuple(n for n in names if n in {f.get(k) for f in real}) for k in sorted(most)}
+
+
+def of_joint(names: Sequence[str], number: int | None) -> tuple[str, ...]:
+    """The columns of one of several joints, with those that belong to all of them.
+
+    Parameters
+    ----------
+    names : sequence of str
+    number : int or None
+        Number in the names; None: the first. Any number that they do not have: every column, as of
+        one joint.
+    """
+    joints = numbered(names)
+    if number is None and joints:
+        number = min(joints)
+    if number not in joints:
+        return tuple(names)
+    others = {n for k, own in joints.items() if k != number for n in own}
+    return tuple(n for n in names if n not in others or n in joints[number])
+
+
 def guess_columns(
-    names: Sequence[str], units: Mapping[str, str] | None = None, kind: str = "rotary"
+    names: Sequence[str],
+    units: Mapping[str, str] | None = None,
+    kind: str = "rotary",
+    number: int | None = None,
 ) -> tuple[Guess, ...]:
     """Propose a column map from names and units.
 
@@ -176,13 +224,16 @@ def guess_columns(
         Units the file gives, by column.
     kind : {"rotary", "linear"}
         Kind of the axis.
+    number : int, optional
+        Where the columns are those of several joints: which of them (see `of_joint`).
 
     Returns
     -------
     tuple of Guess
         At most one a channel, in the order of the columns, each with its reason.
     """
-    found = [(name, *_guess_one(name, (units or {}).get(name), kind)) for name in names]
+    own = of_joint(names, number)
+    found = [(name, *_guess_one(name, (units or {}).get(name), kind)) for name in own]
     taken: dict[str, Guess] = {}
     for named in (True, False):
         for name, quantity, side, unit, reason in found:
@@ -227,4 +278,7 @@ def fragment(guesses: Sequence[Guess], names: Sequence[str], kind: str = "rotary
         if g.column.channel != "run"
     )
     hint = f" (with kind = {other!r})" if doubt else ""
+    joints = numbered(names)
+    if len(joints) > 1:
+        hint += f" (it is of joint {min(joints)} of {min(joints)} to {max(joints)})"
     return f"check this guess and put it into the joint file{hint}: columns = {{ {body} }}"

@@ -68,6 +68,8 @@ class Joint:
         per motor turn, or per metre.
     pitch : float or None
         Travel of a linear axis per turn of its motor [m].
+    sample_time : float or None
+        Of the records of the fit that wrote the file [s].
     laws : mapping of str to TypedLaw
         Laws typed as text, by the key of their effect.
     """
@@ -87,6 +89,7 @@ class Joint:
     source: str = ""
     orders: tuple[float, ...] = ()
     pitch: float | None = None
+    sample_time: float | None = None
     laws: Mapping[str, TypedLaw] = field(default_factory=dict)
 
     def model(self) -> JointModel:
@@ -209,7 +212,18 @@ def parse_joint(data: Mapping[str, Any], source: str = "joint") -> Joint:
                 f"{source}: [fitted] {p.name} = {joint.fitted[p.name]:g} lies outside its "
                 f"physical bounds {bounds}; correct it or fit again"
             )
-    return replace(joint, known=known, orders=orders, pitch=pitch)
+    step = _sample_time(data.get("provenance", {}), source)
+    return replace(joint, known=known, orders=orders, pitch=pitch, sample_time=step)
+
+
+def _sample_time(table: Mapping[str, Any], source: str) -> float | None:
+    """Sample time of the records of the fit; other notes are for the reader."""
+    found: float | None = PROVENANCE["sample_time"].read(table, f"{source}: [provenance]")
+    if found is not None and not found > 0:
+        raise InputError(
+            f"{source}: [provenance]: sample_time = {found:g} s; give the time between two samples"
+        )
+    return found
 
 
 def _added(fitted: Mapping[str, float], model: JointModel) -> dict[str, float]:
@@ -346,7 +360,7 @@ def _fitted(name: str, entry: Any, source: str) -> dict[str, Any]:
 def toml_text(
     joint: Joint,
     parameters: Mapping[str, Mapping[str, Any]] | None = None,
-    provenance: Mapping[str, str] | None = None,
+    provenance: Mapping[str, Any] | None = None,
     calibration: Mapping[str, Mapping[str, Any]] | None = None,
     outside: Sequence[str] = (),
 ) -> str:
@@ -383,8 +397,9 @@ def toml_text(
         lines += ["", "[fitted]", *_entries(FITTED, parameters)]
     if calibration:
         lines += ["", "[calibration]", *_entries(CALIBRATION, calibration)]
-    if provenance:
-        lines += ["", "[provenance]", *PROVENANCE.lines(provenance)]
+    origin = {"sample_time": joint.sample_time, **(provenance or {})}
+    if any(value is not None for value in origin.values()):
+        lines += ["", "[provenance]", *PROVENANCE.lines(origin)]
     text = "\n".join(lines) + "\n"
     from_toml(
         text, f"{joint.source or joint.name}, as it would be written"

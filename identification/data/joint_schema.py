@@ -181,6 +181,14 @@ PROVENANCE: Final = Schema(
     "Written by a fit, for the reader. Any text may stand here; irj writes these.",
     (
         Key("records", "label", "records of the fit"),
+        Key(
+            "sample_time",
+            "number",
+            "their sample time, at which an estimator FMU of this file runs unless told otherwise",
+            unit="s",
+            absent="0.001",
+            digits=6,
+        ),
         Key("version", "label", "version of irj"),
     ),
 )

@@ -57,6 +57,21 @@ def toml_key(text: str) -> str:
     return text if _BARE.fullmatch(text) else toml_string(text)
 
 
+def tables_text(data: Mapping[str, Any]) -> str:
+    """Plain data as the text of a TOML file: one table after another, each key on a line.
+
+    Parameters
+    ----------
+    data : mapping of str to mapping
+        The tables, as `from_toml` reads them.
+    """
+    parts = []
+    for name, table in data.items():
+        lines = [f"{toml_key(str(k))} = {toml_value(v)}" for k, v in table.items()]
+        parts.append("\n".join([f"[{toml_key(str(name))}]", *lines]))
+    return "\n\n".join(parts) + "\n"
+
+
 def toml_value(value: Any) -> str:
     """A value of plain data as TOML: texts, numbers, dates, lists and (inline) tables.
 
@@ -124,4 +139,12 @@ def _too_deep(source: str) -> InputError:
     return InputError(f"{source}: nested deeper than {DEEPEST} levels; no file of irj needs that")
 
 
-__all__ = ["DEEPEST", "from_json", "from_toml", "toml_key", "toml_string", "toml_value"]
+__all__ = [
+    "DEEPEST",
+    "from_json",
+    "from_toml",
+    "tables_text",
+    "toml_key",
+    "toml_string",
+    "toml_value",
+]

@@ -9,6 +9,8 @@ from dataclasses import replace
 from typing import Protocol, final
 
 from casadi_models import JointModel
+from identification.balance.calibration import settled
+from identification.balance.dataset import without
 from identification.balance.sensing import Sensing
 from identification.data.joint_file import Joint
 from identification.data.record import Record
@@ -30,6 +32,8 @@ from identification.diagnosis.trials import Base, Trial, make_base, try_candidat
 from identification.fitting.assess import RATIO_LIMIT, VERDICT_KERNELS, BalanceError, Error, assess
 from identification.fitting.engine import Dataset, Solution, load_dataset, prepared_model, solve
 from identification.fitting.first_fit import first_fit
+from identification.naming.contest import Rival
+from identification.naming.odds import Odds, contenders, contest_of, odds_of, unmodelled
 
 Progress = Callable[[str, float], None]
 
@@ -95,6 +99,16 @@ class Bench(Protocol):
 
     def same_sign(self, trial: Trial, solution: Solution) -> bool:
         """Whether a small effect has the same sign at half and at double kernel."""
+
+    def odds(
+        self, claim: Claim, near: Mapping[str, float], now: Step, last: Ranking
+    ) -> Odds | None:
+        """Whole fits of the names of a claim of a step's model, and of those that came near it;
+        None where they cannot be fitted.
+
+        `near`: by how much the trial of a name was behind that of the claim [nats]; `last`: the
+        ranking on the step's model.
+        """
 
 
 @final
@@ -207,10 +221,17 @@ class JointBench:
         mark = (id(solution), held_out)
         if mark not in self._ratios:
             out: dict[str, BalanceError] = {}
+            # zero and clocks of a record, too, are its own and found at the kernel of the claims
+            values = settled(
+                solution.model,
+                self.data.sensing,
+                [*self.data.train, *self.data.held_out],
+                solution.values,
+            )
             for length in sorted({VERDICT_KERNELS[b] for b in self.data.sensing.balances}):
                 data = self._at_kernel(length)
                 error = assess(
-                    solution.model, data, data.held_out if held_out else data.train, solution.values
+                    solution.model, data, data.held_out if held_out else data.train, values
                 )
                 out.update(
                     {b: e for b, e in error.balances.items() if VERDICT_KERNELS[b] == length}
@@ -259,12 +280,35 @@ class JointBench:
                 return False
         return True
 
+    def odds(
+        self, claim: Claim, near: Mapping[str, float], now: Step, last: Ranking
+    ) -> Odds | None:
+        """See :mod:`identification.naming.odds`."""
+        whole = now.solution
+        less = without(whole.model, claim.label)
+        if less.terms == whole.model.terms or claim.effect.stage == "structure":
+            return None
+        names = contenders(claim.effects, near, unmodelled(last, claim.balance))
+        first = Rival(claim.effects[0], claim.label, whole)
+        bare = self.fitted(less, whole.values, again=True)
+        contest = contest_of(names, claim.balance, first, bare, self.data)
+        if contest.leader is not first:  # what a wrong name leaves is not what is unmodelled
+            last = self.ranking(self.base(contest.leader.solution))
+        return odds_of(contest, unmodelled(last, claim.balance))
+
     def _at_kernel(self, length: float) -> Dataset:
         """The same records with another kernel, prepared once."""
         mark = round(length, 9)
         if mark not in self._kernels:
             model = prepared_model(self.joint, self._train[0])
+            # clocks are the records' own: how late a channel is does not hang on the kernel
             self._kernels[mark] = load_dataset(
-                self._train, self._held, self.joint, model, kernel=length, like=self._like
+                self._train,
+                self._held,
+                self.joint,
+                model,
+                kernel=length,
+                like=self._like,
+                shifts=[w.shifts for w in (*self.data.train, *self.data.held_out)],
             )
         return self._kernels[mark]

@@ -66,13 +66,23 @@ OBSERVED_BY: Final[Mapping[str, Mapping[str, tuple[str, ...]]]] = {
         "deflection": ("deflection",),
         "axis": ("axis",),
     },
-    "link": {"link": ("link",), "sum": ("sum",), "axis": ("axis",)},
+    "link": {
+        "link": ("link",),
+        "sum": ("sum",),
+        "axis": ("axis",),
+        "kinematic": ("kinematic",),
+    },
     "transmission": {
         "transmission": ("transmission",),
         "deflection": ("deflection",),
         "axis": ("axis",),
+        "kinematic": ("kinematic",),
     },
-    "torsion": {"transmission": ("transmission",), "deflection": ("deflection",)},
+    "torsion": {
+        "transmission": ("transmission",),
+        "deflection": ("deflection",),
+        "kinematic": ("kinematic",),
+    },
     "drive": {
         "motor": ("motor",),
         "sum": ("sum",),
@@ -86,6 +96,7 @@ OBSERVED_BY: Final[Mapping[str, Mapping[str, tuple[str, ...]]]] = {
         "transmission": ("transmission",),
         "deflection": ("deflection",),
         "sum": ("sum",),
+        "kinematic": ("kinematic",),
     },
 }
 """Balances in which an effect of a place can be seen."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, final
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from casadi_models import EFFECTS, Effect
 from identification.balance.clocks import MOST_SKEW, carrier
+from identification.data.formats import chances
 from identification.diagnosis.candidates import Candidate, NotTestable, offered
 from identification.diagnosis.trials import Base, Trial, try_candidate
 
@@ -43,9 +44,9 @@ MINOR_P: Final = 0.01
 """p-value up to which a small effect is certain; stricter than a claim's, for the same reason."""
 SET_T: Final = 2.0
 """Blocks tell two names apart from this t on: five in a hundred by chance."""
-SET_LOST: Final = 0.15
-"""Share of the best name's gain up to which another one does as well, whatever the blocks say:
-names off by the grid of their shapes lose as much.
+SCREEN_LOST: Final = 0.15
+"""Share of the best trial's gain up to which the name of another is worth a whole fit, whatever the
+blocks say of the trials: names off by the grid of their shapes lose as much.
 """
 SET_RMS: Final = 1.5
 """Factor by which a name of the set may leave more than the best one in any balance."""
@@ -88,6 +89,9 @@ class Claim:
         RMS of what the effect adds to its balance [N.m].
     like : str
         "like NAME, which explains 97 %", where the law is not shown to be as good as a curve.
+    confidence : mapping of str to float
+        Chance of each name that it is the one that is missing, from the likelihoods of whole fits;
+        empty where none were made.
     """
 
     effects: tuple[str, ...]
@@ -98,11 +102,22 @@ class Claim:
     partial: bool = False
     contribution: float = 0.0
     like: str = ""
+    confidence: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def effect(self) -> Effect:
         """The effect of the first name."""
         return EFFECTS[self.effects[0]]
+
+    @property
+    def surety(self) -> str:
+        """How sure each name is, in words; empty where no whole fits were made."""
+        return chances(self.confidence)
+
+    def with_hint(self) -> Claim:
+        """The claim with what would separate its names; without a hint where there is one name."""
+        hints = [EFFECTS[n].separate_by for n in self.effects if EFFECTS[n].separate_by]
+        return replace(self, separate_by=hints[0] if len(self.effects) > 1 and hints else None)
 
     def as_json(self) -> dict[str, Any]:
         """The shape of `improve --json`."""
@@ -116,6 +131,8 @@ class Claim:
             out["partial"] = True
         if self.like:
             out["like"] = self.like
+        if self.confidence:
+            out["confidence"] = dict(self.confidence)
         return out
 
 
@@ -263,7 +280,9 @@ def _major(trial: Trial, base: Base) -> bool:
 
 
 def confusion_set(best: Trial, trials: Sequence[Trial], base: Base) -> tuple[str, ...]:
-    """Names that these records cannot tell from the best one, the best first."""
+    """Names that the trials cannot tell from the best one, the best first: whole fits decide
+    between them (:mod:`identification.naming.odds`).
+    """
     names = [best.key]
     if best.effect.stage == "structure" and base.data.sensing.both_positions:
         return (best.key,)
@@ -279,7 +298,7 @@ def confusion_set(best: Trial, trials: Sequence[Trial], base: Base) -> tuple[str
             else math.inf
         )
         t = float(np.mean(difference)) / spread if spread > 0 else 0.0
-        alike = abs(t) < SET_T or lost < SET_LOST
+        alike = abs(t) < SET_T or lost < SCREEN_LOST
         involved = [i for i in range(len(best.rms)) if best.rms[i] > 0]
         ratio = max(float(other.rms[i] / best.rms[i]) for i in involved)
         if alike and ratio <= SET_RMS and _still_helps(other, best):
@@ -324,17 +343,14 @@ def make_claim(
     """The claim that follows from the best trial."""
     names = names or confusion_set(best, ranking.everything, base)
     names = (best.key, *(n for n in names if n != best.key))
-    hints = [EFFECTS[n].separate_by for n in names if EFFECTS[n].separate_by]
-    separate = hints[0] if len(names) > 1 and hints else None
     held = best.held_out_drop_percent
     return Claim(
         names,
         best.candidate.label,
         best.balance,
         best.cv_drop_percent if math.isnan(held) else held,
-        separate,
         contribution=best.contribution,
-    )
+    ).with_hint()
 
 
 def minor_claims(ranking: Ranking, base: Base) -> list[Trial]:

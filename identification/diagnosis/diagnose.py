@@ -134,7 +134,7 @@ class Diagnosis:
                 f"cannot be told apart here: {', '.join(self.claims[0].effects)}; separate by "
                 f"{self.claims[0].separate_by}"
             )
-        return "\n".join([*lines, self.reason])
+        return "\n".join([self.reason, *lines])
 
     def __repr__(self) -> str:
         names = [list(c.effects) for c in self.claims]

@@ -172,7 +172,7 @@ class Improvement:
             )
             lines.append(
                 f"{'in part' if claim.partial else 'missing'}: {names} ({claim.balance} "
-                f"balance){apart}"
+                f"balance){f'; {claim.surety}' if claim.confidence else ''}{apart}"
             )
         return "\n".join(lines)
 

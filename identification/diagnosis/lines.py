@@ -25,6 +25,7 @@ from identification.balance.balances import Memory, residual_expressions
 from identification.balance.calibration import settled, values_on
 from identification.balance.clocks import shifted
 from identification.balance.dataset import Dataset, run_name
+from identification.balance.kinematic import residual_unit
 from identification.balance.sensing import Sensing, signals_of
 from identification.balance.stamps import EVEN
 from identification.balance.weak import POSITION_CHAINS, Grid, WeakRecord, kernel, whole
@@ -542,7 +543,7 @@ def _line(peak: Peak, order: float, one: _Tracked, names: tuple[str, ...], joint
         effects=names,
         held_out_drop_percent=_held_out_drop(peak, one.held),
         per="metre" if linear else "motor turn",
-        unit="N" if linear else "N.m",
+        unit=residual_unit(one.balance, "linear" if linear else "rotary"),
         order_error=peak.error,
         amplitude_low=max(peak.amplitude - band, 0.0),
         amplitude_high=peak.amplitude + band,

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from casadi_models.quantities import linear_unit
 from casadi_models.signals import one_line
 from identification.balance.balances import balances_of
+from identification.balance.kinematic import residual_unit
 from identification.balance.weak import WeakRecord
 from identification.diagnosis.locate import axes as signals_of_rows
 from identification.diagnosis.locate import table_r2
@@ -193,7 +194,8 @@ def gather(data: Dataset, records: Sequence[WeakRecord] | None = None) -> Rows:
     put("time", running_time(chosen), "s")
     velocity = found["motor_velocity"][0]
     block = np.concatenate([w.block for w in chosen])
-    return Rows(out, block, velocity > 0, "N" if linear else "N.m")
+    unit = residual_unit(data.sensing.balances[0], data.joint.kind)
+    return Rows(out, block, velocity > 0, unit)
 
 
 def _motor_angle(

@@ -22,6 +22,7 @@ from identification.balance.excitation import (
     not_identifiable,
     unlike_units,
 )
+from identification.balance.kinematic import without_scale
 from identification.data.check.gate import gate_warnings, gated
 from identification.data.joint_file import Joint
 from identification.data.record import Record
@@ -139,6 +140,10 @@ class _Standing:
     def now(self) -> Step:
         return self.steps[-1]
 
+    def with_claim(self, position: int, claim: Claim) -> tuple[Claim, ...]:
+        """The claims with another one in a place."""
+        return tuple(claim if i == position else c for i, c in enumerate(self.claims))
+
 
 @final
 class Session:
@@ -162,6 +167,7 @@ class Session:
         self._refused: dict[str, str] = {}
         self._doubted: dict[str, str] = {}
         self._located: dict[str, str] = {}
+        self._near: dict[str, Mapping[str, float]] = {}
 
     @property
     def data(self) -> Dataset:
@@ -252,6 +258,7 @@ class Session:
             )
             claim = make_claim(best, ranking, base, shortened(names, ranking))
             label = best.candidate.label
+            self._near[label] = _behind(best, ranking)
             if len(claim.effects) > LARGEST_SET:
                 unnamed = unnamed or claim
                 for t in ranking.everything:
@@ -310,6 +317,8 @@ class Session:
                 f"Stopped at the limit of additions ({len(standing.claims)}): {title} "
                 "would be the next."
             )
+        if standing.claims:
+            standing, ranking, base = self._by_whole_fits(standing, ranking, base, stale=stale)
         last = None if lean else (ranking, base)
         found = self.finish(
             first, last, standing.steps, standing.claims, following=stopped, unnamed=unnamed
@@ -398,6 +407,7 @@ class Session:
                 *hardly_a_model(steps[0]),
                 *excitation_warnings(self.data),
                 *self._about_temperature(judged),
+                *([scale] if (scale := self._scale(solution)) else []),
                 *unseen(solution),
                 *without_link(solution),
                 *without_motor(self.data),
@@ -413,6 +423,10 @@ class Session:
         )
 
     # --- inside -----------------------------------------------------------------------------------
+
+    def _scale(self, solution: Solution) -> str:
+        """What torques are worth where none was recorded."""
+        return without_scale(solution.model, self.data.sensing, self.joint.known)
 
     def _within(self, low: float, span: float) -> Progress:
         """Progress of a part of the run."""
@@ -509,7 +523,8 @@ class Session:
             and (t.key in best.effect.confused_with or best.key in t.effect.confused_with)
             and t.candidate.label in ranking.significant
             and t.candidate.label not in refused
-            and t.key not in names
+            # a trial's columns say little of a law that is read backwards
+            and (t.key not in names or self.data.sensing.kinematic)
             and t.score >= RELATIVE_SHARE * best.score
         ][:MOST_RELATIVES]
         if not relatives:
@@ -532,6 +547,46 @@ class Session:
         others = names if found.key in names else tuple(t.key for t in alike)
         kept |= set(others) - set(left)
         return found, (found.key, *(k for k in others if k in kept and k != found.key))
+
+    def _by_whole_fits(
+        self, standing: _Standing, ranking: Ranking, base: Base, *, stale: bool
+    ) -> tuple[_Standing, Ranking, Base]:
+        """The claims with the names that whole fits leave and how sure each is, and the ranking on
+        the model that this ends with.
+
+        A name of the model that falls out gives its place to the one that fits best. `stale`: the
+        ranking is that of an earlier model.
+        """
+        self.progress("fitting the names of each claim", 0.8)
+        swapped: set[str] = set()
+        for position in range(len(standing.claims)):
+            claim = standing.claims[position]
+            if stale:
+                base = self.bench.base(standing.now.solution)
+                ranking, stale = self.bench.ranking(base), False
+            odds = self.bench.odds(claim, self._near.get(claim.label, {}), standing.now, ranking)
+            if odds is None or not odds.rivals:
+                continue
+            self._doubted.update(odds.behind)
+            best = odds.rivals[0]
+            told = replace(claim, confidence=odds.probability)
+            if claim.effects[0] in odds.names:
+                more = [n for n in odds.names if n != claim.effects[0]]
+                told = replace(told, effects=(claim.effects[0], *more))
+                standing = _Standing(standing.steps, standing.with_claim(position, told))
+                continue
+            if best.label in swapped or any(c.label == best.label for c in standing.claims):
+                continue
+            swapped.add(best.label)
+            told = replace(told, effects=odds.names, label=best.label)
+            made = self._replay(standing.with_claim(position, told), standing, best.solution.values)
+            if len(made.claims) == len(standing.claims):
+                self._refused[claim.label] = odds.behind[claim.label]
+                standing, stale = made, True
+        if stale:
+            base = self.bench.base(standing.now.solution)
+            ranking = self.bench.ranking(base)
+        return _with_hints(standing), ranking, base
 
     def _told_apart(self, new: Claim, standing: _Standing) -> _Standing | None:
         """A name of an earlier set that asks to be added beside it: where it alone does better,
@@ -675,6 +730,7 @@ class Session:
                 if claim.effects[0] in names:
                     continue
                 renewed = make_claim(best, ranking, base, names)
+                self._near[renewed.label] = _behind(best, ranking)
                 self._refused[claim.label] = (
                     f"explains less than {best.candidate.effect.title} once the later effects "
                     "are in the model"
@@ -685,6 +741,7 @@ class Session:
                     current[position] = renewed
                     return self._replay(current, standing)
             if same is not None:
+                self._near[claim.label] = _behind(same, ranking)
                 names = confusion_set(same, ranking.everything, base)
                 names = (claim.effects[0], *(n for n in names if n != claim.effects[0]))
                 current[position] = replace(
@@ -791,3 +848,17 @@ class Session:
                         u, frequency_hz=spectral_peak(before.solution, self.data, u.balance)
                     )
         return out
+
+
+def _behind(best: Trial, ranking: Ranking) -> dict[str, float]:
+    """By how much the trial of each other name in the same balance is behind [nats]."""
+    return {
+        t.key: best.score - t.score
+        for t in reversed(ranking.everything)
+        if t.balance == best.balance and t.key != best.key and t.score > 0
+    }
+
+
+def _with_hints(standing: _Standing) -> _Standing:
+    """The claims with the hint that belongs to the names that are left of each."""
+    return _Standing(standing.steps, tuple(c.with_hint() for c in standing.claims))

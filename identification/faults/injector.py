@@ -29,6 +29,8 @@ KINDS: Final[tuple[Kind, ...]] = (
     "drift",
     "delay",
 )
+SPIKES: Final = 10.0
+"""Spikes in a second, on average: a loose plug, as the thesis's injected faults have them."""
 ABRUPT: Final = ("noise", "stuck", "zero", "dropout", "spike", "bias")
 """Kinds that begin at their full size."""
 
@@ -138,7 +140,7 @@ def _faulty(
     if fault.kind == "dropout":
         return float("nan")
     if fault.kind == "spike":
-        hit = rng.random(count) < 10.0 * dt
+        hit = rng.random(count) < SPIKES * dt
         hit[0] = True
         spiked: FloatArray = part + np.where(hit, fault.size * rng.choice([-1.0, 1.0], count), 0.0)
         return spiked

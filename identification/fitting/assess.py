@@ -13,6 +13,7 @@ import numpy.typing as npt
 from casadi_models import JointModel
 from identification.balance.balances import balances_of
 from identification.balance.calibration import settled
+from identification.balance.kinematic import residual_unit
 from identification.balance.weak import WeakRecord
 from identification.fitting.engine import (
     Dataset,
@@ -33,6 +34,7 @@ VERDICT_KERNELS: Final = {
     "sum": 0.06,
     "deflection": 0.06,
     "axis": 0.2,
+    "kinematic": 0.06,
 }
 """Kernel at which a balance is compared with its floor: where records without a hidden effect
 read 1 [s].
@@ -106,6 +108,19 @@ class Error:
         }
 
 
+def relative_error_percent(
+    model: JointModel, data: Dataset, records: Sequence[WeakRecord], values: Mapping[str, float]
+) -> float:
+    """The relative error of `assess` alone, without noise floors: fast enough for a slider."""
+    balances = balances_of(model, data.sensing, wrt=())
+    values = settled(model, data.sensing, [*data.train, *records], values)
+    whole, measured = stack(balances, records, values).residual, references(data, records)
+    rows = {b: taking_part(b, records) for b in balances.balances}
+    r = np.concatenate([whole[b][rows[b]] for b in balances.balances])
+    y = np.concatenate([measured[b][rows[b]] for b in balances.balances])
+    return 100 * float(np.linalg.norm(r)) / (float(np.linalg.norm(y)) or 1e-300)
+
+
 def assess(
     model: JointModel, data: Dataset, records: Sequence[WeakRecord], values: Mapping[str, float]
 ) -> Error:
@@ -122,13 +137,12 @@ def assess(
     )
     weights = {b: w[rows[b]] for b, w in weights.items()}
     floor = {b: f[rows[b]] for b, f in floor.items()}
-    unit = "N.m" if model.kind == "rotary" else "N"
     errors = {
         b: BalanceError(
             rms(residual[b] * weights[b]) / max(rms(weights[b]), 1e-300),
             rms(floor[b] * weights[b]) / max(rms(weights[b]), 1e-300),
             rms(residual[b] * weights[b]) if np.any(floor[b] > 0) else math.inf,
-            unit,
+            residual_unit(b, model.kind),
             residual[b],
             weights[b],
         )

@@ -13,10 +13,12 @@ import numpy as np
 import numpy.typing as npt
 
 from casadi_models import JointModel
+from casadi_models.hold import CLOCKS
 from casadi_models.term import HANGING, LOAD_COMPLIANCE
 from identification.balance.balances import Balances, balances_of
 from identification.balance.calibration import bare, is_of_run, names_of_runs, usual
 from identification.balance.dataset import Dataset, load_dataset, prepared_model, weak_record
+from identification.balance.kinematic import held_scale
 from identification.balance.noise import effective_share
 from identification.balance.stacked import (
     Stacked,
@@ -26,6 +28,7 @@ from identification.balance.stacked import (
     rms,
     row_weights,
     stack,
+    sure_levels,
     taking_part,
 )
 from identification.errors import InputError
@@ -188,26 +191,37 @@ def _fitted(
     """The fit itself; the parameters `held` keep their start values."""
     values, free, limits, unseen = _posed(model, data, start, held)
     shapes = {p.name for p in model.parameters if p.is_shape}
+    softening = model.named("softening")
     known_before = usual(model, data.train, torque=data.sensing.has_torque)
     balances = balances_of(model, data.sensing, wrt=bare(free))
     tell = progress or (lambda text, share: None)
     tell("start values", 0.0)
     # first pass without shapes: linear amplitudes from any start
     linear_only = [n for n in free if n not in shapes and not is_of_run(n)]
+    # the load of a first guess says nothing about when it turns: first without gap
+    soft = {n: values[n] for n in softening} if data.sensing.kinematic else {}
     linear = WeakForm(
-        balances, data, values, tuple(linear_only), dict.fromkeys(balances.balances, 1.0)
+        balances,
+        data,
+        {**values, **dict.fromkeys(soft, 0.0)},
+        tuple(linear_only),
+        dict.fromkeys(balances.balances, 1.0),
     )
     _check_moves(linear)
-    values, _ = linear.fitted(limits, 3)
+    values = {**linear.fitted(limits, 3)[0], **soft}
     values = _best_start(balances, data, values, free, limits)
-    for number in range(2):
-        tell(("first pass", "second pass")[number], 0.2 + 0.35 * number)
+    for number in range(GAP_PASSES if balances.has_gap else 2):
+        tell("first pass" if number == 0 else "second pass", 0.2 + 0.35 * min(number, 1))
+        began = values
         sigma = _sigmas(model, data, values)
         weights = row_weights(balances, data, values, sigma, data.train)
         before = _beside(known_before, _independent(balances, data, values))
         values, used = WeakForm(balances, data, values, tuple(free), weights, before).fitted(
             limits, iterations
         )
+        gaps = [n for n in free if n in shapes and values[n]]
+        if number and all(abs(values[n] / began[n] - 1) < SETTLED_GAP for n in gaps):
+            break
     sigma = _sigmas(model, data, values)
     weights = row_weights(balances, data, values, sigma, data.train)
     tell("standard errors", 0.9)
@@ -246,6 +260,7 @@ def _posed(
     values = starts(model, data)
     values.update({k: v for k, v in start.items() if k in values})
     fixed = {n: k.value for n, k in known.items() if k.value is not None and n in values}
+    fixed.update(held_scale(model, data.sensing, known))
     values.update({n: v for n, v in fixed.items() if v is not None})
     limits = bounds_of(model, known, data)
     unseen = [n for n in unseen_by(model, data) if n not in fixed]
@@ -356,8 +371,12 @@ def _beside(
 
 def _sigmas(model: JointModel, data: Dataset, values: Mapping[str, float]) -> dict[str, float]:
     """RMS of each balance on the training rows, at least its floor."""
-    residual = stack(balances_of(model, data.sensing, wrt=()), data.train, values).residual
     floor = floors(model, data, values)
+    if data.sensing.kinematic:
+        # rows in a gap are no equations: what they leave is no measure of the others
+        level = sure_levels(model, data, values)
+        return {b: max(level[b], floor[b], 1e-12) for b in level}
+    residual = stack(balances_of(model, data.sensing, wrt=()), data.train, values).residual
     return {
         b: max(rms(r[taking_part(b, data.train)]), floor[b], 1e-12) for b, r in residual.items()
     }
@@ -391,6 +410,11 @@ def _best_start(
     trials = [dict(values)]
     for factor in GAP_FACTORS if gaps else ():
         trials.append({**values, **{n: factor * values[n] for n in gaps}})
+    if data.sensing.kinematic:
+        trials += [
+            {**values, **dict.fromkeys(gaps, share * data.ranges["torsion"])}
+            for share in GAP_SHARES
+        ]
     for share in (0.003, 0.01) if smooth else ():
         for power in (1.0, 2.0) if exponents else (1.0,):
             moved = {
@@ -403,11 +427,15 @@ def _best_start(
     sigma = {b: max(floor[b], 1e-12) for b in floor}
     reference = trials[-1]
     weights = row_weights(balances, data, reference, sigma, data.train)
-    bare = balances_of(balances.model, data.sensing, wrt=())
+    if data.sensing.kinematic:
+        # which rows lie inside a gap is not known before the gap is
+        weights = {b: np.ones(len(row)) for b, row in weights.items()}
+        free = [n for n in free if bare([n])[0] not in CLOCKS and n not in smooth]
+    bare_ones = balances_of(balances.model, data.sensing, wrt=())
     best: tuple[float, dict[str, float]] | None = None
     for trial in trials:
         fitted, _ = WeakForm(balances, data, trial, tuple(free), weights).fitted(limits, 6)
-        residual = stack(bare, data.train, fitted).residual
+        residual = stack(bare_ones, data.train, fitted).residual
         cost = sum(float(np.sum((residual[b] * weights[b]) ** 2)) for b in residual)
         if best is None or cost < best[0]:
             best = (cost, fitted)
@@ -418,6 +446,16 @@ GAP_FACTORS: Final = (0.1, 0.3, 3.0)
 """Sizes from which a gap of the transmission is fitted beside its start value: inside a gap that is
 too wide nothing is carried, its stiffness goes to its bound, and the gap then moves nothing. A
 catalogue is wrong by a factor 3, a start by guess by 10."""
+
+
+GAP_PASSES: Final = 8
+"""Passes of a fit in which rows inside a gap count less: which rows these are follows from the gap,
+and each pass takes most of what is wrong of it away."""
+SETTLED_GAP: Final = 2e-3
+"""Relative change of a gap from one pass to the next at which these end: a tenth of its error."""
+GAP_SHARES: Final = (0.05, 0.1, 0.2, 0.3, 0.5, 0.7)
+"""Shares of the twist from which a gap is fitted where no torque is recorded: what the link's load
+leaves of the twist may be next to all of it."""
 
 
 def _check_moves(problem: WeakForm) -> None:
@@ -468,7 +506,7 @@ def _with_errors(
     at_bound = _at_bound(balances.model, values, free, limits)
     usable = np.array(
         [
-            norm > NO_COLUMN * norms.max() and n not in at_bound
+            norm > NO_COLUMN * norms.max(initial=0.0) and n not in at_bound
             for n, norm in zip(free, norms, strict=True)
         ]
     )
@@ -477,7 +515,7 @@ def _with_errors(
     unidentified = [
         n
         for n, norm in zip(free, norms, strict=True)
-        if norm <= NO_COLUMN * norms.max() and n not in smoothing
+        if norm <= NO_COLUMN * norms.max(initial=0.0) and n not in smoothing
     ]
     # without stiffness the link would fall off: the twist follows no torque of these records
     unidentified += [n for n in balances.model.named("stiffness") if n in at_bound]
@@ -487,7 +525,7 @@ def _with_errors(
         unit = np.outer(norms[index], norms[index])
         within = np.ix_(index, index)
         whole = whole_without(scaled.T @ scaled, noise.whole[0][within] / unit)
-        grams, scores = noise.by_block(weights, stacked.block)
+        grams, scores = noise.by_block(weights, stacked.block, stacked.taking)
         apart = (grams[:, index][:, :, index] / unit, scores[:, index] / norms[index])
         errors = block_errors(scaled, r, block, apart, whole)
         # rows of the prior were made heavier by the share; they scatter as the prior itself does

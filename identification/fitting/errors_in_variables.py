@@ -54,21 +54,26 @@ class NoiseProducts:
         return np.asarray(grams.sum(axis=0)), np.asarray(scores.sum(axis=0))
 
     def by_block(
-        self, weights: Mapping[str, FloatArray], block: IntArray
+        self,
+        weights: Mapping[str, FloatArray],
+        block: IntArray,
+        taking: Mapping[str, npt.NDArray[np.bool_]],
     ) -> tuple[FloatArray, FloatArray]:
-        """Both for each block of rows, (blocks, p, p) and (blocks, p): by the squares of its
-        weights.
+        """Both for each block of rows, (blocks, p, p) and (blocks, p): by the squares of the
+        weights of its rows that take part.
 
         Parameters
         ----------
         weights : mapping of str to (rows,) array
         block : (rows,) int array
             Block of each row, -1 for none.
+        taking : mapping of str to (rows,) bool array
         """
         numbers = np.unique(block[block >= 0])
+        squares = {b: w**2 * taking[b] for b, w in weights.items()}
         share = {
-            b: np.array([np.sum(w[block == n] ** 2) for n in numbers]) / max(float(w @ w), 1e-300)
-            for b, w in weights.items()
+            b: np.array([np.sum(w[block == n]) for n in numbers]) / max(float(w.sum()), 1e-300)
+            for b, w in squares.items()
         }
         return (
             np.asarray(sum(share[b][:, None, None] * g for b, g in self.gram.items())),
@@ -92,7 +97,7 @@ def noise_products(problem: WeakForm) -> NoiseProducts:
     for record in data.train:
         rows = slice(first, first + record.rows)
         first = rows.stop
-        drawn = draws_of(record, data.noise)
+        drawn = draws_of(record, data.sources)
         for draw in drawn:
             calm, noisy = (
                 stack(balances, [w], problem.values, free) for w in (draw.calm, draw.noisy)
@@ -107,6 +112,14 @@ def noise_products(problem: WeakForm) -> NoiseProducts:
                 gram[b] += moved.T @ moved
                 score[b] += moved.T @ ((noisy.residual[b] - calm.residual[b]) * weight)
     return NoiseProducts(gram, score)
+
+
+def no_noise(problem: WeakForm) -> NoiseProducts:
+    """Products of a problem from whose rows nothing is taken off."""
+    size, names = len(problem.free), problem.balances.balances
+    return NoiseProducts(
+        {b: np.zeros((size, size)) for b in names}, {b: np.zeros(size) for b in names}
+    )
 
 
 def whole_without(whole: FloatArray, noise: FloatArray) -> FloatArray:
@@ -146,6 +159,10 @@ def unbiased(
     x = np.array([problem.values[n] for n in problem.free])
     moves = (x > low) & (x < high)
     clocks = problem.clocks
+    if problem.balances.has_gap:
+        # noise about where a load turns makes the twist jump by the whole gap: no small error, and
+        # what it adds to products is none of a straight line. Such rows count less already
+        return dict(problem.values), no_noise(problem)
     noise = noise_products(problem)
     for _ in range(STEPS):
         rows, jacobian = problem.residual(x), problem.jacobian(x)
@@ -172,7 +189,9 @@ def _newton(
     """Step of the parameters that move to where these rows, less a share of the noise, hold."""
     out = np.zeros(len(moves))
     size = np.linalg.norm(jacobian, axis=0)
-    moved = moves & (size > 1e-12 * size.max())
+    moved = moves & (size > 1e-12 * size.max(initial=0.0))
+    if not moved.any():  # everything is known
+        return out
     scaled, unit = jacobian[:, moved] / size[moved], np.outer(size[moved], size[moved])
     added, pulled = noise.whole
     score = scaled.T @ rows - share * pulled[moved] / size[moved]

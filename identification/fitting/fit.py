@@ -8,6 +8,7 @@ from typing import Any, Final, final
 
 from casadi_models import JointModel
 from identification.balance.dataset import visible_labels
+from identification.balance.kinematic import without_scale
 from identification.data.check.gate import gated
 from identification.data.joint_file import Joint
 from identification.data.record import Record
@@ -58,6 +59,11 @@ class Fit:
         """Parameter table (see :func:`identification.fitting.parameters.parameter_table`)."""
         return parameter_table(self.solution, self.data)
 
+    @property
+    def scale(self) -> str:
+        """What torques are worth where none was recorded; empty where one was."""
+        return without_scale(self.model, self.data.sensing, self.data.joint.known)
+
     def as_json(self) -> dict[str, Any]:
         """Values, errors and flags as data."""
         return {
@@ -84,6 +90,7 @@ class Fit:
             f"{self.joint.name}: fitted to {', '.join(self.data.train_names)}",
             f"model: {effects}",
             f"relative error {self.train.relative_error_percent:.3g} %{held}",
+            *([self.scale] if self.scale else []),
         ]
         shown = [(n, p) for n, p in self.parameters.items() if not p["nuisance"]]
         for name, p in shown[:SHOWN]:

@@ -26,6 +26,9 @@ def joint_text(joint: Joint, solution: Solution, data: Dataset) -> str:
         f"{c.what} of {c.sensor} in {data.train_names[c.run]}": c.as_json()
         for c in calibration_of(solution, data)
     }
-    return toml_text(
-        whole, fitted, {"records": ", ".join(data.train_names), "version": VERSION}, calibration
-    )
+    origin = {
+        "records": ", ".join(data.train_names),
+        "sample_time": min(w.grid.dt for w in data.train),
+        "version": VERSION,
+    }
+    return toml_text(whole, fitted, origin, calibration)

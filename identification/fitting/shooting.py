@@ -31,6 +31,16 @@ RECORD_CHANNELS: Final = {
     "link_position": "link_position",
     "torque": "link_torque",
 }
+OFF_GRID: Final = 0.02
+"""Part of a step by which a difference of quantised values may miss a whole number of steps: the
+smallest step is a quantile, itself exact to the digits of the file.
+"""
+ON_GRID: Final = 0.95
+"""Share of the differences on whole steps that makes a channel quantised: of values that are not, a
+25th part falls within OFF_GRID by chance.
+"""
+STEPS_TOLD: Final = 1e6
+"""Steps between neighbours beyond which OFF_GRID of one step is below the digits of a file."""
 STABLE: Final = 1.5
 """Largest |eigenvalue| times step of the Runge-Kutta steps (their limit is 2.78)."""
 MOST_SUBSTEPS: Final = 40
@@ -182,7 +192,8 @@ def _grain(values: FloatArray) -> float:
     ratio = steps / smallest
     return (
         smallest
-        if float(np.mean(np.abs(ratio - np.round(ratio)) < 0.02)) > 0.95 and ratio.max() < 1e6
+        if float(np.mean(np.abs(ratio - np.round(ratio)) < OFF_GRID)) > ON_GRID
+        and ratio.max() < STEPS_TOLD
         else 0.0
     )
 

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Final, final
 import numpy as np
 import numpy.typing as npt
 
+from identification.balance.stacked import measured
 from identification.balance.weak import WeakRecord
 from identification.errors import InputError
 from identification.fitting.engine import Dataset
@@ -48,6 +49,7 @@ _INPUTS: Final[Mapping[str, tuple[str, ...]]] = {
     "sum": (*_MOTOR, *_TWIST, "link_acceleration"),
     "deflection": (*_MOTOR, *_TWIST),
     "axis": _MOTOR,
+    "kinematic": _LINK,
 }
 
 
@@ -284,12 +286,7 @@ def _io(w: WeakRecord, balance: str, rows: slice) -> tuple[FloatArray, FloatArra
         for n in _INPUTS[balance]
         if n in twist or n in a
     ]
-    return np.column_stack(columns), a[reference_of(balance)][rows, None]
-
-
-def reference_of(balance: str) -> str:
-    """The measured torque of a balance (as in `identification.fitting.engine.references`)."""
-    return {"link": "torque", "transmission": "torque"}.get(balance, "drive")
+    return np.column_stack(columns), measured(balance, w)[rows, None]
 
 
 def _best(

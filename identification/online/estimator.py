@@ -13,6 +13,8 @@ from typing import Any, Final, final
 import numpy as np
 import numpy.typing as npt
 
+from casadi_models.hold import CLOCKS
+from identification.balance.clocks import MOST_SKEW
 from identification.data.joint_file import Joint
 from identification.errors import InputError
 from identification.faults.detector import ABSURD
@@ -20,8 +22,7 @@ from identification.linear.triangle import single_thread
 from identification.online.first_window import (
     fast_recursion,
     first_estimate,
-    least_range,
-    reversal_weights,
+    prior_range,
 )
 from identification.online.grid import Grid
 from identification.online.guard import Guard
@@ -125,12 +126,13 @@ class OnlineEstimator:
         self.needs = [False] * 6
         for k, reading in enumerate(SAMPLED):
             self.needs[reading] = used[k] and self.present[reading]
-        self.samples = Samples(self.rows.timing, self.needs)
+        self.samples = Samples(self.rows.timing, self.needs, self.rows.alignment)
         self.watch = Watch(dt, self.present)
         self.grid = Grid(dt, max(GAP * self.rows.timing.length, 1.5 * dt))
         self.pulse = Pulse(dt, self.rows.timing.length, self.present)
         own = {p.name: (p.low, p.high) for p in self.model.parameters}
         start = dict(zip(self.model.parameter_names, self.model.value_vector(), strict=True))
+        own |= dict.fromkeys(CLOCKS, (-MOST_SKEW * dt, MOST_SKEW * dt))
         self.low = np.array([min(own[n][0], start[n]) for n in self.names])
         self.high = np.array([max(own[n][1], start[n]) for n in self.names])
         self._margin = 1.0
@@ -166,7 +168,7 @@ class OnlineEstimator:
             ]
         )
         rate = self.rows.timing.stride * dt / _RESIDUAL_SECONDS
-        self._check = RowCheck(
+        self.check = RowCheck(
             len(self.balances),
             len(self.names),
             self.friction,
@@ -174,7 +176,7 @@ class OnlineEstimator:
             rate,
             _STRAIN.error_limit,
         )
-        self._reference = [11 if from_link else 1 for from_link in self.from_link]
+        self.reference = [11 if from_link else 1 for from_link in self.from_link]
         self.reset()
         self.recursion(self.theta)  # its functions are made here and not inside a step
 
@@ -269,7 +271,7 @@ class OnlineEstimator:
     @property
     def is_fitted(self) -> bool:
         """True where the joint file has a value for every estimated parameter."""
-        return all(n in self.joint.fitted for n in self.names)
+        return all(n in self.joint.fitted or n in CLOCKS for n in self.names)
 
     @property
     def held(self) -> bool:
@@ -418,7 +420,7 @@ class OnlineEstimator:
     # --- rows -------------------------------------------------------------------------------------
 
     def _row(self, time: float, enable: bool) -> bool:
-        found = self.rows.make(self.samples.window, time)
+        found = self.rows.make(self.samples.window, time - self.samples.lag)
         if found is None:
             return False
         y, h = found
@@ -430,13 +432,13 @@ class OnlineEstimator:
         if self.estimator is None:
             if enable and on.all():
                 self._collected.append((y, h, shares))
-                power = self.rows.signals[self._reference] ** 2
+                power = self.rows.signals[self.reference] ** 2
                 self._set(torque=self._now.torque + power)
                 if len(self._collected) >= self.collect:
                     with single_thread():
                         self._begin()
             return True
-        check = self._check
+        check = self.check
         check(
             *(
                 y,
@@ -446,7 +448,7 @@ class OnlineEstimator:
                 on,
                 self.floor,
                 self.level,
-                self.rows.signals[self._reference],
+                self.rows.signals[self.reference],
                 self._now.square,
                 self._now.torque,
                 self.options.floor_share,
@@ -498,10 +500,7 @@ class OnlineEstimator:
         """Weights (rows, balances) from the shares (rows, 2) and the size of the residuals
         (balances,).
         """
-        level = np.array(
-            [float(np.abs(theta[which]).sum()) if which else 0.0 for which in self.friction]
-        )
-        return reversal_weights(shares * level, self.feels, size)
+        return self.check.weights(shares, theta, size)
 
     def _begin(self) -> None:
         """Start the recursion from the collected rows."""
@@ -511,8 +510,7 @@ class OnlineEstimator:
         first, weight = first_estimate(y, h, least, partial(self._weight_of, shares))
         least = np.maximum(least, self.rows.floor(first.tolist(), self.watch.noise[list(SAMPLED)]))
         y, h = y * weight, h * weight[:, :, None]
-        size = np.maximum(np.abs(first), np.abs(self.theta))
-        self._set(scale=np.maximum(size, least_range(h, y)))
+        self._set(scale=prior_range(first, self.theta, h, y, self.rows.usual))
         self.estimator = self.recursion(self.theta)
         started = self.estimator.begin(y, h, least, overlap=self.rows.timing.overlap)
         if started.undetermined:

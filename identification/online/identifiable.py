@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from identification.data.joint_file import Joint
-from identification.online.first_window import least_range
+from identification.online.first_window import prior_range
 from identification.online.options import OnlineOptions, held_parameters, prepared
 from identification.online.rows import RowMaker
 from identification.online.samples import Samples
@@ -78,19 +78,19 @@ def identifiable(
     options = options or OnlineOptions()
     model, sensing = prepared(truth, options)
     rows = RowMaker(model, sensing, dt, held_parameters(truth))
-    samples = Samples(rows.timing, [True] * 6)
+    samples = Samples(rows.timing, [True] * 6, rows.alignment)
     values = dict(zip(model.parameter_names, model.value_vector(), strict=True))
     theta = np.array([values[n] for n in rows.names])
     kept_y, kept_h = [], []
     for k, row in enumerate(readings.tolist()):
         samples.add((row[Q_M], row[Q_L], row[TAU], row[DRIVE]))
         if k % rows.timing.stride == rows.timing.stride - 1:
-            found = rows.make(samples.window, k * dt)
+            found = rows.make(samples.window, k * dt - samples.lag)
             if found is not None:
                 kept_y.append(found[0])
                 kept_h.append(found[1])
     y, h = np.array(kept_y), np.array(kept_h)
-    scale = np.maximum(np.abs(theta), least_range(h, y))
+    scale = prior_range(theta, theta, h, y, rows.usual)
     least = np.maximum(
         options.floor_share * np.sqrt(np.mean(y**2, axis=0)),
         rows.floor(theta.tolist(), noise[list(SAMPLED)]),

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any, final
 
 from casadi_models import JointModel
+from casadi_models.hold import HOLD_DELAY
 from identification.balance.sensing import Sensing, adapt
 from identification.data.joint_file import Joint
 from identification.errors import InputError
@@ -84,10 +85,16 @@ def sensing_of(model: JointModel, options: OnlineOptions) -> Sensing:
 
 
 def prepared(joint: Joint, options: OnlineOptions) -> tuple[JointModel, Sensing]:
-    """The joint's model adapted to its sensors, known values filled in."""
+    """The joint's model adapted to its sensors, known values filled in.
+
+    A current is commanded and held, so that its reading is early by part of a sample: the model has
+    the same freedom as in a fit (:func:`identification.balance.dataset.prepared_model`).
+    """
     model = joint.model()
     sensing = sensing_of(model, options)
     model = adapt(model, sensing, joint.known)
+    if joint.torque_per_current is not None and not model.named("delay", "drive"):
+        model = model.add(HOLD_DELAY)
     known = {
         k: v.value
         for k, v in joint.known.items()

@@ -17,10 +17,12 @@ import numpy as np
 import numpy.typing as npt
 
 from casadi_models import JointModel, Signals
+from casadi_models.hold import CLOCKS
 from identification.balance.balances import residual_expressions
+from identification.balance.clocks import USUAL_SKEW
 from identification.balance.sensing import Sensing
 from identification.balance.weak import POSITION_CHAINS, differentiated_kernel, kernel
-from identification.online.timing import Timing
+from identification.online.timing import Alignment, Timing
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
@@ -30,6 +32,9 @@ SOURCES: Final = ("motor_position", "link_position", "torque", "drive")
 _NAMES: Final = Signals.names()
 SHARP: Final = 2e-3
 """A smoothing velocity above this is a law of its own, below it only stands for a jump [rad/s]."""
+
+SEEN: Final = 3.0
+"""Standard deviations by which a velocity must stand out of the noise to count as motion."""
 
 
 def linear_parameters(
@@ -78,6 +83,11 @@ class RowMaker:
     names : tuple of str
         Parameters that are estimated.
     balances, shapes : tuple of str
+    usual : (parameters,) array
+        Prior range of parameters that have one whatever the joint: skews of clocks; 0 for others.
+    alignment : Alignment
+        What :class:`identification.online.samples.Samples` does to late channels; :attr:`model` has
+        only what it leaves of their delays.
     uses : (balances, sources) bool array
         Which sampled signals enter which balance.
     """
@@ -90,11 +100,14 @@ class RowMaker:
         held: Container[str] = (),
         shapes: Sequence[str] = (),
     ) -> None:
-        self.model, self.sensing, self.timing = model, sensing, Timing.of(dt)
+        self.sensing, self.timing = sensing, Timing.of(dt)
+        self.alignment = Alignment.of(model, SOURCES, dt)
+        self.model = model = model.with_values(self.alignment.left)
         self.shapes = tuple(shapes)
         self.eta = ca.SX.sym("eta", len(self.shapes))
         self.shape_values = np.array([self._value(n) for n in self.shapes])
         self.names = linear_parameters(model, sensing, held)
+        self.usual = np.array([USUAL_SKEW * dt if n in CLOCKS else 0.0 for n in self.names])
         expressions = residual_expressions(model, sensing)
         self.balances = tuple(expressions)
         e = model.equations
@@ -252,7 +265,7 @@ class RowMaker:
             np.where(np.arange(len(table)) < plain, table.sum(axis=1), 0.0)[:, None]
             for table, plain in ((self._flat_smoothing, new), (self.averaging, 1))
         )
-        self._still = _standstill(self.weights)
+        self.still = _standstill(self.weights, self.velocity_gain)
 
     def _sharpen(self) -> None:
         """Velocities below which a side counts as standing still.
@@ -297,9 +310,9 @@ class RowMaker:
         for i, item in enumerate(self._out):
             buffer.set_res(i, memoryview(item))  # type: ignore[arg-type, unused-ignore]
         self._buffer = buffer
-        self._slow, self._share = np.zeros(2), np.zeros(2)
-        still, self._find_still = self._still.buffer()
-        for i, item in enumerate((self.speed, self._slow)):
+        self._noise, self._sharp_now, self._share = np.zeros(2), np.zeros(2), np.zeros(2)
+        still, self._find_still = self.still.buffer()
+        for i, item in enumerate((self.speed, self._noise, self._sharp_now)):
             still.set_arg(i, memoryview(item))  # type: ignore[arg-type, unused-ignore]
         still.set_res(0, memoryview(self._share))  # type: ignore[arg-type, unused-ignore]
         self._still_buffer = still
@@ -396,8 +409,7 @@ class RowMaker:
         """
         if not self.needed:
             return np.zeros(2)
-        gain, sharp = self.velocity_gain, self.sharp
-        self._slow[:] = max(3 * motor_noise * gain, sharp[0]), max(3 * link_noise * gain, sharp[1])
+        self._noise[:], self._sharp_now[:] = (motor_noise, link_noise), self.sharp
         self._find_still()
         return self._share.copy()
 
@@ -455,11 +467,13 @@ class RowMaker:
         self.made = int(arrays[-1][0])
 
 
-def _standstill(weights: FloatArray) -> Any:
-    """(velocities at the points, (2, points), velocities that count as none) -> share of the
-    kernel at rest or turning, (2,).
+def _standstill(weights: FloatArray, gain: float) -> Any:
+    """(velocities at the points, (2, points), noise of the positions, velocities that count as none
+    without noise) -> share of the kernel at rest or turning, (2,).
     """
-    speed, slow = ca.SX.sym("speed", 2, len(weights)), ca.SX.sym("slow", 2)
+    speed = ca.SX.sym("speed", 2, len(weights))
+    noise, sharp = ca.SX.sym("noise", 2), ca.SX.sym("sharp", 2)
+    slow = ca.fmax(SEEN * gain * noise, sharp)
     shares = []
     for side in range(2):
         share = ca.SX(0)
@@ -468,4 +482,4 @@ def _standstill(weights: FloatArray) -> Any:
             still = ca.fabs(now) < slow[side]
             share += weight * (ca.logic_or(still, now * speed[side, k - 1] < 0) if k else still)
         shares.append(share)
-    return ca.Function("still", [speed, slow], [ca.vertcat(*shares)])
+    return ca.Function("still", [speed, noise, sharp], [ca.vertcat(*shares)])

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from identification.online.rows import SOURCES
-from identification.online.timing import Timing
+from identification.online.timing import Alignment, Timing
 from identification.online.watch import SAMPLED, Watch
 
 FloatArray = npt.NDArray[np.float64]
@@ -26,15 +26,22 @@ class Samples:
     timing : Timing
     needs : sequence of bool
         Readings that rows need.
+    alignment : Alignment
+        What late channels are in the window at their true time with.
     """
 
-    def __init__(self, timing: Timing, needs: Sequence[bool]) -> None:
-        self.timing, self._needs = timing, needs
+    def __init__(self, timing: Timing, needs: Sequence[bool], alignment: Alignment) -> None:
+        self.timing, self._needs, self._alignment = timing, needs, alignment
+        self.lag = alignment.lead * timing.dt
+        """Time by which the window's last sample is older than the newest reading [s]."""
+        self.memory = timing.window + timing.stride + alignment.taps.shape[1] - 1
+        """Samples until a reading has left the window and what lies before it."""
         self.reset()
 
     def reset(self) -> None:
         """Before the first sample."""
         self._buffer = np.zeros((4 * self.timing.window, len(SOURCES)))
+        self._recent = np.zeros((self._alignment.taps.shape[1], len(SOURCES)))
         self._end = 0
         self._started = self._doubt = False
         self._lost = [0] * len(SOURCES)
@@ -52,6 +59,8 @@ class Samples:
     def add(self, new: tuple[float, float, float, float]) -> None:
         """Append a sample; the first one fills the window."""
         length = self.timing.window
+        if self._alignment.late:
+            new = self._aligned(new)
         if self._end == len(self._buffer):
             self._buffer[:length] = self._buffer[-length:].copy()
             self._end = length
@@ -61,6 +70,16 @@ class Samples:
             self._end = length
         self._buffer[self._end] = new
         self._end += 1
+
+    def _aligned(self, new: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+        """Signals at their true time, from the newest readings."""
+        recent = self._recent
+        if not self._started:
+            recent[:] = new
+        recent[:-1] = recent[1:].copy()
+        recent[-1] = new
+        a, b, c, d = np.einsum("kj,jk->k", self._alignment.taps, recent).tolist()
+        return a, b, c, d
 
     def mark(
         self, good: Sequence[bool], failed: Sequence[bool], watch: Watch, *, whole: bool
@@ -80,14 +99,15 @@ class Samples:
         for k, reading in enumerate(SAMPLED):
             bad = not good[reading] and self._needs[reading]
             if bad or failed[reading] or watch.constant[reading] or watch.scaled[reading]:
-                lost[k] = self.timing.window + self.timing.stride
+                lost[k] = self.memory
             elif lost[k]:
                 lost[k] -= 1
         self._doubt = any(lost)
 
     def state(self) -> tuple[list[int], FloatArray]:
         """Everything that changes."""
-        return [self._end, int(self._started), *self._lost], self._buffer
+        table = np.vstack([self._buffer, self._recent])
+        return [self._end, int(self._started), *self._lost], table
 
     def restore(self, plain: Sequence[int], buffer: FloatArray) -> None:
         """Take up what :meth:`state` gave."""
@@ -97,4 +117,4 @@ class Samples:
             [int(v) for v in plain[2:]],
         )
         self._doubt = any(self._lost)
-        self._buffer[:] = buffer
+        self._buffer[:], self._recent[:] = np.split(buffer, [len(self._buffer)])

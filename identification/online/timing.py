@@ -1,13 +1,26 @@
-"""How long the kernels of online rows are, and how often a row is made."""
+"""How long the kernels of online rows are, how often a row is made, and where late channels stand.
+
+The series of a delay of some samples, of which a model has the first term, is off by percents: 6 ms
+late, an inertia came out 3.5 % off. So channels of which the joint file says how late they are go
+into the rows at their true time, encoders by whole samples, which leaves their noise as it is,
+torques by a cubic through four readings, as :mod:`identification.balance.clocks` does.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, final
 
 import numpy as np
+import numpy.typing as npt
 
-from identification.balance.weak import differentiated_kernel, kernel, whole
+from casadi_models import JointModel
+from identification.balance.clocks import ENCODERS, SIGNAL, cubic
+from identification.balance.weak import HALF, differentiated_kernel, kernel, whole
+
+FloatArray = npt.NDArray[np.float64]
 
 _LENGTH: Final = 0.06
 _OVERLAP: Final = 4
@@ -81,3 +94,65 @@ class Timing:
     def delay(self) -> float:
         """Time between a row's instant and the sample at which it is made [s]."""
         return self.reach * self.dt
+
+
+@final
+@dataclass(frozen=True)
+class Alignment:
+    """Weights of the last readings, whose sum is the signal at its true time.
+
+    Attributes
+    ----------
+    lead : int
+        Samples by which the aligned sample is older than the newest reading.
+    taps : (sources, readings) array
+        Oldest reading first; one column where no channel is late.
+    left : mapping of str to float
+        What is left to the model of each delay [s].
+    """
+
+    lead: int
+    taps: FloatArray
+    left: Mapping[str, float]
+
+    @property
+    def late(self) -> bool:
+        """True where there is anything to do."""
+        return bool(self.taps.shape[1] > 1)
+
+    @staticmethod
+    def of(model: JointModel, sources: Sequence[str], dt: float) -> Alignment:
+        """The alignment of a model's delays at their values; `sources` are signals' names."""
+        values = dict(zip(model.parameter_names, model.value_vector(), strict=True))
+        late, left = dict.fromkeys(sources, 0.0), {}
+        for place, signal in SIGNAL.items():
+            for name in model.named("delay", place):
+                samples = values[name] / dt
+                near = round(samples)
+                off = near if place in ENCODERS or abs(samples - near) < HALF else samples
+                late[signal] += off
+                left[name] = (samples - off) * dt
+        # a cubic between two readings needs one more on either side
+        lead = max(0, *(_newest(d) for d in late.values()))
+        ages = {s: lead - d for s, d in late.items()}
+        length = 1 + max(_oldest(a) for a in ages.values())
+        taps = np.zeros((len(sources), length))
+        for k, source in enumerate(sources):
+            whole = math.floor(ages[source])
+            part = ages[source] - whole
+            for age, weight in (
+                zip(range(whole - 1, whole + 3), cubic(part), strict=True)
+                if part
+                else ((whole, 1.0),)
+            ):
+                taps[k, length - 1 - age] = weight
+        return Alignment(lead, taps, left)
+
+
+def _newest(late: float) -> int:
+    return math.ceil(late) + (late != math.floor(late))
+
+
+def _oldest(age: float) -> int:
+    whole = math.floor(age)
+    return whole + 2 * (age != whole)

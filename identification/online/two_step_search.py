@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from casadi_models import JointModel
 from identification.errors import InputError
-from identification.online.first_window import least_range, least_squares
+from identification.online.first_window import least_squares, prior_range
 from identification.online.two_step_rows import SIGNALS, RowWindow, ShapedBalances
 from identification.recursive.estimator import RecursiveLeastSquares
 from identification.two_step.algorithm import (
@@ -260,7 +260,7 @@ def _restarted(
     y, h = y[whole] * weight, h[whole] * weight[:, :, None]
     first = least_squares(y, h, task.least)
     tick()
-    scale = np.maximum(np.maximum(np.abs(first), np.abs(task.theta)), least_range(h, y))
+    scale = prior_range(first, task.theta, h, y, balances.usual)
     made = recursion(task.theta, scale)
     made.begin(y, h, task.least, overlap=balances.overlap)
     return np.sqrt(np.mean((y - h @ made.theta) ** 2, axis=0)), made, scale

@@ -20,8 +20,9 @@ from identification.diagnosis.candidates import Candidate, offered, shape_grid
 from identification.diagnosis.trials import COLLINEAR, Base, columns, make_base, span_of
 from identification.errors import InputError
 from identification.fitting.engine import solve
+from identification.naming.contest import FEWEST
 from identification.planning.motion import Motion
-from identification.planning.rivals import FEWEST, enough
+from identification.planning.rivals import enough
 from identification.planning.runs import Plant, recorded
 
 FloatArray = npt.NDArray[np.float64]

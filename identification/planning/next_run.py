@@ -23,14 +23,10 @@ from identification.diagnosis.improvement import Improvement
 from identification.fitting.covariance import correlations
 from identification.fitting.engine import Solution, solve
 from identification.fitting.information import form_of, information, white_errors
+from identification.naming.contest import FEWEST, Contest, from_every_valley, rivals_of
+from identification.naming.odds import unmodelled_by
 from identification.planning.motion import Motion
-from identification.planning.rivals import (
-    FEWEST,
-    Contest,
-    enough,
-    power,
-    rivals_of,
-)
+from identification.planning.rivals import Foreseen, enough, power
 from identification.planning.runs import (
     SIMULATED,
     Plant,
@@ -54,6 +50,8 @@ KNOWN: Final = 0.1
 STOOD_IN: Final = 10.0
 """Standard error in units of the one with all others known from which others stand in for a
 parameter."""
+LITTLE: Final = 0.1
+"""Log-likelihood below which a run says nothing about a name, however little it is [nats]."""
 SHOWN: Final = 3
 """Runs that are shown for each set."""
 
@@ -319,8 +317,9 @@ def _for_set(
     rivals = rivals_of(claim.effects, claim.balance, start, data)
     if len(rivals) < 2:
         return [], [], []
-    contest = Contest(rivals, data)
-    alive = contest.alive
+    contest = Contest(from_every_valley(rivals, start, data), data)
+    allowance = unmodelled_by(contest, claim.balance)
+    alive = contest.alive(allowance)
     told = [
         f"{contest.leader.name} fits better than {rival.name} by {nats:.3g} nats over blocks "
         f"(deviate {deviate:.2g})"
@@ -334,7 +333,8 @@ def _for_set(
         listed = " / ".join(r.name for r in alive)
         return [], told, [f"{listed}: no motion keeps the limits; widen them"]
     contest = Contest(alive, data)
-    apart = [contest.distances(rows) for _, rows in runs]
+    foreseen = Foreseen(contest)
+    apart = [foreseen.distances(rows) for _, rows in runs]
     simple, same = _one_law(contest, _most(apart))
     told += same
     kept = [k for k, r in enumerate(contest.rivals) if r.name in simple]
@@ -347,8 +347,8 @@ def _for_set(
     never = _stuck(names, most)
     # what no motion separates is no reason to choose one
     counted = [np.where(most < FEWEST, math.inf, a) for a in apart]
-    scored = [(float(c.min()), run, a) for c, (run, _), a in zip(counted, runs, apart, strict=True)]
-    scored = sorted((s for s in scored if math.isfinite(s[0])), key=lambda s: -s[0])
+    scored = [(c, run, a) for c, (run, _), a in zip(counted, runs, apart, strict=True)]
+    scored = sorted((s for s in scored if np.isfinite(s[0]).any()), key=lambda s: -worth(s[0]))
     before = min(abs(float(behind[i] - behind[j])) for i in range(len(kept)) for j in range(i))
     return [_proposal(names, one, before, most) for one in scored[:SHOWN]], told, never
 
@@ -375,10 +375,31 @@ def _one_law(contest: Contest, most: FloatArray) -> tuple[set[str], list[str]]:
     return kept, told
 
 
+def worth(apart: FloatArray) -> float:
+    """What a run is chosen by: mean over the names, each taken to be true, of the logarithm of how
+    far the closest other comes out behind.
+
+    The smallest difference alone would choose a run that tells little whichever name is true over
+    one that tells a hundred times as much of all names but one.
+
+    Parameters
+    ----------
+    apart : (names, names) array
+        Expected log-likelihood differences, infinite for pairs that do not count [nats].
+    """
+    closest = apart.min(axis=1)
+    counted = closest[np.isfinite(closest)]
+    return float(np.mean(np.log(np.maximum(counted, LITTLE)))) if len(counted) else -math.inf
+
+
 def _proposal(
-    names: tuple[str, ...], scored: tuple[float, Run, FloatArray], before: float, most: FloatArray
+    names: tuple[str, ...],
+    scored: tuple[FloatArray, Run, FloatArray],
+    before: float,
+    most: FloatArray,
 ) -> Proposal:
-    least, run, apart = scored
+    counted, run, apart = scored
+    least = float(counted.min())
     seconds = next((t for t in LENGTHS if least * t / SIMULATED >= enough()), LENGTHS[-1])
     scale = seconds / SIMULATED
     return Proposal(

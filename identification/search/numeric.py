@@ -20,11 +20,15 @@ GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 """The larger part of a golden section."""
 
 
+ORDERS = 1000.0
+"""Factor that counts as orders of magnitude (W. Huyer, A. Neumaier 1999, subint)."""
+
+
 def magnitude_limit(x: float, y: float) -> float:
     """Return the point on the way from `x` to `y` that is not orders of magnitude away from `x`."""
-    if 1000.0 * abs(x) < 1.0:
-        return math.copysign(1.0, y) if abs(y) > 1000.0 else y
-    return math.copysign(10.0 * abs(x), y) if abs(y) > 1000.0 * abs(x) else y
+    if ORDERS * abs(x) < 1.0:
+        return math.copysign(1.0, y) if abs(y) > ORDERS else y
+    return math.copysign(10.0 * abs(x), y) if abs(y) > ORDERS * abs(x) else y
 
 
 def slope_and_curvature(

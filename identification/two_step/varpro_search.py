@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Literal, final
+from typing import Final, Literal, final
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +19,12 @@ from identification.two_step.varpro import BudgetSpent, Projection
 
 FloatArray = npt.NDArray[np.float64]
 
+POLISHED: Final = 0.01
+"""Distance from the end of a polish, as a share of the bounds, from which another one would end
+there too: a polish moves by less between two grids of starts.
+"""
+APART: Final = 0.1
+"""Distance between starts, as a share of the bounds: ten of them fit on each axis."""
 STEPS = 40
 """Steps of one polish at most: a start that needs more lies far from the minimum that a
 neighbouring start ends in.
@@ -140,7 +146,7 @@ def _polish_new(
 ) -> None:
     """Polish unless the start lies where an earlier polish ended."""
     width = problem.high - problem.low
-    if any(np.max(np.abs(start - e) / width) < 0.01 for e in ends):
+    if any(np.max(np.abs(start - e) / width) < POLISHED for e in ends):
         return
     ends.append(polish(problem, start, settings.rough))
 
@@ -169,7 +175,7 @@ def repeat_non_negative(problem: Projection, settings: TwoStepSettings, budget: 
     tried: list[FloatArray] = []
     with suppress(BudgetSpent):
         for reduced in ranked:
-            if all(np.max(np.abs(reduced.z - t) / width) > 0.1 for t in tried):
+            if all(np.max(np.abs(reduced.z - t) / width) > APART for t in tried):
                 tried.append(reduced.z)
                 _polish_new(problem, reduced.z, ends, settings)
             if len(tried) >= settings.starts + 4:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import final
+from typing import Final, final
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +16,11 @@ from identification.two_step.varpro_model import SeparableModel
 from identification.two_step.varpro_search import Method, TwoStepSettings
 
 FloatArray = npt.NDArray[np.float64]
+
+OF_THE_LOST: Final = 0.1
+"""Part of a coefficient in the directions that a window does not determine, from which on it counts
+as not determined: a hundredth of its variance.
+"""
 
 
 @final
@@ -59,7 +64,9 @@ def linear_fit(
     ratio = float(np.sqrt(left @ left / max(1, len(left) - len(theta))))
     share = np.linalg.norm(np.where(weak[:, None], vt, 0.0), axis=0)
     lost = tuple(
-        n for n, s, size in zip(model.names, share, norm, strict=True) if s > 0.1 or size == 0
+        n
+        for n, s, size in zip(model.names, share, norm, strict=True)
+        if s > OF_THE_LOST or size == 0
     )
     return LinearFit(theta, ratio, lost)
 

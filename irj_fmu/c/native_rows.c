@@ -4,8 +4,22 @@ static void clear_rows(Twin *m) {
     memset(&m->s.rows, 0, sizeof m->s.rows);
 }
 
-static void append_sample(Rows *r, const double sample[SOURCES]) {
+/* Take late channels at their true time: identification.online.timing.Alignment. */
+static void align(Rows *r, const double reading[SOURCES], double sample[SOURCES]) {
+    int i, k;
+    if (!r->any)
+        for (i = 0; i < TAPS; i++) memcpy(r->recent[i], reading, sizeof r->recent[i]);
+    memmove(r->recent[0], r->recent[1], (TAPS - 1) * sizeof r->recent[0]);
+    memcpy(r->recent[TAPS - 1], reading, sizeof r->recent[0]);
+    for (k = 0; k < SOURCES; k++)
+        for (i = 0, sample[k] = 0; i < TAPS; i++) sample[k] += tap[k][i] * r->recent[i][k];
+}
+
+static void append_sample(Rows *r, const double reading[SOURCES]) {
+    double sample[SOURCES];
     int i;
+    if (TAPS > 1) align(r, reading, sample);
+    else memcpy(sample, reading, sizeof sample);
     if (!r->any) { /* before the first sample stands the first sample */
         for (i = 0; i < 2 * WINDOW; i++) memcpy(r->history[i], sample, sizeof r->history[i]);
         r->any = 1;
@@ -78,17 +92,14 @@ static int make_row(Twin *m, double time) {
     return 1;
 }
 
-/* Share of the kernel in which a side stands still or turns round, as far as its noise lets one see. */
-static double standstill(const Rows *r, int side, double noise) {
-    const double slow = fmax(3 * noise * velocity_gain[side], sharp[side]);
-    double sum = 0;
-    int k;
-    if (!N_NEEDED) return 0;
-    for (k = 0; k < POINTS; k++) {
-        const double now = r->speed[k][side];
-        if (fabs(now) < slow || (k && now * r->speed[k - 1][side] < 0)) sum += point_weight[k];
-    }
-    return sum;
+/* Shares of the kernel in which motor and link stand still or turn round, as far as their noise lets one see. */
+static void standstill(Twin *m, double share[2]) {
+    const double noise[2] = {m->s.watch.noise[Q_M], m->s.watch.noise[Q_L]};
+    share[0] = share[1] = 0;
+    if (!N_NEEDED) return;
+    m->arg[0] = m->s.rows.speed[0]; m->arg[1] = noise; m->arg[2] = sharp;
+    m->res[0] = share;
+    still(m->arg, m->res, m->iw, m->w, 0);
 }
 
 /* RMS that sensor noise alone leaves in each balance. */

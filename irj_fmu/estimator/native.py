@@ -17,7 +17,8 @@ from identification.data.joint_file import Joint
 from identification.errors import InputError
 from identification.online.estimator import OnlineEstimator, OnlineOptions
 from irj_fmu.estimator.native_tables import MAX_WARM_UP, Code, generate
-from irj_fmu.estimator.slave import Estimator, estimator_variables, two_step_variables
+from irj_fmu.estimator.packed import STEP
+from irj_fmu.estimator.slave import estimator_variables, two_step_variables
 from irj_fmu.fmi.archive import content_guid, write_archive
 from irj_fmu.fmi.compiler import (
     TARGETS,
@@ -76,7 +77,7 @@ class NativeSpec:
     name: str
     options: OnlineOptions = OnlineOptions()
     detector_state: bytes | None = None
-    sample_time: float = Estimator.default_sample_time
+    sample_time: float = STEP
 
 
 def build_native(

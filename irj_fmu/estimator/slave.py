@@ -20,7 +20,9 @@ from identification.online.estimator import (
     searched_parameters,
 )
 from identification.online.rows import linear_parameters
+from identification.online.verdict import PLANT
 from identification.online.watch import Q_L, READINGS, W_L
+from irj_fmu.estimator.packed import STEP, load_options
 from irj_fmu.fmi.slave_base import Health, TableSlave
 from irj_fmu.fmi.variables import Value, Variable
 
@@ -355,7 +357,7 @@ class Estimator(TableSlave):
     :class:`identification.online.estimator.OnlineEstimator`.
     """
 
-    default_sample_time = 1e-3
+    default_sample_time = STEP
     resamples = True
     summary = (
         "Online estimation of the parameters of a geared joint, with residuals of its "
@@ -365,7 +367,8 @@ class Estimator(TableSlave):
     def __init__(self, **kwargs: Any) -> None:
         folder = Path(str(kwargs.get("resources") or "."))
         self._packed = load_joint(folder / JOINT_FILE)
-        self._fixed = load_options(folder / OPTIONS_FILE)
+        self._fixed, step = load_options(folder / OPTIONS_FILE)
+        self.__dict__["default_sample_time"] = step
         detector = folder / DETECTOR_FILE
         self._detector_state = detector.read_bytes() if detector.is_file() else None
         self.__dict__["variables"] = (
@@ -496,7 +499,7 @@ class Estimator(TableSlave):
                 f"input not finite or beyond {ABSURD:g} in SI units: {names}; it counts as missing"
             )
             return Health.NUMERIC_TROUBLE
-        if fault > 8 or estimator.held:
+        if fault > PLANT or estimator.held:
             return Health.NUMERIC_TROUBLE
         return Health.WARMING_UP if estimator.warming_up else Health.OK
 
@@ -542,41 +545,11 @@ class Estimator(TableSlave):
         self._told = len(self._estimator.events)
 
 
-def load_options(path: Path) -> OnlineOptions:
-    """Options that an estimator was built with.
-
-    Raises
-    ------
-    InputError
-        Where the file is not one that :func:`options_text` wrote.
-    """
-    import tomllib
-
-    try:
-        return OnlineOptions(**tomllib.loads(path.read_text(encoding="utf-8")))
-    except (OSError, tomllib.TOMLDecodeError, TypeError) as error:
-        raise InputError(
-            f"{path}: not the options of an estimator ({error}); build the FMU again"
-        ) from error
-
-
-def options_text(options: OnlineOptions) -> str:
-    """The options as TOML."""
-    from dataclasses import asdict
-
-    return "".join(
-        f"{name} = {str(value).lower() if isinstance(value, bool) else repr(value)}\n"
-        for name, value in asdict(options).items()
-    )
-
-
 __all__ = [
     "DETECTOR_FILE",
     "JOINT_FILE",
     "OPTIONS_FILE",
     "Estimator",
     "estimator_variables",
-    "load_options",
-    "options_text",
     "two_step_variables",
 ]

@@ -22,7 +22,8 @@ from test_fmu_package import LOADER, clean_environment, ecos
 from identification.data.joint_file import Joint, toml_text
 from identification.online.estimator import OnlineOptions
 from irj_fmu.build import _package
-from irj_fmu.estimator.slave import JOINT_FILE, OPTIONS_FILE, options_text
+from irj_fmu.estimator.packed import options_text
+from irj_fmu.estimator.slave import JOINT_FILE, OPTIONS_FILE
 from irj_fmu.fmi.compiler import header_folder
 from irj_fmu.fmi.package import SlaveSpec, package_slave
 from irj_fmu.fmi.ssp import PARAMETERS, System, multisine_source, write_ssp

@@ -5,6 +5,7 @@ hosts, platforms.
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -32,7 +33,8 @@ from identification.online.estimator import (
 from irj_fmu.build import main
 from irj_fmu.estimator.native import NativeSpec, build_native, native_sources, native_variables
 from irj_fmu.estimator.native_expressions import cheaper
-from irj_fmu.estimator.slave import DETECTOR_FILE, JOINT_FILE, OPTIONS_FILE, Estimator, options_text
+from irj_fmu.estimator.packed import options_text
+from irj_fmu.estimator.slave import DETECTOR_FILE, JOINT_FILE, OPTIONS_FILE, Estimator
 from irj_fmu.fmi.compiler import find_compiler, has_zig, header_folder
 from irj_fmu.fmi.targets import native_targets
 from irj_fmu.host.run import Fmu, Instance
@@ -87,7 +89,9 @@ class Python:
 
     def __init__(self, spec: NativeSpec, folder: Path, parameters: Mapping[str, Any]) -> None:
         write(folder, spec.joint)
-        (folder / OPTIONS_FILE).write_text(options_text(spec.options), encoding="utf-8")
+        (folder / OPTIONS_FILE).write_text(
+            options_text(spec.options, spec.sample_time), encoding="utf-8"
+        )
         if spec.detector_state is not None:
             (folder / DETECTOR_FILE).write_bytes(spec.detector_state)
         self.slave = Estimator(instance_name="python", resources=str(folder))
@@ -231,6 +235,15 @@ CASES: dict[str, tuple[str, OnlineOptions, Callable[[Joint], Joint]]] = {
     "rigid, not fitted": ("irj1b", PLAIN, start_of),
     "motor side only": ("irj1b", replace(PLAIN, has_link=False, has_torque=False), lambda j: j),
     "no torque sensor": ("irj2a", replace(PLAIN, has_torque=False), lambda j: j),
+    "late channels": (
+        "hd3",
+        PLAIN,
+        lambda j: replace(
+            j,
+            effects=(*j.effects, "channel_delay@drive", "channel_delay@link_position_sensor"),
+            fitted=dict(j.fitted) | {"drive_delay": 2.3e-3, "link_position_sensor_delay": 4.4e-3},
+        ),
+    ),
     "internal states": ("irj2a", PLAIN, lambda j: replace(j, effects=(*j.effects, "lugre"))),
 }
 
@@ -505,13 +518,32 @@ def test_equals_python_through_common_failures(
 
 
 @pytest.mark.parametrize(
-    "steps", [(2e-3,), (5e-3,), (3e-4, 1.7e-3, 1.1e-3, 6e-4)], ids=["2 ms", "5 ms", "jitter"]
+    ("built", "steps"),
+    [
+        (STEP, (2e-3,)),
+        (STEP, (4e-3,)),
+        (STEP, (8e-3,)),
+        (16e-3, (16e-3,)),
+        (STEP, (3e-4, 1.7e-3, 1.1e-3, 6e-4)),
+        (4e-3, (3e-3, 5e-3, 4.4e-3)),
+    ],
+    ids=["2 ms", "4 ms", "8 ms", "16 ms", "jitter", "coarse jitter"],
 )
 def test_equals_python_at_coarse_and_uneven_steps(
-    steps: tuple[float, ...], spec: NativeSpec, fmu: Path, table: FloatArray, tmp_path: Path
+    built: float,
+    steps: tuple[float, ...],
+    spec: NativeSpec,
+    fmu: Path,
+    table: FloatArray,
+    tmp_path: Path,
 ) -> None:
-    """All outputs to 1e-9 and right values, with a dropout and a stuck current on the way."""
+    """All outputs to 1e-9 and right values, with a dropout and a stuck current on the way; steps
+    of the host beside that of the estimator.
+    """
     given = {"warm_up": 4.0}
+    if built != STEP:
+        spec = replace(spec, sample_time=built, detector_state=None)
+        fmu = build_native(spec, tmp_path / "native.fmu")
     python = Python(spec, tmp_path, given).slave
     names = estimated_parameters(spec.joint, PLAIN)
     true = dict(
@@ -646,6 +678,21 @@ def test_command_line(tmp_path: Path) -> None:
         assert "No semantic error" in done.stdout + done.stderr
 
 
+@pytest.mark.parametrize("kind", ["estimator", "native"])
+def test_the_step_is_that_of_the_records_of_the_fit(kind: str, tmp_path: Path) -> None:
+    """The joint file says it; a file without it has the usual one."""
+    joint = start_of(replace(reference_joint("irj1b"), name="axis"))
+    for told, step in ((0.0025, b"0.0025"), (None, b"0.001")):
+        path = write(tmp_path / str(told), replace(joint, sample_time=told))
+        assert load_joint(path).sample_time == told
+        out = tmp_path / "dist"
+        assert main([kind, "--joint", str(path), "--out", str(out)]) == 0
+        with zipfile.ZipFile(out / f"axis_{kind}.fmu") as archive:
+            description = archive.read("modelDescription.xml")
+        assert b'stepSize="%s"' % step in description
+        assert b'start="%s"' % step in description.split(b'name="sample_time"')[1][:400]
+
+
 def test_unusable_requests(tmp_path: Path) -> None:
     joint = reference_joint("irj1b")
     for bad, text in (
@@ -765,3 +812,32 @@ def test_valgrind_finds_nothing(fmu: Path, table: FloatArray, tmp_path: Path) ->
     )
     checker = ["valgrind", "-q", "--error-exitcode=9", "--leak-check=full", str(program)]
     replay(checker, "fmu/binaries/linux64/native.so", fmu, hurt(table)[:16_500], tmp_path)
+
+
+# --- written once ---------------------------------------------------------------------------------
+
+FIGURE = re.compile(r"(?<![\w.])(?:\d+\.\d*|\.\d+|\d+)(?:[eE][+-]?\d+)?(?![\w.])")
+PLAIN_NUMBERS = {"0", "1", "2", "3", "4", "5", "0.5", "1.0"}
+"""Counts, indices, halves and wholes. No limit, time or factor of the estimator is among them."""
+OTHER_NUMBERS = {
+    "native_estimator.c": ["768"],
+    "native_fault.c": ["11", "13", "16"],
+    "native_residuals.c": ["16", "17", "18"],
+    "native_state.h": ["40", "64"],
+}
+"""Room for texts, and positions in the outputs of the observer and among the residuals."""
+
+
+def test_no_figure_of_the_estimator_stands_in_c(spec: NativeSpec) -> None:
+    """Every limit, time, factor and kernel comes from the Python that has it; what the C has of its
+    own are sizes of the FMI's texts and positions.
+    """
+    sources, _ = native_sources(spec)
+    own = {n for n in sources if n.startswith("native_")} - {"native_config.h", "native_model.c"}
+    assert len(own) > 8
+    found = {}
+    for name in own:
+        text = re.sub(r"/\*.*?\*/|\"(?:[^\"\\]|\\.)*\"", "", sources[name].decode(), flags=re.S)
+        code = [line for line in text.splitlines() if not line.startswith(("#define", "enum"))]
+        found[name] = sorted(set(FIGURE.findall("\n".join(code))) - PLAIN_NUMBERS)
+    assert {n: v for n, v in found.items() if v} == OTHER_NUMBERS

@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import os
 import shlex
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
 from importlib.resources import files
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,7 +22,8 @@ from identification import load_joint, read
 from identification.data.typical import true_values
 from workbench.cli import files as outputs
 from workbench.cli import loop
-from workbench.cli.main import main
+from workbench.cli.help import EXAMPLES, print_untested
+from workbench.cli.main import main, parser
 from workbench.cli.online import fault_text
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -96,8 +99,8 @@ def test_improve_prints_the_ledger_the_claim_and_the_verdict(demo: Path) -> None
         f"missing: {HIDDEN}, motor balance, held-out RMS falls by "
         f"{found['claims'][0]['held_out_drop_percent']:.1f} %" in text
     )
-    assert f"not testable with these records ({len(found['not_testable'])})" in text
-    assert found["reason"] in text
+    assert f"not testable ({len(found['not_testable'])}): -v lists them" in text
+    assert lines[0] == found["reason"]
 
 
 def test_no_progress_bar_where_there_is_no_terminal(demo: Path) -> None:
@@ -254,9 +257,15 @@ def test_diagnose_ranks_and_says_what_cannot_be_tested(
     ]
     assert main([*command, "--json", str(tmp_path / "d.json")]) == 0
     text = capsys.readouterr().out
-    assert text.startswith("1. Stribeck effect  -")
-    assert "not testable: extra_inertia: " in text
     found = data(tmp_path, "d.json")
+    answer, first, *_ = text.splitlines()
+    assert answer == found["reason"]
+    assert first.startswith("1. Stribeck effect  -")
+    assert f"not testable ({len(found['not_testable'])}): -v lists them" in text
+    assert "extra_inertia: " not in text
+    assert "\x1b" not in text  # colours are for a terminal
+    print_untested([SimpleNamespace(**n) for n in found["not_testable"]], verbose=True)
+    assert "not testable: extra_inertia: " in capsys.readouterr().out
     assert found["claims"][0]["effects"] == [HIDDEN]
     assert found["ranking"][0]["effect"] == HIDDEN
 
@@ -710,3 +719,50 @@ def test_every_verb_has_help(capsys: pytest.CaptureFixture[str]) -> None:
         assert stopped.value.code == 0
         text = capsys.readouterr().out
         assert "--json" in text, verb
+
+
+# --- first steps ----------------------------------------------------------------------------------
+
+
+def test_irj_alone_shows_three_examples_and_every_example_is_understood(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main([]) == 0
+    text = capsys.readouterr().out
+    assert text.count("\n  irj ") == 3
+    shown = [line.split("  ")[1] for line in text.splitlines() if line.startswith("  irj ")]
+    own = {name for name, sub in parser().verbs.items() if sub.add_help}
+    assert set(EXAMPLES) == own
+    for line in [*shown, *(line for lines in EXAMPLES.values() for line in lines)]:
+        words = shlex.split(line.partition(" > ")[0].removeprefix('eval "$(').removesuffix(')"'))
+        assert words[0] == "irj"
+        assert parser().parse_args(words[1:]).verb in own
+    with pytest.raises(SystemExit):
+        main(["check", "--help"])
+    assert capsys.readouterr().out.endswith(f"examples:\n  {EXAMPLES['check'][0]}\n")
+
+
+def test_a_slip_gets_the_word_that_was_meant(capsys: pytest.CaptureFixture[str]) -> None:
+    for words, meant in (
+        (["diagnos", "x.csv"], "did you mean 'diagnose'?"),
+        (["check", "x.csv", "--jont", "j.toml"], "did you mean '--joint'?"),
+    ):
+        with pytest.raises(SystemExit):
+            main(words)
+        assert meant in capsys.readouterr().err
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="no bash")
+def test_the_completion_script_completes(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["completion", "bash"]) == 0
+    script = capsys.readouterr().out
+    for words, expected in (
+        ("irj dia", "diagnose"),
+        ("irj improve --held", "--held-out"),
+        ("irj joints comp", "compare"),
+    ):
+        ask = f'COMP_WORDS=({words}); COMP_CWORD={len(words.split()) - 1}; _irj; echo "$COMPREPLY"'
+        done = subprocess.run(
+            ["bash", "-c", f"{script}\n{ask}"], capture_output=True, text=True, check=True
+        )
+        assert done.stdout.split() == [expected]

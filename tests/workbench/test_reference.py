@@ -109,6 +109,7 @@ def test_what_is_written_is_what_is_read() -> None:
         orders=(12.0, 36.0),
         virtual_work=False,
         torque_per_voltage=3.5,
+        sample_time=2.5e-3,
         columns={"motor_current": {"column": "iq", "unit": "mA", "sign": -1}},
     )
     fitted = {"motor_viscous": {"value": 3.0, "stderr": 0.1, "unit": "N.m.s/rad", "side": "link"}}
@@ -120,7 +121,7 @@ def test_what_is_written_is_what_is_read() -> None:
     assert again.fitted["motor_viscous"] == 3.0
     assert again.errors == {"motor_viscous": 0.1}
     assert set(tables["calibration"]["zero"]) == {"value", "unit"}
-    assert tables["provenance"] == {"records": "a, b", "version": "1"}
+    assert tables["provenance"] == {"records": "a, b", "sample_time": 2.5e-3, "version": "1"}
 
 
 def test_a_column_is_written_as_it_is_read() -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import base64
+import csv
 import hashlib
 import html
+import io
 import json
 import os
 import re
@@ -27,13 +29,26 @@ from identification.diagnosis.diagnose import diagnose
 from identification.diagnosis.improve import Improvement, improve
 from identification.diagnosis.lines import Line
 from identification.diagnosis.locate import Unexplained
+from identification.diagnosis.outcome import OUTCOMES
+from identification.diagnosis.places import AXIS_TITLES
 from identification.errors import InputError
 from identification.fitting.fit import fit
 from workbench.show import results as fragments_html
+from workbench.show.beside import read_result
+from workbench.show.chart import ticks
 from workbench.show.fragments import pattern_of
-from workbench.show.pictures import ticks
-from workbench.show.plots import Overlay, decimated, overlay_json, report_plots, worst_window
+from workbench.show.pictures import axis_label, place_chart
+from workbench.show.plots import (
+    Overlay,
+    decimated,
+    explained,
+    overlay_json,
+    report_plots,
+    worst_window,
+)
 from workbench.show.report import json_for_html, render_report, write_report
+from workbench.show.results import floor_percent
+from workbench.show.words import OUTCOME_WORDS, kind_of, title_of
 
 EVIL = "<script>alert('x')</script>&\"</title>"
 VOID = {"meta", "br", "img", "input", "hr", "link"}
@@ -233,6 +248,99 @@ def everything(improvement: Improvement) -> Improvement:
         warnings=(f"triangle only {EVIL}",),
         not_testable=(NotTestable("thermal_friction", f"too short {EVIL}"),),
     )
+
+
+def test_the_first_page_tells_all(improvement: Improvement, records: list[Record]) -> None:
+    text = render_report(
+        improvement, records=records, author=f"A. Smith {EVIL}", notes="new oil\ncold"
+    )
+    front = text[text.index('<div class="front">') : text.index('<nav id="details"')]
+    said = " ".join("".join(outline(front).text).split())
+    assert "Found what was missing" in said
+    assert "What to measure next" in said
+    assert '<section class="verdict found"' in front
+    assert front.count('<svg class="picture"') == 2, "the staircase, and the place that told"
+    floor = floor_percent(improvement.as_json()["steps"][-1]["held_out"])
+    assert f"noise alone: {number(floor, 2)} %" in said, "the noise floor on the staircase"
+    assert "coulomb·tanh(" in said, "the law as a formula"
+    parameters = improvement.as_json()["steps"][-1]["parameters"]
+    value = next(v for k, v in parameters.items() if "coulomb" in k)
+    assert with_error(value["value"], value["stderr"]) in said, "and in numbers"
+    assert "s-law" in front, "drawn through the residual"
+    assert "new oil" in said
+    assert f"A. Smith {html.escape(EVIL, quote=True)}" in text
+
+
+def test_a_set_stays_a_set_in_every_part(improvement: Improvement) -> None:
+    shown = replace(everything(improvement), verdict="complete")
+    result = shown.as_json()
+    assert kind_of(result) == "set"
+    both = "Coulomb friction or Stribeck effect"
+    assert both in fragments_html.ledger_html(result)
+    text = render_report(shown)
+    said = " ".join("".join(outline(text).text).split())
+    assert "as one of several names" in said
+    assert said.count(both) >= 4, "staircase, law, ledger, addition"
+    assert '<section class="verdict set"' in text
+
+
+def test_every_axis_of_every_chart_says_its_side(
+    improvement: Improvement, records: list[Record]
+) -> None:
+    text = render_report(improvement, records=records)
+    labels = re.findall(r"<text[^>]*>([^<]*\[[^<]*\])</text>", text)
+    assert len(labels) > 10
+    sideless = ("[s]", "[Hz]", "[K]", "[dB]", "[°]")
+    for label in labels:
+        unit = label[label.rindex("[") :]
+        assert unit in sideless or re.search(r"\b(motor|gear|link)\b", label), label
+    for axis in AXIS_TITLES:
+        shown = str(axis_label(axis, AXIS_TITLES[axis], "rad"))
+        assert axis in ("time", "temperature") or "at the" in shown or "referred to" in shown
+
+
+def test_a_chart_and_its_table_hold_the_same_points(improvement: Improvement) -> None:
+    plots = report_plots(improvement)
+    assert plots is not None
+    step = plots.additions[0]
+    law = explained(step.before, step.after)
+    chart = place_chart(step.before, step.after, law=law)
+    rows = list(csv.reader(io.StringIO(chart.csv())))
+    assert rows[0][1] == "motor velocity, referred to the link [rad/s]"
+    drawn = {name: [float(r[2]) for r in rows[1:] if r[0] == name] for name in ("before", "law")}
+    assert np.allclose(drawn["before"], step.before.branches[0].mean, rtol=1e-8)
+    assert np.allclose(drawn["law"], drawn["before"] - step.after.branches[0].mean, atol=1e-8)
+    frame = chart.frame()
+    assert frame is not None
+    assert frame.y[0] == -frame.y[1]
+
+
+def test_another_result_stands_beside_with_what_moved(
+    improvement: Improvement, records: list[Record], tmp_path: Path
+) -> None:
+    joint = replace(improvement.joint, name="next week")
+    later = improve([swing(3, "later", coulomb=1.4)], joint, [swing(4, "held later", coulomb=1.4)])
+    file = tmp_path / "later.json"
+    file.write_text(json.dumps(later.as_json()), encoding="utf-8")
+    page = render_report(improvement, beside={EVIL: read_result(file)})
+    outline(page)
+    assert "<script>alert" not in page
+    rows = re.search(r'<section id="beside".*?</section>', page, re.DOTALL)
+    assert rows
+    marked = re.findall(r'<tr class="flagged"><th scope="row">([^<]*)</th>', rows[0])
+    assert [m for m in marked if "coulomb" in m], "the friction that changed"
+    assert not [m for m in marked if "inertia" in m], "what did not change is not marked"
+    other = tmp_path / "other.json"
+    other.write_text("{}", encoding="utf-8")
+    with pytest.raises(InputError, match="no result of"):
+        read_result(other)
+
+
+def test_no_internal_name_is_shown() -> None:
+    assert title_of("stribeck@motor") == "Stribeck effect (motor)"
+    assert title_of("sinusoidal#2") == title_of("sinusoidal")
+    assert "#" not in title_of("drive#0")
+    assert set(OUTCOMES) <= set(OUTCOME_WORDS)
 
 
 def test_sets_lines_rest_and_warnings_are_shown(improvement: Improvement) -> None:

@@ -248,7 +248,9 @@ def test_page_shows_faults_readings_and_parameters(page: str) -> None:
         "put into healthy readings on purpose",
     ):
         assert words in page
-    assert page.count('class="s-after band"') == 11, "a band for every parameter"
+    assert page.count('class="s-after band"') == 12, (
+        "a band for every parameter, the hold of the current too"
+    )
 
 
 def test_timeline_draws_the_failure_where_it_was(failed: Replay) -> None:

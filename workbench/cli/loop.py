@@ -7,6 +7,8 @@ from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from importlib.resources import as_file, files
+from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from identification.data.check.gate import gate_warnings
@@ -26,6 +28,7 @@ from workbench.cli.files import (
     write_json,
     write_text,
 )
+from workbench.cli.help import bold, print_untested
 
 
 def improve_files(
@@ -96,7 +99,7 @@ def run_improve(arguments: Namespace) -> int:
         max_additions=arguments.max_steps,
         reference=arguments.reference,
     )
-    print_improvement(found)
+    print_improvement(found, verbose=arguments.verbose)
     write_json(arguments.json, data)
     if arguments.output:
         write_text(arguments.output, found.to_joint_file())
@@ -108,6 +111,7 @@ def run_improve(arguments: Namespace) -> int:
 
 def run_report(arguments: Namespace) -> int:
     """`irj report`."""
+    beside = results_beside(arguments.beside)
     data, found, records = improve_files(
         arguments.records,
         arguments.held_out,
@@ -116,7 +120,15 @@ def run_report(arguments: Namespace) -> int:
     )
     print(found.reason)
     write_json(arguments.json, data)
-    _write_report(found, records, arguments.output, arguments.command)
+    _write_report(
+        found,
+        records,
+        arguments.output,
+        arguments.command,
+        author=arguments.author or "",
+        notes=arguments.notes or "",
+        beside=beside,
+    )
     return 0
 
 
@@ -131,21 +143,46 @@ def run_demo(arguments: Namespace) -> int:
         data, found, records = improve_files(
             [names["train.npz"]], [names["held_out.npz"]], names["joint.toml"]
         )
-    print_improvement(found)
+    print_improvement(found, verbose=arguments.verbose)
     write_json(arguments.json, data)
     write_picture(found, arguments.picture)
     _write_report(found, records, arguments.report, arguments.command)
     return 0
 
 
+def results_beside(paths: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Results of other runs by the names of their files, read before anything is fitted."""
+    if not paths:
+        return {}
+    from workbench.show.beside import read_result
+
+    return {Path(p).name: read_result(p) for p in paths}
+
+
 def _write_report(
-    found: Improvement, records: Sequence[Record], report: str | None, command: str
+    found: Improvement,
+    records: Sequence[Record],
+    report: str | None,
+    command: str,
+    *,
+    author: str = "",
+    notes: str = "",
+    beside: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
 ) -> None:
     """The report comes last: what it is drawn from stands on the disk before it is drawn."""
     if report:
         from workbench.show.report import write_report
 
-        made = write_report(found, report, records=records, command=command, trust=trusted(found))
+        made = write_report(
+            found,
+            report,
+            records=records,
+            command=command,
+            trust=trusted(found),
+            author=author,
+            notes=notes,
+            beside=beside,
+        )
         print(f"report: {made}")
 
 
@@ -158,8 +195,11 @@ def write_picture(found: Improvement, path: str | None) -> None:
         print(f"picture: {path}")
 
 
-def print_improvement(found: Improvement) -> None:
-    """Steps, claims, what is left and the verdict, for a reader."""
+def print_improvement(found: Improvement, *, verbose: bool = False) -> None:
+    """The verdict, then steps, claims and what is left, for a reader; `verbose`: why effects could
+    not be tested.
+    """
+    print(bold(found.reason))
     if found.data.note:
         print(f"note: {found.data.note}")
     print(f"{'step':<32} {'train %':>8} {'held-out %':>10}   residual over noise floor")
@@ -185,6 +225,8 @@ def print_improvement(found: Improvement) -> None:
             f"{said}: {names}, {claim.balance} balance, held-out RMS falls by "
             f"{claim.held_out_drop_percent:.1f} %{rest}"
         )
+        if claim.confidence:
+            print(f"  by the likelihoods of whole fits: {claim.surety}")
         if claim.separate_by:
             print(
                 f"  these cannot be told apart on these records; {claim.separate_by} would "
@@ -217,12 +259,7 @@ def print_improvement(found: Improvement) -> None:
                 f"calibration found: {c.what} of {c.sensor} in {name} {c.value:.4g} +- "
                 f"{2 * c.stderr:.2g} {c.unit} (taken off, no physics)"
             )
-    if found.not_testable:
-        print(
-            f"not testable with these records ({len(found.not_testable)}): "
-            f"{', '.join(n.effect for n in found.not_testable)}"
-        )
-    print(found.reason)
+    print_untested(found.not_testable, verbose=verbose)
 
 
 def print_places(places: Sequence[Unexplained]) -> None:
@@ -255,6 +292,8 @@ def run_fit(arguments: Namespace) -> int:
         f"relative error {fitted.train.relative_error_percent:.3f} %, fit "
         f"{fitted.train.fit_percent:.2f} %"
     )
+    if fitted.scale:
+        print(f"note: {fitted.scale}")
     _print_parameters(fitted.parameters)
     if arguments.output:
         write_text(arguments.output, fitted.to_joint_file())
@@ -377,10 +416,12 @@ def run_diagnose(arguments: Namespace) -> int:
     print_warnings(found.warnings, [*records, *held])
     if found.data.note:
         print(f"note: {found.data.note}")
-    print(found)
+    answer, _, ranked = str(found).partition("\n")
+    print(bold(answer))
+    if ranked:
+        print(ranked)
     print_places(found.unexplained)
-    for item in found.ranking.not_testable:
-        print(f"not testable: {item.effect}: {item.why}")
+    print_untested(found.ranking.not_testable, verbose=arguments.verbose)
     for key in arguments.why:
         print(found.why(key))
     if arguments.output and found.claims:

@@ -18,6 +18,7 @@ from types import FrameType
 from typing import Any, TextIO, cast, final
 
 from identification import __version__
+from identification.data.schema import meant
 from identification.errors import InputError
 from identification.scratch import release
 from irj_fmu.command_line import (
@@ -31,6 +32,7 @@ from irj_fmu.command_line import (
     terminable,
 )
 from workbench.cli.files import check_outputs
+from workbench.cli.help import welcome, with_examples
 from workbench.cli.user_fmu import module_of
 
 
@@ -112,6 +114,27 @@ def parser() -> OneLineParser:
     )
     demo.add_argument(
         "--picture", metavar="FILE.svg", help="draw the falling error and the place of the residual"
+    )
+    taken = verb(
+        "import", "importing", "look at a measurement file and write the joint file that reads it"
+    )
+    taken.add_argument("records", nargs=1, metavar="FILE", help="record file")
+    taken.add_argument("-o", "--output", metavar="FILE", help="the joint file to write (TOML)")
+    taken.add_argument("--name", metavar="NAME", help="name of the joint (default: the file's)")
+    taken.add_argument(
+        "--kind", choices=("rotary", "linear"), help="kind of the axis (default: as it looks)"
+    )
+    taken.add_argument(
+        "--joint-number",
+        type=int,
+        metavar="N",
+        help="where columns of several joints stand side by side: which (default: the first)",
+    )
+    taken.add_argument(
+        "--gear-ratio", type=float, metavar="R", help="motor angle over link angle (default 1)"
+    )
+    taken.add_argument(
+        "--motor-constant", type=float, metavar="K", help="torque on the motor shaft per ampere"
     )
     checked = verb("check", "records", "check records before a fit", records=True)
     checked.add_argument("--joint", metavar="J", help="joint file: column map and gear ratio")
@@ -303,6 +326,18 @@ def parser() -> OneLineParser:
     )
     report.add_argument(
         "-o", "--output", metavar="FILE", default="irj-report.html", help="the HTML file"
+    )
+    report.add_argument(
+        "--beside",
+        nargs="+",
+        action="extend",
+        metavar="RESULT",
+        default=[],
+        help="results of `irj improve --json` of another date or joint, for a comparison",
+    )
+    report.add_argument("--author", metavar="NAME", help="for the first page")
+    report.add_argument(
+        "--notes", metavar="TEXT", help="for the first page, as what was changed before"
     )
     listed = verb("effects", "library", "list the effect library, or one effect")
     listed.add_argument("key", nargs="?", help="key of one effect")
@@ -533,6 +568,16 @@ def parser() -> OneLineParser:
     plain.add_argument(
         "--picture", metavar="FILE.svg", help="draw Bode plots and poles of the best model"
     )
+    first = verb("joint", "first_joint", "a first joint file for somebody else's FMU")
+    first.add_argument("what", choices=("new",), help="write a new one")
+    first.add_argument("fmu", metavar="MODEL.fmu", help="the FMU")
+    first.add_argument(
+        "--record", metavar="REC", required=True, help="a record of the joint: its channels"
+    )
+    first.add_argument(
+        "--like", metavar="J", help="joint file with the gear ratio and the motor constant"
+    )
+    first.add_argument("-o", "--output", metavar="J", help="where to write (default: print)")
     joints = verb("joints", "joints", "the library of identified joints")
     joints.add_argument(
         "what",
@@ -560,6 +605,15 @@ def parser() -> OneLineParser:
     )
     app.add_argument("--port", type=_port, default=0, help="port of the page (0: any free one)")
     app.add_argument("--no-browser", action="store_true", help="print the address, open nothing")
+    text = "completion of verbs and options for your shell"
+    completed = verbs.add_parser("completion", help=text, description=text)
+    completed.set_defaults(module="help", own_effects=[], parser=made)
+    completed.add_argument("shell", choices=("bash",), help="the shell")
+    for judged in (demo, diagnosed, improved):
+        judged.add_argument(
+            "-v", "--verbose", action="store_true", help="list what is not testable, and why"
+        )
+    with_examples(made)
     return made
 
 
@@ -574,12 +628,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         )  # a terminal that lacks a sign must not cost the results
     if any("\0" in word for word in given):
         parser().error("an argument holds a zero byte; no name of a file or effect has one")
+    if not given:
+        return welcome()
     arguments, rest = parser().parse_known_args(given)
     arguments.rest = rest
     if arguments.module == "fmi":
         arguments.rest, arguments.own_effects = _taken(rest)
     if rest and arguments.module != "fmi":
-        parser().error(f"unrecognized arguments: {' '.join(rest)}")
+        own = parser().verbs[arguments.verb]
+        options = [o for a in own.arguments for o in a.option_strings]
+        close = meant(next((r for r in rest if r.startswith("-")), ""), options)
+        own.error(f"unrecognized arguments: {' '.join(rest)}{close}")
     arguments.command = shlex.join(["irj", *given])
     STOPPED.clear()
     with _watched_interrupt(), _patient_output():

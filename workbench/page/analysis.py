@@ -5,6 +5,7 @@ again.
 from __future__ import annotations
 
 import math
+import secrets
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -42,7 +43,8 @@ from identification.fitting.parameters import parameter_table
 from workbench.page.first import first_look
 from workbench.page.records import thinned
 from workbench.page.session import StepEntry
-from workbench.show.results import headline
+from workbench.show.pictures import place_chart
+from workbench.show.words import headline
 
 FloatArray = npt.NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -137,12 +139,32 @@ class Analysis:
 
     def restore(self, step: StepEntry) -> None:
         """Make the solution of a step of the ledger current again."""
+        self.solution, self.trials = self.solution_of(step), {}
+
+    def solution_of(self, step: StepEntry) -> Solution:
+        """The fitted model of a step of the ledger."""
         known = self._solved.get(_mark(step))
         if known is None:
             model = self.model_of(step.effects, step.virtual_work)
             known = solve(model, self.data, start=step.values, iterations=1)
             self._solved[_mark(step)] = known
-        self.solution, self.trials = known, {}
+        return known
+
+    def with_candidate(self, label: str, hint: Mapping[str, Any] | None = None) -> Solution:
+        """The current model with an effect beside it: the fit that was made ahead, else a first
+        look. Nothing here changes.
+
+        Raises
+        ------
+        InputError
+            The effect is in the model already, or cannot be there.
+        """
+        now = self.current
+        ready = self._prepared.get(label)
+        if ready is not None and ready[0] is now:
+            return ready[1]
+        model, start = self._with(label, hint)
+        return first_look(model, self.data, now, start)
 
     # --- verbs ------------------------------------------------------------------------------------
 
@@ -170,7 +192,7 @@ class Analysis:
             The effect is in the model already, or cannot be there.
         """
         began = time.perf_counter()
-        now = self._current()
+        now = self.current
         ready = self._prepared.get(label)
         if ready is not None and ready[0] is now:
             self.solution, self.trials = ready[1], {}
@@ -180,7 +202,7 @@ class Analysis:
 
     def prepare(self, label: str, hint: Mapping[str, Any] | None = None) -> None:
         """Fit a candidate ahead of the click, so that `add` has it at once."""
-        began, now = time.perf_counter(), self._current()
+        began, now = time.perf_counter(), self.current
         model, start = self._with(label, hint)
         made = solve(model, self.data, start=start)
         entry = self._entry("add", label, self.data, began, made)
@@ -189,18 +211,29 @@ class Analysis:
             label: (now, made, entry),
         }
 
+    def trial_of(self, label: str) -> StepEntry:
+        """The step that adding an effect would make; it is at hand for `add` then.
+
+        Raises
+        ------
+        InputError
+            The effect is in the model already, or cannot be there.
+        """
+        self.prepare(label)
+        return self._prepared[label][2]
+
     def settle(self, step: StepEntry) -> StepEntry:
         """The whole fit of a step that was only looked at."""
-        began, now = time.perf_counter(), self._current()
+        began, now = time.perf_counter(), self.current
         made = solve(now.model, self.data, start=now.values)
         entry = self._entry(step.action, step.label, self.data, began, made)
         self.solution = made
-        return replace(entry, names=step.names, separate_by=step.separate_by)
+        return replace(entry, names=step.names, separate_by=step.separate_by, id=step.id)
 
     def remove(self, label: str) -> StepEntry:
         """Take an effect out of the model: a first look, as `add`."""
         began = time.perf_counter()
-        now = self._current()
+        now = self.current
         try:
             model = without(now.model, label)
         except (KeyError, ValueError) as error:
@@ -211,7 +244,7 @@ class Analysis:
         self, label: str, hint: Mapping[str, Any] | None
     ) -> tuple[JointModel, dict[str, float]]:
         """The model with an effect, and the values to start from."""
-        now = self._current()
+        now = self.current
         trial = self.trials.get(label)
         values = {**now.values, **(trial.values if trial else (hint or {}).get("values", {}))}
         try:
@@ -225,7 +258,7 @@ class Analysis:
     def _looked(
         self, action: str, label: str, model: JointModel, start: Mapping[str, float], began: float
     ) -> StepEntry:
-        made = first_look(model, self.data, self._current(), start)
+        made = first_look(model, self.data, self.current, start)
         entry = self._entry(action, label, self.data, began, made, whole=False)
         self.solution, self.trials = made, {}
         return entry
@@ -239,7 +272,7 @@ class Analysis:
         InputError
             Records in unlike units.
         """
-        now = self._current()
+        now = self.current
         session = Session(self.bench, progress, gate_warnings(self.records))
         found = Diagnosis(session.diagnose(now))
         ranking, claim = found.ranking, None
@@ -298,7 +331,7 @@ class Analysis:
         progress("preparing every sample", 0.1)
         data = load_dataset(self._train, self._held, self.joint, self.start_model)
         progress("fitting every sample", 0.4)
-        now = self._current()
+        now = self.current
         self.solution = solve(
             now.model,
             data,
@@ -310,21 +343,22 @@ class Analysis:
         )
         made = self._entry(step.action, step.label, data, began)
         self.restore(made)
-        return replace(made, exact=True)
+        said = replace(made, names=step.names, separate_by=step.separate_by)
+        return replace(said, exact=True, id=step.id)
 
     # --- views ------------------------------------------------------------------------------------
 
     def compare(self) -> dict[str, Any]:
         """Error, and places with the most telling first, on the held-out records."""
-        now = self._current()
-        rows = self._gathered()
-        residual = self._residuals()
+        now = self.current
+        rows = self.rows
+        residual = self.residuals()
         found = places_of(residual, rows)
         error = self.bench.judged(now, assess(now.model, self.data, self.data.held_out, now.values))
         out: dict[str, Any] = clean(
             {
                 "error": error.as_json(),
-                "places": [p.as_json() for p in found],
+                "places": [p.as_json() | {"chart": place_chart(p).as_json()} for p in found],
                 "worst": self._worst(residual, error, rows),
                 "records": list(self.data.held_out_names),
                 "note": self.note,
@@ -340,7 +374,7 @@ class Analysis:
         InputError
             The records have no such balance.
         """
-        residual = self._residuals()
+        residual = self.residuals()
         if balance not in residual:
             raise InputError(
                 f"no {balance} balance in these records; they have {', '.join(residual)}"
@@ -348,18 +382,19 @@ class Analysis:
         # a curve breaks where a new stretch begins
         breaks = np.concatenate([np.where(w.begins, np.nan, 0.0) for w in self.data.held_out])
         measured = references(self.data, self.data.held_out)[balance] + breaks
-        return self._gathered().axes["time"].values, measured, measured - residual[balance]
+        return self.rows.axes["time"].values, measured, measured - residual[balance]
 
     def parameters(self) -> dict[str, Any]:
         """Table of the parameters of the current model."""
-        table = parameter_table(self._current(), self.data)
-        limits = {p.name: (p.low, p.high) for p in self._current().model.parameters}
+        table = parameter_table(self.current, self.data)
+        limits = {p.name: (p.low, p.high) for p in self.current.model.parameters}
         out: dict[str, Any] = clean(
             {
                 n: {
                     **row,
                     "low": limits.get(n, (None, None))[0],
                     "high": limits.get(n, (None, None))[1],
+                    "held": n in self.joint.known and self.joint.known[n].value is not None,
                 }
                 for n, row in table.items()
             }
@@ -368,7 +403,7 @@ class Analysis:
 
     def to_joint_file(self) -> str:
         """The fitted joint as the text of a joint file."""
-        now = self._current()
+        now = self.current
         own = set(self.start_model.effects) - set(self.joint.effects)
         kept = (
             self.joint if own <= set(now.model.effects) else replace(self.joint, model_name="hd1")
@@ -377,18 +412,29 @@ class Analysis:
 
     # --- inside -----------------------------------------------------------------------------------
 
-    def _current(self) -> Solution:
+    @property
+    def current(self) -> Solution:
+        """The fitted model.
+
+        Raises
+        ------
+        InputError
+            Nothing is fitted yet.
+        """
         if self.solution is None:
             raise InputError("no fit yet: press Fit first")
         return self.solution
 
-    def _gathered(self) -> Rows:
+    @property
+    def rows(self) -> Rows:
+        """The held-out rows with their signals."""
         if self._rows is None:
             self._rows = gather(self.data, self.data.held_out)
         return self._rows
 
-    def _residuals(self) -> dict[str, FloatArray]:
-        now = self._current()
+    def residuals(self) -> dict[str, FloatArray]:
+        """Residual of every balance on the held-out rows."""
+        now = self.current
         return dict(
             stack(
                 Balances(now.model, self.data.sensing, wrt=()), self.data.held_out, now.values
@@ -427,7 +473,7 @@ class Analysis:
         """A step of the ledger; without `whole` a first look, judged on the held-out records
         only.
         """
-        now = made or self._current()
+        now = made or self.current
         bench = (
             self.bench
             if data is self.data
@@ -452,6 +498,7 @@ class Analysis:
             exact=self.whole,
             seconds=round(time.perf_counter() - began, 3),
             settled=whole,
+            id=secrets.token_hex(4),
         )
         if data is self.data:
             self._solved[_mark(entry)] = now

@@ -11,20 +11,32 @@ from pathlib import Path
 from typing import Any, Final
 
 from casadi_models.transmission import MODELS
-from identification.data.joint_file import Joint, parse_joint, toml_text
+from identification.data.channels import KINDS
+from identification.data.joint_file import parse_joint
 from identification.data.joint_schema import JOINT
-from identification.data.plain_text import from_toml
+from identification.data.plain_text import from_toml, tables_text
 from identification.errors import InputError
+from workbench.page.charts.choices import held_text, windows_of
+from workbench.page.desk.tree import LONGEST_NAME, given, opened, remarked, used_files
 from workbench.page.live import Live
-from workbench.page.records import guessed_role
+from workbench.page.records import guessed_role, surveyed
 from workbench.page.session import FileEntry, State
 
 LARGEST_JOINT: Final = 1 << 20
 NUMBERS: Final = tuple(key.name for key in JOINT.keys if key.kind == "number")
+DRIVE_TRAIN: Final = {k.name: k.default for k in JOINT.keys if k.name in ("kind", *NUMBERS)}
+"""What fitted values are referred through, with its defaults."""
 
 
 def add_upload(live: Live, name: str, stored: str, size: int) -> dict[str, Any]:
-    """Take a file that is in the session folder: a joint file by its ending, else a record."""
+    """Take a file that is in the session folder: a joint file by its ending, else a record.
+
+    Raises
+    ------
+    InputError
+        A joint file that is wrong, or a file that cannot be read at all: nothing of it is kept. A
+        record that the check gate refuses stays, since another joint or column map may cure it.
+    """
     path = live.session.files / stored
     if name.lower().endswith(".toml"):
         if size > LARGEST_JOINT:
@@ -41,6 +53,8 @@ def add_upload(live: Live, name: str, stored: str, size: int) -> dict[str, Any]:
     entry = live.examine(
         FileEntry(secrets.token_hex(6), name, stored, role, reason, size), soon=True
     )
+    if entry.status == "refused" and not entry.summary:
+        raise InputError(entry.message)
     live.change_input(lambda s: replace(s, files=(*s.files, entry)))
     live.check_soon(entry)
     return {"id": entry.id, "status": entry.status, "message": entry.message}
@@ -59,16 +73,23 @@ def put_upload(live: Live, identifier: str, body: Mapping[str, Any]) -> dict[str
         if body["role"] not in ("train", "held_out"):
             raise InputError("role is 'train' or 'held_out'")
         entry = replace(entry, role=body["role"], role_reason="chosen by hand")
+    if "left_out" in body:
+        entry = replace(entry, left_out=windows_of(body["left_out"]))
     if "columns" in body:
         columns = _columns(body["columns"])
         everywhere = [
             f
             for f in live.state.files
             if f.id == identifier
-            or (body.get("all") and f.status == "columns" and set(_used(columns)) <= set(f.names))
+            or (body.get("all") and f.status == "columns" and _used(columns) <= set(f.names))
         ]
+        kind = str(body.get("kind") or entry.kind)
+        if kind not in ("", *KINDS):
+            raise InputError(f"kind is {kind!r}; give one of {', '.join(KINDS)}")
         made = {
-            f.id: live.examine(replace(entry if f.id == identifier else f, columns=columns))
+            f.id: live.examine(
+                replace(entry if f.id == identifier else f, columns=columns, kind=kind)
+            )
             for f in everywhere
         }
         live.change_input(lambda s: replace(s, files=tuple(made.get(f.id, f) for f in s.files)))
@@ -81,10 +102,13 @@ def put_upload(live: Live, identifier: str, body: Mapping[str, Any]) -> dict[str
 
 
 def drop_upload(live: Live, identifier: str) -> None:
-    """Take a record out of the session and off the disk."""
+    """Take a record out of the session; off the disk where no fit that is kept was made from it."""
     entry = _entry(live.state, identifier)
-    live.change_input(lambda s: replace(s, files=tuple(f for f in s.files if f.id != identifier)))
-    live.session.path_of(entry).unlink(missing_ok=True)
+    now = live.change_input(
+        lambda s: replace(s, files=tuple(f for f in s.files if f.id != identifier))
+    )
+    if entry.stored not in used_files(now):
+        live.session.path_of(entry).unlink(missing_ok=True)
 
 
 def _entry(state: State, identifier: str) -> FileEntry:
@@ -101,9 +125,9 @@ def _columns(given: Any) -> dict[str, Any]:
     for channel, spec in given.items():
         if not isinstance(spec, Mapping):
             raise InputError(f"columns: {channel} must be a table")
-        entry = {k: spec[k] for k in ("column", "unit") if spec.get(k)}
-        for key in ("scale", "counts_per_turn"):
-            if spec.get(key) not in (None, "", 1, 1.0):
+        entry = {k: spec[k] for k in ("column", "formula", "unit") if spec.get(k)}
+        for key in ("scale", "counts_per_turn", "step"):
+            if spec.get(key) not in (None, "", *((1, 1.0) if key != "step" else ())):
                 entry[key] = _number(spec[key], f"{channel}: {key}")
         if spec.get("sign") == -1:
             entry["sign"] = -1
@@ -111,8 +135,35 @@ def _columns(given: Any) -> dict[str, Any]:
     return out
 
 
-def _used(columns: Mapping[str, Any]) -> list[str]:
-    return [str(c.get("column")) for c in columns.values()]
+def _used(columns: Mapping[str, Any]) -> set[str]:
+    return {str(c["column"]) for c in columns.values() if "column" in c}
+
+
+def look(live: Live, identifier: str, body: Mapping[str, Any]) -> dict[str, Any]:
+    """What a record's file holds (see `identification.data.survey`): with the map in the body, the
+    map in use (``now``), or the guess for one of several joints (``number``).
+
+    Raises
+    ------
+    InputError
+        Unknown record; a map that does not fit.
+    """
+    entry = _entry(live.state, identifier)
+    given_map: Mapping[str, Any] | None = None
+    if body.get("columns"):
+        given_map = _columns(body["columns"])
+    number = body.get("number")
+    if number is not None and (isinstance(number, bool) or not isinstance(number, int)):
+        raise InputError(f"number is {number!r}; give a whole number")
+    kind = str(body.get("kind") or "") or (live.kind_of(entry) if live.has_joint else entry.kind)
+    if body.get("now") and given_map is None and number is None:
+        given_map = live.columns_of(entry) or {}
+    path = live.session.path_of(entry)
+    found = surveyed(entry, path, kind or None, given_map, number)
+    others = [
+        f.id for f in live.state.files if f.status == "columns" and set(entry.names) <= set(f.names)
+    ]
+    return {**found, "same": len(others) if entry.status == "columns" else 0}
 
 
 def _number(value: Any, what: str) -> float:
@@ -134,14 +185,18 @@ def set_joint(live: Live, body: Mapping[str, Any]) -> dict[str, Any]:
         What is wrong with it; the joint before it is kept.
     """
     source = str(body.get("source", "joint"))
-    if "text" in body:
+    if "hold" in body:
+        text = held_text(live, body["hold"])
+    elif "text" in body:
         text = str(body["text"])
     else:
-        text = toml_text(_from_form(body, _previous(live.state.joint_text)))
+        text = tables_text(_from_form(body, _previous(live.state.joint_text)))
     parse_joint(from_toml(text, source), source)
+    before = given(live.state)
     changed = live.change_input(lambda s: replace(s, joint_text=text, joint_source=source))
-    made = {f.id: live.examine(f) for f in changed.files}
-    live.change(lambda s: replace(s, files=tuple(made.get(f.id, f) for f in s.files)))
+    if given(changed) != before:
+        made = {f.id: live.examine(f) for f in changed.files}
+        live.change_input(lambda s: replace(s, files=tuple(made.get(f.id, f) for f in s.files)))
     return {"ok": True, "files": [{"id": f.id, "status": f.status} for f in live.state.files]}
 
 
@@ -152,40 +207,56 @@ def _previous(text: str) -> dict[str, Any]:
         return {}
 
 
-def _from_form(body: Mapping[str, Any], previous: Mapping[str, Any]) -> Joint:
-    """The form's fields as a joint; [known] and [columns] of the joint before are kept."""
-    kind = body.get("kind", "rotary")
+def _from_form(body: Mapping[str, Any], previous: Mapping[str, Any]) -> dict[str, Any]:
+    """The tables of the joint before, with the form's fields in them.
+
+    What the form does not show is kept. Two things cannot be: [known] of a parameter that the new
+    model does not have, and values that were fitted to another drive train.
+    """
     model = body.get("model", "hd1")
     effects = body.get("effects", [])
     if model not in MODELS:
         raise InputError(f"model = {model!r} is not known; use one of {', '.join(MODELS)}")
     if not isinstance(effects, list):
         raise InputError("effects must be a list of names")
+    old = previous.get("joint")
+    before: dict[str, Any] = dict(old) if isinstance(old, Mapping) else {}
     table: dict[str, Any] = {
+        **before,
         "name": str(body.get("name") or "joint"),
-        "kind": kind,
+        "kind": body.get("kind") or "rotary",
         "model": model,
         "effects": [str(e) for e in effects],
     }
     for key in NUMBERS:
-        if body.get(key) not in (None, ""):
-            table[key] = _number(body[key], key)
+        if key in body:
+            table.pop(key, None)
+            if body[key] not in (None, ""):
+                table[key] = _number(body[key], key)
     if table.get("gear_ratio") is None:
         raise InputError(
             "gear_ratio is empty; give theta_motor / theta_link with its sign (1 where "
             "everything is measured on one side)"
         )
-    whole = {"joint": table}
-    for part in ("known", "columns"):
-        if previous.get(part):
-            whole[part] = previous[part]
+    whole = {**previous, "joint": table}
+    if any(before.get(k, v) != table.get(k, v) for k, v in DRIVE_TRAIN.items()):
+        for part in ("fitted", "calibration", "provenance"):
+            whole.pop(part, None)
     try:
-        return parse_joint(whole, "joint")
+        parse_joint(whole, "joint")
     except InputError as error:
-        if "[known]" in str(error):
-            whole.pop("known", None)
-            return parse_joint(whole, "joint")
-        raise
+        if "[known]" not in str(error):
+            raise
+        whole["known"] = {k: v for k, v in whole["known"].items() if _fits(whole, k, v)}
+    return whole
+
+
+def _fits(whole: Mapping[str, Any], name: str, entry: Any) -> bool:
+    try:
+        parse_joint({**whole, "known": {name: entry}}, "joint")
+    except InputError as error:
+        return "[known]" not in str(error)
+    return True
 
 
 def joint_form(text: str) -> dict[str, Any]:
@@ -195,6 +266,26 @@ def joint_form(text: str) -> dict[str, Any]:
     table["known"] = data.get("known", {})
     table["columns"] = data.get("columns", {})
     return dict(json.loads(json.dumps(table, default=str)))
+
+
+def change_tree(live: Live, body: Mapping[str, Any]) -> dict[str, Any]:
+    """Open a branch, or a step of one (``open``, ``step``); name a step or write a note on it
+    (``of``, ``name``, ``note``); name the session (``session``).
+
+    Raises
+    ------
+    InputError
+        No such branch or step; other work runs.
+    """
+    texts = {k: str(v) for k, v in body.items() if v is not None}
+    if "open" in texts:
+        live.move(lambda s: opened(s, texts["open"], texts.get("step", "")))
+    elif "session" in texts:
+        live.change(lambda s: replace(s, name=texts["session"].strip()[:LONGEST_NAME]))
+    else:
+        name, note = texts.get("name"), texts.get("note")
+        live.change(lambda s: remarked(s, texts.get("of", ""), name, note))
+    return {"ok": True}
 
 
 def start_demo(live: Live) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
 from collections.abc import Callable, Mapping
@@ -14,7 +15,8 @@ from identification.data.plain_text import from_toml
 from identification.data.record import Record
 from identification.errors import InputError
 from workbench.page.analysis import Analysis, Progress
-from workbench.page.records import checked, opened
+from workbench.page.desk.tree import after_input, given
+from workbench.page.records import checked, opened, without_windows
 from workbench.page.session import FileEntry, Session, State
 from workbench.page.work import CancelledError, Task, Worker
 
@@ -102,7 +104,8 @@ class Live:
         return now
 
     def change_input(self, change: Change) -> State:
-        """As `change`, for records or joint: what was fitted before does not hold any more.
+        """As `change`, for records or joint: where the input of the fits is another one then, they
+        are put away as a branch.
 
         Raises
         ------
@@ -111,9 +114,34 @@ class Live:
         """
         with self.lock:
             self._free()
+            return self.change(lambda s: self._moved(s, after_input(s, change(s))))
+
+    def move(self, change: Change) -> State:
+        """As `change`, to another place of the tree of fits.
+
+        Raises
+        ------
+        BusyError
+            A job runs.
+        """
+        with self.lock:
+            self._free()
+            return self.change(lambda s: self._moved(s, change(s)))
+
+    def _moved(self, before: State, after: State) -> State:
+        """`after`; what was prepared for another input, or another model, is given up."""
+        if given(before) != given(after):
             self.worker.give_up()
             self._analysis = None
-            return self.change(lambda s: change(s).without_fit())
+        elif before.steps[-1:] != after.steps[-1:] and self._analysis is not None:
+            self.worker.give_up()
+            if after.steps:
+                self._analysis.restore(after.steps[-1])
+            else:
+                self._analysis = None
+        if before.joint_text != after.joint_text and self._analysis is not None:
+            self._analysis.joint = joint_of(after)
+        return after
 
     def snapshot(self) -> dict[str, Any]:
         """What the page needs to know at once when something changed."""
@@ -143,12 +171,7 @@ class Live:
         InputError
             None yet, or not a valid one.
         """
-        if not self.state.joint_text:
-            raise InputError(
-                "no joint yet: fill in gear ratio, motor constant and model on the Model page"
-            )
-        source = self.state.joint_source or "joint"
-        return parse_joint(from_toml(self.state.joint_text, source), source)
+        return joint_of(self.state)
 
     # --- records and analysis ---------------------------------------------------------------------
 
@@ -163,10 +186,8 @@ class Live:
             it can be looked at.
         """
         joint = self._joint_or_none()
-        columns = entry.columns or (joint.columns if joint else None)
-        made, record = opened(
-            entry, self.session.path_of(entry), joint.kind if joint else "rotary", columns
-        )
+        path = self.session.path_of(entry)
+        made, record = opened(entry, path, self.kind_of(entry), self.columns_of(entry))
         if record is not None and not (soon and len(record) > SOON):
             made, record = checked(made, record, self.session.path_of(entry), joint)
         with self.lock:
@@ -208,17 +229,15 @@ class Live:
             )
             _LOG.error(said)
             made = replace(entry, status="refused", message=said)
-        self.change(
-            lambda s: replace(
-                s,
-                files=tuple(
-                    replace(made, role=f.role, role_reason=f.role_reason)
-                    if f.id == identifier
-                    else f
-                    for f in s.files
-                ),
+
+        def put(s: State) -> State:
+            files = tuple(
+                replace(made, role=f.role, role_reason=f.role_reason) if f.id == identifier else f
+                for f in s.files
             )
-        )
+            return self._moved(s, after_input(s, replace(s, files=files)))
+
+        self.change(put)
 
     def record(self, identifier: str) -> Record:
         """The record of an upload, read again where it is not in memory.
@@ -242,8 +261,9 @@ class Live:
         with self.building:
             if self._analysis is None:
                 ready = [f for f in self.state.files if f.status == "ready"]
-                train = [self.record(f.id) for f in ready if f.role == "train"]
-                held = [self.record(f.id) for f in ready if f.role == "held_out"]
+                used = [(f.role, without_windows(self.record(f.id), f.left_out)) for f in ready]
+                train = [r for role, r in used if role == "train"]
+                held = [r for role, r in used if role == "held_out"]
                 made = Analysis(self.joint(), train, held)
                 if self.state.steps:
                     made.restore(self.state.steps[-1])
@@ -256,6 +276,21 @@ class Live:
             if self.job is None:
                 self._analysis = None
                 self._records.clear()
+
+    @property
+    def has_joint(self) -> bool:
+        """Whether there is a valid joint."""
+        return self._joint_or_none() is not None
+
+    def columns_of(self, entry: FileEntry) -> Mapping[str, Any] | None:
+        """The column map of a record: its own, else that of the joint file, where there is one."""
+        joint = self._joint_or_none()
+        return entry.columns or (joint.columns if joint else None)
+
+    def kind_of(self, entry: FileEntry) -> str:
+        """Kind of the axis: of the joint, else as the record's columns say it."""
+        joint = self._joint_or_none()
+        return joint.kind if joint else entry.kind or "rotary"
 
     def _joint_or_none(self) -> Joint | None:
         try:
@@ -270,7 +305,13 @@ class Live:
             raise BusyError(f"busy: {self.job.text}; wait for it or cancel it")
 
     def start(
-        self, action: str, text: str, work: Work, after: Callable[[], None] | None = None
+        self,
+        action: str,
+        text: str,
+        work: Work,
+        after: Callable[[], None] | None = None,
+        *,
+        asked: Mapping[str, Any] | None = None,
     ) -> None:
         """Run work in the session's thread; its change is applied only if it came to its end.
 
@@ -281,6 +322,8 @@ class Live:
             ``work(progress) -> change of the state``.
         after : callable, optional
             Called when the change is in the state: queues spare work for the next click.
+        asked : mapping, optional
+            The request, written into the session's folder until the work has ended.
 
         Raises
         ------
@@ -292,6 +335,9 @@ class Live:
             job = self.job = Job(action, text)
             job.task = Task(lambda: self._run(job, work))
             self.error = None
+            if asked is not None:
+                with contextlib.suppress(OSError):  # a full disk: the work itself may still do
+                    self.session.begin({"action": action, **asked})
         self.seen.set()
         self.tell()
         self.worker.submit(Task(lambda: self._guarded(job, after)))
@@ -348,7 +394,12 @@ class Live:
         with self.lock:
             if change is not None:
                 try:
-                    self.state = self.session.save(change(self.state))
+                    made = change(self.state)
+                    if given(made) != given(self.state):
+                        self._analysis = None
+                    elif made.joint_text != self.state.joint_text and self._analysis is not None:
+                        self._analysis.joint = joint_of(made)
+                    self.state = self.session.save(made)
                 except OSError as problem:
                     error = (
                         f"the session folder cannot be written ({problem.strerror}); free "
@@ -360,6 +411,22 @@ class Live:
                 elif self.state.steps:
                     self._analysis = None
             self.job, self.error = None, error
+            with contextlib.suppress(OSError):
+                self.session.end()
+        self.tell()
+
+    def can(self, change: Change) -> bool:
+        """Whether a change has something to do."""
+        try:
+            change(self.state)
+        except InputError:
+            return False
+        return True
+
+    def say(self, error: str) -> None:
+        """A sentence for the page, until the next change."""
+        with self.lock:
+            self.error = error
         self.tell()
 
     def cancel(self) -> bool:
@@ -374,9 +441,20 @@ class Live:
         return True
 
 
-def with_step(state: State, step: Any, **more: Any) -> State:
-    """The state with one more step on the ledger."""
-    return replace(state, steps=(*state.steps, step), undone=(), diagnosis=None, **more)
+def joint_of(state: State) -> Joint:
+    """The joint of a state.
+
+    Raises
+    ------
+    InputError
+        None yet, or not a valid one.
+    """
+    if not state.joint_text:
+        raise InputError(
+            "no joint yet: fill in gear ratio, motor constant and model on the Model page"
+        )
+    source = state.joint_source or "joint"
+    return parse_joint(from_toml(state.joint_text, source), source)
 
 
 def hint_for(state: State, label: str) -> Mapping[str, Any] | None:

@@ -16,6 +16,7 @@ from identification.data.guess import guess_columns
 from identification.data.joint_file import Joint
 from identification.data.read import open_table, read
 from identification.data.record import Record
+from identification.data.survey import survey
 from identification.errors import InputError
 from workbench.page.session import FileEntry
 from workbench.page.uploads import check_unpacked
@@ -23,6 +24,8 @@ from workbench.page.uploads import check_unpacked
 FloatArray = npt.NDArray[np.float64]
 
 HELD_OUT_WORDS: Final = ("test", "held", "valid", "check")
+NO_COLUMN: Final = frozenset(("step", "formula"))
+"""Keys of a map's entry that stand in place of a column."""
 WINDOW: Final = 6.0
 """Length of the windows of a thinned record [s]."""
 
@@ -128,7 +131,7 @@ def _read(path: Path, entry: FileEntry, kind: str, columns: Mapping[str, Any] | 
         used = {
             k: v
             for k, v in columns.items()
-            if not isinstance(v, Mapping) or v.get("column") in names or "step" in v
+            if not isinstance(v, Mapping) or v.get("column") in names or v.keys() & NO_COLUMN
         }
         return read(path, columns=used, kind=kind, name=name)
     return read(path, kind=kind, name=name)
@@ -161,6 +164,30 @@ def _unread(entry: FileEntry, path: Path, kind: str, message: str) -> FileEntry:
     return replace(
         entry, status="columns", message=short, names=tuple(table.names), guess=rows, findings=()
     )
+
+
+def surveyed(
+    entry: FileEntry,
+    path: Path,
+    kind: str | None,
+    columns: Mapping[str, Any] | None,
+    number: int | None = None,
+) -> dict[str, Any]:
+    """What the file holds, with a map: the one given, or the guess.
+
+    Raises
+    ------
+    InputError
+        A map that does not fit the file.
+    """
+    try:
+        made = survey(path, kind=kind, columns=columns, number=number, name=entry.name)
+    except InputError as error:
+        raise InputError(_plain(str(error), path, entry.name)) from None
+    found = made.as_json()
+    for finding in found["findings"]:
+        finding["message"] = _plain(finding["message"], path, entry.name)
+    return found
 
 
 def _plain(message: str, path: Path, name: str) -> str:
@@ -205,6 +232,25 @@ def plot_time(record: Record) -> FloatArray:
         out[part] = record.time[part] - record.time[part.start] + offset
         offset = float(out[part.stop - 1]) + record.dt
     return out
+
+
+def without_windows(record: Record, windows: Sequence[Sequence[float]]) -> Record:
+    """The record without some windows of its plot; the stretches between them stay apart.
+
+    Raises
+    ------
+    InputError
+        Nothing is left.
+    """
+    if not windows:
+        return record
+    time = plot_time(record)
+    keep = np.ones(len(record), dtype=np.bool_)
+    for low, high in windows:
+        keep &= (time < low) | (time > high)
+    if not keep.any():
+        raise InputError(f"{record.name}: every sample is left out; take a window back")
+    return record.take(keep, f"{len(windows)} window(s) left out by hand")
 
 
 def decimated(

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import json
 import math
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, cast, final
 import numpy as np
 
 from identification.data.joint_file import Joint, parse_joint
+from identification.data.plain_text import from_toml
 from identification.data.record import Record
 from identification.errors import InputError
 from irj_fmu.estimator.healthy import detector_state, online_readings
@@ -113,7 +113,7 @@ def replay(
 
     if not steps:
         raise InputError("replay: fit first, the estimator starts from the fitted joint")
-    joint = parse_joint(tomllib.loads(live.analysis().to_joint_file()), "joint")
+    joint = parse_joint(from_toml(live.analysis().to_joint_file(), "joint"), "joint")
     whole = live.record(asked.file)
     part = _part(whole, asked)
     options = OnlineOptions(

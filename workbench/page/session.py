@@ -16,7 +16,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, final
+from typing import Any, ClassVar, Final, final
 
 from identification.errors import InputError
 from identification.scratch import hold, sweep
@@ -69,8 +69,11 @@ class FileEntry:
     message : str
     columns : mapping or None
         Column map that the user confirmed.
+    kind : {"", "rotary", "linear"}
+        Kind of the axis as its columns say it, until there is a joint.
     names, guess : what the file holds and which map is proposed.
     findings, summary : result of the check gate; size, channels and where they come from.
+    left_out : windows that no fit and no judgement takes, in the time of the plot [s].
     """
 
     id: str
@@ -82,10 +85,12 @@ class FileEntry:
     status: str = "ready"
     message: str = ""
     columns: Mapping[str, Any] | None = None
+    kind: str = ""
     names: tuple[str, ...] = ()
     guess: tuple[Mapping[str, Any], ...] = ()
     findings: tuple[Mapping[str, Any], ...] = ()
     summary: Mapping[str, Any] = field(default_factory=dict)
+    left_out: tuple[tuple[float, float], ...] = ()
 
 
 @final
@@ -106,6 +111,8 @@ class StepEntry:
         False while the values come from a part of the samples.
     settled : bool
         False while the values are those of the first look, before the whole fit.
+    id : str
+        Stays the same when the step is fitted further: notes and diagnoses are kept by it.
     """
 
     action: str
@@ -122,6 +129,41 @@ class StepEntry:
     names: tuple[str, ...] = ()
     separate_by: str | None = None
     settled: bool = True
+    id: str = ""
+
+
+@final
+@dataclass(frozen=True)
+class Branch:
+    """A path of fits that was put away, with the input it was made from; the attributes are those
+    of `State`.
+    """
+
+    WORKING: ClassVar[tuple[str, ...]] = (
+        "files",
+        "joint_text",
+        "joint_source",
+        "steps",
+        "undone",
+        "diagnosis",
+        "improvement",
+        "note",
+        "left_open",
+    )
+    """What a branch and the state have in common."""
+
+    id: str
+    parent: str = ""
+    created: float = 0.0
+    files: tuple[FileEntry, ...] = ()
+    joint_text: str = ""
+    joint_source: str = ""
+    steps: tuple[StepEntry, ...] = ()
+    undone: tuple[StepEntry, ...] = ()
+    diagnosis: Mapping[str, Any] | None = None
+    improvement: Mapping[str, Any] | None = None
+    note: str = ""
+    left_open: Mapping[str, Any] = field(default_factory=dict)
 
 
 @final
@@ -142,6 +184,16 @@ class State:
     left_open : mapping
         What the last diagnosis, whatever was added since, could not test, and its warnings about
         the records.
+    name : str
+        Name of the session; empty: that of the joint.
+    branch, parent, ahead : str
+        The current branch, the one it came from, and the one that undo left.
+    branches : tuple of Branch
+        Every other path of fits.
+    found : mapping
+        By step: its diagnosis and the result of the loop that ended there.
+    remarks : mapping
+        By step or branch: ``name`` and ``note``.
     """
 
     revision: int = 0
@@ -155,11 +207,25 @@ class State:
     improvement: Mapping[str, Any] | None = None
     note: str = ""
     left_open: Mapping[str, Any] = field(default_factory=dict)
+    name: str = ""
+    branch: str = "first"
+    parent: str = ""
+    ahead: str = ""
+    branches: tuple[Branch, ...] = ()
+    found: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    remarks: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
 
     def without_fit(self) -> State:
-        """The state before any fit: after a change of records or of the joint."""
+        """The state before any fit, on its records and its joint."""
         return replace(
-            self, steps=(), undone=(), diagnosis=None, improvement=None, note="", left_open={}
+            self,
+            steps=(),
+            undone=(),
+            diagnosis=None,
+            improvement=None,
+            note="",
+            left_open={},
+            ahead="",
         )
 
     def as_json(self) -> dict[str, Any]:
@@ -171,10 +237,21 @@ class State:
         """Read `as_json` back; keys of a newer version are left out."""
         known = set(cls.__dataclass_fields__)
         kept = {k: v for k, v in data.items() if k in known}
-        kept["files"] = tuple(_made(FileEntry, f) for f in kept.get("files", ()))
-        kept["steps"] = tuple(_made(StepEntry, s) for s in kept.get("steps", ()))
-        kept["undone"] = tuple(_made(StepEntry, s) for s in kept.get("undone", ()))
-        return cls(**kept)
+        kept["branches"] = tuple(
+            _made(Branch, {**b, **_entries(b)}) for b in kept.get("branches", ())
+        )
+        return cls(**{**kept, **_entries(kept)})
+
+
+def _entries(data: Mapping[str, Any]) -> dict[str, tuple[Any, ...]]:
+    """Records and steps of a state or a branch."""
+    kinds = (("files", FileEntry), ("steps", StepEntry), ("undone", StepEntry))
+    return {key: tuple(_made(kind, _named(e)) for e in data.get(key, ())) for key, kind in kinds}
+
+
+def _named(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """A record or a step with an identifier: steps of an older version have none."""
+    return {**entry, "id": entry.get("id") or secrets.token_hex(4)}
 
 
 def _made(kind: type[Any], data: Mapping[str, Any]) -> Any:
@@ -228,6 +305,24 @@ class Session:
             raise InputError(
                 f"{path}: the session cannot be read ({error}); start a new one"
             ) from None
+
+    def running(self) -> dict[str, Any] | None:
+        """The job that was at work when the server ended, as `begin` wrote it; None where none
+        was.
+        """
+        try:
+            data = json.loads((self.folder / "running.json").read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return None
+        return data if isinstance(data, dict) else None
+
+    def begin(self, job: Mapping[str, Any]) -> None:
+        """Write down that a job is at work: a killed server finds it again."""
+        write_atomic(self.folder / "running.json", json.dumps(job).encode())
+
+    def end(self) -> None:
+        """No job is at work."""
+        (self.folder / "running.json").unlink(missing_ok=True)
 
     def save(self, state: State) -> State:
         """Write the state with its revision counted up; returns what was written."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -12,10 +13,11 @@ from identification.diagnosis.improve import HOLD_DELAY, Improvement, improve
 from identification.errors import InputError
 from workbench.page import export as app_export
 from workbench.page.analysis import Progress, clean
+from workbench.page.desk import law, tree
 from workbench.page.input import folder_of
-from workbench.page.live import Change, Live, hint_for, with_step
+from workbench.page.live import Change, Live, hint_for
 from workbench.page.session import State, StepEntry
-from workbench.show.results import headline
+from workbench.show.words import headline
 
 PREPARED: Final = 6
 """Best candidates that are fitted ahead of the click after a diagnosis."""
@@ -39,6 +41,7 @@ def run(live: Live, action: str, body: Mapping[str, Any]) -> None:
         "redo": ("redoing", lambda p: _redo(live)),
         "confirm": ("fitting every sample", lambda p: _confirm(live, p)),
         "improve": ("running the whole loop", lambda p: _improve(live, p)),
+        "law": ("trying your law", lambda p: _law(live, body, p)),
         "replay": ("replaying a record", lambda p: _replay(live, body, p)),
         "plan": ("planning a motion", lambda p: _plan(live, body, p)),
         "report": ("writing the report", lambda p: _export(live, "report", p)),
@@ -50,7 +53,28 @@ def run(live: Live, action: str, body: Mapping[str, Any]) -> None:
     if action in ("add", "remove") and not label:
         raise InputError(f"{action}: say which effect")
     text, work = verbs[action]
-    live.start(action, text, work, after=lambda: next_click(live))
+    live.start(action, text, work, after=lambda: next_click(live), asked=dict(body))
+
+
+def resume(live: Live) -> None:
+    """Take up the job that was at work when the server ended; one that was taken up before, and
+    ended the server again, is only named.
+    """
+    asked = live.session.running()
+    if asked is None:
+        return
+    action = str(asked.get("action", ""))
+    live.session.end()
+    if asked.get("again"):
+        live.say(
+            f"{action}: the server ended twice while it ran, so it was not started again; what was "
+            "done before is kept"
+        )
+        return
+    try:
+        run(live, action, {**asked, "again": True})
+    except InputError as error:
+        live.say(f"{action}: was running when the server ended, and cannot go on: {error}")
 
 
 def _fit(live: Live, progress: Progress) -> Change:
@@ -59,7 +83,7 @@ def _fit(live: Live, progress: Progress) -> Change:
     step = analysis.fit_start(
         lambda text, share: progress(f"fitting the start model, {text}", 0.4 + 0.6 * share)
     )
-    return lambda s: replace(s.without_fit(), steps=(step,), note=analysis.note)
+    return lambda s: replace(tree.continued(s, (step,)), note=analysis.note)
 
 
 def _settled(live: Live, progress: Progress) -> tuple[StepEntry, ...]:
@@ -77,7 +101,12 @@ def _diagnose(live: Live, progress: Progress) -> Change:
     steps = _settled(live, progress) or (analysis.fit_start(),)
     found = analysis.diagnose(progress)
     left = {key: found[key] for key in ("warnings", "not_testable")}
-    return lambda s: replace(s, steps=steps, diagnosis=found, note=analysis.note, left_open=left)
+
+    def change(s: State) -> State:
+        made = replace(s, steps=steps, note=analysis.note, left_open=left)
+        return tree.with_found(made, diagnosis=found)
+
+    return change
 
 
 def _add(live: Live, label: str, progress: Progress) -> Change:
@@ -86,31 +115,34 @@ def _add(live: Live, label: str, progress: Progress) -> Change:
     claim = (live.state.diagnosis or {}).get("claim")
     if claim and claim["label"] == label:
         step = replace(step, names=tuple(claim["effects"]), separate_by=claim["separate_by"])
-    return lambda s: with_step(replace(s, steps=steps), step)
+    return lambda s: tree.continued(replace(s, steps=steps), (*steps, step))
+
+
+def _law(live: Live, body: Mapping[str, Any], progress: Progress) -> Change:
+    steps = _settled(live, progress)
+    change = law.tried(live, body, progress)
+    return lambda s: change(replace(s, steps=steps))
 
 
 def _remove(live: Live, label: str, progress: Progress) -> Change:
     steps = _settled(live, progress)
     step = live.analysis().remove(label)
-    return lambda s: with_step(replace(s, steps=steps), step)
+    return lambda s: tree.continued(replace(s, steps=steps), (*steps, step))
 
 
 def _undo(live: Live) -> Change:
-    steps = live.state.steps
-    if len(steps) < 2:
-        raise InputError("nothing to undo: the ledger has the start model only")
-    live.analysis().restore(steps[-2])
-    return lambda s: replace(
-        s, steps=s.steps[:-1], undone=(s.steps[-1], *s.undone), diagnosis=None, improvement=None
-    )
+    return _shift(live, tree.undone)
 
 
 def _redo(live: Live) -> Change:
-    undone = live.state.undone
-    if not undone:
-        raise InputError("nothing to redo")
-    live.analysis().restore(undone[0])
-    return lambda s: replace(s, steps=(*s.steps, s.undone[0]), undone=s.undone[1:], diagnosis=None)
+    return _shift(live, tree.redone)
+
+
+def _shift(live: Live, move: Change) -> Change:
+    made = move(live.state)
+    if tree.given(made) == tree.given(live.state) and made.steps:
+        live.analysis().restore(made.steps[-1])
+    return move
 
 
 def _confirm(live: Live, progress: Progress) -> Change:
@@ -130,9 +162,12 @@ def _improve(live: Live, progress: Progress) -> Change:
     live.analysis().restore(steps[-1])
     story = clean(result.as_json())
     story["headline"] = headline(story)
-    return lambda s: replace(
-        s, steps=steps, undone=(), diagnosis=None, improvement=story, note=analysis.note
-    )
+
+    def change(s: State) -> State:
+        made = replace(tree.continued(s, steps), note=analysis.note)
+        return tree.with_found(made, improvement=story)
+
+    return change
 
 
 def _export(live: Live, kind: str, progress: Progress) -> Change:
@@ -182,6 +217,7 @@ def ledger(result: Improvement, *, exact: bool = True) -> tuple[StepEntry, ...]:
             title=EFFECTS[s.added].title if s.added else None,
             virtual_work=s.solution.model.virtual_work,
             exact=exact,
+            id=secrets.token_hex(4),
         )
         for s in result.steps
     )

@@ -13,12 +13,16 @@ import numpy as np
 from starlette.responses import FileResponse, Response
 
 from casadi_models import EFFECTS
+from casadi_models.effect import PLACE_SIDE
 from casadi_models.transmission import MODELS
+from identification.balance.kinematic import residual_unit
 from identification.data.channels import CHANNELS
 from identification.errors import InputError
 from workbench.page import export as app_export
 from workbench.page import plan as app_plan
 from workbench.page import replay as app_replay
+from workbench.page.charts.asked import CHART_VIEWS, along, run_starts, said, side_of
+from workbench.page.desk import tree
 from workbench.page.input import folder_of, joint_form
 from workbench.page.live import Live
 from workbench.page.pattern import pattern
@@ -35,11 +39,13 @@ def _config(live: Any, query: Query) -> dict[str, Any]:
     return {
         "max_upload": query["max_upload"],
         "channels": ["time", *CHANNELS],
+        "places": list(PLACE_SIDE),
         "models": {name: list(own) for name, own in MODELS.items()},
         "effects": [
             {"key": e.key, "title": e.title, "family": e.family, "places": list(e.acts_on)}
             for e in EFFECTS.values()
         ],
+        "words": said(),
         "report": app_export.report_available(),
         "fmu": app_export.fmu_available(),
     }
@@ -57,7 +63,10 @@ def _decimated(live: Live, query: Query) -> dict[str, Any]:
     names = [n for n in str(query.get("channels", "")).split(",") if n] or list(record.channels)[:1]
     values = [record[n] for n in names]
     stamps, columns, full = decimated(plot_time(record), values, _points(query), _window(query))
-    return _drawn(stamps, names, [record.unit(n) for n in names], columns, full)
+    made = _drawn(stamps, names, [record.unit(n) for n in names], columns, full)
+    for one in made["series"]:
+        one["side"] = side_of(one["name"])
+    return {**made, "runs": run_starts(record)}
 
 
 def first_plot(live: Live, file: str, query: Query) -> dict[str, Any] | None:
@@ -91,8 +100,9 @@ def _balance(live: Live, query: Query) -> dict[str, Any]:
     stamps, columns, full = decimated(
         time, [measured, model, measured - model], _points(query), _window(query)
     )
-    unit = "N" if analysis.joint.kind == "linear" else "N.m"
-    return _drawn(stamps, ("measured", "model", "residual"), [unit] * 3, columns, full)
+    unit = residual_unit(str(query.get("balance", "")), analysis.joint.kind)
+    drawn = _drawn(stamps, ("measured", "model", "residual"), [unit] * 3, columns, full)
+    return {**drawn, "along": along(analysis, stamps)}
 
 
 def _drawn(
@@ -164,6 +174,14 @@ def _library(live: Live, query: Query) -> list[dict[str, Any]]:
     return addable(live)
 
 
+def _tree(live: Live, query: Query) -> dict[str, Any]:
+    return {"branches": tree.shown(live.state), "name": live.state.name}
+
+
+def _fits(live: Live, query: Query) -> dict[str, Any]:
+    return tree.compared(live.state, str(query.get("a", "")), str(query.get("b", "")))
+
+
 def _joint(live: Live, query: Query) -> dict[str, Any]:
     return {"text": live.state.joint_text, "form": joint_form(live.state.joint_text)}
 
@@ -226,6 +244,8 @@ VIEWS: Final[Mapping[str, Callable[[Any, Query], Any]]] = {
     "compare": _compare,
     "parameters": _parameters,
     "library": _library,
+    "tree": _tree,
+    "fits": _fits,
     "joint": _joint,
     "code": _code,
     "joint.toml": _joint_file,
@@ -236,4 +256,5 @@ VIEWS: Final[Mapping[str, Callable[[Any, Query], Any]]] = {
     "replay": _replay,
     "plan": _plan,
     "motion.csv": _motion,
+    **CHART_VIEWS,
 }

@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+
 from casadi_models import EFFECTS
 from casadi_models.quantities import linear_unit
 from identification.data.formats import interval, number, percent, pretty_unit, ratio, words
@@ -18,12 +20,16 @@ from identification.diagnosis.places import AXIS_TITLES, Place
 from identification.fitting.assess import VERDICT_KERNELS
 from workbench.show.bode import bode_html
 from workbench.show.ceiling import ceiling_html
-from workbench.show.pictures import place_picture
-from workbench.show.plots import Overlay, ReportPlots, StepPlace
+from workbench.show.chart import Chart, Curve, FloatArray, Label, Style
+from workbench.show.pictures import place_picture, torque_label
+from workbench.show.plots import Overlay, ReportPlots, StepPlace, decimated, explained
 from workbench.show.results import BALANCES, table, text, title_of
+from workbench.show.words import GLOSSARY
 
 SHOWN_PER_BALANCE: Final = 3
 TELLING_STRENGTH: Final = 2.5
+STILL_POINTS: Final = 700
+"""Points of a curve of a still picture."""
 
 PATTERNS: Final[Mapping[frozenset[str], str]] = {
     frozenset(
@@ -54,6 +60,8 @@ PATTERNS: Final[Mapping[frozenset[str], str]] = {
         ("sum", "deflection")
     ): "a physical effect on the motor side, the current, or a position sensor, which look alike "
     "without a torque sensor",
+    frozenset(("kinematic",)): "the transmission (backlash, lost motion, kinematic error), a load "
+    "on the link, or a position sensor",
     frozenset(("axis",)): "physics or sensor alike: a single balance cannot tell the two apart",
 }
 
@@ -104,39 +112,24 @@ def pattern_html(improvement: Improvement) -> str:
         return ""
     first, last = improvement.steps[0].held_out.balances, improvement.steps[-1].held_out.balances
     _, meaning = pattern_of({b: e.ratio for b, e in first.items()})
-    rows = []
-    for b, e in first.items():
-        end = improvement.final_ratios.get(b, last[b])
-        rows.append(
-            [
-                f"{text(b)} balance",
-                text(BALANCES.get(b, "")),
-                ratio(e.ratio),
-                ratio(last[b].ratio),
-                ratio(end.ratio),
-                _state(e.ratio, end.ratio),
-            ]
-        )
-    kinds = [
-        "flagged" if improvement.final_ratios.get(b, last[b]).ratio > RATIO_LIMIT else ""
-        for b in first
+    rows = [
+        [
+            f"{text(b)} balance",
+            text(BALANCES.get(b, "")),
+            ratio(e.ratio),
+            ratio(last[b].ratio),
+            _state(e.ratio, last[b].ratio),
+        ]
+        for b, e in first.items()
     ]
-    head = [
-        "balance",
-        "what it compares",
-        "start model",
-        "after the additions",
-        "at the verdict",
-        "state",
-    ]
+    kinds = ["flagged" if last[b].ratio > RATIO_LIMIT else "" for b in first]
+    head = ["balance", "what it compares", "start model", "after the additions", "state"]
+    clean = ", ".join(f"{text(b)} {number(1e3 * VERDICT_KERNELS[b])} ms" for b in first)
     note = (
         f"1 × means: only measurement noise is left. Above {number(RATIO_LIMIT)} × counts as "
-        "over the noise. "
-        "Start and additions: all balances averaged over "
-        f"{number(1e3 * improvement.data.kernel)} ms. At the verdict each balance is "
-        "averaged over the time "
-        "at which complete models read 1 ×: "
-        f"{', '.join(f'{text(b)} {number(1e3 * VERDICT_KERNELS[b])} ms' for b in first)}."
+        "over the noise. A balance at its noise is averaged over the time at which complete models "
+        f"read 1 × ({clean}); one with structure left over the time that shows it best, at least "
+        f"{number(1e3 * improvement.data.kernel)} ms."
     )
     return (
         f"<p>{text(meaning)}.</p>"
@@ -156,8 +149,8 @@ def telling(p: Place) -> bool:
     return p.share_percent >= 100 * AXIS_R2 and p.strength >= TELLING_STRENGTH
 
 
-def place_figure(before: Place, after: Place | None) -> str:
-    """A figure of one place with its caption."""
+def place_figure(before: Place, after: Place | None, law: Place | None = None) -> str:
+    """A figure of one place with its caption; `law`: what an addition explains of it."""
     unit = pretty_unit(before.residual_unit)
     share = max(before.share_percent, 0.0)
     said = (
@@ -173,7 +166,8 @@ def place_figure(before: Place, after: Place | None) -> str:
     )
     if len(before.branches) > 1:
         caption += " Forward motion: full line; backward: dashed."
-    return f"<figure>{place_picture(before, after)}<figcaption>{caption}</figcaption></figure>"
+    picture = place_picture(before, after, law=law)
+    return f"<figure>{picture}<figcaption>{caption}</figcaption></figure>"
 
 
 def _largest(p: Place) -> float:
@@ -242,14 +236,15 @@ def addition_html(step: StepPlace, claim: Mapping[str, Any], before: float, afte
     known = EFFECTS.get(step.effect)
     absence = f"<p>How its absence looks: {text(known.absence)}.</p>" if known else ""
     drop = percent(claim["held_out_drop_percent"])
+    names = " or ".join(title_of(k) for k in claim["effects"])
     return (
-        f"<article class='addition'><h3>+ {title_of(step.effect)}</h3><p>Error on held-out "
+        f"<article class='addition'><h3>+ {names}</h3><p>Error on held-out "
         f"records: {percent(before)} before, "
         f"{percent(after)} after. Residual of the {text(claim['balance'])} balance: {drop} "
         f"smaller.</p>{absence}"
         "<p class='legend'><span class='key before'>◆ before this addition</span> <span "
-        "class='key after'>■ after it</span></p>"
-        f"{place_figure(step.before, step.after)}</article>"
+        "class='key after'>■ after it</span> <span class='key law'>━ what it explains</span></p>"
+        f"{place_figure(step.before, step.after, explained(step.before, step.after))}</article>"
     )
 
 
@@ -364,7 +359,9 @@ def overlay_html(shown: Sequence[Overlay]) -> str:
             ("out", "−", "Zoom out"),
         )
     )
+    still = "".join(f"<figure>{c.svg()}</figure>" for c in window_charts(shown[0])) if shown else ""
     return (
+        f'<div class="print-only grid">{still}</div>'
         f'<div class="controls"><label>Show <select id="overlay-choice">{options}</select></label> '
         f'<span role="group" aria-label="Time window">{buttons}</span></div>'
         '<p id="overlay-status" class="note" aria-live="polite"></p>'
@@ -377,6 +374,45 @@ def overlay_html(shown: Sequence[Overlay]) -> str:
         "<noscript><p>These three plots need scripts; every other part of this page does "
         "without.</p></noscript>"
     )
+
+
+def window_charts(o: Overlay) -> tuple[Chart, Chart]:
+    """The worst window of an overlay as still pictures: torque, and the residual in a frame of its
+    own.
+    """
+    inside = (o.time >= o.window[0]) & (o.time <= o.window[1])
+    whole = [o.measured[inside], o.start[inside], o.final[inside]]
+    time, (measured, start, final) = decimated(o.time[inside], whole, STILL_POINTS)
+    added = not np.array_equal(o.start, o.final, equal_nan=True)
+    x = Label("time, records end to end", "s")
+    what = "force" if o.unit == "N" else "torque"
+    kinds: list[tuple[str, FloatArray, Style]] = [("with the additions", final, "after")]
+    kinds = [("start model", start, "before"), *kinds] if added else [("model", final, "after")]
+    said = f"{o.balance} balance on {o.record}, {number(o.window[0])} to {number(o.window[1])} s"
+    return (
+        Chart(
+            f"Measured and modelled {what}, {said}",
+            x,
+            torque_label(f"{what}, {o.balance} balance", o.unit),
+            (
+                Curve("measured", time, measured, "ink"),
+                *(Curve(n, time, v, s, dashed=s == "before") for n, v, s in kinds),
+            ),
+            zero=False,
+        ),
+        Chart(
+            f"Residual, {said}",
+            x,
+            torque_label(f"residual, {o.balance} balance", o.unit),
+            tuple(Curve(n, time, measured - v, s, dashed=s == "before") for n, v, s in kinds),
+        ),
+    )
+
+
+def glossary_html() -> str:
+    """Every term, by the word that stands on the page."""
+    items = "".join(f"<dt>{text(k)}</dt><dd>{text(v)}</dd>" for k, v in GLOSSARY.items())
+    return f"<dl class='words'>{items}</dl>"
 
 
 def linear_html(plots: ReportPlots) -> str:

@@ -6,219 +6,126 @@ No scripts, no style attributes: colours are presentation attributes that a page
 
 from __future__ import annotations
 
-import html
 import math
+import textwrap
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, final
 
 import numpy as np
 
-from identification.data.formats import number, pretty_unit
+from identification.data.formats import number
+from workbench.show.chart import (
+    AFTER,
+    BEFORE,
+    BOTTOM,
+    GRID,
+    HEIGHT,
+    INK,
+    LEFT,
+    LETTER,
+    RIGHT,
+    TOP,
+    WIDTH,
+    Chart,
+    Curve,
+    Frame,
+    Label,
+    Style,
+    axes,
+    svg,
+    word,
+)
 
 if TYPE_CHECKING:
-    from identification.diagnosis.places import Branch, Place
+    from identification.diagnosis.places import Place
     from identification.linear.poles import Pole
 
-WIDTH: Final = 360
-HEIGHT: Final = 224
-LEFT: Final = 54
-RIGHT: Final = 12
-TOP: Final = 12
-BOTTOM: Final = 40
-
-MOST_LOG_TICKS: Final = 8
-"""Marks of a logarithmic axis; with more, only the decades are marked."""
-
-BEFORE: Final = "#d55e00"
-AFTER: Final = "#0072b2"
-INK: Final = "#444444"
-GRID: Final = "#cccccc"
-
-
-@final
-@dataclass(frozen=True)
-class Frame:
-    """Linear map from data to the picture's coordinates."""
-
-    x: tuple[float, float]
-    y: tuple[float, float]
-    height: int = HEIGHT
-    bottom: int = BOTTOM
-
-    def across(self, value: float) -> float:
-        """Horizontal coordinate of a value."""
-        low, high = self.x
-        return LEFT + (value - low) / (high - low) * (WIDTH - LEFT - RIGHT)
-
-    def up(self, value: float) -> float:
-        """Vertical coordinate of a value, kept inside the frame."""
-        low, high = self.y
-        share = min(max((value - low) / (high - low), 0.0), 1.0)
-        return TOP + (1 - share) * (self.height - TOP - self.bottom)
+REFERRED: Final = "referred to the link"
+AT_THE_LINK: Final = "at the link"
+AT_THE_MOTOR: Final = "at the motor"
+SIDES: Final = {
+    "motor_velocity": ("motor velocity", REFERRED),
+    "motor_angle": ("motor angle within a turn", AT_THE_MOTOR),
+    "motor_position": ("motor position", REFERRED),
+    "motor_acceleration": ("motor acceleration", REFERRED),
+    "link_position": ("link position", AT_THE_LINK),
+    "link_velocity": ("link velocity", AT_THE_LINK),
+    "link_acceleration": ("link acceleration", AT_THE_LINK),
+    "load": ("load through the gear", AT_THE_LINK),
+    "torsion": ("twist of the gear", AT_THE_LINK),
+    "temperature": ("warming since the start", ""),
+    "time": ("time, records end to end", ""),
+}
+"""Each signal in the field's words, with its side."""
+LABEL_LINES: Final = 3
+LINE: Final = 13
 
 
-def ticks(low: float, high: float, most: int = 5) -> list[float]:
-    """Round numbers inside a range, at most `most` + 1 of them."""
-    span = high - low
-    if not (math.isfinite(span) and span > 0):
-        return [low]
-    raw = span / most
-    unit = 10.0 ** math.floor(math.log10(raw))
-    step = next(m * unit for m in (1, 2, 2.5, 5, 10, 20) if m * unit >= raw * 0.999)
-    first = math.ceil(low / step - 1e-9)
-    return [round(k * step, 12) + 0.0 for k in range(first, math.floor(high / step + 1e-9) + 1)]
+def axis_label(axis: str, title: str, unit: str) -> Label:
+    """What an axis of residuals shows, with its side."""
+    what, side = SIDES.get(axis, (title, ""))
+    return Label(what, unit, side)
 
 
-def _text(x: float, y: float, text: str, anchor: str = "middle", extra: str = "") -> str:
-    return (
-        f'<text class="s-ink" fill="{INK}" x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" '
-        f'font-size="11"{extra}>{html.escape(text)}</text>'
-    )
+def torque_label(what: str, unit: str) -> Label:
+    """Torque or force of a balance: balances are written on the link's side of the gear."""
+    return Label(what, unit, REFERRED)
 
 
-def log_ticks(low: float, high: float) -> list[float]:
-    """Exponents of the round numbers 1, 2 and 5 of each decade inside a range of exponents."""
-    first, last = math.floor(low), math.ceil(high)
-    every = [k + math.log10(m) for k in range(first, last + 1) for m in (1, 2, 5)]
-    inside = [t for t in every if low <= t <= high]
-    if len(inside) > MOST_LOG_TICKS:
-        return [t for t in inside if t == round(t)]
-    return inside if len(inside) > 1 else ticks(low, high, 3)
-
-
-def whole_ticks(low: float, high: float) -> list[float]:
-    """Whole numbers inside a range, at most about ten of them."""
-    step = max(1, math.ceil((high - low) / 10))
-    return [float(k) for k in range(math.ceil(low), math.floor(high) + 1, step)]
-
-
-def _axes(
-    frame: Frame,
-    x_label: str,
-    y_label: str,
-    *,
-    x_ticks: bool = True,
-    logarithmic: bool = False,
-    counted: bool = False,
-) -> str:
-    base = frame.height - frame.bottom
-    out = [
-        f'<path class="s-grid" stroke="{GRID}" fill="none" d="M{LEFT} '
-        f'{TOP}V{base}H{WIDTH - RIGHT}"/>'
-    ]
-    for t in log_ticks(*frame.y) if logarithmic else ticks(*frame.y, 4):
-        y = frame.up(t)
-        out.append(
-            f'<path class="s-grid" stroke="{GRID}" stroke-width="0.6" d="M{LEFT} '
-            f'{y:.1f}H{WIDTH - RIGHT}"/>'
-        )
-        out.append(_text(LEFT - 5, y + 4, number(10**t if logarithmic else t, 3), "end"))
-    if x_ticks:
-        for t in whole_ticks(*frame.x) if counted else ticks(*frame.x, 5):
-            x = frame.across(t)
-            out.append(
-                f'<path class="s-grid" stroke="{GRID}" d="M{x:.1f} {base}v4"/>'
-                + _text(min(x, WIDTH - 16), base + 16, number(t, 3))
-            )
-    out.append(_text((LEFT + WIDTH - RIGHT) / 2, frame.height - 6, x_label))
-    middle = (TOP + base) / 2
-    out.append(_text(11, middle, y_label, "middle", f' transform="rotate(-90 11 {middle:.1f})"'))
-    return "".join(out)
-
-
-def _svg(label: str, body: str, height: int = HEIGHT) -> str:
-    return (
-        f'<svg class="picture" role="img" aria-label="{html.escape(label, quote=True)}" '
-        f'viewBox="0 0 {WIDTH} {height}" '
-        f'width="{WIDTH}" height="{height}" font-family="system-ui, sans-serif">{body}</svg>'
-    )
-
-
-def _curve(b: Branch, frame: Frame, kind: str, colour: str) -> str:
-    if not len(b.centre):
-        return ""
-    x = [frame.across(float(v)) for v in b.centre]
-    known = np.isfinite(b.low) & np.isfinite(b.high)
-    out = []
-    for run in np.split(np.arange(len(known)), np.flatnonzero(~known)):
-        run = run[known[run]]  # a band ends where a bin has none
-        if len(run) < 2:
-            continue
-        upper = [f"{x[i]:.1f} {frame.up(float(b.high[i])):.1f}" for i in run]
-        lower = [f"{x[i]:.1f} {frame.up(float(b.low[i])):.1f}" for i in run[::-1]]
-        points = "M" + "L".join(upper + lower) + "Z"
-        out.append(
-            f'<path class="s-{kind} band" fill="{colour}" fill-opacity="0.22" stroke="none" '
-            f'd="{points}"/>'
-        )
-    line = "M" + "L".join(
-        f"{p:.1f} {frame.up(float(m)):.1f}" for p, m in zip(x, b.mean, strict=True)
-    )
-    dash = ' stroke-dasharray="5 3"' if b.direction == "backward" else ""
-    out.append(
-        f'<path class="s-{kind}" fill="none" stroke="{colour}" stroke-width="1.6"{dash} '
-        f'd="{line}"/>'
-    )
-    for p, m in zip(x, b.mean, strict=True):
-        y = frame.up(float(m))
-        shape = (
-            f"M{p - 2:.1f} {y - 2:.1f}h4v4h-4z"
-            if kind == "after"
-            else f"M{p:.1f} {y - 2.8:.1f}l2.8 2.8l-2.8 2.8l-2.8 -2.8z"
-        )
-        out.append(f'<path class="s-{kind} dot" fill="{colour}" d="{shape}"/>')
-    return "".join(out)
-
-
-def place_picture(before: Place, after: Place | None = None, quantity: str = "residual") -> str:
+def place_chart(
+    before: Place,
+    after: Place | None = None,
+    quantity: str = "residual",
+    law: Place | None = None,
+) -> Chart:
     """Mean residual against one signal before (diamonds) and after (squares) an addition, with 95 %
-    bands.
+    bands, and what a law explains of it (line).
 
     Parameters
     ----------
     before : Place
-    after : Place, optional
+    after, law : Place, optional
         With the same bins.
     quantity : str
         What is drawn, where it is no residual.
-
-    Returns
-    -------
-    str
-        An ``svg`` element.
     """
-    shown = [before, *([after] if after is not None else [])]
-    centres = np.concatenate([b.centre for p in shown for b in p.branches])
-    values = np.concatenate(
-        [v for p in shown for b in p.branches for v in (b.mean, *_kept_bands(b))]
+    curves = [replace(c, line=law is None) for c in _curves(before, "before", "diamond", "before")]
+    curves += _curves(after, "after", "square", "after") if after is not None else []
+    for c in _curves(law, "law", "", "law") if law is not None else []:
+        curves.append(replace(c, low=None, high=None))
+    return Chart(
+        _place_label(before, after, quantity),
+        axis_label(before.axis, before.title, before.unit),
+        torque_label(f"{quantity}, {before.balance} balance", before.residual_unit),
+        tuple(curves),
     )
-    values = values[np.isfinite(values)]
-    if not len(centres) or not len(values):
-        return _svg(f"{before.title}: no rows", _text(WIDTH / 2, HEIGHT / 2, "no rows"))
-    size = max(float(np.max(np.abs(values))), 1e-12) * 1.06
-    low, high = float(centres.min()), float(centres.max())
-    frame = Frame((low, high if high > low else low + 1.0), (-size, size))
-    body = _axes(
-        frame,
-        f"{before.title} [{pretty_unit(before.unit)}]",
-        f"{quantity} [{pretty_unit(before.residual_unit)}]",
-    )
-    zero = frame.up(0.0)
-    body += (
-        f'<path class="s-ink" stroke="{INK}" stroke-width="0.8" d="M{LEFT} '
-        f'{zero:.1f}H{WIDTH - RIGHT}"/>'
-    )
-    body += "".join(_curve(b, frame, "before", BEFORE) for b in before.branches)
-    if after is not None:
-        body += "".join(_curve(b, frame, "after", AFTER) for b in after.branches)
-    return _svg(_place_label(before, after, quantity), body)
 
 
-def _kept_bands(b: Branch) -> tuple[np.ndarray[tuple[int], np.dtype[np.float64]], ...]:
-    """Bands that decide the scale: one wild bin must not flatten the curve."""
-    limit = 3 * float(np.max(np.abs(b.mean), initial=0.0))
-    return tuple(v[np.isfinite(v) & (np.abs(v) <= limit)] for v in (b.low, b.high))
+def _curves(p: Place, style: Style, marks: str, name: str) -> list[Curve]:
+    return [
+        Curve(
+            name if b.direction == "both" else f"{name}, {b.direction}",
+            b.centre,
+            b.mean,
+            style,
+            low=b.low,
+            high=b.high,
+            marks=marks,
+            dashed=b.direction == "backward",
+        )
+        for b in p.branches
+    ]
+
+
+def place_picture(
+    before: Place,
+    after: Place | None = None,
+    quantity: str = "residual",
+    law: Place | None = None,
+) -> str:
+    """`place_chart` as an ``svg`` element."""
+    return place_chart(before, after, quantity, law).svg()
 
 
 def _largest(place: Place) -> float:
@@ -237,9 +144,12 @@ def _place_label(before: Place, after: Place | None, quantity: str) -> str:
 
 
 def staircase_picture(
-    values: Sequence[float], floor: float | None, labels: Sequence[str] = ()
+    values: Sequence[float],
+    floor: float | None,
+    labels: Sequence[str] = (),
+    width: int = WIDTH,
 ) -> str:
-    """Held-out error after each step as a falling staircase.
+    """Held-out error after each step as a falling staircase, with the noise floor on it.
 
     Parameters
     ----------
@@ -248,13 +158,30 @@ def staircase_picture(
     floor : float or None
         Error that measurement noise alone would leave [%].
     labels : sequence of str
-        Under each tread; "start", "1", "2" ... by default.
+        Under each tread, in up to `LABEL_LINES` lines; "start", "1", "2" ... by default.
+    width : int
     """
     names = list(labels) or ["start", *(str(i) for i in range(1, len(values)))]
     top = max([*values, floor or 0.0, 1e-9]) * 1.18
-    frame = Frame((0.0, float(len(values))), (0.0, top))
-    body = _axes(frame, "step of the ledger", "held-out error [%]", x_ticks=False)
-    base = HEIGHT - BOTTOM
+    room = max(4, int((width - LEFT - RIGHT) / len(values) / LETTER))
+    wrapped = [_wrapped(n, room) for n in names]
+    height = HEIGHT + LINE * (max(map(len, wrapped)) - 1)
+    frame = Frame(
+        (0.0, float(len(values))),
+        (0.0, top),
+        height=height,
+        bottom=height - HEIGHT + BOTTOM,
+        width=width,
+    )
+    body = axes(
+        frame,
+        "step",
+        "error on held-out records [% of the measured torque, referred to the link]"
+        if width > WIDTH
+        else "held-out error [%], referred to the link",
+        x_ticks=False,
+    )
+    base = height - frame.bottom
     treads = [
         (frame.across(i + 0.06), frame.across(i + 1), frame.up(v)) for i, v in enumerate(values)
     ]
@@ -270,17 +197,35 @@ def staircase_picture(
         f'<path class="s-after band" fill="{AFTER}" fill-opacity="0.22" stroke="none" d="{area}"/>'
     )
     body += f'<path class="s-after" fill="none" stroke="{AFTER}" stroke-width="2.4" d="{line}"/>'
-    for (a, b, y), v, name in zip(treads, values, names, strict=True):
-        body += _text((a + b) / 2, y - 5, f"{number(v, 3)} %") + _text((a + b) / 2, base + 15, name)
+    for (a, b, y), v, lines in zip(treads, values, wrapped, strict=True):
+        body += word((a + b) / 2, y - 5, f"{number(v, 3)} %")
+        body += "".join(
+            word((a + b) / 2, base + 15 + LINE * k, said) for k, said in enumerate(lines)
+        )
     if floor is not None:
         y = frame.up(floor)
         body += (
             f'<path class="s-ink" stroke="{INK}" stroke-dasharray="2 3" d="M{LEFT} '
-            f'{y:.1f}H{WIDTH - RIGHT}"/>'
+            f'{y:.1f}H{width - RIGHT}"/>'
         )
+        body += word(LEFT + 4, y + 12, f"noise alone: {number(floor, 2)} %", "start")
     fall = " to ".join(f"{number(v, 3)} %" for v in values)
     noise = f"; measurement noise alone leaves {number(floor, 3)} %" if floor is not None else ""
-    return _svg(f"Held-out error, step by step: {fall}{noise}", body)
+    return svg(f"Held-out error, step by step: {fall}{noise}", body, height, width)
+
+
+def staircase_csv(values: Sequence[float], floor: float | None, labels: Sequence[str]) -> str:
+    """The staircase as a table."""
+    rows = [f'"{n}",{v:.9g}' for n, v in zip(labels, values, strict=True)]
+    rows += [f'"noise alone",{floor:.9g}'] if floor is not None else []
+    return "\n".join(["step,held-out error [%]", *rows]) + "\n"
+
+
+def _wrapped(text: str, room: int) -> list[str]:
+    lines = textwrap.wrap(text, room, break_long_words=True) or [""]
+    if len(lines) > LABEL_LINES:
+        lines = [*lines[: LABEL_LINES - 1], lines[LABEL_LINES - 1][: room - 1] + "…"]
+    return lines
 
 
 @final
@@ -324,7 +269,7 @@ def front_picture(dots: Sequence[Dot], front: Sequence[int], height: int = HEIGH
     frame = Frame(
         (few - 0.6, many + 0.6), (min(errors) - 2 * room, max(errors) + room), height=height
     )
-    body = _axes(
+    body = axes(
         frame, "free parameters", "held-out error [% of start]", logarithmic=True, counted=True
     )
     treads = {dots[k].parameters: errors[k] for k in reversed(front)}  # the best of each column
@@ -346,9 +291,9 @@ def front_picture(dots: Sequence[Dot], front: Sequence[int], height: int = HEIGH
             column = dots[k].parameters
             y = max(frame.up(errors[k]) - 5, lowest.get(column, -math.inf) + 11)
             lowest[column] = y
-            body += _text(frame.across(column) + 9, y, str(dots[k].number), "start")
+            body += word(frame.across(column) + 9, y, str(dots[k].number), "start")
     least = min(d.error for d in dots)
-    return _svg(
+    return svg(
         f"Held-out error against free parameters: {len(dots)} variants with {few} to {many} "
         f"parameters, the lowest error {number(least, 3)} % of that of the start model",
         body,
@@ -389,7 +334,7 @@ def pole_picture(poles: Sequence[Pole], title: str) -> str:
     # one length is one length either way, so that the circle is round
     wide, high = WIDTH - LEFT - RIGHT, HEIGHT - TOP - BOTTOM
     frame = Frame((-1.05, 1.05), (-0.06, 2.1 * high / wide - 0.06))
-    body = _axes(frame, "real part", "imaginary part")
+    body = axes(frame, "real part", "imaginary part")
     turn = np.linspace(0.0, math.pi, 91)
     circle = "L".join(
         f"{frame.across(float(a)):.1f} {frame.up(float(b)):.1f}"
@@ -404,18 +349,18 @@ def pole_picture(poles: Sequence[Pole], title: str) -> str:
             f'd="M{x - 4:.1f} {y - 4:.1f}l8 8m0 -8l-8 8"/>'
         )
     said = ", ".join(f"{number(p.value.real, 4)} {number(p.value.imag, 4)}i" for p in poles)
-    return _svg(f"Poles of {title}, upper half: {said or 'none'}", body)
+    return svg(f"Poles of {title}, upper half: {said or 'none'}", body)
 
 
 def _ellipse(one: Pole, frame: Frame) -> str:
     if not np.isfinite(one.covariance).all():
         return ""
-    size, axes = np.linalg.eigh(one.covariance)
+    size, main = np.linalg.eigh(one.covariance)
     turn = np.linspace(0.0, 2.0 * math.pi, 37)
     round_ = 2.0 * np.sqrt(np.maximum(size, 0.0))[:, None] * np.array([np.cos(turn), np.sin(turn)])
     path = "L".join(
         f"{frame.across(one.value.real + float(a)):.1f} {frame.up(one.value.imag + float(b)):.1f}"
-        for a, b in (axes @ round_).T
+        for a, b in (main @ round_).T
     )
     return (
         f'<path class="s-after band" fill="{AFTER}" fill-opacity="0.22" stroke="none" '
@@ -426,9 +371,8 @@ def _ellipse(one: Pole, frame: Frame) -> str:
 def bar(share: float, label: str) -> str:
     """A bar from 0 to 100 %; a share below 0 is drawn as 0."""
     width = 80 * min(max(share / 100, 0.0), 1.0) if math.isfinite(share) else 0.0
-    return (
-        f'<svg class="bar" role="img" aria-label="{html.escape(label, quote=True)}" viewBox="0 0 '
-        '80 10" width="80" height="10">'
+    body = (
         f'<rect class="s-rest" fill="{GRID}" fill-opacity="0.5" width="80" height="10"/>'
-        f'<rect class="s-after" fill="{AFTER}" width="{width:.1f}" height="10"/></svg>'
+        f'<rect class="s-after" fill="{AFTER}" width="{width:.1f}" height="10"/>'
     )
+    return svg(label, body, 10, 80, "bar")

@@ -7,12 +7,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final, final
 
 import numpy as np
 import numpy.typing as npt
 
+from identification.balance.balances import balances_of
+from identification.balance.kinematic import residual_unit
 from identification.balance.weak import WeakRecord
 from identification.data.record import Record
 from identification.diagnosis.improve import Improvement
@@ -26,7 +28,7 @@ from identification.diagnosis.places import (
     running_time,
 )
 from identification.errors import InputError
-from identification.fitting.engine import Dataset, Solution, references
+from identification.fitting.engine import Dataset, Solution, references, stack
 from identification.linear.ceiling import Ceiling, ceiling
 from identification.linear.frequency import Bode, bode_of
 
@@ -193,7 +195,6 @@ def overlays(
         Residuals of the two models on all the records.
     """
     measured = references(data, records)
-    unit = "N" if data.joint.kind == "linear" else "N.m"
     out: list[tuple[float, Overlay]] = []
     first = 0
     for w, name in zip(records, names, strict=True):
@@ -213,7 +214,7 @@ def overlays(
                     Overlay(
                         balance,
                         name,
-                        unit=unit,
+                        unit=residual_unit(balance, data.joint.kind),
                         time=time,
                         measured=m,
                         start=m - before,
@@ -299,7 +300,10 @@ def report_plots(improvement: Improvement, raw: Sequence[Record] = ()) -> Report
         )
     last = improvement.steps[-1]
     floor = {b: e.floor for b, e in last.held_out.balances.items()}
-    above = ceiling(data, records, final, floor, unseen=held)
+    every = stack(
+        balances_of(last.solution.model, data.sensing, wrt=()), records, last.solution.values
+    ).residual  # rows at rest too: a black box explains all rows
+    above = ceiling(data, records, every, floor, unseen=held)
     response = None
     with suppress(InputError):
         response = bode_of(last.solution.model, data, raw)
@@ -325,6 +329,19 @@ def step_place(
     """
     best = places_of({balance: before[balance]}, rows)[0]
     return StepPlace(effect, best, place(rows, after[balance], balance, best.axis, like=best))
+
+
+def explained(before: Place, after: Place) -> Place | None:
+    """What an addition takes off the residual, bin by bin; None where the bins differ."""
+    if any(
+        len(b.centre) != len(a.centre) for b, a in zip(before.branches, after.branches, strict=True)
+    ):
+        return None
+    branches = tuple(
+        replace(b, mean=b.mean - a.mean)
+        for b, a in zip(before.branches, after.branches, strict=True)
+    )
+    return replace(before, branches=branches)
 
 
 def overlay_json(shown: Sequence[Overlay]) -> list[dict[str, Any]]:

@@ -7,12 +7,13 @@ import hashlib
 import json
 import platform
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from importlib import metadata, resources
 from itertools import count
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final
 
 from identification.data.formats import percent, ratio
@@ -21,7 +22,8 @@ from identification.diagnosis.improve import Improvement
 from identification.errors import InputError
 from identification.fitting.trust import Trust
 from irj_fmu.command_line import replace_file
-from workbench.show import fragments
+from workbench.show import first_page, fragments
+from workbench.show.beside import beside_html
 from workbench.show.plots import ReportPlots, overlay_json, report_plots
 from workbench.show.results import (
     calibration_html,
@@ -31,12 +33,12 @@ from workbench.show.results import (
     not_testable_html,
     parameters_html,
     ranking_html,
-    staircase_html,
     text,
     verdict_html,
     warnings_html,
 )
 from workbench.show.trusted import trusted_html
+from workbench.show.words import kind_of
 
 RANKED_SHOWN: Final = 8
 PACKAGES: Final = ("irj", "casadi", "numpy", "scipy")
@@ -49,6 +51,9 @@ def write_report(
     records: Sequence[Record] = (),
     command: str | None = None,
     trust: Trust | None = None,
+    author: str = "",
+    notes: str = "",
+    beside: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
 ) -> Path:
     """Write the report of an improvement as one HTML file.
 
@@ -65,6 +70,11 @@ def write_report(
         The command that made it, for the provenance.
     trust : Trust, optional
         Which number of the last step to trust, for a table.
+    author, notes : str
+        For the first page; lines of the notes are kept.
+    beside : mapping of str to mapping
+        Results of other sessions, dates or joints, by name
+        (:func:`workbench.show.beside.read_result`).
 
     Returns
     -------
@@ -77,7 +87,15 @@ def write_report(
         The folder does not exist or cannot be written, or the disk is full.
     """
     path = Path(to)
-    page = render_report(improvement, records=records, command=command, trust=trust)
+    page = render_report(
+        improvement,
+        records=records,
+        command=command,
+        trust=trust,
+        author=author,
+        notes=notes,
+        beside=beside,
+    )
     if path.is_dir():
         raise InputError(f"{path}: is a folder; give the name of a file, as {path / 'report.html'}")
     replace_file(path, lambda stream: stream.write(page.encode("utf-8", "backslashreplace")))
@@ -90,12 +108,17 @@ def render_report(
     records: Sequence[Record] = (),
     command: str | None = None,
     trust: Trust | None = None,
+    author: str = "",
+    notes: str = "",
+    beside: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
 ) -> str:
     """The report as text (see :func:`write_report`)."""
     result = improvement.as_json()
     plots = report_plots(improvement, records)
     name = improvement.joint.name
-    sections = [s for s in _sections(improvement, result, plots) if s[2]]
+    sections = [s for s in _sections(improvement, result, plots, records) if s[2]]
+    if beside and result["steps"]:
+        sections.append(("beside", "Beside other results", beside_html(result, beside)))
     if trust is not None:
         sections.append(("trust", "Which number to trust", trusted_html(trust)))
     made = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
@@ -106,19 +129,29 @@ def render_report(
             fragments.provenance_html(improvement, records, versions(), command, made),
         )
     )
+    sections.append(("words", "What the words mean", fragments.glossary_html()))
     links = "".join(f'<li><a href="#{key}">{text(title)}</a></li>' for key, title, _ in sections)
     parts = "".join(
         f'<section id="{key}" aria-labelledby="{key}-title"><h2 '
         f'id="{key}-title">{text(title)}</h2>{body}</section>'
         for key, title, body in sections
     )
+    pair = first_page.pair_html(improvement, result, plots) if plots else ""
+    by = f"{text(author)}, {made}" if author else made
+    paragraphs = "".join(f"<p>{text(n)}</p>" for n in notes.splitlines() if n.strip())
+    said = f'<section class="notes" aria-label="Notes">{paragraphs}</section>' if notes else ""
+    front = (
+        f'<section class="verdict {kind_of(result)}" aria-label="Verdict">{verdict_html(result)}'
+        f"{warnings_html(result['warnings'])}</section>{_tiles(result)}{said}{pair}"
+        f'<section class="law" aria-label="The law">{first_page.law_html(improvement, result)}'
+        '</section><section class="next" aria-label="What to measure next">'
+        f"{first_page.next_html(improvement, result)}</section>"
+    )
     body = (
-        '<a class="skip" href="#ledger">Skip to the figures</a><header><p class="eyebrow">Joint '
-        f"report</p><h1>{text(name)}</h1></header><main>"
-        f'<section class="verdict {text(result["verdict"])}" '
-        f'aria-label="Verdict">{verdict_html(result)}{_next_html(result)}'
-        f"{warnings_html(result['warnings'])}</section>{_tiles(result)}"
-        f'<nav aria-label="Contents"><ul>{links}</ul></nav>{_scrollable(parts)}</main>'
+        '<a class="skip" href="#details">Skip to the details</a><header><p class="eyebrow">Joint '
+        f'report · {by}</p><h1>{text(name)}</h1></header><main><div class="front">'
+        f'{_scrollable(front)}</div><nav id="details" aria-label="Contents"><ul>{links}</ul></nav>'
+        f"{_scrollable(parts, 100)}</main>"
     )
     return _page(
         f"{name}: joint report",
@@ -129,7 +162,10 @@ def render_report(
 
 
 def _sections(
-    improvement: Improvement, result: dict[str, Any], plots: ReportPlots | None
+    improvement: Improvement,
+    result: dict[str, Any],
+    plots: ReportPlots | None,
+    records: Sequence[Record],
 ) -> list[tuple[str, str, str]]:
     """Key, title and body of each section, in reading order; empty ones are left out by the
     caller.
@@ -137,10 +173,7 @@ def _sections(
     trials = improvement.ranking.trials if improvement.ranking else ()
     where = "held-out records" if plots is not None and plots.on_held_out else "training records"
     effort = "force" if improvement.joint.kind == "linear" else "torque"
-    ledger = (
-        f"<div class='beside'>{staircase_html(result)}<div>{ledger_html(result)}</div></div>"
-        f"<p class='note'>{_ledger_note(result, effort)}</p>"
-    )
+    ledger = f"{ledger_html(result)}<p class='note'>{_ledger_note(result, effort)}</p>"
     ranked = ""
     if result["ranking"]:
         rest = len(result["ranking"]) - RANKED_SHOWN
@@ -161,6 +194,7 @@ def _sections(
     final = result["steps"][-1]["parameters"] if result["steps"] else {}
     start = result["steps"][0]["parameters"] if len(result["steps"]) > 1 else None
     return [
+        ("joint", "The joint and its motion", first_page.joint_html(improvement, records)),
         ("ledger", "How far the model is from the measurements", ledger if result["steps"] else ""),
         (
             "places",
@@ -196,6 +230,7 @@ def _sections(
             fragments.linear_html(plots) if plots else "",
         ),
         ("untested", "What these records cannot show", not_testable_html(result)),
+        ("equations", "The model as formulas", first_page.equations_html(improvement)),
         (
             "parameters",
             "Parameters",
@@ -209,28 +244,16 @@ def _sections(
     ]
 
 
-def _next_html(result: dict[str, Any]) -> str:
-    """What to do next, where the result says so."""
-    runs = list(
-        dict.fromkeys(
-            c["separate_by"] for c in result["claims"] if len(c["effects"]) > 1 and c["separate_by"]
-        )
-    )
-    return (
-        f"<p><strong>Next run:</strong> {text('; '.join(runs))}. It would separate the names "
-        "given together.</p>"
-        if runs
-        else ""
-    )
-
-
 def _tiles(result: dict[str, Any]) -> str:
     """Three figures at a glance."""
     if not result["steps"]:
         return ""
     first, last = result["steps"][0]["held_out"], result["steps"][-1]["held_out"]
     floor = floor_percent(last)
-    names = ", ".join(f"{text(b)} {ratio(e['ratio'])}" for b, e in result["floor_ratio"].items())
+    names = ", ".join(
+        f"<span class='nowrap'>{text(b)} {ratio(e['ratio'])}</span>"
+        for b, e in last["balances"].items()
+    )
     before = f"{percent(first['relative_error_percent'])} → " if len(result["steps"]) > 1 else ""
     tiles = [
         (
@@ -253,7 +276,7 @@ def _ledger_note(result: dict[str, Any], effort: str) -> str:
         "balances. "
         "Fit: 100 % is a perfect model, 0 % no better than a constant. "
         "÷ noise: residual over what measurement noise alone would leave; 1 × cannot be "
-        "improved. The dotted line in the picture is that noise. "
+        "improved. The dotted line of the staircase is that noise. "
         "The fit never saw the held-out records; they confirm or refuse each addition."
         + (f" Note: {note}." if note else "")
     )
@@ -283,11 +306,11 @@ def _overlay(plots: ReportPlots, where: str, effort: str) -> str:
     )
 
 
-def _scrollable(body: str) -> str:
+def _scrollable(body: str, first: int = 1) -> str:
     """Tables in regions that scroll by themselves on a narrow screen and can be reached by
     keyboard.
     """
-    numbers = count(1)
+    numbers = count(first)
 
     def wrapped(found: re.Match[str]) -> str:
         return (

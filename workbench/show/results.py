@@ -13,8 +13,18 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
-from identification.data.formats import number, percent, pretty_unit, ratio, with_error, words
+from identification.data.formats import (
+    chances,
+    number,
+    percent,
+    pretty_unit,
+    ratio,
+    with_error,
+    words,
+)
 from workbench.show.pictures import bar, place_picture, staircase_picture
+from workbench.show.words import headline
+from workbench.show.words import title_of as effect_title
 
 if TYPE_CHECKING:
     from identification.data.record import Record
@@ -24,12 +34,6 @@ if TYPE_CHECKING:
     from identification.diagnosis.trials import Trial
     from identification.fitting.fit import Fit
 
-HEADLINES: Final = {
-    "complete": "Found what was missing",
-    "nothing_missing": "Nothing is missing",
-    "unexplained": "Something is left that the library cannot explain",
-    "not_identifiable": "These records cannot answer the question",
-}
 BALANCES: Final = {
     "motor": "drive torque against torque sensor, motor inertia and motor-side friction",
     "link": "torque sensor against link inertia, gravity and link-side friction",
@@ -37,6 +41,7 @@ BALANCES: Final = {
     "sum": "drive torque against everything that moves (no torque sensor)",
     "deflection": "drive torque against motor side and twist of the gear (no torque sensor)",
     "axis": "drive torque against everything that moves, seen from one side",
+    "kinematic": "twist of the gear against what the link's own motion asks for (no torque)",
 }
 STRONG_CORRELATION: Final = 0.95
 SHOWN_PLACES: Final = 4
@@ -91,24 +96,15 @@ def spaced(fragment: str) -> str:
     )
 
 
-def title_of(key: str) -> str:
+def title_of(label: str) -> str:
     """Title of an effect of the library (the key as words where it is not in it), escaped."""
-    from casadi_models import EFFECTS
-
-    return text(EFFECTS[key].title if key in EFFECTS else words(key))
+    return text(effect_title(label))
 
 
 def verdict_html(result: Mapping[str, Any], level: int = 2) -> str:
     """Headline and sentence of an `improve --json` result."""
     reason = text(result.get("reason", "")).replace(" %", "&nbsp;%")
     return f"<h{level}>{text(headline(result))}</h{level}><p>{reason}</p>"
-
-
-def headline(result: Mapping[str, Any]) -> str:
-    """The verdict of an `improve --json` result in a few words."""
-    if result["verdict"] == "unexplained" and any("curve" not in c for c in result["claims"]):
-        return "Found a part of what is missing; something is left"
-    return HEADLINES.get(result["verdict"], words(result["verdict"]))
 
 
 def _ratios(balances: Mapping[str, Mapping[str, Any]], names: Sequence[str]) -> list[str]:
@@ -122,11 +118,15 @@ def floor_percent(error: Mapping[str, Any]) -> float | None:
     return float(error["relative_error_percent"]) * floor / size if size > 0 and floor > 0 else None
 
 
-def step_title(step: Mapping[str, Any], number_of_step: int) -> str:
-    """What a step added, escaped."""
-    return (
-        "start model" if step["added"] is None else f"{number_of_step}. + {title_of(step['added'])}"
-    )
+def step_names(result: Mapping[str, Any]) -> list[str]:
+    """What each step added: a set where its claim is one."""
+    sets = {k: c["effects"] for c in result["claims"] if "curve" not in c for k in c["effects"]}
+    return [
+        "start model"
+        if s["added"] is None
+        else " or ".join(effect_title(k) for k in sets.get(s["added"], [s["added"]]))
+        for s in result["steps"]
+    ]
 
 
 def ledger_html(result: Mapping[str, Any]) -> str:
@@ -146,16 +146,14 @@ def ledger_html(result: Mapping[str, Any]) -> str:
     ]
     rows = [
         [
-            step_title(s, i),
+            text(f"{i}. + {name}" if i else name),
             percent(s["held_out"]["relative_error_percent"]),
             percent(s["train"]["relative_error_percent"]),
             percent(s["held_out"]["fit_percent"]),
             *_ratios(s["held_out"]["balances"], names),
         ]
-        for i, s in enumerate(steps)
+        for i, (s, name) in enumerate(zip(steps, step_names(result), strict=True))
     ]
-    if result.get("floor_ratio"):
-        rows.append(["at the verdict", "", "", "", *_ratios(result["floor_ratio"], names)])
     return table(head, rows, "Error of each step")
 
 
@@ -165,7 +163,8 @@ def staircase_html(result: Mapping[str, Any]) -> str:
     if not steps:
         return ""
     values = [float(s["held_out"]["relative_error_percent"]) for s in steps]
-    return staircase_picture(values, floor_percent(steps[-1]["held_out"]))
+    names = [f"+ {n}" if i else n for i, n in enumerate(step_names(result))]
+    return staircase_picture(values, floor_percent(steps[-1]["held_out"]), names)
 
 
 def claims_html(result: Mapping[str, Any]) -> str:
@@ -179,6 +178,9 @@ def claims_html(result: Mapping[str, Any]) -> str:
         )
         if "curve" in claim:
             line = f"{names}: {text(claim['sentence'])}"
+        if claim.get("confidence"):
+            by_title = {title_of(k): p for k, p in claim["confidence"].items()}
+            line += f" By the likelihoods of whole fits: {chances(by_title)}."
         if len(claim["effects"]) > 1:
             how = text(claim["separate_by"] or "a run that moves differently")
             line += f" These records cannot tell these names apart; what would: {how}."

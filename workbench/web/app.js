@@ -16,8 +16,8 @@ function h(tag, attributes, ...children) {
   return node;
 }
 
-async function call(method, path, body) {
-  const options = { method, headers: { "X-IRJ": "1" } };
+async function call(method, path, body, more) {
+  const options = { method, headers: { "X-IRJ": "1", ...more } };
   if (body) { options.body = JSON.stringify(body); options.headers["Content-Type"] = "application/json"; }
   let answer;
   try { answer = await fetch(path, options); } catch (error) { throw new Error("the server does not answer; is it still running? What was done is kept in the session folder."); }
@@ -95,7 +95,8 @@ function adopt(state) {
   }
   if (state.error) fail(new Error(state.error));
   surround();
-  if (changed) render(false);
+  if (changed && !usable(state)[app.view]) open("load");
+  else if (changed) render(false);
   goOn();
 }
 
@@ -113,26 +114,31 @@ function listen() {
   };
 }
 
+function usable(state) {
+  const fitted = state.steps.length > 0, known = Boolean(state.joint_text);
+  return { home: true, load: true, model: true, compare: fitted, diagnose: fitted, ledger: fitted, parameters: fitted, replay: fitted, plan: known, export: known };
+}
+
 function surround() {
   const state = app.state;
   if (!state) return;
   const fitted = state.steps.length > 0, ready = state.files.some((f) => ["ready", "checking"].includes(f.status));
-  const usable = { load: true, model: true, compare: fitted, diagnose: fitted, ledger: fitted, parameters: fitted, replay: fitted, plan: Boolean(state.joint_text), export: Boolean(state.joint_text) };
+  const can = usable(state);
   const done = { load: ready, model: Boolean(state.joint_text), compare: fitted, diagnose: Boolean(state.diagnosis), ledger: state.steps.length > 1, parameters: false, replay: false, plan: false, export: false };
   const list = $("nav");
   if (!list.children.length) VIEWS.forEach(([key, name], k) => list.append(h("li", {}, h("button", { type: "button", id: `nav-${key}`, onclick: () => open(key) }, h("span", { class: "count", "aria-hidden": "true" }, String(k + 1)), name))));
   for (const [key] of VIEWS) {
     const button = $(`nav-${key}`);
-    button.disabled = !usable[key];
-    button.title = usable[key] ? "" : key === "plan" || key === "export" ? "once the joint is described" : "after the first fit";
+    button.disabled = !can[key];
+    button.title = can[key] ? "" : key === "plan" || key === "export" ? "once the joint is described" : "after the first fit";
     button.className = done[key] ? "done" : "";
     if (key === app.view) button.setAttribute("aria-current", "page"); else button.removeAttribute("aria-current");
   }
   const last = state.steps[state.steps.length - 1];
   const headline = last ? `${digits(last.held_out.relative_error_percent)} %` : "";
   if ($("headline").dataset.text !== headline) { $("headline").dataset.text = headline; $("headline").replaceChildren(...(last ? ["held-out error ", h("strong", {}, headline)] : [])); }
-  $("undo").disabled = busy() || state.steps.length < 2;
-  $("redo").disabled = busy() || !state.undone.length;
+  $("undo").disabled = busy() || !state.can.undo;
+  $("redo").disabled = busy() || !state.can.redo;
   const job = app.upload || state.job;
   $("job").hidden = !job;
   if (job) {
@@ -142,9 +148,11 @@ function surround() {
   document.querySelectorAll("[data-work]").forEach((b) => { if (busy()) b.setAttribute("aria-disabled", "true"); else b.removeAttribute("aria-disabled"); }); /* not "disabled", which would take the focus and the key with it */
 }
 
-function open(view) {
+/* Each view has its address: back and forward go between them. */
+function open(view, { moved = true } = {}) {
+  const address = `#session=${app.id}&view=${view}`, same = location.hash === address || app.view === null;
   app.view = view;
-  try { history.replaceState(null, "", `#session=${app.id}&view=${view}`); } catch (error) { location.hash = `session=${app.id}&view=${view}`; }
+  if (moved) try { if (same || !location.hash) history.replaceState(null, "", address); else history.pushState(null, "", address); } catch (error) { location.hash = address; }
   surround();
   const here = $(`nav-${view}`);
   if (here) here.closest(".steps").scrollLeft = here.offsetLeft - here.closest(".steps").clientWidth / 2 + here.offsetWidth / 2; /* on a phone the steps are wider than the screen */
@@ -166,7 +174,7 @@ function render(moved) {
     const focused = main.contains(document.activeElement) ? placeOf(document.activeElement, main) : null; /* now, not when the drawing began */
     main.replaceChildren(...[nodes].flat(3).filter(Boolean));
     main.dataset.view = app.view; main.dataset.revision = app.state.revision;
-    document.title = `${VIEWS.find((v) => v[0] === app.view)[1]} – Joint workbench`;
+    document.title = `${(VIEWS.find((v) => v[0] === app.view) || ["", "Sessions"])[1]} – Joint workbench`;
     surround();
     (app.after || []).forEach((f) => f());
     app.after = [];
@@ -240,15 +248,27 @@ async function boot() {
   $("redo").addEventListener("click", () => run("redo"));
   $("cancel").addEventListener("click", () => { app.waiting = null; if (app.sending) app.sending.abort(); else post("/cancel").catch(fail); });
   $("fresh").addEventListener("click", () => act(fresh));
+  $("home").addEventListener("click", () => open("home"));
   $("error-close").addEventListener("click", clearError);
   addEventListener("dragover", (e) => { e.preventDefault(); document.querySelectorAll(".drop").forEach((d) => d.classList.add("over")); });
   addEventListener("dragleave", () => document.querySelectorAll(".drop").forEach((d) => d.classList.remove("over")));
   addEventListener("drop", (e) => { e.preventDefault(); if (e.dataTransfer && e.dataTransfer.files.length) { if (app.view !== "load") open("load"); upload(e.dataTransfer.files); } });
+  addEventListener("popstate", () => {
+    const asked = new URLSearchParams(location.hash.slice(1)), view = asked.get("view");
+    const shown = () => open(usable(app.state)[view] ? view : "load", { moved: false });
+    if (asked.get("session") && asked.get("session") !== app.id) enter(asked.get("session")).then(shown).catch(fail); else if (view) shown();
+  });
+  addEventListener("keydown", (e) => {
+    if (!(e.ctrlKey || e.metaKey) || e.altKey || e.target.matches("input:not([type=checkbox]):not([type=radio]), textarea")) return;
+    const key = e.key.toLowerCase(), asked = key === "y" || (key === "z" && e.shiftKey) ? "redo" : key === "z" ? "undo" : null;
+    if (asked && !$(asked).disabled) { e.preventDefault(); run(asked); }
+  });
   app.config = await call("GET", "/api/config");
   const asked = new URLSearchParams(location.hash.slice(1));
   const known = asked.get("session") || remembered("irj-session");
+  if (asked.get("home")) remembered("irj-home", asked.get("home"));
   try { if (!known) throw new Error(); await enter(known); } catch (error) { await enter((await call("POST", "/api/session")).id); }
   const wanted = asked.get("view");
-  open(VIEWS.some(([key]) => key === wanted) && (app.state.steps.length || ["load", "model"].includes(wanted)) ? wanted : app.state.steps.length ? "ledger" : "load");
+  open((VIEWS.some(([key]) => key === wanted) && (app.state.steps.length || ["load", "model"].includes(wanted))) || wanted === "home" ? wanted : app.state.steps.length ? "ledger" : "load");
 }
 addEventListener("DOMContentLoaded", () => boot().catch(fail));

@@ -1,11 +1,6 @@
 "use strict";
 /* Pictures: SVG for places and the staircase, uPlot for series. */
 const SVG = "http://www.w3.org/2000/svg";
-const NAMES = {
-  motor_velocity: "velocity", motor_angle: "motor angle within a turn", motor_position: "position", link_position: "link position",
-  load: "load", torsion: "torsion", temperature: "warming", time: "time",
-};
-
 function svg(tag, attributes, ...children) {
   const node = document.createElementNS(SVG, tag);
   for (const [key, value] of Object.entries(attributes || {})) node.setAttribute(key, value);
@@ -40,59 +35,11 @@ function pictureWidth(most) {
   return Math.max(280, Math.min(most, document.documentElement.clientWidth - 70));
 }
 
-/* One place: mean residual with its 95 % band, one curve or one per direction of motion. */
-function placePlot(place) {
-  const legend = place.branches.length > 1 ? 16 : 0, W = pictureWidth(420), H = 250 + legend, L = 58, R = 14, T = 12 + legend, B = 44;
-  const xs = place.branches.flatMap((b) => b.centre), ys = place.branches.flatMap((b) => [...b.low, ...b.high, ...b.mean]).filter((v) => v != null);
-  let [x0, x1] = [Math.min(...xs), Math.max(...xs)], [y0, y1] = [Math.min(0, ...ys), Math.max(0, ...ys)];
-  const means = place.branches.flatMap((b) => b.mean), top = Math.max(...means.map(Math.abs)) * 2.2 || 1;
-  y0 = Math.max(y0, -top); y1 = Math.min(y1, top);
-  if (x1 === x0) x1 = x0 + 1;
-  if (y1 === y0) y1 = y0 + 1;
-  const X = (v) => L + ((v - x0) / (x1 - x0)) * (W - L - R), Y = (v) => T + ((y1 - Math.min(y1, Math.max(y0, v))) / (y1 - y0)) * (H - T - B);
-  const worst = place.branches.flatMap((b) => b.mean.map((m, i) => [m, b.centre[i]])).reduce((a, b) => (Math.abs(b[0]) > Math.abs(a[0]) ? b : a), [0, 0]);
-  const label = `Mean residual of the ${place.balance} balance against ${place.title}; largest ${digits(worst[0])} ${unit(place.residual_unit)} at ${digits(worst[1])} ${unit(place.unit)}`;
-  const out = svg("svg", { viewBox: `0 0 ${W} ${H}`, role: "img", "aria-label": label });
-  for (const t of ticks(y0, y1, 4)) out.append(svg("path", { class: t === 0 ? "s-zero" : "s-grid", d: `M${L} ${Y(t)}H${W - R}` }), svg("text", { x: L - 6, y: Y(t) + 4, "text-anchor": "end" }, digits(t)));
-  for (const t of ticks(x0, x1, 5)) out.append(svg("path", { class: "s-grid", d: `M${X(t)} ${T}V${H - B}` }), svg("text", { x: X(t), y: H - B + 16, "text-anchor": "middle" }, digits(t)));
-  place.branches.forEach((b, k) => {
-    const runs = b.centre.reduce((all, c, i) => { if (b.low[i] == null) all.push([]); else all[all.length - 1].push(i); return all; }, [[]]).filter((run) => run.length > 1);
-    for (const run of runs) {
-      const d = run.map((i) => `${X(b.centre[i])} ${Y(b.high[i])}`).join("L") + "L" + run.slice().reverse().map((i) => `${X(b.centre[i])} ${Y(b.low[i])}`).join("L");
-      out.append(svg("path", { class: k ? "s-band-2" : "s-band", d: `M${d}Z` }));
-    }
-    out.append(svg("path", { class: k ? "s-line-2" : "s-line", d: "M" + b.centre.map((c, i) => `${X(c)} ${Y(b.mean[i])}`).join("L") }));
-    b.centre.forEach((c, i) => out.append(k ? svg("rect", { class: "s-dot-2", x: X(c) - 2, y: Y(b.mean[i]) - 2, width: 4, height: 4 }) : svg("circle", { class: "s-dot", cx: X(c), cy: Y(b.mean[i]), r: 2.2 })));
-    if (place.branches.length > 1) out.append(svg("text", { class: "strong", x: W - R - 120 * (1 - k), y: 14, "text-anchor": "end" }, (k ? "▪ - - " : "● — ") + b.direction));
-  });
-  out.append(svg("text", { x: (L + W - R) / 2, y: H - 8, "text-anchor": "middle" }, `${place.title}${unit(place.unit) ? ` [${unit(place.unit)}]` : ""}`));
-  out.append(svg("text", { x: 14, y: (T + H - B) / 2, transform: `rotate(-90 14 ${(T + H - B) / 2})`, "text-anchor": "middle" }, `mean residual [${unit(place.residual_unit)}]`));
-  return out;
-}
-
-/* The falling staircase: held-out error after each step. */
-function staircase(steps) {
-  const W = pictureWidth(640), H = 270, L = 54, R = 16, T = 26, B = 46, n = steps.length;
-  const errors = steps.map((s) => s.held_out.relative_error_percent), top = Math.max(...errors) * 1.12 || 1, w = (W - L - R) / Math.max(n, 2);
-  const Y = (v) => T + (1 - v / top) * (H - T - B), X = (k) => L + k * w;
-  const out = svg("svg", { viewBox: `0 0 ${W} ${H}`, role: "img", "aria-label": "Error on held-out records: " + steps.map((s, k) => `${stepName(s)} ${digits(errors[k])} percent`).join(", ") });
-  for (const t of ticks(0, top, 4)) out.append(svg("path", { class: t === 0 ? "s-zero" : "s-grid", d: `M${L} ${Y(t)}H${W - R}` }), svg("text", { x: L - 6, y: Y(t) + 4, "text-anchor": "end" }, digits(t)));
-  let d = "";
-  errors.forEach((e, k) => { d += `${k ? "L" : "M"}${X(k)} ${Y(e)}L${X(k + 1)} ${Y(e)}`; });
-  out.append(svg("path", { class: "s-fill", d: `${d}L${X(n)} ${Y(0)}L${X(0)} ${Y(0)}Z` }), svg("path", { class: "s-stair", d }));
-  errors.forEach((e, k) => {
-    out.append(svg("text", { class: "strong", x: X(k) + w / 2, y: Y(e) - 7, "text-anchor": "middle" }, `${digits(e)} %`));
-    const name = stepName(steps[k]), room = Math.max(8, Math.floor(w / 6.2));
-    out.append(svg("text", { x: X(k) + w / 2, y: H - B + 17, "text-anchor": "middle" }, name.length > room ? name.slice(0, room - 1) + "…" : name, svg("title", {}, name)));
-  });
-  out.append(svg("text", { x: 4, y: 12 }, `held-out error, % of the measured ${effort()}`));
-  return out;
-}
-
+/* What a step did; a set of names stays a set. */
 function stepName(step) {
   if (step.action === "start") return "start model";
-  const place = step.label && step.label.includes("@") ? ` (${step.label.split("@")[1].replace(/_/g, " ")})` : "";
-  return (step.action === "remove" ? "− " : "+ ") + (step.title || step.label || "") + place;
+  const names = step.names && step.names.length > 1 ? step.names.map(effectTitle).join(" or ") : effectTitle(step.label || step.title || "");
+  return (step.action === "remove" ? "− " : "+ ") + names;
 }
 
 /* What a balance is a sum of: torques, or forces of a linear axis. */
@@ -102,19 +49,22 @@ const vaf = (v) => digits(v, v > 99.9 ? 5 : 4);
 const plotPoints = (width) => Math.max(200, Math.min(1600, Math.round(width)));
 
 /* A series with min-max decimation on the server; a drag zooms and asks for the samples of the window.
-   Zoomed in, a strip below shows the whole record and the window in it. */
+   Zoomed in, a strip below shows the whole record and the window in it. `panels` names the series of each frame: their
+   cursors are one. */
 class SeriesPlot {
-  constructor(host, fetcher, { title, local } = {}) {
-    this.host = host; this.fetcher = fetcher; this.title = title || ""; this.local = Boolean(local); this.range = null; this.asked = 0; this.plot = null; this.small = null; this.whole = null;
+  constructor(host, fetcher, { title, local, panels, side } = {}) {
+    this.host = host; this.fetcher = fetcher; this.title = title || ""; this.local = Boolean(local); this.panels = panels || null; this.side = side || "";
+    this.range = null; this.asked = 0; this.plots = []; this.small = null; this.whole = null; this.marks = null; this.onCursor = null;
     this.main = h("div"); this.strip = h("div", { class: "strip", hidden: true });
-    host.replaceChildren(this.main, this.strip);
+    host.replaceChildren(this.main, this.strip, h("div", { class: "row under end" }, saver(this.title || "series", () => this.svg(), () => this.csv())));
     this.observer = new ResizeObserver(() => {
-      if (this.plot && host.clientWidth) this.plot.setSize({ width: host.clientWidth, height: this.height() });
+      if (host.clientWidth) this.plots.forEach((p, k) => p.setSize({ width: host.clientWidth, height: this.height(k) }));
       if (this.small && host.clientWidth) { this.small.setSize({ width: host.clientWidth, height: 74 }); this.mark(); }
     });
     this.observer.observe(host);
   }
-  height() { return this.host.clientWidth < 600 ? 220 : 300; }
+  get plot() { return this.plots[0] || null; }
+  height(k = 0) { const most = this.host.clientWidth < 600 ? 220 : 300; return this.panels ? Math.round(most * 0.75) : most; }
   forget() { this.whole = null; if (this.small) { this.small.destroy(); this.small = null; } }
   async show(range) {
     this.range = range || null;
@@ -133,24 +83,64 @@ class SeriesPlot {
     return { of: (s, k) => colour(palette[s.name] || cycle[k % cycle.length]), axis: { stroke: colour("--soft"), grid: { stroke: colour("--grid"), width: 1 }, ticks: { stroke: colour("--grid") } } };
   }
   picked(u) { if (u.select.width > 3) this.show([u.posToVal(u.select.left, "x"), u.posToVal(u.select.left + u.select.width, "x")]).catch(fail); }
+  /* The samples that a brush chose, and where a run begins. */
+  shade(u) {
+    const spans = this.marks ? this.marks() : [], begins = (this.data && this.data.runs) || [], context = u.ctx, css = getComputedStyle(document.documentElement);
+    if (!spans.length && !begins.length) return;
+    context.save();
+    context.beginPath(); context.rect(u.bbox.left, u.bbox.top, u.bbox.width, u.bbox.height); context.clip();
+    context.fillStyle = css.getPropertyValue("--band-2").trim();
+    for (const [a, b] of spans) { const x = u.valToPos(a, "x", true); context.fillRect(x, u.bbox.top, Math.max(1, u.valToPos(b, "x", true) - x), u.bbox.height); }
+    context.strokeStyle = css.getPropertyValue("--soft").trim(); context.setLineDash([3, 4]);
+    for (const t of begins) { const x = u.valToPos(t, "x", true); context.beginPath(); context.moveTo(x, u.bbox.top); context.lineTo(x, u.bbox.top + u.bbox.height); context.stroke(); }
+    context.restore();
+  }
+  redraw() { this.plots.forEach((p) => p.redraw(false)); }
   draw(data) {
-    const { of, axis } = this.colours(), units = [...new Set(data.series.map((s) => s.unit))];
-    if (this.plot) this.plot.destroy();
-    const options = {
-      width: this.host.clientWidth || 800, height: this.height(), legend: { live: true }, cursor: { drag: { x: true, y: false, setScale: false } },
-      scales: { x: { time: false, range: this.range ? () => this.range : undefined } },
-      series: [{ label: "time [s]", value: (u, v) => digits(v, 6) }, ...data.series.map((s, k) => ({
-        label: s.name.replace(/_/g, " ") + (unit(s.unit) ? ` [${unit(s.unit)}]` : ""), stroke: of(s, k), width: data.time.length < 600 ? 1.5 : 1, scale: s.unit,
-        dash: s.name === "model" ? [6, 3] : k % 2 && s.name !== "residual" ? [8, 3] : undefined, value: (u, v) => digits(v, 4), points: { show: data.full && data.time.length < 200 && !this.local },
-      }))],
-      axes: [{ ...axis, label: "time [s]", labelSize: 20, size: 40 }, ...units.map((u, k) => ({ ...axis, scale: u, side: k ? 1 : 3, label: unit(u), labelSize: 18, size: 58, grid: k ? { show: false } : axis.grid }))],
-      hooks: { setSelect: [(u) => this.picked(u)] },
-    };
-    this.plot = new uPlot(options, [data.time, ...data.series.map((s) => s.values)], this.main);
+    const { of, axis } = this.colours();
+    this.data = data;
+    this.plots.forEach((p) => p.destroy());
+    const groups = this.panels ? this.panels.map((names) => data.series.filter((s) => names.includes(s.name))).filter((g) => g.length) : [data.series];
+    this.plots = groups.map((group, panel) => {
+      const units = [...new Set(group.map((s) => s.unit))], last = panel === groups.length - 1;
+      const label = (u) => { const first = group.find((s) => s.unit === u), side = this.side || first.side, what = this.panels ? (group.length > 1 ? effort() : first.name) : ""; return [[what, side].filter(Boolean).join(" "), unit(u) && `[${unit(u)}]`].filter(Boolean).join(" "); };
+      const made = new uPlot({
+        width: this.host.clientWidth || 800, height: this.height(panel), legend: { live: true }, cursor: { drag: { x: true, y: false, setScale: false }, sync: this.panels ? { key: "series", setSeries: false } : undefined },
+        scales: { x: { time: false, range: this.range ? () => this.range : undefined } },
+        series: [{ label: "time [s]", value: (u, v) => digits(v, 6) }, ...group.map((s) => { const k = data.series.indexOf(s); return {
+          label: s.name.replace(/_/g, " ") + (unit(s.unit) ? ` [${unit(s.unit)}]` : ""), stroke: of(s, k), width: data.time.length < 600 ? 1.5 : 1, scale: s.unit,
+          dash: s.name === "model" ? [6, 3] : k % 2 && s.name !== "residual" ? [8, 3] : undefined, value: (u, v) => digits(v, 4), points: { show: data.full && data.time.length < 200 && !this.local },
+        }; })],
+        axes: [{ ...axis, label: last ? "time [s]" : undefined, labelSize: 20, size: last ? 40 : 24 }, ...units.map((u, k) => ({ ...axis, scale: u, side: k ? 1 : 3, label: label(u), labelSize: 18, size: 58, grid: k ? { show: false } : axis.grid }))],
+        hooks: { setSelect: [(u) => this.picked(u)], drawClear: [(u) => this.shade(u)], setCursor: [(u) => { if (this.onCursor) this.onCursor(u.cursor.left < 0 ? null : u.cursor.idx); }] },
+      }, [data.time, ...group.map((s) => s.values)], this.main);
+      made.over.addEventListener("dblclick", () => this.show(null).catch(fail));
+      made.root.setAttribute("role", "img");
+      made.root.setAttribute("aria-label", `${this.title || "Series"} over time${this.panels ? `: ${group.map((s) => s.name).join(" and ")}` : ""}, ${data.full ? "every sample" : "smallest and largest value per pixel"}`);
+      return made;
+    });
     this.host.dataset.points = String(data.time.length);
-    this.plot.over.addEventListener("dblclick", () => this.show(null).catch(fail));
-    this.plot.root.setAttribute("role", "img");
-    this.plot.root.setAttribute("aria-label", `${this.title || "Series"} over time, ${data.full ? "every sample" : "smallest and largest value per pixel"}`);
+  }
+  csv() {
+    const d = this.data, cell = (v) => (v == null ? "" : String(v));
+    return [["time [s]", ...d.series.map((s) => `${s.name}${s.unit ? ` [${s.unit}]` : ""}`)].join(","), ...d.time.map((t, i) => [t, ...d.series.map((s) => cell(s.values[i]))].join(","))].join("\n") + "\n";
+  }
+  /* What is drawn now as an svg, one frame a panel. */
+  svg() {
+    const W = 760, high = 230, L = 62, R = 12, T = 20, B = 34, ink = "#444444", { of } = this.colours();
+    const groups = this.panels ? this.panels.map((names) => this.data.series.filter((s) => names.includes(s.name))).filter((g) => g.length) : [this.data.series], time = this.data.time, [x0, x1] = this.range || this.full;
+    const out = svg("svg", { xmlns: SVG, viewBox: `0 0 ${W} ${high * groups.length}`, width: W, height: high * groups.length, "font-family": "system-ui, sans-serif" }, svg("rect", { width: "100%", height: "100%", fill: "#ffffff" }));
+    groups.forEach((group, k) => {
+      const seen = time.map((t, i) => i).filter((i) => time[i] >= x0 && time[i] <= x1), ys = group.flatMap((s) => seen.map((i) => s.values[i])).filter((v) => v != null), top = k * high + T, base = (k + 1) * high - B;
+      let [y0, y1] = [Math.min(...ys), Math.max(...ys)];
+      if (!(y1 > y0)) { y0 -= 1; y1 += 1; }
+      const X = (t) => L + ((t - x0) / (x1 - x0)) * (W - L - R), Y = (v) => base - ((v - y0) / (y1 - y0)) * (base - top), word = (x, y, text, anchor = "middle") => svg("text", { x, y, "text-anchor": anchor, "font-size": 11, fill: ink }, text);
+      for (const t of ticks(y0, y1, 4)) out.append(svg("path", { d: `M${L} ${Y(t)}H${W - R}`, stroke: "#cccccc", fill: "none" }), word(L - 5, Y(t) + 4, digits(t), "end"));
+      for (const t of ticks(x0, x1, 8)) out.append(svg("path", { d: `M${X(t)} ${top}V${base}`, stroke: "#cccccc", fill: "none" }), word(X(t), base + 15, digits(t, 5)));
+      group.forEach((s, n) => { let pen = "M"; const d = seen.map((i) => { if (s.values[i] == null) { pen = "M"; return ""; } const at = `${pen}${X(time[i]).toFixed(1)} ${Y(s.values[i]).toFixed(1)}`; pen = "L"; return at; }).join(""); out.append(svg("path", { d, stroke: of(s, this.data.series.indexOf(s)), fill: "none" }), svg("text", { x: L + 150 * n, y: top - 6, "font-size": 11, fill: of(s, this.data.series.indexOf(s)) }, `${s.name.replace(/_/g, " ")}${unit(s.unit) ? ` [${unit(s.unit)}]` : ""}`)); });
+      out.append(word((L + W - R) / 2, base + 29, "time [s]"));
+    });
+    return new XMLSerializer().serializeToString(out);
   }
   overview(all) {
     this.strip.hidden = !this.range;
@@ -177,5 +167,5 @@ class SeriesPlot {
     const low = Math.max(this.full[0], c - half), high = Math.min(this.full[1], c + half);
     this.show(high - low >= (this.full[1] - this.full[0]) * 0.999 ? null : [low, high]).catch(fail);
   }
-  destroy() { this.observer.disconnect(); if (this.plot) this.plot.destroy(); if (this.small) this.small.destroy(); }
+  destroy() { this.observer.disconnect(); this.plots.forEach((p) => p.destroy()); if (this.small) this.small.destroy(); }
 }

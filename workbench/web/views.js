@@ -4,7 +4,7 @@ const later = (f) => { (app.after = app.after || []).push(f); };
 const button = (text, onclick, { kind = "", id, off, work = true, label } = {}) => h("button", { type: "button", class: kind, id, onclick: work ? whenIdle(id || label || text, onclick) : onclick, "aria-label": label, "data-work": work ? "1" : null, "data-off": off ? "1" : null, disabled: Boolean(off) }, text);
 const sentence = (text, end = ".") => text.charAt(0).toUpperCase() + text.slice(1) + (text.endsWith(end) ? "" : end);
 const plural = (n, one, many) => `${n.toLocaleString("en")} ${n === 1 ? one : many || one + "s"}`;
-const effectTitle = (label) => { const e = app.config.effects.find((x) => x.key === label.split(/[@#]/)[0]); const p = label.includes("@") ? ` (${label.split("@")[1].replace(/_/g, " ")})` : ""; return (e ? e.title : label) + p; };
+const effectTitle = (label) => { const [key, at] = label.split("#")[0].split("@"), e = app.config.effects.find((x) => x.key === key); return (e ? e.title : key.replace(/_/g, " ")) + (at ? ` (${at.replace(/_/g, " ")})` : ""); };
 const SEVERITY = { refuse: ["bad", "refused"], repair: ["warn", "repaired"], warn: ["warn", "check"], ok: ["good", "fine"] };
 
 function heading(title, lead) { return [h("h1", {}, title), lead && h("p", { class: "lead" }, lead)]; }
@@ -32,12 +32,13 @@ const views = {
     return [
       h("div", { class: "row between head" }, h("div", {}, heading("Records")), next),
       state.joint_text ? h("p", { class: "soft" }, "Joint: ", h("strong", {}, jointLine(state)), " ", h("button", { type: "button", class: "quiet", onclick: () => open("model") }, "Change")) : h("p", { class: "soft" }, "No joint described yet: gear ratio, motor constant and start model come next."),
-      state.files.map(fileCard), ready.length ? seriesCard(ready) : null, drop,
+      state.files.map(fileCard), ready.length ? seriesCard(ready) : null, ready.length ? againstCard(ready) : null, drop, state.fits ? treeCard(state) : null,
     ];
   },
 
   async model(state) {
-    const { text, form } = await get("/view/joint");
+    const { text, form } = await get("/view/joint"), seen = state.files.find((f) => f.kind);
+    if (!form.kind && seen) form.kind = seen.kind;
     const own = (m) => app.config.models[m] || [];
     const side = (k) => { /* the units of the drive, for a rotary or a linear axis */
       const force = k === "linear";
@@ -78,21 +79,26 @@ const views = {
     const found = await get("/view/compare"), last = state.steps[state.steps.length - 1];
     const balances = Object.keys(found.error.balances), first = found.places[0], host = h("div", { class: "plot" });
     let balance = found.worst.balance;
-    const plot = new SeriesPlot(host, (range, points) => get(`/view/balance?balance=${balance}&points=${points}${range ? `&from=${range[0]}&to=${range[1]}` : ""}`), { title: "Measured torque, model and residual" });
+    forgetCharts();
+    const plot = new SeriesPlot(host, (range, points) => get(`/view/balance?balance=${balance}&points=${points}${range ? `&from=${range[0]}&to=${range[1]}` : ""}`), { title: "Measured torque, model and residual", panels: [["measured", "model"], ["residual"]], side: "at the link" });
+    plot.marks = () => linked.marks; linked.plot = plot;
+    plot.onCursor = (index) => plot.data && cursorInCharts(plot.data)(index);
     app.plots.push(plot);
     later(() => plot.show([found.worst.low, found.worst.high]).catch(fail));
     const pick = h("select", { id: "balance", "aria-label": "Balance in the time plot", onchange: (e) => { balance = e.target.value; plot.forget(); plot.show(plot.range).catch(fail); } }, balances.map((b) => h("option", { value: b, selected: b === balance }, `${b} balance`)));
     const strong = found.places.filter((p) => p.share_percent > 5 && (found.error.balances[p.balance].ratio ?? 9) > 1.2), rest = found.places.filter((p) => !strong.includes(p));
-    const figure = (p) => h("figure", { class: "card place" }, h("figcaption", {}, `${p.balance} balance against ${p.title}`, h("span", {}, p.share_percent > 1 ? `explains ${digits(p.share_percent, 2)} % of the residual's variance on blocks it was not drawn from` : "explains next to nothing")), placePlot(p));
+    const figure = (p) => chartFigure([`${p.balance} balance against ${p.title}`, h("span", {}, p.share_percent > 1 ? `explains ${digits(p.share_percent, 2)} % of the residual's variance on blocks it was not drawn from` : "explains next to nothing")], p.chart, { name: `${p.balance} residual against ${p.title}`, axis: p.axis, brush: markInTime(p.axis) });
+    const curves = await get("/view/as-such");
     return [
       h("div", { class: "row between head" }, h("div", {}, heading("Where does the model fail?")), button("What is missing? Diagnose", () => run("diagnose", {}, "diagnose"), { kind: "primary", id: "diagnose" })),
       state.note ? h("p", { class: "note small" }, sentence(state.note)) : null,
       h("div", { class: "tiles" }, h("div", { class: "card" }, h("p", { class: "soft" }, "Held-out error"), h("div", { class: "figure", id: "held-out-error" }, `${digits(found.error.relative_error_percent)} %`), h("p", { class: "small soft" }, `of the measured ${effort()} is not explained, on records the fit did not see (${found.records.join(", ")}). On the fit's own: ${digits(last.train.relative_error_percent)} %.`)),
-        balances.map((b) => { const e = found.error.balances[b]; return h("div", { class: "card" }, h("p", { class: "soft" }, `${b} balance`), h("div", { class: "figure" }, digits(e.ratio), h("small", {}, " × noise")), h("p", { class: "small soft" }, `residual ${digits(e.rms)} ${unit(e.unit)} rms; noise alone would leave ${digits(e.floor)}. ${e.ratio < 1.5 ? "Down to the noise." : "There is something left."}`)); })),
+        balances.map((b) => { const e = found.error.balances[b]; return h("div", { class: "card" }, h("p", { class: "soft" }, `${b} balance`), h("div", { class: "figure" }, digits(e.ratio), h("small", {}, " ", term("÷ noise", "× noise"))), h("p", { class: "small soft" }, `residual ${digits(e.rms)} ${unit(e.unit)} rms; noise alone would leave ${digits(e.floor)}. ${e.ratio < 1.5 ? "Down to the noise." : "There is something left."}`)); })),
       h("h2", { class: "gap" }, strong.length ? "Places where the residual is not chance" : "No place stands out"),
-      strong.length && first ? h("p", { class: "soft" }, `Line: mean residual; shade: 95 % band. The ${first.balance} balance fails most clearly against ${first.title}.`) : h("p", { class: "soft" }, "The residual looks alike everywhere: what is left is noise, or depends on something that was not measured."),
+      strong.length && first ? h("p", { class: "soft" }, `Line: mean residual; shade: 95 % band. The ${first.balance} balance fails most clearly against ${first.title}.`) : h("p", { class: "soft" }, nowhere(found)),
       h("div", { class: "grid" }, (strong.length ? strong : found.places.slice(0, 1)).map(figure)),
       h("details", {}, h("summary", {}, `Other places (${rest.length})`), h("div", { class: "grid" }, rest.map(figure))),
+      curves.length ? h("section", { class: "gap", id: "as-such" }, h("h2", {}, "Curves as such"), h("p", { class: "soft" }, "◆ as measured, with a band of 95 %; line: as the model has it."), h("div", { class: "grid" }, curves.map((c) => chartFigure([c.title, h("span", {}, `${c.balance} balance`)], c.chart, { name: `${c.title}, ${c.balance} balance` })))) : null,
       patternCard(found.pattern),
       h("section", { class: "card gap" }, h("h2", {}, "In time, at the worst two seconds"), h("p", { class: "soft small" }, "Drag to zoom: up close every row is drawn. The strip below shows the whole record: drag across it to look elsewhere."),
         plotControls(plot, [pick, button("Worst window", () => plot.show([found.worst.low, found.worst.high]), { kind: "quiet", work: false })]), host),
@@ -104,11 +110,12 @@ const views = {
     const again = button(d ? "Diagnose again" : "Diagnose", () => run("diagnose", {}, "diagnose"), { kind: d ? "" : "primary", id: "diagnose" });
     if (!d) return [h("div", { class: "row between head" }, h("div", {}, heading("What is missing?", "Every effect of the library is tried in every place of the current model, and judged on blocks and records it was not fitted to.")), again)];
     const clear = d.ranking.filter((r) => r.significant), faint = d.ranking.filter((r) => !r.significant), most = Math.max(1, ...d.ranking.map((r) => r.held_out_drop_percent || 0));
+    const panel = new LawPanel(clear.map((r) => r.label));
     const row = (r, k) => {
       const bar = h("i"), drop = r.held_out_drop_percent || 0;
       later(() => { bar.style.width = `${Math.max(0, (100 * drop) / most)}%`; });
       const key = d.claim && d.claim.label === r.label;
-      return h("li", { class: `candidate${r.significant ? "" : " dim"}` }, h("span", { class: "rank" }, String(k + 1)),
+      return h("li", { class: `candidate${r.significant ? "" : " dim"}`, "data-label": r.label, onpointerenter: () => panel.show(r.label), onfocusin: () => panel.show(r.label) }, h("span", { class: "rank" }, String(k + 1)),
         h("div", {}, h("h3", {}, r.title, " ", h("span", { class: "place" }, `· ${r.place.replace(/_/g, " ")}`)), h("p", { class: "small" }, `Without it ${r.absence}.`),
           h("p", { class: "small soft" }, `${digits(r.contribution)} ${unit(d.unit)} rms in the ${r.balance} balance; p ${r.p_value < 1e-4 ? "< 0.0001" : "= " + digits(r.p_value, 2)}; evidence ${digits(r.gain_nats)} (gain in log-likelihood).${r.confusable_with.length ? ` Often confused with ${r.confusable_with.map(effectTitle).join(", ")}.` : ""}`)),
         h("div", { class: "effect-size" }, h("p", { class: "small" }, drop > 0 ? `residual −${digits(drop, 2)} %` : "no fall"), h("span", { class: "bar", "aria-hidden": "true" }, bar)),
@@ -117,19 +124,21 @@ const views = {
     const claim = d.claim;
     return [
       h("div", { class: "row between head" }, h("div", {}, heading("What is missing?")), again),
-      h("div", { class: "card" }, h("p", { class: "figure", id: "claim" }, claim ? claim.effects.map(effectTitle).join(" or ") : sentence(d.headline || "Nothing is named")),
+      outcomeCard(d, [h("p", { class: "figure", id: "claim" }, claim ? claim.effects.map(effectTitle).join(" or ") : sentence(d.headline || "Nothing is named")),
         claim ? h("p", {}, claim.effects.length > 1 ? `These records cannot tell the ${claim.effects.length} apart.${claim.separate_by ? ` ${claim.separate_by} would.` : ""}` : `The ${claim.balance} balance says so: with it the held-out residual there falls by ${digits(claim.held_out_drop_percent, 2)} %.`) : null,
-        h("p", { id: "reason" }, sentence(d.reason || ""))),
+        claim && claim.confidence ? h("p", { class: "small soft", id: "confidence" }, `By the likelihoods of whole fits: ${Object.entries(claim.confidence).map(([k, p]) => `${p > 0.99 ? "over 99" : p < 0.01 ? "under 1" : Math.round(100 * p)} % ${effectTitle(k)}`).join(", ")}.`) : null,
+        h("p", { id: "reason" }, sentence(d.reason || ""))]),
       d.warnings.map((w) => h("p", { class: "note small" }, sentence(w))),
-      clear.length ? h("div", { class: "card" }, h("h2", {}, "Ranked effects"), h("p", { class: "soft small" }, "The bar is the fall of the residual on held-out records if the effect is added to the model as it stands. Falls do not add up: add one, then diagnose again."), h("ol", { class: "ranked" }, clear.map(row))) : null,
+      clear.length ? h("div", { class: "two ranking" }, h("div", { class: "card" }, h("h2", {}, "Ranked effects"), h("p", { class: "soft small" }, "The bar is the fall of the residual on held-out records if the effect is added to the model as it stands. Falls do not add up: add one, then diagnose again."), h("ol", { class: "ranked" }, clear.map(row))), panel.node) : null,
       faint.length ? h("details", { class: "card" }, h("summary", {}, `Not to be told from chance, or too small (${faint.length})`), h("ol", { class: "ranked" }, faint.map((r, k) => row(r, k + clear.length)))) : null,
       d.refused && d.refused.length ? h("details", { class: "card", id: "refused" }, h("summary", {}, `Why not another? (${d.refused.length})`), h("ul", {}, d.refused.map((r) => h("li", {}, h("strong", {}, effectTitle(r.effect)), r.why.startsWith("with ") ? `: ${r.why}.` : `: it ${r.why}.`)))) : null,
       d.not_testable.length ? h("details", { class: "card" }, h("summary", {}, `Not testable with these records (${d.not_testable.length})`), h("ul", {}, d.not_testable.map((n) => h("li", {}, h("strong", {}, n.title), `: ${n.why}.`)))) : null,
+      glossaryCard(),
     ];
   },
 
   async ledger(state) {
-    const library = await get("/view/library"), steps = state.steps, last = steps[steps.length - 1], before = steps[steps.length - 2];
+    const [library, stairs] = await Promise.all([get("/view/library"), get(`/view/staircase?width=${Math.round(pictureWidth(560))}`)]), steps = state.steps, last = steps[steps.length - 1], before = steps[steps.length - 2];
     const now = last.held_out.relative_error_percent, was = before && before.held_out.relative_error_percent;
     const story = state.improvement, inside = last.effects.filter((e) => e !== "channel_delay@drive");
     const add = h("select", { id: "add-label", "aria-label": "Effect to add" }, library.filter((e) => !e.inside).map((e) => h("option", { value: e.label }, `${e.title} (${e.place.replace(/_/g, " ")})`)));
@@ -139,24 +148,28 @@ const views = {
       state.note && last.exact ? h("p", { class: "note small" }, sentence(state.note)) : null,
       !last.settled ? h("p", { class: "note", id: "first-look", role: "status" }, "First look: two steps from the diagnosis. The whole fit follows by itself …") : null,
       !last.exact ? h("p", { class: "note" }, `${sentence(state.note || "fitted and judged on a part of the samples")} `, button("Confirm on every sample", () => run("confirm"), { kind: "quiet", id: "confirm" })) : null,
-      story ? h("p", { class: "note", id: "verdict" }, h("strong", {}, sentence(story.headline || story.verdict.replace(/_/g, " ")) + " "), sentence(story.reason)) : null,
-      h("div", { class: "two" }, h("figure", { class: "card", id: "staircase" }, h("figcaption", {}, "The falling staircase"), staircase(steps)),
+      story ? h("p", { class: `note outcome ${outcomeOf(story)}`, id: "verdict" }, h("strong", {}, sentence(story.headline || story.verdict.replace(/_/g, " ")) + " "), sentence(story.reason)) : null,
+      h("div", { class: "two" }, h("figure", { class: "card", id: "staircase" }, h("figcaption", {}, "The falling staircase", h("span", {}, "dotted: ", term("noise floor"))), new ServedChart(stairs.stairs, { name: "The falling staircase" }).node),
         h("div", { class: "card" }, h("h2", {}, "In the model now"), h("ul", { class: "plain" }, inside.map((e) => h("li", {}, h("div", { class: "row between" }, effectTitle(e), button("Remove", () => run("remove", { label: e }), { kind: "quiet", label: `Remove ${effectTitle(e)}`, off: e === "transmission_compliance" && inside.includes("structural_damping") })))))),
       ),
+      stairs.told ? h("div", { class: "grid" }, chartFigure([`The place that told: ${stairs.told.name}`, h("span", {}, `${stairs.told.balance} balance, before (◆) and after (■); line: what it explains`)], stairs.told.chart, { name: "The place that told", kind: "told" })) : null,
       h("div", { class: "card scroll", tabindex: "0", role: "region", "aria-label": "Ledger" }, h("table", {}, h("caption", {}, "Ledger"), h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Step"), h("th", { scope: "col", class: "num" }, "Held-out error"), h("th", { scope: "col", class: "num" }, "Fit"), h("th", { scope: "col", class: "num" }, "VAF"), Object.keys(last.held_out.balances).map((b) => h("th", { scope: "col", class: "num" }, `${b}: × floor`)))),
         h("tbody", {}, steps.map((s, k) => h("tr", { class: k === steps.length - 1 ? "now" : null }, h("td", {}, stepName(s)), h("td", { class: "num" }, `${digits(s.held_out.relative_error_percent)} %`), h("td", { class: "num" }, `${digits(s.held_out.fit_percent)} %`), h("td", { class: "num" }, `${vaf(s.held_out.vaf_percent)} %`), Object.keys(last.held_out.balances).map((b) => h("td", { class: "num" }, s.held_out.balances[b] ? digits(s.held_out.balances[b].ratio) : "–"))))))),
+      treeCard(state),
+      lawCard(state),
       h("div", { class: "card" }, h("h2", {}, "By hand"), h("div", { class: "row" }, add, button("Add", () => run("add", { label: $("add-label").value }), { id: "add-by-hand", label: "Add the chosen effect" }), button("Run the whole loop", () => run("improve", {}, "ledger"), { id: "improve" })), h("p", { class: "small soft" }, "The whole loop diagnoses and adds until nothing is left to name; it starts from the start model again.")),
     ];
   },
 
   async parameters(state) {
-    const table = await get("/view/parameters"), rows = Object.entries(table).filter(([, p]) => !p.nuisance);
+    const table = await get("/view/parameters"), error = state.steps[state.steps.length - 1].held_out.relative_error_percent, rows = Object.entries(table).filter(([, p]) => !p.nuisance);
     const enough = (p) => (p.stderr > 0 && p.value ? Math.min(9, Math.max(2, 2 + Math.floor(Math.log10(Math.abs(p.value))) - Math.floor(Math.log10(p.stderr)))) : 4);
     const band = (p) => p.stderr == null ? "–" : `${digits(p.value - 1.96 * p.stderr, enough(p))} … ${digits(p.value + 1.96 * p.stderr, enough(p))}`;
     const flags = (p) => [p.at_bound && h("span", { class: "tag warn" }, "at its bound"), p.identifiable === false && h("span", { class: "tag warn" }, "not identified"), p.correlation && Math.abs(p.correlation.value) > 0.95 && h("span", { class: "tag warn" }, `tied to ${p.correlation.with.replace(/_/g, " ")}`)].filter(Boolean);
     return [heading("Parameters", "Standard errors come from the scatter between blocks of the records. All values are referred to the link."),
       h("div", { class: "card scroll", tabindex: "0", role: "region", "aria-label": "Table of parameters" }, h("table", {}, h("thead", {}, h("tr", {}, ["Parameter", "Value", "± std. error", "95 % band", "Unit", "Side", "Flags"].map((t, k) => h("th", { scope: "col", class: k > 0 && k < 4 ? "num" : null }, t)))),
-        h("tbody", {}, rows.map(([name, p]) => h("tr", {}, h("td", {}, name.replace(/_/g, " "), h("div", { class: "small soft" }, p.meaning)), h("td", { class: "num" }, digits(p.value, 5)), h("td", { class: "num" }, digits(p.stderr, 2)), h("td", { class: "num" }, band(p)), h("td", {}, unit(p.unit)), h("td", {}, p.side), h("td", {}, h("div", { class: "row" }, flags(p).length ? flags(p) : h("span", { class: "soft" }, "–"))))))))];
+        h("tbody", {}, rows.map(([name, p]) => h("tr", {}, h("td", {}, name.replace(/_/g, " "), h("div", { class: "small soft" }, p.meaning)), h("td", { class: "num" }, digits(p.value, 5)), h("td", { class: "num" }, digits(p.stderr, 2)), h("td", { class: "num" }, band(p)), h("td", {}, unit(p.unit)), h("td", {}, p.side), h("td", {}, h("div", { class: "row" }, flags(p).length ? flags(p) : h("span", { class: "soft" }, "–")))))))),
+      slidersCard(table, error)];
   },
 
   async export(state) {
@@ -172,6 +185,12 @@ const views = {
       h("section", { class: "card" }, h("h2", {}, "Copy as code"), h("p", { class: "soft" }, "Python that does this session again, with the same errors. Run it in the folder of the measurement files."), h("div", { class: "row" }, button("Copy", () => navigator.clipboard.writeText(code).then(() => { copied.textContent = "copied"; }, () => { copied.textContent = "not allowed; select the text instead"; }), { work: false, id: "copy" }), h("a", { class: "button", href: `${base()}/view/session.py`, download: "" }, "Download"), copied), h("pre", { tabindex: "0", "aria-label": "Python code" }, h("code", {}, code)))];
   },
 };
+
+/* What no place shows: noise, or something that hangs on no measured signal. A balance over its noise is said. */
+function nowhere(found) {
+  const over = Object.entries(found.error.balances).filter(([, e]) => e.ratio > found.pattern.limit).map(([b]) => b);
+  return over.length ? `The ${over.join(" and ")} balance is over its noise, but none of the measured signals explains it: what is missing depends on something that was not measured, or comes and goes.` : "Every balance is at its noise, and no signal explains what is left.";
+}
 
 const MODEL_TITLES = {
   hd1: "rigid", hd2: "rigid, with the transmission's losses", hd3: "elastic, with structural damping", hd4: "elastic, with kinematic error",
@@ -189,33 +208,13 @@ function fileCard(f) {
   const role = h("select", { id: `role-${f.id}`, "aria-label": `Role of ${f.name}`, onchange: (e) => act(async () => { await post(`/file/${f.id}`, { role: e.target.value }); await refresh(); }) }, [["train", "Fit"], ["held_out", "Held out"]].map(([v, t]) => h("option", { value: v, selected: f.role === v }, t)));
   return h("section", { class: "card", "aria-label": f.name }, h("div", { class: "row between" },
     h("div", {}, h("h2", {}, f.name), shown ? h("p", { class: "soft small" }, `${plural(s.samples, "sample")}, ${digits(s.duration, 4)} s, every ${digits(1000 * s.dt, 3)} ms${s.segments > 1 ? `, ${s.segments} stretches` : ""}. ${f.role_reason.charAt(0).toUpperCase()}${f.role_reason.slice(1)}.`) : null),
-    h("div", { class: "row" }, shown ? role : null, button("Remove", () => act(async () => { await call("DELETE", `${base()}/file/${f.id}`); await refresh(); }), { kind: "quiet", label: `Remove ${f.name}` }))),
+    h("div", { class: "row" }, shown ? role : null, f.status === "columns" ? null : button("Columns", () => { app.drafts[`map-${f.id}`] = app.drafts[`map-${f.id}`] ? null : { now: true }; render(false); }, { kind: "quiet", work: false, id: `columns-${f.id}`, label: `Columns of ${f.name}` }), button("Remove", () => act(async () => { await call("DELETE", `${base()}/file/${f.id}`); await refresh(); }), { kind: "quiet", label: `Remove ${f.name}` }))),
     f.status === "refused" ? h("p", { class: "bad" }, f.message) : null,
     f.status === "checking" ? h("p", { class: "small soft", role: "status" }, "Going through the check gate …") : null,
     f.status === "columns" ? columnMap(f) : null,
     bad.length ? h("ul", { class: "findings" }, bad.map((x) => h("li", {}, h("span", { class: `tag ${SEVERITY[x.severity][0]}` }, SEVERITY[x.severity][1]), " ", x.message))) : null,
+    f.status !== "columns" && app.drafts[`map-${f.id}`] ? columnMap(f) : null,
     f.status === "ready" ? h("details", {}, h("summary", {}, bad.length ? `Checked: ${fine.length} fine; columns` : "Checked, nothing to repair; columns"), h("ul", { class: "findings" }, s.columns.map((c) => h("li", {}, c)), s.notes.map((n) => h("li", {}, n)), fine.map((x) => h("li", {}, x.message)))) : null);
-}
-
-/* The guess is shown; it is used when the user confirms it. */
-function columnMap(f) {
-  const guessed = Object.fromEntries(f.guess.map((g) => [g.column, g])), used = f.guess.map((g) => g.column), same = app.state.files.filter((o) => o.status === "columns" && used.every((c) => o.names.includes(c))).length;
-  const rows = f.names.map((name, k) => {
-    const g = guessed[name] || {}, id = `map-${f.id}-${k}`;
-    const channel = h("select", { id: `${id}-channel`, "aria-label": `Channel of column ${name}` }, h("option", { value: "" }, "not used"), app.config.channels.map((c) => h("option", { value: c, selected: c === g.channel }, c.replace(/_/g, " "))));
-    const box = (part, value, label) => h("input", { id: `${id}-${part}`, value, size: "9", placeholder: label, "aria-label": `${label} of column ${name}`, autocomplete: "off" });
-    const parts = { channel, unit: box("unit", g.unit || "", "Unit"), scale: box("scale", g.scale && g.scale !== 1 ? String(g.scale) : "", "Scale"), sign: h("select", { id: `${id}-sign`, "aria-label": `Sign of column ${name}` }, h("option", { value: "1" }, "+"), h("option", { value: "-1", selected: g.sign === -1 }, "−")), counts: box("counts", "", "Counts per turn") };
-    return { name, parts, node: h("tr", {}, h("td", {}, h("strong", {}, name)), h("td", {}, parts.channel), h("td", {}, parts.unit), h("td", {}, parts.scale), h("td", {}, parts.sign), h("td", {}, parts.counts), h("td", { class: "small soft" }, g.reason || "no guess")) };
-  });
-  const confirm = () => act(async () => {
-    const columns = {};
-    for (const { name, parts } of rows) if (parts.channel.value) columns[parts.channel.value] = { column: name, unit: parts.unit.value.trim(), scale: parts.scale.value, sign: Number(parts.sign.value), counts_per_turn: parts.counts.value };
-    const made = await post(`/file/${f.id}`, { columns, all: true });
-    await refresh();
-    if (made.status !== "ready") throw new Error(made.message);
-  });
-  return h("div", {}, h("p", { class: "note" }, f.message.includes("no column is recognised") ? "The headers do not say which channel they are" : f.message, ". This is a guess by name and unit: check it, then use it."), h("div", { class: "scroll" }, h("table", { class: "map-table" }, h("thead", {}, h("tr", {}, ["Column", "Channel", "Unit", "Scale", "Sign", "Counts/turn", "Why"].map((t) => h("th", { scope: "col" }, t)))), h("tbody", {}, rows.map((r) => r.node)))),
-    h("div", { class: "row gap" }, button(same > 1 ? `Use for all ${same} files with these columns` : "Use these columns", confirm, { kind: "primary", id: `use-${f.id}` })));
 }
 
 function seriesCard(files) {
@@ -227,5 +226,5 @@ function seriesCard(files) {
   app.plots.push(plot);
   later(() => plot.show(null).catch(fail));
   const pick = (id, label, options, chosen, key) => h("select", { id, "aria-label": label, onchange: (e) => { draft[key] = e.target.value; render(false); } }, options.map(([v, t]) => h("option", { value: v, selected: v === chosen }, t)));
-  return h("section", { class: "card" }, h("h2", {}, "Look at the records"), plotControls(plot, [pick("series-file", "Record", files.map((f) => [f.id, f.name]), file.id, "file"), pick("series-channel", "Channel", channels.map((c) => [c, c.replace(/_/g, " ")]), channel, "channel")]), host);
+  return h("section", { class: "card" }, h("h2", {}, "Look at the records"), plotControls(plot, [pick("series-file", "Record", files.map((f) => [f.id, f.name]), file.id, "file"), pick("series-channel", "Channel", channels.map((c) => [c, c.replace(/_/g, " ")]), channel, "channel")]), host, leftOut(file, plot));
 }

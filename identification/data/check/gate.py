@@ -25,10 +25,17 @@ same record in both.
 def needed(record: Record, joint: Joint | None) -> tuple[str, ...]:
     """Channels that this joint says are there: a motor constant goes with a current.
 
-    A torque sensor carries balances of its own, with or without the drive.
+    A torque sensor carries balances of its own, with or without the drive; two positions show the
+    twist.
     """
     torques = (*DRIVES, "link_torque")
-    if joint is None or joint.torque_per_current is None or any(record.has(c) for c in torques):
+    both = record.has("motor_position") and record.has("link_position")
+    if (
+        joint is None
+        or joint.torque_per_current is None
+        or both
+        or any(record.has(c) for c in torques)
+    ):
         return ()
     return ("motor_current",)
 

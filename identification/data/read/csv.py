@@ -22,6 +22,10 @@ if TYPE_CHECKING:
 
 FloatColumn = npt.NDArray[np.float64]
 
+MOSTLY: Final = 0.9
+"""Share of the high bytes that are 0 in a table of numbers as UTF-16; the rest are letters of other
+scripts in the header.
+"""
 _HEAD_BYTES: Final = 1 << 17
 _HEAD_LINES: Final = 100
 _CLOCK: Final = re.compile(r"\d{4}-\d\d?-\d\d?|\d\d?:\d\d|\d\d?[./]\d\d?[./]\d{2,4}")
@@ -114,7 +118,7 @@ def _wide(head: bytes) -> str | None:
         ("utf-16-le", head[1::2], head[::2]),
         ("utf-16-be", head[::2], head[1::2]),
     ):
-        if len(head) > 2 and high.count(0) > 0.9 * len(high) and low.count(0) == 0:
+        if len(head) > 2 and high.count(0) > MOSTLY * len(high) and low.count(0) == 0:
             return encoding
     return None
 

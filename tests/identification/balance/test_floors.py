@@ -9,6 +9,7 @@ import numpy.typing as npt
 import pytest
 
 from identification import Record, fit
+from identification.balance.colour import white
 from identification.balance.drawn_noise import LONGEST, draws_of, excerpt
 from identification.balance.excitation import attenuation, excitation_warnings
 from identification.balance.noise import noise_level
@@ -174,7 +175,7 @@ def test_pieces_of_a_long_record_have_its_rows_and_its_floor() -> None:
     short = prepare(time[:40_000], {n: x[:40_000] for n, x in signals.items()}, (slice(0, 40_000),))
     assert excerpt(short)[0] is short
 
-    noise = {"motor_position": 1e-5, "torque": 0.01}
+    noise = {"motor_position": white(1e-5), "torque": white(0.01)}
     drawn = draws_of(whole, noise)[0]
     assert drawn.record.rows == part.rows
     assert np.array_equal(drawn.rows, index)

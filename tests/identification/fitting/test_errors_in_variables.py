@@ -11,7 +11,11 @@ from identification import Joint, Record, fit
 from identification.balance.dataset import load_dataset, prepared_model
 from identification.balance.drawn_noise import LONGEST
 from identification.balance.excitation import attenuation
-from identification.fitting.errors_in_variables import MOST_NOISE, whole_without
+from identification.fitting.errors_in_variables import (
+    MOST_NOISE,
+    NoiseProducts,
+    whole_without,
+)
 
 DT, JOINTS = 2e-3, 40
 NAMES = ("link_inertia", "link_viscous", "gravity_torque")
@@ -89,3 +93,12 @@ def test_only_certain_noise_is_taken_off_a_normal_matrix() -> None:
     assert whole_without(whole, noise) == pytest.approx(whole - noise, abs=1e-12)
     left = np.linalg.eigvalsh(np.linalg.solve(whole, whole_without(whole, 5 * whole)))
     assert left == pytest.approx([1 - MOST_NOISE] * 2)
+
+
+def test_noise_falls_on_the_blocks_whose_rows_take_part() -> None:
+    products = NoiseProducts({"link": np.eye(2)}, {"link": np.ones(2)})
+    block = np.array([0, 0, 1, 1, -1])
+    weights = {"link": np.array([1.0, 1.0, 1.0, 50.0, 1.0])}
+    gram, score = products.by_block(weights, block, {"link": np.array([1, 1, 1, 0, 1]) > 0})
+    assert gram[:, 0, 0] == pytest.approx([0.5, 0.25])
+    assert score[:, 1] == pytest.approx([0.5, 0.25])

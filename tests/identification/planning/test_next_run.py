@@ -11,9 +11,10 @@ import pytest
 from benchmarks.next_run import one_joint
 from casadi_models import JointModel
 from identification import Joint
+from identification.naming.contest import FEWEST
 from identification.planning.blind import blind_spots
 from identification.planning.motion import Motion
-from identification.planning.rivals import FEWEST, enough, power
+from identification.planning.rivals import enough, power
 from identification.planning.runs import FAMILIES, LOADS, Plant, Run
 from tests.hidden_effect.generator import generate_case
 from workbench.cli.main import main

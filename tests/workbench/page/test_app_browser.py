@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-SHARED = Path(__file__).resolve().parents[2].parent / "shared"
+SHARED = Path(__file__).resolve().parents[3].parent / "shared"
 CHROMIUM = Path(os.environ.get("IRJ_CHROMIUM", "/usr/bin/chromium"))
 AXE = os.environ.get("IRJ_AXE", "")
 CI = bool(os.environ.get("CI"))

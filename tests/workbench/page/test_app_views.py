@@ -219,7 +219,7 @@ def test_a_profiler_works_beside_the_thread_of_a_session() -> None:
     )
     done = subprocess.run(
         [sys.executable, "-c", code],
-        cwd=Path(__file__).parents[2],
+        cwd=Path(__file__).parents[3],
         timeout=60,
         check=False,
         capture_output=True,

@@ -1,0 +1,273 @@
+"""The noise of one channel: how much of it, how fast it forgets itself, and the hum of the mains.
+
+Fourth differences over m samples hold next to nothing of a motion and all of a noise: of white
+noise the same for every m, of noise through a filter the more the longer they reach. The course
+over m tells white noise from noise with a memory; from there the noise is continued to the slower
+rows of the balances.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final, final
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+
+REACH: Final = 0.0202
+"""Longest spacing of the fourth differences [s], four samples at 200 Hz and one in a hundred more
+for its clock: they hold frequencies above 25 Hz, where a motion has little but the few samples
+around a turn.
+"""
+SPACINGS: Final = (1, 2, 3, 4, 6, 8, 12, 16)
+"""Samples between the five that make a fourth difference."""
+MEMORIES: Final = tuple(float(x) for x in np.geomspace(0.5, 40.0, 23))
+"""Time constants of noise with a memory, in samples: steps of a fifth, which the readings just
+resolve, up to the noise of which 16 ms show a tenth.
+"""
+SCATTER: Final = 0.03
+"""Relative error of the power of such differences over :data:`SAMPLES` samples of white noise."""
+SAMPLES: Final = 12_000
+STEEP: Final = 4.0
+"""Power of the spacing with which the part of a motion rises at least: a jump of the acceleration
+between samples gives the fifth, smooth motion the eighth; noise with a memory at most the first.
+"""
+CLEARLY: Final = 4.0
+"""Standard errors of the readings by which such noise must explain them better than a motion."""
+SETTLED: Final = 3.0
+"""Memories of two low-passes in a row that the longest spacing must hold, so that the readings
+show their whole power: before that they rise as steeply as a motion.
+"""
+WARM: Final = 10.0
+"""Memories after which a drawn course has forgotten its beginning."""
+COLOURED: Final = 1.2
+"""Power of the longer differences over that of the shortest from which noise is not white: the
+readings of white noise scatter by 3 %, and the motion adds up to 10 % to the longest.
+"""
+STANDS_OUT: Final = 40.0
+"""Power of a line over the median around it: noise reaches it once in 1e12 frequencies."""
+AROUND: Final = 40
+"""Frequencies, in those that the record resolves, on either side that make this median."""
+WIDTH: Final = 3
+"""Half the width of a line after the window, in the same."""
+PURE: Final = 0.9
+"""Share of the power around a line that it must hold itself: that of a vibration of the joint
+wanders with its motion."""
+LOWEST_LINE: Final = 33.0
+"""Lowest frequency of a hum [Hz]: two periods to a kernel of the claims; the joint's own modes are
+slower."""
+CLEAN: Final = 0.1
+"""Share of a reading that must be no hum: the amplitude of a line is known within 5 %."""
+MOST_LINES: Final = 4
+"""Lines of one channel: mains and three harmonics."""
+FEWEST_SPACINGS: Final = 4
+"""Spacings from which on: one more than white noise beside one with a memory needs."""
+FEWEST: Final = 1000
+"""Samples from which a colour is read."""
+
+
+@final
+@dataclass(frozen=True)
+class Part:
+    """White noise through a low-pass.
+
+    Attributes
+    ----------
+    size : float
+        Standard deviation, in the channel's unit.
+    memory : float
+        Time constant of the low-pass [s]; 0 for white noise.
+    stages : int
+        Low-passes in a row.
+    """
+
+    size: float
+    memory: float = 0.0
+    stages: int = 1
+
+    def draw(self, rng: np.random.Generator, count: int, dt: float) -> FloatArray:
+        """A course of this noise, shape (count,), at steps of `dt` seconds."""
+        if self.memory <= 0:
+            return np.asarray(self.size * rng.standard_normal(count))
+        from scipy.signal import lfilter
+
+        warm = math.ceil(WARM * self.memory / dt)
+        pole = math.exp(-dt / self.memory)
+        # of one pole and of two: the sums of the squares of r^k and of (k + 1) r^k
+        power = 1 / (1 - pole**2) if self.stages == 1 else (1 + pole**2) / (1 - pole**2) ** 3
+        course = rng.standard_normal(count + warm)
+        for _ in range(self.stages):
+            course = lfilter([1.0], [1.0, -pole], course)
+        return np.asarray(self.size / math.sqrt(power) * course[warm:])
+
+
+@final
+@dataclass(frozen=True)
+class ChannelNoise:
+    """Noise of a channel.
+
+    Attributes
+    ----------
+    level : float
+        Deviation of the white noise that has the same fourth differences, in the channel's unit.
+    parts : tuple of Part
+        Independent of each other.
+    lines : tuple of (float, float)
+        Amplitude of each line and its frequency [Hz].
+    """
+
+    level: float
+    parts: tuple[Part, ...]
+    lines: tuple[tuple[float, float], ...] = ()
+
+    def scaled(self, level: float) -> ChannelNoise:
+        """The same colour at another level."""
+        if level == self.level:
+            return self
+        if self.level <= 0:
+            return white(level)
+        factor = level / self.level
+        return ChannelNoise(
+            level,
+            tuple(replace(part, size=factor * part.size) for part in self.parts),
+            tuple((factor * size, frequency) for size, frequency in self.lines),
+        )
+
+    def draw(self, rng: np.random.Generator, count: int, dt: float) -> FloatArray:
+        """A course of this noise, shape (count,), at steps of `dt` seconds."""
+        out = np.zeros(count)
+        for part in self.parts:
+            out += part.draw(rng, count, dt)
+        for size, frequency in self.lines:
+            phase = rng.uniform(0.0, 2 * np.pi)
+            out += size * np.sin(2 * np.pi * frequency * dt * np.arange(count) + phase)
+        return out
+
+
+def white(level: float) -> ChannelNoise:
+    """White noise of this deviation."""
+    return ChannelNoise(level, (Part(level),))
+
+
+def spacings_of(dt: float) -> list[int]:
+    """Spacings of the fourth differences that tell the colour of a channel, in samples of `dt`
+    seconds; too few to tell it where the logger is slow.
+    """
+    return [m for m in SPACINGS if m == 1 or m * dt <= REACH]
+
+
+def coloured(values: FloatArray, part: slice, dt: float, levels: Sequence[float]) -> ChannelNoise:
+    """Noise of a channel from its fourth differences.
+
+    Parameters
+    ----------
+    values : (n,) array
+        At even steps.
+    part : slice
+        The longest contiguous stretch: lines are looked for there.
+    dt : float
+        Step [s].
+    levels : sequence of float
+        Deviations of white noise with the same fourth differences over each of
+        :func:`spacings_of`; zeros where that is not known.
+    """
+    spacings, level = spacings_of(dt), levels[0]
+    if level <= 0 or len(spacings) < FEWEST_SPACINGS or part.stop - part.start < FEWEST:
+        return white(level)
+    count = sum(1 for x in levels if x > 0)
+    if count < FEWEST_SPACINGS:
+        return white(level)
+    spacings, power = spacings[:count], np.square(levels[:count])
+    lines = _lines(values, part, dt)
+    hum = sum(
+        (
+            size**2 / 2 * (2 * np.sin(np.pi * f * dt * np.array(spacings))) ** 8 / 70
+            for size, f in lines
+        ),
+        np.zeros(len(spacings)),
+    )
+    heard = hum > (COLOURED - 1) * power
+    lines = lines if heard.any() else ()
+    rest = power - hum if lines else power
+    use = rest > CLEAN * power
+    if use.sum() < FEWEST_SPACINGS or not use[0]:
+        return ChannelNoise(level, (Part(level),), lines)
+    # readings next to a line's own frequency are mostly that line
+    spacings, rest = [m for m, u in zip(spacings, use, strict=True) if u], rest[use]
+    if float(np.median(rest[1:])) < COLOURED * rest[0]:
+        return ChannelNoise(level, (Part(math.sqrt(rest[0])),), lines)
+    samples = part.stop - part.start
+    found = _with_memory(rest, spacings, dt, SCATTER * float(np.sqrt(SAMPLES / samples)))
+    return ChannelNoise(level, found, lines)
+
+
+def _with_memory(
+    power: FloatArray, spacings: Sequence[int], dt: float, scatter: float
+) -> tuple[Part, ...]:
+    """White noise, beside noise of one memory where the readings need it: the shortest one within
+    one standard error of them, since what a motion adds looks like a longer one.
+    """
+    from scipy.optimize import nnls
+
+    m = np.array(spacings, dtype=float)
+    error, flat = scatter * power, np.ones(len(m))
+
+    def misfit(second: FloatArray) -> tuple[float, FloatArray]:
+        share, left = nnls(np.column_stack([flat, second]) / error[:, None], power / error)
+        return float(left**2), share
+
+    def of_memory(stages: int, longest: float) -> tuple[float, tuple[Part, ...]]:
+        fits = [(x, *misfit(_seen(x, stages, spacings))) for x in MEMORIES if x <= longest]
+        best = min((left for _, left, _ in fits), default=np.inf)
+        for tau, left, share in fits:
+            if left <= best + 1:
+                parts = (Part(math.sqrt(share[0])), Part(math.sqrt(share[1]), dt * tau, stages))
+                return best, tuple(p for p in parts if p.size > 0)
+        return best, ()
+
+    moving, _ = misfit((m / m[-1]) ** STEEP)
+    found = [of_memory(1, np.inf), of_memory(2, m[-1] / SETTLED)]
+    left, parts = found[1] if found[1][0] < found[0][0] - CLEARLY**2 else found[0]
+    return parts if moving - left >= CLEARLY**2 else (Part(math.sqrt(power[0])),)
+
+
+def _seen(memory: float, stages: int, spacings: Sequence[int]) -> FloatArray:
+    """Share of the power of noise with that memory, in samples, in fourth differences over these
+    spacings.
+    """
+    pole, m = math.exp(-1 / memory), np.array(spacings, dtype=float)
+    slope = (1 - pole**2) / (1 + pole**2) if stages > 1 else 0.0
+    r = [pole ** (k * m) * (1 + slope * k * m) for k in range(5)]
+    return np.asarray((70 * r[0] - 112 * r[1] + 56 * r[2] - 16 * r[3] + 2 * r[4]) / 70)
+
+
+def _lines(values: FloatArray, part: slice, dt: float) -> tuple[tuple[float, float], ...]:
+    """Amplitude and frequency of the lines that stand out of the longest stretch."""
+    # differences take the slow motion out, which the window would not keep apart
+    course = np.diff(values[part], 2)
+    count = len(course)
+    window = np.sin(np.pi * (np.arange(count) + 0.5) / count) ** 4
+    power = np.abs(np.fft.rfft((course - course.mean()) * window)) ** 2
+    frequency = np.fft.rfftfreq(count, dt)
+    first = max(int(np.searchsorted(frequency, LOWEST_LINE)), AROUND)
+    found: list[tuple[float, float]] = []
+    usual = float(np.median(power[first:])) if first < len(power) else 0.0
+    for k in np.flatnonzero(power[first:-AROUND] > STANDS_OUT * usual) + first:
+        near = power[k - AROUND : k + AROUND + 1]
+        around = float(np.median(near))
+        own = float(near[AROUND - WIDTH : AROUND + WIDTH + 1].sum()) - (2 * WIDTH + 1) * around
+        over = float(np.sum(np.maximum(near - around / np.log(2), 0.0)))
+        if power[k] < near.max() or power[k] < STANDS_OUT * around or own < PURE * over:
+            continue
+        gain = (2 * np.sin(np.pi * frequency[k] * dt)) ** 2
+        # all power of a line in a window: (size/2)^2 n sum of its squares
+        size = 2 * np.sqrt(own / (count * float(np.sum(window**2)))) / gain
+        found.append((float(size), float(frequency[k])))
+    return tuple(sorted(found, reverse=True)[:MOST_LINES])
+
+
+__all__ = ["ChannelNoise", "Part", "coloured", "spacings_of", "white"]

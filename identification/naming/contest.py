@@ -1,0 +1,283 @@
+"""Names that tie: each fitted whole on the records, and what the records say about each."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Final, final
+
+import numpy as np
+import numpy.typing as npt
+
+from casadi_models import EFFECTS
+from identification.balance.balances import balances_of
+from identification.balance.dataset import Dataset
+from identification.balance.stacked import INDEPENDENT_SHARE, stack
+from identification.balance.weak import REST_SHARE, RESTING_SIDES, WeakRecord
+from identification.diagnosis.candidates import offered, shape_grid
+from identification.diagnosis.trials import Trial, make_base, try_candidate
+from identification.fitting.engine import Solution, reweighed, solve, stepped
+from identification.fitting.information import eliminated, form_of
+
+FloatArray = npt.NDArray[np.float64]
+
+FEWEST: Final = 3.0
+"""Log-likelihood from which a name counts as better: odds of twenty to one [nats]."""
+VALLEY_STEPS: Final = 5
+"""Gauss-Newton steps from each point of a grid, to see which valley is the deepest."""
+TURN_WIDTHS: Final = 3.0
+"""Smoothing velocities up to which friction has not yet reached its level (to 1 %)."""
+DECIDED: Final = 2.0
+"""Normal deviate over blocks of a difference of log-likelihoods from which a name is behind."""
+
+
+@final
+@dataclass(frozen=True)
+class Rival:
+    """One name of a set, fitted.
+
+    Attributes
+    ----------
+    name, label : str
+        Effect key; label in the model.
+    solution : Solution
+        The whole fit of the model that has this name in the place of the set.
+    """
+
+    name: str
+    label: str
+    solution: Solution
+
+
+def rivals_of(names: Sequence[str], balance: str, start: Solution, data: Dataset) -> list[Rival]:
+    """Every name of a set, fitted from the best point of its grid.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Effect keys.
+    balance : str
+        Where the set was claimed: of several places of a name, one that helps there.
+    start : Solution
+        The fit of the model without any of them.
+    data : Dataset
+    """
+    base = make_base(start, data)
+    candidates = offered(start.model, data, late=True)[0]
+    best: dict[str, Trial] = {}
+    for candidate in candidates:
+        if candidate.effect.key not in names:
+            continue
+        trial = try_candidate(candidate, base)
+        if not isinstance(trial, Trial):
+            continue
+        old = best.get(trial.key)
+        here = trial.balance == balance
+        if old is None or (here, trial.score) > (old.balance == balance, old.score):
+            best[trial.key] = trial
+    return [
+        Rival(
+            key,
+            best[key].candidate.label,
+            solve(best[key].candidate.model, data, start={**start.values, **best[key].values}),
+        )
+        for key in names
+        if key in best
+    ]
+
+
+def from_every_valley(rivals: Sequence[Rival], start: Solution, data: Dataset) -> list[Rival]:
+    """Rivals of which those behind the best were fitted again from every point of the grid of their
+    shapes.
+
+    A name must not fall out because its fit ended in another valley: a law with one knot more than
+    the best one can do all that this does.
+
+    Parameters
+    ----------
+    rivals : sequence of Rival
+    start : Solution
+        The fit of the model without any of them.
+    data : Dataset
+    """
+    contest = Contest(rivals, data)
+    known = {c.label: c for c in offered(start.model, data, late=True)[0]}
+    out = []
+    for rival, (nats, _) in zip(contest.rivals, contest.ahead, strict=True):
+        candidate = known.get(rival.label)
+        if nats <= FEWEST or candidate is None or not candidate.shapes:
+            out.append(rival)
+            continue
+        like = contest.leader.solution
+        tried = []
+        for shapes in shape_grid(candidate, data):
+            begun = {**start.values, **_common(like, start), **shapes}
+            found, cost = stepped(candidate.model, data, begun, like, iterations=VALLEY_STEPS)
+            if math.isfinite(cost):
+                tried.append((cost, found))
+        if tried:
+            best = min(tried, key=lambda t: t[0])[1]
+            whole = solve(candidate.model, data, start=best.values)
+            again = [replace(rival, solution=x) for x in (reweighed(best, data), whole)]
+            rival = Contest([rival, *again], data).leader
+        out.append(rival)
+    return out
+
+
+def _common(like: Solution, start: Solution) -> dict[str, float]:
+    """What a fit says of the parameters of a smaller model."""
+    return {n: v for n, v in like.values.items() if n in start.values}
+
+
+@final
+class Contest:
+    """Rivals on one weighting of the rows, and what the old records say about each.
+
+    Parameters
+    ----------
+    rivals : sequence of Rival
+        At least one.
+    data : Dataset
+    """
+
+    def __init__(self, rivals: Sequence[Rival], data: Dataset) -> None:
+        self.rivals, self.data = tuple(rivals), data
+        # each row by the largest scatter that one of them allows it, to find who fits best
+        common = {
+            b: np.minimum.reduce([r.solution.weights[b] for r in self.rivals])
+            for b in self.rivals[0].solution.weights
+        }
+        costs = [self._cost(r, common) for r in self.rivals]
+        self.leader = self.rivals[int(np.argmin(costs))]
+        self._old = [self._rows(r, data, self.leader.solution.weights) for r in self.rivals]
+
+    def _cost(self, rival: Rival, weights: Mapping[str, FloatArray]) -> float:
+        """Log-likelihood of the balances but for its sign, each with a scatter of its own."""
+        model = rival.solution.model
+        balances = balances_of(model, self.data.sensing, wrt=())
+        left = stack(balances, self.data.train, rival.solution.values).residual
+        return sum(
+            len(r) * math.log(max(float(np.linalg.norm(r * weights[b])), 1e-300))
+            for b, r in left.items()
+        )
+
+    def _rows(
+        self, rival: Rival, data: Dataset, weights: Mapping[str, FloatArray]
+    ) -> tuple[FloatArray, FloatArray, npt.NDArray[np.int64]]:
+        """Weighted residual, Jacobian over free parameters and unknowns of the runs, block of each
+        row."""
+        form = form_of(rival.solution, data, self.free(rival), weights)
+        x = np.array([form.values[n] for n in form.free])
+        stacked = form.stacked(x)
+        names = form.balances.balances
+        r = np.concatenate([stacked.residual[b] * weights[b] for b in names])
+        j = np.concatenate([stacked.jacobian[b] * weights[b][:, None] for b in names])
+        block = np.concatenate([np.where(stacked.taking[b], stacked.block, -1) for b in names])
+        return r, j, block
+
+    def free(self, rival: Rival) -> tuple[str, ...]:
+        """Parameters of a rival that may adapt: none that a bound holds."""
+        held = set(rival.solution.at_bound)
+        return tuple(n for n in rival.solution.free if n not in held)
+
+    @cached_property
+    def likelihood(self) -> FloatArray:
+        """Log-likelihood of each rival on the old records, (rivals,) [nats]."""
+        return np.array([-0.5 * INDEPENDENT_SHARE * float(r @ r) for r, _, _ in self._old])
+
+    @cached_property
+    def ahead(self) -> FloatArray:
+        """By how much the leader is ahead of each rival on the old records, and how sure that is
+        over blocks, as a normal deviate: by their mean or by their signs.  (rivals, 2)
+
+        Rows at a turn count only where one of the two laws says what happens there.
+        """
+        names = self.data.sensing.balances
+        calm = np.concatenate([~turning(self.leader.solution, self.data.train, b) for b in names])
+        best, _, block = self._old[self.rivals.index(self.leader)]
+        out = np.zeros((len(self.rivals), 2))
+        for k, (rival, (own, _, _)) in enumerate(zip(self.rivals, self._old, strict=True)):
+            counted = np.ones_like(calm) if about_turns(rival) or about_turns(self.leader) else calm
+            apart = _by_block(own * counted, block) - _by_block(best * counted, block)
+            difference = 0.5 * INDEPENDENT_SHARE * apart
+            count = len(difference)
+            spread = float(np.std(difference, ddof=1)) * math.sqrt(count) if count > 1 else 0.0
+            mean = float(difference.sum()) / spread if spread > 0 else 0.0
+            # one block may hold most of a difference that all of them show
+            signs = float(np.sign(difference).sum()) / math.sqrt(count)
+            out[k] = difference.sum(), max(mean, signs)
+        return out
+
+    def alive(self, unmodelled: float = 0.0) -> tuple[Rival, ...]:
+        """Rivals that the whole fits on the old records leave.
+
+        Parameters
+        ----------
+        unmodelled : float
+            Log-likelihood that laws which are not missing still gain in what the leader leaves
+            (:func:`identification.naming.odds.unmodelled`): names that differ by no more may differ
+            by such a gain [nats].
+        """
+        limit = max(FEWEST, unmodelled)
+        return tuple(
+            rival
+            for rival, (nats, deviate) in zip(self.rivals, self.ahead, strict=True)
+            if not (nats > limit and deviate > DECIDED)
+        )
+
+    def probability(self, unmodelled: float = 0.0) -> FloatArray:
+        """Chance of each rival that it is the true one of them, (rivals,).
+
+        Odds of the likelihoods with the price of each free parameter as in Bayes' criterion; before
+        the records all are equally likely. Likelihoods are tempered so that what is `unmodelled`
+        [nats] is no more than `FEWEST`.
+        """
+        tempering = max(1.0, unmodelled / FEWEST)
+        rows = np.count_nonzero(self._old[0][2] >= 0) / len(self.data.sensing.balances)
+        price = 0.5 * math.log(max(INDEPENDENT_SHARE * rows / tempering, 1.0))
+        count = np.array([len(r.solution.free) for r in self.rivals])
+        log = -self.ahead[:, 0] / tempering - price * count
+        odds = np.exp(log - log.max())
+        return np.asarray(odds / odds.sum())
+
+    @cached_property
+    def information(self) -> list[FloatArray]:
+        """What the old records say about the free parameters of each rival, unknowns of the runs
+        eliminated: (free, free) each.
+        """
+        return [
+            eliminated(j.T @ j, len(self.free(rival)))
+            for rival, (_, j, _) in zip(self.rivals, self._old, strict=True)
+        ]
+
+
+def about_turns(rival: Rival) -> bool:
+    """Whether a law says what happens while the motion turns round."""
+    effect = EFFECTS.get(rival.name)
+    return effect is not None and (effect.memory is not None or effect.shapes_reversal)
+
+
+def turning(
+    solution: Solution, records: Sequence[WeakRecord], balance: str
+) -> npt.NDArray[np.bool_]:
+    """Rows that touch a turn of a side whose friction acts in the balance: there dry friction is an
+    inequality, and the width of its change a stand-in.
+    """
+    parts = []
+    for rows in records:
+        out = np.zeros(rows.rows, dtype=np.bool_)
+        for side in RESTING_SIDES.get(balance, ()):
+            velocity = rows.points[f"{side}_velocity"]
+            widths = [solution.values[n] for n in solution.model.named("smoothing", side)]
+            slow = np.abs(velocity) < TURN_WIDTHS * max(widths, default=0.0)
+            turns = np.diff(np.sign(velocity), append=velocity[-1]) != 0
+            out |= rows.average((slow | turns).astype(np.float64)) > REST_SHARE
+        parts.append(out)
+    return np.concatenate(parts)
+
+
+def _by_block(residual: FloatArray, block: npt.NDArray[np.int64]) -> FloatArray:
+    used = block >= 0
+    return np.bincount(block[used], weights=residual[used] ** 2).astype(np.float64)

@@ -1,0 +1,132 @@
+"""Noise with a memory, hum, heavy tails and wild samples: the floor is what each of them leaves."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from identification import Joint, Record, fit
+from identification.balance.colour import ChannelNoise, Part, white
+from identification.balance.noise import noise_of
+from identification.balance.spikes import without_spikes
+from identification.fitting.assess import assess
+from identification.fitting.engine import load_dataset, prepared_model
+from tests.noise_bench import KINDS, filtered
+
+FloatArray = npt.NDArray[np.float64]
+
+DT, COUNT = 2e-3, 12_000
+JOINT = Joint(name="arm", gear_ratio=1.0, model_name="hd1", effects=("viscous@link", "gravity"))
+TIME = np.arange(COUNT) * DT
+POSITION, TORQUE = 1e-4, 0.4
+
+
+def motion() -> tuple[FloatArray, FloatArray]:
+    """A link under a torque, in closed form; Coulomb friction turns with it."""
+    angle = 2 * np.pi * np.outer([0.17, 0.45, 1.1, 1.9], TIME) + np.arange(4.0)[:, None]
+    rate = 2 * np.pi * np.array([0.17, 0.45, 1.1, 1.9])
+    size = np.array([0.5, 0.2, 0.1, 0.05])
+    q, v, bend = size @ np.sin(angle), (size * rate) @ np.cos(angle), size * rate**2
+    return q, -3.0 * (bend @ np.sin(angle)) + 4.0 * v - 30.0 * np.sin(q)
+
+
+def read(channel: FloatArray) -> ChannelNoise:
+    """What a record makes of the noise of a channel."""
+    return noise_of(Record.from_channels(TIME, {"link_torque": channel}), "torque", channel, 1.0)
+
+
+def record(kind: str, seed: int) -> Record:
+    """The link through sensors with this noise."""
+    rng = np.random.default_rng(seed)
+    make, (q, torque) = KINDS[kind].noise, motion()
+    step = KINDS[kind].step * TORQUE
+    torque = torque + TORQUE * make(rng, COUNT)
+    channels = {
+        "link_position": q + POSITION * make(rng, COUNT),
+        "link_torque": step * np.round(torque / step) if step else torque,
+    }
+    return Record.from_channels(TIME, channels, name=f"{kind} {seed}")
+
+
+@pytest.mark.parametrize("size", [0.01, 0.1, 1.0])
+def test_white_noise_on_a_motion_that_turns_stays_white(size: float) -> None:
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        q, torque = motion()
+        turning = torque + 20.0 * np.tanh(200.0 * np.gradient(q) / DT)
+        found = read(turning + size * TORQUE * rng.standard_normal(COUNT))
+        assert found == white(found.level)
+        assert found.level == pytest.approx(size * TORQUE, rel=0.1)
+
+
+@pytest.mark.parametrize(("corner", "within"), [(8.0, 2.0), (20.0, 1.3), (50.0, 1.1)])
+def test_noise_through_a_filter_is_read_with_its_memory(corner: float, within: float) -> None:
+    # 16 ms show the memory of 3 ms whole, and of that of 20 ms the beginning
+    rng = np.random.default_rng(int(corner))
+    q, torque = motion()
+    found = read(torque + 20.0 * np.sign(np.gradient(q)) + TORQUE * filtered(corner)(rng, COUNT))
+    # density towards zero frequency, which is what the rows of a balance see
+    slow = sum(p.size**2 * max(2 * p.stages * p.memory, DT) for p in found.parts)
+    assert 1 / within < np.sqrt(slow) / (TORQUE / np.sqrt(np.pi * corner)) < within
+    again = found.draw(rng, COUNT, DT)
+    assert read(torque + again).level == pytest.approx(found.level, rel=0.1)
+
+
+def test_hum_is_told_from_noise_and_a_motion_has_none() -> None:
+    rng = np.random.default_rng(3)
+    torque = motion()[1] + TORQUE * rng.standard_normal(COUNT)
+    found = read(torque + 0.7 * np.sin(2 * np.pi * 50.02 * TIME + 1.0))
+    ((size, frequency),) = found.lines
+    assert size == pytest.approx(0.7, rel=0.05)
+    assert frequency == pytest.approx(50.02, abs=0.05)
+    assert sum(p.size**2 for p in found.parts) == pytest.approx(TORQUE**2, rel=0.1)
+    # a mode of the joint that rings after every knock is no hum
+    knocks = np.zeros(COUNT)
+    knocks[rng.integers(0, COUNT, 60)] = rng.standard_normal(60)
+    ring = np.exp(-0.02 * 2 * np.pi * 40 * TIME[:2000]) * np.sin(2 * np.pi * 40 * TIME[:2000])
+    assert read(torque + 3.0 * np.convolve(knocks, ring)[:COUNT]).lines == ()
+
+
+def test_wild_samples_are_bridged_and_nothing_else_is_touched() -> None:
+    rng = np.random.default_rng(4)
+    q, torque = motion()
+    calm = torque + 20.0 * np.sign(np.gradient(q)) + TORQUE * rng.standard_normal(COUNT)
+    whole = (slice(0, COUNT),)
+    assert without_spikes(calm, whole, TORQUE) is calm
+    slow = np.abs(np.sin(TIME[::50])) + np.sign(np.sin(3 * TIME[::50]))
+    assert without_spikes(slow, (slice(0, len(slow)),), 1e-9) is slow
+    toggles = np.round(q / 0.05) * 0.05
+    assert without_spikes(toggles, whole, 1e-4) is toggles
+    hit = np.flatnonzero(rng.random(COUNT) < 0.005)
+    spoilt = calm.copy()
+    spoilt[hit] += rng.choice([-1.0, 1.0], len(hit)) * rng.uniform(10, 30, len(hit)) * TORQUE
+    mended = without_spikes(spoilt, whole, TORQUE)
+    left = np.ones(COUNT, dtype=bool)
+    left[hit] = False
+    assert np.array_equal(mended[left], calm[left])
+    # one in thirty has another one beside it
+    assert np.mean(np.abs(mended - calm)[hit] < 5 * TORQUE) > 0.95
+
+
+@pytest.mark.parametrize("kind", [k for k in KINDS if k != "drift"])
+def test_the_true_model_leaves_its_floor_under_every_kind_of_noise(kind: str) -> None:
+    ratios = []
+    for seed in (1, 2):
+        one = record(kind, seed)
+        data = load_dataset([one], [], JOINT, prepared_model(JOINT, one), kernel=0.12)
+        solution = fit(JOINT, [one]).solution
+        ratios.append(
+            assess(solution.model, data, data.train, solution.values).balances["link"].ratio
+        )
+    assert all(0.85 < r < 1.2 for r in ratios), ratios
+
+
+def test_noise_through_two_filters_in_a_row_is_read_too() -> None:
+    rng = np.random.default_rng(8)
+    drawn = ChannelNoise(1.0, (Part(TORQUE, 0.003, 2),)).draw(rng, COUNT, DT)
+    assert np.std(drawn) == pytest.approx(TORQUE, rel=0.05)
+    found = read(motion()[1] + drawn)
+    assert any(p.stages == 2 for p in found.parts)
+    slow = sum(p.size**2 * max(2 * p.stages * p.memory, DT) for p in found.parts)
+    assert np.sqrt(slow) == pytest.approx(TORQUE * np.sqrt(4 * 0.003), rel=0.15)

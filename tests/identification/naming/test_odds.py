@@ -1,0 +1,129 @@
+"""Whole fits of names of one effect: the one that was put in leads, and how sure that is."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from identification import improve
+from identification.data.formats import chances
+from identification.data.joint_file import Joint
+from identification.diagnosis.claims import Ranking, rank
+from identification.diagnosis.trials import make_base
+from identification.fitting.engine import load_dataset, prepared_model, solve
+from identification.naming.contest import FEWEST, Contest, rivals_of
+from identification.naming.odds import contenders, contest_of, odds_of, unmodelled
+from tests.smooth_laws import Law, record
+
+FloatArray = npt.NDArray[np.float64]
+JOINT = Joint("axis", model_name="hd1", effects=("viscous", "coulomb"))
+NAMES = ("cubic_viscous", "quadratic_drag")
+
+
+def drag(q: FloatArray, v: FloatArray) -> FloatArray:
+    """`quadratic_drag` of the library, weak beside the viscous friction."""
+    return 3 * v * np.abs(v)
+
+
+def level(q: FloatArray, v: FloatArray) -> FloatArray:
+    """A constant: an offset of the current, or a Coulomb friction that differs by direction."""
+    return 4.0 + 0 * q
+
+
+def contest(law: Law, names: tuple[str, ...]) -> Contest:
+    runs = [record(np.random.default_rng([3, k]), 20.0, law) for k in (0, 1)]
+    model = prepared_model(JOINT, runs[0])
+    data = load_dataset(runs[:1], runs[1:], JOINT, model)
+    bare = solve(model, data)
+    first = rivals_of(names[:1], "axis", bare, data)[0]
+    return contest_of(names, "axis", first, bare, data)
+
+
+@pytest.fixture(scope="module")
+def drags() -> Contest:
+    """Led by the name that is not the hidden one."""
+    return contest(drag, NAMES)
+
+
+def left_by(found: Contest) -> Ranking:
+    return rank(make_base(found.leader.solution, found.data))
+
+
+def test_the_hidden_name_leads_and_the_chances_add_up(drags: Contest) -> None:
+    assert drags.leader.name == "quadratic_drag"
+    assert [r.name for r in drags.rivals] == [*NAMES, ""], "nothing at all is a rival too"
+    for allowance in (0.0, 30.0):
+        share = drags.probability(allowance)
+        assert share.sum() == pytest.approx(1.0)
+        assert int(np.argmax(share)) == 1
+    # both names have one amplitude: their odds are those of the likelihoods alone
+    share, nats = drags.probability(), drags.likelihood
+    assert np.log(share[1] / share[0]) == pytest.approx(drags.ahead[0, 0])
+    assert nats[2] < min(nats[:2]), "a law that imitates is better than none"
+
+
+def test_a_name_falls_out_by_more_than_what_is_unmodelled(drags: Contest) -> None:
+    nats, deviate = drags.ahead[0]
+    assert nats > FEWEST
+    assert deviate > 2
+    names = {allow: {r.name for r in drags.alive(allow)} for allow in (0.0, 1.01 * nats)}
+    assert names[0.0] == {"quadratic_drag"}
+    assert names[1.01 * nats] == set(NAMES) | ({""} if drags.ahead[2, 0] <= 1.01 * nats else set())
+    unsure = drags.probability(2 * nats)[1]
+    assert 0.5 < unsure < 0.9, "what is unmodelled makes a name less sure"
+
+
+def test_what_the_true_law_leaves_holds_no_other(drags: Contest) -> None:
+    allowance = unmodelled(left_by(drags), "axis")
+    assert allowance < 0.05 * drags.ahead[0, 0]
+    odds = odds_of(drags, allowance)
+    assert odds.names == ("quadratic_drag",)
+    assert odds.probability["quadratic_drag"] > 0.99
+    assert "nats behind" in odds.behind["cubic_viscous@motor"]
+
+
+def test_a_bump_that_no_name_has_is_an_allowance() -> None:
+    found = contest(lambda q, v: drag(q, v) + 5 * np.exp(-(((q - 0.3) / 0.15) ** 2)), NAMES)
+    clean = contest(drag, NAMES)
+    assert unmodelled(left_by(found), "axis") > 10 * max(FEWEST, unmodelled(left_by(clean), "axis"))
+
+
+def test_names_that_are_one_column_share_the_chance() -> None:
+    found = contest(level, ("current_offset", "asymmetric_coulomb"))
+    odds = odds_of(found, 0.0)
+    assert set(odds.names) == {"current_offset", "asymmetric_coulomb"}
+    for p in odds.probability.values():
+        assert p == pytest.approx(0.5, abs=0.1)
+
+
+def test_who_is_worth_a_whole_fit() -> None:
+    near = {"cyclic_torque": 5.9, "added_spring": 6.1, "cubic_viscous": 0.0, "stribeck": 1.0}
+    assert contenders(("quadratic_drag",), near, 0.0) == (
+        "quadratic_drag",
+        "cubic_viscous",
+        "stribeck",
+        "cyclic_torque",
+    )
+    assert "added_spring" in contenders(("quadratic_drag",), near, 3.1)
+    assert "cubic_viscous" not in contenders(("viscous",), near, 0.0), "it holds the other"
+    many = tuple("abcdef")
+    assert contenders(many, near, 0.0) == many
+
+
+def test_improve_takes_the_name_that_fits_best_and_says_how_sure_it_is() -> None:
+    runs = [
+        record(np.random.default_rng([3, k]), 20.0, lambda q, v: 5 * drag(q, v)) for k in (0, 1)
+    ]
+    found = improve(runs[0], JOINT, runs[1])
+    assert [c.effects for c in found.claims] == [("quadratic_drag",)]
+    claim = found.claims[0]
+    assert claim.confidence["quadratic_drag"] > 0.99
+    assert claim.as_json()["confidence"] == dict(claim.confidence)
+    assert claim.separate_by is None
+    assert "over 99 % quadratic_drag" in str(found)
+
+
+def test_chances_are_told_without_false_certainty() -> None:
+    assert chances({"a": 0.9999, "b": 1e-5}) == "over 99 % a, under 1 % b"
+    assert chances({"a": 0.967, "b": 0.033}) == "97 % a, 3 % b"

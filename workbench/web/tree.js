@@ -1,0 +1,64 @@
+"use strict";
+/* The tree of fits: every fit that was made, by the input it was made from; opened, named, noted, held against another. */
+const stepTitle = (s) => s.remark.name || (s.action === "start" ? "Start model" : `${s.action === "remove" ? "−" : "+"} ${s.title || s.label}`);
+
+/* Branches of one input as one tree: paths that begin alike share their beginning. */
+function treeOf(branches) {
+  const groups = [];
+  for (const b of branches) {
+    let group = groups.find((g) => g.input === b.input && g.steps && b.steps.length && g.root.children[0] && g.root.children[0].step.id === b.steps[0].id);
+    if (!group) { group = { input: b.input, change: b.change, branch: b, root: { children: [] }, steps: b.steps.length, current: false }; groups.push(group); }
+    group.current = group.current || b.current;
+    let node = group.root;
+    b.steps.forEach((step, k) => {
+      let next = node.children.find((c) => c.step.id === step.id);
+      if (!next) { next = { step, branch: b, children: [], now: false, on: false }; node.children.push(next); }
+      if (b.current && !step.undone) { next.on = true; next.now = k === b.steps.length - 1 || b.steps[k + 1].undone; next.branch = b; }
+      node = next;
+    });
+  }
+  return groups;
+}
+
+function treeCard(state) {
+  const draft = app.drafts.tree || (app.drafts.tree = { chosen: [], noting: null });
+  const body = h("div", { class: "tree" }), card = h("section", { class: "card", id: "tree", "aria-label": "Tree of fits" }, h("h2", {}, "Tree of fits"), h("p", { class: "small soft" }, "Every fit is kept. A changed record or joint begins a branch; nothing is deleted."), body);
+  const go = (branch, step) => act(async () => { await post("/tree", { open: branch, step }); await refresh(); });
+  const write = (of, change) => act(async () => { draft.noting = null; await post("/tree", { of, ...change }); await refresh(); });
+  const draw = (branches) => {
+    const node = (n) => {
+      const s = n.step, id = `fit-${s.id}`, noting = draft.noting === s.id;
+      const tick = h("input", { type: "checkbox", id: `${id}-compare`, "aria-label": `Compare ${stepTitle(s)}, ${digits(s.error)} %`, checked: draft.chosen.includes(s.id), onchange: (e) => { draft.chosen = [...draft.chosen.filter((x) => x !== s.id), ...(e.target.checked ? [s.id] : [])].slice(-2); draw(branches); } });
+      return h("li", {}, h("div", { class: `fit${n.now ? " now" : n.on ? " on" : ""}`, id }, tick, h("span", { class: "fit-name" }, stepTitle(s)), h("span", { class: "num" }, `${digits(s.error)} %`), s.diagnosed ? h("span", { class: "tag good" }, "diagnosed") : null,
+        n.now ? h("span", { class: "tag" }, "now") : button("Open", () => go(n.branch.id, s.id), { kind: "quiet", id: `${id}-open`, label: `Open ${stepTitle(s)}, ${digits(s.error)} %` }),
+        button(s.remark.note || s.remark.name ? "Edit note" : "Name, note", () => { draft.noting = noting ? null : s.id; draw(branches); }, { kind: "quiet", work: false, id: `${id}-note`, label: `Name, note of ${stepTitle(s)}` })),
+        noting ? h("form", { class: "row", onsubmit: (e) => { e.preventDefault(); write(s.id, { name: $(`${id}-name`).value, note: $(`${id}-text`).value }); } }, h("input", { id: `${id}-name`, "aria-label": "Name", placeholder: "Name", value: s.remark.name || "" }), h("input", { id: `${id}-text`, size: "48", "aria-label": "Note", placeholder: "Note", value: s.remark.note || "" }), h("button", { type: "submit" }, "Keep")) : s.remark.note ? h("p", { class: "small soft note-text" }, s.remark.note) : null,
+        n.children.length ? h("ul", {}, n.children.map(node)) : null);
+    };
+    const groups = treeOf(branches).map((g) => h("div", { class: "input" }, h("p", { class: "small" }, h("strong", {}, g.change || "First input"), h("span", { class: "soft" }, ` · ${g.input || "no record"}`)),
+      g.root.children.length ? h("ul", {}, g.root.children.map(node)) : h("div", { class: g.current ? "fit now" : "fit" }, h("span", { class: "soft" }, "not fitted yet"), g.current ? h("span", { class: "tag" }, "now") : button("Open", () => go(g.branch.id, ""), { kind: "quiet", label: `Open ${g.change || "this input"}` }))));
+    const both = draft.chosen.length === 2, held = h("div", { id: "held-against" });
+    body.replaceChildren(...groups, h("div", { class: "row" }, button("Compare the two", () => get(`/view/fits?a=${draft.chosen[0]}&b=${draft.chosen[1]}`).then((found) => held.replaceChildren(fitsTable(found))).catch(fail), { work: false, id: "compare-fits", off: !both })), held);
+  };
+  get("/view/tree").then((found) => draw(found.branches)).catch(fail);
+  return card;
+}
+
+function fitsTable(found) {
+  const [a, b] = found.steps, changed = found.values.filter((v) => v.first !== v.second), cell = (v) => h("td", { class: "num" }, v == null ? "–" : digits(v, 4));
+  return h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Two fits compared" }, h("table", {}, h("caption", {}, "Two fits side by side"), h("thead", {}, h("tr", {}, h("th", { scope: "col" }, ""), h("th", { scope: "col", class: "num" }, stepTitle(a)), h("th", { scope: "col", class: "num" }, stepTitle(b)))),
+    h("tbody", {}, h("tr", { class: "now" }, h("th", { scope: "row" }, "Held-out error [%]"), cell(a.error), cell(b.error)), h("tr", {}, h("th", { scope: "row" }, "Only in it"), found.only.map((o) => h("td", {}, o.length ? o.map(effectTitle).join(", ") : "–"))),
+      changed.map((v) => h("tr", {}, h("th", { scope: "row" }, v.name.replace(/_/g, " ")), cell(v.first), cell(v.second))))));
+}
+
+/* A law of one's own: typed in one line, fitted at once to what the model leaves, kept in the joint file. */
+function lawCard(state) {
+  const draft = app.drafts.law || (app.drafts.law = { law: "", on: "motor", parameters: "" });
+  const field = (key, label, placeholder, size) => h("input", { id: `law-${key}`, value: draft[key], placeholder, size, "aria-label": label, autocomplete: "off", spellcheck: "false", oninput: (e) => { draft[key] = e.target.value; } });
+  const place = h("select", { id: "law-on", "aria-label": "Where it acts", onchange: (e) => { draft.on = e.target.value; } }, app.config.places.map((p) => h("option", { value: p, selected: p === draft.on }, p.replace(/_/g, " "))));
+  const row = (t) => h("li", {}, h("div", { class: "row between" }, h("span", {}, h("code", {}, t.law), ` on ${t.on.replace(/_/g, " ")}: the held-out error ${t.after < t.before ? "falls" : "goes"} from ${digits(t.before)} to `, h("strong", {}, `${digits(t.after)} %`)),
+    button("Add", () => run("add", { label: t.label }, "ledger"), { kind: t.after < t.before ? "primary" : "", id: `add-${t.label}`, label: `Add ${t.law}` })));
+  return h("form", { class: "card", id: "own-law", onsubmit: (e) => { e.preventDefault(); $("try-law").click(); } }, h("h2", {}, "A law of your own"), h("div", { class: "row" }, field("law", "Law", "a*tanh(v/b)", "28"), place, field("parameters", "Parameters with ranges and units", "a=0..10 N.m, b=0.01..1 rad/s", "34"),
+    button("Try it", () => run("law", { ...draft }), { id: "try-law" })), h("p", { class: "small soft" }, "Signals: q, v, a (angle, speed, acceleration of the place), twist, T, t. It is fitted at once to what the model leaves, and stays in the joint file."),
+    state.laws.length ? h("ul", { class: "plain", id: "tried-laws" }, state.laws.map(row)) : null);
+}
