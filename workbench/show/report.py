@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from importlib import metadata, resources
 from itertools import count
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from identification.data.formats import percent, ratio
 from identification.data.record import Record
@@ -38,6 +38,9 @@ from workbench.show.results import (
 from workbench.show.trusted import trusted_html
 from workbench.show.words import kind_of
 
+if TYPE_CHECKING:
+    from identification.variants.exploration import Exploration
+
 RANKED_SHOWN: Final = 8
 PACKAGES: Final = ("irj", "casadi", "numpy", "scipy")
 
@@ -49,6 +52,7 @@ def write_report(
     records: Sequence[Record] = (),
     command: str | None = None,
     trust: Trust | None = None,
+    exploration: Exploration | None = None,
     author: str = "",
     notes: str = "",
 ) -> Path:
@@ -67,6 +71,8 @@ def write_report(
         The command that made it, for the provenance.
     trust : Trust, optional
         Which number of the last step to trust, for a table.
+    exploration : Exploration, optional
+        All variants of the model on the same records, for a section.
     author, notes : str
         For the first page; lines of the notes are kept.
 
@@ -82,7 +88,13 @@ def write_report(
     """
     path = Path(to)
     page = render_report(
-        improvement, records=records, command=command, trust=trust, author=author, notes=notes
+        improvement,
+        records=records,
+        command=command,
+        trust=trust,
+        exploration=exploration,
+        author=author,
+        notes=notes,
     )
     if path.is_dir():
         raise InputError(f"{path}: is a folder; give the name of a file, as {path / 'report.html'}")
@@ -96,6 +108,7 @@ def render_report(
     records: Sequence[Record] = (),
     command: str | None = None,
     trust: Trust | None = None,
+    exploration: Exploration | None = None,
     author: str = "",
     notes: str = "",
 ) -> str:
@@ -104,6 +117,10 @@ def render_report(
     plots = report_plots(improvement, records)
     name = improvement.joint.name
     sections = [s for s in _sections(improvement, result, plots, records) if s[2]]
+    if exploration is not None:
+        from workbench.show.front import exploration_section
+
+        sections.append(("variants", "All variants of the model", exploration_section(exploration)))
     if trust is not None:
         sections.append(("trust", "Which number to trust", trusted_html(trust)))
     made = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
