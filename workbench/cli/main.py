@@ -309,6 +309,9 @@ def parser() -> OneLineParser:
     explored.add_argument(
         "-o", "--output", metavar="FILE", help="write the joint file of the recommended variant"
     )
+    explored.add_argument(
+        "--report", metavar="FILE", help="write the HTML report, with a section of the variants"
+    )
     moved = verb("changed", "changed", "which parameters of a fitted joint moved, by how much")
     moved.add_argument("reference", metavar="REFERENCE", help="joint file written by a fit")
     moved.add_argument("records", nargs="+", metavar="REC", help="record files")

@@ -14,7 +14,7 @@ from importlib import metadata, resources
 from itertools import count
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from identification.data.formats import percent, ratio
 from identification.data.record import Record
@@ -40,6 +40,9 @@ from workbench.show.results import (
 from workbench.show.trusted import trusted_html
 from workbench.show.words import kind_of
 
+if TYPE_CHECKING:
+    from identification.variants.exploration import Exploration
+
 RANKED_SHOWN: Final = 8
 PACKAGES: Final = ("irj", "casadi", "numpy", "scipy")
 
@@ -51,6 +54,7 @@ def write_report(
     records: Sequence[Record] = (),
     command: str | None = None,
     trust: Trust | None = None,
+    exploration: Exploration | None = None,
     author: str = "",
     notes: str = "",
     beside: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
@@ -70,6 +74,8 @@ def write_report(
         The command that made it, for the provenance.
     trust : Trust, optional
         Which number of the last step to trust, for a table.
+    exploration : Exploration, optional
+        All variants of the model on the same records, for a section.
     author, notes : str
         For the first page; lines of the notes are kept.
     beside : mapping of str to mapping
@@ -92,6 +98,7 @@ def write_report(
         records=records,
         command=command,
         trust=trust,
+        exploration=exploration,
         author=author,
         notes=notes,
         beside=beside,
@@ -108,6 +115,7 @@ def render_report(
     records: Sequence[Record] = (),
     command: str | None = None,
     trust: Trust | None = None,
+    exploration: Exploration | None = None,
     author: str = "",
     notes: str = "",
     beside: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
@@ -119,6 +127,10 @@ def render_report(
     sections = [s for s in _sections(improvement, result, plots, records) if s[2]]
     if beside and result["steps"]:
         sections.append(("beside", "Beside other results", beside_html(result, beside)))
+    if exploration is not None:
+        from workbench.show.front import exploration_section
+
+        sections.append(("variants", "All variants of the model", exploration_section(exploration)))
     if trust is not None:
         sections.append(("trust", "Which number to trust", trusted_html(trust)))
     made = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
