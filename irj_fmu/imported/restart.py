@@ -10,7 +10,8 @@ nothing but inertias and a spring, which that joint explains exactly where the F
 with the FMU's accelerations a and its gear torque T, and P = K d + D d' from its torsion d in the
 middle of the run. J_m, K and D follow from how its accelerations answer to the input and to the
 other side's position and velocity, J_l from the reaction. What P takes out is what a wrong law of
-one side does to the other within the run.
+one side does to the other within the run; what it does to its own side is taken out by the slope of
+that side's resistance.
 """
 
 from __future__ import annotations
@@ -94,12 +95,15 @@ class Inertias:
         Drive torque per acceleration of the driven side [kg.m2].
     link, stiffness, damping : float
         Of the other side, and between them; zero for a joint of one side.
+    drag : tuple of float
+        Slope of each side's own resistance over its velocity [N.m.s/rad].
     """
 
     motor: float
     link: float = 0.0
     stiffness: float = 0.0
     damping: float = 0.0
+    drag: tuple[float, ...] = ()
 
 
 def sides_of(model: UserModel) -> tuple[Side, ...]:
@@ -207,12 +211,19 @@ class Restart:
             rows = self._rows(w, starts)
             rates, speeds, path = self._answers(given, starts, rows, own)
             drive = self._mean(given, rows)
-            left = found.motor * rates[:, 0] - drive
+            drifts = [
+                b * (speeds[:, j] - smooth_velocity(starts[rows + 1, s.velocity], model, s))
+                for j, (b, s) in enumerate(zip(found.drag, sides, strict=True))
+            ]
+            left = found.motor * rates[:, 0] + drifts[0] - drive
             known = {"drive": left}
             if len(sides) == 2:
                 twist = path[:, 0] * sides[0].unit - path[:, 1] * sides[1].unit
                 pull = found.stiffness * twist + found.damping * (speeds[:, 0] - speeds[:, 1])
-                known = {"drive": left + pull, "coupling": found.link * rates[:, 1] - pull}
+                known = {
+                    "drive": left + pull,
+                    "coupling": found.link * rates[:, 1] + drifts[1] - pull,
+                }
                 if self._torque is not None:
                     scale = model.outputs[self._torque].scale
                     known["torque"] = pull - path[:, -1] / scale
@@ -427,9 +438,9 @@ class Restart:
         drive = np.array([torque for _, torque in probes])
         scale = 1.0 / np.maximum(np.abs(answers[:, : len(sides)]).max(axis=1), 1e-300)
         if len(sides) == 1:
-            (motor, *_), *_ = np.linalg.lstsq(answers * scale[:, None], drive * scale, rcond=None)
-            self._must_move(motor)
-            return Inertias(float(motor))
+            alone = np.linalg.lstsq(answers * scale[:, None], drive * scale, rcond=None)[0]
+            self._must_move(float(alone[0]))
+            return Inertias(float(alone[0]), drag=(float(alone[1]),))
         a, w, q = answers[:, 0:2], answers[:, 2:4], answers[:, 4:6]
         twist = np.column_stack([q[:, 0] - q[:, 1], w[:, 0] - w[:, 1]])
         left = np.column_stack([a[:, 0], twist, w[:, 0], q[:, 0]])
@@ -438,7 +449,8 @@ class Restart:
         self._must_move(motor)
         right = np.column_stack([a[:, 1], w[:, 1], q[:, 1]])
         pull = twist @ found[1:3]
-        link = float(np.linalg.lstsq(right * scale[:, None], pull * scale, rcond=None)[0][0])
+        other = np.linalg.lstsq(right * scale[:, None], pull * scale, rcond=None)[0]
+        link, drag = float(other[0]), (float(found[3]), float(other[1]))
         if not (stiffness > 0 and link > 0):
             raise InputError(
                 f"{self.model.fmu.path.name}: its link does not answer to its motor; check the "
@@ -446,7 +458,7 @@ class Restart:
             )
         dt = float(np.median(np.diff(window.time)))
         damping = damping if damping > LEAST_DAMPING * stiffness * dt else 0.0
-        return Inertias(motor, link, stiffness, damping)
+        return Inertias(motor, link, stiffness, damping, drag)
 
     def _must_move(self, inertia: float) -> None:
         if not (np.isfinite(inertia) and inertia > 0):

@@ -8,10 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from identification.data.joint_file import Joint
 from identification.data.record import Record
 from identification.errors import InputError
 from irj_fmu.imported.diagnose import diagnose
 from irj_fmu.imported.restart import Restart
+from tests.irj_fmu.imported.test_user_fmu import DRAG, axis, axis_model
+from tests.irj_fmu.imported.test_user_fmu import TRUTH as AXIS
 from tests.user_fmus.make import Make, build, check
 from tests.user_fmus.plant import TRUTH, foreign, recorded
 
@@ -75,3 +78,23 @@ def test_a_kinematic_error_is_named_and_nothing_beside_it(path: Path) -> None:
     assert after.rms < 0.05 * before.rms
     with pytest.raises(InputError, match="only a torque at the drive rides outside"):
         found.add()
+
+
+def test_what_the_file_says_the_fmu_holds_changes_no_answer(tmp_path: Path) -> None:
+    """A slow motion tells friction laws apart badly: beside the FMU's own parameter of the same law
+    a listed effect in the balance would be a column that is nearly another.
+    """
+    path = build("Axis", tmp_path, Make(2, ("CoSimulation",)))
+    record = axis(
+        lambda _q, w: DRAG * w * abs(w), seconds=8.0, h=4e-3, motion=lambda t: 0.3 * np.sin(0.5 * t)
+    )
+    outcomes, falls = [], []
+    for effects in ((), ("viscous", "coulomb", "gravity")):
+        model = axis_model(path, joint=Joint(name="axis", effects=effects)).with_values(AXIS)
+        found = diagnose(model, record.window(0, 5.5), record.window(5.5, 8))
+        outcomes.append(found.diagnosis.outcome)
+        falls.append({t.key: t.held_out_drop_percent for t in found.ranking.trials})
+    assert outcomes[0] == outcomes[1]
+    assert "quadratic_drag" in falls[1]
+    for key, fall in falls[1].items():
+        assert fall == pytest.approx(falls[0][key]), key
