@@ -208,7 +208,9 @@ def staircase_picture(
             f'<path class="s-ink" stroke="{INK}" stroke-dasharray="2 3" d="M{LEFT} '
             f'{y:.1f}H{width - RIGHT}"/>'
         )
-        body += word(LEFT + 4, y + 12, f"noise alone: {number(floor, 2)} %", "start")
+        below = y + 12 <= base - 2  # else the words would stand in those of the steps
+        at = y + 12 if below else y - 4
+        body += word(LEFT + 4, at, f"noise alone: {number(floor, 2)} %", "start")
     fall = " to ".join(f"{number(v, 3)} %" for v in values)
     noise = f"; measurement noise alone leaves {number(floor, 3)} %" if floor is not None else ""
     return svg(f"Held-out error, step by step: {fall}{noise}", body, height, width)
