@@ -17,6 +17,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks.fault_plant import DT, FACTORS, SIZES
 from identification.data.formats import number
 from identification.faults.detector import ABRUPT, KINDS, SENSORS
+from workbench.show.chart import sheet
 
 Results = dict[str, Any]
 UNITS = {
@@ -434,12 +435,12 @@ def curves_picture(found: dict[tuple[str, str], list[tuple[float, float]]]) -> s
         for j, (k, c) in enumerate(COLOURS.items())
     )
     whole = 46 + 3 * (width + gap)
-    return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {whole} {60 + 2 * (height + 70)}" '
-        'font-family="system-ui, sans-serif" role="img" '
-        'aria-label="Percent of faults named rightly against their size, per sensor and '
-        'kind"><rect width="100%" height="100%" fill="#fff"/>'
-        f"{legend}{''.join(body)}</svg>\n"
+    label = "Percent of faults named rightly against their size, per sensor and kind"
+    return sheet(
+        legend + "".join(body),
+        whole,
+        60 + 2 * (height + 70),
+        f' role="img" aria-label="{label}"',
     )
 
 

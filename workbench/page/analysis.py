@@ -394,6 +394,7 @@ class Analysis:
                     **row,
                     "low": limits.get(n, (None, None))[0],
                     "high": limits.get(n, (None, None))[1],
+                    "held": n in self.joint.known and self.joint.known[n].value is not None,
                 }
                 for n, row in table.items()
             }

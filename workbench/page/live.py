@@ -16,7 +16,7 @@ from identification.data.record import Record
 from identification.errors import InputError
 from workbench.page.analysis import Analysis, Progress
 from workbench.page.desk.tree import after_input, given
-from workbench.page.records import checked, opened
+from workbench.page.records import checked, opened, without_windows
 from workbench.page.session import FileEntry, Session, State
 from workbench.page.work import CancelledError, Task, Worker
 
@@ -261,8 +261,9 @@ class Live:
         with self.building:
             if self._analysis is None:
                 ready = [f for f in self.state.files if f.status == "ready"]
-                train = [self.record(f.id) for f in ready if f.role == "train"]
-                held = [self.record(f.id) for f in ready if f.role == "held_out"]
+                used = [(f.role, without_windows(self.record(f.id), f.left_out)) for f in ready]
+                train = [r for role, r in used if role == "train"]
+                held = [r for role, r in used if role == "held_out"]
                 made = Analysis(self.joint(), train, held)
                 if self.state.steps:
                     made.restore(self.state.steps[-1])

@@ -15,7 +15,7 @@ from identification.data.channels import channel_unit
 from identification.data.formats import number, pretty_unit, with_error
 from identification.data.record import Record
 from identification.diagnosis.improve import Improvement
-from workbench.show.chart import Chart, Curve, Label
+from workbench.show.chart import Chart, Curve, Label, svg
 from workbench.show.pictures import AT_THE_LINK, AT_THE_MOTOR, place_picture
 from workbench.show.plots import ReportPlots, decimated, explained
 from workbench.show.results import staircase_html, step_names, table, text
@@ -201,11 +201,7 @@ def joint_picture(improvement: Improvement) -> str:
             )
     measured_names = ", ".join(f"{b[1]} at the {b[0]}" for b in boxes if b[2])
     label = f"The joint from drive to link; measured: {measured_names}"
-    return (
-        f'<svg class="picture chain" role="img" aria-label="{text(label)}" '
-        f'viewBox="0 0 {width} 60" width="{width}" height="60" '
-        f'font-family="system-ui, sans-serif">{"".join(out)}</svg>'
-    )
+    return svg(label, "".join(out), 60, width, "picture chain")
 
 
 def motion_charts(improvement: Improvement, records: Sequence[Record]) -> list[tuple[str, Chart]]:

@@ -8,7 +8,7 @@ from typing import Final
 
 from identification.data.formats import number
 from identification.variants.exploration import Exploration, Variant
-from workbench.show.chart import AFTER, BEFORE, INK, WIDTH
+from workbench.show.chart import AFTER, BEFORE, INK, WIDTH, sheet
 from workbench.show.pictures import Dot, front_picture
 from workbench.show.results import spaced, table, text
 
@@ -63,12 +63,8 @@ def exploration_picture(found: Exploration) -> str:
     for line, colour in [*named, ("", INK), *((w, INK) for w in lines)]:
         beside += _word(WIDTH + 16, y, colour, line)
         y += LINE
-    size = f"{WIDTH + BESIDE} {height}"
-    return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {size}" width="{WIDTH + BESIDE}" '
-        f'height="{height}" font-family="system-ui, sans-serif"><rect width="100%" height="100%" '
-        f'fill="#ffffff"/>{legend}<g transform="translate(0 30)">{picture}</g>{beside}</svg>\n'
-    )
+    body = f'{legend}<g transform="translate(0 30)">{picture}</g>{beside}'
+    return sheet(body, WIDTH + BESIDE, height)
 
 
 def exploration_html(found: Exploration) -> str:

@@ -6,7 +6,6 @@ No scripts, no style attributes: colours are presentation attributes that a page
 
 from __future__ import annotations
 
-import html
 import math
 import textwrap
 from collections.abc import Sequence
@@ -372,9 +371,8 @@ def _ellipse(one: Pole, frame: Frame) -> str:
 def bar(share: float, label: str) -> str:
     """A bar from 0 to 100 %; a share below 0 is drawn as 0."""
     width = 80 * min(max(share / 100, 0.0), 1.0) if math.isfinite(share) else 0.0
-    return (
-        f'<svg class="bar" role="img" aria-label="{html.escape(label, quote=True)}" viewBox="0 0 '
-        '80 10" width="80" height="10">'
+    body = (
         f'<rect class="s-rest" fill="{GRID}" fill-opacity="0.5" width="80" height="10"/>'
-        f'<rect class="s-after" fill="{AFTER}" width="{width:.1f}" height="10"/></svg>'
+        f'<rect class="s-after" fill="{AFTER}" width="{width:.1f}" height="10"/>'
     )
+    return svg(label, body, 10, 80, "bar")

@@ -226,5 +226,5 @@ function seriesCard(files) {
   app.plots.push(plot);
   later(() => plot.show(null).catch(fail));
   const pick = (id, label, options, chosen, key) => h("select", { id, "aria-label": label, onchange: (e) => { draft[key] = e.target.value; render(false); } }, options.map(([v, t]) => h("option", { value: v, selected: v === chosen }, t)));
-  return h("section", { class: "card" }, h("h2", {}, "Look at the records"), plotControls(plot, [pick("series-file", "Record", files.map((f) => [f.id, f.name]), file.id, "file"), pick("series-channel", "Channel", channels.map((c) => [c, c.replace(/_/g, " ")]), channel, "channel")]), host);
+  return h("section", { class: "card" }, h("h2", {}, "Look at the records"), plotControls(plot, [pick("series-file", "Record", files.map((f) => [f.id, f.name]), file.id, "file"), pick("series-channel", "Channel", channels.map((c) => [c, c.replace(/_/g, " ")]), channel, "channel")]), host, leftOut(file, plot));
 }

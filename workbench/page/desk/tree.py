@@ -31,7 +31,11 @@ def given(state: State | Branch) -> str:
     be used with its role and its column map.
     """
     files = sorted(
-        (f.id, f.role, json.dumps(f.columns, sort_keys=True))
+        (
+            f.id,
+            f.role,
+            json.dumps([f.columns, f.left_out] if f.left_out else f.columns, sort_keys=True),
+        )
         for f in state.files
         if f.status == "ready"
     )
