@@ -28,7 +28,7 @@ from workbench.cli.files import (
     write_json,
     write_text,
 )
-from workbench.cli.help import bold, print_untested
+from workbench.cli.first.help import bold, print_untested
 
 
 def improve_files(

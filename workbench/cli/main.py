@@ -32,7 +32,7 @@ from irj_fmu.command_line import (
     terminable,
 )
 from workbench.cli.files import check_outputs
-from workbench.cli.help import welcome, with_examples
+from workbench.cli.first.help import welcome, with_examples
 from workbench.cli.user_fmu import module_of
 
 
@@ -116,7 +116,9 @@ def parser() -> OneLineParser:
         "--picture", metavar="FILE.svg", help="draw the falling error and the place of the residual"
     )
     taken = verb(
-        "import", "importing", "look at a measurement file and write the joint file that reads it"
+        "import",
+        "first.importing",
+        "look at a measurement file and write the joint file that reads it",
     )
     taken.add_argument("records", nargs=1, metavar="FILE", help="record file")
     taken.add_argument("-o", "--output", metavar="FILE", help="the joint file to write (TOML)")
@@ -610,7 +612,7 @@ def parser() -> OneLineParser:
     app.add_argument("--no-browser", action="store_true", help="print the address, open nothing")
     text = "completion of verbs and options for your shell"
     completed = verbs.add_parser("completion", help=text, description=text)
-    completed.set_defaults(module="help", own_effects=[], parser=made)
+    completed.set_defaults(module="first.help", own_effects=[], parser=made)
     completed.add_argument("shell", choices=("bash",), help="the shell")
     for judged in (demo, diagnosed, improved):
         judged.add_argument(

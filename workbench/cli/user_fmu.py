@@ -18,7 +18,7 @@ from identification.data.record import Record
 from identification.errors import InputError
 from irj_fmu.command_line import OneLineParser, check_output, keep_inputs
 from workbench.cli.files import distinct, open_records, progress_bar, write_json, write_text
-from workbench.cli.help import print_untested
+from workbench.cli.first.help import print_untested
 from workbench.cli.library import with_law
 from workbench.cli.records import checked
 

@@ -22,7 +22,7 @@ views.home = async () => {
   const rename = (s, name) => act(async () => { await call("POST", `/api/session/${s.id}/tree`, { session: name }); s.name = name; draw(); });
   const card = (s) => {
     const last = s.errors[s.errors.length - 1];
-    return h("section", { class: "card session", "aria-label": called(s) }, h("div", { class: "row between" }, h("div", {}, h("h2", {}, called(s), s.id === app.id ? h("span", { class: "tag" }, "open") : null),
+    return h("section", { class: "card session", "aria-label": called(s) }, h("div", { class: "row between" }, h("div", {}, h("h2", {}, called(s), " ", s.id === app.id ? h("span", { class: "tag" }, "open") : null),
       h("p", { class: "small soft" }, s.problem || [s.files.join(", ") || "no record", plural(s.fits, "fit"), sized(s.size), s.changed ? new Date(1000 * s.changed).toLocaleString() : ""].filter(Boolean).join(" · ")), s.effects && s.effects.length ? h("p", { class: "small" }, s.effects.join(", ")) : null),
       last != null ? h("div", { class: "thumb" }, stairs(s.errors), h("span", { class: "small" }, `${digits(last)} %`)) : null),
       h("div", { class: "row" }, s.problem ? null : button("Open", () => go(s.id), { label: `Open ${called(s)}`, id: `open-${s.id}` }), s.problem ? null : h("input", { value: s.name, placeholder: "Name", "aria-label": `Name of ${called(s)}`, onchange: (e) => rename(s, e.target.value) }),

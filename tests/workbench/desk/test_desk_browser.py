@@ -140,7 +140,7 @@ def test_no_move_loses_a_fit(address: str, page: Any, tmp_path: Path) -> None:
     idle(page, "ledger")
     fits(page)
     row = page.locator("#tree .fit", has_text="Stribeck")
-    row.get_by_role("button", name=re.compile("Name")).click()
+    row.get_by_role("button", name=re.compile("Name, note")).click()
     page.get_by_placeholder("Name").fill("with Stribeck")
     page.get_by_placeholder("Note").fill("looks right at low speed")
     page.get_by_role("button", name="Keep").click()
