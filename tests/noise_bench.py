@@ -228,14 +228,15 @@ def main(argv: Sequence[str] | None = None) -> int:
             "complete | named | in set | extra claims | seconds |\n" + 8 * "|---" + "|\n"
         )
         for kind in options.kinds.split(",") if options.kinds else KINDS:
-            tally, said = Tally(), []
+            tally = Tally()
             jobs: list[tuple[str | None, int]] = [(None, first + k) for k in range(options.none)]
             jobs += [
                 (e, first + k) for e in EFFECTS[: options.effects] for k in range(options.seeds)
             ]
             for effect, seed in jobs:
-                said.append(judge(tally, effect, seed, KINDS[kind]))
-            write("".join(said) if options.each else "")
+                said = judge(tally, effect, seed, KINDS[kind])
+                write(said if options.each else "")
+                sys.stdout.flush()
             write(tally.row(kind))
             sys.stdout.flush()
     return 0

@@ -25,7 +25,7 @@ from identification.planning.trajectories import triangular
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 NUMBER = re.compile(r"-?\d+\.?\d*(?:e-?\d+)?")
-FIGURES = [f"3.{n}" for n in range(12, 17)] + [f"4.{n}" for n in range(16, 48)]
+FIGURES = [f"3.{n}" for n in range(12, 17)] + [f"4.{n}" for n in range(1, 48)]
 
 
 def sections(text: str) -> dict[str, list[list[str]]]:

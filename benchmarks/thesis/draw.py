@@ -21,6 +21,7 @@ from workbench.show.chart import (
     WIDTH,
     Frame,
     axes,
+    sheet,
     word,
 )
 from workbench.show.plots import min_max
@@ -133,7 +134,7 @@ def picture(
     rows = -(-len(panels) // columns)
     head = _LEGEND if legend else 4
     wide, high = columns * WIDTH, rows * (HEIGHT + _LEGEND) + head
-    body = [f'<rect width="{wide}" height="{high}" fill="#fff"/>']
+    body: list[str] = []
     for i, (kind, words) in enumerate(legend):
         x = LEFT + 150 * i
         body.append(_line([(x, 13.0), (x + 22.0, 13.0)], kind) + word(x + 28, 17, words, "start"))
@@ -154,12 +155,8 @@ def picture(
     inside = "".join(body)
     for long, short in _SHORTER:
         inside = inside.replace(long, short)
-    return (
-        '<svg xmlns="http://www.w3.org/2000/svg" role="img" '
-        f'aria-label="{html.escape(label, quote=True)}" viewBox="0 0 {wide} {high}" '
-        f'width="{wide}" height="{high}" font-family="system-ui, sans-serif" font-size="11" '
-        f'fill="{INK}">{inside}</svg>\n'
-    )
+    said = f'role="img" aria-label="{html.escape(label, quote=True)}"'
+    return sheet(inside, wide, high, f' {said} font-size="11" fill="{INK}"')
 
 
 def _panel(panel: Panel) -> str:

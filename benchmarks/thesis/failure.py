@@ -114,10 +114,8 @@ class Tracked:
 
 
 @cache
-def subspace() -> Subspace:
-    """Order 2 from motor position, velocity, acceleration to link position, velocity, on twelve
-    motions (4.1.4).
-    """
+def seen_motions() -> tuple[list[FloatArray], list[FloatArray]]:
+    """Inputs q_m, v_m, a_m and outputs q_l, v_l along the twelve motions of 4.1.4."""
     d = np.radians
     more = [
         triangular(float(d(v)), limit=float(d(60)), reversal=0.2, duration=15.0)
@@ -134,6 +132,15 @@ def subspace() -> Subspace:
         rate = np.diff(seen[:, 2], prepend=seen[0, 2]) / DT
         inputs.append(np.column_stack([seen[:, 1:3], rate]))
         outputs.append(seen[:, 3:5])
+    return inputs, outputs
+
+
+@cache
+def subspace() -> Subspace:
+    """Order 2 from motor position, velocity, acceleration to link position, velocity, on twelve
+    motions (4.1.4).
+    """
+    inputs, outputs = seen_motions()
     names = MoespOptions(input_names=("qm", "vm", "am"), output_names=("ql", "vl"))
     return moesp(inputs, outputs, block_rows=20, order=2, dt=DT, options=names)
 
@@ -223,9 +230,15 @@ class Bench:
         return float(when), tuple(sorted(set(named) - set(failed))), float(np.max(gap, initial=0.0))
 
 
+@cache
+def bench() -> Bench:
+    """One for all sections."""
+    return Bench()
+
+
 def under_failure() -> Section:
     """Section 4.4."""
-    bench = Bench()
+    made = bench()
     page = Section("Figures 4.33 to 4.47: identification while sensors fail (section 4.4)")
     page.add(
         f"TS model as above, {SECONDS:g} s; at {FAILS:g} s the reading of the link's velocity, "
@@ -242,7 +255,7 @@ def under_failure() -> Section:
     rows, pictures, wrong = [], [], set[str]()
     for stem, figures, failed, alternative in (("healthy", "", (), 1), *CASES):
         tracks: dict[Rule, Tracked] = {
-            rule: bench.track(rule, failed, alternative) for rule in ("structured", "thesis")
+            rule: made.track(rule, failed, alternative) for rule in ("structured", "thesis")
         }
         for rule, tracked in tracks.items():
             wrong.update(tracked.wrong)
@@ -251,11 +264,11 @@ def under_failure() -> Section:
                     f"{' and '.join(failed).replace('_', ' ') or 'nothing'}, alternative "
                     f"{alternative}, {_WORDS[rule]}",
                     tracked,
-                    bench.offline,
+                    made.offline,
                 )
             )
         if failed:
-            pictures.append(_figure(stem, figures, tracks, bench.offline))
+            pictures.append(_figure(stem, figures, tracks, made.offline))
     heads = (
         *(f"{n.replace('_', ' ')} [%]" for n in (*NAMES[:7], "A")),
         "position replaced to [rad]",

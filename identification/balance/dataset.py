@@ -282,18 +282,18 @@ def weak_record(
     """One record, resampled to uniform time where needed, averaged with the kernel; the channels
     of the places `late` are shifted where they are late (`known`: by these times [s]).
     """
-    noise = measured_noise(record, joint, sensing)
+    noise = measured_sources(record, joint, sensing)
     record = evened(record)
     segments = tuple(record.segments())
     signals = {
-        c: without_spikes(x, segments, noise[c]) if c in noise else x
+        c: without_spikes(x, segments, noise[c].level) if c in noise else x
         for c, x in signals_of(record, joint, sensing).items()
     }
     length = max(length, KERNEL_SAMPLES * record.dt)
     longest = length / 2 if length <= CLAIM_KERNEL else 0.06
     pointwise = {
-        c: pointwise_kernel(signals[c], segments, record.dt, longest, level)
-        for c, level in noise.items()
+        c: pointwise_kernel(signals[c], segments, record.dt, longest, own)
+        for c, own in noise.items()
     }
 
     last: list[tuple[Mapping[str, float], WeakRecord]] = []
@@ -338,7 +338,7 @@ def weak_record(
     return made
 
 
-def _with_rests(made: WeakRecord, noise: Mapping[str, float]) -> WeakRecord:
+def _with_rests(made: WeakRecord, noise: Mapping[str, ChannelNoise]) -> WeakRecord:
     """The record with the kernel average, for each row, of the flag "this side stands still".
 
     A side stands still where its pointwise speed stays within its noise for at least one kernel of
@@ -352,9 +352,8 @@ def _with_rests(made: WeakRecord, noise: Mapping[str, float]) -> WeakRecord:
         source = f"{side}_position"
         if source not in noise:
             continue
-        slow = np.abs(made.points[f"{side}_velocity"]) <= STILL * noise[
-            source
-        ] * made.grid.velocity_gain(source)
+        still_speed = STILL * made.grid.velocity_noise(source, noise[source])
+        slow = np.abs(made.points[f"{side}_velocity"]) <= still_speed
         shortest = max(1, whole(made.grid.pointwise[source] / (made.grid.step * made.grid.dt)))
         still, held = np.zeros(len(slow)), made.smooth[source].copy()
         for first, last in zip(made.starts[:-1], made.starts[1:], strict=True):
@@ -371,18 +370,13 @@ def _with_rests(made: WeakRecord, noise: Mapping[str, float]) -> WeakRecord:
 
 def _loudness(noise: ChannelNoise) -> float:
     """Deviation of all parts of a noise, which is what a slow row sees most of."""
-    return sum(size**2 for size, _ in noise.parts)
-
-
-def measured_noise(record: Record, joint: Joint, sensing: Sensing) -> dict[str, float]:
-    """White-noise level of each measured signal, from samples that were measured: bridges are
-    smoother than a reading.
-    """
-    return {c: x.level for c, x in measured_sources(record, joint, sensing).items()}
+    return sum(part.size**2 for part in noise.parts)
 
 
 def measured_sources(record: Record, joint: Joint, sensing: Sensing) -> dict[str, ChannelNoise]:
-    """Noise of each measured signal, as :func:`measured_noise`."""
+    """Noise of each measured signal, from samples that were measured: bridges are smoother than a
+    reading.
+    """
     signals = signals_of(record, joint, sensing)
     return {
         c: noise_of(record, c, x, joint.gear_ratio)
@@ -392,7 +386,11 @@ def measured_sources(record: Record, joint: Joint, sensing: Sensing) -> dict[str
 
 
 def pointwise_kernel(
-    position: FloatArray, segments: tuple[slice, ...], dt: float, longest: float, noise: float
+    position: FloatArray,
+    segments: tuple[slice, ...],
+    dt: float,
+    longest: float,
+    noise: ChannelNoise,
 ) -> float:
     """Shortest kernel whose velocity noise does not matter beside the velocities of the record [s].
 
@@ -407,7 +405,7 @@ def pointwise_kernel(
     for length in POINTWISE_KERNELS:
         if (
             6 * dt <= length < longest
-            and noise * float(np.linalg.norm(kernel(length, dt, 1))) <= VELOCITY_NOISE * fast
+            and noise.after(kernel(length, dt, 1), dt) <= VELOCITY_NOISE * fast
         ):
             return length
     return max(longest, 6 * dt)

@@ -61,7 +61,9 @@ def not_identifiable(data: Dataset) -> str:
     speed = np.concatenate([w.smooth["motor_velocity"] for w in data.train])
     top = float(np.quantile(np.abs(speed), 0.99))
     grid = data.train[0].grid
-    still = 5 * data.noise.get("motor_position", 0.0) * grid.velocity_gain("motor_position")
+    source = "motor_position"
+    noise = data.sources.get(source)
+    still = 5 * grid.velocity_noise(source, noise) if noise is not None else 0.0
     if top <= still:
         return (
             "The joint does not move in the training records: record a motion with reversals "
@@ -263,27 +265,23 @@ def attenuation(data: Dataset) -> dict[str, float]:
     Noise power over power of the averaged signal, noise included, that the parameter multiplies
     (errors in variables).
     """
-    grid, out = data.train[0].grid, {}
+    grid, out, sources = data.train[0].grid, dict[str, float](), data.sources
     if (
-        {"motor_position", "link_position"} <= set(data.noise)
+        {"motor_position", "link_position"} <= set(sources)
         and data.sensing.both_positions
         and not data.sensing.clamped_link
     ):
         torsion = np.concatenate(
             [w.averaged["motor_position"] - w.averaged["link_position"] for w in data.train]
         )
-        noise = data.noise["motor_position"] ** 2 + data.noise["link_position"] ** 2
-        out["stiffness"] = (
-            float(np.sum(differentiated_kernel(grid.length, grid.dt, 0) ** 2))
-            * noise
-            / max(float(np.var(torsion)), 1e-300)
-        )
+        average = differentiated_kernel(grid.length, grid.dt, 0)
+        positions = [sources[f"{side}_position"] for side in ("motor", "link")]
+        noise = sum(x.after(average, grid.dt) ** 2 for x in positions)
+        out["stiffness"] = noise / max(float(np.var(torsion)), 1e-300)
     for side in ("motor", "link"):
-        if f"{side}_position" in data.noise:
-            noise = (
-                float(np.sum(differentiated_kernel(grid.length, grid.dt, 2) ** 2))
-                * data.noise[f"{side}_position"] ** 2
-            )
+        if f"{side}_position" in sources:
+            bend = differentiated_kernel(grid.length, grid.dt, 2)
+            noise = sources[f"{side}_position"].after(bend, grid.dt) ** 2
             power = float(np.var(np.concatenate([_moving(w, side) for w in data.train])))
             out[f"{side} inertia"] = noise / max(power, 1e-300)
     return out

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from casadi_models import JointModel
 from identification.balance.balances import Balances, balances_of
 from identification.balance.calibration import bare, of_run, settled, values_on
+from identification.balance.colour import ChannelNoise
 from identification.balance.dataset import Dataset
 from identification.balance.drawn_noise import draws_of
 from identification.balance.weak import Grid, WeakRecord, whole
@@ -276,6 +277,7 @@ def _either_way(
     like a row [N.m].
     """
     zero = np.zeros(sum(w.rows for w in records))
+    sources = data.sources
     out = dict.fromkeys(data.sensing.balances, zero)
     for place, balances in (
         ("motor", ("motor", "sum", "deflection", "axis")),
@@ -283,7 +285,7 @@ def _either_way(
     ):
         level = sticking_torque(model, values, place)
         source = f"{place}_position"
-        if not level or source not in data.noise:
+        if not level or source not in sources:
             continue
         lag = (
             model.swinging_inertia(values) * model.load_compliance(values)
@@ -293,7 +295,7 @@ def _either_way(
         shares = []
         for w in records:
             either = _either_direction(
-                w.points[f"{place}_velocity"], data.noise[source], w.grid, source
+                w.points[f"{place}_velocity"], sources[source], w.grid, source
             ).astype(float)
             shares.append(w.average(either))
             if lag:
@@ -311,12 +313,12 @@ def sticking_torque(model: JointModel, values: Mapping[str, float], place: str) 
 
 
 def _either_direction(
-    velocity: FloatArray, noise: float, grid: Grid, source: str
+    velocity: FloatArray, noise: ChannelNoise, grid: Grid, source: str
 ) -> npt.NDArray[np.bool_]:
     """Points at which the direction is not known: slower than the noise, or nearer to a turn
     than its kernel tells when it was.
     """
-    slow = np.abs(velocity) < 3 * noise * grid.velocity_gain(source)
+    slow = np.abs(velocity) < 3 * grid.velocity_noise(source, noise)
     turns = np.diff(np.sign(velocity), append=velocity[-1]) != 0
     reach = max(
         0, whole(TURN_SHARE * (grid.pointwise[source] - TURN_KERNEL) / (grid.step * grid.dt))

@@ -19,6 +19,7 @@ import numpy.typing as npt
 from numpy.lib.stride_tricks import sliding_window_view
 
 from casadi_models.signals import one_line
+from identification.balance.colour import ChannelNoise
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -164,9 +165,9 @@ class Grid:
     half: int
     pointwise: Mapping[str, float]
 
-    def velocity_gain(self, source: str) -> float:
-        """Noise of the pointwise velocity per noise of that position [1/s]."""
-        return float(np.linalg.norm(kernel(self.pointwise[source], self.dt, 1)))
+    def velocity_noise(self, source: str, noise: ChannelNoise) -> float:
+        """Standard deviation of the pointwise velocity of that position under its noise [1/s]."""
+        return noise.after(kernel(self.pointwise[source], self.dt, 1), self.dt)
 
     def correlate(self, values: FloatArray, weights: FloatArray) -> FloatArray:
         """Rows of a correlation of a full-rate signal with kernel weights."""

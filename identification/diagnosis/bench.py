@@ -32,7 +32,7 @@ from identification.diagnosis.trials import Base, Trial, make_base, try_candidat
 from identification.fitting.assess import RATIO_LIMIT, VERDICT_KERNELS, BalanceError, Error, assess
 from identification.fitting.engine import Dataset, Solution, load_dataset, prepared_model, solve
 from identification.fitting.first_fit import first_fit
-from identification.naming.contest import Rival
+from identification.naming.contest import FEWEST, Rival
 from identification.naming.odds import Odds, contenders, contest_of, odds_of, unmodelled
 
 Progress = Callable[[str, float], None]
@@ -137,6 +137,7 @@ class JointBench:
         self.joint, self.data, self._like = joint, data, like
         self._train, self._held = list(train), list(held)
         self._solved: dict[tuple[object, ...], Solution] = {}
+        self._stepped: dict[tuple[object, ...], Solution] = {}
         self._ratios: dict[tuple[int, bool], tuple[Solution, dict[str, BalanceError]]] = {}
         self._equal: dict[tuple[object, ...], tuple[Solution, dict[str, Equivalence]]] = {}
         self._kernels: dict[float, Dataset] = {round(data.kernel, 9): data}
@@ -159,6 +160,7 @@ class JointBench:
 
     def step(self, key: str | None, label: str | None, solution: Solution) -> Step:
         """A fitted model with its errors on training and held-out records."""
+        self._stepped[solution.model.structure] = solution
         train = assess(solution.model, self.data, self.data.train, solution.values)
         held = assess(solution.model, self.data, self.data.held_out, solution.values)
         return Step(key, visible_keys(solution.model), train, held, solution, label)
@@ -290,9 +292,10 @@ class JointBench:
             return None
         names = contenders(claim.effects, near, unmodelled(last, claim.balance))
         first = Rival(claim.effects[0], claim.label, whole)
-        bare = self.fitted(less, whole.values, again=True)
+        before = self._stepped.get(less.structure)
+        bare = before or self.fitted(less, whole.values, again=True)
         contest = contest_of(names, claim.balance, first, bare, self.data)
-        if contest.leader is not first:  # what a wrong name leaves is not what is unmodelled
+        if contest.ahead[0, 0] > FEWEST:  # what a wrong name leaves is not what is unmodelled
             last = self.ranking(self.base(contest.leader.solution))
         return odds_of(contest, unmodelled(last, claim.balance))
 

@@ -26,6 +26,7 @@ from casadi_models.signals import LocalSignals
 from casadi_models.table import SHARP, SLOW
 from casadi_models.term import Term
 from identification.balance.balances import balances_of
+from identification.balance.colour import ChannelNoise
 from identification.balance.dataset import Dataset
 from identification.balance.noise import effective_share
 from identification.balance.stacked import stack
@@ -138,7 +139,7 @@ def _range(effect: Effect, shapes: Mapping[str, float]) -> tuple[float, float]:
 # --- which rows tell of a curve -------------------------------------------------------------------
 
 
-def _clear(w: WeakRecord, noise: Mapping[str, float]) -> FloatArray:
+def _clear(w: WeakRecord, noise: Mapping[str, ChannelNoise]) -> FloatArray:
     """Direction of motion at the points of a record: 1, -1, or 0 where it is not beyond doubt."""
     out = np.ones(int(w.starts[-1]))
     for side in ("motor", "link"):
@@ -146,7 +147,7 @@ def _clear(w: WeakRecord, noise: Mapping[str, float]) -> FloatArray:
         if source not in noise or name not in w.points:
             continue
         v = w.points[name]
-        clear = np.abs(v) > CLEAR * noise[source] * w.grid.velocity_gain(source)
+        clear = np.abs(v) > CLEAR * w.grid.velocity_noise(source, noise[source])
         out = np.where(clear & (out != 0), np.sign(v), 0.0)
     return out
 
@@ -172,8 +173,8 @@ def steadily_moving(base: Base) -> Base:
     )
     moved = _refitted(make_base(solution, data))
     count = len(base.balances)
-    clear = np.tile(_steady(data.train, data.noise), count)
-    held = np.tile(_steady(data.held_out, data.noise), count)
+    clear = np.tile(_steady(data.train, data.sources), count)
+    held = np.tile(_steady(data.held_out, data.sources), count)
     return replace(
         moved,
         block=np.where(clear, moved.block, -1),
@@ -211,7 +212,9 @@ def _speeds(data: Dataset, side: str) -> FloatArray:
     )
 
 
-def _steady(records: Sequence[WeakRecord], noise: Mapping[str, float]) -> npt.NDArray[np.bool_]:
+def _steady(
+    records: Sequence[WeakRecord], noise: Mapping[str, ChannelNoise]
+) -> npt.NDArray[np.bool_]:
     """Rows whose whole kernel moves clearly in one direction."""
     parts = [np.abs(w.average(_clear(w, noise))) >= WHOLE for w in records]
     return np.concatenate(parts) if parts else np.empty(0, dtype=np.bool_)
@@ -816,7 +819,7 @@ def _points(effect: Effect, place: Place, data: Dataset, shapes: Mapping[str, fl
             for w, v in zip(data.train, _signal(effect, place, data.train), strict=True)
         ]
     )
-    x = rows[_steady(data.train, data.noise)]
+    x = rows[_steady(data.train, data.sources)]
     low, high = (float(v) for v in np.quantile(x, INSIDE))
     if _table(effect).of_speed:
         bend = SLOW * _range(effect, shapes)[1]

@@ -269,6 +269,8 @@ def turning(
     for rows in records:
         out = np.zeros(rows.rows, dtype=np.bool_)
         for side in RESTING_SIDES.get(balance, ()):
+            if f"{side}_velocity" not in rows.points:
+                continue
             velocity = rows.points[f"{side}_velocity"]
             widths = [solution.values[n] for n in solution.model.named("smoothing", side)]
             slow = np.abs(velocity) < TURN_WIDTHS * max(widths, default=0.0)

@@ -137,7 +137,8 @@ class CorrectionLaw:
     """The torque of a correction along a run (see :class:`irj_fmu.imported.run.Feedback`).
 
     The effect resists: its torque is taken off the drive. It is read and held for a millisecond at
-    a time.
+    a time, at the position and velocity that are predicted for the middle of that time: read at its
+    beginning, it would be late by half of it.
 
     Parameters
     ----------
@@ -176,9 +177,9 @@ class CorrectionLaw:
     def restart(self) -> None:
         """From rest, with empty memory."""
         self._z = np.zeros(self._held)
-        self._before = math.nan
-        self._speed = 0.0
-        self._now = math.nan
+        self._place = self._now = math.nan
+        self._rate = self._step = self._given = 0.0
+        self._before = self._speed = math.nan
 
     def __call__(
         self, sample: int, time: float, inputs: FloatArray, outputs: FloatArray
@@ -207,17 +208,30 @@ class CorrectionLaw:
         position, velocity : float
             Link-referred [rad, rad/s]; without a velocity the difference of positions is taken.
         """
-        first = math.isnan(self._before)
-        step = time - self._now
-        if velocity is None:
-            velocity = 0.0 if first or step <= 0 else (position - self._before) / step
+        first = math.isnan(self._now)
+        step = 0.0 if first else time - self._now
+        lead = step / 2
+        owed = 0.0
+        if velocity is None:  # the difference is the velocity half a step ago
+            velocity = 0.0 if step <= 0 else (position - self._place) / step
+            lead = step
+            if step > 0 and self._step == 0 and self._move is None:
+                # at the first sample no velocity was known: what that step lacked follows now
+                half = ((position + self._place) / 2, velocity)
+                owed = -float(self._resist(half, (drive, 0.0, time))[0]) - self._given
+        known = step > 0 and self._step > 0
+        bend = (velocity - self._rate) / step if known else 0.0
+        ahead = velocity + bend * lead
+        middle = position + step / 2 * (velocity + bend * (lead - step / 4))
         u = (drive, 0.0, time)
-        if self._move is not None and not first and step > 0:
+        if self._move is not None and not math.isnan(self._before) and step > 0:
             self._z = self._move(
-                (position, velocity), (self._before, self._speed), self._z, u, (step,)
+                (middle, ahead), (self._before, self._speed), self._z, u, (step,)
             ).copy()
-        self._before, self._speed, self._now = position, velocity, time
-        return -float(self._resist((position, velocity, *self._z), u)[0])
+        self._place, self._rate, self._now, self._step = position, velocity, time, step
+        self._before, self._speed = middle, ahead
+        self._given = -float(self._resist((middle, ahead, *self._z), u)[0])
+        return self._given + owed
 
 
 @final

@@ -22,7 +22,7 @@ from identification import load_joint, read
 from identification.data.typical import true_values
 from workbench.cli import files as outputs
 from workbench.cli import loop
-from workbench.cli.help import EXAMPLES, print_untested
+from workbench.cli.first.help import EXAMPLES, print_untested
 from workbench.cli.main import main, parser
 from workbench.cli.online import fault_text
 

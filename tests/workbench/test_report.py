@@ -34,6 +34,7 @@ from identification.diagnosis.places import AXIS_TITLES
 from identification.errors import InputError
 from identification.fitting.fit import fit
 from workbench.show import results as fragments_html
+from workbench.show.beside import read_result
 from workbench.show.chart import ticks
 from workbench.show.fragments import pattern_of
 from workbench.show.pictures import axis_label, place_chart
@@ -312,6 +313,27 @@ def test_a_chart_and_its_table_hold_the_same_points(improvement: Improvement) ->
     frame = chart.frame()
     assert frame is not None
     assert frame.y[0] == -frame.y[1]
+
+
+def test_another_result_stands_beside_with_what_moved(
+    improvement: Improvement, records: list[Record], tmp_path: Path
+) -> None:
+    joint = replace(improvement.joint, name="next week")
+    later = improve([swing(3, "later", coulomb=1.4)], joint, [swing(4, "held later", coulomb=1.4)])
+    file = tmp_path / "later.json"
+    file.write_text(json.dumps(later.as_json()), encoding="utf-8")
+    page = render_report(improvement, beside={EVIL: read_result(file)})
+    outline(page)
+    assert "<script>alert" not in page
+    rows = re.search(r'<section id="beside".*?</section>', page, re.DOTALL)
+    assert rows
+    marked = re.findall(r'<tr class="flagged"><th scope="row">([^<]*)</th>', rows[0])
+    assert [m for m in marked if "coulomb" in m], "the friction that changed"
+    assert not [m for m in marked if "inertia" in m], "what did not change is not marked"
+    other = tmp_path / "other.json"
+    other.write_text("{}", encoding="utf-8")
+    with pytest.raises(InputError, match="no result of"):
+        read_result(other)
 
 
 def test_no_internal_name_is_shown() -> None:

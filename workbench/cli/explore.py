@@ -21,7 +21,7 @@ from workbench.cli.files import (
     write_json,
     write_text,
 )
-from workbench.cli.loop import print_warnings, training
+from workbench.cli.loop import print_warnings, training, trusted
 from workbench.show.front import exploration_picture
 
 
@@ -61,6 +61,18 @@ def run_explore(arguments: Namespace) -> int:
         write_text(arguments.output, found.to_joint_file())
         print(f"joint file: {arguments.output}")
     write_json(arguments.json, data)
+    if arguments.report:
+        from workbench.show.report import write_report
+
+        made_report = write_report(
+            found.improvement,
+            arguments.report,
+            records=[*records, *held],
+            command=arguments.command,
+            trust=trusted(found.improvement),
+            exploration=found,
+        )
+        print(f"report: {made_report}")
     return 0
 
 

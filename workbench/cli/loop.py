@@ -7,6 +7,8 @@ from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from importlib.resources import as_file, files
+from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from identification.data.check.gate import gate_warnings
@@ -26,7 +28,7 @@ from workbench.cli.files import (
     write_json,
     write_text,
 )
-from workbench.cli.help import bold, print_untested
+from workbench.cli.first.help import bold, print_untested
 
 
 def improve_files(
@@ -109,6 +111,7 @@ def run_improve(arguments: Namespace) -> int:
 
 def run_report(arguments: Namespace) -> int:
     """`irj report`."""
+    beside = results_beside(arguments.beside)
     data, found, records = improve_files(
         arguments.records,
         arguments.held_out,
@@ -124,6 +127,7 @@ def run_report(arguments: Namespace) -> int:
         arguments.command,
         author=arguments.author or "",
         notes=arguments.notes or "",
+        beside=beside,
     )
     return 0
 
@@ -146,6 +150,15 @@ def run_demo(arguments: Namespace) -> int:
     return 0
 
 
+def results_beside(paths: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Results of other runs by the names of their files, read before anything is fitted."""
+    if not paths:
+        return {}
+    from workbench.show.beside import read_result
+
+    return {Path(p).name: read_result(p) for p in paths}
+
+
 def _write_report(
     found: Improvement,
     records: Sequence[Record],
@@ -154,6 +167,7 @@ def _write_report(
     *,
     author: str = "",
     notes: str = "",
+    beside: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
 ) -> None:
     """The report comes last: what it is drawn from stands on the disk before it is drawn."""
     if report:
@@ -167,6 +181,7 @@ def _write_report(
             trust=trusted(found),
             author=author,
             notes=notes,
+            beside=beside,
         )
         print(f"report: {made}")
 
@@ -283,6 +298,50 @@ def run_fit(arguments: Namespace) -> int:
     if arguments.output:
         write_text(arguments.output, fitted.to_joint_file())
     write_json(arguments.json, {**fitted.as_json(), "warnings": warnings})
+    return 0
+
+
+def run_twostep(arguments: Namespace) -> int:
+    """`irj twostep`."""
+    from identification.two_step.offline import fit_records
+
+    joint = open_joint(arguments.joint)
+    records, warnings = open_records(arguments.records, joint)
+    found = fit_records(records, joint, method=arguments.method, cutoff=arguments.cutoff)
+    units = {p.name: p.unit for p in joint.model().parameters}
+    print(found.outcome)
+    print(f"{found.samples} samples, {found.evaluations} evaluations of the search")
+    for name, value in found.values.items():
+        notes = [
+            text
+            for text, names in (
+                ("not identifiable", found.unidentifiable),
+                ("held", found.frozen),
+                ("at its bound", found.at_bound),
+            )
+            if name in names
+        ]
+        said = f" ({', '.join(notes)})" if notes else ""
+        print(f"  {name:<28} {value:.6g} +- {found.deviation[name]:.2g} {units[name]}{said}")
+    write_json(
+        arguments.json,
+        {
+            "method": arguments.method,
+            "outcome": found.outcome.value,
+            "parameters": {
+                n: {"value": v, "deviation": found.deviation[n], "unit": units[n]}
+                for n, v in found.values.items()
+            },
+            "shapes": list(found.nonlinear),
+            "unidentifiable": list(found.unidentifiable),
+            "frozen": list(found.frozen),
+            "at_bound": list(found.at_bound),
+            "residual_deviation": found.residual_deviation.tolist(),
+            "evaluations": found.evaluations,
+            "samples": found.samples,
+            "warnings": warnings,
+        },
+    )
     return 0
 
 

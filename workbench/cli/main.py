@@ -32,7 +32,7 @@ from irj_fmu.command_line import (
     terminable,
 )
 from workbench.cli.files import check_outputs
-from workbench.cli.help import welcome, with_examples
+from workbench.cli.first.help import welcome, with_examples
 from workbench.cli.user_fmu import module_of
 
 
@@ -116,7 +116,9 @@ def parser() -> OneLineParser:
         "--picture", metavar="FILE.svg", help="draw the falling error and the place of the residual"
     )
     taken = verb(
-        "import", "importing", "look at a measurement file and write the joint file that reads it"
+        "import",
+        "first.importing",
+        "look at a measurement file and write the joint file that reads it",
     )
     taken.add_argument("records", nargs=1, metavar="FILE", help="record file")
     taken.add_argument("-o", "--output", metavar="FILE", help="the joint file to write (TOML)")
@@ -146,6 +148,49 @@ def parser() -> OneLineParser:
     resampled.add_argument(
         "-o", "--output", metavar="OUT", required=True, help="record file to write, .csv or .npz"
     )
+    smoothed = verb(
+        "prefilter",
+        "records",
+        "the thesis's low-pass on every channel alike, derivatives, fewer samples",
+    )
+    smoothed.add_argument("records", nargs=1, metavar="FILE", help="record file")
+    smoothed.add_argument("--joint", metavar="J", help="joint file: column map")
+    smoothed.add_argument(
+        "--cutoff", type=float, default=15.0, metavar="HZ", help="of one pass (default 15)"
+    )
+    smoothed.add_argument(
+        "--order", type=_count, default=8, metavar="N", help="of one pass (default 8)"
+    )
+    smoothed.add_argument(
+        "--derivatives", action="store_true", help="add velocities and accelerations"
+    )
+    smoothed.add_argument(
+        "--trim", type=_count, default=49, metavar="N", help="samples dropped at each end"
+    )
+    smoothed.add_argument(
+        "--every", type=_count, default=1, metavar="N", help="keep every Nth sample (default 1)"
+    )
+    smoothed.add_argument(
+        "-o", "--output", metavar="OUT", required=True, help="record file to write, .csv or .npz"
+    )
+    levelled = verb(
+        "accelerometer",
+        "records",
+        "offset and volts per g of an accelerometer from files at rest",
+    )
+    levelled.add_argument("--up", metavar="FILE", required=True, help="face up, +1 g")
+    levelled.add_argument("--down", metavar="FILE", required=True, help="face down, -1 g")
+    levelled.add_argument(
+        "--horizontal",
+        nargs="+",
+        action="extend",
+        metavar="FILE",
+        default=[],
+        help="horizontal, 0 g: the offset is then their mean",
+    )
+    levelled.add_argument(
+        "--column", metavar="NAME", help="column of the output [V] (default: the only one)"
+    )
     fitted = verb("fit", "loop", "fit the joint's model", records=True, joint=True)
     other_payload(fitted)
     fitted.add_argument(
@@ -154,6 +199,22 @@ def parser() -> OneLineParser:
         help="refine by the error of the simulated outputs (slower, less bias by noise)",
     )
     fitted.add_argument("-o", "--output", metavar="FILE", help="write the fitted joint file")
+    separated = verb(
+        "twostep",
+        "loop",
+        "the thesis's two-step fit: shapes by coordinate search, the rest by least squares",
+        records=True,
+        joint=True,
+    )
+    separated.add_argument(
+        "--method",
+        choices=("variable_projection", "alternating"),
+        default="variable_projection",
+        help="eliminate the linear parameters inside the search (default), or take turns",
+    )
+    separated.add_argument(
+        "--cutoff", type=float, default=15.0, metavar="HZ", help="of the prefilter (default 15)"
+    )
     compared = verb(
         "compare",
         "loop",
@@ -250,6 +311,9 @@ def parser() -> OneLineParser:
     explored.add_argument(
         "-o", "--output", metavar="FILE", help="write the joint file of the recommended variant"
     )
+    explored.add_argument(
+        "--report", metavar="FILE", help="write the HTML report, with a section of the variants"
+    )
     moved = verb("changed", "changed", "which parameters of a fitted joint moved, by how much")
     moved.add_argument("reference", metavar="REFERENCE", help="joint file written by a fit")
     moved.add_argument("records", nargs="+", metavar="REC", help="record files")
@@ -267,6 +331,14 @@ def parser() -> OneLineParser:
     )
     report.add_argument(
         "-o", "--output", metavar="FILE", default="irj-report.html", help="the HTML file"
+    )
+    report.add_argument(
+        "--beside",
+        nargs="+",
+        action="extend",
+        metavar="RESULT",
+        default=[],
+        help="results of `irj improve --json` of another date or joint, for a comparison",
     )
     report.add_argument("--author", metavar="NAME", help="for the first page")
     report.add_argument(
@@ -501,6 +573,16 @@ def parser() -> OneLineParser:
     plain.add_argument(
         "--picture", metavar="FILE.svg", help="draw Bode plots and poles of the best model"
     )
+    first = verb("joint", "joints", "a first joint file for somebody else's FMU")
+    first.add_argument("what", choices=("new",), help="write a new one")
+    first.add_argument("fmu", metavar="MODEL.fmu", help="the FMU")
+    first.add_argument(
+        "--record", metavar="REC", required=True, help="a record of the joint: its channels"
+    )
+    first.add_argument(
+        "--like", metavar="J", help="joint file with the gear ratio and the motor constant"
+    )
+    first.add_argument("-o", "--output", metavar="J", help="where to write (default: print)")
     joints = verb("joints", "joints", "the library of identified joints")
     joints.add_argument(
         "what",
@@ -530,7 +612,7 @@ def parser() -> OneLineParser:
     app.add_argument("--no-browser", action="store_true", help="print the address, open nothing")
     text = "completion of verbs and options for your shell"
     completed = verbs.add_parser("completion", help=text, description=text)
-    completed.set_defaults(module="help", own_effects=[], parser=made)
+    completed.set_defaults(module="first.help", own_effects=[], parser=made)
     completed.add_argument("shell", choices=("bash",), help="the shell")
     for judged in (demo, diagnosed, improved):
         judged.add_argument(

@@ -16,10 +16,11 @@ from identification.data.joint_file import parse_joint
 from identification.data.joint_schema import JOINT
 from identification.data.plain_text import from_toml, tables_text
 from identification.errors import InputError
+from workbench.page.charts.choices import held_text, windows_of
+from workbench.page.desk.tree import LONGEST_NAME, given, opened, remarked, used_files
 from workbench.page.live import Live
 from workbench.page.records import guessed_role, surveyed
 from workbench.page.session import FileEntry, State
-from workbench.page.tree import LONGEST_NAME, given, opened, remarked, used_files
 
 LARGEST_JOINT: Final = 1 << 20
 NUMBERS: Final = tuple(key.name for key in JOINT.keys if key.kind == "number")
@@ -72,6 +73,8 @@ def put_upload(live: Live, identifier: str, body: Mapping[str, Any]) -> dict[str
         if body["role"] not in ("train", "held_out"):
             raise InputError("role is 'train' or 'held_out'")
         entry = replace(entry, role=body["role"], role_reason="chosen by hand")
+    if "left_out" in body:
+        entry = replace(entry, left_out=windows_of(body["left_out"]))
     if "columns" in body:
         columns = _columns(body["columns"])
         everywhere = [
@@ -182,7 +185,9 @@ def set_joint(live: Live, body: Mapping[str, Any]) -> dict[str, Any]:
         What is wrong with it; the joint before it is kept.
     """
     source = str(body.get("source", "joint"))
-    if "text" in body:
+    if "hold" in body:
+        text = held_text(live, body["hold"])
+    elif "text" in body:
         text = str(body["text"])
     else:
         text = tables_text(_from_form(body, _previous(live.state.joint_text)))

@@ -234,6 +234,25 @@ def plot_time(record: Record) -> FloatArray:
     return out
 
 
+def without_windows(record: Record, windows: Sequence[Sequence[float]]) -> Record:
+    """The record without some windows of its plot; the stretches between them stay apart.
+
+    Raises
+    ------
+    InputError
+        Nothing is left.
+    """
+    if not windows:
+        return record
+    time = plot_time(record)
+    keep = np.ones(len(record), dtype=np.bool_)
+    for low, high in windows:
+        keep &= (time < low) | (time > high)
+    if not keep.any():
+        raise InputError(f"{record.name}: every sample is left out; take a window back")
+    return record.take(keep, f"{len(windows)} window(s) left out by hand")
+
+
 def decimated(
     time: FloatArray,
     columns: Sequence[FloatArray],

@@ -73,6 +73,7 @@ class FileEntry:
         Kind of the axis as its columns say it, until there is a joint.
     names, guess : what the file holds and which map is proposed.
     findings, summary : result of the check gate; size, channels and where they come from.
+    left_out : windows that no fit and no judgement takes, in the time of the plot [s].
     """
 
     id: str
@@ -89,6 +90,7 @@ class FileEntry:
     guess: tuple[Mapping[str, Any], ...] = ()
     findings: tuple[Mapping[str, Any], ...] = ()
     summary: Mapping[str, Any] = field(default_factory=dict)
+    left_out: tuple[tuple[float, float], ...] = ()
 
 
 @final

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from identification.data.formats import number, pretty_unit
 from identification.linear.frequency import PHYSICAL, Bode
 from identification.linear.spectra import SHOWN_COHERENCE, TRUSTED_COHERENCE, Curve, Response
-from workbench.show.chart import AFTER, BEFORE, GRID, INK, LEFT, RIGHT, WIDTH, ticks
+from workbench.show.chart import AFTER, BEFORE, GRID, INK, LEFT, RIGHT, WIDTH, svg, ticks
 from workbench.show.results import table, text
 
 FloatArray = npt.NDArray[np.float64]
@@ -190,11 +190,7 @@ def bode_picture(one: Response) -> str:
         f"Bode plot from {one.title}, {number(low, 2)} to {number(high, 2)} Hz. "
         f"{' '.join(sentences(one))}"
     )
-    return (
-        f'<svg class="picture" role="img" aria-label="{html.escape(said, quote=True)}" '
-        f'viewBox="0 0 {WIDTH} {HEIGHT}" '
-        f'width="{WIDTH}" height="{HEIGHT}" font-family="system-ui, sans-serif">{body}</svg>'
-    )
+    return svg(said, body, HEIGHT)
 
 
 def _bars(panel: _Panel, one: Response, shown: npt.NDArray[np.bool_]) -> str:

@@ -140,12 +140,23 @@ def _fitted(said: str, frame: Frame) -> str:
     return f' textLength="{room}" lengthAdjust="spacingAndGlyphs"'
 
 
-def svg(label: str, body: str, height: int = HEIGHT, width: int = WIDTH) -> str:
-    """An ``svg`` element; `label` says in words what it shows."""
+def svg(
+    label: str, body: str, height: int = HEIGHT, width: int = WIDTH, kind: str = "picture"
+) -> str:
+    """An ``svg`` element; `label` says in words what it shows, `kind` is its class."""
     return (
-        f'<svg class="picture" role="img" aria-label="{html.escape(label, quote=True)}" '
+        f'<svg class="{kind}" role="img" aria-label="{html.escape(label, quote=True)}" '
         f'viewBox="0 0 {width} {height}" '
         f'width="{width}" height="{height}" font-family="system-ui, sans-serif">{body}</svg>'
+    )
+
+
+def sheet(body: str, width: int, height: int, more: str = "") -> str:
+    """A picture that is a file of its own: on white, with the attributes of `more`."""
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" '
+        f'height="{height}" font-family="system-ui, sans-serif"{more}>'
+        f'<rect width="100%" height="100%" fill="#ffffff"/>{body}</svg>\n'
     )
 
 

@@ -15,12 +15,13 @@ from identification.data.channels import channel_unit
 from identification.data.formats import number, pretty_unit, with_error
 from identification.data.record import Record
 from identification.diagnosis.improve import Improvement
-from workbench.show.chart import Chart, Curve, Label
+from workbench.show.chart import Chart, Curve, Label, svg
 from workbench.show.pictures import AT_THE_LINK, AT_THE_MOTOR, place_picture
 from workbench.show.plots import ReportPlots, decimated, explained
 from workbench.show.results import staircase_html, step_names, table, text
 from workbench.show.words import OUTCOME_WORDS, kind_of, plain_name, title_of
 
+MOST_LAWS: Final = 4
 MOST_RUNS: Final = 3
 """Motions asked for on the first page; the others stand in the details."""
 MOTIONS: Final = 4
@@ -69,10 +70,12 @@ def law_html(improvement: Improvement, result: Mapping[str, Any]) -> str:
     model = improvement.steps[-1].solution.model
     values = result["steps"][-1]["parameters"]
     parts = _parts(model)
+    balances = {k: c["balance"] for c in result["claims"] for k in c["effects"]}
     rows = []
     for step, name in zip(improvement.steps[1:], step_names(result)[1:], strict=True):
         label = step.label or step.added or ""
-        where, formula = parts.get(label, ("", ""))
+        formula = parts.get(label, "")
+        where = balances.get(step.added or "", "")
         term = next((t for t in model.terms if t.label == label), None)
         names = [n for n in (term.names if term else ()) if n in values]
         numbers = "<br>".join(
@@ -82,26 +85,39 @@ def law_html(improvement: Improvement, result: Mapping[str, Any]) -> str:
             for n in names
         )
         shown = f"<code>{text(formula)}</code>" if formula else "–"
-        side = f" <span class='side'>in the {text(where)}</span>" if where else ""
+        side = f" <span class='side'>in the {text(where)} balance</span>" if where else ""
         rows.append([f"+ {text(name)}{side}", shown, numbers or "–"])
-    curves = "".join(f"<p>{text(c.sentence)}</p>" for c in improvement.learned)
+    curves = _curves_left(result)
     if not rows:
         return f"<h2>The law</h2>{curves}" if curves else ""
     head = ["added", "law", "values, ± standard error"]
     word = "laws" if len(rows) > 1 else "law"
-    shown = table(head, rows, "Torques referred to the link, SI units", wide=True)
+    effort = "Forces" if improvement.joint.kind == "linear" else "Torques"
+    more = f"; {len(rows) - MOST_LAWS} more in the details" if len(rows) > MOST_LAWS else ""
+    caption = f"{effort} referred to the link, SI units{more}"
+    shown = table(head, rows[:MOST_LAWS], caption, wide=True)
     return f"<h2>The {word} in numbers</h2>{shown}{curves}"
 
 
-def _parts(model: Any) -> dict[str, tuple[str, str]]:
-    """Of each effect its equation and its law; empty for a model whose equations are not known."""
+def _curves_left(result: Mapping[str, Any]) -> str:
+    """What is left without a name, by the signals of the learned curves: one sentence."""
+    curves = [c for c in result["claims"] if "curve" in c]
+    if not curves:
+        return ""
+    over: dict[str, list[str]] = {}
+    for c in curves:
+        signal = plain_name(c["curve"]["axis"])
+        signal += " with the direction of motion" if c["curve"]["by_direction"] else ""
+        over.setdefault(c["balance"], []).append(signal)
+    said = "; ".join(f"in the {b} balance a function of {', of '.join(v)}" for b, v in over.items())
+    return f"<p>Left without a name: {text(said)}. The details draw it.</p>"
+
+
+def _parts(model: Any) -> dict[str, str]:
+    """Of each effect its law; empty for a model whose equations are not known."""
     if not isinstance(model, JointModel):
         return {}
-    return {
-        source: (e.title, _formula(part))
-        for e in shown_equations(model)
-        for source, part in e.parts
-    }
+    return {source: _formula(part) for e in shown_equations(model) for source, part in e.parts}
 
 
 def _formula(part: Expression) -> str:
@@ -135,6 +151,7 @@ def _source(source: str) -> str:
 def next_html(improvement: Improvement, result: Mapping[str, Any]) -> str:
     """What to measure next, the most useful first."""
     sentence = OUTCOME_WORDS[kind_of(result)].next_step
+    crowded = (len(result["steps"]) > 2) + any("curve" in c for c in result["claims"])
     runs = []
     for c in result["claims"]:
         if len(c["effects"]) > 1 and c["separate_by"]:
@@ -148,7 +165,7 @@ def next_html(improvement: Improvement, result: Mapping[str, Any]) -> str:
         if key in EFFECTS:
             seen.setdefault(EFFECTS[key].excitation, []).append(EFFECTS[key].title)
     for motion, titles in sorted(seen.items(), key=lambda p: -len(p[1])):
-        if len(runs) < MOST_RUNS and motion:
+        if len(runs) < MOST_RUNS - crowded and motion:
             runs.append(f"<strong>{text(motion)}</strong>: would show {text(', '.join(titles))}")
     items = "".join(f"<li>{r}.</li>" for r in runs)
     return (
@@ -201,11 +218,7 @@ def joint_picture(improvement: Improvement) -> str:
             )
     measured_names = ", ".join(f"{b[1]} at the {b[0]}" for b in boxes if b[2])
     label = f"The joint from drive to link; measured: {measured_names}"
-    return (
-        f'<svg class="picture chain" role="img" aria-label="{text(label)}" '
-        f'viewBox="0 0 {width} 60" width="{width}" height="60" '
-        f'font-family="system-ui, sans-serif">{"".join(out)}</svg>'
-    )
+    return svg(label, "".join(out), 60, width, "picture chain")
 
 
 def motion_charts(improvement: Improvement, records: Sequence[Record]) -> list[tuple[str, Chart]]:

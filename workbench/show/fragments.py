@@ -14,6 +14,7 @@ from casadi_models.quantities import linear_unit
 from identification.data.formats import interval, number, percent, pretty_unit, ratio, words
 from identification.data.record import Record
 from identification.diagnosis.improve import RATIO_LIMIT, Improvement
+from identification.diagnosis.learned import LearnedClaim
 from identification.diagnosis.lines import Line
 from identification.diagnosis.locate import AXIS_R2, Unexplained
 from identification.diagnosis.places import AXIS_TITLES, Place
@@ -314,7 +315,7 @@ def unexplained_html(improvement: Improvement) -> str:
     linear = improvement.joint.kind == "linear"
     items = "".join(f"<li>{unexplained_sentence(u, linear)}</li>" for u in improvement.unexplained)
     curves = "".join(
-        f"<article><p>{text(c.sentence)}</p>{place_picture(c.place, None, 'torque')}</article>"
+        f"<article><p>{text(_plain(c))}</p>{place_picture(c.place, None, 'torque')}</article>"
         for c in improvement.learned
     )
     if curves:
@@ -325,6 +326,11 @@ def unexplained_html(improvement: Improvement) -> str:
         f"<ul>{items}</ul><p class='note'>This is not in the library. Look at the place named "
         "above; an effect of your own takes about ten lines of Python.</p>"
     )
+
+
+def _plain(claim: LearnedClaim) -> str:
+    """The sentence of a learned curve without the label that a model knows it by."""
+    return claim.sentence.replace(f" ({claim.curve.label})", "")
 
 
 def minor_html(improvement: Improvement) -> str:

@@ -8,7 +8,7 @@ from typing import Final
 
 from identification.data.formats import number
 from identification.variants.exploration import Exploration, Variant
-from workbench.show.chart import AFTER, BEFORE, INK, WIDTH
+from workbench.show.chart import AFTER, BEFORE, INK, WIDTH, sheet
 from workbench.show.pictures import Dot, front_picture
 from workbench.show.results import spaced, table, text
 
@@ -18,6 +18,8 @@ LINE: Final = 15
 LETTERS: Final = 84
 """Letters of a line beside the picture."""
 BESIDE: Final = 560
+FIGURE: Final = 300
+"""Height of the picture in a report."""
 WORST: Final = 1.15
 """Error, in units of that of the start model, up to which a variant is drawn."""
 
@@ -26,19 +28,8 @@ def exploration_picture(found: Exploration) -> str:
     """A self-contained SVG: every variant's held-out error against its parameters, with the names
     of those that matter.
     """
-    drawn, front = _drawn(found)
-    numbers = {id(v): k for k, v in enumerate(_numbered(found), 1)}
-    dots = [
-        Dot(
-            v.parameters,
-            v.error_percent,
-            number=numbers.get(id(v), 0),
-            best=v is found.recommended,
-            tied=v.tied,
-            ours=v is found.improved,
-        )
-        for v in drawn
-    ]
+    dots, front = _dots(found)
+    numbers = _numbers(found)
     rows = [
         f"{numbers[id(v)]}  {_short(v)}: {number(v.relative_error_percent, 3)} %, "
         f"{v.parameters} parameters{_said(found, v)}"
@@ -63,12 +54,8 @@ def exploration_picture(found: Exploration) -> str:
     for line, colour in [*named, ("", INK), *((w, INK) for w in lines)]:
         beside += _word(WIDTH + 16, y, colour, line)
         y += LINE
-    size = f"{WIDTH + BESIDE} {height}"
-    return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {size}" width="{WIDTH + BESIDE}" '
-        f'height="{height}" font-family="system-ui, sans-serif"><rect width="100%" height="100%" '
-        f'fill="#ffffff"/>{legend}<g transform="translate(0 30)">{picture}</g>{beside}</svg>\n'
-    )
+    body = f'{legend}<g transform="translate(0 30)">{picture}</g>{beside}'
+    return sheet(body, WIDTH + BESIDE, height)
 
 
 def exploration_html(found: Exploration) -> str:
@@ -85,6 +72,66 @@ def exploration_html(found: Exploration) -> str:
     ]
     head = ("variant", "parameters", "held-out error", "score behind", "best in")
     return spaced(f"<div>{exploration_picture(found)}{table(head, rows, found.agreement)}</div>")
+
+
+def exploration_section(found: Exploration) -> str:
+    """The section of a report: the front, the variants that are named on it, and what follows."""
+    dots, front = _dots(found)
+    rows = [
+        [
+            str(k),
+            text(v.name),
+            str(v.parameters),
+            f"{number(v.relative_error_percent, 3)} %",
+            number(v.score, 2),
+            f"{v.chosen_percent:.0f} %",
+            text(_said(found, v).strip(" ()")),
+        ]
+        for k, v in enumerate(_numbered(found), 1)
+    ]
+    head = ("dot", "variant", "parameters", "held-out error", "score behind", "best in", "note")
+    tied = ", ".join(text(v.name) for v in found.ties if v is not found.recommended)
+    said = [found.reason, found.agreement]
+    said += [
+        f"{s.by} stands in for {s.effect}: the records do not tell them apart."
+        for s in found.stand_ins
+        if s.tied
+    ]
+    paragraphs = "".join(f"<p>{text(x)}</p>" for x in said)
+    return (
+        f"<p>{found.screened} variants of the model were scored and {len(found.variants)} fitted. "
+        "A dot is a variant: its error on records that no fit saw, against its free parameters. "
+        "The line joins those that no other beats with as few; the filled dot is recommended, "
+        "open ones tie with it, and the square is what the improve loop ends with.</p>"
+        f"<figure>{front_picture(dots, front, FIGURE)}</figure>{paragraphs}"
+        f"{table(head, rows, f'Tied: {tied}' if tied else 'Nothing ties with the recommended one')}"
+        "<p class='note'>Score behind: sum over the balances of the logarithm of the error on "
+        "unseen blocks and .10 for each parameter, less that of the recommended variant. Best in: "
+        "share of resampled records in which the variant has the lowest score.</p>"
+    )
+
+
+def _numbers(found: Exploration) -> dict[int, int]:
+    """Number of each variant that is named, by its identity."""
+    return {id(v): k for k, v in enumerate(_numbered(found), 1)}
+
+
+def _dots(found: Exploration) -> tuple[list[Dot], list[int]]:
+    """Dots of the picture, and which of them are on the front."""
+    drawn, front = _drawn(found)
+    numbers = _numbers(found)
+    dots = [
+        Dot(
+            v.parameters,
+            v.error_percent,
+            number=numbers.get(id(v), 0),
+            best=v is found.recommended,
+            tied=v.tied,
+            ours=v is found.improved,
+        )
+        for v in drawn
+    ]
+    return dots, front
 
 
 def _numbered(found: Exploration) -> list[Variant]:

@@ -8,7 +8,7 @@ from identification.linear.models import LinearModels
 from identification.linear.spectra import Response
 from workbench.show.bode import HEIGHT as BODE_HEIGHT
 from workbench.show.bode import bode_picture
-from workbench.show.chart import BEFORE, HEIGHT, INK, WIDTH
+from workbench.show.chart import BEFORE, HEIGHT, INK, WIDTH, sheet
 from workbench.show.pictures import pole_picture
 
 _HEAD = 24
@@ -49,9 +49,4 @@ def linear_picture(found: LinearModels, responses: Sequence[Response]) -> str:
         f'<tspan fill="{BEFORE}">- - model {best.name}</tspan> × pole, shaded: two standard '
         "deviations</text>"
     )
-    size = (columns * WIDTH, top + _HEAD)
-    return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {size[0]} {size[1]}" '
-        f'width="{size[0]}" height="{size[1]}" font-family="system-ui, sans-serif">'
-        f'<rect width="100%" height="100%" fill="#ffffff"/>{"".join(body)}{legend}</svg>\n'
-    )
+    return sheet("".join(body) + legend, columns * WIDTH, top + _HEAD)

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from identification.diagnosis.improve import Improvement
 from identification.errors import InputError
-from workbench.show.chart import AFTER, BEFORE, HEIGHT, INK, WIDTH
+from workbench.show.chart import AFTER, BEFORE, HEIGHT, INK, WIDTH, sheet
 from workbench.show.pictures import place_picture, staircase_picture
 from workbench.show.plots import report_plots
 from workbench.show.results import floor_percent
@@ -36,14 +36,11 @@ def improvement_picture(improvement: Improvement) -> str:
         _word(WIDTH + 154, AFTER, "■ with the additions") if after is not None else ""
     )
     title = _word(54, INK, "error on records the fit never saw")
-    return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {2 * WIDTH} {HEIGHT + _HEAD}" '
-        f'width="{2 * WIDTH}" height="{HEIGHT + _HEAD}" '
-        'font-family="system-ui, sans-serif"><rect width="100%" height="100%" '
-        f'fill="#ffffff"/>{title}{legend}'
-        f'<g transform="translate(0 {_HEAD})">{stairs}</g><g transform="translate({WIDTH} '
-        f'{_HEAD})">{telling}</g></svg>\n'
+    body = (
+        f'{title}{legend}<g transform="translate(0 {_HEAD})">{stairs}</g>'
+        f'<g transform="translate({WIDTH} {_HEAD})">{telling}</g>'
     )
+    return sheet(body, 2 * WIDTH, HEIGHT + _HEAD)
 
 
 def _word(x: float, colour: str, text: str, anchor: str = "start") -> str:

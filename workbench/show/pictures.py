@@ -6,7 +6,6 @@ No scripts, no style attributes: colours are presentation attributes that a page
 
 from __future__ import annotations
 
-import html
 import math
 import textwrap
 from collections.abc import Sequence
@@ -209,7 +208,9 @@ def staircase_picture(
             f'<path class="s-ink" stroke="{INK}" stroke-dasharray="2 3" d="M{LEFT} '
             f'{y:.1f}H{width - RIGHT}"/>'
         )
-        body += word(LEFT + 4, y + 12, f"noise alone: {number(floor, 2)} %", "start")
+        below = y + 12 <= base - 2  # else the words would stand in those of the steps
+        at = y + 12 if below else y - 4
+        body += word(LEFT + 4, at, f"noise alone: {number(floor, 2)} %", "start")
     fall = " to ".join(f"{number(v, 3)} %" for v in values)
     noise = f"; measurement noise alone leaves {number(floor, 3)} %" if floor is not None else ""
     return svg(f"Held-out error, step by step: {fall}{noise}", body, height, width)
@@ -372,9 +373,8 @@ def _ellipse(one: Pole, frame: Frame) -> str:
 def bar(share: float, label: str) -> str:
     """A bar from 0 to 100 %; a share below 0 is drawn as 0."""
     width = 80 * min(max(share / 100, 0.0), 1.0) if math.isfinite(share) else 0.0
-    return (
-        f'<svg class="bar" role="img" aria-label="{html.escape(label, quote=True)}" viewBox="0 0 '
-        '80 10" width="80" height="10">'
+    body = (
         f'<rect class="s-rest" fill="{GRID}" fill-opacity="0.5" width="80" height="10"/>'
-        f'<rect class="s-after" fill="{AFTER}" width="{width:.1f}" height="10"/></svg>'
+        f'<rect class="s-after" fill="{AFTER}" width="{width:.1f}" height="10"/>'
     )
+    return svg(label, body, 10, 80, "bar")

@@ -7,13 +7,14 @@ import hashlib
 import json
 import platform
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from importlib import metadata, resources
 from itertools import count
 from pathlib import Path
-from typing import Any, Final
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Final
 
 from identification.data.formats import percent, ratio
 from identification.data.record import Record
@@ -22,6 +23,7 @@ from identification.errors import InputError
 from identification.fitting.trust import Trust
 from irj_fmu.command_line import replace_file
 from workbench.show import first_page, fragments
+from workbench.show.beside import beside_html
 from workbench.show.plots import ReportPlots, overlay_json, report_plots
 from workbench.show.results import (
     calibration_html,
@@ -38,6 +40,9 @@ from workbench.show.results import (
 from workbench.show.trusted import trusted_html
 from workbench.show.words import kind_of
 
+if TYPE_CHECKING:
+    from identification.variants.exploration import Exploration
+
 RANKED_SHOWN: Final = 8
 PACKAGES: Final = ("irj", "casadi", "numpy", "scipy")
 
@@ -49,8 +54,10 @@ def write_report(
     records: Sequence[Record] = (),
     command: str | None = None,
     trust: Trust | None = None,
+    exploration: Exploration | None = None,
     author: str = "",
     notes: str = "",
+    beside: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
 ) -> Path:
     """Write the report of an improvement as one HTML file.
 
@@ -67,8 +74,13 @@ def write_report(
         The command that made it, for the provenance.
     trust : Trust, optional
         Which number of the last step to trust, for a table.
+    exploration : Exploration, optional
+        All variants of the model on the same records, for a section.
     author, notes : str
         For the first page; lines of the notes are kept.
+    beside : mapping of str to mapping
+        Results of other sessions, dates or joints, by name
+        (:func:`workbench.show.beside.read_result`).
 
     Returns
     -------
@@ -82,7 +94,14 @@ def write_report(
     """
     path = Path(to)
     page = render_report(
-        improvement, records=records, command=command, trust=trust, author=author, notes=notes
+        improvement,
+        records=records,
+        command=command,
+        trust=trust,
+        exploration=exploration,
+        author=author,
+        notes=notes,
+        beside=beside,
     )
     if path.is_dir():
         raise InputError(f"{path}: is a folder; give the name of a file, as {path / 'report.html'}")
@@ -96,14 +115,22 @@ def render_report(
     records: Sequence[Record] = (),
     command: str | None = None,
     trust: Trust | None = None,
+    exploration: Exploration | None = None,
     author: str = "",
     notes: str = "",
+    beside: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
 ) -> str:
     """The report as text (see :func:`write_report`)."""
     result = improvement.as_json()
     plots = report_plots(improvement, records)
     name = improvement.joint.name
     sections = [s for s in _sections(improvement, result, plots, records) if s[2]]
+    if beside and result["steps"]:
+        sections.append(("beside", "Beside other results", beside_html(result, beside)))
+    if exploration is not None:
+        from workbench.show.front import exploration_section
+
+        sections.append(("variants", "All variants of the model", exploration_section(exploration)))
     if trust is not None:
         sections.append(("trust", "Which number to trust", trusted_html(trust)))
     made = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")

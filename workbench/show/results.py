@@ -177,7 +177,8 @@ def claims_html(result: Mapping[str, Any]) -> str:
             f"{percent(claim['held_out_drop_percent'])} on held-out records."
         )
         if "curve" in claim:
-            line = f"{names}: {text(claim['sentence'])}"
+            plain = claim["sentence"].replace(f" ({claim['label']})", "")
+            line = f"<strong>free curve</strong>: {text(plain)}"
         if claim.get("confidence"):
             by_title = {title_of(k): p for k, p in claim["confidence"].items()}
             line += f" By the likelihoods of whole fits: {chances(by_title)}."

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from identification.data.formats import number, pretty_unit
 from identification.faults.detector import SENSORS
-from workbench.show.chart import AFTER, BEFORE, GRID, INK, ticks
+from workbench.show.chart import AFTER, BEFORE, GRID, INK, svg, ticks
 from workbench.show.plots import decimated
 from workbench.show.replayed import READINGS, Replay
 from workbench.show.results import text
@@ -125,12 +125,7 @@ def _word(x: float, y: float, content: str, anchor: str = "middle", extra: str =
 
 
 def _svg(label: str, body: str, width: int, height: int) -> str:
-    kind = "track" if width > NARROW else "track narrow"
-    return (
-        f'<svg class="{kind}" role="img" aria-label="{text(label)}" viewBox="0 0 {width} '
-        f'{height}" width="{width}" height="{height}" '
-        f'font-family="system-ui, sans-serif">{body}</svg>'
-    )
+    return svg(label, body, height, width, "track" if width > NARROW else "track narrow")
 
 
 def _reach(values: Sequence[FloatArray]) -> tuple[float, float]:

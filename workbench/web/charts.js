@@ -203,6 +203,17 @@ function againstCard(files) {
   return box;
 }
 
+/* Hold parameters at values, or let them free: the model as it stands is fitted again on a branch of its own. */
+const held = (values) => act(async () => { await post("/joint", { hold: values, source: app.state.joint_source || "joint" }); await refresh(); }).then(() => { if ($("error").hidden) run("fit", {}, "parameters"); });
+
+/* Windows of a record that no fit takes: the one that is shown is left out, each can be taken back. */
+function leftOut(file, plot) {
+  const windows = file.left_out || [], put = (list) => act(async () => { await post(`/file/${file.id}`, { left_out: list }); await refresh(); });
+  plot.marks = () => windows;
+  return h("div", { class: "row under", id: "left-out" }, button("Leave out this window", () => { if (plot.range) put([...windows, plot.range]); else fail(new Error("drag across the plot first: the window that is shown is left out")); }, { kind: "quiet", id: "leave-out" }),
+    windows.map(([a, b], k) => button(`Take back ${digits(a, 4)} to ${digits(b, 4)} s`, () => put(windows.filter((_, n) => n !== k)), { kind: "quiet", id: `take-back-${k}` })));
+}
+
 /* --- sliders -------------------------------------------------------------------------------------------------- */
 
 /* Every parameter as a slider: the held-out error and the residual follow; nothing is changed until it is said. */
@@ -224,12 +235,14 @@ function slidersCard(rows, error) {
   const inputs = [];
   const row = ([name, p]) => {
     const size = Math.abs(p.value), spread = Math.max(3 * (p.stderr || 0), 0.5 * size, 1e-9), low = Math.max(p.low ?? -Infinity, p.value - spread), high = Math.min(p.high ?? Infinity, p.value + spread);
-    const shown = h("span", { class: "small" }, `${digits(p.value, 4)} ${unit(p.unit)}`), id = `slide-${name}`;
-    const input = h("input", { type: "range", id, min: String(low), max: String(high), step: String((high - low) / 400), value: String(p.value), "aria-label": `${words(name)} [${unit(p.unit)}]`, oninput: (e) => { values[name] = Number(e.target.value); shown.textContent = `${digits(values[name], 4)} ${unit(p.unit)}`; look(); } });
-    inputs.push(() => { input.value = String(p.value); shown.textContent = `${digits(p.value, 4)} ${unit(p.unit)}`; });
-    return h("div", { class: "slide" }, h("label", { for: id, class: "small" }, words(name), h("span", { class: "soft plain" }, ` ${p.side}`)), input, shown);
+    const id = `slide-${name}`, short = (v) => String(Number(v.toPrecision(6)));
+    const typed = h("input", { id: `value-${name}`, value: short(p.value), size: "8", inputmode: "decimal", autocomplete: "off", "aria-label": `Value of ${words(name)} [${unit(p.unit)}]`, onchange: (e) => { const v = Number(e.target.value.replace(",", ".")); if (Number.isFinite(v)) { values[name] = v; input.value = String(v); look(); } } });
+    const hold = button(p.held ? "Release" : "Hold", () => held({ [name]: p.held ? null : typed.value.replace(",", ".") }), { kind: "quiet", id: `hold-${name}`, label: `${p.held ? "Release" : "Hold"} ${words(name)}` });
+    const input = h("input", { type: "range", id, min: String(low), max: String(high), step: String((high - low) / 400), value: String(p.value), "aria-label": `${words(name)} [${unit(p.unit)}]`, oninput: (e) => { values[name] = Number(e.target.value); typed.value = short(values[name]); look(); } });
+    inputs.push(() => { input.value = String(p.value); typed.value = short(p.value); });
+    return h("div", { class: "slide" }, h("label", { for: id, class: "small" }, words(name), h("span", { class: "soft plain" }, ` ${p.side} ${unit(p.unit) ? `[${unit(p.unit)}]` : ""}`)), input, typed, hold);
   };
   const moved = Object.entries(rows).filter(([, p]) => !p.nuisance);
   const reset = () => { for (const k of Object.keys(values)) delete values[k]; inputs.forEach((f) => f()); figure.textContent = `${digits(error)} %`; charts.replaceChildren(); };
-  return h("section", { class: "card", id: "sliders" }, h("h2", {}, "What if?"), h("p", { class: "soft small" }, "Move a parameter: the held-out error and the residual follow at once. The fit stays as it is."), h("div", { class: "two" }, h("div", {}, moved.map(row), button("Back to the fit", reset, { kind: "quiet", work: false, id: "slider-reset" })), h("div", {}, h("p", { class: "soft" }, "Held-out error"), figure, charts)));
+  return h("section", { class: "card", id: "sliders" }, h("h2", {}, "What if?"), h("p", { class: "soft small" }, "Move a parameter: the held-out error and the residual follow at once. The fit stays as it is. Hold fixes a parameter at its value, typed or slid, and fits the model again as a new branch."), h("div", { class: "two" }, h("div", {}, moved.map(row), button("Back to the fit", reset, { kind: "quiet", work: false, id: "slider-reset" })), h("div", {}, h("p", { class: "soft" }, "Held-out error"), figure, charts)));
 }

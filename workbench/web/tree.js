@@ -31,7 +31,7 @@ function treeCard(state) {
       const tick = h("input", { type: "checkbox", id: `${id}-compare`, "aria-label": `Compare ${stepTitle(s)}, ${digits(s.error)} %`, checked: draft.chosen.includes(s.id), onchange: (e) => { draft.chosen = [...draft.chosen.filter((x) => x !== s.id), ...(e.target.checked ? [s.id] : [])].slice(-2); draw(branches); } });
       return h("li", {}, h("div", { class: `fit${n.now ? " now" : n.on ? " on" : ""}`, id }, tick, h("span", { class: "fit-name" }, stepTitle(s)), h("span", { class: "num" }, `${digits(s.error)} %`), s.diagnosed ? h("span", { class: "tag good" }, "diagnosed") : null,
         n.now ? h("span", { class: "tag" }, "now") : button("Open", () => go(n.branch.id, s.id), { kind: "quiet", id: `${id}-open`, label: `Open ${stepTitle(s)}, ${digits(s.error)} %` }),
-        button(s.remark.note || s.remark.name ? "Edit note" : "Name, note", () => { draft.noting = noting ? null : s.id; draw(branches); }, { kind: "quiet", work: false, id: `${id}-note`, label: `Name or note of ${stepTitle(s)}` })),
+        button(s.remark.note || s.remark.name ? "Edit note" : "Name, note", () => { draft.noting = noting ? null : s.id; draw(branches); }, { kind: "quiet", work: false, id: `${id}-note`, label: `${s.remark.note || s.remark.name ? "Edit note" : "Name, note"} of ${stepTitle(s)}` })),
         noting ? h("form", { class: "row", onsubmit: (e) => { e.preventDefault(); write(s.id, { name: $(`${id}-name`).value, note: $(`${id}-text`).value }); } }, h("input", { id: `${id}-name`, "aria-label": "Name", placeholder: "Name", value: s.remark.name || "" }), h("input", { id: `${id}-text`, size: "48", "aria-label": "Note", placeholder: "Note", value: s.remark.note || "" }), h("button", { type: "submit" }, "Keep")) : s.remark.note ? h("p", { class: "small soft note-text" }, s.remark.note) : null,
         n.children.length ? h("ul", {}, n.children.map(node)) : null);
     };
@@ -49,4 +49,16 @@ function fitsTable(found) {
   return h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Two fits compared" }, h("table", {}, h("caption", {}, "Two fits side by side"), h("thead", {}, h("tr", {}, h("th", { scope: "col" }, ""), h("th", { scope: "col", class: "num" }, stepTitle(a)), h("th", { scope: "col", class: "num" }, stepTitle(b)))),
     h("tbody", {}, h("tr", { class: "now" }, h("th", { scope: "row" }, "Held-out error [%]"), cell(a.error), cell(b.error)), h("tr", {}, h("th", { scope: "row" }, "Only in it"), found.only.map((o) => h("td", {}, o.length ? o.map(effectTitle).join(", ") : "–"))),
       changed.map((v) => h("tr", {}, h("th", { scope: "row" }, v.name.replace(/_/g, " ")), cell(v.first), cell(v.second))))));
+}
+
+/* A law of one's own: typed in one line, fitted at once to what the model leaves, kept in the joint file. */
+function lawCard(state) {
+  const draft = app.drafts.law || (app.drafts.law = { law: "", on: "motor", parameters: "" });
+  const field = (key, label, placeholder, size) => h("input", { id: `law-${key}`, value: draft[key], placeholder, size, "aria-label": label, autocomplete: "off", spellcheck: "false", oninput: (e) => { draft[key] = e.target.value; } });
+  const place = h("select", { id: "law-on", "aria-label": "Where it acts", onchange: (e) => { draft.on = e.target.value; } }, app.config.places.map((p) => h("option", { value: p, selected: p === draft.on }, p.replace(/_/g, " "))));
+  const row = (t) => h("li", {}, h("div", { class: "row between" }, h("span", {}, h("code", {}, t.law), ` on ${t.on.replace(/_/g, " ")}: the held-out error ${t.after < t.before ? "falls" : "goes"} from ${digits(t.before)} to `, h("strong", {}, `${digits(t.after)} %`)),
+    button("Add", () => run("add", { label: t.label }, "ledger"), { kind: t.after < t.before ? "primary" : "", id: `add-${t.label}`, label: `Add ${t.law}` })));
+  return h("form", { class: "card", id: "own-law", onsubmit: (e) => { e.preventDefault(); $("try-law").click(); } }, h("h2", {}, "A law of your own"), h("div", { class: "row" }, field("law", "Law", "a*tanh(v/b)", "28"), place, field("parameters", "Parameters with ranges and units", "a=0..10 N.m, b=0.01..1 rad/s", "34"),
+    button("Try it", () => run("law", { ...draft }), { id: "try-law" })), h("p", { class: "small soft" }, "Signals: q, v, a (angle, speed, acceleration of the place), twist, T, t. It is fitted at once to what the model leaves, and stays in the joint file."),
+    state.laws.length ? h("ul", { class: "plain", id: "tried-laws" }, state.laws.map(row)) : null);
 }

@@ -153,9 +153,10 @@ const views = {
         h("div", { class: "card" }, h("h2", {}, "In the model now"), h("ul", { class: "plain" }, inside.map((e) => h("li", {}, h("div", { class: "row between" }, effectTitle(e), button("Remove", () => run("remove", { label: e }), { kind: "quiet", label: `Remove ${effectTitle(e)}`, off: e === "transmission_compliance" && inside.includes("structural_damping") })))))),
       ),
       stairs.told ? h("div", { class: "grid" }, chartFigure([`The place that told: ${stairs.told.name}`, h("span", {}, `${stairs.told.balance} balance, before (◆) and after (■); line: what it explains`)], stairs.told.chart, { name: "The place that told", kind: "told" })) : null,
-      h("div", { class: "card scroll", tabindex: "0", role: "region", "aria-label": "Ledger" }, h("table", {}, h("caption", {}, "Ledger"), h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Step"), h("th", { scope: "col", class: "num" }, "Held-out error"), h("th", { scope: "col", class: "num" }, "Fit"), h("th", { scope: "col", class: "num" }, "VAF"), Object.keys(last.held_out.balances).map((b) => h("th", { scope: "col", class: "num" }, `${b}: × floor`)))),
+      h("div", { class: "card scroll", tabindex: "0", role: "region", "aria-label": "Ledger" }, h("table", {}, h("caption", {}, "Ledger"), h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Step"), h("th", { scope: "col", class: "num" }, "Held-out error"), h("th", { scope: "col", class: "num" }, "Fit"), h("th", { scope: "col", class: "num" }, "VAF"), Object.keys(last.held_out.balances).map((b) => h("th", { scope: "col", class: "num" }, [`${b} `, term("÷ noise")])))),
         h("tbody", {}, steps.map((s, k) => h("tr", { class: k === steps.length - 1 ? "now" : null }, h("td", {}, stepName(s)), h("td", { class: "num" }, `${digits(s.held_out.relative_error_percent)} %`), h("td", { class: "num" }, `${digits(s.held_out.fit_percent)} %`), h("td", { class: "num" }, `${vaf(s.held_out.vaf_percent)} %`), Object.keys(last.held_out.balances).map((b) => h("td", { class: "num" }, s.held_out.balances[b] ? digits(s.held_out.balances[b].ratio) : "–"))))))),
       treeCard(state),
+      lawCard(state),
       h("div", { class: "card" }, h("h2", {}, "By hand"), h("div", { class: "row" }, add, button("Add", () => run("add", { label: $("add-label").value }), { id: "add-by-hand", label: "Add the chosen effect" }), button("Run the whole loop", () => run("improve", {}, "ledger"), { id: "improve" })), h("p", { class: "small soft" }, "The whole loop diagnoses and adds until nothing is left to name; it starts from the start model again.")),
     ];
   },
@@ -225,5 +226,5 @@ function seriesCard(files) {
   app.plots.push(plot);
   later(() => plot.show(null).catch(fail));
   const pick = (id, label, options, chosen, key) => h("select", { id, "aria-label": label, onchange: (e) => { draft[key] = e.target.value; render(false); } }, options.map(([v, t]) => h("option", { value: v, selected: v === chosen }, t)));
-  return h("section", { class: "card" }, h("h2", {}, "Look at the records"), plotControls(plot, [pick("series-file", "Record", files.map((f) => [f.id, f.name]), file.id, "file"), pick("series-channel", "Channel", channels.map((c) => [c, c.replace(/_/g, " ")]), channel, "channel")]), host);
+  return h("section", { class: "card" }, h("h2", {}, "Look at the records"), plotControls(plot, [pick("series-file", "Record", files.map((f) => [f.id, f.name]), file.id, "file"), pick("series-channel", "Channel", channels.map((c) => [c, c.replace(/_/g, " ")]), channel, "channel")]), host, leftOut(file, plot));
 }

@@ -88,3 +88,11 @@ def test_an_elastic_model_of_a_moving_joint_needs_both_positions() -> None:
     joint = Joint(name="test", gear_ratio=100.0, model_name="hd3")
     with pytest.raises(InputError, match="the joint moves, and link_position is missing"):
         fit(joint, moving(4))
+
+
+def test_nothing_hidden_stands_at_its_floor_although_stamps_are_uneven() -> None:
+    # cubics between the stamps smooth the noise: its level is not that of neighbouring samples
+    joint = Joint(name="test", gear_ratio=100.0, model_name="hd1")
+    found = improve(record(50, 0.0, 100.0), joint, [record(60, 0.0, 100.0)])
+    assert found.verdict == "nothing_missing"
+    assert 0.85 < found.final_ratios["transmission"].ratio < 1.2

@@ -40,7 +40,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
             [
                 *("explore", *given, "--joint", str(DEMO / "joint.toml")),
                 *("--json", str(folder / "found.json"), "--out", str(folder / "all")),
-                *("-o", str(folder / "better.toml")),
+                *("-o", str(folder / "better.toml"), "--report", str(folder / "report.html")),
             ]
         )
     assert code == 0
@@ -217,6 +217,17 @@ def test_picture_names_the_recommended_variant(demo: Path) -> None:
     words = " ".join(t.text or "" for t in root.iter("{http://www.w3.org/2000/svg}text"))
     assert HIDDEN in words
     assert "(recommended, improve)" in words
+
+
+def test_the_report_has_a_section_of_the_variants(demo: Path) -> None:
+    page = (demo / "report.html").read_text()
+    section = page.split('<section id="variants"')[1].split("</section>")[0]
+    found = json.loads((demo / "found.json").read_text())
+    best = next(v for v in found["variants"] if v["labels"] == found["recommended"])
+    assert f"<td>{best['parameters']}</td>" in section
+    assert "recommended, improve" in section
+    assert "<svg" in section
+    assert "free parameters" in section
 
 
 def test_joint_file_of_the_recommended_variant_is_a_joint_file(demo: Path) -> None:

@@ -248,4 +248,41 @@ def test_the_falling_staircase_has_its_floor_and_the_place_that_told(page: Any) 
         for view in ("ledger", "compare", "parameters", "load"):
             go(page, view)
             found = page.evaluate("() => axe.run(document)")
-            assert [v["id"] for v in found["violations"]] == []
+            bad = [(v["id"], n["html"][:160]) for v in found["violations"] for n in v["nodes"]]
+            assert bad == [], view
+
+
+def test_a_parameter_is_held_at_a_typed_value_and_let_free_again(page: Any) -> None:
+    go(page, "parameters")
+    free = float(page.inner_text("#headline strong").split()[0])
+    page.fill("#value-motor_coulomb", "15")
+    page.click("#hold-motor_coulomb")
+    page.wait_for_function(
+        "() => /\\[known\\]\\s+motor_coulomb = 15/.test(app.state.joint_text)"
+        " && app.state.steps.length === 1"
+    )
+    idle(page, "parameters")
+    assert page.input_value("#value-motor_coulomb") == "15"
+    assert float(page.inner_text("#headline strong").split()[0]) > 1.2 * free
+    page.click("#hold-motor_coulomb")
+    page.wait_for_function("() => !app.state.joint_text.includes('[known]')")
+    idle(page, "parameters")
+    assert float(page.inner_text("#headline strong").split()[0]) == pytest.approx(free, rel=2e-3)
+
+
+def test_a_window_is_left_out_and_taken_back(page: Any) -> None:
+    go(page, "load")
+    page.wait_for_selector(".plot .uplot")
+    page.evaluate("() => app.plots[0].show([5, 9])")
+    page.wait_for_function("() => app.plots[0].range !== null")
+    page.click("#leave-out")
+    page.wait_for_selector("#take-back-0")
+    assert page.evaluate("() => app.state.files.find((f) => f.left_out.length).left_out") == [
+        [5, 9]
+    ]
+    page.click("#fit")
+    idle(page, "compare")
+    go(page, "load")
+    page.click("#take-back-0")
+    page.wait_for_function("() => app.state.files.every((f) => !f.left_out.length)")
+    page.wait_for_function("() => app.state.steps.length > 0")  # the branch before it is back

@@ -1,0 +1,1 @@
+"""First steps in the terminal: examples, completion, the import of a file."""
