@@ -173,7 +173,8 @@ def test_jacobian_is_the_derivative_of_the_rows(key: str, place: str, sensors: s
     bare = balances_of(case.model, case.sensing, wrt=())
     jacobian = stack(balances, [data], case.values).jacobian
     for name in names:
-        step = 1e-4 * (abs(case.values[name]) or 1.0)
+        # read backwards, a law has the kinks of its knots at samples: none may lie inside the step
+        step = (1e-5 if case.sensing.kinematic else 1e-4) * (abs(case.values[name]) or 1.0)
         sides = [
             stack(bare, [data], {**case.values, name: case.values[name] + s * step}).residual
             for s in (1, -1)
