@@ -52,6 +52,10 @@ _PLACES: Final = [
     tuple(i for i, bit in enumerate(_BITS) if bits & bit) for bits in range(1 << len(_BITS))
 ]
 """Places of the bits that are set, for each set of bits."""
+WELL_OVER: Final = 1.5
+"""Largest torsion residual over its limit that is no noise: a limit is passed by noise by a few
+percent.
+"""
 LARGEST: Final = 1e6
 """A reading beyond this is no place to start an estimate from."""
 WIDER: Final = 1.5

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Final, final
 
 import numpy as np
 
+from identification.balance.colour import white
 from identification.balance.dataset import pointwise_kernel
 from identification.balance.noise import noise_level
 from identification.data.record import Record
@@ -310,7 +311,7 @@ class Restart:
     def _slope(position: FloatArray, dt: float) -> FloatArray:
         """Velocity with the kernel that the balances would take for this position."""
         part = (slice(0, len(position)),)
-        noise = noise_level(position, part)
+        noise = white(noise_level(position, part))
         return smooth_slope(position, dt, pointwise_kernel(position, part, dt, LONGEST, noise))
 
     def _driven(self, window: Window, starts: FloatArray, law: CorrectionLaw | None) -> Window:
