@@ -521,7 +521,7 @@ def parser() -> OneLineParser:
     other_payload(trusted)
     plain = verb(
         "linear",
-        "linear",
+        "records",
         "linear models without physics: subspace and black boxes, orders, poles, held-out VAF",
         records=True,
     )

@@ -12,7 +12,7 @@ import numpy.typing as npt
 import pytest
 from scipy.signal import lfilter
 
-from benchmarks.subspace_order import draw, identify
+from benchmarks.algorithms.subspace_order import draw, identify
 from identification.data.record import Record
 from identification.errors import InputError
 from identification.linear.hankel_qr import Method
@@ -140,7 +140,7 @@ def test_the_gain_is_that_which_slicot_prints() -> None:
 
 def test_orders_of_simulated_joints_from_current_to_position() -> None:
     """Elastic and rigid, integrating and hanging, open and closed loop; figures of a hundred are
-    printed by ``python -m benchmarks.subspace_order``.
+    printed by ``python -m benchmarks.algorithms.subspace_order``.
     """
     joints = [draw(seed) for seed in range(2000, 2010)]
     right = sum(identify(one).order == one.order for one in joints)

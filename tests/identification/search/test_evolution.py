@@ -6,8 +6,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from benchmarks.algorithms.mcs_rotated import Problem, ours, problems, rosenbrock
 from benchmarks.mcs import JONES, SUM_BAND, solve
-from benchmarks.mcs_rotated import Problem, ours, problems, rosenbrock
 from identification.errors import InputError
 from identification.search.evaluate import Evaluator
 from identification.search.evolution import FLATTEST, evolve
@@ -86,7 +86,7 @@ def hard() -> list[Problem]:
 
 @pytest.mark.parametrize("problem", hard(), ids=lambda p: p.name)
 def test_rotated_functions_are_solved(problem: Problem) -> None:
-    """All sixty, beside scipy's methods: ``python -m benchmarks.mcs_rotated``."""
+    """All sixty, beside scipy's methods: ``python -m benchmarks.algorithms.mcs_rotated``."""
     solved, calls = ours(problem)
     assert solved
     assert calls <= problem.limit

@@ -1,8 +1,8 @@
 """How often the order of simulated joints from current to position is found, and what the models
 explain of an unseen record, on pieces of it where the joint integrates.
 
-    python -m benchmarks.subspace_order                  100 joints, about a minute
-    python -m benchmarks.subspace_order --joints 20 --seed 1
+    python -m benchmarks.algorithms.subspace_order                  100 joints, about a minute
+    python -m benchmarks.algorithms.subspace_order --joints 20 --seed 1
 
 Each joint is drawn anew: inertias, stiffness with a resonance of 4 to 20 Hz, damping, viscous
 friction, with or without gravity about a hanging equilibrium, elastic or rigid. The drive is noise
@@ -144,7 +144,7 @@ def pieces_vaf(drawn: Drawn, model: Subspace) -> float:
 
 def main() -> int:
     """Print the share of right orders."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.subspace_order")
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.algorithms.subspace_order")
     parser.add_argument("--joints", type=int, default=100, help="joints drawn (default 100)")
     parser.add_argument("--seed", type=int, default=0, help="first seed (default 0)")
     parser.add_argument(

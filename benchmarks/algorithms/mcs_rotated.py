@@ -1,8 +1,8 @@
 """Sixty shifted and rotated test functions in 2 to 10 coordinates: the coordinate search with
 restarts beside scipy's differential evolution and dual annealing.
 
-    python -m benchmarks.mcs_rotated              all sixty, some minutes
-    python -m benchmarks.mcs_rotated --every 6    ten of them
+    python -m benchmarks.algorithms.mcs_rotated              all sixty, some minutes
+    python -m benchmarks.algorithms.mcs_rotated --every 6    ten of them
 
 Ackley, Rastrigin, Griewank, Levy and Rosenbrock in 2, 3, 5, 8 and 10 coordinates, twice each, and
 Hartmann's functions in 3 and 6, five times each: f(m + Q (x - s)) with a random rotation Q and a
@@ -213,7 +213,7 @@ def claims(asked: list[Problem]) -> int:
 
 def main() -> int:
     """Print solved problems and evaluations."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.mcs_rotated")
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.algorithms.mcs_rotated")
     parser.add_argument("--every", type=int, default=1, help="every how manyth problem")
     asked = list(problems())[:: parser.parse_args().every]
     methods: dict[str, Callable[[Problem], tuple[bool, int]]] = {"mcs with restarts": ours}

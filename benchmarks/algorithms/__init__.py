@@ -1,0 +1,1 @@
+"""Algorithms on problems drawn at random: orders of subspace models, rotated test functions."""
