@@ -27,9 +27,16 @@ import numpy.typing as npt
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.fault_identify import MODEL_NAMES, NAMES, SCALE, identify, least_squares, regression
-from benchmarks.fault_page import printed, write_page
-from benchmarks.fault_plant import (
+from benchmarks.faults.identify import (
+    MODEL_NAMES,
+    NAMES,
+    SCALE,
+    identify,
+    least_squares,
+    regression,
+)
+from benchmarks.faults.page import printed, write_page
+from benchmarks.faults.plant import (
     DT,
     FACTORS,
     SIZES,

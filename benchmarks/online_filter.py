@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.fault_plant import DT, plant, reference
+from benchmarks.faults.plant import DT, plant, reference
 from identification.online.filter import JointFilter, Levels
 from identification.planning.follow import Follower
 

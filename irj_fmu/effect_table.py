@@ -62,6 +62,8 @@ class EffectRow:
         Of the sensor noise; None: no noise.
     plant, estimate, sigma : float
         `estimate` without the part of the error that the motion does not show.
+    size : float
+        What an error is a share of: the plant's value, or the prior range where that is 0.
     combined : bool
         True where the motion shows the parameter in combinations only.
     """
@@ -74,14 +76,13 @@ class EffectRow:
     plant: float
     estimate: float
     sigma: float
+    size: float
     combined: bool
 
     @property
     def error(self) -> float:
-        """Relative error [%]; infinite where the plant has 0 and the estimate not."""
-        if self.plant == 0:
-            return 0.0 if self.estimate == 0 else float("inf")
-        return 100.0 * abs(self.estimate / self.plant - 1.0)
+        """Relative error [%]."""
+        return 100.0 * abs(self.estimate - self.plant) / self.size
 
     @property
     def sigmas(self) -> float:
@@ -124,12 +125,12 @@ def joint_with(label: str) -> Joint:
     return replace(grown, fitted={**values, **base.fitted})
 
 
-def readings_of(joint: Joint, motion: Motion | None = None) -> FloatArray:
+def readings_of(joint: Joint, motion: Motion | None = None, stop: float = STOP) -> FloatArray:
     """Drive, positions, velocities and torque that the plant FMU reads in closed loop,
     link-referred, without noise, (samples, 6).
     """
     motion = motion or Motion()
-    count = round(STOP / STEP) + 1
+    count = round(stop / STEP) + 1
     table = np.empty((count, 6))
     drive = "motor_current" if joint.torque_per_current is not None else "motor_torque"
     with tempfile.TemporaryDirectory(prefix="irj-effects-") as folder:
@@ -211,6 +212,7 @@ def run(label: str, seeds: Sequence[int | None], sides: Sequence[Side]) -> Itera
                     plant=plant[i],
                     estimate=float(seen[i]),
                     sigma=float(sigma[i]),
+                    size=float(abs(plant[i]) or shown.scale[i]),
                     combined=not shown.alone(i),
                 )
 

@@ -8,6 +8,7 @@ rows of the balances.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final, final
@@ -17,9 +18,10 @@ import numpy.typing as npt
 
 FloatArray = npt.NDArray[np.float64]
 
-REACH: Final = 0.016
-"""Longest spacing of the fourth differences [s]: they hold frequencies above 30 Hz, where a motion
-has nothing but the few samples around a turn.
+REACH: Final = 0.0202
+"""Longest spacing of the fourth differences [s], four samples at 200 Hz and one in a hundred more
+for its clock: they hold frequencies above 25 Hz, where a motion has little but the few samples
+around a turn.
 """
 SPACINGS: Final = (1, 2, 3, 4, 6, 8, 12, 16)
 """Samples between the five that make a fourth difference."""
@@ -36,6 +38,12 @@ between samples gives the fifth, smooth motion the eighth; noise with a memory a
 """
 CLEARLY: Final = 4.0
 """Standard errors of the readings by which such noise must explain them better than a motion."""
+SETTLED: Final = 3.0
+"""Memories of two low-passes in a row that the longest spacing must hold, so that the readings
+show their whole power: before that they rise as steeply as a motion.
+"""
+WARM: Final = 10.0
+"""Memories after which a drawn course has forgotten its beginning."""
 COLOURED: Final = 1.2
 """Power of the longer differences over that of the shortest from which noise is not white: the
 readings of white noise scatter by 3 %, and the motion adds up to 10 % to the longest.
@@ -64,6 +72,41 @@ FEWEST: Final = 1000
 
 @final
 @dataclass(frozen=True)
+class Part:
+    """White noise through a low-pass.
+
+    Attributes
+    ----------
+    size : float
+        Standard deviation, in the channel's unit.
+    memory : float
+        Time constant of the low-pass [s]; 0 for white noise.
+    stages : int
+        Low-passes in a row.
+    """
+
+    size: float
+    memory: float = 0.0
+    stages: int = 1
+
+    def draw(self, rng: np.random.Generator, count: int, dt: float) -> FloatArray:
+        """A course of this noise, shape (count,), at steps of `dt` seconds."""
+        if self.memory <= 0:
+            return np.asarray(self.size * rng.standard_normal(count))
+        from scipy.signal import lfilter
+
+        warm = math.ceil(WARM * self.memory / dt)
+        pole = math.exp(-dt / self.memory)
+        # of one pole and of two: the sums of the squares of r^k and of (k + 1) r^k
+        power = 1 / (1 - pole**2) if self.stages == 1 else (1 + pole**2) / (1 - pole**2) ** 3
+        course = rng.standard_normal(count + warm)
+        for _ in range(self.stages):
+            course = lfilter([1.0], [1.0, -pole], course)
+        return np.asarray(self.size / math.sqrt(power) * course[warm:])
+
+
+@final
+@dataclass(frozen=True)
 class ChannelNoise:
     """Noise of a channel.
 
@@ -71,15 +114,14 @@ class ChannelNoise:
     ----------
     level : float
         Deviation of the white noise that has the same fourth differences, in the channel's unit.
-    parts : tuple of (float, float)
-        Deviation of each independent part and the time after which it forgets itself [s]; 0 for
-        white noise.
+    parts : tuple of Part
+        Independent of each other.
     lines : tuple of (float, float)
         Amplitude of each line and its frequency [Hz].
     """
 
     level: float
-    parts: tuple[tuple[float, float], ...]
+    parts: tuple[Part, ...]
     lines: tuple[tuple[float, float], ...] = ()
 
     def scaled(self, level: float) -> ChannelNoise:
@@ -91,26 +133,15 @@ class ChannelNoise:
         factor = level / self.level
         return ChannelNoise(
             level,
-            tuple((factor * size, memory) for size, memory in self.parts),
+            tuple(replace(part, size=factor * part.size) for part in self.parts),
             tuple((factor * size, frequency) for size, frequency in self.lines),
         )
-
-    def with_part(self, size: float, memory: float) -> ChannelNoise:
-        """With one more part."""
-        return replace(self, parts=(*self.parts, (size, memory)))
 
     def draw(self, rng: np.random.Generator, count: int, dt: float) -> FloatArray:
         """A course of this noise, shape (count,), at steps of `dt` seconds."""
         out = np.zeros(count)
-        for size, memory in self.parts:
-            fresh = rng.standard_normal(count)
-            if memory > 0:
-                from scipy.signal import lfilter
-
-                pole = float(np.exp(-dt / memory))
-                fresh[1:] *= np.sqrt(1 - pole**2)
-                fresh = np.asarray(lfilter([1.0], [1.0, -pole], fresh))
-            out += size * fresh
+        for part in self.parts:
+            out += part.draw(rng, count, dt)
         for size, frequency in self.lines:
             phase = rng.uniform(0.0, 2 * np.pi)
             out += size * np.sin(2 * np.pi * frequency * dt * np.arange(count) + phase)
@@ -119,7 +150,7 @@ class ChannelNoise:
 
 def white(level: float) -> ChannelNoise:
     """White noise of this deviation."""
-    return ChannelNoise(level, ((level, 0.0),))
+    return ChannelNoise(level, (Part(level),))
 
 
 def spacings_of(dt: float) -> list[int]:
@@ -164,11 +195,11 @@ def coloured(values: FloatArray, part: slice, dt: float, levels: Sequence[float]
     rest = power - hum if lines else power
     use = rest > CLEAN * power
     if use.sum() < FEWEST_SPACINGS or not use[0]:
-        return ChannelNoise(level, ((level, 0.0),), lines)
+        return ChannelNoise(level, (Part(level),), lines)
     # readings next to a line's own frequency are mostly that line
     spacings, rest = [m for m, u in zip(spacings, use, strict=True) if u], rest[use]
     if float(np.median(rest[1:])) < COLOURED * rest[0]:
-        return ChannelNoise(level, ((float(np.sqrt(rest[0])), 0.0),), lines)
+        return ChannelNoise(level, (Part(math.sqrt(rest[0])),), lines)
     samples = part.stop - part.start
     found = _with_memory(rest, spacings, dt, SCATTER * float(np.sqrt(SAMPLES / samples)))
     return ChannelNoise(level, found, lines)
@@ -176,7 +207,7 @@ def coloured(values: FloatArray, part: slice, dt: float, levels: Sequence[float]
 
 def _with_memory(
     power: FloatArray, spacings: Sequence[int], dt: float, scatter: float
-) -> tuple[tuple[float, float], ...]:
+) -> tuple[Part, ...]:
     """White noise, beside noise of one memory where the readings need it: the shortest one within
     one standard error of them, since what a motion adds looks like a longer one.
     """
@@ -189,22 +220,29 @@ def _with_memory(
         share, left = nnls(np.column_stack([flat, second]) / error[:, None], power / error)
         return float(left**2), share
 
+    def of_memory(stages: int, longest: float) -> tuple[float, tuple[Part, ...]]:
+        fits = [(x, *misfit(_seen(x, stages, spacings))) for x in MEMORIES if x <= longest]
+        best = min((left for _, left, _ in fits), default=np.inf)
+        for tau, left, share in fits:
+            if left <= best + 1:
+                parts = (Part(math.sqrt(share[0])), Part(math.sqrt(share[1]), dt * tau, stages))
+                return best, tuple(p for p in parts if p.size > 0)
+        return best, ()
+
     moving, _ = misfit((m / m[-1]) ** STEEP)
-    fits = [(tau, *misfit(_seen(float(np.exp(-1 / tau)), spacings))) for tau in MEMORIES]
-    best = min(left for _, left, _ in fits)
-    if moving - best < CLEARLY**2:
-        return ((float(np.sqrt(power[0])), 0.0),)
-    tau, _, share = next(f for f in fits if f[1] <= best + 1)
-    parts = ((float(np.sqrt(share[0])), 0.0), (float(np.sqrt(share[1])), dt * tau))
-    return tuple(p for p in parts if p[0] > 0)
+    found = [of_memory(1, np.inf), of_memory(2, m[-1] / SETTLED)]
+    left, parts = found[1] if found[1][0] < found[0][0] - CLEARLY**2 else found[0]
+    return parts if moving - left >= CLEARLY**2 else (Part(math.sqrt(power[0])),)
 
 
-def _seen(pole: float, spacings: Sequence[int]) -> FloatArray:
-    """Share of the power of noise with that correlation of neighbouring samples in fourth
-    differences over these spacings.
+def _seen(memory: float, stages: int, spacings: Sequence[int]) -> FloatArray:
+    """Share of the power of noise with that memory, in samples, in fourth differences over these
+    spacings.
     """
-    r = pole ** np.array(spacings, dtype=float)
-    return np.asarray((70 - 112 * r + 56 * r**2 - 16 * r**3 + 2 * r**4) / 70)
+    pole, m = math.exp(-1 / memory), np.array(spacings, dtype=float)
+    slope = (1 - pole**2) / (1 + pole**2) if stages > 1 else 0.0
+    r = [pole ** (k * m) * (1 + slope * k * m) for k in range(5)]
+    return np.asarray((70 * r[0] - 112 * r[1] + 56 * r[2] - 16 * r[3] + 2 * r[4]) / 70)
 
 
 def _lines(values: FloatArray, part: slice, dt: float) -> tuple[tuple[float, float], ...]:
@@ -232,4 +270,4 @@ def _lines(values: FloatArray, part: slice, dt: float) -> tuple[tuple[float, flo
     return tuple(sorted(found, reverse=True)[:MOST_LINES])
 
 
-__all__ = ["ChannelNoise", "coloured", "spacings_of", "white"]
+__all__ = ["ChannelNoise", "Part", "coloured", "spacings_of", "white"]

@@ -371,7 +371,7 @@ def _with_rests(made: WeakRecord, noise: Mapping[str, float]) -> WeakRecord:
 
 def _loudness(noise: ChannelNoise) -> float:
     """Deviation of all parts of a noise, which is what a slow row sees most of."""
-    return sum(size**2 for size, _ in noise.parts)
+    return sum(part.size**2 for part in noise.parts)
 
 
 def measured_noise(record: Record, joint: Joint, sensing: Sensing) -> dict[str, float]:

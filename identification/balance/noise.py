@@ -22,6 +22,8 @@ stamps written with few digits.
 
 KEPT: Final = 0.95
 """Share of the fourth differences that counts: the rest may be jumps of the motion and spikes."""
+FOURTH_GAIN: Final = 70.0
+"""Variance of a fourth difference of unit noise: 1 + 16 + 36 + 16 + 1."""
 CUT_DEVIATION: Final = 0.87
 """Standard deviation of a unit normal variable that is cut at that quantile of its size (0.871)."""
 
@@ -185,7 +187,7 @@ def _fourth(x: FloatArray, time: FloatArray | None) -> FloatArray:
     """Fourth differences, scaled to unit noise gain: zero for a cubic course over the stamps."""
     steps = np.ones(1) if time is None else np.diff(time)
     if time is None or np.ptp(steps) <= EVEN * float(np.median(steps)) or steps.min() <= 0:
-        return np.asarray(np.diff(x, 4) / np.sqrt(70), dtype=np.float64)
+        return np.asarray(np.diff(x, 4) / np.sqrt(FOURTH_GAIN), dtype=np.float64)
     count = len(x) - 4
     stamps = [time[i : i + count] for i in range(5)]
     total, power = np.zeros(count), np.zeros(count)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, final
@@ -76,12 +77,16 @@ class Sensing:
 
 TEMPERATURE_CHANGE: Final = 2.0
 """Change of the temperature over the records that is worth the name [K]."""
+CLAMPED_TRAVEL: Final = math.radians(5.0)
+"""Motion of one side, link-referred, that a clamped other side allows: some twenty times what a
+strain-wave gear twists at its rated torque, twice what a soft belt or spring behind a gear does
+[rad]."""
 DRIVES: Final = ("motor_torque", "motor_current", "motor_voltage")
 
 
-_SENSED: Final[WeakKeyDictionary[Record, dict[bool, Sensing]]] = WeakKeyDictionary()
-"""What each record lets one see, by whether the model is elastic: all that is asked of the
-model.
+_SENSED: Final[WeakKeyDictionary[Record, dict[tuple[bool, float], Sensing]]] = WeakKeyDictionary()
+"""What each record lets one see, by whether the model is elastic and its gear ratio: all that is
+asked of the model.
 """
 
 
@@ -94,12 +99,13 @@ def sense(record: Record, model: JointModel) -> Sensing:
         No position; nothing to balance; an elastic model on one-sided data (says what is missing).
     """
     known = _SENSED.setdefault(record, {})
-    if model.is_elastic not in known:
-        known[model.is_elastic] = _sensed(record, model.is_elastic)
-    return known[model.is_elastic]
+    asked = (model.is_elastic, abs(model.gear_ratio))
+    if asked not in known:
+        known[asked] = _sensed(record, *asked)
+    return known[asked]
 
 
-def _sensed(record: Record, elastic: bool) -> Sensing:
+def _sensed(record: Record, elastic: bool, gear_ratio: float) -> Sensing:
     drive = any(record.has(c) for c in DRIVES)
     torque = record.has("link_torque")
     motor, link = record.has("motor_position"), record.has("link_position")
@@ -127,8 +133,14 @@ def _sensed(record: Record, elastic: bool) -> Sensing:
     if not (drive or torque):
         return Sensing(("kinematic",), moving=moving, **common)
     if not drive and not (motor and link):
-        if link and not motor and not elastic:
+        if not elastic and (link or _travels(record, gear_ratio)):
             return Sensing(("link",), moving=moving, **common)
+        if gear_ratio != 1.0 and _travels(record, gear_ratio):
+            raise InputError(
+                f"{record.name}: model is elastic, the joint moves, and "
+                f"{'motor' if link else 'link'}_position is missing; add it or use model = "
+                '"hd1"'
+            )
         return Sensing(("transmission",), clamped_link=True, moving=moving, **common)
     if torque:
         found: list[str] = []
@@ -251,6 +263,17 @@ def _difference(record: Record, first: Record, label: str) -> str:
                 else f"has no {channel}, which {label} has"
             )
     return f"shows another torsion under its link_torque than {label}"
+
+
+def _travels(record: Record, gear_ratio: float) -> bool:
+    """True where the one position of a geared joint moves further than a gear twists: the link is
+    not clamped. Without gear the position may be a displacement of any size.
+    """
+    if gear_ratio == 1.0 or record.kind != "rotary":
+        return False
+    motor = record.has("motor_position")
+    position = record["motor_position"] / gear_ratio if motor else record["link_position"]
+    return bool(np.ptp(position[np.isfinite(position)]) > CLAMPED_TRAVEL)
 
 
 def _twists(record: Record) -> bool:

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from identification.data.joint_file import Joint
 from identification.data.own_effects import TABLE, remembered
-from identification.data.plain_text import from_toml, toml_key, toml_value
+from identification.data.plain_text import from_toml, tables_text, toml_value
 from identification.data.typed_laws import LAWS, law_lines
 from identification.errors import InputError
 
@@ -50,7 +50,7 @@ def with_effects(text: str, joint: Joint) -> str:
                 return edited
         except InputError:
             continue
-    return "\n".join(_written(wanted)[1:]) + "\n"
+    return tables_text(wanted)
 
 
 def _edits(text: str, wanted: Mapping[str, Any]) -> Iterator[str]:
@@ -58,22 +58,13 @@ def _edits(text: str, wanted: Mapping[str, Any]) -> Iterator[str]:
     text = text if text.endswith("\n") else text + "\n"
     effects = toml_value(wanted["joint"]["effects"])
     new = {n: wanted[n] for n in (LAWS, TABLE) if n in wanted and f"[{n}]" not in text}
-    end = "".join(f"{line}\n" for line in _written(new))
+    end = f"\n{tables_text(new)}" if new else ""
     for found in _LIST.finditer(text):
         before, after = text[: found.end()], text[found.end() :]
         for close in re.finditer(r"\]", after[:LONGEST]):
             yield before + effects + after[close.end() :] + end
     for found in _HEAD.finditer(text):
         yield text[: found.end()] + f"effects = {effects}\n" + text[found.end() :] + end
-
-
-def _written(tables: Mapping[str, Any]) -> list[str]:
-    """Tables of plain data, one entry a line."""
-    lines: list[str] = []
-    for name, table in tables.items():
-        entries = [f"{toml_key(k)} = {toml_value(v)}" for k, v in table.items()]
-        lines += ["", f"[{toml_key(name)}]", *entries]
-    return lines
 
 
 __all__ = ["with_effects"]

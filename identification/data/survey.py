@@ -180,7 +180,11 @@ def survey(
         proposed = tuple({**chosen, **more}.values())
     seen, rows = _seen(table)
     made = Survey(table.reader, rows, seen, axis, proposed, joints=tuple(joints), number=number)
-    return _looked(made, Path(path), gear_ratio, name or Path(path).name)
+    said = _looked(made, Path(path), gear_ratio, name or Path(path).name)
+    if kind is None and axis == "linear":
+        linear = ("", "a position is a length: a linear axis")
+        said = replace(said, questions=(linear, *said.questions))
+    return said
 
 
 def _looked(made: Survey, path: Path, ratio: float | None, name: str) -> Survey:
@@ -295,8 +299,6 @@ def _questions(
             ("", f"columns of {len(made.joints)} joints, {first} to {last}: this is {which}")
         )
     out += _of_time(record)
-    if made.kind == "linear":
-        out.append(("", "a position is a length: a linear axis"))
     entries = {g.column.channel: g.column for g in made.proposed}
     seen = {c.name: c for c in made.columns}
     for channel, (low, high, _) in spans.items():

@@ -523,7 +523,8 @@ class Session:
             and (t.key in best.effect.confused_with or best.key in t.effect.confused_with)
             and t.candidate.label in ranking.significant
             and t.candidate.label not in refused
-            and t.key not in names
+            # a trial's columns say little of a law that is read backwards
+            and (t.key not in names or self.data.sensing.kinematic)
             and t.score >= RELATIVE_SHARE * best.score
         ][:MOST_RELATIVES]
         if not relatives:

@@ -47,6 +47,10 @@ KERNEL_SHARE: Final = 0.4
 NO_COLUMN: Final = 1e-12
 """Size of a column, as a share of the largest one, below which it is rounding."""
 
+UNSEEN: Final = 1.0
+"""Standard deviations, over all rows together, by which a change of a shape by all of its size must
+move them to be seen at all."""
+
 DEPENDENT: Final = 1e-9
 """Singular value, as a share of the largest one, below which columns are dependent: far over the
 rounding of their sums, far below what records can show.
@@ -213,6 +217,7 @@ def make_base(solution: Solution, data: Dataset) -> Base:
     jw = j * towards * weight[:, None]
     norms = np.linalg.norm(jw, axis=0)
     alive = norms > NO_COLUMN * max(float(norms.max(initial=0.0)), 1e-300)
+    alive &= ~_unseen_sizes(solution, names, norms)
     back = alive & (np.arange(len(norms)) >= len(free))
     alive[len(free) :] = False
     inward = jw[:, back] / norms[back]
@@ -266,6 +271,25 @@ def make_base(solution: Solution, data: Dataset) -> Base:
         names=tuple(n for n, a in zip(free, alive, strict=False) if a),
         norms=norms[alive],
         inward_names=tuple(n for n, b in zip(names, back, strict=True) if b),
+    )
+
+
+def _unseen_sizes(
+    solution: Solution, names: Sequence[str], norms: FloatArray
+) -> npt.NDArray[np.bool_]:
+    """Shapes and smoothing velocities that these rows do not show: a change by all of their size
+    moves them less than one deviation.
+
+    A step along such a column is of any length, and other records may show it.
+    """
+    model = solution.model
+    sizes = {p.name for p in model.parameters if p.is_shape} | set(model.named("smoothing"))
+    return np.array(
+        [
+            n in sizes and abs(solution.values[n]) * norm < UNSEEN
+            for n, norm in zip(names, norms, strict=True)
+        ],
+        dtype=bool,
     )
 
 

@@ -40,6 +40,8 @@ sensor 0.0010 deg, link encoder 0.0036 deg, torque sensor 50 mNm); current: 15 b
 N.m; velocities are not printed there and are assumed."""
 
 ABSURD: Final = 1e9
+OPEN: Final = 1e9
+"""Gate of an innovation that is taken whole: beyond every reading."""
 """A reading beyond this (SI) counts as missing, as NaN and infinity do."""
 DISTURBANCE: Final = (50.0, 15.0)
 """Random walk of the unknown torque on motor and link that the observer allows [N.m/sqrt(s)]."""
@@ -182,7 +184,7 @@ class ObserverCore:
         """Take innovations whole (after a replacement, so that the estimate settles), or cut
         them again.
         """
-        self.gate[:] = 1e9 if is_open else self.gates
+        self.gate[:] = OPEN if is_open else self.gates
 
     def tune(self, torque_deviation: float) -> None:
         """Take the deviation of torque reading less spring torque from healthy data; gains

@@ -82,6 +82,10 @@ ENERGY_RESIDUALS: Final = tuple(at for at, _ in _ENERGY)
 _SUMS, _LAST, _CUSUM = slice(0, 5), slice(5, 10), slice(10, 13)
 _SCALE, _LIMITS, _INVERSE, _MOST = slice(0, 5), slice(5, 5 + COUNT), slice(24, 27), slice(27, 30)
 _NEVER: Final = 1 << 62
+ENERGY_LEFT: Final = 0.5
+ENERGY_TOP: Final = 1e9
+"""What is left of an energy over its limit once it has been told, as a share of the limit; the most
+that one grows to."""
 PARITY_SENSORS: Final = (
     (LINK_POSITION, LINK_VELOCITY),
     (MOTOR_POSITION, MOTOR_VELOCITY),
@@ -184,7 +188,9 @@ class Residuals:
             grown = memory[_CUSUM][i] + values[at] * values[at] * weights[_INVERSE][i] - self.drift
             most = weights[_MOST][i]
             passed = ca.logic_and(grown > 0, grown > most)
-            energies.append(ca.if_else(passed, 0.5 * most, ca.fmax(0, ca.fmin(grown, 1e9))))
+            energies.append(
+                ca.if_else(passed, ENERGY_LEFT * most, ca.fmax(0, ca.fmin(grown, ENERGY_TOP)))
+            )
             note(bit, passed)
         innovation = out[n + 6 : n + 11]
         locked = _any([_outside(innovation[i], judged[i]) for i in range(5)])

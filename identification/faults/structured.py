@@ -52,12 +52,18 @@ _PLACES: Final = [
     tuple(i for i, bit in enumerate(_BITS) if bits & bit) for bits in range(1 << len(_BITS))
 ]
 """Places of the bits that are set, for each set of bits."""
-WELL_OVER: Final = 1.5
-"""Largest torsion residual over its limit that is no noise: a limit is passed by noise by a few
-percent.
-"""
 LARGEST: Final = 1e6
 """A reading beyond this is no place to start an estimate from."""
+WIDER: Final = 1.5
+"""Factor on the limits for every further reading that is replaced: estimates lean on fewer."""
+SHORT_PEAK: Final = 1.5
+SHORT: Final = (2, 10, 20)
+"""A torque sensor that failed for a moment: peak of r1 over its limit; samples for which it is back
+(from, to) and since it began (below)."""
+FRESH: Final = 5
+"""Samples within which a residual must have been over its limit to count for a verdict."""
+SHOWS: Final = 2.0
+"""Times the limit of r1 at which a position error would have shown there."""
 OTHERS: Final = (
     (MOTOR_POSITION, LINK_POSITION),
     (LINK_POSITION, MOTOR_POSITION),
@@ -331,10 +337,11 @@ class StructuredRule:
                 (self._age(b) for b in (LINK, MOTOR, LINK_JUMP, MOTOR_JUMP) if latched & b),
                 default=-1,
             )
+            back, longest, young = SHORT
             gone = (
-                self.peak > WELL_OVER
-                and 2 <= self._since(TORSION) <= 10
-                and self._age(TORSION) < 20
+                self.peak > SHORT_PEAK
+                and back <= self._since(TORSION) <= longest
+                and self._age(TORSION) < young
             )
             if (
                 moving
@@ -385,7 +392,7 @@ class StructuredRule:
         at = 0 if parity == LINK_PARITY else 4
         size = max(abs(v) for v in res.values[at : at + 4]) * self.core.stiffness
         return (
-            size > 2.0 * res.limits[16]
+            size > SHOWS * res.limits[16]
             if self.core.has_torque
             else self._age(parity) >= self.waits["pair_wait"]
         )
@@ -406,7 +413,7 @@ class StructuredRule:
             return
         motor_only = latched & (MOTOR | MOTOR_JUMP) and not latched & ~(MOTOR | MOTOR_JUMP)
         if motor_only:
-            if self._age(MOTOR) >= waits["pair_wait"] and self._since(MOTOR) < 5:
+            if self._age(MOTOR) >= waits["pair_wait"] and self._since(MOTOR) < FRESH:
                 self._report(Verdict.CURRENT_OR_FRICTION, ("current", "motor friction"))
             return
         if k - self.opened >= waits["plant_wait"]:
@@ -457,7 +464,7 @@ class StructuredRule:
             if any(s in involved for s in sensors) or not self.core.has_torque:
                 self.residuals.invalidate(i, self.k + 1 + self.waits["settle_seconds"])
             wide = [self.widening[s][i] for s in range(6) if self.failed[s]]
-            self.residuals.scale[i] = 1.0 / (max(wide) * 1.5 ** (len(wide) - 1)) if wide else 1.0
+            self.residuals.scale[i] = 1.0 / (max(wide) * WIDER ** (len(wide) - 1)) if wide else 1.0
         if any(self.failed[s] for s in PARITY_SENSORS[4]):
             self.residuals.scale[4] = 0.0  # r1 compares the estimate with itself
         self.open_gates()

@@ -506,7 +506,7 @@ def _with_errors(
     at_bound = _at_bound(balances.model, values, free, limits)
     usable = np.array(
         [
-            norm > NO_COLUMN * norms.max() and n not in at_bound
+            norm > NO_COLUMN * norms.max(initial=0.0) and n not in at_bound
             for n, norm in zip(free, norms, strict=True)
         ]
     )
@@ -515,7 +515,7 @@ def _with_errors(
     unidentified = [
         n
         for n, norm in zip(free, norms, strict=True)
-        if norm <= NO_COLUMN * norms.max() and n not in smoothing
+        if norm <= NO_COLUMN * norms.max(initial=0.0) and n not in smoothing
     ]
     # without stiffness the link would fall off: the twist follows no torque of these records
     unidentified += [n for n in balances.model.named("stiffness") if n in at_bound]

@@ -189,7 +189,9 @@ def _newton(
     """Step of the parameters that move to where these rows, less a share of the noise, hold."""
     out = np.zeros(len(moves))
     size = np.linalg.norm(jacobian, axis=0)
-    moved = moves & (size > 1e-12 * size.max())
+    moved = moves & (size > 1e-12 * size.max(initial=0.0))
+    if not moved.any():  # everything is known
+        return out
     scaled, unit = jacobian[:, moved] / size[moved], np.outer(size[moved], size[moved])
     added, pulled = noise.whole
     score = scaled.T @ rows - share * pulled[moved] / size[moved]

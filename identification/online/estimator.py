@@ -23,7 +23,6 @@ from identification.online.first_window import (
     fast_recursion,
     first_estimate,
     prior_range,
-    reversal_weights,
 )
 from identification.online.grid import Grid
 from identification.online.guard import Guard
@@ -169,7 +168,7 @@ class OnlineEstimator:
             ]
         )
         rate = self.rows.timing.stride * dt / _RESIDUAL_SECONDS
-        self._check = RowCheck(
+        self.check = RowCheck(
             len(self.balances),
             len(self.names),
             self.friction,
@@ -177,7 +176,7 @@ class OnlineEstimator:
             rate,
             _STRAIN.error_limit,
         )
-        self._reference = [11 if from_link else 1 for from_link in self.from_link]
+        self.reference = [11 if from_link else 1 for from_link in self.from_link]
         self.reset()
         self.recursion(self.theta)  # its functions are made here and not inside a step
 
@@ -433,13 +432,13 @@ class OnlineEstimator:
         if self.estimator is None:
             if enable and on.all():
                 self._collected.append((y, h, shares))
-                power = self.rows.signals[self._reference] ** 2
+                power = self.rows.signals[self.reference] ** 2
                 self._set(torque=self._now.torque + power)
                 if len(self._collected) >= self.collect:
                     with single_thread():
                         self._begin()
             return True
-        check = self._check
+        check = self.check
         check(
             *(
                 y,
@@ -449,7 +448,7 @@ class OnlineEstimator:
                 on,
                 self.floor,
                 self.level,
-                self.rows.signals[self._reference],
+                self.rows.signals[self.reference],
                 self._now.square,
                 self._now.torque,
                 self.options.floor_share,
@@ -501,10 +500,7 @@ class OnlineEstimator:
         """Weights (rows, balances) from the shares (rows, 2) and the size of the residuals
         (balances,).
         """
-        level = np.array(
-            [float(np.abs(theta[which]).sum()) if which else 0.0 for which in self.friction]
-        )
-        return reversal_weights(shares * level, self.feels, size)
+        return self.check.weights(shares, theta, size)
 
     def _begin(self) -> None:
         """Start the recursion from the collected rows."""

@@ -19,6 +19,14 @@ first sample on).
 """
 
 
+RANGE: Final = 0.01
+"""Share of the torque that a parameter moves at least within its prior range; what moves less is
+not seen beside a floor of a thousandth of it, ten times over."""
+PASSES: Final = 3
+"""Passes in which the weights at reversals follow from the estimate; the third changes them by less
+than a hundredth."""
+DEVIATION: Final = 1.5
+"""Standard deviation over median size of normal residuals (1.48)."""
 RIDGE: Final = 1e-5
 """Weight of the rows theta = 0 beside columns of unit length: a direction that is 1000 times weaker
 than its columns loses one part in ten thousand, one that rounding alone shows stays at zero."""
@@ -35,7 +43,7 @@ def least_range(h: FloatArray, y: FloatArray) -> FloatArray:
     """
     size = np.sqrt(np.mean(h**2, axis=(0, 1)))
     level = float(np.sqrt(np.mean(y**2))) or 1.0
-    found: FloatArray = np.where(size > ABSENT, 0.01 * level / np.maximum(size, ABSENT), 1.0)
+    found: FloatArray = np.where(size > ABSENT, RANGE * level / np.maximum(size, ABSENT), 1.0)
     return found
 
 
@@ -109,30 +117,11 @@ def first_estimate(
     parameters and weights
     """
     weight = np.ones_like(y)
-    for _ in range(3):
+    for _ in range(PASSES):
         first = least_squares(y * weight, h * weight[:, :, None], least)
-        size = 1.5 * np.median(np.abs(y - h @ first), axis=0)
+        size = DEVIATION * np.median(np.abs(y - h @ first), axis=0)
         weight = weight_of(first, np.maximum(size, least))
     return first, weight
-
-
-def reversal_weights(doubt: FloatArray, feels: FloatArray, size: FloatArray) -> FloatArray:
-    """Weights (rows, balances) of rows at a reversal, where friction may take any value between its
-    limits.
-
-    Parameters
-    ----------
-    doubt : (rows, 2) array
-        Share of standstill times friction, of motor and link [N.m].
-    feels : (balances, 2) array
-        True where a balance holds that side's friction.
-    size : (balances,) array
-        Size of the residuals [N.m].
-    """
-    found: FloatArray = 1.0 / np.sqrt(
-        1.0 + np.sum((doubt[:, None, :] * feels) ** 2, axis=2) / size**2
-    )
-    return found
 
 
 def fast_recursion(

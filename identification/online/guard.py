@@ -31,6 +31,9 @@ _ACCEPT: Final = 3.0
 back, or explained [s].
 """
 _INERTIA: Final = 0.05
+_EXPLAINED: Final = 0.5
+"""Share of the limit under which a new estimate explains the readings: a half, so that residuals
+that hover at the limit do not pass for explained."""
 _LONG_AGO: Final = -1_000_000
 _PLAIN: Final = (
     "on_probation",
@@ -132,7 +135,7 @@ class Guard:
             self.held_for if now else then for now, then in zip(over, self._over, strict=True)
         ]
         self._back = 0 if True in over else self._back + 1
-        unexplained = self._follow(self._new, estimator.error.tolist(), limits, share=0.5)
+        unexplained = self._follow(self._new, estimator.error.tolist(), limits, share=_EXPLAINED)
         self._explained = 0 if True in unexplained else self._explained + 1
         if self._back >= self._wait_back:
             self._restore(estimator)
@@ -225,6 +228,8 @@ class Guard:
             "BACK": self._wait_back,
             "ACCEPT": self._wait_accept,
             "INERTIA": _INERTIA,
+            "EXPLAINED": _EXPLAINED,
+            "LONG_AGO": _LONG_AGO,
         }
 
     # --- state ------------------------------------------------------------------------------------

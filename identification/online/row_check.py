@@ -1,5 +1,5 @@
 """What a new row says before the recursion takes it: residuals, weights, their mean squares; one
-CasADi call.
+CasADi call, of which the native estimator has the C.
 
 A row at a reversal counts less: there friction may take any value between its limits.
 """
@@ -17,6 +17,9 @@ FloatArray = npt.NDArray[np.float64]
 
 LEAST: Final = 1e-12
 """Nothing counts as smaller than this [N.m]."""
+_TORQUE: Final = 0.2
+"""Share of the rate of the residuals' mean square at which that of the torques moves: torque swings
+with the motion, over some seconds, and a floor should not."""
 _INTO: Final = (
     "y",
     "h",
@@ -56,6 +59,8 @@ class RowCheck:
         [N.m]; residual over that; 1 where the residual is over its limit.
     y, h : (balances,) and (balances, parameters) array
         The row times its weights.
+    function, weight : casadi.Function
+        The whole check, and (shares, parameters, size of the residuals) -> weights.
     """
 
     def __init__(
@@ -74,24 +79,15 @@ class RowCheck:
             "floor_share": (1, 1),
         }
         v = {name: ca.SX.sym(name, *sizes.get(name, (balances, 1))) for name in _INTO}
-        force = [
-            v["share"][i] * sum((ca.fabs(v["theta"][j]) for j in friction[i]), ca.SX(0))
-            for i in range(2)
-        ]
         size = ca.fmax(ca.fmax(v["floor"], ca.sqrt(v["square"])), LEAST)
-        doubt = [
-            sum((force[i] * force[i] for i in range(2) if feels[b, i]), ca.SX(0))
-            for b in range(balances)
-        ]
-        weight = ca.vertcat(
-            *(1 / ca.sqrt(1 + doubt[b] / (size[b] * size[b])) for b in range(balances))
-        )
+        self.weight = _weight_function(balances, parameters, friction, feels)
+        weight = self.weight(v["share"], v["theta"], size)
         error = v["y"] - v["h"].T @ v["theta"]
         left, use = weight * error, v["on"]
         square = ca.if_else(use, v["square"] + rate * (left * left - v["square"]), v["square"])
         torque = ca.if_else(
             use,
-            v["torque"] + rate / 5 * (v["reference"] * v["reference"] - v["torque"]),
+            v["torque"] + _TORQUE * rate * (v["reference"] * v["reference"] - v["torque"]),
             v["torque"],
         )
         least = ca.fmax(ca.fmax(v["floor"], v["floor_share"] * ca.sqrt(torque)), LEAST)
@@ -108,12 +104,12 @@ class RowCheck:
             weight * v["y"],
             v["h"] * ca.repmat(weight.T, parameters, 1),
         )
-        function = ca.Function("check", list(v.values()), [ca.densify(e) for e in out])
+        self.function = ca.Function("row_check", list(v.values()), [ca.densify(e) for e in out])
         self._into = [
             np.zeros((balances, parameters) if name == "h" else v[name].numel()) for name in _INTO
         ]
         found = [np.zeros((balances, parameters) if name == "h" else balances) for name in _OUT]
-        self._buffer, self._trigger = function.buffer()
+        self._buffer, self._trigger = self.function.buffer()
         for i, item in enumerate(self._into):
             self._buffer.set_arg(i, item.data)
         for i, item in enumerate(found):
@@ -137,6 +133,34 @@ class RowCheck:
         for target, value in zip(self._into, given, strict=True):
             target[:] = value
         self._trigger()
+
+    def weights(self, shares: FloatArray, theta: FloatArray, size: FloatArray) -> FloatArray:
+        """Weights (rows, balances) of rows with shares of standstill (rows, 2), for residuals of
+        size (balances,).
+        """
+        return np.array(self.weight(shares.T, theta, size)).T
+
+
+def _weight_function(
+    balances: int,
+    parameters: int,
+    friction: Sequence[Sequence[int]],
+    feels: npt.NDArray[np.bool_],
+) -> Any:
+    """Weights of the balances' rows at a reversal, where friction may take any value between its
+    limits.
+    """
+    share, theta, size = (
+        ca.SX.sym("share", 2),
+        ca.SX.sym("theta", parameters),
+        ca.SX.sym("size", balances),
+    )
+    force = [share[i] * sum((ca.fabs(theta[j]) for j in friction[i]), ca.SX(0)) for i in range(2)]
+    weights = []
+    for b in range(balances):
+        doubt = sum((force[i] * force[i] for i in range(2) if feels[b, i]), ca.SX(0))
+        weights.append(1 / ca.sqrt(1 + doubt / (size[b] * size[b])))
+    return ca.Function("row_weight", [share, theta, size], [ca.densify(ca.vertcat(*weights))])
 
 
 __all__ = ["LEAST", "RowCheck"]

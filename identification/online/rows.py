@@ -33,6 +33,9 @@ _NAMES: Final = Signals.names()
 SHARP: Final = 2e-3
 """A smoothing velocity above this is a law of its own, below it only stands for a jump [rad/s]."""
 
+SEEN: Final = 3.0
+"""Standard deviations by which a velocity must stand out of the noise to count as motion."""
+
 
 def linear_parameters(
     model: JointModel, sensing: Sensing, held: Container[str] = ()
@@ -262,7 +265,7 @@ class RowMaker:
             np.where(np.arange(len(table)) < plain, table.sum(axis=1), 0.0)[:, None]
             for table, plain in ((self._flat_smoothing, new), (self.averaging, 1))
         )
-        self._still = _standstill(self.weights)
+        self.still = _standstill(self.weights, self.velocity_gain)
 
     def _sharpen(self) -> None:
         """Velocities below which a side counts as standing still.
@@ -307,9 +310,9 @@ class RowMaker:
         for i, item in enumerate(self._out):
             buffer.set_res(i, memoryview(item))  # type: ignore[arg-type, unused-ignore]
         self._buffer = buffer
-        self._slow, self._share = np.zeros(2), np.zeros(2)
-        still, self._find_still = self._still.buffer()
-        for i, item in enumerate((self.speed, self._slow)):
+        self._noise, self._sharp_now, self._share = np.zeros(2), np.zeros(2), np.zeros(2)
+        still, self._find_still = self.still.buffer()
+        for i, item in enumerate((self.speed, self._noise, self._sharp_now)):
             still.set_arg(i, memoryview(item))  # type: ignore[arg-type, unused-ignore]
         still.set_res(0, memoryview(self._share))  # type: ignore[arg-type, unused-ignore]
         self._still_buffer = still
@@ -406,8 +409,7 @@ class RowMaker:
         """
         if not self.needed:
             return np.zeros(2)
-        gain, sharp = self.velocity_gain, self.sharp
-        self._slow[:] = max(3 * motor_noise * gain, sharp[0]), max(3 * link_noise * gain, sharp[1])
+        self._noise[:], self._sharp_now[:] = (motor_noise, link_noise), self.sharp
         self._find_still()
         return self._share.copy()
 
@@ -465,11 +467,13 @@ class RowMaker:
         self.made = int(arrays[-1][0])
 
 
-def _standstill(weights: FloatArray) -> Any:
-    """(velocities at the points, (2, points), velocities that count as none) -> share of the
-    kernel at rest or turning, (2,).
+def _standstill(weights: FloatArray, gain: float) -> Any:
+    """(velocities at the points, (2, points), noise of the positions, velocities that count as none
+    without noise) -> share of the kernel at rest or turning, (2,).
     """
-    speed, slow = ca.SX.sym("speed", 2, len(weights)), ca.SX.sym("slow", 2)
+    speed = ca.SX.sym("speed", 2, len(weights))
+    noise, sharp = ca.SX.sym("noise", 2), ca.SX.sym("sharp", 2)
+    slow = ca.fmax(SEEN * gain * noise, sharp)
     shares = []
     for side in range(2):
         share = ca.SX(0)
@@ -478,4 +482,4 @@ def _standstill(weights: FloatArray) -> Any:
             still = ca.fabs(now) < slow[side]
             share += weight * (ca.logic_or(still, now * speed[side, k - 1] < 0) if k else still)
         shares.append(share)
-    return ca.Function("still", [speed, slow], [ca.vertcat(*shares)])
+    return ca.Function("still", [speed, noise, sharp], [ca.vertcat(*shares)])

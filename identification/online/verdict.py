@@ -28,6 +28,11 @@ FAULT_TEXT: Final = (
     "constant while the joint moves, 31 to 36 reading of wrong scale, in the same order"
 )
 _RECENT: Final = 5.0
+WRONG_SCALE: Final = 3.0
+"""Factor by which an inertia must be off that of the fitted joint for a scale to be wrong: a
+payload changes it by less, an ampere for a newton metre by more."""
+WRONG_SIGMAS: Final = 5.0
+"""Standard deviations by which it must be off, too: one chance in a million."""
 
 
 def worst(missing: Sequence[bool], detector: FaultDetector | None, watch: Watch) -> int:
@@ -82,6 +87,7 @@ def implausible(
         if name in names and name in fitted:
             i = list(names).index(name)
             before, now, spread = fitted[name], float(theta[i]), float(sigma[i])
-            if not before / 3 < now < 3 * before and abs(now - before) > 5 * spread:
+            near = before / WRONG_SCALE < now < WRONG_SCALE * before
+            if not near and abs(now - before) > WRONG_SIGMAS * spread:
                 return code
     return NONE

@@ -24,6 +24,8 @@ _MOVED: Final = 1e-3
 _SCALE_MOTION: Final = 2e-2
 SCALE: Final = 0.2
 MEMORY: Final = 30
+TINY: Final = 1e-300
+"""What keeps a division from zero; nothing measured is as small."""
 
 
 @final
@@ -142,4 +144,4 @@ class Watch:
 def _slope(x: FloatArray, y: FloatArray) -> float:
     """Least-squares slope of x against y about their means (how many times larger x moves)."""
     a, b = x - x.mean(), y - y.mean()
-    return float(a @ b / max(float(b @ b), 1e-300))
+    return float(a @ b / max(float(b @ b), TINY))

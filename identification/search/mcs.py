@@ -29,7 +29,8 @@ def mcs(
 ) -> MCSResult:
     """Find the global minimum of a function in a box by multilevel coordinate search.
 
-    No derivatives and no random numbers are used: the same call gives the same result.
+    No derivatives are used. The same call gives the same result; random numbers, from a fixed seed,
+    are drawn by `restarts` only.
 
     Parameters
     ----------
@@ -82,6 +83,12 @@ def mcs(
         ``hessian_pattern`` : symmetric matrix of bools, shape (n, n), or None (default: all True)
             False where the mixed second derivative is known to be zero: saves one evaluation per
             False pair and model.
+        ``restarts`` : int, at least 0; default 0
+            Runs of covariance matrix adaptation after the sweeps have stalled, the first from the
+            best point, each with twice the population of the one before, a local search after
+            each. For functions of four coordinates or more whose valleys lie across the
+            coordinates; give `max_evaluations` too. A search that is not ended by target or limit
+            then ends after the last of them.
 
     Returns
     -------
@@ -123,8 +130,9 @@ def mcs(
     is kept: with the boxes around it 1 kB per evaluation, up to 10 kB in long runs.
 
     The default stopping rules do not prove a minimum to be global; no rule based on samples alone
-    does. The basket shows the rivals, but not every local minimum: a candidate from which the
-    objective falls to a known minimum is not followed.
+    does, and ``success`` is True only where `target` was reached. The basket shows the rivals, but
+    not every local minimum: a candidate from which the objective falls to a known minimum is not
+    followed.
 
     See Also
     --------

@@ -33,6 +33,7 @@ class Problem:
     pattern: list[list[bool]]
     levels: int
     local_steps: int
+    restarts: int
     precision: float
 
 
@@ -83,6 +84,7 @@ def make_problem(bounds: Any, options: MCSOptions) -> Problem:
         pattern=_pattern(options.hessian_pattern, n),
         levels=levels,
         local_steps=whole_number("options.local_steps", options.local_steps, 0),
+        restarts=whole_number("options.restarts", options.restarts, 0),
         precision=precision,
     )
 

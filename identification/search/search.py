@@ -10,6 +10,7 @@ import numpy as np
 from identification.search.basket import Basket
 from identification.search.boxes import BoxTree
 from identification.search.evaluate import Evaluator, SearchStopped
+from identification.search.evolution import evolve
 from identification.search.local import LocalSearch
 from identification.search.problem import Problem
 from identification.search.types import FloatArray, MCSMinimum, MCSOutcome, MCSProgress, MCSResult
@@ -52,11 +53,13 @@ class Search:
                 self.evaluate, problem.pattern, problem.local_steps, problem.precision
             )
         self.basket = Basket(self.evaluate, self._local)
+        self._restarts = problem.restarts
 
     def run(self) -> MCSResult:
         """Search until a stopping rule holds."""
         try:
             outcome = self._sweeps()
+            self._restart()
         except SearchStopped as stopped:
             outcome = stopped.outcome
         evaluate = self.evaluate
@@ -92,6 +95,17 @@ class Search:
             self._report()
             if self._stall and evaluate.sweep - evaluate.best_sweep >= self._stall:
                 return MCSOutcome.STALLED
+
+    def _restart(self) -> None:
+        """Runs across the coordinates, each followed by a local search where one is made."""
+        evaluate = self.evaluate
+        if evaluate.not_finite == evaluate.count:
+            return
+        for run in range(self._restarts):
+            evaluate.sweep += 1
+            value, x = evolve(evaluate, run, np.array(evaluate.best_x) if run == 0 else None)
+            self.basket.offer(value, tuple(x.tolist()))
+            self._report()
 
     def _report(self) -> None:
         if self._callback is None:

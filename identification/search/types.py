@@ -43,6 +43,7 @@ class MCSOptions:
     local_steps: int = 50
     precision: float = 2.220446049250313e-16
     hessian_pattern: npt.ArrayLike | None = None
+    restarts: int = 0
 
 
 @final
@@ -131,10 +132,10 @@ class MCSResult:
 
     @property
     def success(self) -> bool:
-        """True where the search ended by its own rules, not by a limit, the callback or a
-        useless objective.
+        """True where the target was reached: the one rule that proves something. A search that
+        stalled or split every box has found a minimum, perhaps not the lowest.
         """
-        return self.outcome in (MCSOutcome.TARGET, MCSOutcome.STALLED, MCSOutcome.EXHAUSTED)
+        return self.outcome is MCSOutcome.TARGET
 
     @property
     def message(self) -> str:

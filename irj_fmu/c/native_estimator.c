@@ -23,7 +23,6 @@ static void tell(Twin *m, int once, const char *format, ...) { /* a text once pe
     va_end(values);
 }
 
-#define UNEVEN_HOLD 200 /* samples for which health remembers a gap */
 enum { HEALTH_OK, WARMING_UP, NUMERIC_TROUBLE, STEP_MISMATCH, INTERNAL_ERROR };
 enum { TELL_STEP = N_VARIABLES, TELL_SETUP, TELL_WINDOW, TELL_UNEVEN, TELL_FAULT }; /* places in `told` after those of the variables */
 
@@ -85,7 +84,7 @@ static int configure(Twin *m) { /* take the parameters over; 0 where they ask fo
     const double dt = s->real[V_SAMPLE_TIME], warm_up = s->real[V_WARM_UP];
     double rows;
     s->changed = 0;
-    if (!(fabs(dt - SAMPLE_TIME) <= 1e-9 * SAMPLE_TIME)) {
+    if (!(fabs(dt - SAMPLE_TIME) <= GRID_SLACK * SAMPLE_TIME)) {
         tell(m, TELL_SETUP, "sample_time %g s: this native estimator was built for %g s; build it again with --sample-time", dt, SAMPLE_TIME);
         return 0;
     }
@@ -132,18 +131,13 @@ static void floors(Twin *m) {
     ratios(&m->s);
 }
 
-static void shares(const State *s, double out[2]) {
-    out[0] = standstill(&s->rows, 0, s->watch.noise[Q_M]);
-    out[1] = standstill(&s->rows, 1, s->watch.noise[Q_L]);
-}
-
 static void collect_row(Twin *m) {
     State *s = &m->s;
     FirstWindow *f = &s->window;
     int b;
     memcpy(f->y[f->count], m->y, sizeof m->y);
     memcpy(f->h[f->count], m->h, sizeof m->h);
-    shares(s, f->shares[f->count]);
+    standstill(m, f->shares[f->count]);
     for (b = 0; b < N_BALANCES; b++) s->torque[b] += s->rows.signals[reference_signal[b]] * s->rows.signals[reference_signal[b]];
     if (++f->count < s->collect) return;
     if (begin_recursion(m)) tell(m, TELL_WINDOW, "the first window does not determine every parameter");
@@ -151,17 +145,35 @@ static void collect_row(Twin *m) {
     for (b = 0; b < N_BALANCES; b++) s->first_level[b] = sqrt(s->square[b]);
 }
 
-static void recursive_step(Twin *m, const double weight[N_BALANCES], const int on[N_BALANCES], double theta[N_THETA]) {
+/* Residuals, weights and mean squares of the row: identification.online.row_check.RowCheck. Gives 1 where one is over its limit. */
+static int check_row(Twin *m, const int on[N_BALANCES]) {
+    State *s = &m->s;
+    Checked *c = &m->checked;
+    double share[2], use[N_BALANCES], reference[N_BALANCES], over[N_BALANCES];
+    const double *const into[] = {m->y, m->h, s->theta, share, use, s->floor, s->first_level, reference, s->square, s->torque, &s->floor_share};
+    double *const out[] = {c->error, c->weighted, c->square, c->torque, c->least, s->ratio, over, c->y, c->h};
+    int b, any = 0;
+    standstill(m, share);
+    for (b = 0; b < N_BALANCES; b++) {
+        use[b] = on[b];
+        reference[b] = s->rows.signals[reference_signal[b]];
+    }
+    memcpy(m->arg, into, sizeof into);
+    memcpy(m->res, out, sizeof out);
+    row_check(m->arg, m->res, m->iw, m->w, 0);
+    memcpy(s->residual, c->error, sizeof s->residual);
+    memcpy(s->square, c->square, sizeof s->square);
+    memcpy(s->torque, c->torque, sizeof s->torque);
+    for (b = 0; b < N_BALANCES; b++) any |= over[b] != 0;
+    return any;
+}
+
+static void recursive_step(Twin *m, const int on[N_BALANCES], double theta[N_THETA]) {
     State *s = &m->s;
     Recursion *r = &s->rls;
-    double row[N_BALANCES * N_THETA], y[N_BALANCES];
-    int b, i;
-    for (b = 0; b < N_BALANCES; b++) {
-        r->config[CONFIG_ENABLED + b] = on[b];
-        y[b] = m->y[b] * weight[b];
-        for (i = 0; i < N_THETA; i++) row[b * N_THETA + i] = m->h[b * N_THETA + i] * weight[b];
-    }
-    m->arg[0] = r->fast; m->arg[1] = r->slow; m->arg[2] = r->config; m->arg[3] = y; m->arg[4] = row;
+    int b;
+    for (b = 0; b < N_BALANCES; b++) r->config[CONFIG_ENABLED + b] = on[b];
+    m->arg[0] = r->fast; m->arg[1] = r->slow; m->arg[2] = r->config; m->arg[3] = m->checked.y; m->arg[4] = m->checked.h;
     m->res[0] = m->fast_next; m->res[1] = m->theta_next; m->res[2] = NULL; m->res[3] = NULL;
     rls_step(m->arg, m->res, m->iw, m->w, 0);
     if (m->fast_next[FAST_DUE] != 0) {
@@ -173,23 +185,14 @@ static void recursive_step(Twin *m, const double weight[N_BALANCES], const int o
         memcpy(r->fast, m->fast_next, sizeof r->fast);
     }
     memcpy(theta, m->theta_next, sizeof s->theta);
-    for (b = 0; b < N_BALANCES; b++) r->fast[FAST_NOISE + b] = fmax(r->fast[FAST_NOISE + b], least(s, b) * least(s, b));
-}
-
-/* Errors that stay over their limit for longer than the linear parameters need to follow ask for the optimiser. */
-static void watch_strain(State *s, const int on[N_BALANCES]) {
-    int b, over = 0;
-    for (b = 0; b < N_BALANCES; b++)
-        if (on[b] && sqrt(s->square[b]) > ERROR_LIMIT * fmax(least(s, b), s->first_level[b])) over = 1;
-    s->strained = over ? s->strained + 1 : 0;
-    s->reoptimise = s->strained >= CONFIRM_ROWS;
+    for (b = 0; b < N_BALANCES; b++) r->fast[FAST_NOISE + b] = fmax(r->fast[FAST_NOISE + b], m->checked.least[b] * m->checked.least[b]);
 }
 
 /* Take a row; 0 until there is one. */
 static int take_row(Twin *m, double time, int enable) {
     State *s = &m->s;
-    double error[N_BALANCES], weight[N_BALANCES], size[N_BALANCES], share[2], theta[N_THETA];
-    int on[N_BALANCES], any = 0, all = 1, b, k;
+    double size[N_BALANCES], theta[N_THETA];
+    int on[N_BALANCES], any = 0, all = 1, over, b, k;
     if (!make_row(m, time)) return 0;
     s->n_rows++;
     for (b = 0; b < N_BALANCES; b++) {
@@ -203,32 +206,18 @@ static int take_row(Twin *m, double time, int enable) {
         if (enable && all) collect_row(m);
         return 1;
     }
-    for (b = 0; b < N_BALANCES; b++) {
-        s->residual[b] = error[b] = error_of(m->y[b], m->h + b * N_THETA, s->theta);
-        size[b] = fmax(fmax(s->floor[b], sqrt(s->square[b])), LEAST);
-    }
-    shares(s, share);
-    weight_of(share, s->theta, size, weight);
-    for (b = 0; b < N_BALANCES; b++) {
-        const double reference = s->rows.signals[reference_signal[b]], left = weight[b] * error[b];
-        if (!on[b]) continue;
-        s->square[b] += RESIDUAL_RATE * (left * left - s->square[b]);
-        s->torque[b] += RESIDUAL_RATE / 5 * (reference * reference - s->torque[b]);
-    }
-    ratios(s);
+    over = check_row(m, on);
     if (!enable) return 1;
     if (!any) {
         guard_blind(s);
         show(s, s->guard.theta);
         return 1;
     }
-    recursive_step(m, weight, on, theta);
-    watch_strain(s, on);
-    for (b = 0; b < N_BALANCES; b++) {
-        error[b] *= weight[b];
-        size[b] = fmax(least(s, b), s->first_level[b]);
-    }
-    if (guard_step(s, theta, error, size, on) == BACK) {
+    recursive_step(m, on, theta);
+    s->strained = over ? s->strained + 1 : 0;
+    s->reoptimise = s->strained >= CONFIRM_ROWS;
+    for (b = 0; b < N_BALANCES; b++) size[b] = fmax(m->checked.least[b], s->first_level[b]);
+    if (guard_step(s, theta, m->checked.weighted, size, on) == BACK) {
         for (b = 0; b < N_BALANCES; b++) s->square[b] = s->first_level[b] * s->first_level[b];
         s->strained = 0;
     }
@@ -240,22 +229,22 @@ static int take_row(Twin *m, double time, int enable) {
 
 static int plant_verdict(const Fault *f) {
     if (f->k - f->event_sample >= RECENT_SAMPLES) return 0;
-    return f->event == CURRENT_OR_FRICTION ? 7 : f->event == PLANT ? 8 : 0;
+    return f->event == CURRENT_OR_FRICTION ? CODE_CURRENT_OR_FRICTION : f->event == PLANT ? CODE_PLANT : 0;
 }
 
 static int implausible(const State *s) { /* an inertia far from that of the fitted joint: a wrong scale of torque or current */
     int i;
     for (i = 0; i < N_INERTIAS; i++) {
         const double before = inertia_before[i], now = s->theta[inertia_theta[i]], spread = s->sigma[inertia_theta[i]];
-        if (!(before / 3 < now && now < 3 * before) && fabs(now - before) > 5 * spread) return inertia_code[i];
+        if (!(before / WRONG_SCALE < now && now < WRONG_SCALE * before) && fabs(now - before) > WRONG_SIGMAS * spread) return inertia_code[i];
     }
     return 0;
 }
 
 static void judge(State *s, const int good[SENSORS]) {
-    int found = s->pulse.failed && s->rls.running ? HELD_CODE : 0, i;
+    int found = s->pulse.failed && s->rls.running ? CODE_HELD : 0, i;
     for (i = 0; i < SENSORS && !found; i++)
-        if (!good[i] && (needs[i] || (s->detect && present[i]))) found = 11 + i;
+        if (!good[i] && (needs[i] || (s->detect && present[i]))) found = CODE_MISSING + 1 + i;
     if (s->detect) {
         for (i = 0; i < SENSORS && !found; i++)
             if (s->detector.failed[i]) found = 1 + i;
@@ -263,12 +252,12 @@ static void judge(State *s, const int good[SENSORS]) {
         scores(&s->detector, s->score);
     }
     for (i = 0; i < SENSORS && !found; i++)
-        if (s->watch.constant[i]) found = 21 + i;
+        if (s->watch.constant[i]) found = CODE_CONSTANT + 1 + i;
     for (i = 0; i < SENSORS && !found; i++)
-        if (s->watch.scaled[i]) found = 31 + i;
+        if (s->watch.scaled[i]) found = CODE_SCALED + 1 + i;
     if (!found && s->rls.running) found = implausible(s);
     if (!found) found = s->plant_alarm;
-    if (!found && s->guard.on_probation) found = HELD_CODE;
+    if (!found && s->guard.on_probation) found = CODE_HELD;
     s->fault = found;
 }
 
@@ -373,7 +362,7 @@ static int process(Twin *m, double time) { /* gives the health */
         s->whole[V_FAULT] = s->fault;
         if (s->fault) tell(m, TELL_FAULT + s->fault, "fault %d at t = %g s (%s)", s->fault, time, FAULT_TEXT);
     }
-    if (lost || s->fault > 8 || is_held(s)) return NUMERIC_TROUBLE;
+    if (lost || s->fault > CODE_PLANT || is_held(s)) return NUMERIC_TROUBLE;
     return s->rls.running ? HEALTH_OK : WARMING_UP;
 }
 
@@ -383,8 +372,8 @@ static void sample(Twin *m, double time, double length) {
     int too_long, health;
     double apart;
     if (isnan(s->start)) s->start = time;
-    too_long = length > GRID_GAP * (1 + 1e-6);
-    if (length <= SAMPLE_TIME * (1 + 1e-6) && time < s->start + s->samples * SAMPLE_TIME - SAMPLE_TIME * 1e-5) return;
+    too_long = length > GRID_GAP * (1 + GRID_SLACK);
+    if (length <= SAMPLE_TIME * (1 + GRID_SLACK) && time < s->start + s->samples * SAMPLE_TIME - SAMPLE_TIME * GRID_EARLY) return;
     if ((s->changed || !s->configured) && !configure(m)) {
         s->whole[V_HEALTH] = INTERNAL_ERROR;
         return;
@@ -393,17 +382,17 @@ static void sample(Twin *m, double time, double length) {
         s->whole[V_HEALTH] = INTERNAL_ERROR;
         return;
     }
-    s->samples = (Count)floor((time - s->start) / SAMPLE_TIME + 1e-3) + 1;
+    s->samples = (Count)floor((time - s->start) / SAMPLE_TIME + GRID_ROUNDED) + 1;
     apart = time - s->last;
     s->last = time;
     if (too_long) {
         tell(m, TELL_STEP, "the host's step %g s is too long for sample_time %g s; steps up to %g s are followed", length, SAMPLE_TIME, GRID_GAP);
-    } else if (s->expected > 0 && apart > GRID_GAP * (1 + 1e-6)) {
+    } else if (s->expected > 0 && apart > GRID_GAP * (1 + GRID_SLACK)) {
         s->uneven = time;
         tell(m, TELL_UNEVEN, "the host's steps of %g s put samples %g s apart, sample_time is %g s; use steps that divide it", length, apart, SAMPLE_TIME);
     }
     s->expected = fmax(SAMPLE_TIME, length);
-    too_long |= time < s->uneven + UNEVEN_HOLD * SAMPLE_TIME;
+    too_long |= time < s->uneven + GRID_HOLD * SAMPLE_TIME;
     health = process(m, time);
     s->whole[V_HEALTH] = too_long && health < STEP_MISMATCH ? STEP_MISMATCH : health;
     s->whole[V_N_SAMPLES]++;

@@ -2,9 +2,6 @@
  *
  * Bits, waits, limits and signatures come from native_config.h. A verdict on the joint itself is kept as an event.
  */
-#define LARGEST 1e6   /* a reading beyond this is no place to start an estimate from */
-#define EXCHANGED 1e9 /* gates while the estimate settles */
-
 /* ---- replacement -------------------------------------------------------------------------------------------------- */
 
 static void event(Fault *f, int verdict) {
@@ -28,7 +25,7 @@ static void use_sensors(Fault *f) {
 
 static void open_gates(Fault *f) {
     int i;
-    for (i = 0; i < 5; i++) f->gate[i] = EXCHANGED;
+    for (i = 0; i < 5; i++) f->gate[i] = FAULT_OPEN;
     f->gate_until = f->k + WAIT_SETTLE;
     f->cut = 0;
 }
@@ -49,7 +46,7 @@ static void exchange(Fault *f, int changed) {
         for (j = 0; j < SENSORS; j++)
             if (f->failed[j]) {
                 widest = fmax(widest, widening[j][i]);
-                if (wide++) all *= 1.5;
+                if (wide++) all *= FAULT_WIDER;
             }
         f->scale[i] = wide ? 1 / (widest * all) : 1;
     }
@@ -115,7 +112,7 @@ static int would_show(const Fault *f, int parity) {
     double size = 0;
     int i;
     for (i = 0; i < 4; i++) size = fmax(size, fabs(f->values[at + i]));
-    return HAS_TORQUE ? size * FAULT_STIFFNESS > 2 * f->limits[16] : age_of(f, parity) >= WAIT_PAIR;
+    return HAS_TORQUE ? size * FAULT_STIFFNESS > FAULT_SHOWS * f->limits[16] : age_of(f, parity) >= WAIT_PAIR;
 }
 
 /* Position, velocity or both of one side, as bits of sensors. */
@@ -154,7 +151,7 @@ static void decide_plant(Fault *f) {
     if (f->k - recent > WAIT_QUIET) {
         close_suspicion(f);
     } else if (f->latched & (MOTOR | MOTOR_JUMP) && !(f->latched & ~(MOTOR | MOTOR_JUMP))) {
-        if (age_of(f, MOTOR) >= WAIT_PAIR && since(f, MOTOR) < 5) report(f, CURRENT_OR_FRICTION);
+        if (age_of(f, MOTOR) >= WAIT_PAIR && since(f, MOTOR) < FAULT_FRESH) report(f, CURRENT_OR_FRICTION);
     } else if (f->k - f->opened >= WAIT_PLANT) {
         report(f, PLANT);
     }
@@ -169,7 +166,7 @@ static int torque_failed(const Fault *f) {
             const Count own = age_of(f, 1 << i);
             if (age < 0 || own < age) age = own;
         }
-    if (f->peak > 1.5 && since(f, TORSION) >= 2 && since(f, TORSION) <= 10 && age_of(f, TORSION) < 20) return 1;
+    if (f->peak > FAULT_SHORT_PEAK && since(f, TORSION) >= fault_short[0] && since(f, TORSION) <= fault_short[1] && age_of(f, TORSION) < fault_short[2]) return 1;
     return moving && age >= WAIT_TORQUE && age_of(f, TORSION) >= WAIT_TORQUE;
 }
 
@@ -259,7 +256,7 @@ static void start_anew(Fault *f, const double readings[SENSORS]) {
     for (i = 0; i < 5; i++) invalidate(f, i, f->k + 1 + WAIT_SETTLE);
 }
 
-static double usable(double reading) { return reading > -LARGEST && reading < LARGEST ? reading : 0; }
+static double usable(double reading) { return reading > -FAULT_LARGEST && reading < FAULT_LARGEST ? reading : 0; }
 
 /* Absurd readings have driven the estimate out of all bounds: start it and the residuals again. */
 static void begin_anew(Fault *f, const double reading[SENSORS], double used[SENSORS]) {

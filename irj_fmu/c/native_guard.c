@@ -1,7 +1,6 @@
 /* What holds the estimate: identification.online.pulse.Pulse for failures of all readings at once, identification.online.guard.Guard for those that
  * nothing else has told. */
 
-#define LONG_AGO (-1000000)
 enum { NOTHING, HELD_NOW, BACK, ACCEPTED };
 
 /* Take a sample; 0 where it does not count. */
@@ -32,7 +31,7 @@ static int pulse_sample(State *s, double time, const double readings[SENSORS]) {
 static void clear_guard(Guard *g) {
     int b;
     memset(g, 0, sizeof *g);
-    for (b = 0; b < N_BALANCES; b++) { g->over[b] = LONG_AGO; g->on[b] = 1; }
+    for (b = 0; b < N_BALANCES; b++) { g->over[b] = GUARD_LONG_AGO; g->on[b] = 1; }
 }
 
 static void estimate_of(const State *s, const Recursion *r, double theta[N_THETA]) {
@@ -91,7 +90,7 @@ static int guard_step(State *s, const double theta[N_THETA], const double error[
     if (!g->on_probation) {
         if (any) {
             g->on_probation = 1;
-            for (b = 0; b < N_BALANCES; b++) g->over[b] = over[b] ? 0 : LONG_AGO;
+            for (b = 0; b < N_BALANCES; b++) g->over[b] = over[b] ? 0 : GUARD_LONG_AGO;
             memcpy(g->fresh, g->quick, sizeof g->fresh);
             g->back = g->explained = g->held_for = 0;
             estimate_of(s, &g->kept[0], g->theta);
@@ -113,7 +112,7 @@ static int guard_step(State *s, const double theta[N_THETA], const double error[
     for (b = 0; b < N_BALANCES; b++)
         if (over[b]) g->over[b] = g->held_for;
     g->back = any ? 0 : g->back + 1;
-    any = guard_follow(g, g->fresh, s->rls.fast + FAST_ERROR, limits, 0.5, unexplained);
+    any = guard_follow(g, g->fresh, s->rls.fast + FAST_ERROR, limits, GUARD_EXPLAINED, unexplained);
     g->explained = any ? 0 : g->explained + 1;
     if (g->back >= GUARD_BACK) {
         guard_restore(s);

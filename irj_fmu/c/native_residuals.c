@@ -52,10 +52,10 @@ static int residuals(Fault *f, const double positions[4], const double rates[4],
     }
     for (i = 0; i < 3; i++) {
         const double value = f->values[energy_at[i]], grown = f->energy[i] + value * value * energy_inverse[i] - ENERGY_DRIFT;
-        f->energy[i] = fmax(0, fmin(grown, 1e9));
+        f->energy[i] = fmax(0, fmin(grown, ENERGY_TOP));
         if (grown > 0 && grown > energy_limit[i]) {
             bits |= residual_bit[energy_at[i]];
-            f->energy[i] = 0.5 * energy_limit[i];
+            f->energy[i] = ENERGY_LEFT * energy_limit[i];
         }
     }
     return bits;

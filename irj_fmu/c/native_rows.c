@@ -92,17 +92,14 @@ static int make_row(Twin *m, double time) {
     return 1;
 }
 
-/* Share of the kernel in which a side stands still or turns round, as far as its noise lets one see. */
-static double standstill(const Rows *r, int side, double noise) {
-    const double slow = fmax(3 * noise * velocity_gain[side], sharp[side]);
-    double sum = 0;
-    int k;
-    if (!N_NEEDED) return 0;
-    for (k = 0; k < POINTS; k++) {
-        const double now = r->speed[k][side];
-        if (fabs(now) < slow || (k && now * r->speed[k - 1][side] < 0)) sum += point_weight[k];
-    }
-    return sum;
+/* Shares of the kernel in which motor and link stand still or turn round, as far as their noise lets one see. */
+static void standstill(Twin *m, double share[2]) {
+    const double noise[2] = {m->s.watch.noise[Q_M], m->s.watch.noise[Q_L]};
+    share[0] = share[1] = 0;
+    if (!N_NEEDED) return;
+    m->arg[0] = m->s.rows.speed[0]; m->arg[1] = noise; m->arg[2] = sharp;
+    m->res[0] = share;
+    still(m->arg, m->res, m->iw, m->w, 0);
 }
 
 /* RMS that sensor noise alone leaves in each balance. */

@@ -6,9 +6,7 @@
 #define DIM(n) ((n) > 0 ? (n) : 1)
 #define MAX_TEXT 512
 #define SENSORS 6
-#define RESIDUALS 19 /* four parities at four lags, then r1 and two means of it */
 #define BITS 7
-#define ABSURD 1e9   /* a reading beyond this (SI) counts as missing, as NaN and infinity do */
 
 enum { DRIVE, Q_M, W_M, Q_L, W_L, TAU };
 enum { NO_EVENT, ARMED, SENSOR, DROPOUT, CURRENT_OR_FRICTION, PLANT, RECOVERED };
@@ -99,8 +97,14 @@ typedef struct {
     Fault detector;
 } State;
 
+typedef struct { /* RowCheck: what a row says before the recursion takes it */
+    double error[N_BALANCES], weighted[N_BALANCES], square[N_BALANCES], torque[N_BALANCES], least[N_BALANCES];
+    double y[N_BALANCES], h[N_BALANCES * N_THETA];
+} Checked;
+
 typedef struct {
     State s;
+    Checked checked;
     fmi2CallbackFunctions host;
     char *name;
     int logging;

@@ -36,7 +36,7 @@ static double noise_level(Twin *m, int sensor) {
     for (i = 0; i < n; i++) d[i] = fabs(d[i]);
     select_value(d, n, last);
     for (i = 0; i <= last; i++) square += d[i] * d[i];
-    return sqrt(square / (last + 1) / 70.0) / NOISE_CUT_DEVIATION;
+    return sqrt(square / (last + 1) / NOISE_GAIN) / NOISE_CUT_DEVIATION;
 }
 
 /* Least-squares slope of x against y about their means. */
@@ -46,7 +46,7 @@ static double slope_of(const double x[], const double y[], int n) {
     for (i = 0; i < n; i++) { mx += x[i]; my += y[i]; }
     mx /= n; my /= n;
     for (i = 0; i < n; i++) { xy += (x[i] - mx) * (y[i] - my); yy += (y[i] - my) * (y[i] - my); }
-    return xy / fmax(yy, 1e-300);
+    return xy / fmax(yy, TINY);
 }
 
 /* Ratio of velocity reading to position reading, and of the two positions. */

@@ -1,18 +1,10 @@
 /* Start of the recursion from the first window: identification.online.first_window, identification.recursive.prior_start, OnlineEstimator._begin. */
 
 /* Weights of the balances' rows at a reversal, where friction may take any value between its limits. */
-static void weight_of(const double shares[2], const double theta[N_THETA], const double size[N_BALANCES], double out[N_BALANCES]) {
-    double level[2] = {0, 0};
-    int b, i, place;
-    for (place = 0; place < 2; place++)
-        for (i = 0; i < N_THETA; i++)
-            if (is_friction[place][i]) level[place] += fabs(theta[i]);
-    for (b = 0; b < N_BALANCES; b++) {
-        double sum = 0;
-        for (place = 0; place < 2; place++)
-            if (feels[b][place]) sum += shares[place] * level[place] * (shares[place] * level[place]);
-        out[b] = 1 / sqrt(1 + sum / (size[b] * size[b]));
-    }
+static void weight_of(Twin *m, const double shares[2], const double theta[N_THETA], const double size[N_BALANCES], double out[N_BALANCES]) {
+    m->arg[0] = shares; m->arg[1] = theta; m->arg[2] = size;
+    m->res[0] = out;
+    row_weight(m->arg, m->res, m->iw, m->w, 0);
 }
 
 static double error_of(const double y, const double h[N_THETA], const double theta[N_THETA]) {
@@ -114,13 +106,13 @@ static void robust_fit(Twin *m, const double least[N_BALANCES], double first[N_T
     int pass, k, b;
     for (k = 0; k < f->count; k++)
         for (b = 0; b < N_BALANCES; b++) m->weight[k][b] = 1;
-    for (pass = 0; pass < 3; pass++) {
+    for (pass = 0; pass < FIRST_PASSES; pass++) {
         least_squares(m, least, first);
         for (b = 0; b < N_BALANCES; b++) {
             for (k = 0; k < f->count; k++) m->sorted[k] = fabs(error_of(f->y[k][b], f->h[k][b], first));
-            size[b] = fmax(1.5 * median(m->sorted, f->count), least[b]);
+            size[b] = fmax(FIRST_DEVIATION * median(m->sorted, f->count), least[b]);
         }
-        for (k = 0; k < f->count; k++) weight_of(f->shares[k], first, size, m->weight[k]);
+        for (k = 0; k < f->count; k++) weight_of(m, f->shares[k], first, size, m->weight[k]);
     }
     reduce_window(m);
 }
@@ -137,7 +129,7 @@ static void least_range(const Twin *m, double out[N_THETA]) {
         double size = 0;
         for (b = 0; b < N_BALANCES; b++) size += column_square(m, b, i);
         size = sqrt(size / rows);
-        out[i] = size > ABSENT ? 0.01 * level / size : 1;
+        out[i] = size > ABSENT ? FIRST_RANGE * level / size : 1;
     }
 }
 
@@ -148,7 +140,7 @@ static void factorise(double p[N_THETA][N_THETA], double d[N_THETA], double u[])
         for (i = j; i >= 0; i--) {
             double sum = p[i][j];
             for (k = j + 1; k < N_THETA; k++) sum -= p[i][k] * p[j][k] * d[k];
-            if (i == j) { d[j] = fmax(sum, 1e-300); p[j][j] = 1; }
+            if (i == j) { d[j] = fmax(sum, TINY); p[j][j] = 1; }
             else { p[i][j] = sum / d[j]; u[j * (j - 1) / 2 + i] = p[i][j]; }
         }
     }

@@ -20,20 +20,25 @@ from typing import Any, Final, final
 import numpy as np
 import numpy.typing as npt
 
-from identification.balance.noise import CUT_DEVIATION, KEPT
+from identification.balance.noise import CUT_DEVIATION, FOURTH_GAIN, KEPT
 from identification.data.joint_file import Joint
 from identification.errors import InputError
+from identification.faults import structured
+from identification.faults.core import ABSURD, OPEN
 from identification.faults.detector import MOVED, PARITY_SENSORS, DetectorTables
+from identification.faults.residuals import COUNT, ENERGY_LEFT, ENERGY_TOP
+from identification.online import first_window, verdict
 from identification.online import watch as watch_settings
-from identification.online.estimator import _RESIDUAL_SECONDS, _STRAIN, OnlineEstimator
+from identification.online.estimator import OnlineEstimator
 from identification.online.first_window import ABSENT, RIDGE
 from identification.online.grid import ON_GRID
 from identification.online.row_check import LEAST
 from identification.online.rows import _NAMES, SOURCES
-from identification.online.verdict import _RECENT, FAULT_TEXT, HELD, SCALED
+from identification.online.verdict import _RECENT, FAULT_TEXT, SCALED, WRONG_SCALE, WRONG_SIGMAS
 from identification.online.watch import DRIVE, READINGS, TAU
 from identification.recursive.prior_start import PRIOR_PASSES, UNDETERMINED
 from irj_fmu.estimator.native_expressions import cheaper
+from irj_fmu.fmi import slave_base
 from irj_fmu.fmi.variables import Variable
 
 FloatArray = npt.NDArray[np.float64]
@@ -89,6 +94,7 @@ def _functions(made: OnlineEstimator) -> list[Any]:
 
     engine = made.recursion(made.theta).engine_for("generate")
     found = [engine.formulas.step, engine.formulas.check, made.rows.point, made.rows.slopes]
+    own = [made.check.function, made.check.weight, made.rows.still]
     if made.detector is not None:
         found.append(made.detector.tables().function)
     recursion = []
@@ -96,7 +102,7 @@ def _functions(made: OnlineEstimator) -> list[Any]:
         arguments = function.sx_in()
         recursion.append(ca.Function(name, arguments, function.call(arguments)))
     laws = zip(("points", "slopes", "sample_observer"), found[2:], strict=False)
-    return [*recursion, *(cheaper(function, name) for name, function in laws)]
+    return [*recursion, *own, *(cheaper(function, name) for name, function in laws)]
 
 
 def _model(functions: Sequence[Any]) -> bytes:
@@ -215,6 +221,8 @@ def _variable_tables(
     gear = joint.gear_ratio
     per_unit = joint.torque_per_current if drive == "i_m" else gear
     header.doubles("input_gain", [float(per_unit or 1.0), 1.0 / gear, 1.0 / gear, 1.0, 1.0, 1.0])
+    for name in ("SLACK", "EARLY", "ROUNDED", "HOLD"):
+        header.define(f"GRID_{name}", getattr(slave_base, name))
     header.define("FAULT_TEXT", f'"{FAULT_TEXT}"')
 
 
@@ -280,9 +288,6 @@ def _row_tables(header: _Header, made: OnlineEstimator) -> None:
     header.doubles("smooth_kernel", smoothing)
     header.doubles("point_weight", rows.weights)
     header.doubles("sharp", rows.sharp)
-    header.doubles(
-        "velocity_gain", np.broadcast_to(np.asarray(rows.velocity_gain, dtype=np.float64), (2,))
-    )
     linear = [
         (i, j)
         for i, j in itertools.product(range(count * width), range(len(_NAMES)))
@@ -314,6 +319,10 @@ def _watch_tables(header: _Header, made: OnlineEstimator) -> None:
     header.define("SCALE_ERROR", float(watch_settings.SCALE))
     header.define("NOISE_MEMORY", watch_settings.MEMORY)
     header.define("NOISE_KEPT", KEPT)
+    header.define("NOISE_GAIN", FOURTH_GAIN)
+    header.define("TINY", watch_settings.TINY)
+    header.define("WRONG_SCALE", WRONG_SCALE)
+    header.define("WRONG_SIGMAS", WRONG_SIGMAS)
     header.define("NOISE_CUT_DEVIATION", CUT_DEVIATION)
     header.whole("present", made.present, "unsigned char")
     header.whole("needs", made.needs, "unsigned char")
@@ -347,7 +356,8 @@ def _recursion_tables(header: _Header, made: OnlineEstimator) -> None:
     header.define("UNDETERMINED", UNDETERMINED)
     header.define("PRIOR_PASSES", PRIOR_PASSES)
     header.define("OVERLAP", float(made.rows.timing.overlap))
-    header.define("RESIDUAL_RATE", period / _RESIDUAL_SECONDS)
+    for name in ("RANGE", "PASSES", "DEVIATION"):
+        header.define(f"FIRST_{name}", getattr(first_window, name))
     for name, block, parts in (
         ("FAST", layout.fast, ("d", "u", "theta", "noise", "error", "learned", "alarm", "due")),
         ("SLOW", layout.slow, ()),
@@ -360,12 +370,7 @@ def _recursion_tables(header: _Header, made: OnlineEstimator) -> None:
     header.doubles("start_slow", slow)
     header.doubles("start_config", engine.config)
     header.doubles("fixed_theta", made.theta)
-    friction = [[i in where for i in range(n)] for where in made.friction]
-    feels = ", ".join("{" + ", ".join(str(int(v)) for v in line) + "}" for line in made.feels)
-    marks = ", ".join("{" + ", ".join(str(int(v)) for v in line) + "}" for line in friction)
-    header.raw(f"static const unsigned char is_friction[2][N_THETA] = {{{marks}}};")
-    header.raw(f"static const unsigned char feels[N_BALANCES][2] = {{{feels}}};")
-    header.whole("reference_signal", (11 if from_link else 1 for from_link in made.from_link))
+    header.whole("reference_signal", made.reference)
     for key, value in made.guard.figures().items():
         header.define(f"GUARD_{key}", value)
     header.whole("is_inertia", (int(i in made.guard.inertias) for i in range(n)), "unsigned char")
@@ -374,10 +379,10 @@ def _recursion_tables(header: _Header, made: OnlineEstimator) -> None:
     header.doubles("highest", made.high)
     for key, number in made.pulse.figures().items():
         header.define(f"PULSE_{key}", number)
-    header.define("HELD_CODE", HELD)
+    for name in ("MISSING", "CONSTANT", "SCALED", "CURRENT_OR_FRICTION", "PLANT", "HELD"):
+        header.define(f"CODE_{name}", getattr(verdict, name))
     header.define("ON_GRID", ON_GRID)
     header.define("GRID_GAP", float(made.grid.gap))
-    header.define("ERROR_LIMIT", float(_STRAIN.error_limit))
     header.define("CONFIRM_ROWS", made.confirm)
 
 
@@ -393,6 +398,14 @@ def _fault_tables(header: _Header, made: OnlineEstimator) -> None:
         "settle_seconds",
         "plant_rest_seconds",
     )
+    for name in ("LARGEST", "WIDER", "SHORT_PEAK", "FRESH", "SHOWS"):
+        header.define(f"FAULT_{name}", getattr(structured, name))
+    header.define("ABSURD", ABSURD)
+    header.define("FAULT_OPEN", OPEN)
+    header.whole("fault_short", structured.SHORT)
+    header.define("RESIDUALS", COUNT)
+    header.define("ENERGY_LEFT", ENERGY_LEFT)
+    header.define("ENERGY_TOP", ENERGY_TOP)
     keys = ("LINK", "TORQUE", "PAIR", "PLANT", "QUIET", "RECOVER", "SETTLE", "REST")
     header.whole("parity_sensors", (sum(1 << s for s in sensors) for sensors in PARITY_SENSORS))
     header.doubles("moved", MOVED)

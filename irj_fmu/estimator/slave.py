@@ -20,6 +20,7 @@ from identification.online.estimator import (
     searched_parameters,
 )
 from identification.online.rows import linear_parameters
+from identification.online.verdict import PLANT
 from identification.online.watch import Q_L, READINGS, W_L
 from irj_fmu.estimator.packed import STEP, load_options
 from irj_fmu.fmi.slave_base import Health, TableSlave
@@ -498,7 +499,7 @@ class Estimator(TableSlave):
                 f"input not finite or beyond {ABSURD:g} in SI units: {names}; it counts as missing"
             )
             return Health.NUMERIC_TROUBLE
-        if fault > 8 or estimator.held:
+        if fault > PLANT or estimator.held:
             return Health.NUMERIC_TROUBLE
         return Health.WARMING_UP if estimator.warming_up else Health.OK
 

@@ -22,12 +22,18 @@ from pythonfmu.enums import Fmi2Status
 from irj_fmu.fmi.model_description import Description, Entry, model_description
 from irj_fmu.fmi.variables import Kind, Value, Variable
 
-_SLACK = 1e-6
+SLACK = 1e-6
+"""Rounding of a host's clock, as a share of the step."""
+EARLY = 1e-5
+"""Share of ``sample_time`` by which a host's step may come before the grid."""
+ROUNDED = 1e-3
+"""Share of ``sample_time`` by which the count of samples is rounded up: ten thousand steps of
+rounding."""
 _UNEVEN = 0.25
 """Largest deviation of the time between two samples from ``sample_time``, as a share of it,
 that passes without a word.
 """
-_HOLD = 200
+HOLD = 200
 """Samples for which ``health`` remembers an uneven one."""
 _KNOWN = 64
 """Lists of references whose kinds are looked at once and remembered."""
@@ -233,22 +239,22 @@ class TableSlave(Fmi2Slave):  # type: ignore[misc, unused-ignore]
         if self._start != self._start:
             self._start = time
         longest = self.longest(period)
-        self._too_long = length > longest * (1 + _SLACK)
+        self._too_long = length > longest * (1 + SLACK)
         due = self._start + self._count * period
-        if length <= period * (1 + _SLACK) and time < due - period * _SLACK * 10:
+        if length <= period * (1 + SLACK) and time < due - period * EARLY:
             return False
         if self._changed:
             self._configure()
         self._step = period if self._last != self._last else time - self._last
         self._last = time
-        self._count = math.floor((time - self._start) / period + 1e-3) + 1
+        self._count = math.floor((time - self._start) / period + ROUNDED) + 1
         if self._too_long:
             self._report(
                 f"the host's step {length:g} s is too long for sample_time {period:g} s; steps "
                 f"up to {longest:g} s are followed"
             )
         elif self._expected > 0 and (
-            self._step > longest * (1 + _SLACK)
+            self._step > longest * (1 + SLACK)
             if self.resamples
             else abs(self._step - self._expected) > _UNEVEN * period
         ):
@@ -258,7 +264,7 @@ class TableSlave(Fmi2Slave):  # type: ignore[misc, unused-ignore]
                 f"sample_time is {period:g} s; use steps that divide it"
             )
         self._expected = max(period, length)
-        self._too_long |= time < self._uneven + _HOLD * period
+        self._too_long |= time < self._uneven + HOLD * period
         return True
 
     def _sample(self, time: float, length: float) -> None:

@@ -4,54 +4,39 @@ unexplained.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Final, final
+from typing import Any, Final, final
 
-import numpy as np
-
-from casadi_models import EFFECTS, JointModel
+from casadi_models import Effect, JointModel
+from casadi_models.joint import TWIST
 from identification.data.check.gate import gate_warnings, gated
-from identification.data.joint_file import Joint
+from identification.data.joint_file import Joint, Known
 from identification.data.record import Record
-from identification.diagnosis.bench import Progress
-from identification.diagnosis.candidates import Candidate, NotTestable, offered
-from identification.diagnosis.claims import Claim, Ranking, rank
-from identification.diagnosis.curve import Curve
+from identification.diagnosis.claims import Claim, Ranking
 from identification.diagnosis.diagnose import Diagnosis
-from identification.diagnosis.improvement import Improvement, Step, visible_keys
-from identification.diagnosis.learned import Doubt, Equivalence, LearnedClaim
-from identification.diagnosis.lines import Line
-from identification.diagnosis.locate import Unexplained, locate
+from identification.diagnosis.improvement import Improvement
 from identification.diagnosis.session import Session, with_held_out
-from identification.diagnosis.trials import Base, Trial, make_base, span_of
 from identification.errors import InputError
-from identification.fitting.assess import RATIO_LIMIT, BalanceError, Error, assess
+from identification.fitting.assess import RATIO_LIMIT, Error
 from identification.fitting.engine import (
     Dataset,
     Solution,
     load_dataset,
     prepared_model,
-    solve,
-    weak_record,
 )
-from identification.naming.odds import Odds
-from irj_fmu.host.signals import FloatArray
+from irj_fmu.imported.bench import OUTSIDE, FmuBench, Freedom, freedom, without_steep
 from irj_fmu.imported.compare import compare
 from irj_fmu.imported.correction import Correction, correction_of
 from irj_fmu.imported.fit import UserFit, fit
 from irj_fmu.imported.model import UserModel, listed
 from irj_fmu.imported.outputs import UserComparison
+from irj_fmu.imported.port import port_of
+from irj_fmu.imported.restart import Restart
 from irj_fmu.imported.sensitivity import scale_of
-from irj_fmu.imported.tracking import balanced_records
-
-if TYPE_CHECKING:
-    from identification.balance.weak import WeakRecord
+from irj_fmu.imported.tracking import Following
 
 _STEP: Final = 0.01
-_OUTSIDE: Final = ("friction", "torque")
-"""Families of effects that can ride outside an FMU as a torque."""
 
 
 @final
@@ -65,7 +50,10 @@ class UserDiagnosis:
     diagnosis : Diagnosis
         Ranking and the first claim, as of a joint model.
     error : Error
-        Of the balance with nothing added, on held-out rows.
+        Of the balances with nothing added, on held-out rows.
+    why_followed : str
+        Why the FMU had to follow the measured motion, seen at the drive alone, and was not
+        restarted at measured states; empty where it was.
     """
 
     model: UserModel
@@ -73,6 +61,7 @@ class UserDiagnosis:
     error: Error
     solution: Solution
     records: tuple[Record, ...]
+    why_followed: str = ""
 
     @property
     def ranking(self) -> Ranking:
@@ -130,25 +119,54 @@ class UserDiagnosis:
             raise InputError(
                 f"{wanted!r} is not among the candidates that these records can show: {there}"
             )
-        values = {**_starts(trial.candidate.model), **self.solution.values, **trial.values}
-        before = self.model.correction
-        labels: tuple[str, ...] = (trial.candidate.label,)
-        joint = trial.candidate.model
-        free = (*trial.candidate.amplitudes, *trial.candidate.shapes)
-        if before is not None:
-            joint = replace(
-                joint, terms=(*before.model.terms, *(t for t in joint.terms if t.label in labels))
-            )
-            values |= {
-                **dict(zip(before.model.parameter_names, before.model.value_vector(), strict=True)),
-                **trial.values,
-            }
-            labels, free = (*before.labels, *labels), (*before.free, *free)
-        return replace(self.model, correction=correction_of(joint, labels, values, free))
+        why = self.stays(trial.candidate.effect, trial.candidate.place)
+        if why:
+            raise InputError(f"{self.model.fmu.path.name}: {trial.candidate.label} {why}")
+        values = {**self.solution.values, **trial.values}
+        return with_outside(self.model, trial.candidate.model, trial.candidate.label, values)
+
+    def stays(self, effect: Effect, place: str) -> str:
+        """Why an effect cannot ride outside the FMU; empty where it can."""
+        if effect.family not in OUTSIDE:
+            return "acts inside the gear or at a sensor; only a torque at the drive rides outside"
+        driven = port_of(self.model).output
+        side = self.model.outputs[driven].channel.partition("_")[0]
+        both = {"motor_position", "link_position"} <= {m.channel for m in self.model.outputs}
+        if both and place not in (side, "drive"):
+            return f"acts at the {place}; only a torque at the drive rides outside"
+        return ""
 
     def refit(self, label: str | None = None) -> UserFit:
         """Add the effect and fit FMU and effect together by the error of the outputs."""
         return fit(self.add(label), self.records)
+
+
+def with_outside(
+    model: UserModel, joint: JointModel, label: str, values: Mapping[str, float]
+) -> UserModel:
+    """A model with one more effect outside.
+
+    Parameters
+    ----------
+    model : UserModel
+    joint : JointModel
+        Has the effect.
+    label : str
+        Of the effect in it.
+    values : mapping
+        Of the parameters of `joint`, as far as they are known.
+    """
+    term = next(t for t in joint.terms if t.label == label)
+    before = model.correction
+    labels: tuple[str, ...] = (label,)
+    free: tuple[str, ...] = tuple(term.names)
+    known = {**_starts(joint), **values}
+    if before is not None:
+        joint = replace(joint, terms=(*before.model.terms, term))
+        theirs = dict(zip(before.model.parameter_names, before.model.value_vector(), strict=True))
+        known |= {**theirs, **{n: known[n] for n in term.names}}
+        labels, free = (*before.labels, *labels), (*before.free, *free)
+    return replace(model, correction=correction_of(joint, labels, known, free))
 
 
 def _starts(model: JointModel) -> dict[str, float]:
@@ -160,6 +178,7 @@ def diagnose(
     records: Record | Sequence[Record],
     held_out: Record | Sequence[Record] = (),
     *,
+    most: int | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> UserDiagnosis:
     """Rank the effect library on the correction torque that a user's FMU needs.
@@ -175,6 +194,8 @@ def diagnose(
     records : Record or sequence of Record
     held_out : Record or sequence of Record
         Records the fit did not see; without them blocks of the records are held out.
+    most : int, optional
+        Look for so many effects, each beside those before it; by default for the first one.
     progress : callable, optional
         ``progress(text, share)``.
 
@@ -191,26 +212,56 @@ def diagnose(
     apart = gated(listed(held_out), model.joint) if held_out else []
     train, held, note = with_held_out(given, apart)
     every = [*train, *held]
-    say("following the motion", 0.05)
-    balanced = balanced_records(model, every)
-    joint = _outside_joint(model.joint)
     count = len(train)
-    outside = replace(prepared_model(joint, balanced[0]), lagging_load=False)
-    data = replace(load_dataset(balanced[:count], balanced[count:], joint, outside), note=note)
-    columns = []
-    for i, p in enumerate(model.parameters):
-        say(f"sensitivity to {p.name}", 0.1 + 0.6 * i / max(len(model.parameters), 1))
-        columns.append(_column(model, every, balanced, p.name, data))
+    say("what the FMU leaves", 0.05)
+    left, why = _left_of(model, every)
+    before = [left.record(r) for r in every]
+    joint = _outside_joint(model.joint, left)
+    outside = replace(prepared_model(joint, before[0]), lagging_load=False)
+    steep = [left.steep(r) for r in every] if isinstance(left, Restart) else []
+
+    def prepared(given: Sequence[Record]) -> Dataset:
+        made = load_dataset(given[:count], given[count:], joint, outside)
+        return without_steep(replace(made, note=note), given, steep)
+
+    data = prepared(before)
+    free: list[Freedom] = []
+    own: frozenset[str] = frozenset()
+    values, bounds = model.values, model.bounds()
+    for i, (name, value) in enumerate(values.items()):
+        say(f"sensitivity to {name}", 0.1 + 0.6 * i / len(values))
+        low, high = bounds[name]
+        step = _STEP * scale_of(value, (low, high))
+        step = -step if value + step > high else step
+        pairs = [
+            (b, left.record(r, {name: value + step})) for b, r in zip(before, every, strict=True)
+        ]
+        if isinstance(left, Restart):
+            own |= left.moved_inertias(name, step)
+        free.append(freedom(name, (low - value, high - value), step, pairs, data))
     say("ranking the library", 0.75)
-    bench = FmuBench(outside, data, columns, [p.name for p in model.parameters])
+    inside = model.joint.model().terms
+    if model.correction is not None:
+        inside = (*inside, *model.correction.model.terms)
+
+    def remade(added: Mapping[str, float]) -> Dataset:
+        at = {n: values[n] + x for n, x in added.items()}
+        return prepared([left.record(r, at) for r in every])
+
+    bench = FmuBench(
+        outside, data, free, remade, inside=inside, own_inertias=own, only_torque=bool(why)
+    )
     session = Session(
         bench, lambda text, share: say(text, 0.75 + 0.25 * share), gate_warnings([*given, *apart])
     )
-    decided = session.diagnose(session.start())
-    found = Diagnosis(held_to_outputs(decided, compare(model, held)))
+    solution = session.start()
+    decided = session.diagnose(solution) if most is None else session.run(solution, most)
+    # a claim that the restarts of both sides bear out is judged there: the outputs lack it still
+    seen = not why and bool(decided.claims)
+    found = Diagnosis(decided if seen else held_to_outputs(decided, compare(model, held)))
     say("done", 1.0)
     start = found.found.steps[0]
-    return UserDiagnosis(model, found, start.held_out, start.solution, tuple(listed(records)))
+    return UserDiagnosis(model, found, start.held_out, start.solution, tuple(listed(records)), why)
 
 
 def held_to_outputs(found: Improvement, outputs: UserComparison) -> Improvement:
@@ -235,272 +286,34 @@ def held_to_outputs(found: Improvement, outputs: UserComparison) -> Improvement:
     return replace(found, verdict="unexplained", reason=reason)
 
 
-@final
-class FmuBench:
-    """What an FMU leaves along the measured motion, as the model that a session judges.
+def _left_of(model: UserModel, records: Sequence[Record]) -> tuple[Restart | Following, str]:
+    """How what an FMU leaves is found, and why not by restarts where it cannot be restarted."""
+    whole = replace(model, window=None)
+    first = whole.windows(records[:1])[0]
+    try:
+        return Restart(whole, first, records[0]), ""
+    except InputError as error:
+        return Following(whole, first), str(error)
 
-    A candidate rides outside as a torque; the FMU's own parameters move along linearly with it.
 
-    Parameters
-    ----------
-    outside : JointModel
-        Balance of what is left.
-    data : Dataset
-    columns : sequence of (rows,) array
-        Derivative of every row with respect to each of the FMU's parameters.
-    names : sequence of str
-        Of these parameters.
+def _outside_joint(joint: Joint, left: Restart | Following) -> Joint:
+    """The joint that is balanced: inertias, and a spring where both sides are seen.
+
+    They are known, as the scale of what is left: a fit that could move them along with the
+    parameters of the FMU would make every balance, and its noise with it, as small as it likes.
     """
-
-    def __init__(
-        self,
-        outside: JointModel,
-        data: Dataset,
-        columns: Sequence[FloatArray],
-        names: Sequence[str],
-    ) -> None:
-        self.joint, self.data = data.joint, data
-        self._outside, self._columns, self._names = outside, list(columns), list(names)
-
-    def start(self) -> Solution:
-        """The fit of the balance with nothing added."""
-        return solve(self._outside, self.data)
-
-    def fitted(
-        self, model: JointModel, start: Mapping[str, float], *, again: bool = False
-    ) -> Solution:
-        """The fit of a balance with more terms."""
-        return solve(model, self.data, start=start)
-
-    def step(self, key: str | None, label: str | None, solution: Solution) -> Step:
-        """The balance with its errors."""
-        train = assess(solution.model, self.data, self.data.train, solution.values)
-        held = assess(solution.model, self.data, self.data.held_out, solution.values)
-        return Step(key, visible_keys(solution.model), train, held, solution, label)
-
-    def added(self, trial: Trial, now: Step) -> Step:
-        """The balance with a candidate as its trial found it, the FMU's parameters moved along.
-
-        Nothing is simulated here: what is left is what was left, less the fall that the trial had.
-        """
-        held = trial.held_out_drop_percent
-        falls = (trial.cv_drop_percent, trial.cv_drop_percent if math.isnan(held) else held)
-        train, apart = (
-            _fallen(e, trial.balance, f)
-            for e, f in zip((now.train, now.held_out), falls, strict=True)
-        )
-        return Step(
-            trial.key, (*now.effects, trial.key), train, apart, now.solution, trial.candidate.label
-        )
-
-    def listen(self, step: Step) -> None:
-        """Nothing: what a tracked FMU leaves is averaged already, and holds no line."""
-
-    def base(self, solution: Solution) -> Base:
-        """Rows of the balance, with the FMU's parameters as nuisance."""
-        return with_nuisance(make_base(solution, self.data), self._columns, self._names)
-
-    def ranking(
-        self, base: Base, *, late: bool = False, progress: Progress | None = None
-    ) -> Ranking:
-        """The effects that can ride outside as a torque."""
-        return _only_outside(
-            rank(base, _extra(self._outside, self.data), late=late, progress=progress)
-        )
-
-    def tried(self, solution: Solution) -> list[str]:
-        """Keys of the effects that can ride outside as a torque."""
-        every = [*offered(solution.model, self.data)[0], *_extra(self._outside, self.data)]
-        return [c.effect.key for c in every if c.effect.family in _OUTSIDE]
-
-    def ratios(self, step: Step) -> dict[str, BalanceError]:
-        """Of the one balance, at the kernel of the claims."""
-        return dict(step.held_out.balances)
-
-    def shown(self, step: Step) -> Step:
-        """The step: its one kernel is that of the verdict."""
-        return step
-
-    def lines(self, step: Step) -> list[Line]:
-        """None are looked for: the FMU has its own periodic parts."""
-        return []
-
-    def places(
-        self, step: Step, error: Error, lines: Sequence[Line], limit: float
-    ) -> list[Unexplained]:
-        """Where the balance as it stands is over its floor; with a candidate, only that it
-        still is.
-        """
-        if step.label is None:
-            return locate(step.solution, self.data, error, lines, limit)
-        return [
-            Unexplained(b, 0.0, rms=e.rms)
-            for b, e in error.balances.items()
-            if not e.ratio <= limit
-        ]
-
-    def learned(self, step: Step, error: Error) -> tuple[LearnedClaim, ...]:
-        """None: a curve cannot ride outside an FMU yet."""
-        return ()
-
-    def held_against(self, claims: Sequence[Claim], step: Step) -> Mapping[str, Equivalence]:
-        """None: a curve cannot ride outside an FMU yet."""
-        return {}
-
-    def artefacts(self, step: Step, curves: Sequence[Curve], start: Step) -> tuple[Doubt, ...]:
-        """None: the FMU has its own parameters."""
-        return ()
-
-    def same_sign(self, trial: Trial, solution: Solution) -> bool:
-        """No minor effects are looked for."""
-        return False
-
-    def odds(
-        self, claim: Claim, near: Mapping[str, float], now: Step, last: Ranking
-    ) -> Odds | None:
-        """None: nothing is fitted whole outside an FMU, and its trials have told what there is."""
-        return None
-
-
-def _fallen(error: Error, balance: str, percent: float) -> Error:
-    """An error after a fall of the RMS of one balance."""
-    share = 1 - percent / 100
-    before = error.balances[balance]
-    after = replace(
-        before,
-        rms=before.rms * share,
-        ratio=before.ratio * share,
-        residual=before.residual * share,
-    )
-    power = sum(e.rms**2 for e in error.balances.values())
-    left = math.sqrt(max(power - before.rms**2 + after.rms**2, 0.0) / power) if power > 0 else 1.0
-    return replace(
-        error,
-        relative_error_percent=error.relative_error_percent * left,
-        fit_percent=100 - (100 - error.fit_percent) * left,
-        vaf_percent=100 - (100 - error.vaf_percent) * left**2,
-        balances={**error.balances, balance: after},
-    )
-
-
-def _outside_joint(joint: Joint) -> Joint:
-    """The joint that is balanced: rigid, with the effects that the file says the FMU has."""
+    sizes = {"inertia": left.inertia} if isinstance(left, Following) else left.sizes
+    terms = {TWIST: "stiffness", "structural_damping": "structural_damping"}
     return Joint(
         name=joint.name,
         kind=joint.kind,
         gear_ratio=joint.gear_ratio,
         model_name="hd1",
-        effects=joint.effects,
+        effects=tuple(label for label, name in terms.items() if name in sizes),
+        known={name: Known(value=size) for name, size in sizes.items()},
         virtual_work=joint.virtual_work,
         source=joint.source,
     )
 
 
-def _column(
-    model: UserModel,
-    records: Sequence[Record],
-    balanced: Sequence[Record],
-    name: str,
-    data: Dataset,
-) -> FloatArray:
-    """Derivative of every row with respect to a parameter of the FMU, training rows first [N.m
-    per unit].
-    """
-    value = model.values[name]
-    step = _STEP * scale_of(value, model.bounds()[name])
-    if value + step > model.bounds()[name][1]:
-        step = -step
-    moved = balanced_records(model, records, {name: value + step})
-    rows: list[WeakRecord] = []
-    for a, b in zip(moved, balanced, strict=True):
-        change = b.with_channel("motor_torque", (a["motor_torque"] - b["motor_torque"]) / step)
-        rows.append(weak_record(change, data.joint, data.sensing, data.kernel))
-    return np.concatenate([w.averaged["drive"] for w in rows])
-
-
-def with_nuisance(base: Base, columns: Sequence[FloatArray], names: Sequence[str]) -> Base:
-    """The base with further columns that a candidate must stand out from.
-
-    Parameters
-    ----------
-    base : Base
-        Of one balance.
-    columns : sequence of (training rows + held-out rows,) array
-        Unweighted.
-    names : sequence of str
-    """
-    count = len(base.weight)
-    kept, extra, held = [], [], []
-    for name, column in zip(names, columns, strict=True):
-        weighted = column[:count] * base.weight
-        size = float(np.linalg.norm(weighted))
-        if size > 1e-12 * math.sqrt(count):
-            kept.append(name)
-            extra.append(weighted / size)
-            held.append(column[count:] * base.held_weight / size)
-    if not kept:
-        return base
-    jacobian = np.column_stack([base.jacobian, *extra])
-    orthonormal = span_of(jacobian)
-    return replace(
-        base,
-        jacobian=jacobian,
-        orthonormal=orthonormal,
-        residual=base.residual - orthonormal @ (orthonormal.T @ base.residual),
-        held_jacobian=np.column_stack([base.held_jacobian, *held]),
-        names=(*base.names, *kept),
-    )
-
-
-def _extra(model: JointModel, data: Dataset) -> list[Candidate]:
-    """Effects that need a parent which the FMU may hold itself, such as the Stribeck part of a
-    Coulomb friction.
-    """
-    there = {c.label for c in offered(model, data)[0]}
-    found = []
-    for effect in EFFECTS.values():
-        parents = [n for n in effect.needs if not model.has(n)]
-        plain = (
-            effect.family in _OUTSIDE
-            and effect.candidate
-            and not effect.needs_load
-            and not effect.periodic
-        )
-        if (
-            not plain
-            or not parents
-            or any(EFFECTS[n].family not in _OUTSIDE for n in parents)
-            or "motor" not in effect.acts_on
-        ):
-            continue
-        label = f"{effect.key}@motor" if len(effect.acts_on) > 1 else effect.key
-        if label in there or model.has(effect.key, "motor") or effect.warms:
-            continue
-        bigger = model.add(label)
-        term = next(t for t in bigger.terms if t.label == label)
-        pairs = list(zip(term.names, effect.parameters, strict=True))
-        names = [tuple(n for n, p in pairs if p.is_shape is shape) for shape in (False, True)]
-        found.append(Candidate(label, effect, "motor", bigger, *names))
-    return found
-
-
-def _only_outside(ranking: Ranking) -> Ranking:
-    """The ranking without effects that cannot ride outside as a torque."""
-
-    def fits(effect: Any) -> bool:
-        return effect.family in _OUTSIDE
-
-    gone = {t.key: t for t in ranking.everything if not fits(t.candidate.effect)}
-    refused = tuple(NotTestable(key, "it cannot ride outside the FMU as a torque") for key in gone)
-    return replace(
-        ranking,
-        trials=tuple(t for t in ranking.trials if fits(t.candidate.effect)),
-        everything=tuple(t for t in ranking.everything if fits(t.candidate.effect)),
-        significant=frozenset(
-            n for n in ranking.significant if n not in {t.candidate.label for t in gone.values()}
-        ),
-        not_testable=(*ranking.not_testable, *refused),
-    )
-
-
-__all__ = ["Correction", "UserDiagnosis", "diagnose", "held_to_outputs", "with_nuisance"]
+__all__ = ["Correction", "UserDiagnosis", "diagnose", "held_to_outputs", "with_outside"]

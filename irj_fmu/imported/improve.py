@@ -16,7 +16,7 @@ from identification.diagnosis.improvement import Improvement, held_drop
 from identification.diagnosis.session import LEAST_ADDED_DROP, MAX_ADDITIONS, with_held_out
 from identification.diagnosis.verdict import verdict_of
 from irj_fmu.imported.compare import compare
-from irj_fmu.imported.diagnose import UserDiagnosis, diagnose, held_to_outputs
+from irj_fmu.imported.diagnose import UserDiagnosis, diagnose, held_to_outputs, with_outside
 from irj_fmu.imported.fit import fit
 from irj_fmu.imported.model import UserModel, listed
 from irj_fmu.imported.outputs import UserComparison
@@ -113,7 +113,35 @@ def improve(
         return fitted, compare(fitted, held)
 
     start, outputs = looked_at(model, 0)
-    diagnoses, compared = [diagnose(start, train, held)], [outputs]
+    begun = diagnose(start, train, held)
+    if not begun.why_followed:
+        if begun.claims and max_additions > 1:
+            begun = diagnose(start, train, held, most=max_additions)
+        steps = begun.diagnosis.found.steps
+        models, compared = [start], [outputs]
+        aside: list[str] = []
+        for number, (claim, step) in enumerate(
+            zip(begun.diagnosis.found.claims, steps[1:], strict=True), 1
+        ):
+            joint = step.solution.model
+            place = next(t.place for t in joint.terms if t.label == claim.label)
+            now, after = models[-1], compared[-1]
+            if begun.stays(claim.effect, place):
+                aside.append(claim.effect.title)
+            else:
+                say(f"adding {claim.label}", number / (max_additions + 1))
+                larger = with_outside(now, joint, claim.label, step.solution.values)
+                now, after = looked_at(larger, number)
+            models.append(now)
+            compared.append(after)
+        say("done", 1.0)
+        found = replace(begun.diagnosis.found, data=replace(begun.data, note=note))
+        return UserImprovement(
+            _with_aside(found, compared[-1], aside),
+            tuple(replace(begun, model=m) for m in models),
+            tuple(compared),
+        )
+    diagnoses, compared = [begun], [outputs]
     claims: list[Claim] = []
     following = None
     while diagnoses[-1].claims:
@@ -147,6 +175,17 @@ def improve(
     return UserImprovement(
         _result(diagnoses, compared, claims, following, note), tuple(diagnoses), tuple(compared)
     )
+
+
+def _with_aside(found: Improvement, outputs: UserComparison, aside: Sequence[str]) -> Improvement:
+    """The result of restarts: held to the outputs where all that is named rides outside."""
+    if not aside:
+        return held_to_outputs(found, outputs)
+    reason = (
+        f"{found.reason} The outputs are those without {' and '.join(aside)}, which cannot ride "
+        "outside the FMU as a torque at its drive."
+    )
+    return replace(found, reason=reason)
 
 
 def _size(outputs: UserComparison) -> float:

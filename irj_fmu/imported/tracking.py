@@ -11,7 +11,6 @@ physics that the FMU lacks is still to be explained.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Final, final
 
 import numpy as np
@@ -124,48 +123,57 @@ def inertia_of(runner: Runner, window: Window, values: Mapping[str, float], port
     return 1.0 / acceleration
 
 
-def balanced_records(
-    model: UserModel, records: Sequence[Record], values: Mapping[str, float] | None = None
-) -> list[Record]:
-    """Records with the position as measured, and as motor torque what the FMU leaves for
-    acceleration.
+@final
+class Following:
+    """An FMU that follows measured motions.
 
     Parameters
     ----------
     model : UserModel
-    records : sequence of Record
-    values : mapping, optional
-        Parameters of the FMU, in place of the model's.
+        With a window of None.
+    first : Window
+        Of the first record: the inertia is taken from its start.
 
-    Returns
-    -------
-    list of Record
-        ``motor_torque`` on the motor shaft, and the position that the FMU follows.
+    Attributes
+    ----------
+    inertia : float
+        Link-referred torque per link-referred acceleration of the position [kg.m2].
 
     Raises
     ------
     InputError
-        Where no drive or no position is mapped, or a record is too short.
+        Where no drive or no position is mapped, or the drive moves nothing.
     """
-    port = port_of(model)
-    whole = replace(model, window=None)
-    own = {p.name: p.value for p in model.parameters} | {
-        k: v for k, v in (values or {}).items() if k in {p.name for p in model.parameters}
-    }
-    law = feedback_of(model, {**model.values, **(values or {})})
-    runner = whole.runner()
-    found = []
-    for number, record in enumerate(records):
-        windows = whole.windows([record])
-        if number == 0:
-            runner.choose_substeps(windows[0], own)
-            tracker = Tracker(
-                port, len(model.inputs), inertia_of(runner, windows[0], own, port), law
-            )
-        found.append(
-            _joined(record, model, port, [(w, *_left(runner, w, own, tracker)) for w in windows])
-        )
-    return found
+
+    def __init__(self, model: UserModel, first: Window) -> None:
+        self.model, self.port = model, port_of(model)
+        self.values = {p.name: p.value for p in model.parameters}
+        self.runner = model.runner()
+        self.runner.choose_substeps(first, self.values)
+        self._inertia = inertia_of(self.runner, first, self.values, self.port)
+        self.inertia = self._inertia * self.port.torque / self.port.position
+
+    def record(self, record: Record, values: Mapping[str, float] | None = None) -> Record:
+        """A record with the position as measured, and as torque on the motor shaft what the FMU
+        leaves for acceleration.
+
+        Parameters
+        ----------
+        record : Record
+        values : mapping, optional
+            Parameters of the FMU and of what rides outside it, in place of the model's.
+
+        Raises
+        ------
+        InputError
+            Where the record is too short.
+        """
+        model, given = self.model, values or {}
+        own = {**self.values, **{k: v for k, v in given.items() if k in self.values}}
+        law = feedback_of(model, {**model.values, **given})
+        tracker = Tracker(self.port, len(model.inputs), self._inertia, law)
+        parts = [(w, *_left(self.runner, w, own, tracker)) for w in model.windows([record])]
+        return _joined(record, model, self.port, parts)
 
 
 def _left(
@@ -201,4 +209,4 @@ def _joined(
     return made.without("run")
 
 
-__all__ = ["BANDWIDTH", "Tracker", "balanced_records", "inertia_of", "smooth_slope"]
+__all__ = ["BANDWIDTH", "Following", "Tracker", "inertia_of", "smooth_slope"]

@@ -33,6 +33,7 @@ BANDWIDTH: Final = 30.0
 """Bandwidth of the position controller's default gains [rad/s]; its damping ratio is 0.8."""
 _DAMPING: Final = 0.8
 _MOTOR: Final = ("motor_position", "motor_velocity")
+_LINK_POSITION, _LINK_VELOCITY = (CHANNELS.index(n) for n in ("link_position", "link_velocity"))
 
 
 @final
@@ -233,9 +234,14 @@ class _Builder:
         rates = ca.vertcat(
             rates[: size if self.stepped else size + held], *([1] if self.clocked else [])
         )
-        channels = self._readings(
-            f.outputs(full, model_input, p), drive - f.drive_lag(p) * ca.jtimes(drive, x, rates)
-        )
+        outputs = f.outputs(full, model_input, p)
+        for name in self.model.named("delay", "link_position_sensor"):
+            at = self.model.parameter_names.index(name)
+            timely = ca.vertcat(p[:at], 0, p[at + 1 :])
+            bend = ca.jtimes(f.outputs(full, model_input, timely)[_LINK_VELOCITY], x, rates)
+            # stiffness makes a torque of what the first order of a late encoder leaves
+            outputs[_LINK_POSITION] += p[at] ** 2 / 2 * bend
+        channels = self._readings(outputs, drive - f.drive_lag(p) * ca.jtimes(drive, x, rates))
         if options.sensors:
             readings = Readings(self._parameter, clock, options.sample_time)
             channels = [readings.read(*pair) for pair in channels]

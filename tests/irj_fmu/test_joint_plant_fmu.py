@@ -16,6 +16,8 @@ from casadi_models import JointModel, thesis
 from casadi_models.simulate import simulate
 from identification.data.joint_file import Joint
 from identification.errors import InputError
+from identification.online.watch import Q_L
+from irj_fmu.effect_table import joint_with, readings_of
 from irj_fmu.host.exchange import Exchange, simulate_me
 from irj_fmu.host.run import Fmu, Instance, Trajectory, Wiring, simulate_cs
 from irj_fmu.host.signals import Table
@@ -337,3 +339,16 @@ def test_linear_axis_has_linear_units(tmp_path: Path) -> None:
 def test_current_needs_a_motor_constant() -> None:
     with pytest.raises(InputError, match="motor_constant"):
         plant_spec(Joint(name="bare"), PlantOptions(drive="current"))
+
+
+def test_a_late_link_encoder_reads_what_was() -> None:
+    """Six samples late: the position of six samples ago, to a tenth of the second order of the
+    delay, which the stiffness would make a torque of.
+    """
+    late = joint_with("channel_delay@link_position_sensor")
+    samples = round(late.fitted["link_position_sensor_delay"] / STEP)
+    timely = replace(late, fitted={**late.fitted, "link_position_sensor_delay": 0.0})
+    read, true = (readings_of(j, stop=2.0)[:, Q_L] for j in (late, timely))
+    error = np.abs(read[samples:] - true[:-samples]).max()
+    bend = np.abs(np.diff(true, 2)).max() * samples**2 / 2
+    assert error < bend / 10

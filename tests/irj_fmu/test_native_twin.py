@@ -5,6 +5,7 @@ hosts, platforms.
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -811,3 +812,32 @@ def test_valgrind_finds_nothing(fmu: Path, table: FloatArray, tmp_path: Path) ->
     )
     checker = ["valgrind", "-q", "--error-exitcode=9", "--leak-check=full", str(program)]
     replay(checker, "fmu/binaries/linux64/native.so", fmu, hurt(table)[:16_500], tmp_path)
+
+
+# --- written once ---------------------------------------------------------------------------------
+
+FIGURE = re.compile(r"(?<![\w.])(?:\d+\.\d*|\.\d+|\d+)(?:[eE][+-]?\d+)?(?![\w.])")
+PLAIN_NUMBERS = {"0", "1", "2", "3", "4", "5", "0.5", "1.0"}
+"""Counts, indices, halves and wholes. No limit, time or factor of the estimator is among them."""
+OTHER_NUMBERS = {
+    "native_estimator.c": ["768"],
+    "native_fault.c": ["11", "13", "16"],
+    "native_residuals.c": ["16", "17", "18"],
+    "native_state.h": ["40", "64"],
+}
+"""Room for texts, and positions in the outputs of the observer and among the residuals."""
+
+
+def test_no_figure_of_the_estimator_stands_in_c(spec: NativeSpec) -> None:
+    """Every limit, time, factor and kernel comes from the Python that has it; what the C has of its
+    own are sizes of the FMI's texts and positions.
+    """
+    sources, _ = native_sources(spec)
+    own = {n for n in sources if n.startswith("native_")} - {"native_config.h", "native_model.c"}
+    assert len(own) > 8
+    found = {}
+    for name in own:
+        text = re.sub(r"/\*.*?\*/|\"(?:[^\"\\]|\\.)*\"", "", sources[name].decode(), flags=re.S)
+        code = [line for line in text.splitlines() if not line.startswith(("#define", "enum"))]
+        found[name] = sorted(set(FIGURE.findall("\n".join(code))) - PLAIN_NUMBERS)
+    assert {n: v for n, v in found.items() if v} == OTHER_NUMBERS

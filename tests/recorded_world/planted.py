@@ -326,7 +326,9 @@ def _sets(result: Mapping[str, Any]) -> list[tuple[frozenset[str], bool]]:
         for c in result["claims"]
         if "curve" not in c
     ]
-    return claims + [(frozenset(map(str, x["effects"])), False) for x in result.get("lines", [])]
+    lines = [frozenset(map(str, x["effects"])) for x in result.get("lines", [])]
+    # a line without a name names nothing
+    return claims + [(names, False) for names in lines if names]
 
 
 def _calibrated(result: Mapping[str, Any]) -> bool:

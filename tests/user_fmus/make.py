@@ -40,6 +40,13 @@ MODELS: Final = {
         ("angle", "speed"),
         ("torque",),
     ),
+    "Elastic": Shape(
+        "ELASTIC",
+        ("qm", "wm", "ql", "wl"),
+        ("motor_inertia", "link_inertia", "stiffness", "damping", "viscous", "coulomb", "gravity"),
+        ("motor_angle", "motor_speed", "link_angle", "link_speed", "gear_torque"),
+        ("torque",),
+    ),
 }
 START: Final = {
     "x0": 2.0,
@@ -54,7 +61,14 @@ START: Final = {
     "coulomb": 1.0,
     "gravity": 5.0,
     "idle": 1.0,
+    **dict.fromkeys(("qm", "wm", "ql", "wl"), 0.0),
+    "motor_inertia": 4.0e-4,
+    "link_inertia": 11.0,
+    "stiffness": 2.0e4,
+    "damping": 25.0,
 }
+OWN_START: Final = {"Elastic": {"viscous": 2.0e-3, "coulomb": 0.15, "gravity": 55.0}}
+"""Start values that a model has otherwise."""
 OFFSET: Final = {"states": 1, "derivatives": 11, "inputs": 21, "parameters": 31, "outputs": 41}
 
 
@@ -129,13 +143,14 @@ def build(name: str, folder: Path, make: Make | None = None) -> Path:
 
 
 def _rows(
-    shape: Shape, make: Make
+    name: str, shape: Shape, make: Make
 ) -> list[tuple[str, int, str, str, str, float | None, int | None]]:
     """(name, value reference, causality, variability, initial, start, state of a derivative)."""
     o = OFFSET
+    first = START | OWN_START.get(name, {})
     rows: list[tuple[str, int, str, str, str, float | None, int | None]] = []
     rows += [
-        (n, o["states"] + i, "local", "continuous", "exact", START[n], None)
+        (n, o["states"] + i, "local", "continuous", "exact", first[n], None)
         for i, n in enumerate(shape.states)
     ]
     rows += [
@@ -148,7 +163,7 @@ def _rows(
     ]
     kind = make.says or ("fixed" if make.strict else "tunable")
     rows += [
-        (n, o["parameters"] + i, "parameter", kind, "exact", START[n], None)
+        (n, o["parameters"] + i, "parameter", kind, "exact", first[n], None)
         for i, n in enumerate(shape.parameters)
     ]
     rows += [
@@ -180,7 +195,7 @@ def _two(name: str, guid: str, shape: Shape, make: Make) -> str:
         named = [f'<Unit name="{unit}"/>' for unit in sorted(set(units.values()))]
         lines.append(f"<UnitDefinitions>{''.join(named)}</UnitDefinitions>")
     lines.append("<ModelVariables>")
-    rows = _rows(shape, make)
+    rows = _rows(name, shape, make)
     for n, vr, causality, variability, initial, start, state in rows:
         about = _attributes(
             {
@@ -230,7 +245,7 @@ def _three(name: str, token: str, shape: Shape, make: Make) -> str:
         '<ModelVariables><Float64 name="time" valueReference="0" causality="independent" '
         'variability="continuous"/>'
     )
-    for n, vr, causality, variability, initial, start, state in _rows(shape, make):
+    for n, vr, causality, variability, initial, start, state in _rows(name, shape, make):
         about = _attributes(
             {
                 "name": n,

@@ -25,6 +25,27 @@ static const double start_x[NX] = {1.0}, start_p[NP] = {1.0}, start_u[1] = {0.0}
 static void model_f(const cplx *x, const cplx *u, const cplx *p, cplx *dx) { dx[0] = -p[0] * x[0]; }
 static void model_y(const cplx *x, const cplx *u, const cplx *p, cplx *y) { y[0] = x[0]; }
 
+#elif defined MODEL_ELASTIC /* motor, gear of ratio 100 as a spring with damping, hanging link; motor side on its own shaft */
+#define NX 4
+#define NU 1
+#define NP 7
+#define NY 5
+#define GEAR 100.0
+static const double start_x[NX] = {0, 0, 0, 0}, start_u[NU] = {0.0};
+static const double start_p[NP] = {4.0e-4, 11.0, 2.0e4, 25.0, 2.0e-3, 0.15, 55.0};
+static cplx spring(const cplx *x, const cplx *p) { return p[2] * (x[0] / GEAR - x[2]) + p[3] * (x[1] / GEAR - x[3]); }
+static void model_f(const cplx *x, const cplx *u, const cplx *p, cplx *dx) {
+    cplx t = spring(x, p);
+    dx[0] = x[1];
+    dx[1] = (u[0] - p[4] * x[1] - p[5] * ctanh(x[1] / (GEAR * 2e-3)) - t / GEAR) / p[0];
+    dx[2] = x[3];
+    dx[3] = (t - p[6] * csin(x[2])) / p[1];
+}
+static void model_y(const cplx *x, const cplx *u, const cplx *p, cplx *y) {
+    for (int i = 0; i < 4; i++) y[i] = x[i];
+    y[4] = spring(x, p);
+}
+
 #else /* an axis: inertia, viscous and Coulomb friction, gravity; and a parameter that acts on nothing */
 #define NX 2
 #define NU 1

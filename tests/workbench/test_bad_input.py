@@ -130,7 +130,7 @@ def test_unit_of_another_dimension(said: Say, tmp_path: Path) -> None:
     [
         (("time_s",), "no column is recognised as time"),
         (
-            ("motor_current_A", "link_torque_Nm"),
+            ("motor_current_A", "link_torque_Nm", "link_position_rad", "link_velocity_rad_s"),
             "channel motor_current is missing: measure it or name its column in [columns]",
         ),
         (("motor_position_rad", "motor_velocity_rad_s"), "motor_position is missing"),

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.fault_plant import plant
+from benchmarks.faults.plant import plant
 from workbench.cli.main import main
 
 

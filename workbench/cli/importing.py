@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from argparse import Namespace
 from pathlib import Path
 from typing import Any, Final
@@ -22,13 +23,22 @@ def run_import(arguments: Namespace) -> int:
     path = Path(arguments.records[0])
     if not path.exists():
         raise InputError(f"{path}: there is no such file; check the path")
+    ratio = arguments.gear_ratio
+    if ratio is not None and (ratio == 0.0 or not math.isfinite(ratio)):
+        raise InputError(f"--gear-ratio is {ratio:g}; give theta_motor / theta_link with its sign")
     made = survey(
         path,
         kind=arguments.kind,
         number=arguments.joint_number,
-        gear_ratio=arguments.gear_ratio,
+        gear_ratio=ratio,
         name=str(path),
     )
+    wanted = arguments.joint_number
+    if wanted not in (None, -1) and wanted not in made.joints:
+        joints = f"{made.joints[0]} to {made.joints[-1]}" if made.joints else "one joint"
+        raise InputError(
+            f"{path}: no joint {wanted}; its columns are those of {joints} (-1: all are one joint)"
+        )
     for line in lines(made, path):
         print(line)
     joint = _joint(made, path, arguments)

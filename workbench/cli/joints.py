@@ -1,12 +1,13 @@
-"""joints: the library of identified joints."""
+"""joints, joint: the library of identified joints; a first joint file for somebody else's FMU."""
 
 from __future__ import annotations
 
+import sys
 from argparse import Namespace
 
 from identification.data.joint_library import Entry, chosen, entries, packaged, side_by_side
 from identification.errors import InputError
-from workbench.cli.files import write_json
+from workbench.cli.files import open_joint, open_records, write_json, write_text
 
 
 def run_joints(arguments: Namespace) -> int:
@@ -65,3 +66,25 @@ def _compared(arguments: Namespace, among: list[Entry]) -> None:
         spread = row["spread_percent"]
         print(f"{label:<{first}}{cells}    {'' if spread is None else f'{spread:.3g} %'}".rstrip())
     write_json(arguments.json, {"joints": [e.as_json() for e in given], "rows": rows})
+
+
+def run_joint(arguments: Namespace) -> int:
+    """`irj joint new MODEL.fmu --record REC`."""
+    from irj_fmu.first_joint import first_joint
+    from irj_fmu.host.fmu import FmuError
+
+    known = open_joint(arguments.like) if arguments.like else None
+    records, _ = open_records([arguments.record], known)
+    try:
+        text = first_joint(arguments.fmu, records[0], known)
+    except FmuError as error:
+        raise InputError(str(error)) from error
+    guesses = [line for line in text.splitlines() if "#" in line]
+    if arguments.output:
+        write_text(arguments.output, text)
+        print("\n".join(guesses))
+        print(f"joint file: {arguments.output}")
+    else:
+        sys.stdout.write(text)
+    write_json(arguments.json, {"file": arguments.output, "guesses": guesses})
+    return 0

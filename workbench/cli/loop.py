@@ -301,6 +301,50 @@ def run_fit(arguments: Namespace) -> int:
     return 0
 
 
+def run_twostep(arguments: Namespace) -> int:
+    """`irj twostep`."""
+    from identification.two_step.offline import fit_records
+
+    joint = open_joint(arguments.joint)
+    records, warnings = open_records(arguments.records, joint)
+    found = fit_records(records, joint, method=arguments.method, cutoff=arguments.cutoff)
+    units = {p.name: p.unit for p in joint.model().parameters}
+    print(found.outcome)
+    print(f"{found.samples} samples, {found.evaluations} evaluations of the search")
+    for name, value in found.values.items():
+        notes = [
+            text
+            for text, names in (
+                ("not identifiable", found.unidentifiable),
+                ("held", found.frozen),
+                ("at its bound", found.at_bound),
+            )
+            if name in names
+        ]
+        said = f" ({', '.join(notes)})" if notes else ""
+        print(f"  {name:<28} {value:.6g} +- {found.deviation[name]:.2g} {units[name]}{said}")
+    write_json(
+        arguments.json,
+        {
+            "method": arguments.method,
+            "outcome": found.outcome.value,
+            "parameters": {
+                n: {"value": v, "deviation": found.deviation[n], "unit": units[n]}
+                for n, v in found.values.items()
+            },
+            "shapes": list(found.nonlinear),
+            "unidentifiable": list(found.unidentifiable),
+            "frozen": list(found.frozen),
+            "at_bound": list(found.at_bound),
+            "residual_deviation": found.residual_deviation.tolist(),
+            "evaluations": found.evaluations,
+            "samples": found.samples,
+            "warnings": warnings,
+        },
+    )
+    return 0
+
+
 def _refined(fitted: Fit) -> Fit:
     """The fit refined by the error of its simulated outputs, and what that gained."""
     from identification.fitting.output_error import refine

@@ -146,6 +146,49 @@ def parser() -> OneLineParser:
     resampled.add_argument(
         "-o", "--output", metavar="OUT", required=True, help="record file to write, .csv or .npz"
     )
+    smoothed = verb(
+        "prefilter",
+        "records",
+        "the thesis's low-pass on every channel alike, derivatives, fewer samples",
+    )
+    smoothed.add_argument("records", nargs=1, metavar="FILE", help="record file")
+    smoothed.add_argument("--joint", metavar="J", help="joint file: column map")
+    smoothed.add_argument(
+        "--cutoff", type=float, default=15.0, metavar="HZ", help="of one pass (default 15)"
+    )
+    smoothed.add_argument(
+        "--order", type=_count, default=8, metavar="N", help="of one pass (default 8)"
+    )
+    smoothed.add_argument(
+        "--derivatives", action="store_true", help="add velocities and accelerations"
+    )
+    smoothed.add_argument(
+        "--trim", type=_count, default=49, metavar="N", help="samples dropped at each end"
+    )
+    smoothed.add_argument(
+        "--every", type=_count, default=1, metavar="N", help="keep every Nth sample (default 1)"
+    )
+    smoothed.add_argument(
+        "-o", "--output", metavar="OUT", required=True, help="record file to write, .csv or .npz"
+    )
+    levelled = verb(
+        "accelerometer",
+        "records",
+        "offset and volts per g of an accelerometer from files at rest",
+    )
+    levelled.add_argument("--up", metavar="FILE", required=True, help="face up, +1 g")
+    levelled.add_argument("--down", metavar="FILE", required=True, help="face down, -1 g")
+    levelled.add_argument(
+        "--horizontal",
+        nargs="+",
+        action="extend",
+        metavar="FILE",
+        default=[],
+        help="horizontal, 0 g: the offset is then their mean",
+    )
+    levelled.add_argument(
+        "--column", metavar="NAME", help="column of the output [V] (default: the only one)"
+    )
     fitted = verb("fit", "loop", "fit the joint's model", records=True, joint=True)
     other_payload(fitted)
     fitted.add_argument(
@@ -154,6 +197,22 @@ def parser() -> OneLineParser:
         help="refine by the error of the simulated outputs (slower, less bias by noise)",
     )
     fitted.add_argument("-o", "--output", metavar="FILE", help="write the fitted joint file")
+    separated = verb(
+        "twostep",
+        "loop",
+        "the thesis's two-step fit: shapes by coordinate search, the rest by least squares",
+        records=True,
+        joint=True,
+    )
+    separated.add_argument(
+        "--method",
+        choices=("variable_projection", "alternating"),
+        default="variable_projection",
+        help="eliminate the linear parameters inside the search (default), or take turns",
+    )
+    separated.add_argument(
+        "--cutoff", type=float, default=15.0, metavar="HZ", help="of the prefilter (default 15)"
+    )
     compared = verb(
         "compare",
         "loop",
@@ -509,6 +568,16 @@ def parser() -> OneLineParser:
     plain.add_argument(
         "--picture", metavar="FILE.svg", help="draw Bode plots and poles of the best model"
     )
+    first = verb("joint", "joints", "a first joint file for somebody else's FMU")
+    first.add_argument("what", choices=("new",), help="write a new one")
+    first.add_argument("fmu", metavar="MODEL.fmu", help="the FMU")
+    first.add_argument(
+        "--record", metavar="REC", required=True, help="a record of the joint: its channels"
+    )
+    first.add_argument(
+        "--like", metavar="J", help="joint file with the gear ratio and the motor constant"
+    )
+    first.add_argument("-o", "--output", metavar="J", help="where to write (default: print)")
     joints = verb("joints", "joints", "the library of identified joints")
     joints.add_argument(
         "what",

@@ -1,4 +1,6 @@
-"""check: is a record fit for use? resample: the record on an even grid."""
+"""check: is a record fit for use? resample: the record on an even grid. prefilter: low-pass and
+derivatives. accelerometer: its calibration at rest.
+"""
 
 from __future__ import annotations
 
@@ -7,15 +9,24 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from identification.balance.dataset import load_dataset, prepared_model
 from identification.data.check.checks import Finding, check, repair
 from identification.data.check.gate import inspected, passed
 from identification.data.joint_file import Joint
-from identification.data.read import read
+from identification.data.prepare import (
+    STANDARD_GRAVITY,
+    calibrate_accelerometer,
+    decimated,
+    filtered,
+    trimmed,
+    with_derivatives,
+)
+from identification.data.read import open_table, read
 from identification.data.record import Record
 from identification.errors import InputError
-from workbench.cli.files import open_joint, write_json
+from workbench.cli.files import open_joint, open_records, write_json
 from workbench.cli.virtual import write_table
 
 
@@ -52,8 +63,7 @@ def run_resample(arguments: Namespace) -> int:
     """
     joint = open_joint(arguments.joint) if arguments.joint else None
     path = arguments.records[0]
-    if Path(arguments.output).suffix not in (".csv", ".npz"):
-        raise InputError(f"{arguments.output}: give a name that ends in .csv or .npz")
+    _table_name(arguments.output)
     record = read(
         path, columns=joint.columns if joint else None, kind=joint.kind if joint else None
     )
@@ -64,12 +74,7 @@ def run_resample(arguments: Namespace) -> int:
     for finding in stamps:
         print(f"{finding.severity}: {finding.message}")
     even = repair(record)
-    table = {"time_s": np.asarray(even.time)} | {
-        f"{c}{_suffix(even.unit(c))}": np.asarray(v) for c, v in even.channels.items() if c != "run"
-    }
-    if len(even.segments()) > 1:
-        table["run"] = even.segment.astype(np.float64)
-    write_table(Path(arguments.output), table)
+    _write_record(Path(arguments.output), even)
     lost = 0 if even.measured is None else int(np.sum(~even.measured))
     print(
         f"{arguments.output}: {len(even)} samples in {len(even.segments())} run(s), step "
@@ -84,6 +89,90 @@ def run_resample(arguments: Namespace) -> int:
     }
     write_json(arguments.json, out)
     return 0
+
+
+def run_prefilter(arguments: Namespace) -> int:
+    """`irj prefilter`: every channel through the same low-pass, forward and backward."""
+    joint = open_joint(arguments.joint) if arguments.joint else None
+    _table_name(arguments.output)
+    (record,), _ = open_records(arguments.records, joint)
+    smooth = filtered(record.resampled(), arguments.cutoff, arguments.order)
+    if arguments.derivatives:
+        smooth = with_derivatives(smooth)
+    if arguments.trim:
+        smooth = trimmed(smooth, arguments.trim)
+    if arguments.every > 1:
+        smooth = decimated(smooth, arguments.every)
+    _write_record(Path(arguments.output), smooth)
+    for note in smooth.provenance.notes:
+        print(note)
+    print(
+        f"{arguments.output}: {len(smooth)} samples, step {smooth.dt:.6g} s, channels "
+        f"{', '.join(c for c in smooth.channels if c != 'run')}"
+    )
+    write_json(
+        arguments.json,
+        {
+            "samples": len(smooth),
+            "step_s": smooth.dt,
+            "cutoff_hz": arguments.cutoff,
+            "order": arguments.order,
+            "notes": list(smooth.provenance.notes),
+        },
+    )
+    return 0
+
+
+def run_accelerometer(arguments: Namespace) -> int:
+    """`irj accelerometer`: the static calibration of annex A."""
+    up, down = (_volts(path, arguments.column) for path in (arguments.up, arguments.down))
+    level = [_volts(path, arguments.column) for path in arguments.horizontal]
+    found = calibrate_accelerometer(up, down, np.concatenate(level) if level else None)
+    print(f"offset {found.offset:.6g} V, {found.volts_per_g:.6g} V per g")
+    noise = float(np.std(up)) / abs(found.volts_per_g) * STANDARD_GRAVITY
+    print(f"acceleration = (volts - {found.offset:.6g}) / {found.volts_per_g:.6g} * 9.80665 m/s2")
+    print(f"noise at rest {noise:.2g} m/s2")
+    write_json(
+        arguments.json,
+        {
+            "offset_v": found.offset,
+            "volts_per_g": found.volts_per_g,
+            "noise_m_s2": noise,
+            "samples": [len(up), len(down), *(len(v) for v in level)],
+        },
+    )
+    return 0
+
+
+def _volts(path: str, column: str | None) -> npt.NDArray[np.float64]:
+    """The column of an accelerometer in a file."""
+    table = open_table(Path(path))
+    names = [n for n in table.names if n not in ("time", "time_s", "t")]
+    chosen = column if column is not None else names[0] if len(names) == 1 else None
+    if chosen is None or chosen not in table.names:
+        said = "no column is named" if chosen is None else f"no column {chosen!r}"
+        raise InputError(f"{path}: {said}; give --column with one of {', '.join(names)}")
+    values = np.asarray(table.load([chosen], [])[chosen], dtype=np.float64)
+    if not values.size or not np.isfinite(values).all():
+        raise InputError(f"{path}: column {chosen} holds no number in some rows; cut them out")
+    return values
+
+
+def _table_name(output: str) -> None:
+    if Path(output).suffix not in (".csv", ".npz"):
+        raise InputError(f"{output}: give a name that ends in .csv or .npz")
+
+
+def _write_record(path: Path, record: Record) -> None:
+    """A record as a table with units in the heads."""
+    table = {"time_s": np.asarray(record.time)} | {
+        f"{c}{_suffix(record.unit(c))}": np.asarray(v)
+        for c, v in record.channels.items()
+        if c != "run"
+    }
+    if len(record.segments()) > 1:
+        table["run"] = record.segment.astype(np.float64)
+    write_table(path, table)
 
 
 def _suffix(unit: str) -> str:

@@ -202,15 +202,25 @@ def run_diagnose(arguments: Namespace) -> int:
             print(f"irj: {text}", file=sys.stderr)
     if found.data.note:
         print(f"note: {found.data.note}")
-    balance = found.error.balances["axis"]
-    print(
-        f"torque that the FMU leaves unexplained: {balance.rms:.3g} {balance.unit} on held-out "
-        f"data, noise {balance.floor:.3g} {balance.unit}"
-    )
+    if found.why_followed:
+        print(f"irj: seen at the drive alone: {found.why_followed}", file=sys.stderr)
+    for name, balance in found.error.balances.items():
+        where = "" if name == "axis" else f" in the {name} balance"
+        print(
+            f"torque that the FMU leaves unexplained{where}: {balance.rms:.3g} {balance.unit} on "
+            f"held-out data, noise {balance.floor:.3g} {balance.unit}"
+        )
     print(found)
     print_untested(found.ranking.not_testable, verbose=arguments.verbose)
     if found.claims:
-        _offer(found, arguments)
+        joint = found.diagnosis.found.steps[-1].solution.model
+        label = found.claims[0].label
+        place = next(t.place for t in joint.terms if t.label == label)
+        why = found.stays(found.claims[0].effect, place)
+        if why:
+            print(f"{label} {why}: it is named, not added")
+        else:
+            _offer(found, arguments)
     for key in arguments.why:
         print(found.diagnosis.why(key))
     write_json(arguments.json, found.as_json())
@@ -254,7 +264,10 @@ def run_improve(arguments: Namespace) -> int:
     from workbench.cli.loop import print_improvement, write_picture
 
     found = _improved(arguments, arguments.report, arguments.max_steps)
-    print("balance at the drive:")
+    followed = found.diagnoses[0].why_followed
+    if followed:
+        print(f"irj: seen at the drive alone: {followed}", file=sys.stderr)
+    print("balance at the drive:" if followed else "balances:")
     print_improvement(found.found, verbose=arguments.verbose)
     print("outputs on held-out data:")
     for step, outputs in zip(found.found.steps, found.outputs, strict=True):

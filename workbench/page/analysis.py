@@ -211,6 +211,17 @@ class Analysis:
             label: (now, made, entry),
         }
 
+    def trial_of(self, label: str) -> StepEntry:
+        """The step that adding an effect would make; it is at hand for `add` then.
+
+        Raises
+        ------
+        InputError
+            The effect is in the model already, or cannot be there.
+        """
+        self.prepare(label)
+        return self._prepared[label][2]
+
     def settle(self, step: StepEntry) -> StepEntry:
         """The whole fit of a step that was only looked at."""
         began, now = time.perf_counter(), self.current

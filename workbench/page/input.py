@@ -17,10 +17,10 @@ from identification.data.joint_schema import JOINT
 from identification.data.plain_text import from_toml, tables_text
 from identification.errors import InputError
 from workbench.page.charts.choices import held_text, windows_of
+from workbench.page.desk.tree import LONGEST_NAME, given, opened, remarked, used_files
 from workbench.page.live import Live
 from workbench.page.records import guessed_role, surveyed
 from workbench.page.session import FileEntry, State
-from workbench.page.tree import LONGEST_NAME, given, opened, remarked, used_files
 
 LARGEST_JOINT: Final = 1 << 20
 NUMBERS: Final = tuple(key.name for key in JOINT.keys if key.kind == "number")

@@ -15,9 +15,9 @@ from identification.data.plain_text import from_toml
 from identification.data.record import Record
 from identification.errors import InputError
 from workbench.page.analysis import Analysis, Progress
+from workbench.page.desk.tree import after_input, given
 from workbench.page.records import checked, opened, without_windows
 from workbench.page.session import FileEntry, Session, State
-from workbench.page.tree import after_input, given
 from workbench.page.work import CancelledError, Task, Worker
 
 Change = Callable[[State], State]
@@ -130,7 +130,7 @@ class Live:
 
     def _moved(self, before: State, after: State) -> State:
         """`after`; what was prepared for another input, or another model, is given up."""
-        if before.joint_text != after.joint_text or given(before) != given(after):
+        if given(before) != given(after):
             self.worker.give_up()
             self._analysis = None
         elif before.steps[-1:] != after.steps[-1:] and self._analysis is not None:
@@ -139,6 +139,8 @@ class Live:
                 self._analysis.restore(after.steps[-1])
             else:
                 self._analysis = None
+        if before.joint_text != after.joint_text and self._analysis is not None:
+            self._analysis.joint = joint_of(after)
         return after
 
     def snapshot(self) -> dict[str, Any]:
@@ -169,12 +171,7 @@ class Live:
         InputError
             None yet, or not a valid one.
         """
-        if not self.state.joint_text:
-            raise InputError(
-                "no joint yet: fill in gear ratio, motor constant and model on the Model page"
-            )
-        source = self.state.joint_source or "joint"
-        return parse_joint(from_toml(self.state.joint_text, source), source)
+        return joint_of(self.state)
 
     # --- records and analysis ---------------------------------------------------------------------
 
@@ -400,6 +397,8 @@ class Live:
                     made = change(self.state)
                     if given(made) != given(self.state):
                         self._analysis = None
+                    elif made.joint_text != self.state.joint_text and self._analysis is not None:
+                        self._analysis.joint = joint_of(made)
                     self.state = self.session.save(made)
                 except OSError as problem:
                     error = (
@@ -440,6 +439,22 @@ class Live:
         self.tell()
         job.task.stop()
         return True
+
+
+def joint_of(state: State) -> Joint:
+    """The joint of a state.
+
+    Raises
+    ------
+    InputError
+        None yet, or not a valid one.
+    """
+    if not state.joint_text:
+        raise InputError(
+            "no joint yet: fill in gear ratio, motor constant and model on the Model page"
+        )
+    source = state.joint_source or "joint"
+    return parse_joint(from_toml(state.joint_text, source), source)
 
 
 def hint_for(state: State, label: str) -> Mapping[str, Any] | None:

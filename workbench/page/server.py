@@ -34,8 +34,8 @@ from identification.crash import internal_error
 from identification.data.plain_text import from_json
 from identification.errors import InputError
 from irj_fmu.command_line import system_refusal
-from workbench.page import tree
 from workbench.page import verbs as app_verbs
+from workbench.page.desk import home, tree
 from workbench.page.input import (
     add_upload,
     change_tree,
@@ -63,6 +63,7 @@ PAGE: Final = {
     "/app.js": (WEB / "app.js", "text/javascript; charset=utf-8"),
     "/views.js": (WEB / "views.js", "text/javascript; charset=utf-8"),
     "/more.js": (WEB / "more.js", "text/javascript; charset=utf-8"),
+    "/home.js": (WEB / "home.js", "text/javascript; charset=utf-8"),
     "/import.js": (WEB / "import.js", "text/javascript; charset=utf-8"),
     "/tree.js": (WEB / "tree.js", "text/javascript; charset=utf-8"),
     "/preview.js": (WEB / "preview.js", "text/javascript; charset=utf-8"),
@@ -104,6 +105,22 @@ class Service:
             for old in spare[: max(0, len(self.lives) - IN_MEMORY)]:
                 del self.lives[old]
             return self.lives[identifier]
+
+    def delete(self, identifier: str) -> None:
+        """Delete a session.
+
+        Raises
+        ------
+        KeyError
+        BusyError
+            It works.
+        """
+        with self.lock:
+            live = self.lives.get(identifier)
+            if live is not None and live.job is not None:
+                raise BusyError(f"busy: {live.job.text}; wait for it or cancel it")
+            self.lives.pop(identifier, None)
+            home.delete(self.store, identifier)
 
 
 _LOG = logging.getLogger(__name__)
@@ -163,7 +180,8 @@ def _public(live: Live) -> dict[str, Any]:
         entry.pop("stored")
     state["can"] = {"undo": live.can(tree.undone), "redo": live.can(tree.redone)}
     state["fits"] = len(state.pop("branches"))
-    state.pop("found")
+    last = state["steps"][-1]["id"] if state["steps"] else ""
+    state["laws"] = state.pop("found").get(last, {}).get("laws", [])
     return state
 
 
@@ -200,10 +218,11 @@ async def _events(request: Request, live: Live) -> Response:
     )
 
 
-async def _upload(request: Request, live: Live, limit: int) -> Response:
+async def _upload(request: Request, live: Live, limit: int, store: Store) -> Response:
     name = safe_name(request.path_params["name"])
     announced = int(request.headers.get("content-length", "0") or 0)
     refuse_size(name, announced, limit, live.session.files)
+    await run_in_threadpool(home.refuse_over, store, name, announced)
     stored = f"{secrets.token_hex(4)}-{name}"
     path = live.session.files / stored
     size = await stream_to(path, request.stream(), limit)
@@ -295,6 +314,7 @@ def create_app(
         Host headers in place of the loopback names.
     """
     service = Service(Store(root), max_upload, OrderedDict(), threading.Lock())
+    home.sweep_empty(service.store)
 
     async def page(request: Request) -> Response:
         path, kind = PAGE[request.url.path]
@@ -317,12 +337,30 @@ def create_app(
         )
 
     async def upload(request: Request, live: Live) -> Response:
-        return await _upload(request, live, service.max_upload)
+        return await _upload(request, live, service.max_upload, service.store)
+
+    async def sessions(request: Request) -> Response:
+        if not home.allowed(service.store, request.headers.get("x-irj-home", "")):
+            return PlainTextResponse("open the address that irj app printed", 403)
+        return _json(await run_in_threadpool(home.sessions, service.store))
+
+    async def delete(request: Request) -> Response:
+        if not home.allowed(service.store, request.headers.get("x-irj-home", "")):
+            return PlainTextResponse("open the address that irj app printed", 403)
+        try:
+            await run_in_threadpool(service.delete, request.path_params["sid"])
+        except KeyError:
+            return PlainTextResponse("no such session", 404)
+        except BusyError as error:
+            return PlainTextResponse(str(error), 409)
+        return _json({})
 
     routes = [
         *(Route(path, page) for path in PAGE),
         Route("/api/config", config),
         Route("/api/session", new, methods=["POST"]),
+        Route("/api/home", sessions),
+        Route("/api/home/{sid}", delete, methods=["DELETE"]),
         at("", _state),
         at("/events", _events),
         at("/files/{name}", upload, "PUT"),
@@ -411,7 +449,8 @@ def serve(
     folder = root or default_root()
     listening = _listen(port)
     port = int(listening.getsockname()[1])
-    tail = f"#session={with_files(folder, files)}" if files else ""
+    key = home.key_of(Store(folder))
+    tail = f"#home={key}" + (f"&session={with_files(folder, files)}" if files else "")
     address = f"http://127.0.0.1:{port}/{tail}"
     if say is not None:
         say(address)

@@ -12,8 +12,8 @@ from typing import Any, Final
 from identification.diagnosis.improve import HOLD_DELAY, Improvement, improve
 from identification.errors import InputError
 from workbench.page import export as app_export
-from workbench.page import tree
 from workbench.page.analysis import Progress, clean
+from workbench.page.desk import law, tree
 from workbench.page.input import folder_of
 from workbench.page.live import Change, Live, hint_for
 from workbench.page.session import State, StepEntry
@@ -41,6 +41,7 @@ def run(live: Live, action: str, body: Mapping[str, Any]) -> None:
         "redo": ("redoing", lambda p: _redo(live)),
         "confirm": ("fitting every sample", lambda p: _confirm(live, p)),
         "improve": ("running the whole loop", lambda p: _improve(live, p)),
+        "law": ("trying your law", lambda p: _law(live, body, p)),
         "replay": ("replaying a record", lambda p: _replay(live, body, p)),
         "plan": ("planning a motion", lambda p: _plan(live, body, p)),
         "report": ("writing the report", lambda p: _export(live, "report", p)),
@@ -115,6 +116,12 @@ def _add(live: Live, label: str, progress: Progress) -> Change:
     if claim and claim["label"] == label:
         step = replace(step, names=tuple(claim["effects"]), separate_by=claim["separate_by"])
     return lambda s: tree.continued(replace(s, steps=steps), (*steps, step))
+
+
+def _law(live: Live, body: Mapping[str, Any], progress: Progress) -> Change:
+    steps = _settled(live, progress)
+    change = law.tried(live, body, progress)
+    return lambda s: change(replace(s, steps=steps))
 
 
 def _remove(live: Live, label: str, progress: Progress) -> Change:

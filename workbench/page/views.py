@@ -13,6 +13,7 @@ import numpy as np
 from starlette.responses import FileResponse, Response
 
 from casadi_models import EFFECTS
+from casadi_models.effect import PLACE_SIDE
 from casadi_models.transmission import MODELS
 from identification.balance.kinematic import residual_unit
 from identification.data.channels import CHANNELS
@@ -20,8 +21,8 @@ from identification.errors import InputError
 from workbench.page import export as app_export
 from workbench.page import plan as app_plan
 from workbench.page import replay as app_replay
-from workbench.page import tree
 from workbench.page.charts.asked import CHART_VIEWS, along, run_starts, said, side_of
+from workbench.page.desk import tree
 from workbench.page.input import folder_of, joint_form
 from workbench.page.live import Live
 from workbench.page.pattern import pattern
@@ -38,6 +39,7 @@ def _config(live: Any, query: Query) -> dict[str, Any]:
     return {
         "max_upload": query["max_upload"],
         "channels": ["time", *CHANNELS],
+        "places": list(PLACE_SIDE),
         "models": {name: list(own) for name, own in MODELS.items()},
         "effects": [
             {"key": e.key, "title": e.title, "family": e.family, "places": list(e.acts_on)}

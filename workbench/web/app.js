@@ -16,8 +16,8 @@ function h(tag, attributes, ...children) {
   return node;
 }
 
-async function call(method, path, body) {
-  const options = { method, headers: { "X-IRJ": "1" } };
+async function call(method, path, body, more) {
+  const options = { method, headers: { "X-IRJ": "1", ...more } };
   if (body) { options.body = JSON.stringify(body); options.headers["Content-Type"] = "application/json"; }
   let answer;
   try { answer = await fetch(path, options); } catch (error) { throw new Error("the server does not answer; is it still running? What was done is kept in the session folder."); }
@@ -116,7 +116,7 @@ function listen() {
 
 function usable(state) {
   const fitted = state.steps.length > 0, known = Boolean(state.joint_text);
-  return { load: true, model: true, compare: fitted, diagnose: fitted, ledger: fitted, parameters: fitted, replay: fitted, plan: known, export: known };
+  return { home: true, load: true, model: true, compare: fitted, diagnose: fitted, ledger: fitted, parameters: fitted, replay: fitted, plan: known, export: known };
 }
 
 function surround() {
@@ -174,7 +174,7 @@ function render(moved) {
     const focused = main.contains(document.activeElement) ? placeOf(document.activeElement, main) : null; /* now, not when the drawing began */
     main.replaceChildren(...[nodes].flat(3).filter(Boolean));
     main.dataset.view = app.view; main.dataset.revision = app.state.revision;
-    document.title = `${VIEWS.find((v) => v[0] === app.view)[1]} – Joint workbench`;
+    document.title = `${(VIEWS.find((v) => v[0] === app.view) || ["", "Sessions"])[1]} – Joint workbench`;
     surround();
     (app.after || []).forEach((f) => f());
     app.after = [];
@@ -248,6 +248,7 @@ async function boot() {
   $("redo").addEventListener("click", () => run("redo"));
   $("cancel").addEventListener("click", () => { app.waiting = null; if (app.sending) app.sending.abort(); else post("/cancel").catch(fail); });
   $("fresh").addEventListener("click", () => act(fresh));
+  $("home").addEventListener("click", () => open("home"));
   $("error-close").addEventListener("click", clearError);
   addEventListener("dragover", (e) => { e.preventDefault(); document.querySelectorAll(".drop").forEach((d) => d.classList.add("over")); });
   addEventListener("dragleave", () => document.querySelectorAll(".drop").forEach((d) => d.classList.remove("over")));
@@ -265,8 +266,9 @@ async function boot() {
   app.config = await call("GET", "/api/config");
   const asked = new URLSearchParams(location.hash.slice(1));
   const known = asked.get("session") || remembered("irj-session");
+  if (asked.get("home")) remembered("irj-home", asked.get("home"));
   try { if (!known) throw new Error(); await enter(known); } catch (error) { await enter((await call("POST", "/api/session")).id); }
   const wanted = asked.get("view");
-  open(VIEWS.some(([key]) => key === wanted) && (app.state.steps.length || ["load", "model"].includes(wanted)) ? wanted : app.state.steps.length ? "ledger" : "load");
+  open((VIEWS.some(([key]) => key === wanted) && (app.state.steps.length || ["load", "model"].includes(wanted))) || wanted === "home" ? wanted : app.state.steps.length ? "ledger" : "load");
 }
 addEventListener("DOMContentLoaded", () => boot().catch(fail));

@@ -50,3 +50,15 @@ function fitsTable(found) {
     h("tbody", {}, h("tr", { class: "now" }, h("th", { scope: "row" }, "Held-out error [%]"), cell(a.error), cell(b.error)), h("tr", {}, h("th", { scope: "row" }, "Only in it"), found.only.map((o) => h("td", {}, o.length ? o.map(effectTitle).join(", ") : "–"))),
       changed.map((v) => h("tr", {}, h("th", { scope: "row" }, v.name.replace(/_/g, " ")), cell(v.first), cell(v.second))))));
 }
+
+/* A law of one's own: typed in one line, fitted at once to what the model leaves, kept in the joint file. */
+function lawCard(state) {
+  const draft = app.drafts.law || (app.drafts.law = { law: "", on: "motor", parameters: "" });
+  const field = (key, label, placeholder, size) => h("input", { id: `law-${key}`, value: draft[key], placeholder, size, "aria-label": label, autocomplete: "off", spellcheck: "false", oninput: (e) => { draft[key] = e.target.value; } });
+  const place = h("select", { id: "law-on", "aria-label": "Where it acts", onchange: (e) => { draft.on = e.target.value; } }, app.config.places.map((p) => h("option", { value: p, selected: p === draft.on }, p.replace(/_/g, " "))));
+  const row = (t) => h("li", {}, h("div", { class: "row between" }, h("span", {}, h("code", {}, t.law), ` on ${t.on.replace(/_/g, " ")}: the held-out error ${t.after < t.before ? "falls" : "goes"} from ${digits(t.before)} to `, h("strong", {}, `${digits(t.after)} %`)),
+    button("Add", () => run("add", { label: t.label }, "ledger"), { kind: t.after < t.before ? "primary" : "", id: `add-${t.label}`, label: `Add ${t.law}` })));
+  return h("form", { class: "card", id: "own-law", onsubmit: (e) => { e.preventDefault(); $("try-law").click(); } }, h("h2", {}, "A law of your own"), h("div", { class: "row" }, field("law", "Law", "a*tanh(v/b)", "28"), place, field("parameters", "Parameters with ranges and units", "a=0..10 N.m, b=0.01..1 rad/s", "34"),
+    button("Try it", () => run("law", { ...draft }), { id: "try-law" })), h("p", { class: "small soft" }, "Signals: q, v, a (angle, speed, acceleration of the place), twist, T, t. It is fitted at once to what the model leaves, and stays in the joint file."),
+    state.laws.length ? h("ul", { class: "plain", id: "tried-laws" }, state.laws.map(row)) : null);
+}

@@ -156,6 +156,7 @@ const views = {
       h("div", { class: "card scroll", tabindex: "0", role: "region", "aria-label": "Ledger" }, h("table", {}, h("caption", {}, "Ledger"), h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Step"), h("th", { scope: "col", class: "num" }, "Held-out error"), h("th", { scope: "col", class: "num" }, "Fit"), h("th", { scope: "col", class: "num" }, "VAF"), Object.keys(last.held_out.balances).map((b) => h("th", { scope: "col", class: "num" }, [`${b} `, term("÷ noise")])))),
         h("tbody", {}, steps.map((s, k) => h("tr", { class: k === steps.length - 1 ? "now" : null }, h("td", {}, stepName(s)), h("td", { class: "num" }, `${digits(s.held_out.relative_error_percent)} %`), h("td", { class: "num" }, `${digits(s.held_out.fit_percent)} %`), h("td", { class: "num" }, `${vaf(s.held_out.vaf_percent)} %`), Object.keys(last.held_out.balances).map((b) => h("td", { class: "num" }, s.held_out.balances[b] ? digits(s.held_out.balances[b].ratio) : "–"))))))),
       treeCard(state),
+      lawCard(state),
       h("div", { class: "card" }, h("h2", {}, "By hand"), h("div", { class: "row" }, add, button("Add", () => run("add", { label: $("add-label").value }), { id: "add-by-hand", label: "Add the chosen effect" }), button("Run the whole loop", () => run("improve", {}, "ledger"), { id: "improve" })), h("p", { class: "small soft" }, "The whole loop diagnoses and adds until nothing is left to name; it starts from the start model again.")),
     ];
   },

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from identification.balance.noise import noise_level
+from identification.balance.sensing import CLAMPED_TRAVEL
 from identification.data.check.channels import GUESSED_RATIO, quantum, span
 from identification.data.check.finding import Finding, at
 
@@ -52,8 +53,6 @@ motion.
 """
 _OWN: Final = 0.03
 """Share of the link's motion that must be left beside the torque for the two to be told apart."""
-_WIND_UP: Final = math.radians(5.0)
-"""Motion of the motor, link-referred, that a locked link allows [rad]."""
 _FEW_VALUES: Final = 8
 """Values of a position that may stand still: a locked link whose encoder toggles."""
 _VELOCITY_TOLERANCE: Final = 0.05
@@ -351,7 +350,7 @@ def check_ratio(record: Record, gear_ratio: float | None) -> list[Finding]:
     ratio, correlation = found
     if np.unique(record["link_position"]).size < _FEW_VALUES and span(
         record["motor_position"]
-    ) < _WIND_UP * abs(gear_ratio or GUESSED_RATIO):
+    ) < CLAMPED_TRAVEL * abs(gear_ratio or GUESSED_RATIO):
         return [
             Finding(
                 "warn",

@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 
 from identification import Joint, Record, fit
-from identification.balance.colour import ChannelNoise, white
+from identification.balance.colour import ChannelNoise, Part, white
 from identification.balance.noise import noise_of
 from identification.balance.spikes import without_spikes
 from identification.fitting.assess import assess
@@ -67,7 +67,7 @@ def test_noise_through_a_filter_is_read_with_its_memory(corner: float, within: f
     q, torque = motion()
     found = read(torque + 20.0 * np.sign(np.gradient(q)) + TORQUE * filtered(corner)(rng, COUNT))
     # density towards zero frequency, which is what the rows of a balance see
-    slow = sum(a**2 * (max(2 * tau, DT)) for a, tau in found.parts)
+    slow = sum(p.size**2 * max(2 * p.stages * p.memory, DT) for p in found.parts)
     assert 1 / within < np.sqrt(slow) / (TORQUE / np.sqrt(np.pi * corner)) < within
     again = found.draw(rng, COUNT, DT)
     assert read(torque + again).level == pytest.approx(found.level, rel=0.1)
@@ -80,7 +80,7 @@ def test_hum_is_told_from_noise_and_a_motion_has_none() -> None:
     ((size, frequency),) = found.lines
     assert size == pytest.approx(0.7, rel=0.05)
     assert frequency == pytest.approx(50.02, abs=0.05)
-    assert sum(a**2 for a, _ in found.parts) == pytest.approx(TORQUE**2, rel=0.1)
+    assert sum(p.size**2 for p in found.parts) == pytest.approx(TORQUE**2, rel=0.1)
     # a mode of the joint that rings after every knock is no hum
     knocks = np.zeros(COUNT)
     knocks[rng.integers(0, COUNT, 60)] = rng.standard_normal(60)
@@ -120,3 +120,13 @@ def test_the_true_model_leaves_its_floor_under_every_kind_of_noise(kind: str) ->
             assess(solution.model, data, data.train, solution.values).balances["link"].ratio
         )
     assert all(0.85 < r < 1.2 for r in ratios), ratios
+
+
+def test_noise_through_two_filters_in_a_row_is_read_too() -> None:
+    rng = np.random.default_rng(8)
+    drawn = ChannelNoise(1.0, (Part(TORQUE, 0.003, 2),)).draw(rng, COUNT, DT)
+    assert np.std(drawn) == pytest.approx(TORQUE, rel=0.05)
+    found = read(motion()[1] + drawn)
+    assert any(p.stages == 2 for p in found.parts)
+    slow = sum(p.size**2 * max(2 * p.stages * p.memory, DT) for p in found.parts)
+    assert np.sqrt(slow) == pytest.approx(TORQUE * np.sqrt(4 * 0.003), rel=0.15)

@@ -137,3 +137,21 @@ def test_a_file_without_time_is_said_and_not_written(tmp_path: Path) -> None:
     assert not (tmp_path / "j.toml").exists()
     with pytest.raises(InputError, match="no column 'nothing'"):
         survey(file, columns={"time": {"column": "nothing", "unit": "s"}})
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        (("--joint-number", "9"), "no joint 9; its columns are those of 1 to 2"),
+        (("--gear-ratio", "0"), "--gear-ratio is 0"),
+        (("--gear-ratio", "nan"), "--gear-ratio is nan"),
+    ],
+)
+def test_what_the_terminal_cannot_take_is_one_line(
+    given: tuple[str, ...], says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = written(tmp_path, **CASES["joints side by side"][0])
+    assert main(["import", str(file), *given]) == 2
+    err = capsys.readouterr().err
+    assert says in err
+    assert err.count("\n") == 1

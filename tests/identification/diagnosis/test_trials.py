@@ -88,6 +88,26 @@ def raw_columns(base: Base, found: Trial) -> FloatArray:
     return raw * base.weight[:, None]
 
 
+@pytest.mark.parametrize("size", [1.0, 1e-3, 1e-6])
+def test_a_shape_that_the_rows_do_not_show_takes_no_step(base: Base, size: float) -> None:
+    """A smoothing velocity that is passed between two samples moves no training row, but may move
+    the turn of another record: a step along it would be of any length there.
+    """
+    name = "motor_smoothing_velocity"
+    values = {**base.solution.values, name: size * base.solution.values[name]}
+    solution = replace(
+        base.solution, values=values, model=base.solution.model.with_values({name: values[name]})
+    )
+    made_base = make_base(solution, base.data)
+    shown = dict(zip(made_base.names, made_base.norms, strict=True))
+    assert all(shown[n] * values[n] >= 1.0 for n in shown if n == name)
+    if size < 1e-4:
+        assert name not in shown
+    found = try_candidate(candidate(base, "cyclic_torque"), made_base)
+    assert isinstance(found, Trial)
+    assert found.held_out_drop_percent > 10.0
+
+
 # --- small parts ----------------------------------------------------------------------------------
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.fault_plant import DT
+from benchmarks.faults.plant import DT
 from benchmarks.online_filter import Readings, plant, recorded
 from casadi_models import JointModel
 from identification.errors import InputError

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
+import random
 import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
@@ -13,7 +16,7 @@ import pytest
 pytest.importorskip("starlette")
 
 from identification.errors import InputError
-from workbench.page import tree
+from workbench.page.desk import home, tree
 from workbench.page.input import change_tree, joint_form, set_joint
 from workbench.page.live import Live
 from workbench.page.session import FileEntry, State, StepEntry, Store
@@ -156,3 +159,88 @@ def test_notes_and_names_stay_with_their_step_and_a_wrong_one_is_said(live: Live
     found = tree.compared(live.state, "None", "coulomb")
     assert found["only"] == [[], ["coulomb"]]
     assert found["values"] == [{"name": "x", "first": 9.0, "second": 5.0}]
+
+
+def test_the_quota_refuses_an_upload_and_names_the_way_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = Store(tmp_path)
+    session = store.create()
+    (session.files / "a.csv").write_bytes(bytes(900_000))
+    monkeypatch.setenv("IRJ_QUOTA_GB", "0.001")
+    home.refuse_over(store, "b.csv", 50_000)
+    with pytest.raises(InputError, match=r"b\.csv: .* more than 1 MB; delete some"):
+        home.refuse_over(store, "b.csv", 200_000)
+    monkeypatch.setenv("IRJ_QUOTA_GB", "much")
+    with pytest.raises(InputError, match="give a number of gigabytes"):
+        home.quota()
+
+
+def test_only_empty_sessions_that_are_old_are_swept(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    old, used, young = store.create(), store.create(), store.create()
+    for session in (old, used):
+        state = session.load()
+        (session.folder / "state.json").write_text(
+            json.dumps({**state.as_json(), "created": state.created - 2 * home.STALE})
+        )
+    (used.files / "a.csv").write_text("t\n")
+    home.sweep_empty(store)
+    left = {folder.name for folder in tmp_path.iterdir()}
+    assert left >= {used.id, young.id}
+    assert old.id not in left
+    home.delete(store, used.id)
+    assert not used.folder.exists()
+    with pytest.raises(KeyError):
+        home.delete(store, used.id)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_random_moves_lose_no_fit_no_note_and_no_record(seed: int) -> None:
+    draw = random.Random(seed)
+    state, made, files = tree.continued(START, (step(None, 9.0, "s0"),)), {"s0"}, {"a", "b"}
+    state = tree.remarked(state, "s0", "first", "kept")
+
+    def add(s: State) -> State:
+        name = f"s{len(made)}"
+        made.add(name)
+        new = step(name if s.steps else None, 9.0 / len(made), name)
+        return tree.continued(s, (*s.steps, new))
+
+    def again(s: State) -> State:  # Fit once more: the same values under a new identifier
+        return tree.continued(s, (replace(s.steps[0], id="new"),)) if s.steps else s
+
+    def role(s: State) -> State:
+        k = draw.randrange(len(s.files))
+        roles = ["train", "held_out"]
+        changed = replace(s.files[k], role=draw.choice(roles))
+        return tree.after_input(s, replace(s, files=(*s.files[:k], changed, *s.files[k + 1 :])))
+
+    def upload(s: State) -> State:
+        name = f"f{len(files)}"
+        files.add(name)
+        status = draw.choice(["ready", "refused", "checking"])
+        return tree.after_input(s, replace(s, files=(*s.files, record(name, status=status))))
+
+    def drop(s: State) -> State:
+        return tree.after_input(s, replace(s, files=s.files[1:])) if len(s.files) > 1 else s
+
+    def rename(s: State) -> State:
+        text = JOINT.replace("elbow", f"joint{draw.randrange(9)}")
+        return tree.after_input(s, replace(s, joint_text=text))
+
+    def go(s: State) -> State:
+        branch = draw.choice(tree.shown(s))
+        steps = [t["id"] for t in branch["steps"]]
+        return tree.opened(s, branch["id"], draw.choice(steps) if steps else "")
+
+    moves = (add, add, again, role, upload, drop, rename, go, go, tree.undone, tree.redone)
+    for _ in range(60):
+        with contextlib.suppress(InputError):
+            state = draw.choice(moves)(state)
+        assert {s for path in paths(state) for s in path} == made
+        assert state.remarks["s0"] == {"name": "first", "note": "kept"}
+        every: tuple[Any, ...] = (state, *state.branches)
+        fitted = {f.stored for b in every if b.steps for f in b.files if f.status == "ready"}
+        assert fitted <= tree.used_files(state)
+        assert len({b.id for b in state.branches} | {state.branch}) == len(state.branches) + 1

@@ -25,14 +25,19 @@ pytestmark = pytest.mark.skipif(
 
 
 @pytest.fixture(scope="module")
-def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("sessions")
+
+
+@pytest.fixture(scope="module")
+def address(root: Path) -> Iterator[str]:
     import uvicorn
 
     from workbench.page.server import _listen, create_app
 
     listening = _listen(0)
     port = int(listening.getsockname()[1])
-    app = create_app(tmp_path_factory.mktemp("sessions"), port=port)
+    app = create_app(root, port=port)
     server = uvicorn.Server(
         uvicorn.Config(app, log_level="error", ws="none", timeout_graceful_shutdown=1)
     )
@@ -225,3 +230,75 @@ def test_the_import_shows_what_would_be_odd_before_it_is_used(
     shot(page, "import-later")
     page.click("button.primary:has-text('Use these columns')")
     page.wait_for_function("() => app.state.files[0].columns.motor_current.sign === -1")
+
+
+def test_sessions_are_found_named_and_deleted(address: str, page: Any, root: Path) -> None:
+    page.goto(address)
+    page.click("#fresh")
+    page.wait_for_selector("#demo")
+    page.click("#demo")
+    idle(page, "load")
+    page.click("#fresh")
+    page.wait_for_selector("#demo")
+    write_two_joints(root / "rig.csv")
+    page.set_input_files("#files", str(root / "rig.csv"))
+    page.wait_for_selector(".import svg")
+    page.click("#home")
+    page.wait_for_selector(".note")
+    assert "irj app printed" in page.inner_text(".note")  # no list without the key
+    key = (root / "home.key").read_text()
+    page.goto(f"{address}#home={key}")
+    page.reload()
+    page.wait_for_selector("#demo, #fit, #staircase, .drop")
+    page.click("#home")
+    page.wait_for_selector(".session")
+    before = page.locator(".session").count()
+    page.get_by_label("Name of rig").first.fill("left bench")
+    page.keyboard.press("Tab")
+    page.wait_for_selector("h2:has-text('left bench')")
+    page.fill("#search", "bench")
+    assert page.locator(".session").count() == 1
+    page.fill("#search", "")
+    shot(page, "home")
+    page.get_by_label("Delete left bench", exact=True).click()
+    page.get_by_label("Delete left bench for good").click()
+    page.wait_for_function(
+        "n => document.querySelectorAll('.session').length === n", arg=before - 1
+    )
+    assert "left bench" not in page.inner_text("#main")
+
+
+def test_a_law_of_ones_own_is_tried_at_once_and_saved(address: str, page: Any) -> None:
+    page.goto(address)
+    page.click("#fresh")
+    page.wait_for_selector("#demo")
+    page.click("#demo")
+    page.click("#fit")
+    idle(page, "compare")
+    page.click("#nav-ledger")
+    idle(page, "ledger")
+    start = float(page.inner_text("#headline strong").split()[0])
+    page.fill("#law-law", "a*tanh(v/b")
+    page.fill("#law-parameters", "a=0..100 N.m, b=0.001..1 rad/s")
+    page.click("#try-law")
+    page.wait_for_selector("#error:not([hidden])")
+    assert "law: " in page.inner_text("#error-text")
+    idle(page, "ledger")
+    page.fill("#law-law", "a*exp(-abs(v)/b)*sign(v)")
+    page.click("#try-law")
+    page.wait_for_selector("#tried-laws")
+    idle(page, "ledger")
+    tried = page.evaluate("app.state.laws[0]")
+    assert tried["after"] < 0.5 * tried["before"]
+    assert tried["before"] == pytest.approx(start, rel=0.01)
+    shot(page, "law")
+    page.click("#tried-laws button")
+    page.wait_for_function("() => app.state.steps.length === 2")
+    idle(page, "ledger")
+    assert float(page.inner_text("#headline strong").split()[0]) == pytest.approx(
+        tried["after"], rel=0.01
+    )
+    assert "law_" in page.evaluate("app.state.joint_text")
+    taken = page.evaluate("fetch(base() + '/view/joint.toml').then((r) => r.text())")
+    assert 'law = "a*exp(-abs(v)/b)*sign(v)"' in taken
+    assert page.evaluate("app.state.fits") == 0  # no branch by a law that is only there

@@ -258,6 +258,11 @@ def test_session_identifiers_cannot_be_guessed_or_listed(client: Client, root: P
     assert first != second
     assert len(first.rsplit("/", 1)[1]) == 32
     assert client.raw("GET", "/api/session")[0] == 405
+    assert client.raw("GET", "/api/home")[0] == 403
+    wrong = {"X-IRJ-Home": "0" * 32}
+    assert client.raw("GET", "/api/home", headers=wrong)[0] == 403
+    assert client.raw("DELETE", f"/api/home/{first[-32:]}", headers=wrong)[0] == 403
+    assert (root / "home.key").stat().st_mode & 0o077 == 0
     assert client.raw("GET", "/api/session/" + "0" * 32)[0] == 404
     assert all(folder.stat().st_mode & 0o077 == 0 for folder in root.glob("*/files"))
 
@@ -700,7 +705,7 @@ def test_a_killed_server_loses_nothing(tmp_path: Path) -> None:
         )
         assert process.stdout is not None
         address = process.stdout.readline().strip()
-        match = re.fullmatch(r"http://127\.0\.0\.1:(\d+)/", address)
+        match = re.fullmatch(r"http://127\.0\.0\.1:(\d+)/#home=[\w-]{32}", address)
         assert match, address
         return process, Client(int(match.group(1)))
 

@@ -7,6 +7,7 @@ one input; steps carry identifiers, so that paths that begin alike share their b
 from __future__ import annotations
 
 import json
+import re
 import secrets
 import time
 from collections.abc import Mapping
@@ -16,6 +17,7 @@ from typing import Any, Final
 from identification.balance.calibration import is_of_run
 from identification.data.joint_schema import JOINT
 from identification.data.plain_text import from_toml
+from identification.data.typed_laws import LAWS
 from identification.errors import InputError
 from workbench.page.session import Branch, FileEntry, State, StepEntry
 
@@ -41,12 +43,16 @@ def given(state: State | Branch) -> str:
 
 
 def _joint(text: str) -> Any:
-    """The tables of a joint file without its name; a key that is left out has its default."""
+    """The tables of a joint file without its name; a key that is left out has its default, and a
+    typed law that the start model does not use is none of its input.
+    """
     try:
         data = from_toml(text, "joint")
         table = data.get("joint")
         if isinstance(table, Mapping):
             data["joint"] = {**JOINT.read(table, "joint"), "name": None}
+            used = {re.split("[@#]", e)[0] for e in data["joint"]["effects"]}
+            data[LAWS] = {k: v for k, v in data.get(LAWS, {}).items() if k in used}
     except InputError:
         return text
     return {k: v for k, v in data.items() if v}
@@ -59,7 +65,7 @@ def after_input(before: State, after: State) -> State:
     a branch with the new input is there already, it is taken up again.
     """
     now = given(after)
-    if given(before) == now:
+    if given(before) == now and not _other_laws(before.joint_text, after.joint_text):
         return after
     kept = put_away(before, after)
     back = next((b for b in reversed(kept.branches) if b.steps and given(b) == now), None)
@@ -69,6 +75,19 @@ def after_input(before: State, after: State) -> State:
         return replace(found, files=files, joint_text=text, joint_source=source)
     parent = before.branch if before.steps else before.parent
     return replace(kept.without_fit(), branch=secrets.token_hex(4), parent=parent)
+
+
+def _other_laws(before: str, after: str) -> bool:
+    """Whether a law of a key says something else: steps that have it would not be theirs."""
+    old, new = ((_tables(t)).get(LAWS, {}) for t in (before, after))
+    return any(old[k] != new[k] for k in old.keys() & new.keys())
+
+
+def _tables(text: str) -> dict[str, Any]:
+    try:
+        return from_toml(text, "joint")
+    except InputError:
+        return {}
 
 
 def put_away(before: State, after: State | None = None) -> State:
@@ -89,6 +108,10 @@ def put_away(before: State, after: State | None = None) -> State:
 def continued(state: State, steps: tuple[StepEntry, ...]) -> State:
     """The state on another path of the same input: a path that it leaves is kept as a branch."""
     path = (*state.steps, *state.undone)
+    for k, (old, new) in enumerate(zip(path, steps, strict=False)):
+        if not _same(old, new):
+            break  # below here a step that was made before keeps its identifier, and its notes
+        steps = (*steps[:k], replace(new, id=old.id), *steps[k + 1 :])
     if _begins(path, steps):
         return on(state, steps, ())
     if _begins(steps, path):

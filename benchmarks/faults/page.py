@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from benchmarks.fault_plant import DT, FACTORS, SIZES
+from benchmarks.faults.plant import DT, FACTORS, SIZES
 from identification.data.formats import number
 from identification.faults.detector import ABRUPT, KINDS, SENSORS
 from workbench.show.chart import sheet
@@ -359,7 +359,7 @@ Every figure on this page is printed by
 
 The readings are simulated: the TS joint of the thesis (tables 4.1, 4.3, 4.6) with structural damping, the noise of
 table B.1, 1 kHz. The detector's model is wrong by what an identification leaves (`ERRORS` in
-`benchmarks/fault_plant.py`), and no trajectory of the test was used to set a limit. A fault counts as named rightly
+`benchmarks/faults/plant.py`), and no trajectory of the test was used to set a limit. A fault counts as named rightly
 where every sensor that failed is named and no other. The current sensor and a change of the motor's friction cannot be
 told apart from these readings; the detector names the pair, and that counts as right for the current sensor.
 

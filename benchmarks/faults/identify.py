@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from benchmarks.fault_plant import DT, detector_model, readings, reference
+from benchmarks.faults.plant import DT, detector_model, readings, reference
 from casadi_models import JointModel
 from identification.faults.detector import Fault, FaultDetector, Reconfiguration, inject
 from identification.planning.follow import Follower

@@ -1,0 +1,1 @@
+"""Plant, identification and page of the fault campaign."""

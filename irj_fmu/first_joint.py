@@ -1,0 +1,324 @@
+"""A first joint file for somebody else's FMU, from its model description, a record and a few short
+runs; every guess is written beside what it decides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, final
+
+import numpy as np
+
+from casadi_models import EFFECTS
+from identification.data.channels import channel_unit
+from identification.data.guess import guess_columns
+from identification.data.joint_file import Joint
+from identification.data.plain_text import toml_key, toml_string
+from identification.data.record import Record
+from identification.data.units import base_unit, same_dimension
+from identification.errors import InputError
+from irj_fmu.host.fmu import FmuError
+from irj_fmu.host.signals import FloatArray
+from irj_fmu.imported.library import Kind, UserFmu
+from irj_fmu.imported.model import DRIVES
+from irj_fmu.imported.run import Runner, Window
+
+SIDES: Final = ("motor", "link")
+WINDOW: Final = 0.5
+"""Stretches that are simulated from their own starts [s]: the small error of a start grows no
+further."""
+SHORT: Final = 1e-3
+"""Sample time of the runs that tell what a variable does [s]."""
+PUSHES: Final = (1e-3, 1e-1, 10.0, 1000.0)
+"""What is added to a variable to see what it does, in its unit, the smallest that tells: dry
+friction stops a velocity that is too small within a sample."""
+ALIKE: Final = 0.05
+"""Share by which two samples may differ from twice one where a start is a velocity: what drives the
+joint would give three to four times."""
+REACH: Final = 10.0
+"""Factor below and above its start value within which a fit looks for a parameter that says no
+bounds."""
+WHOLE: Final = 3e-3
+"""Share by which a gear ratio read from two encoders may miss a whole number: what a load twists a
+gear adds to it."""
+
+
+@final
+@dataclass
+class _Draft:
+    """What is found, with the reasons."""
+
+    channels: dict[str, tuple[str, float, str]] = field(default_factory=dict)
+    starts: dict[str, tuple[str, float, str]] = field(default_factory=dict)
+    parameters: dict[str, str] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+
+def first_joint(path: str | Path, record: Record, joint: Joint | None = None) -> str:
+    """The text of a joint file whose model is an FMU.
+
+    Parameters
+    ----------
+    path : str or Path
+        The FMU.
+    record : Record
+        Only its channels are mapped; both positions give the gear ratio.
+    joint : Joint, optional
+        Gear ratio and motor constant where they are known.
+
+    Raises
+    ------
+    InputError
+        An FMU that cannot be read, or none of whose outputs goes with a channel of the record.
+    """
+    fmu = UserFmu(Path(path))
+    kind = fmu.kinds()[0]
+    draft = _Draft()
+    ratio, why = _ratio(record, joint)
+    known = joint or Joint(name=fmu.path.stem, kind=record.kind, gear_ratio=ratio)
+    named = {
+        c: [v for v in fmu.variables.values() if v.causality == c and v.type in ("Real", "Float64")]
+        for c in ("input", "output", "local", "parameter")
+    }
+    _channels(draft, named["input"], record, known, ratio, driving=True)
+    _channels(draft, named["output"] or named["local"], record, known, ratio, driving=False)
+    inputs = {v.name for v in named["input"]}
+    outputs = {c: m for c, m in draft.channels.items() if m[0] not in inputs}
+    if not outputs:
+        there = ", ".join(v.name for v in named["output"]) or "none"
+        raise InputError(
+            f"{fmu.path.name}: no output goes with a channel of {record.name} (outputs: {there}; "
+            f"channels: {', '.join(record.channels)}); write [model.channels] by hand"
+        )
+    _starts(draft, fmu, kind, outputs, [*named["local"], *named["parameter"]])
+    _parameters(draft, named["parameter"])
+    return _text(draft, fmu, kind, known, why)
+
+
+def _ratio(record: Record, joint: Joint | None) -> tuple[float, str]:
+    """The gear ratio and where it comes from."""
+    if joint is not None:
+        return joint.gear_ratio, "as given"
+    if not (record.has("motor_position") and record.has("link_position")):
+        return 1.0, "CHECK: one side is recorded; 1 where the FMU and the record are of one side"
+    motor, link = (record[f"{s}_position"] for s in SIDES)
+    slope = float(np.polyfit(link, motor, 1)[0])
+    near = round(slope)
+    found = float(near) if near and abs(slope / near - 1) < WHOLE else slope
+    how = f" ({slope:.6g}, taken as a whole number: CHECK)" if found != slope else ""
+    return found, f"theta_motor / theta_link, from the two encoders of the record{how}"
+
+
+def _channels(
+    draft: _Draft,
+    variables: Sequence[Any],
+    record: Record,
+    joint: Joint,
+    ratio: float,
+    *,
+    driving: bool,
+) -> None:
+    """Map variables to channels of the record, by name and unit."""
+    taken: dict[str, str] = {}
+    left = {v.name: v for v in variables}
+    while left:
+        units = {n: v.unit for n, v in left.items() if v.unit}
+        guesses = guess_columns(list(left), units, record.kind)
+        if not guesses:
+            break
+        for guess in guesses:
+            variable = left.pop(guess.column.column)
+            wanted = guess.column.channel
+            if driving and wanted.startswith("link_") and "no side" in guess.reason:
+                wanted = wanted.replace("link_", "motor_")
+            reason = guess.reason
+            if wanted != guess.column.channel:
+                reason = reason.replace("link side", "motor side")
+            found = _through(wanted, record, joint, ratio, driving=driving)
+            if found is None:
+                draft.notes.append(f"{variable.name}: looks like {wanted}, which is not recorded")
+                continue
+            channel, scale, how = found
+            if channel in taken or channel in draft.channels:
+                other = taken.get(channel) or draft.channels[channel][0]
+                draft.notes.append(f"{variable.name}: could be {channel} in place of {other}")
+                continue
+            scale *= _units(variable.unit, channel_unit(wanted, record.kind))
+            taken[channel] = variable.name
+            reason = f"{reason}; {how}" if how else reason
+            draft.channels[channel] = (variable.name, scale, reason)
+    draft.notes += [f"{n}: says nothing that tells its channel" for n in left]
+
+
+def _through(
+    wanted: str, record: Record, joint: Joint, ratio: float, *, driving: bool
+) -> tuple[str, float, str] | None:
+    """The recorded channel that goes with a wanted one: itself, the current of a torque, or the
+    other side through the gear ratio; with the factor and how.
+    """
+    if record.has(wanted):
+        return wanted, 1.0, ""
+    if driving and wanted == "motor_torque" and record.has("motor_current"):
+        constant = joint.torque_per_current
+        if constant is None:
+            return "motor_current", 1.0, "CHECK the scale: torque of the input per ampere"
+        return "motor_current", constant / joint.gear_ratio, "motor constant of the joint"
+    side, _, quantity = wanted.partition("_")
+    if driving or side not in SIDES or quantity not in ("position", "velocity"):
+        return None
+    other = SIDES[1 - SIDES.index(side)]
+    channel = f"{other}_{quantity}"
+    if not record.has(channel):
+        return None
+    return channel, ratio if side == "motor" else 1 / ratio, "the other side, by the gear ratio"
+
+
+def _units(unit: str | None, wanted: str) -> float:
+    """Variable / channel by their units; 1 where the FMU states none."""
+    if not unit:
+        return 1.0
+    try:
+        given, own = base_unit(unit), base_unit(wanted)
+    except InputError:
+        return 1.0
+    return own.factor / given.factor if same_dimension(given, own) else 1.0
+
+
+def _starts(
+    draft: _Draft,
+    fmu: UserFmu,
+    kind: Kind,
+    outputs: Mapping[str, tuple[str, float, str]],
+    variables: Sequence[Any],
+) -> None:
+    """Find the start values of positions and velocities by what they do: each is moved, and the
+    FMU runs for two samples.
+    """
+    places = {c: m for c, m in outputs.items() if c.endswith("_position")}
+    if not places:
+        return
+    names = [m[0] for m in places.values()]
+    for v in variables:
+        if v.start is None or v.name in names:
+            continue
+        for push in PUSHES:
+            try:
+                change = _change(fmu, kind, v.name, (float(v.start), push), names)
+            except (FmuError, InputError):
+                break  # it cannot be set: no start value
+            told = _told(change, push)
+            if told is None:
+                continue
+            number, slope, steady = told
+            channel, (_, scale, _) = list(places.items())[number]
+            kept, how = scale / slope, "moves that position at once"
+            if steady:
+                channel, how = (
+                    channel.replace("position", "velocity"),
+                    "moves that position steadily",
+                )
+            if channel not in [c for c, _, _ in draft.starts.values()]:
+                draft.starts[v.name] = (channel, kept, f"moves that position {how}")
+            break
+    # a velocity is the rate of the position that is started, in its unit
+    positions = {c: k for c, k, _ in draft.starts.values()}
+    for name, (channel, scale, how) in draft.starts.items():
+        whole = positions.get(channel.replace("velocity", "position"), scale)
+        if abs(scale / whole - 1) < 2 * ALIKE:
+            draft.starts[name] = (channel, whole, how)
+
+
+def _told(change: FloatArray, push: float) -> tuple[int, float, bool] | None:
+    """Which position a push moves, by how much for each unit of it (or in each second), and whether
+    steadily; None where it is no start value.
+    """
+    size = np.abs(change).max(axis=0)
+    number = int(np.argmax(size))
+    at, most = change[:, number], float(size[number])
+    if not most > 0:
+        return None
+    if abs(at[0]) > (1 - ALIKE) * most:
+        return number, round(float(at[0]) / push, 9), False
+    straight = abs(at[2] - 2 * at[1]) < ALIKE * abs(at[2])
+    if abs(at[0]) < ALIKE * abs(at[1]) and straight:
+        return number, float(at[1]) / (push * SHORT), True
+    return None
+
+
+def _change(
+    fmu: UserFmu, kind: Kind, name: str, given: tuple[float, float], outputs: Sequence[str]
+) -> FloatArray:
+    """What a push (value, push) of a variable changes in outputs over two samples, (3, outputs)."""
+    value, push = given
+    runner = Runner(fmu, kind, inputs=(), outputs=outputs, starts=(name,), settings={})
+    time = SHORT * np.arange(3.0)
+    none = np.empty((3, 0))
+    runs = [
+        runner.run(Window(time, none, none, np.array([value + more])), {}) for more in (0.0, push)
+    ]
+    return np.asarray(runs[1] - runs[0])
+
+
+def _parameters(draft: _Draft, variables: Sequence[Any]) -> None:
+    """Parameters that a fit may move, with bounds."""
+    for v in variables:
+        if v.name in draft.starts or v.start is None:
+            continue
+        if v.min is not None and v.max is not None:
+            draft.parameters[v.name] = "{}  # bounds of the FMU"
+            continue
+        value = float(v.start)
+        if value == 0:
+            draft.notes.append(f"{v.name}: starts at 0 and says no bounds; add it with bounds")
+            continue
+        ends = sorted((value / REACH, value * REACH))
+        draft.parameters[v.name] = (
+            f"{{ low = {ends[0]:.6g}, high = {ends[1]:.6g} }}  # start value {value:g}, a factor "
+            f"of {REACH:g} either way"
+        )
+
+
+def _text(draft: _Draft, fmu: UserFmu, kind: Kind, joint: Joint, why: str) -> str:
+    effects = [
+        key for key in EFFECTS if any(key in n.lower().split(".")[-1] for n in draft.parameters)
+    ]
+    lines = [
+        "# Guesses from the FMU's model description and a record: check every line.",
+        "[joint]",
+        f"name = {toml_string(joint.name)}",
+        f'kind = "{joint.kind}"',
+        f"gear_ratio = {joint.gear_ratio!r}  # {why}",
+    ]
+    if joint.torque_per_current is not None:
+        lines.append(f"torque_per_current = {joint.torque_per_current!r}")
+    lines.append(
+        f"effects = [{', '.join(toml_string(e) for e in effects)}]  # what the FMU holds, by the "
+        "names of its parameters; a diagnosis does not propose it"
+    )
+    lines += [
+        "",
+        "[model]",
+        f"fmu = {toml_string(str(fmu.path))}",
+        f'kind = "{kind}"',
+        f"window = {WINDOW!r}" if draft.starts else "# window: nothing was found that starts it",
+        "",
+        "[model.channels]",
+    ]
+    for channel, (name, scale, reason) in draft.channels.items():
+        entry = f"{{ variable = {toml_string(name)}, scale = {scale!r} }}"
+        lines.append(f"{channel} = {entry}  # {reason}")
+    if not any(c in DRIVES for c in draft.channels):
+        lines.append("# CHECK: no input goes with a recorded drive; a diagnosis needs one")
+    lines += ["", "[model.parameters]"]
+    lines += [f"{toml_key(n)} = {entry}" for n, entry in draft.parameters.items()]
+    lines += ["", "[model.start]"]
+    for name, (channel, scale, reason) in draft.starts.items():
+        entry = f"{{ channel = {toml_string(channel)}, scale = {scale!r} }}"
+        lines.append(f"{toml_key(name)} = {entry}  # {reason}")
+    lines += ["", *(f"# {note}" for note in draft.notes)] if draft.notes else []
+    return "\n".join(lines) + "\n"
+
+
+__all__ = ["first_joint"]

@@ -1,0 +1,465 @@
+"""What a user's FMU leaves along the measured motion, as a model that a session judges.
+
+The parameters of the FMU stay unknown beside those of a candidate: in a trial as columns that the
+candidate must stand out from, in a whole fit as values that move along.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final, final
+
+import numpy as np
+
+from casadi_models import EFFECTS, Effect, JointModel
+from casadi_models.term import SIDE_INERTIAS
+from identification.balance.balances import balances_of
+from identification.balance.sensing import signals_of
+from identification.balance.stamps import evened
+from identification.balance.weak import WeakRecord, differentiated_kernel, filtered
+from identification.data.record import Record
+from identification.diagnosis.bench import Progress
+from identification.diagnosis.candidates import Candidate, NotTestable, offered
+from identification.diagnosis.claims import Claim, Ranking, rank
+from identification.diagnosis.curve import Curve
+from identification.diagnosis.improvement import Step, visible_keys
+from identification.diagnosis.learned import Doubt, Equivalence, LearnedClaim
+from identification.diagnosis.lines import Line
+from identification.diagnosis.locate import Unexplained, locate
+from identification.diagnosis.trials import COLLINEAR, Base, Trial, flatten, make_base
+from identification.fitting.assess import BalanceError, Error, assess
+from identification.fitting.engine import Dataset, Solution, solve, stack
+from identification.naming.odds import Odds
+from irj_fmu.host.signals import FloatArray
+
+if TYPE_CHECKING:
+    from casadi_models.term import Term
+
+ROUNDS: Final = 3
+"""Steps of a whole fit in which the parameters of the FMU follow: they enter nearly linearly."""
+EXACT: Final = 2
+"""The last of these rounds, in which the FMU runs at its moved parameters: before them its change
+is taken as linear."""
+OUTSIDE: Final = ("friction", "torque")
+"""Families of effects that can ride outside an FMU as a torque."""
+
+
+TORQUES: Final = {
+    "motor_torque": "drive",
+    "coupling_torque": "coupling_torque",
+    "link_torque": "torque",
+}
+"""Channels that follow from the FMU and its parameters, and their signals."""
+
+
+@final
+@dataclass(frozen=True)
+class Freedom:
+    """A parameter of the FMU: what one unit of it changes in every record.
+
+    Attributes
+    ----------
+    name : str
+    low, high : float
+        How far it can move from its value.
+    step : float
+        Step with which the changes were taken: a scale of the parameter.
+    changes : tuple of mapping of str to (n,) array
+        By record, training ones first: signals at full rate, link-referred.
+    """
+
+    name: str
+    low: float
+    high: float
+    step: float
+    changes: tuple[Mapping[str, FloatArray], ...]
+
+
+def freedom(
+    name: str,
+    limits: tuple[float, float],
+    step: float,
+    pairs: Sequence[tuple[Record, Record]],
+    data: Dataset,
+) -> Freedom:
+    """A parameter's changes, from records (before, after) a step of it; training ones first."""
+    out = []
+    for before, after in pairs:
+        changed = before
+        for channel in TORQUES:
+            if before.has(channel):
+                changed = changed.with_channel(channel, (after[channel] - before[channel]) / step)
+        signals = signals_of(evened(changed), data.joint, data.sensing)
+        out.append({n: x for n, x in signals.items() if n in TORQUES.values()})
+    return Freedom(name, *limits, step, tuple(out))
+
+
+def _sum(table: Mapping[str, FloatArray], more: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+    return {**table, **{n: table[n] + x for n, x in more.items()}}
+
+
+def _shifted(
+    records: Sequence[WeakRecord], changes: Sequence[Mapping[str, FloatArray]]
+) -> tuple[WeakRecord, ...]:
+    """Prepared records with torques added at full rate."""
+    out = []
+    for w, change in zip(records, changes, strict=True):
+        averaged, points, smooth, _ = filtered(w.grid, change)
+        out.append(
+            replace(
+                w,
+                averaged=_sum(w.averaged, averaged),
+                points=_sum(w.points, points),
+                smooth=_sum(w.smooth, smooth),
+            )
+        )
+    return tuple(out)
+
+
+def without_steep(
+    data: Dataset, records: Sequence[Record], steep: Sequence[Mapping[str, FloatArray]]
+) -> Dataset:
+    """The records without the rows in which a side's friction is not known: as rows in which that
+    side stands still.
+
+    Parameters
+    ----------
+    data : Dataset
+    records : sequence of Record
+        What it was made of, training ones first.
+    steep : sequence of mapping of side to (n,) array
+        Flags of the samples of each record; empty where there are none.
+    """
+    if not steep:
+        return data
+    out = []
+    for w, record, flags in zip((*data.train, *data.held_out), records, steep, strict=True):
+        weights = differentiated_kernel(w.grid.length, w.grid.dt, 0)
+        rest = dict(w.rest)
+        for side, flag in flags.items():
+            even = np.interp(evened(record).time, record.time, flag)
+            found = w.grid.correlate(even, weights)
+            rest[side] = np.maximum(rest[side], found) if side in rest else found
+        out.append(replace(w, rest=rest))
+    count = len(data.train)
+    return replace(data, train=tuple(out[:count]), held_out=tuple(out[count:]))
+
+
+@final
+class FmuBench:
+    """What an FMU leaves along the measured motion, as the model that a session judges.
+
+    Parameters
+    ----------
+    outside : JointModel
+        Balances of what is left: inertias, and a spring where both sides are seen.
+    data : Dataset
+    free : sequence of Freedom
+        The FMU's parameters.
+    remade : callable
+        The records prepared anew, by what is added to each of these parameters.
+    inside : sequence of Term
+        Effects that the FMU holds already: they are not proposed.
+    own_inertias : collection of str
+        Sides whose inertia is a parameter of the FMU: no other one is proposed there.
+    only_torque : bool
+        What is left was seen at the drive alone: only effects that act there as a torque are tried.
+    """
+
+    def __init__(
+        self,
+        outside: JointModel,
+        data: Dataset,
+        free: Sequence[Freedom],
+        remade: Callable[[Mapping[str, float]], Dataset],
+        *,
+        inside: Sequence[Term] = (),
+        own_inertias: Collection[str] = (),
+        only_torque: bool = True,
+    ) -> None:
+        self.joint, self.data = data.joint, data
+        self._outside, self._free, self._only = outside, list(free), only_torque
+        self._remade = remade
+        self._own = frozenset(own_inertias)
+        self._inside = {(t.effect.key, t.place) for t in inside}
+        self._known: dict[int, tuple[Solution, Dataset]] = {}
+        self._fits: dict[tuple[object, ...], Solution] = {}
+
+    def start(self) -> Solution:
+        """The fit of the balances with nothing added."""
+        return self.fitted(self._outside, {})
+
+    def fitted(
+        self, model: JointModel, start: Mapping[str, float], *, again: bool = False
+    ) -> Solution:
+        """The whole fit of balances with more terms, the FMU's parameters moved along."""
+        if not again and model.structure in self._fits:
+            return self._fits[model.structure]
+        sizes, data = np.zeros(len(self._free)), self.data
+        solution = solve(model, data, start=start)
+        names = [f.name for f in self._free]
+        for number in range(ROUNDS if self._free else 0):
+            sizes = self._moved(solution, data, sizes)
+            data = (
+                self._at(sizes)
+                if number < ROUNDS - EXACT
+                else self._remade(dict(zip(names, sizes.tolist(), strict=True)))
+            )
+            solution = solve(model, data, start=solution.values)
+        self._known[id(solution)] = solution, data
+        self._fits[model.structure] = solution
+        return solution
+
+    def data_of(self, solution: Solution) -> Dataset:
+        """The records with the FMU's parameters where a fit of this bench has moved them."""
+        known = self._known.get(id(solution))
+        return known[1] if known else self.data
+
+    def step(self, key: str | None, label: str | None, solution: Solution) -> Step:
+        """The balances with their errors."""
+        data = self.data_of(solution)
+        train = assess(solution.model, data, data.train, solution.values)
+        held = assess(solution.model, data, data.held_out, solution.values)
+        return Step(key, visible_keys(solution.model), train, held, solution, label)
+
+    def added(self, trial: Trial, now: Step) -> Step:
+        """The whole fit of the balances with a candidate."""
+        values = {**now.solution.values, **trial.values}
+        solution = self.fitted(trial.candidate.model, values)
+        return self.step(trial.key, trial.candidate.label, solution)
+
+    def listen(self, step: Step) -> None:
+        """Nothing: what an FMU leaves is averaged already, and holds no line."""
+
+    def base(self, solution: Solution) -> Base:
+        """Rows of the balances, with the FMU's parameters as nuisance."""
+        data = self.data_of(solution)
+        return with_nuisance(
+            make_base(solution, data), self._columns(solution, data), [f.name for f in self._free]
+        )
+
+    def ranking(
+        self, base: Base, *, late: bool = False, progress: Progress | None = None
+    ) -> Ranking:
+        """The effects that the FMU can lack."""
+        extra = _extra(base.solution.model, self.data)
+        return self._proposed(rank(base, extra, late=late, progress=progress))
+
+    def tried(self, solution: Solution) -> list[str]:
+        """Keys of the effects that the FMU can lack."""
+        every = [*offered(solution.model, self.data)[0], *_extra(solution.model, self.data)]
+        return [c.effect.key for c in every if self._why_not(c) is None]
+
+    def ratios(self, step: Step) -> dict[str, BalanceError]:
+        """Of every balance, at the kernel of the claims."""
+        return dict(step.held_out.balances)
+
+    def shown(self, step: Step) -> Step:
+        """The step: its one kernel is that of the verdict."""
+        return step
+
+    def lines(self, step: Step) -> list[Line]:
+        """None are looked for: the FMU has its own periodic parts."""
+        return []
+
+    def places(
+        self, step: Step, error: Error, lines: Sequence[Line], limit: float
+    ) -> list[Unexplained]:
+        """Where the balances are over their floor."""
+        return locate(step.solution, self.data_of(step.solution), error, lines, limit)
+
+    def learned(self, step: Step, error: Error) -> tuple[LearnedClaim, ...]:
+        """None: a curve cannot ride outside an FMU yet."""
+        return ()
+
+    def held_against(self, claims: Sequence[Claim], step: Step) -> Mapping[str, Equivalence]:
+        """None: a curve cannot ride outside an FMU yet."""
+        return {}
+
+    def artefacts(self, step: Step, curves: Sequence[Curve], start: Step) -> tuple[Doubt, ...]:
+        """None: the FMU has its own parameters."""
+        return ()
+
+    def same_sign(self, trial: Trial, solution: Solution) -> bool:
+        """No minor effects are looked for."""
+        return False
+
+    def odds(
+        self, claim: Claim, near: Mapping[str, float], now: Step, last: Ranking
+    ) -> Odds | None:
+        """None: its trials have told what there is, beside the FMU's own parameters."""
+        return None
+
+    # --- inside -----------------------------------------------------------------------------------
+
+    def _at(self, sizes: FloatArray) -> Dataset:
+        """The records with the FMU's parameters moved, as far as that is linear."""
+        return self._with(self.data, sizes)
+
+    def _with(self, data: Dataset, sizes: FloatArray) -> Dataset:
+        changes = [
+            {
+                n: sum(s * f.changes[i][n] for f, s in zip(self._free, sizes, strict=True))
+                for n in self._free[0].changes[i]
+            }
+            for i in range(len(data.train) + len(data.held_out))
+        ]
+        count = len(data.train)
+        return replace(
+            data,
+            train=_shifted(data.train, changes[:count]),
+            held_out=_shifted(data.held_out, changes[count:]),
+        )
+
+    def _columns(self, solution: Solution, data: Dataset) -> list[FloatArray]:
+        """Change of every row with each of the FMU's parameters, training rows first [N.m per
+        unit]."""
+        balances = balances_of(solution.model, data.sensing, wrt=())
+
+        def rows(given: Dataset) -> FloatArray:
+            both = [
+                flatten(stack(balances, records, solution.values), balances.balances)[0]
+                for records in (given.train, given.held_out)
+                if records
+            ]
+            return np.concatenate(both)
+
+        before, out = rows(data), []
+        for i, f in enumerate(self._free):
+            sizes = np.zeros(len(self._free))
+            sizes[i] = f.step
+            out.append((rows(self._with(data, sizes)) - before) / f.step)
+        return out
+
+    def _moved(self, solution: Solution, data: Dataset, sizes: FloatArray) -> FloatArray:
+        """The FMU's parameters after a Gauss-Newton step of all that is free."""
+        base = make_base(solution, data)
+        q, found = base.orthonormal, []
+        for column in self._columns(solution, data):
+            found.append(column[: len(base.weight)] * base.weight)
+        columns = np.column_stack(found)
+        norms = np.linalg.norm(columns, axis=0)
+        norms = np.where(norms > 0, norms, 1.0)
+        columns = columns / norms
+        apart = columns - q @ (q.T @ columns)
+        left, singular, right = np.linalg.svd(apart, full_matrices=False)
+        kept = singular > COLLINEAR
+        change = -(right[kept].T / singular[kept]) @ (left[:, kept].T @ base.residual)
+        low, high = (np.array([getattr(f, n) for f in self._free]) for n in ("low", "high"))
+        return np.asarray(np.clip(sizes + change / norms, low, high), dtype=np.float64)
+
+    def _why_not(self, candidate: Candidate) -> str | None:
+        """Why a candidate is not proposed; None where it is."""
+        if (candidate.effect.key, candidate.place) in self._inside:
+            return "the joint file says that the FMU holds it"
+        known = {n for r in candidate.effect.requires for n in r.any_of}
+        if candidate.place in self._own and known & set(SIDE_INERTIAS):
+            return "the inertia of that side is a parameter of the FMU and not known"
+        if self._only and candidate.effect.family not in OUTSIDE:
+            return "it cannot ride outside the FMU as a torque"
+        return None
+
+    def _proposed(self, ranking: Ranking) -> Ranking:
+        """The ranking without what is not proposed."""
+        reasons = {t.candidate.label: self._why_not(t.candidate) for t in ranking.everything}
+        kept = tuple(t for t in ranking.everything if reasons[t.candidate.label] is None)
+        first: dict[str, Trial] = {}
+        for t in sorted(
+            kept, key=lambda t: (t.candidate.label not in ranking.significant, -t.score)
+        ):
+            first.setdefault(t.key, t)
+        gone = {
+            t.key: str(reasons[t.candidate.label]) for t in ranking.everything if t.key not in first
+        }
+        return replace(
+            ranking,
+            trials=tuple(first.values()),
+            everything=kept,
+            significant=frozenset(n for n in ranking.significant if reasons.get(n) is None),
+            not_testable=(
+                *ranking.not_testable,
+                *(NotTestable(key, why) for key, why in gone.items()),
+            ),
+        )
+
+
+def with_nuisance(base: Base, columns: Sequence[FloatArray], names: Sequence[str]) -> Base:
+    """The base with further columns that a candidate must stand out from.
+
+    A column that lies in the span of those before it, but for a part that no candidate could be
+    tried on, is left out: it has nothing of its own to explain, and its value would be noise.
+
+    Parameters
+    ----------
+    base : Base
+    columns : sequence of (training rows + held-out rows,) array
+        Unweighted.
+    names : sequence of str
+    """
+    count = len(base.weight)
+    q, kept, extra, held, norms = base.orthonormal, [], [], [], []
+    for name, column in zip(names, columns, strict=True):
+        weighted = column[:count] * base.weight
+        size = float(np.linalg.norm(weighted))
+        if not size > 1e-12 * np.sqrt(count):
+            continue
+        weighted = weighted / size
+        apart = weighted - q @ (q.T @ weighted)
+        own = float(np.linalg.norm(apart))
+        if own < COLLINEAR:
+            continue
+        q = np.column_stack([q, apart / own])
+        kept.append(name)
+        extra.append(weighted)
+        norms.append(size)
+        held.append(column[count:] * base.held_weight / size)
+    if not kept:
+        return base
+    return replace(
+        base,
+        jacobian=np.column_stack([base.jacobian, *extra]),
+        orthonormal=q,
+        residual=base.residual - q @ (q.T @ base.residual),
+        held_jacobian=np.column_stack([base.held_jacobian, *held]),
+        names=(*base.names, *kept),
+        norms=np.append(base.norms, norms),
+    )
+
+
+def _extra(model: JointModel, data: Dataset) -> list[Candidate]:
+    """Effects that need a parent which the FMU may hold itself, such as the Stribeck part of a
+    Coulomb friction.
+    """
+    there = {c.label for c in offered(model, data)[0]}
+    found = []
+    for effect in EFFECTS.values():
+        parents = [n for n in effect.needs if not model.has(n)]
+        if (
+            not _plain(effect)
+            or not parents
+            or any(EFFECTS[n].family not in OUTSIDE for n in parents)
+            or "motor" not in effect.acts_on
+        ):
+            continue
+        label = f"{effect.key}@motor" if len(effect.acts_on) > 1 else effect.key
+        if label in there or model.has(effect.key, "motor") or effect.warms:
+            continue
+        bigger = model.add(label)
+        term = next(t for t in bigger.terms if t.label == label)
+        pairs = list(zip(term.names, effect.parameters, strict=True))
+        names = [tuple(n for n, p in pairs if p.is_shape is shape) for shape in (False, True)]
+        found.append(Candidate(label, effect, "motor", bigger, *names))
+    return found
+
+
+def _plain(effect: Effect) -> bool:
+    return (
+        effect.family in OUTSIDE
+        and effect.candidate
+        and not effect.needs_load
+        and not effect.periodic
+    )
+
+
+__all__ = ["OUTSIDE", "FmuBench", "Freedom", "freedom", "with_nuisance", "without_steep"]

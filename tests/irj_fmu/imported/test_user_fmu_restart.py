@@ -1,0 +1,77 @@
+"""A user's FMU of an elastic joint, restarted at measured states: every balance is seen."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from identification.data.record import Record
+from identification.errors import InputError
+from irj_fmu.imported.diagnose import diagnose
+from irj_fmu.imported.restart import Restart
+from tests.user_fmus.make import Make, build, check
+from tests.user_fmus.plant import TRUTH, foreign, recorded
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Co-simulation only, parameters fixed, no FMU state."""
+    made = build("Elastic", tmp_path_factory.mktemp("r"), Make(2, ("CoSimulation",), strict=True))
+    assert check(made) == []
+    return made
+
+
+@pytest.fixture(scope="module")
+def plain() -> Record:
+    return recorded(None, 12.0, 1)
+
+
+def restart_of(path: Path, record: Record, **options: object) -> Restart:
+    model = replace(foreign(path, **options), window=None)
+    return Restart(model, model.windows([record])[0], record)
+
+
+def test_probes_find_the_inertias_and_the_spring(path: Path, plain: Record) -> None:
+    found = restart_of(path, plain.window(0, 2)).sizes
+    for name in ("motor_inertia", "link_inertia", "stiffness", "structural_damping"):
+        assert found[name] == pytest.approx(TRUTH[name], rel=2e-3), name
+
+
+def test_both_kinds_of_fmu_leave_the_same(path: Path, plain: Record, tmp_path: Path) -> None:
+    short = plain.window(0, 1)
+    other = build("Elastic", tmp_path, Make(2, ("ModelExchange",)))
+    restarts = [restart_of(p, short) for p in (path, other)]
+    one, two = (r.record(short) for r in restarts)
+    # their integrators differ where friction changes its sign within a sample
+    smooth = restarts[0].steep(short)["motor"] == 0
+    assert 0.5 < np.mean(smooth) < 1.0
+    for channel in ("motor_torque", "coupling_torque", "link_torque"):
+        size = float(np.std(one[channel]))
+        difference = np.abs(one[channel] - two[channel])[smooth]
+        assert difference.max() < 1e-4 * size, channel
+
+
+def test_a_state_that_is_not_started_is_told(path: Path, plain: Record) -> None:
+    with pytest.raises(InputError, match=r"no variable of \[model.start\] starts at link_pos"):
+        restart_of(path, plain.window(0, 2), start={"qm": "motor_position", "wm": "motor_velocity"})
+
+
+def test_nothing_is_missing_where_nothing_is_hidden(path: Path, plain: Record) -> None:
+    found = diagnose(foreign(path), plain.window(0, 8), plain.window(8, 12))
+    assert found.why_followed == ""
+    assert set(found.error.balances) == {"motor", "link", "transmission"}
+    assert found.diagnosis.outcome == "complete"
+
+
+def test_a_kinematic_error_is_named_and_nothing_beside_it(path: Path) -> None:
+    """It moves the link alone: the balance at the drive does not see it."""
+    record = recorded("kinematic_error", 12.0, 3)
+    found = diagnose(foreign(path), record.window(0, 8), record.window(8, 12), most=2)
+    assert [c.effects for c in found.diagnosis.found.claims] == [("kinematic_error",)]
+    before, after = (s.held_out.balances["transmission"] for s in found.diagnosis.found.steps)
+    assert after.rms < 0.05 * before.rms
+    with pytest.raises(InputError, match="only a torque at the drive rides outside"):
+        found.add()
