@@ -30,8 +30,8 @@ SETS: Final[dict[tuple[str, ...], str]] = {
     ("current", "motor", "link", "torque"): "both",
 }
 """Sets of sensors, and the side whose friction they show."""
-BLIND: Final = [("current", "torque"), ("motor", "link"), ("current",), ("motor",)]
-"""Sets without a balance: no position, or no torque."""
+BLIND: Final = [("current", "torque"), ("current",), ("motor",)]
+"""Sets without a balance: no position, or no torque and one position."""
 
 
 @cache
@@ -114,3 +114,10 @@ def test_a_set_without_a_balance_is_refused_with_what_is_missing(given: tuple[st
     train, held = records(given, ())
     with pytest.raises(InputError, match=r"record one|measure it|add one|needs one"):
         improve(train, joint(given, ("viscous",)), [held])
+
+
+def test_two_positions_alone_have_a_balance_of_angles_and_claim_nothing() -> None:
+    train, held = records(("motor", "link"), ())
+    found = improve(train, joint(("motor", "link"), ("viscous", "coulomb", "gravity")), [held])
+    assert list(found.final_ratios) == ["kinematic"]
+    assert found.claims == ()
