@@ -13,11 +13,13 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from casadi_models import EFFECTS
+from casadi_models import EFFECTS, JointModel
+from identification.balance.sensing import check_alike, sense
 from identification.crash import FOLDER
 from identification.data.joint_file import load_joint
 from identification.data.own_effects import STORE
 from identification.data.plain_text import from_toml
+from identification.data.record import Record
 from irj_fmu.command_line import LONGEST
 from workbench.cli.main import main
 
@@ -411,6 +413,38 @@ def test_the_next_command_of_an_import_can_be_pasted(
     line = next(x for x in capsys.readouterr().out.splitlines() if "next: " in x)
     said = shlex.split(line.partition("next: ")[2])
     assert said == ["irj", "check", str(path), "--joint", str(joint)]
+
+
+TWO_POSITIONS = {
+    "time_s": RUN_T,
+    "motor_position_rad": -160 * (np.sin(2 * RUN_T) + 1e-3 * np.sin(9 * RUN_T)),
+    "link_position_rad": np.sin(2 * RUN_T),
+}
+
+
+def test_no_drive_is_said_by_what_could_be_recorded(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, joint = tmp_path / "r.csv", tmp_path / "j.toml"
+    path.write_text(csv(TWO_POSITIONS))
+    joint.write_text(JOINT)
+    line = refused(capsys, "track", str(path), "--joint", str(joint))
+    assert "no motor_torque, motor_current or motor_voltage says what drives the joint" in line
+
+
+def test_parts_of_a_record_of_a_rigid_joint_are_alike() -> None:
+    """Whether a part shows a twist beside its torque is no matter of its channels."""
+    twist = 1e-3 * np.sin(9 * RUN_T)
+    channels = {
+        "motor_position": -160 * (np.sin(2 * RUN_T) + twist),
+        "link_position": np.sin(2 * RUN_T),
+    }
+    model = JointModel.by_name("hd1", -160.0)
+    loud = Record.from_channels(RUN_T, {**channels, "link_torque": 1e4 * twist}, name="a")
+    other = Record.from_channels(RUN_T, {**channels, "link_torque": np.cos(31 * RUN_T)}, name="b")
+    assert "transmission" in sense(loud, model).balances
+    assert check_alike([loud, other], model).balances == ("link",)
+    assert check_alike([other, loud], model).balances == ("link",)
 
 
 def test_a_joint_file_is_no_record_to_import(
