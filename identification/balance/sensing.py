@@ -172,7 +172,7 @@ def _sensed(record: Record, elastic: bool, gear_ratio: float) -> Sensing:
 def check_alike(
     records: Sequence[Record], model: JointModel, labels: Sequence[str] = (), *, once: bool = True
 ) -> Sensing:
-    """What the first record lets one see, where the others let one see the same.
+    """What all records let one see, where their channels let one see the same.
 
     Parameters
     ----------
@@ -211,15 +211,23 @@ def check_alike(
             found.append(sense(record, model))
         except InputError as error:
             raise InputError(f"{label}: {str(error).removeprefix(record.name + ': ')}") from None
-        if (
-            found[-1].balances != found[0].balances
-            or found[-1].has_coupling != found[0].has_coupling
-        ):
+        if _fixed(found[-1]) != _fixed(found[0]) or found[-1].has_coupling != found[0].has_coupling:
             raise InputError(
                 f"{label}: {_difference(record, records[0], called[0])}; give records with the "
                 "same channels"
             )
-    return replace(found[0], **_warmth(records))
+    seen = tuple(b for b in found[0].balances if all(b in one.balances for one in found))
+    return replace(found[0], balances=seen, **_warmth(records))
+
+
+def _fixed(sensing: Sensing) -> tuple[str, ...]:
+    """The balances that the channels alone decide. Whether a rigid model's records show a twist
+    beside their torque depends on the motion of each (:func:`_twists`), even on that of two parts
+    of one record: where one does not, the others are judged without that balance.
+    """
+    if sensing.clamped_link or not sensing.has_torque:
+        return sensing.balances
+    return tuple(b for b in sensing.balances if b != "transmission")
 
 
 def _warmth(records: Sequence[Record]) -> dict[str, Any]:
@@ -328,8 +336,13 @@ def drive_torque(record: Record, joint: Joint) -> FloatArray:
     Raises
     ------
     InputError
-        Current without a motor constant.
+        No drive channel; current without a motor constant.
     """
+    if not any(record.has(channel) for channel in DRIVES):
+        raise InputError(
+            f"{record.name}: no {', '.join(DRIVES[:-1])} or {DRIVES[-1]} says what drives the "
+            "joint; record one of them or map it in [columns]"
+        )
     if record.has("motor_torque"):
         return np.asarray(record["motor_torque"] * joint.gear_ratio, dtype=np.float64)
     if record.has("motor_current"):

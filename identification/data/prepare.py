@@ -62,24 +62,42 @@ def butterworth(
         raise InputError(f"filter: time step {dt!r} s cannot be used: give a positive one")
     if not 0.0 < cutoff < 0.5 / dt:
         raise InputError(
-            f"filter: cut-off {cutoff!r} Hz must be under half the sampling rate, {0.5 / dt:g} Hz"
+            f"filter: cut-off {cutoff!r} Hz must be above 0 and under half the sampling rate, "
+            f"{0.5 / dt:g} Hz"
         )
     if order < 1:
         raise InputError(f"filter: order {order!r} must be at least 1")
+    _long_enough(array, 3 * (order + 1))
     from scipy.signal import butter
 
-    return _both_ways(butter(order, 2.0 * cutoff * dt, output="sos"), array, 3 * (order + 1))
+    with np.errstate(all="ignore"):  # the result is looked at instead
+        sections = butter(order, 2.0 * cutoff * dt, output="sos")
+    return _both_ways(sections, array, 3 * (order + 1))
 
 
-def _both_ways(sections: npt.NDArray[np.float64], array: FloatArray, padding: int) -> FloatArray:
-    from scipy.signal import sosfiltfilt
-
+def _long_enough(array: FloatArray, padding: int) -> None:
     if array.shape[0] <= padding:
         raise InputError(
             f"filter: {array.shape[0]} samples are too few, more than {padding} are needed: "
             "record longer"
         )
-    return np.asarray(sosfiltfilt(sections, array, axis=0, padlen=padding), dtype=np.float64)
+
+
+def _both_ways(sections: npt.NDArray[np.float64], array: FloatArray, padding: int) -> FloatArray:
+    from scipy.signal import sosfiltfilt
+
+    _long_enough(array, padding)
+    try:
+        with np.errstate(all="ignore"):
+            result = np.asarray(sosfiltfilt(sections, array, axis=0, padlen=padding), np.float64)
+    except np.linalg.LinAlgError:  # poles on the unit circle
+        result = np.full(1, np.nan)
+    if not np.isfinite(result).all():
+        raise InputError(
+            "filter: cut-off and order cannot be computed with at this sampling rate: raise the "
+            "cut-off or lower the order"
+        )
+    return result
 
 
 def _finite(values: npt.ArrayLike) -> FloatArray:
@@ -182,6 +200,11 @@ def decimate(values: npt.ArrayLike, factor: int = 10) -> FloatArray:
         raise InputError(f"decimate: factor {factor!r} must be at least 1")
     if factor == 1:
         return array
+    if array.shape[0] <= factor:
+        raise InputError(
+            f"decimate: {array.shape[0]} samples do not hold a second one at every {factor}th: "
+            "give a smaller number or record longer"
+        )
     from scipy.signal import cheby1
 
     return _both_ways(cheby1(8, 0.05, 0.8 / factor, output="sos"), array, 27)[::factor]
@@ -317,6 +340,8 @@ def decimated(record: Record, factor: int = 10) -> Record:
     out.
     """
     _uniform(record)
+    if factor < 1:
+        raise InputError(f"decimate: factor {factor!r} must be at least 1")
     parts = record.segments()
     channels = {
         channel: np.concatenate(

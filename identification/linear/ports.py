@@ -211,7 +211,13 @@ def _edge(signal: FloatArray, dt: float) -> float:
 
 
 def thinned(parts: Sequence[Part], every: int) -> list[Part]:
-    """Every `every`-th sample after a low-pass; stretches that get too short are left out."""
+    """Every `every`-th sample after a low-pass; stretches that get too short are left out.
+
+    Raises
+    ------
+    InputError
+        None is long enough.
+    """
     if every == 1:
         return list(parts)
     found = []
@@ -220,6 +226,11 @@ def thinned(parts: Sequence[Part], every: int) -> list[Part]:
             continue
         kept = None if p.reference is None else decimate(p.reference, every)
         found.append(Part(p.record, decimate(p.u, every), decimate(p.y, every), kept))
+    if parts and not found:
+        raise InputError(
+            f"{parts[0].record}: no stretch is long enough to keep every {every}th sample: give a "
+            "smaller --every or record longer"
+        )
     return found
 
 

@@ -17,7 +17,7 @@ from casadi_models.transmission import MODELS
 from identification.balance.balances import Balances
 from identification.balance.calibration import unknowns_of
 from identification.balance.dataset import visible_labels, without
-from identification.balance.sensing import sense
+from identification.balance.sensing import adapt, sense
 from identification.data.joint_file import Joint
 from identification.data.record import Record
 from identification.diagnosis.bench import Progress
@@ -255,6 +255,9 @@ class _Search:
                     "shows other balances of these records: give it as the model of the joint file"
                 )
                 continue
+            if self.start.model.is_elastic and not model.is_elastic:
+                # the twist is what these channels show, so a rigid model gets one, as the start did
+                model = adapt(model, sensing, joint.known)
             prepared = replace(
                 self.start.model,
                 terms=(

@@ -13,11 +13,13 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from casadi_models import EFFECTS
+from casadi_models import EFFECTS, JointModel
+from identification.balance.sensing import check_alike, sense
 from identification.crash import FOLDER
 from identification.data.joint_file import load_joint
 from identification.data.own_effects import STORE
 from identification.data.plain_text import from_toml
+from identification.data.record import Record
 from irj_fmu.command_line import LONGEST
 from workbench.cli.main import main
 
@@ -273,6 +275,10 @@ ARGUMENTS: dict[str, tuple[str, str]] = {
     "a root as report": ("report J --joint J -o /", "is a folder"),
     "an input as result": ("check J --json J", "would be lost"),
     "a device as code": ("--effects /dev/zero effects", "no such file"),
+    "a ratio to compute nothing with": ("import J --gear-ratio 1e300 -o O", "gear_ratio = 1e+300"),
+    "a calibration on its record": ("accelerometer --up J --down x --json J", "would be lost"),
+    "a joint on the one it follows": ("joint new x.fmu --record x --like J -o J", "would be lost"),
+    "a report on a result it reads": ("report x --joint x --beside J -o J", "would be lost"),
 }
 
 
@@ -363,6 +369,92 @@ def test_arguments(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     given = [places.get(w, w.replace("O.", f"{tmp_path}/o.")) for w in shlex.split(words)]
     assert expected in refused(capsys, *given)
     assert [p.name for p in tmp_path.iterdir()] == ["j.toml"]
+
+
+RUN_T = np.arange(400) * 0.01
+RUN = {
+    "time_s": RUN_T,
+    "motor_current_A": np.sin(9 * RUN_T) + np.sin(2 * RUN_T),
+    "motor_position_rad": np.cos(9 * RUN_T) - np.cos(2 * RUN_T),
+}
+ON_A_RUN = {
+    "a filter of no band": ("prefilter R --cutoff 1e-9 -o O", "raise the cut-off"),
+    "a filter below zero": ("prefilter R --cutoff -1 -o O", "must be above 0"),
+    "a filter of a high order": ("prefilter R --order 1000 -o O", "more than 3003 are needed"),
+    "no sample kept": ("prefilter R --every 0 -o O", "must be at least 1"),
+    "one sample kept": (f"prefilter R --every 1{'0' * 30} -o O", "a second one"),
+    "one sample for a linear model": ("linear R --every 100000", "give a smaller --every"),
+    "volts without end": (
+        "accelerometer --up B --down R --column motor_current_A",
+        "no sensor reads that",
+    ),
+}
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("name", ON_A_RUN)
+def test_absurd_numbers_on_a_run(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words, expected = ON_A_RUN[name]
+    (tmp_path / "r.csv").write_text(csv(RUN))
+    (tmp_path / "b.csv").write_text(csv({**RUN, "motor_current_A": RUN_T + 1e308}))
+    places = {k: str(tmp_path / f"{k.lower()}.csv") for k in "RBO"}
+    assert expected in refused(capsys, *(places.get(w, w) for w in words.split()))
+    assert not (tmp_path / "o.csv").exists()
+
+
+def test_the_next_command_of_an_import_can_be_pasted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, joint = tmp_path / "läuf 1.csv", tmp_path / "axis 1.toml"
+    path.write_text(csv(RUN))
+    assert main(["import", str(path), "-o", str(joint)]) == 0
+    line = next(x for x in capsys.readouterr().out.splitlines() if "next: " in x)
+    said = shlex.split(line.partition("next: ")[2])
+    assert said == ["irj", "check", str(path), "--joint", str(joint)]
+
+
+TWO_POSITIONS = {
+    "time_s": RUN_T,
+    "motor_position_rad": -160 * (np.sin(2 * RUN_T) + 1e-3 * np.sin(9 * RUN_T)),
+    "link_position_rad": np.sin(2 * RUN_T),
+}
+
+
+def test_no_drive_is_said_by_what_could_be_recorded(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, joint = tmp_path / "r.csv", tmp_path / "j.toml"
+    path.write_text(csv(TWO_POSITIONS))
+    joint.write_text(JOINT)
+    line = refused(capsys, "track", str(path), "--joint", str(joint))
+    assert "no motor_torque, motor_current or motor_voltage says what drives the joint" in line
+
+
+def test_parts_of_a_record_of_a_rigid_joint_are_alike() -> None:
+    """Whether a part shows a twist beside its torque is no matter of its channels."""
+    twist = 1e-3 * np.sin(9 * RUN_T)
+    channels = {
+        "motor_position": -160 * (np.sin(2 * RUN_T) + twist),
+        "link_position": np.sin(2 * RUN_T),
+    }
+    model = JointModel.by_name("hd1", -160.0)
+    loud = Record.from_channels(RUN_T, {**channels, "link_torque": 1e4 * twist}, name="a")
+    other = Record.from_channels(RUN_T, {**channels, "link_torque": np.cos(31 * RUN_T)}, name="b")
+    assert "transmission" in sense(loud, model).balances
+    assert check_alike([loud, other], model).balances == ("link",)
+    assert check_alike([other, loud], model).balances == ("link",)
+
+
+def test_a_joint_file_is_no_record_to_import(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, out = tmp_path / "j.toml", tmp_path / "o.toml"
+    path.write_text(JOINT)
+    assert main(["import", str(path), "-o", str(out)]) == 2
+    assert capsys.readouterr().err.startswith(f"irj: {path}: no column is recognised as time")
+    assert not out.exists()
 
 
 def test_a_zero_byte_in_an_argument(capsys: pytest.CaptureFixture[str]) -> None:

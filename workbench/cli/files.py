@@ -80,6 +80,24 @@ def named(error: InputError, path: str, record: Record) -> InputError:
 
 
 OUTPUTS: Final = ("json", "output", "report", "truth", "picture")
+READ: Final = [
+    "records",
+    "held_out",
+    "fit_records",
+    "healthy",
+    "other_payload",
+    "effects",
+    "own_effects",
+    "reference",
+    "beside",
+    "up",
+    "down",
+    "horizontal",
+    "record",
+    "like",
+    "fmu",
+]
+"""Options whose files are read, whatever the verb."""
 
 
 def check_outputs(arguments: Namespace) -> None:
@@ -88,20 +106,9 @@ def check_outputs(arguments: Namespace) -> None:
 
     The joint file may be written back in place by ``fit``, ``improve`` and ``add``.
     """
-    inputs = [
-        *_listed(arguments, "records"),
-        *_listed(arguments, "held_out"),
-        *_listed(arguments, "fit_records"),
-    ]
-    inputs += [
-        *_listed(arguments, "healthy"),
-        *_listed(arguments, "other_payload"),
-        *_listed(arguments, "effects"),
-        *_listed(arguments, "own_effects"),
-    ]
+    inputs = [path for name in READ for path in _listed(arguments, name)]
     joint = getattr(arguments, "joint", None)
     inputs += _fmu_of(joint)
-    inputs += [arguments.reference] if getattr(arguments, "reference", None) else []
     named: dict[str, str] = {}
     for option in OUTPUTS:
         path = getattr(arguments, option, None)
@@ -144,7 +151,8 @@ def distinct(**groups: Sequence[str]) -> None:
 
 
 def _listed(arguments: Namespace, name: str) -> list[str]:
-    return list(getattr(arguments, name, None) or [])
+    given = getattr(arguments, name, None) or []
+    return [given] if isinstance(given, str) else list(given)
 
 
 def write_bytes(path: str | Path, content: bytes) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from identification.balance.dataset import load_dataset, prepared_model
+from identification.data.check.channels import LARGEST
 from identification.data.check.checks import Finding, check, repair
 from identification.data.check.gate import inspected, passed
 from identification.data.joint_file import Joint
@@ -113,7 +114,7 @@ def run_prefilter(arguments: Namespace) -> int:
         smooth = with_derivatives(smooth)
     if arguments.trim:
         smooth = trimmed(smooth, arguments.trim)
-    if arguments.every > 1:
+    if arguments.every != 1:
         smooth = decimated(smooth, arguments.every)
     _write_record(Path(arguments.output), smooth)
     for note in smooth.provenance.notes:
@@ -167,6 +168,8 @@ def _volts(path: str, column: str | None) -> npt.NDArray[np.float64]:
     values = np.asarray(table.load([chosen], [])[chosen], dtype=np.float64)
     if not values.size or not np.isfinite(values).all():
         raise InputError(f"{path}: column {chosen} holds no number in some rows; cut them out")
+    if float(np.abs(values).max()) > LARGEST:
+        raise InputError(f"{path}: column {chosen}: no sensor reads that, export it again")
     return values
 
 
@@ -231,7 +234,7 @@ def run_linear(arguments: Namespace) -> int:
     joint = open_joint(arguments.joint) if arguments.joint else None
     records, warnings = open_records(arguments.records, joint)
     held, more = open_records(arguments.held_out, joint)
-    asked = {"families": arguments.family} if arguments.family else {}
+    asked = {"families": list(dict.fromkeys(arguments.family))} if arguments.family else {}
     found = linear_models(
         records,
         held,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from argparse import Namespace
 from pathlib import Path
 from typing import Any, Final
@@ -26,6 +27,8 @@ def run_import(arguments: Namespace) -> int:
     ratio = arguments.gear_ratio
     if ratio is not None and (ratio == 0.0 or not math.isfinite(ratio)):
         raise InputError(f"--gear-ratio is {ratio:g}; give theta_motor / theta_link with its sign")
+    if arguments.output:  # refuse the arguments before anything is said of the file
+        parse_joint({"joint": _table(path.stem, "rotary", arguments)}, str(arguments.output))
     made = survey(
         path,
         kind=arguments.kind,
@@ -44,10 +47,12 @@ def run_import(arguments: Namespace) -> int:
     joint = _joint(made, path, arguments)
     if arguments.output:
         if not made.proposed or made.problem:
-            raise InputError(f"{path}: {made.problem or 'no column is recognised'}")
+            problem = made.problem.removeprefix(f"{path}: ")
+            raise InputError(f"{path}: {problem or 'no column is recognised'}")
         parse_joint(joint, str(arguments.output))
         write_text(arguments.output, tables_text(joint))
-        print(f"{arguments.output}: written; next: irj check {path} --joint {arguments.output}")
+        check = shlex.join(["irj", "check", str(path), "--joint", str(arguments.output)])
+        print(f"{arguments.output}: written; next: {check}")
         if arguments.gear_ratio is None:
             print("gear_ratio = 1 stands in it: correct it where there is a gear")
         if "motor_current" in made.map and arguments.motor_constant is None:
@@ -93,12 +98,16 @@ def _range(column: Seen) -> str:
 
 def _joint(made: Survey, path: Path, arguments: Namespace) -> dict[str, Any]:
     named = f"{path.stem}_{made.number}" if made.number in made.joints else path.stem
+    return {"joint": _table(named, made.kind, arguments), "columns": made.map}
+
+
+def _table(name: str, kind: str, arguments: Namespace) -> dict[str, Any]:
     table = {
-        "name": arguments.name or named,
-        "kind": made.kind,
+        "name": arguments.name or name,
+        "kind": kind,
         "gear_ratio": 1.0 if arguments.gear_ratio is None else arguments.gear_ratio,
         "motor_constant": arguments.motor_constant,
         "model": "hd1",
         "effects": ["viscous", "coulomb"],
     }
-    return {"joint": {k: v for k, v in table.items() if v is not None}, "columns": made.map}
+    return {k: v for k, v in table.items() if v is not None}
