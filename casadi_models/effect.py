@@ -406,6 +406,12 @@ class Registry(Mapping[str, Effect]):
         """The effects that were typed as text, each as a file that declares it."""
         return tuple(self._typed.values())
 
+    def forget(self, key: str) -> None:
+        """Take an effect that was typed as text out of the library; any other key is an error."""
+        if key not in self._typed:
+            raise ValueError(f"effect {key!r} was not typed as text")
+        del self._typed[key], self._effects[key]
+
     @property
     def files(self) -> tuple[EffectFile, ...]:
         """The users' files that were loaded, with those of their effects that are registered

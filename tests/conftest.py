@@ -5,6 +5,8 @@ from collections.abc import Iterator
 
 import pytest
 
+from casadi_models import EFFECTS
+
 if (
     signal.getsignal(signal.SIGINT) is signal.SIG_IGN
 ):  # pytest was started in the background: Ctrl-C would not reach the programs that tests start
@@ -19,3 +21,13 @@ def _allowed_effects(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]
         patched.setenv("IRJ_ALLOWED_EFFECTS", str(state / "allowed-effects.txt"))
         patched.setenv("IRJ_CRASHES", str(state / "crashes"))
         yield
+
+
+@pytest.fixture(autouse=True)
+def _typed_laws_forgotten() -> Iterator[None]:
+    """A law that a test types in this process does not stay in the library of the other tests."""
+    before = {key for found in EFFECTS.typed for key in found.keys}
+    yield
+    for found in EFFECTS.typed:
+        for key in set(found.keys) - before:
+            EFFECTS.forget(key)

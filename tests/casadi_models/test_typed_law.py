@@ -7,7 +7,6 @@ from __future__ import annotations
 import json
 import pickle
 import time
-from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
 from types import SimpleNamespace
@@ -105,19 +104,11 @@ STATED = {"load_dependent_friction": {"e": 1e-3}}
 """Numbers with a unit inside a law of the library: a parameter of the typed one."""
 
 
-@pytest.fixture(autouse=True)
-def forgotten() -> Iterator[None]:
-    """Typed laws do not stay in the library of the other tests."""
-    yield
-    forget()
-
-
 def forget() -> None:
     """As in a new process."""
     for found in EFFECTS.typed:
         for key in found.keys:
-            EFFECTS._effects.pop(key, None)
-    EFFECTS._typed.clear()
+            EFFECTS.forget(key)
 
 
 def typed(key: str) -> TypedLaw:

@@ -581,8 +581,7 @@ def test_a_typed_law_rides_outside_an_fmu(folder: Path, dragged: Record, tmp_pat
             DRAG, rel=0.05
         )
     finally:
-        EFFECTS._effects.pop("typed_drag", None)
-        EFFECTS._typed.clear()
+        EFFECTS.forget("typed_drag")
 
 
 def test_an_fmu_that_fails_is_unusable_input(folder: Path, plain: Record, tmp_path: Path) -> None:

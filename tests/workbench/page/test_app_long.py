@@ -204,8 +204,9 @@ def test_a_memory_law_is_followed_again_only_where_its_own_values_change(
     wider = bare.evaluate(record, {**values, "hysteresis_width": 1.5 * values["hysteresis_width"]})
     assert len(followed) == 2
     assert not np.allclose(wider["transmission"][0], first["transmission"][0])
-    np.testing.assert_array_equal(
-        bare.evaluate(record, values)["transmission"][0], first["transmission"][0]
+    # with columns and without them the rows are summed in another order: the last digit may differ
+    np.testing.assert_allclose(
+        bare.evaluate(record, values)["transmission"][0], first["transmission"][0], rtol=1e-14
     )
     assert len(followed) == 2
 
