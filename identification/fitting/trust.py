@@ -37,6 +37,9 @@ WINDOWS: Final = 4
 """Windows of equal time over all training rows."""
 PROFILE_STEPS: Final = 4
 """Refits on each side of a shape: its interval is wanted to some percent of its width."""
+NEAR_END: Final = 0.03
+"""Relative distance of a refit from the end of the interval at which it is the end: those percent.
+"""
 REFITS: Final = 4
 """Gauss-Newton steps of the others in such a refit."""
 CLASSES: Final = ("inertia", "stiffness", "friction", "shape", "other")
@@ -356,7 +359,7 @@ class _Judge:
                     reach = guess if inside < guess < outside else middle
                 else:
                     reach = min(max(guess, 1.2 * reach), 3 * reach)
-                if abs(root / NORMAL - 1) < 0.03:
+                if abs(root / NORMAL - 1) < NEAR_END:
                     break
             ends.append(value * math.exp(sign * reach))
         return ends[0], ends[1]
