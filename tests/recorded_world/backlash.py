@@ -163,9 +163,11 @@ def load(path: Path | None) -> list[Seen]:
     if path is None or not path.exists():
         return []
     lines = [json.loads(x) for x in path.read_text(encoding="utf-8").splitlines() if x.strip()]
-    return [
-        Seen(**{k: tuple(v) if isinstance(v, list) else v for k, v in x.items()}) for x in lines
-    ]
+    return [_seen({k: tuple(v) if isinstance(v, list) else v for k, v in x.items()}) for x in lines]
+
+
+def _seen(fields: dict[str, Any]) -> Seen:
+    return Seen(**fields)
 
 
 def main(argv: list[str] | None = None) -> int:
