@@ -928,9 +928,7 @@ def _result(search: _Search, point: _Point, records: tuple[str, ...]) -> Changes
         records=records,
         payload_note=note,
         minor=_minor(search, point, rates),
-        least={
-            names[i]: v for i in tested if names[i] in still and (v := point.least(i)) < math.inf
-        },
+        least={n: v for n, v in least.items() if math.isfinite(v)},
     )
 
 
