@@ -39,6 +39,7 @@ from identification.fitting.errors_in_variables import (
     whole_without,
 )
 from identification.fitting.start_values import bounds_of, starts
+from identification.fitting.turns import turns_of
 from identification.fitting.weak_form import WeakForm
 
 __all__ = [
@@ -493,9 +494,12 @@ def _with_errors(
     stacked = problem.stacked(np.array([values[n] for n in free]))
     prior = problem.prior
     x = np.array([values[n] for n in free])
-    j = problem.jacobian(x) * ~np.outer(~problem.one_way, problem.clocks)
-    r = np.concatenate(
-        [*(stacked.residual[b] * weights[b] for b in balances.balances), problem.surprise(x)]
+    turns = turns_of(problem)
+    j = turns.without(problem.jacobian(x)) * ~np.outer(~problem.one_way, problem.clocks)
+    r = turns.without(
+        np.concatenate(
+            [*(stacked.residual[b] * weights[b] for b in balances.balances), problem.surprise(x)]
+        )
     )
     # what is known beforehand belongs to no block of time: it scatters by itself
     block = np.concatenate(

@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from identification.balance.drawn_noise import draws_of
 from identification.balance.stacked import noise_believed, stack
+from identification.fitting.turns import turns_of
 from identification.fitting.weak_form import WeakForm
 
 FloatArray = npt.NDArray[np.float64]
@@ -146,7 +147,7 @@ def unbiased(
     noise adds there.
 
     The clocks follow from rows within which the joint does not turn: where dry friction turns, the
-    torque hangs on the very instant of the turn.
+    torque hangs on the very instant of the turn.  For the others these instants are unknown.
 
     Parameters
     ----------
@@ -164,8 +165,9 @@ def unbiased(
         # what it adds to products is none of a straight line. Such rows count less already
         return dict(problem.values), no_noise(problem)
     noise = noise_products(problem)
+    turns = turns_of(problem)
     for _ in range(STEPS):
-        rows, jacobian = problem.residual(x), problem.jacobian(x)
+        rows, jacobian = turns.without(problem.residual(x)), turns.without(problem.jacobian(x))
         step = np.zeros(len(x))
         if clocks.any():
             told = problem.one_way

@@ -22,6 +22,7 @@ from identification.fitting.covariance import NORMAL, correlations
 from identification.fitting.engine import Solution
 from identification.fitting.information import eliminated, form_of, white_errors
 from identification.fitting.start_values import bounds_of
+from identification.fitting.turns import turns_of
 from identification.fitting.weak_form import WeakForm
 
 FloatArray = npt.NDArray[np.float64]
@@ -181,8 +182,11 @@ class _Judge:
         stacked = self.form.stacked(x)
         names = self.form.balances.balances
         weights = solution.weights
-        self.j = np.concatenate([stacked.jacobian[b] * weights[b][:, None] for b in names])
-        self.r = np.concatenate([stacked.residual[b] * weights[b] for b in names])
+        turns = turns_of(self.form)
+        self.j = turns.without(
+            np.concatenate([stacked.jacobian[b] * weights[b][:, None] for b in names])
+        )
+        self.r = turns.without(np.concatenate([stacked.residual[b] * weights[b] for b in names]))
         self.plain = np.concatenate([stacked.jacobian[b] for b in names])
         self.block = np.tile(stacked.block, len(names))
         self.record = np.tile(
