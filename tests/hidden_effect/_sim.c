@@ -97,6 +97,10 @@ int simulate(const double *p, const double *ref, const double *dref, int n_ref, 
             f = s - a;
             r = ref[a] + f * (ref[a + 1] - ref[a]);
             dr = dref[a] + f * (dref[a + 1] - dref[a]);
+            if (p[P_CURVE] != 0.0) {
+                double rise = ref[a + 1] - ref[a];
+                r += f * (1.0 - f) * ((1.0 - f) * (dt_ref * dref[a] - rise) - f * (dt_ref * dref[a + 1] - rise));
+            }
         }
         if (p[P_HEAT] != 0.0 && t > 0.0) heat = 1.0 - p[P_HEAT] * (1.0 - exp(-t / p[P_HEAT_TAU]));
         qm = q + 0.5 * h * v; tm = th + 0.5 * h * w; xm = x + 0.5 * h * u;

@@ -17,19 +17,21 @@ from tests.hidden_effect.generator import simulate_case
 
 @pytest.mark.parametrize("smoothing", [0.0, 0.002])
 def test_a_turn_of_dry_friction_is_no_inertia(smoothing: float) -> None:
-    """A triangle accelerates at its turns only: without unknown instants .35 % stay in the motor's
-    inertia where friction jumps."""
+    """A triangle accelerates at its turns only: without unknown instants .6 % stay in the motor's
+    inertia, and 2.4 % in its viscous friction where the friction turns smoothly."""
     case = simulate_case(
-        None, 50_000, overrides={"M_V0": smoothing, "L_V0": smoothing}, records=("train",)
+        None,
+        50_001,
+        overrides={"M_V0": smoothing, "L_V0": smoothing, "CURVE": 1.0},
+        records=("train",),
     )
     record = record_of(case.measured["train"], "train", "same")
     joint = joint_of(case)
     model = prepared_model(joint, record)
     data = load_dataset([record], [], joint, model)
     found = solve(model, data)
-    # the generator's drive ripples between samples, which takes .06 to .1 % off what is recorded
-    assert found.values["motor_inertia"] == pytest.approx(case.parameters["JM"], rel=1.5e-3)
-    assert found.values["motor_viscous"] == pytest.approx(case.parameters["M_B"], rel=1.5e-3)
+    assert found.values["motor_inertia"] == pytest.approx(case.parameters["JM"], rel=8e-4)
+    assert found.values["motor_viscous"] == pytest.approx(case.parameters["M_B"], rel=8e-4)
     rows = WeakForm(balances_of(model, data.sensing, wrt=()), data, found.values, (), found.weights)
     turns = turns_of(rows)
     left = rows.residual(np.empty(0))
