@@ -112,7 +112,7 @@ def _at_turns(record: WeakRecord, side: str) -> Any:
     at = np.flatnonzero(np.diff(np.sign(speed)) != 0)
     turns = np.split(at, np.flatnonzero(np.diff(at) > apart) + 1) if len(at) else []
     points = [np.arange(t[0], t[-1] + 2) for t in turns]
-    count = np.array([len(p) for p in points])
+    count = np.array([len(p) for p in points], dtype=np.int64)
     where = np.concatenate([*points, np.empty(0, dtype=np.int64)])
     which = np.repeat(np.arange(len(points)), count)
     late = TURN_SHARE * grid.pointwise[f"{side}_position"] / spacing

@@ -47,3 +47,18 @@ def test_a_turn_of_dry_friction_is_no_inertia(smoothing: float) -> None:
         )
     )
     assert still.without(left) is left
+
+
+def test_a_record_without_a_turn_is_fitted_as_it_is() -> None:
+    time = np.arange(6000) * 2e-3
+    speed = 0.6 + 0.4 * np.sin(2 * np.pi * 0.7 * time) * np.sin(0.3 * time)
+    angle = np.cumsum(speed) * 2e-3
+    case = simulate_case(None, 50_000, span=12.0, references={"train": (angle, speed)})
+    record = record_of(case.measured["train"], "train", "same")
+    joint = joint_of(case)
+    model = prepared_model(joint, record)
+    data = load_dataset([record], [], joint, model)
+    found = solve(model, data)
+    assert found.values["motor_inertia"] == pytest.approx(case.parameters["JM"], rel=5e-3)
+    form = WeakForm(balances_of(model, data.sensing, wrt=()), data, found.values, (), found.weights)
+    assert turns_of(form).columns is None
