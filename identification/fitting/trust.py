@@ -253,8 +253,7 @@ class _Judge:
         if not math.isfinite(white):
             return replace(bare_one, why="flat: no value of it is worse than another")
         stated = white if from_blocks is None else from_blocks
-        # blocks may agree by chance, and what the model's form takes off shows in none of them
-        error = max(stated, white)
+        error = stated
         low, high = value - NORMAL * error, value + NORMAL * error
         if p.is_shape and profiles and error < abs(value):
             low, high = self._profiled(p.name, error, error / white)
