@@ -22,6 +22,7 @@ from identification.fitting.covariance import NORMAL, correlations
 from identification.fitting.engine import Solution
 from identification.fitting.information import eliminated, form_of, white_errors
 from identification.fitting.start_values import bounds_of
+from identification.fitting.turns import turns_of
 from identification.fitting.weak_form import WeakForm
 
 FloatArray = npt.NDArray[np.float64]
@@ -56,10 +57,9 @@ class Trusted:
         `kind` is one of `CLASSES`.
     value : float
     stderr : float or None
-        As the fit states it, from blocks.
+        As the fit states it, from windows of time.
     low, high : float or None
-        95 % interval, from the larger of the errors from blocks and from white rows; for shapes
-        from a profile.
+        95 % interval, from that error; for shapes from a profile.
     records, windows : tuple of (float or None)
         Value on each training record and in each of `WINDOWS` windows, where these tell it.
     partner : str or None
@@ -184,8 +184,11 @@ class _Judge:
         stacked = self.form.stacked(x)
         names = self.form.balances.balances
         weights = solution.weights
-        self.j = np.concatenate([stacked.jacobian[b] * weights[b][:, None] for b in names])
-        self.r = np.concatenate([stacked.residual[b] * weights[b] for b in names])
+        turns = turns_of(self.form)
+        self.j = turns.without(
+            np.concatenate([stacked.jacobian[b] * weights[b][:, None] for b in names])
+        )
+        self.r = turns.without(np.concatenate([stacked.residual[b] * weights[b] for b in names]))
         self.plain = np.concatenate([stacked.jacobian[b] for b in names])
         self.block = np.tile(stacked.block, len(names))
         self.record = np.tile(
@@ -247,13 +250,11 @@ class _Judge:
         if p.name not in self.moving:
             return replace(bare_one, why="at its bound")
         k = self.moving.index(p.name)
-        from_blocks = self.solution.stderr.get(p.name)
+        from_windows = self.solution.stderr.get(p.name)
         white = float(self.white[k])
         if not math.isfinite(white):
             return replace(bare_one, why="flat: no value of it is worse than another")
-        stated = white if from_blocks is None else from_blocks
-        # blocks may agree by chance, and what the model's form takes off shows in none of them
-        error = max(stated, white)
+        error = white if from_windows is None else from_windows
         low, high = value - NORMAL * error, value + NORMAL * error
         if p.is_shape and profiles and error < abs(value):
             low, high = self._profiled(p.name, error, error / white)
@@ -264,7 +265,7 @@ class _Judge:
         verdict, why = self._verdict(p, value, share, rho)
         return replace(
             bare_one,
-            stderr=stated,
+            stderr=error,
             low=low,
             high=high,
             records=tuple(v[p.name] for v in by_record),
