@@ -69,7 +69,7 @@ def halved(t: FloatArray) -> None:
 
 def gap(t: FloatArray) -> None:
     """50 ms of the motion are missing, and no time stamp says so."""
-    t[FIRST:-GAP] = t[FIRST + GAP :].copy()
+    t[FIRST:COUNT] = t[FIRST + GAP : COUNT + GAP].copy()
 
 
 def positions(t: FloatArray) -> None:
@@ -218,13 +218,13 @@ def run(key: str) -> Iterator[Outcome]:
     whole = OnlineEstimator(joint, STEP, OPTIONS)
     count = len(whole.names)
     names = [f"{n}[{i}]" for n in ("theta", "sigma") for i in range(1, count + 1)]
-    clean = readings_of(key, COUNT * STEP) * link_referred(joint)
+    clean = readings_of(key, (COUNT + GAP) * STEP) * link_referred(joint)
     with tempfile.TemporaryDirectory(prefix="irj-common-") as folder:
         path = build_native(spec, Path(folder) / "native.fmu")
         for change in FAILURES:
             table = clean.copy()
             change(table)
-            table = table / link_referred(joint)
+            table = table[:COUNT] / link_referred(joint)
             for side in ("python", "native"):
                 found, health = (
                     by_python(spec, table, names)
