@@ -88,7 +88,9 @@ def test_a_sensor_gain_and_a_motor_constant_are_a_set_where_all_torques_are_free
     """
     record = recorded("torque_sensor_gain", 10.0, 3)
     found = diagnose(foreign(path), record.window(0, 6), record.window(6, 10))
-    assert [set(c.effects) for c in found.claims] == [{"torque_sensor_gain", "motor_constant_error"}]
+    assert [set(c.effects) for c in found.claims] == [
+        {"torque_sensor_gain", "motor_constant_error"}
+    ]
 
 
 def test_what_the_file_says_the_fmu_holds_changes_no_answer(tmp_path: Path) -> None:
