@@ -240,7 +240,7 @@ class RowMaker:
                 at = centre + (t.point_half - (new - 1 - k)) * t.step
                 self.smoothing[order, k, at - own : at + own + 1] = w
         self.raw_at = [centre + (t.point_half - (new - 1 - k)) * t.step for k in range(new)]
-        self.weights = differentiated_kernel(t.length, t.dt * t.step, 0)
+        self.weights = differentiated_kernel(t.length, t.dt, 0, t.step)
         self.place: list[tuple[int, int, int]] = [
             (_NAMES.index(name), order, k)
             for k, source in enumerate(SOURCES)
