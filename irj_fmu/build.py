@@ -38,14 +38,22 @@ _TRY: Final = (
     "and systems need one: run `pip install ziglang`, or install gcc and pass --cc gcc"
 )
 _SMOKE: Final = """
-import sys
-from fmpy import read_model_description, simulate_fmu
+import os, sys, tempfile
+from fmpy import extract, instantiate_fmu, read_model_description, simulate_fmu
 import numpy as np
 path, step, count = sys.argv[1], float(sys.argv[2]), int(sys.argv[3])
-names = [v.name for v in read_model_description(path).modelVariables if v.causality == "output"]
+described = read_model_description(path)
+names = [v.name for v in described.modelVariables if v.causality == "output"]
+folder = tempfile.mkdtemp(dir=".")
+extract(path, folder)
+made = instantiate_fmu(os.path.abspath(folder), described, "CoSimulation")
 found = simulate_fmu(path, stop_time=step * count, output_interval=step, step_size=step,
-                     output=names,
-                     fmi_type="CoSimulation")
+                     output=names, fmi_type="CoSimulation", fmu_instance=made,
+                     model_description=described)
+getattr(made, f"fmi{described.fmiVersion[0]}FreeInstance")(made.component)
+# the library of pythonfmu releases its interpreter once more at exit unless this was called
+getattr(made.dll, "finalizePythonInterpreter", int)()
+made.freeLibrary()
 if len(found) != count + 1:
     sys.exit(f"{len(found)} of {count + 1} steps")
 for name in names:
@@ -267,6 +275,7 @@ def _one_plant(
 def _estimator(request: Request, folder: Path) -> list[tuple[Path, str]]:
     from identification.online.estimator import OnlineOptions, prepared
     from irj_fmu.estimator.healthy import detector_state
+    from irj_fmu.estimator.notes import estimator_notes
     from irj_fmu.estimator.packed import options_text
     from irj_fmu.estimator.slave import DETECTOR_FILE, JOINT_FILE, OPTIONS_FILE
     from irj_fmu.fmi.package import SlaveSpec, package_slave
@@ -290,6 +299,7 @@ def _estimator(request: Request, folder: Path) -> list[tuple[Path, str]]:
         tuple(_package(p) for p in ("casadi_models", "identification", "irj_fmu")),
         files,
         effects=files_of(request.joint.effects),
+        notes=estimator_notes(request.joint, options),
     )
     packaged = package_slave(spec, folder / f"{name}.fmu", cc=request.cc)
     return [(packaged.path, f"FMI 2.0 co-simulation; {packaged.message}")]

@@ -17,6 +17,7 @@ from identification.data.joint_file import Joint
 from identification.errors import InputError
 from identification.online.estimator import OnlineEstimator, OnlineOptions
 from irj_fmu.estimator.native_tables import MAX_WARM_UP, Code, generate
+from irj_fmu.estimator.notes import estimator_notes
 from irj_fmu.estimator.packed import STEP
 from irj_fmu.estimator.slave import estimator_variables, two_step_variables
 from irj_fmu.fmi.archive import content_guid, write_archive
@@ -27,6 +28,7 @@ from irj_fmu.fmi.compiler import (
     header_folder,
     universal_library,
 )
+from irj_fmu.fmi.documentation import beside
 from irj_fmu.fmi.model_description import Description, Entry, model_description, to_bytes
 from irj_fmu.fmi.slave_base import STANDARD
 from irj_fmu.fmi.targets import SHORT_TARGETS, native_targets
@@ -131,6 +133,7 @@ def build_native(
     sources, description = native_sources(spec)
     content = {f"sources/{name}": text for name, text in sources.items()}
     content["modelDescription.xml"] = description
+    content |= beside(description, estimator_notes(spec.joint, spec.options))
     built = {
         triple: compile_library(sources, _MAIN, triple, cc=cc, libraries=("m",))
         for triple in targets

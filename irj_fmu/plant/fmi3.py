@@ -12,17 +12,20 @@ from xml.etree.ElementTree import Element, SubElement
 from identification.errors import InputError
 from irj_fmu.fmi.archive import content_guid, write_archive
 from irj_fmu.fmi.compiler import TARGETS, compile_library, find_compiler
-from irj_fmu.fmi.model_description import GENERATOR, to_bytes
-from irj_fmu.fmi.unit_definitions import add_unit_definitions
+from irj_fmu.fmi.documentation import beside
+from irj_fmu.fmi.model_description import identity, to_bytes
+from irj_fmu.fmi.unit_definitions import add_unit_definitions, quantity_of
 from irj_fmu.fmi.variables import Variable
 from irj_fmu.plant.library import (
+    Known,
     PlantSpec,
     _check,
     _config,
     _generate,
     _parameter,
-    _per_second,
     _targets,
+    dependencies,
+    slopes_of,
 )
 
 _SOURCE: Final = "plant_fmi3.c"
@@ -59,9 +62,9 @@ def build_plant_fmi3(
 
     Notes
     -----
-    Outputs and derivatives state no ``dependencies``, which means that each depends on everything.
-    A list as the standard has it leaves parameters out, and importers then give wrong derivatives
-    with respect to them.
+    The ``dependencies`` of outputs and derivatives are those of the expressions and name parameters
+    too. A list as the standard has it leaves parameters out, and importers then give wrong
+    derivatives with respect to them.
     """
     _check(spec)
     if spec.memory:
@@ -88,6 +91,7 @@ def build_plant_fmi3(
     content = {f"sources/{name}": text for name, text in sources.items()}
     content["sources/buildDescription.xml"] = to_bytes(_build_description(spec.name))
     content["modelDescription.xml"] = to_bytes(_describe(spec, token))
+    content |= beside(content["modelDescription.xml"], spec.notes)
     for triple in targets:
         library = compile_library(sources, _SOURCE, triple, cc=cc, libraries=("m",))
         content[f"binaries/{_FOLDERS[triple]}/{spec.name}{TARGETS[triple].suffix}"] = library
@@ -110,7 +114,7 @@ def _describe(spec: PlantSpec, token: str) -> Element:
             "modelName": spec.name,
             "instantiationToken": token,
             **({"description": spec.description} if spec.description else {}),
-            "generationTool": GENERATOR,
+            **identity(),
             "variableNamingConvention": "structured",
         },
     )
@@ -124,7 +128,7 @@ def _describe(spec: PlantSpec, token: str) -> Element:
             "providesDirectionalDerivatives": "true",
         },
     )
-    slopes = [Variable(f"der({v.name})", unit=_per_second(v.unit)) for v in spec.states]
+    slopes = slopes_of(spec)
     groups = (spec.states, slopes, spec.inputs, spec.parameters, spec.outputs)
     add_unit_definitions(
         root, [(v.unit, v.display_unit) for group in groups for v in group] + [("s", None)]
@@ -188,20 +192,31 @@ def _describe(spec: PlantSpec, token: str) -> Element:
     )
     structure = SubElement(root, "ModelStructure")
     first = len(rows) - len(spec.outputs)
-    unknowns = [("Output", first + i) for i in range(len(spec.outputs))] + [
-        ("ContinuousStateDerivative", n + i) for i in range(n)
+    rates, readings = dependencies(spec)
+    unknowns = [("Output", first + i, known) for i, known in enumerate(readings)]
+    unknowns += [("ContinuousStateDerivative", n + i, known) for i, known in enumerate(rates)]
+    about = [
+        (title, {"valueReference": str(reference), "dependencies": _references(known, 2 * n)})
+        for title, reference, known in unknowns
     ]
-    for title, reference in unknowns:
-        SubElement(structure, title, {"valueReference": str(reference)})
-    for _, reference in unknowns:
-        SubElement(structure, "InitialUnknown", {"valueReference": str(reference)})
+    for title, attributes in about:
+        SubElement(structure, title, attributes)
+    for _, attributes in about:
+        SubElement(structure, "InitialUnknown", attributes)
     return root
+
+
+def _references(known: Known, first: int) -> str:
+    """Value references of states, and of inputs and parameters from `first` on."""
+    states, others = known
+    return " ".join(map(str, (*states, *(i + first for i in others))))
 
 
 def _attributes(variable: Variable, reference: int) -> dict[str, str]:
     found: dict[str, str] = {"name": variable.name, "valueReference": str(reference)}
     optional: Mapping[str, Any] = {
         "description": variable.description or None,
+        "quantity": quantity_of(variable.unit) if variable.unit else None,
         "unit": variable.unit or None,
         "displayUnit": variable.display_unit if variable.unit else None,
         "min": variable.minimum,

@@ -19,9 +19,11 @@ from casadi_models import JointModel
 from casadi_models.functions import JointFunctions
 from casadi_models.parameter import Parameter
 from casadi_models.quantities import linear_unit
+from casadi_models.text.shown import shown
 from identification.data.channels import channel_unit
 from identification.data.joint_file import Joint
 from identification.errors import InputError
+from irj_fmu.fmi.documentation import Note
 from irj_fmu.fmi.variables import Variable
 from irj_fmu.plant.library import PlantSpec
 from irj_fmu.plant.readings import CHANNELS, Readings
@@ -271,6 +273,7 @@ class _Builder:
             memory=tuple(memory) if self.stepped else (),
             default_step=options.sample_time,
             tolerance=options.tolerance,
+            notes=self._notes(),
         )
 
     def _reference(self, u: Any, clock: Any) -> tuple[Any, Any, Any]:
@@ -378,6 +381,29 @@ class _Builder:
         kept = ca.if_else(duration > 0, moved, z)
         return ca.Function("z", [x, z, u, every, before], [ca.densify(kept)])
 
+    def _notes(self) -> tuple[Note, ...]:
+        """Equations, faults and limits, for a reader."""
+        limits = [
+            "Motor quantities are on the motor shaft, link quantities on the link; parameters and "
+            "states are referred to the link.",
+            "Signs of friction are smooth in the width that the smoothing velocity names.",
+        ]
+        if self.stepped:
+            limits.append(
+                "Displacement memory knows its states only as steps: co-simulation only, and inner "
+                f"steps up to {self.options.sample_time:g} s."
+            )
+        notes = [Note("Equations", shown(self.model), verbatim=True)]
+        if self.options.sensors:
+            notes.append(
+                Note(
+                    "Sensor faults",
+                    "Every reading has parameters for noise, quantisation and faults, named after "
+                    "it. All of them start at none and may be changed while the FMU runs.",
+                )
+            )
+        return (*notes, Note("Limits", "\n\n".join(limits)))
+
     def _description(self) -> str:
         parts = [f"Joint {self.model.name}", f"gear ratio {self.model.gear_ratio:g}"]
         if self.model.effects:
@@ -399,6 +425,7 @@ def _variable(parameter: Parameter, value: float) -> Variable:
         value,
         _bound(parameter.low, value, min),
         _bound(parameter.high, value, max),
+        abs(value) or None,
         description=text,
         variability="tunable",
     )
