@@ -63,6 +63,9 @@ class PlantOptions:
         Communication step, and time between two values of the noise [s].
     tolerance : float
         Relative tolerance of the integrator where the host names none.
+    payload: bool
+        True: inputs ``payload_inertia`` and, where the model has gravity, ``payload_weight`` add to
+        the link's; a payload that is taken up or put down while the plant runs.
     """
 
     drive: Drive | None = None
@@ -72,6 +75,7 @@ class PlantOptions:
     name: str | None = None
     sample_time: float = 1e-3
     tolerance: float = 1e-9
+    payload: bool = False
 
 
 def identifier(name: str) -> str:
@@ -209,6 +213,19 @@ class _Builder:
             )
         return found
 
+    def _payload(self) -> dict[str, Variable]:
+        """Inputs of a payload, by the parameter that they add to."""
+        if not self.options.payload:
+            return {}
+        added = {self.model.inertias[-1]: ("payload_inertia", "Inertia of the payload.")}
+        for name in self.model.named("weight")[:1]:
+            added[name] = ("payload_weight", "Gravity torque of the payload at a level link.")
+        units = {p.name: p.unit for p in self.own_parameters}
+        return {
+            name: Variable(title, units[name], description=text)
+            for name, (title, text) in added.items()
+        }
+
     def _parameter(
         self, name: str, unit: str, start: float, description: str, low: float | None = None
     ) -> Any:
@@ -224,10 +241,14 @@ class _Builder:
         f, options = self.functions, self.options
         mechanical, memory = self._states(), self._memory()
         size, held = len(mechanical), len(memory)
-        inputs = self._inputs()
+        inputs, payload = self._inputs(), self._payload()
         x = ca.SX.sym("x", size + (0 if self.stepped else held) + self.clocked)
         z = ca.SX.sym("z", held) if self.stepped else ca.SX(0, 1)
-        u, p = ca.SX.sym("u", len(inputs)), ca.SX.sym("p", len(self.own_parameters))
+        every_input = ca.SX.sym("u", len(inputs) + len(payload))
+        u, own = every_input[: len(inputs)], ca.SX.sym("p", len(self.own_parameters))
+        p = ca.SX(own)
+        for i, name in enumerate(payload, len(inputs)):
+            p[self.model.parameter_names.index(name)] += every_input[i]
         clock = x[-1] if self.clocked else ca.SX(0)
         full = ca.vertcat(x[:size], z) if self.stepped else x[: size + held]
         drive = self._drive(x, u, clock)
@@ -247,8 +268,8 @@ class _Builder:
         if options.sensors:
             readings = Readings(self._parameter, clock, options.sample_time)
             channels = [readings.read(*pair) for pair in channels]
-        every = ca.vertcat(p, *(symbol for _, symbol in self.extra))
-        arguments = [x, u, every, *([z] if self.stepped else [])]
+        every = ca.vertcat(own, *(symbol for _, symbol in self.extra))
+        arguments = [x, every_input, every, *([z] if self.stepped else [])]
         states = [*mechanical, *([] if self.stepped else memory)]
         if self.clocked:
             states.append(Variable("state.clock", "s", description="Time since the start."))
@@ -259,7 +280,7 @@ class _Builder:
                 "y", arguments, [ca.densify(ca.vertcat(*(value for _, value in channels)))]
             ),
             states=tuple(states),
-            inputs=tuple(inputs),
+            inputs=(*inputs, *payload.values()),
             parameters=(
                 *(
                     _variable(q, v)
