@@ -91,6 +91,8 @@ class Request:
         file says, or of the healthy records.
     say : callable
         Called with one sentence per doubt about a record.
+    fmi : {2, 3}
+        Version of FMI, of plants.
     """
 
     joint: Joint
@@ -105,6 +107,7 @@ class Request:
     has_torque: bool = True
     sample_time: float | None = None
     say: Callable[[str], object] = lambda _text: None
+    fmi: int = 2
 
 
 def build(
@@ -253,6 +256,7 @@ def _controlled(request: Request, folder: Path) -> list[tuple[Path, str]]:
 def _one_plant(
     request: Request, folder: Path, name: str, *, controller: bool, sensors: bool
 ) -> tuple[Path, str]:
+    from irj_fmu.plant.fmi3 import build_plant_fmi3
     from irj_fmu.plant.joint import PlantOptions, plant_spec
     from irj_fmu.plant.library import build_plant
     from irj_fmu.plant.reference import Motion
@@ -263,12 +267,13 @@ def _one_plant(
         request.joint,
         PlantOptions(controller=controller, motion=motion, sensors=sensors, name=name),
     )
-    path = build_plant(spec, folder / f"{name}.fmu", cc=request.cc, target=targets)
+    maker = {2: build_plant, 3: build_plant_fmi3}[request.fmi]
+    path = maker(spec, folder / f"{name}.fmu", cc=request.cc, target=targets)
     kinds = "co-simulation" if spec.memory else "model exchange and co-simulation"
     return (
         path,
-        f"FMI 2.0 {kinds}, {len(spec.states) + len(spec.memory)} states, {len(spec.parameters)} "
-        "parameters",
+        f"FMI {request.fmi}.0 {kinds}, {len(spec.states) + len(spec.memory)} states, "
+        f"{len(spec.parameters)} parameters",
     )
 
 
@@ -414,9 +419,9 @@ def _step(path: Path) -> str:
 
 
 def _runs_here(path: Path) -> bool:
-    from fmpy import platform, supported_platforms
+    from fmpy import platform, platform_tuple, supported_platforms
 
-    return platform in supported_platforms(str(path))
+    return not {platform, platform_tuple}.isdisjoint(supported_platforms(str(path)))
 
 
 def _run(path: Path, command: Sequence[str]) -> None:
@@ -459,6 +464,7 @@ def parser(prog: str = "build_fmu.py") -> OneLineParser:
         metavar="S",
         help="native: time between two samples, built in (default: that of the records of the fit)",
     )
+    made.add_argument("--fmi", type=int, choices=(2, 3), help="plant: version of FMI (default: 2)")
     made.add_argument(
         "--controller", action="store_true", help="plant: drive it by a position controller"
     )
@@ -489,6 +495,7 @@ def parser(prog: str = "build_fmu.py") -> OneLineParser:
 
 _OF: Final = {  # options that only some kinds heed
     "sample_time": ("native", "all"),
+    "fmi": ("plant",),
     "controller": ("plant", "all"),
     "sensors": ("plant", "ssp", "all"),
     "healthy": ("estimator", "native", "ssp", "all"),
@@ -527,6 +534,7 @@ def _request(given: argparse.Namespace) -> Request:
         has_torque=not given.no_torque,
         sample_time=given.sample_time,
         say=lambda text: sys.stderr.write(f"irj: {text}\n"),
+        fmi=given.fmi or 2,
     )
     if given.json is not None:
         made = [request.out / name for name in _names(given.kind, _base(request))]

@@ -1,5 +1,5 @@
-"""Plants as FMI 3.0 model exchange, an extra beside the FMI 2.0 FMUs of
-:mod:`irj_fmu.plant.library`.
+"""Plants as FMI 3.0 model exchange and co-simulation; the model and the integrator are those of
+the FMI 2.0 FMUs of :mod:`irj_fmu.plant.library`.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, Final
 from xml.etree.ElementTree import Element, SubElement
 
-from identification.errors import InputError
 from irj_fmu.fmi.archive import content_guid, write_archive
 from irj_fmu.fmi.compiler import TARGETS, compile_library, find_compiler
 from irj_fmu.fmi.documentation import beside
@@ -41,12 +40,12 @@ _FOLDERS: Final = {
 def build_plant_fmi3(
     spec: PlantSpec, out: Path, *, cc: str | None = None, target: str | Sequence[str] | None = None
 ) -> Path:
-    """Build the FMI 3.0 model-exchange FMU of a plant, with directional derivatives and FMU state.
+    """Build the FMI 3.0 FMU of a plant, with directional and adjoint derivatives and FMU state.
 
     Parameters
     ----------
     spec : PlantSpec
-        A plant without displacement memory.
+        With displacement memory it runs in co-simulation only.
     out, cc, target
         As in :func:`irj_fmu.plant.library.build_plant`.
 
@@ -58,7 +57,7 @@ def build_plant_fmi3(
     Raises
     ------
     InputError
-        A plant with memory; no compiler; a folder that cannot be written.
+        Functions and declarations that do not fit; no compiler; a folder that cannot be written.
 
     Notes
     -----
@@ -67,18 +66,13 @@ def build_plant_fmi3(
     derivatives with respect to them.
     """
     _check(spec)
-    if spec.memory:
-        raise InputError(
-            f"plant {spec.name}: its displacement memory moves with the steps of a "
-            "co-simulation; FMI 3.0 model exchange cannot hold it"
-        )
     targets = _targets(target)
     for triple in targets:
         find_compiler(triple, cc)
     code, limits = _generate(spec)
     folder = Path(__file__).parents[1] / "c"
     sources = {"plant_model.c": code} | {
-        name: (folder / name).read_bytes() for name in (_SOURCE, "living.c")
+        name: (folder / name).read_bytes() for name in (_SOURCE, "living.c", "plant_integrator.c")
     }
     token = content_guid(
         {
@@ -118,18 +112,18 @@ def _describe(spec: PlantSpec, token: str) -> Element:
             "variableNamingConvention": "structured",
         },
     )
-    SubElement(
-        root,
-        "ModelExchange",
-        {
-            "modelIdentifier": spec.name,
-            "canGetAndSetFMUState": "true",
-            "canSerializeFMUState": "true",
-            "providesDirectionalDerivatives": "true",
-        },
-    )
+    able = {
+        "modelIdentifier": spec.name,
+        "canGetAndSetFMUState": "true",
+        "canSerializeFMUState": "true",
+        "providesDirectionalDerivatives": "true",
+        "providesAdjointDerivatives": "true",
+    }
+    if not spec.memory:
+        SubElement(root, "ModelExchange", able)
+    SubElement(root, "CoSimulation", {**able, "canHandleVariableCommunicationStepSize": "true"})
     slopes = slopes_of(spec)
-    groups = (spec.states, slopes, spec.inputs, spec.parameters, spec.outputs)
+    groups = (spec.states, slopes, spec.inputs, spec.parameters, spec.outputs, spec.memory)
     add_unit_definitions(
         root, [(v.unit, v.display_unit) for group in groups for v in group] + [("s", None)]
     )
@@ -182,6 +176,8 @@ def _describe(spec: PlantSpec, token: str) -> Element:
         (v, {"causality": "output", "variability": "continuous", "initial": "calculated"})
         for v in spec.outputs
     ]
+    held = {"causality": "local", "variability": "continuous", "initial": "exact"}
+    rows += [(v, {**held, "start": repr(float(v.start))}) for v in spec.memory]
     for reference, (variable, more) in enumerate(rows):
         SubElement(node, "Float64", {**_attributes(variable, reference), **more})
     time = Variable("time", "s", description="Time.")
@@ -191,7 +187,7 @@ def _describe(spec: PlantSpec, token: str) -> Element:
         {**_attributes(time, len(rows)), "causality": "independent", "variability": "continuous"},
     )
     structure = SubElement(root, "ModelStructure")
-    first = len(rows) - len(spec.outputs)
+    first = len(rows) - len(spec.outputs) - len(spec.memory)
     rates, readings = dependencies(spec)
     unknowns = [("Output", first + i, known) for i, known in enumerate(readings)]
     unknowns += [("ContinuousStateDerivative", n + i, known) for i, known in enumerate(rates)]
