@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from examples import two_joints
+from examples import exchange, fleet, two_joints
 
 
 @pytest.fixture(scope="module")
@@ -48,3 +48,17 @@ def test_every_part_can_be_taken_out_and_validates(system: dict[str, float], fol
     parts = sorted((folder / "apart" / "resources").glob("*.fmu"))
     assert len(parts) == 6
     assert [validate_fmu(str(part)) for part in parts] == [[]] * 6
+
+
+def test_the_fleet_gives_what_fmpy_gives(tmp_path: Path) -> None:
+    found = fleet.figures(tmp_path, count=12)
+    assert found["failed"] == 0
+    assert found["spread over the stiffness [N.m]"] > 1.0
+    assert found["largest difference to fmpy [N.m]"] < 1e-9
+
+
+def test_a_solver_of_the_host_gives_what_the_own_integrator_gives(tmp_path: Path) -> None:
+    found = exchange.figures(tmp_path)
+    assert found["link position [rad]"] > 0.1
+    assert found["FMI 3.0 less FMI 2.0, largest state"] <= 1e-12
+    assert found["own integrator less Radau, largest state"] < 1e-6
