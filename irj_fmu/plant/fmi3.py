@@ -72,7 +72,8 @@ def build_plant_fmi3(
     code, limits = _generate(spec)
     folder = Path(__file__).parents[1] / "c"
     sources = {"plant_model.c": code} | {
-        name: (folder / name).read_bytes() for name in (_SOURCE, "living.c", "plant_integrator.c")
+        name: (folder / name).read_bytes()
+        for name in (_SOURCE, "fmi3_common.c", "living.c", "plant_integrator.c")
     }
     token = content_guid(
         {
