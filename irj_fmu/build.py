@@ -92,7 +92,7 @@ class Request:
     say : callable
         Called with one sentence per doubt about a record.
     fmi : {2, 3}
-        Version of FMI, of plants.
+        Version of FMI, of plants and native estimators.
     """
 
     joint: Joint
@@ -328,6 +328,7 @@ def _native(request: Request, folder: Path) -> list[tuple[Path, str]]:
     from identification.online.estimator import OnlineOptions
     from irj_fmu.estimator.healthy import detector_state
     from irj_fmu.estimator.native import NativeSpec, build_native
+    from irj_fmu.estimator.native_fmi3 import build_native_fmi3
 
     targets = _compiler(request)
     name = f"{_base(request)}_native"
@@ -335,8 +336,9 @@ def _native(request: Request, folder: Path) -> list[tuple[Path, str]]:
     healthy, step = _healthy(request)
     state = detector_state(request.joint, options, healthy, step, request.say)
     spec = NativeSpec(request.joint, name, options, state, step)
-    path = build_native(spec, folder / f"{name}.fmu", cc=request.cc, target=targets)
-    return [(path, f"FMI 2.0 co-simulation without Python, sample time {step:g} s")]
+    maker = {2: build_native, 3: build_native_fmi3}[request.fmi]
+    path = maker(spec, folder / f"{name}.fmu", cc=request.cc, target=targets)
+    return [(path, f"FMI {request.fmi}.0 co-simulation without Python, sample time {step:g} s")]
 
 
 def _ssp(request: Request, folder: Path) -> list[tuple[Path, str]]:
@@ -464,7 +466,9 @@ def parser(prog: str = "build_fmu.py") -> OneLineParser:
         metavar="S",
         help="native: time between two samples, built in (default: that of the records of the fit)",
     )
-    made.add_argument("--fmi", type=int, choices=(2, 3), help="plant: version of FMI (default: 2)")
+    made.add_argument(
+        "--fmi", type=int, choices=(2, 3), help="plant, native: version of FMI (default: 2)"
+    )
     made.add_argument(
         "--controller", action="store_true", help="plant: drive it by a position controller"
     )
@@ -495,7 +499,7 @@ def parser(prog: str = "build_fmu.py") -> OneLineParser:
 
 _OF: Final = {  # options that only some kinds heed
     "sample_time": ("native", "all"),
-    "fmi": ("plant",),
+    "fmi": ("plant", "native"),
     "controller": ("plant", "all"),
     "sensors": ("plant", "ssp", "all"),
     "healthy": ("estimator", "native", "ssp", "all"),

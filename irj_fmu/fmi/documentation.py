@@ -70,7 +70,10 @@ class Note:
 
 
 def beside(
-    description: bytes, notes: Sequence[Note] = (), inside: Mapping[str, str] | None = None
+    description: bytes,
+    notes: Sequence[Note] = (),
+    inside: Mapping[str, str] | None = None,
+    terminals: Mapping[str, Mapping[str, str]] | None = None,
 ) -> dict[str, bytes]:
     """Files that go into the FMU with its model.
 
@@ -82,6 +85,8 @@ def beside(
         Sections beside the tables of the variables: equations, faults, limits.
     inside : mapping of str to str, optional
         Text of the licence of each other work that the FMU holds, by its name.
+    terminals : mapping of str to mapping, optional
+        FMI 3.0: variable by member of each terminal. Members of the same name go together.
 
     Returns
     -------
@@ -96,13 +101,13 @@ def beside(
     found["documentation/index.html"] = _page(root, notes, sorted(licences)).encode()
     if root.get("fmiVersion", "").startswith("3"):
         found["terminalsAndIcons/icon.png"] = icon()
-        found["terminalsAndIcons/terminalsAndIcons.xml"] = to_bytes(_icons())
+        found["terminalsAndIcons/terminalsAndIcons.xml"] = to_bytes(_icons(terminals or {}))
     else:
         found["model.png"] = icon()
     return found
 
 
-def _icons() -> Element:
+def _icons(terminals: Mapping[str, Mapping[str, str]]) -> Element:
     root = Element("fmiTerminalsAndIcons", {"fmiVersion": "3.0"})
     graphic = SubElement(root, "GraphicalRepresentation")
     SubElement(
@@ -117,6 +122,16 @@ def _icons() -> Element:
         },
     )
     SubElement(graphic, "Icon", {"x1": "-100", "y1": "-100", "x2": "100", "y2": "100"})
+    if terminals:
+        group = SubElement(root, "Terminals")
+        for name, members in terminals.items():
+            terminal = SubElement(group, "Terminal", {"name": name, "matchingRule": "bus"})
+            for member, variable in members.items():
+                SubElement(
+                    terminal,
+                    "TerminalMemberVariable",
+                    {"variableName": variable, "memberName": member, "variableKind": "signal"},
+                )
     return root
 
 

@@ -13,6 +13,7 @@ from irj_fmu.fmi.archive import content_guid, write_archive
 from irj_fmu.fmi.compiler import TARGETS, compile_library, find_compiler
 from irj_fmu.fmi.documentation import beside
 from irj_fmu.fmi.model_description import identity, to_bytes
+from irj_fmu.fmi.targets import FMI3_FOLDERS
 from irj_fmu.fmi.unit_definitions import add_unit_definitions, quantity_of
 from irj_fmu.fmi.variables import Variable
 from irj_fmu.plant.library import (
@@ -28,13 +29,6 @@ from irj_fmu.plant.library import (
 )
 
 _SOURCE: Final = "plant_fmi3.c"
-_FOLDERS: Final = {
-    "x86_64-linux-gnu": "x86_64-linux",
-    "aarch64-linux-gnu": "aarch64-linux",
-    "x86_64-windows-gnu": "x86_64-windows",
-    "x86_64-macos": "x86_64-darwin",
-    "aarch64-macos": "aarch64-darwin",
-}
 
 
 def build_plant_fmi3(
@@ -86,10 +80,14 @@ def build_plant_fmi3(
     content = {f"sources/{name}": text for name, text in sources.items()}
     content["sources/buildDescription.xml"] = to_bytes(_build_description(spec.name))
     content["modelDescription.xml"] = to_bytes(_describe(spec, token))
-    content |= beside(content["modelDescription.xml"], spec.notes)
+    content |= beside(
+        content["modelDescription.xml"],
+        spec.notes,
+        terminals={"joint": {v.name: v.name for v in spec.outputs}},
+    )
     for triple in targets:
         library = compile_library(sources, _SOURCE, triple, cc=cc, libraries=("m",))
-        content[f"binaries/{_FOLDERS[triple]}/{spec.name}{TARGETS[triple].suffix}"] = library
+        content[f"binaries/{FMI3_FOLDERS[triple]}/{spec.name}{TARGETS[triple].suffix}"] = library
     return write_archive(out, content)
 
 
