@@ -414,7 +414,8 @@ def with_files(root: Path, files: Sequence[str | Path]) -> str:
         name = safe_name(file.name)
         stored = f"{secrets.token_hex(4)}-{name}"
         shutil.copyfile(file, session.files / stored)
-        add_upload(live, name, stored, file.stat().st_size)
+        with live.library():
+            add_upload(live, name, stored, file.stat().st_size)
     return session.id
 
 
