@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from identification import Joint, Record, fit
+from identification import Joint, Record, fit, load_joint, read
 from identification.balance.dataset import load_dataset, prepared_model
 from identification.balance.drawn_noise import LONGEST
 from identification.balance.excitation import attenuation
@@ -16,6 +17,8 @@ from identification.fitting.errors_in_variables import (
     NoiseProducts,
     whole_without,
 )
+from tests.recorded_world._engine import library
+from tests.recorded_world.world import make_case, write_case
 
 DT, JOINTS = 2e-3, 40
 NAMES = ("link_inertia", "link_viscous", "gravity_torque")
@@ -102,3 +105,13 @@ def test_noise_falls_on_the_blocks_whose_rows_take_part() -> None:
     gram, score = products.by_block(weights, block, {"link": np.array([1, 1, 1, 0, 1]) > 0})
     assert gram[:, 0, 0] == pytest.approx([0.5, 0.25])
     assert score[:, 1] == pytest.approx([0.5, 0.25])
+
+
+@pytest.mark.skipif(library() is None, reason="no C compiler")
+def test_a_gap_as_small_as_the_encoders_tell_stays_where_the_fit_put_it(tmp_path: Path) -> None:
+    """The correction of first order had led to a stiffness of 2e7 N.m/rad inside a gap of 0."""
+    folder = write_case(make_case(8812, without=("zero",)), tmp_path, "all")
+    joint = load_joint(folder / "joint.toml")
+    found = fit(joint, read(folder / "train.csv", joint=joint))
+    assert found.train.relative_error_percent < 1.0
+    assert 0 < found.solution.values["backlash_stiffness_loss"] < 300.0
