@@ -68,13 +68,6 @@ def begun(live: Live, action: str, says: str = "") -> int:
     return live.helper.pid
 
 
-def alive(pid: int) -> bool:
-    found = subprocess.run(
-        ["ps", "-o", "stat=", "-p", str(pid)], capture_output=True, text=True, check=False
-    ).stdout.strip()
-    return bool(found) and not found.startswith("Z")
-
-
 def group(pid: int) -> list[str]:
     """Living processes of a group."""
     lines = subprocess.run(
@@ -140,42 +133,54 @@ def test_the_server_stands_on_the_very_model_that_the_process_fitted(live: Live)
     assert live.analysis().solution is solution
 
 
-@posix
-def test_a_killed_server_takes_its_processes_with_it_and_finds_the_job_again(
-    tmp_path: Path,
-) -> None:
-    """Another program serves a session and is killed in the middle of the whole loop."""
-    script = tmp_path / "serving.py"
-    script.write_text(
-        "import sys, time\n"
-        "from pathlib import Path\n"
-        "from workbench.page import verbs\n"
-        "from workbench.page.input import start_demo\n"
-        "from workbench.page.live import Live\n"
-        "from workbench.page.session import Store\n"
-        "if __name__ == '__main__':\n"
-        "    live = Live(Store(Path(sys.argv[1])).create())\n"
-        "    start_demo(live)\n"
-        "    verbs.run(live, 'improve', {})\n"
-        "    while not live.helper.pid or live.job.share <= 0.02: time.sleep(0.005)\n"
-        "    print(live.session.id, live.helper.pid, flush=True)\n"
-        "    time.sleep(60)\n"
-    )
-    root = tmp_path / "sessions"
+SERVING = """
+import sys, time
+from pathlib import Path
+from workbench.page import verbs
+from workbench.page.input import start_demo
+from workbench.page.live import Live
+from workbench.page.session import Store
+if __name__ == '__main__':
+    root, action, says = sys.argv[1:]
+    live = Live(Store(Path(root)).create())
+    start_demo(live)
+    if action == 'plant':
+        verbs.run(live, 'fit', {})
+        while live.job: time.sleep(0.005)
+    verbs.run(live, action, {})
+    while not live.helper.pid or live.job.share <= 0.02 or says not in live.job.text:
+        time.sleep(0.005)
+    print(live.session.id, live.helper.pid, flush=True)
+    sys.stdin.readline()
+"""
+"""Another program that serves a session; it ends by itself at a line of input."""
+
+
+def serving(folder: Path, action: str, says: str) -> tuple[subprocess.Popen[str], str, int]:
+    script = folder / "serving.py"
+    script.write_text(SERVING)
     paths = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
-    serving = subprocess.Popen(
-        [sys.executable, str(script), str(root)],
+    process = subprocess.Popen(
+        [sys.executable, str(script), str(folder / "sessions"), action, says],
+        stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
         env={**os.environ, "PYTHONPATH": paths},
     )
-    assert serving.stdout is not None
-    name, pid = serving.stdout.readline().split()
-    serving.kill()
-    serving.wait()
-    serving.stdout.close()
-    until(lambda: not alive(int(pid)), 20)
-    again = Live(Store(root).open(name))
+    assert process.stdout is not None
+    name, pid = process.stdout.readline().split()
+    return process, name, int(pid)
+
+
+@posix
+def test_a_killed_server_takes_its_processes_with_it_and_finds_the_job_again(
+    tmp_path: Path,
+) -> None:
+    server, name, pid = serving(tmp_path, "improve", "")
+    server.kill()
+    server.communicate()
+    until(lambda: not group(pid), 20)
+    again = Live(Store(tmp_path / "sessions").open(name))
     assert (again.session.running() or {})["action"] == "improve"
     assert not again.state.steps
     verbs.resume(again)
@@ -185,6 +190,15 @@ def test_a_killed_server_takes_its_processes_with_it_and_finds_the_job_again(
     wait(again)
     assert again.session.running() is None
     again.close()
+
+
+@posix
+def test_a_server_that_ends_in_the_middle_of_a_build_ends_the_build(tmp_path: Path) -> None:
+    server, _, pid = serving(tmp_path, "plant", "building")
+    until(lambda: len(group(pid)) > 1)
+    server.communicate("end\n", timeout=60)
+    assert server.returncode == 0
+    until(lambda: not group(pid), 20)
 
 
 def test_a_law_of_one_session_is_in_no_other_and_two_work_at_once(

@@ -4,6 +4,7 @@ pipe, and sends back how far it is and what it found.
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
 import signal
@@ -25,6 +26,10 @@ from workbench.page.session import Session, State, StepEntry
 
 STOP: Final = "stop"
 """Sent while spare work runs: it ends at its next stage."""
+FIRST_TO_GO: Final = "500"
+"""Linux's `oom_score_adj` of the process, half of its range: where the memory runs out it is ended
+before the server, which has the sessions.
+"""
 
 
 @final
@@ -113,6 +118,8 @@ def main(pipe: Connection, folder: Path, files: Sequence[EffectFile]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if hasattr(os, "setsid"):
         os.setsid()  # what it starts, such as a compiler, ends with it
+    with contextlib.suppress(OSError):  # another system than Linux
+        Path("/proc/self/oom_score_adj").write_text(FIRST_TO_GO, encoding="ascii")
     threading.Thread(target=_end_with_the_server, daemon=True, name="watching").start()
     known = {f.sha256 for f in EFFECTS.files}
     for file in files:

@@ -10,6 +10,7 @@ import os
 import signal
 import threading
 import time
+import weakref
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -84,6 +85,7 @@ class Helper:
         self._lock = threading.Lock()
         self._process: BaseProcess | None = None
         self._pipe: Connection | None = None
+        self._at_exit: weakref.finalize[[BaseProcess], Helper] | None = None
         self._preparing = 0.0
 
     @property
@@ -189,23 +191,27 @@ class Helper:
             finally:
                 there.close()
             self._pipe = here
+            self._at_exit = weakref.finalize(self, _kill, self._process)
         return self._pipe
 
     def _end(self) -> None:
         process, pipe, self._process, self._pipe = self._process, self._pipe, None, None
         if pipe is not None:
             pipe.close()
-        if process is None or process.pid is None:
-            return
-        if process.is_alive():
-            try:
-                # its group: a compiler that it started ends with it
-                if os.getpgid(process.pid) == process.pid:
-                    os.killpg(process.pid, signal.SIGKILL)
-            except (AttributeError, ProcessLookupError, PermissionError):
-                pass
-            process.kill()
-        process.join(ENDING)
+        if process is not None:
+            _kill(process)
+        if self._at_exit is not None:
+            self._at_exit.detach()
+
+
+def _kill(process: BaseProcess) -> None:
+    """End a process and what it started, such as a compiler."""
+    if process.pid is not None and process.is_alive():
+        with contextlib.suppress(AttributeError, ProcessLookupError, PermissionError):
+            if os.getpgid(process.pid) == process.pid:
+                os.killpg(process.pid, signal.SIGKILL)
+        process.kill()
+    process.join(ENDING)
 
 
 def _context() -> Any:
