@@ -201,6 +201,31 @@ def test_a_server_that_ends_in_the_middle_of_a_build_ends_the_build(tmp_path: Pa
     until(lambda: not group(pid), 20)
 
 
+@posix
+def test_an_interrupted_app_ends_in_one_line_and_leaves_nothing(tmp_path: Path) -> None:
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    paths = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
+    app = subprocess.Popen(
+        [sys.executable, "-m", "workbench", "app", "--no-browser"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={
+            **os.environ,
+            "PYTHONPATH": paths,
+            "TMPDIR": str(temporary),
+            "IRJ_SESSIONS": str(tmp_path / "sessions"),
+        },
+    )
+    until(lambda: list(temporary.glob("irj-run-*/pymp-*")))  # other processes can be started
+    time.sleep(0.5)
+    app.send_signal(signal.SIGINT)
+    _, said = app.communicate(timeout=60)
+    assert (app.returncode, said) == (130, "irj: interrupted\n")
+    assert not list(temporary.glob("irj-run-*"))
+
+
 def test_a_law_of_one_session_is_in_no_other_and_two_work_at_once(
     live: Live, tmp_path: Path
 ) -> None:

@@ -228,8 +228,9 @@ def _context() -> Any:
 def warm_up() -> None:
     """Start the process that the others are copies of, before the first work needs it."""
     process = _context().Process(target=os.getpid, daemon=True, name="warm up")
-    process.start()
-    process.join()
+    with contextlib.suppress(OSError, EOFError, RuntimeError):  # the server ends just then
+        process.start()
+        process.join()
 
 
 __all__ = ["BrokenOffError", "Halt", "Helper", "InternalError", "warm_up"]
