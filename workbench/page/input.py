@@ -7,7 +7,6 @@ import math
 import secrets
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, Final
 
 from casadi_models.transmission import MODELS
@@ -18,7 +17,7 @@ from identification.data.plain_text import from_toml, tables_text
 from identification.errors import InputError
 from workbench.page.charts.choices import held_text, windows_of
 from workbench.page.desk.tree import LONGEST_NAME, given, opened, remarked, used_files
-from workbench.page.live import Live
+from workbench.page.live import SOON, Live
 from workbench.page.records import guessed_role, surveyed
 from workbench.page.session import FileEntry, State
 
@@ -51,7 +50,7 @@ def add_upload(live: Live, name: str, stored: str, size: int) -> dict[str, Any]:
         return set_joint(live, {"text": text, "source": name})
     role, reason = guessed_role(name)
     entry = live.examine(
-        FileEntry(secrets.token_hex(6), name, stored, role, reason, size), soon=True
+        FileEntry(secrets.token_hex(6), name, stored, role, reason, size), longest=SOON
     )
     if entry.status == "refused" and not entry.summary:
         raise InputError(entry.message)
@@ -305,10 +304,3 @@ def start_demo(live: Live) -> dict[str, Any]:
         (live.session.files / stored).write_bytes(content)
         add_upload(live, name, stored, len(content))
     return {"ok": True}
-
-
-def folder_of(live: Live) -> Path:
-    """Folder for what is made for a download."""
-    made = live.session.folder / "exports"
-    made.mkdir(exist_ok=True, mode=0o700)
-    return made

@@ -22,7 +22,8 @@ from identification.errors import InputError
 from identification.fitting.assess import relative_error_percent
 from identification.fitting.engine import references, stack
 from workbench.page.analysis import Analysis
-from workbench.page.live import Live, hint_for
+from workbench.page.jobs.place import hint_for
+from workbench.page.live import Live
 from workbench.page.records import plot_time
 from workbench.page.session import StepEntry
 from workbench.show.chart import WIDTH, Chart, Curve, Label, Style
