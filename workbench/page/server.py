@@ -121,6 +121,8 @@ class Service:
                 raise BusyError(f"busy: {live.job.text}; wait for it or cancel it")
             self.lives.pop(identifier, None)
             home.delete(self.store, identifier)
+        for listener in tuple(live.listeners) if live is not None else ():
+            listener({"gone": True})  # other tabs that have it open
 
 
 _LOG = logging.getLogger(__name__)

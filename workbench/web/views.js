@@ -109,16 +109,16 @@ const views = {
     const d = state.diagnosis;
     const again = button(d ? "Diagnose again" : "Diagnose", () => run("diagnose", {}, "diagnose"), { kind: d ? "" : "primary", id: "diagnose" });
     if (!d) return [h("div", { class: "row between head" }, h("div", {}, heading("What is missing?", "Every effect of the library is tried in every place of the current model, and judged on blocks and records it was not fitted to.")), again)];
-    const clear = d.ranking.filter((r) => r.significant), faint = d.ranking.filter((r) => !r.significant), most = Math.max(1, ...d.ranking.map((r) => r.held_out_drop_percent || 0));
+    const clear = d.ranking.filter((r) => r.significant), faint = d.ranking.filter((r) => !r.significant), said = d.claim, fallOf = (r) => (said && said.label === r.label ? said.held_out_drop_percent : r.held_out_drop_percent) || 0, most = Math.max(1, ...d.ranking.map(fallOf)); /* what is claimed was fitted wholly: its figure is the one in the sentence, too */
     const panel = new LawPanel(clear.map((r) => r.label));
     const row = (r, k) => {
-      const bar = h("i"), drop = r.held_out_drop_percent || 0;
+      const bar = h("i"), drop = fallOf(r);
       later(() => { bar.style.width = `${Math.max(0, (100 * drop) / most)}%`; });
       const key = d.claim && d.claim.label === r.label;
       return h("li", { class: `candidate${r.significant ? "" : " dim"}`, "data-label": r.label, onpointerenter: () => panel.show(r.label), onfocusin: () => panel.show(r.label) }, h("span", { class: "rank" }, String(k + 1)),
         h("div", {}, h("h3", {}, r.title, " ", h("span", { class: "place" }, `· ${r.place.replace(/_/g, " ")}`)), h("p", { class: "small" }, `Without it ${r.absence}.`),
           h("p", { class: "small soft" }, `${digits(r.contribution)} ${unit(d.unit)} rms in the ${r.balance} balance; p ${r.p_value < 1e-4 ? "< 0.0001" : "= " + digits(r.p_value, 2)}; evidence ${digits(r.gain_nats)} (gain in log-likelihood).${r.confusable_with.length ? ` Often confused with ${r.confusable_with.map(effectTitle).join(", ")}.` : ""}`)),
-        h("div", { class: "effect-size" }, h("p", { class: "small" }, drop > 0 ? `residual −${digits(drop, 2)} %` : "no fall"), h("span", { class: "bar", "aria-hidden": "true" }, bar)),
+        h("div", { class: "effect-size" }, h("p", { class: "small" }, drop > 0 ? ["residual ", h("span", { class: "num" }, `−${digits(drop, 2)} %`)] : "no fall"), h("span", { class: "bar", "aria-hidden": "true" }, bar)),
         h("div", { class: "act" }, button("Add", () => run("add", { label: r.label }, "ledger"), { kind: key ? "primary" : "", id: `add-${r.label.replace(/[@#]/g, "-")}`, label: `Add ${r.title}, ${r.place.replace(/_/g, " ")}` })));
     };
     const claim = d.claim;
@@ -165,7 +165,7 @@ const views = {
     const table = await get("/view/parameters"), error = state.steps[state.steps.length - 1].held_out.relative_error_percent, rows = Object.entries(table).filter(([, p]) => !p.nuisance);
     const enough = (p) => (p.stderr > 0 && p.value ? Math.min(9, Math.max(2, 2 + Math.floor(Math.log10(Math.abs(p.value))) - Math.floor(Math.log10(p.stderr)))) : 4);
     const band = (p) => p.stderr == null ? "–" : `${digits(p.value - 1.96 * p.stderr, enough(p))} … ${digits(p.value + 1.96 * p.stderr, enough(p))}`;
-    const flags = (p) => [p.at_bound && h("span", { class: "tag warn" }, "at its bound"), p.identifiable === false && h("span", { class: "tag warn" }, "not identified"), p.correlation && Math.abs(p.correlation.value) > 0.95 && h("span", { class: "tag warn" }, `tied to ${p.correlation.with.replace(/_/g, " ")}`)].filter(Boolean);
+    const flags = (p) => [p.held && h("span", { class: "tag" }, "held"), p.at_bound && h("span", { class: "tag warn" }, "at its bound"), p.identifiable === false && h("span", { class: "tag warn" }, "not identified"), p.correlation && Math.abs(p.correlation.value) > 0.95 && h("span", { class: "tag warn" }, `tied to ${p.correlation.with.replace(/_/g, " ")}`)].filter(Boolean);
     return [heading("Parameters", "Standard errors come from the scatter between blocks of the records. All values are referred to the link."),
       h("div", { class: "card scroll", tabindex: "0", role: "region", "aria-label": "Table of parameters" }, h("table", {}, h("thead", {}, h("tr", {}, ["Parameter", "Value", "± std. error", "95 % band", "Unit", "Side", "Flags"].map((t, k) => h("th", { scope: "col", class: k > 0 && k < 4 ? "num" : null }, t)))),
         h("tbody", {}, rows.map(([name, p]) => h("tr", {}, h("td", {}, name.replace(/_/g, " "), h("div", { class: "small soft" }, p.meaning)), h("td", { class: "num" }, digits(p.value, 5)), h("td", { class: "num" }, digits(p.stderr, 2)), h("td", { class: "num" }, band(p)), h("td", {}, unit(p.unit)), h("td", {}, p.side), h("td", {}, h("div", { class: "row" }, flags(p).length ? flags(p) : h("span", { class: "soft" }, "–")))))))),
