@@ -174,8 +174,8 @@ def check_sampling(record: Record) -> list[Finding]:
     elif dt >= _SLOWEST or dt < _FASTEST:
         unit = "ms" if dt >= _SLOWEST else "s"
         counted = (
-            "does time number the samples? give the period of the clock as their step (at 250 Hz: "
-            "time = { step = 0.004 }); "
+            "does time number the samples? give the period of the clock as the scale of this "
+            "column (0.004 at 250 Hz); "
             if bool(np.all(steps == 1.0))
             else ""
         )
