@@ -126,7 +126,7 @@ def paths() -> str:
 
 
 def wait_for(address: str) -> None:
-    port = int(address.rstrip("/").rsplit(":", 1)[1])
+    port = int(address.partition("#")[0].rstrip("/").rsplit(":", 1)[1])
     for _ in range(300):
         try:
             socket.create_connection(("127.0.0.1", port), timeout=1).close()

@@ -6,6 +6,7 @@ diagnosis candidate, FMU variable, row of the documentation) follows from it.
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import hashlib
 import importlib
@@ -13,6 +14,7 @@ import math
 import pkgutil
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping
+from contextvars import ContextVar
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -349,6 +351,15 @@ class EffectFile:
     code: bytes = field(repr=False)
 
 
+@final
+@dataclass
+class _Typed:
+    """Effects that were typed as text, by key, each with a file that declares it."""
+
+    effects: dict[str, Effect] = field(default_factory=dict)
+    files: dict[str, EffectFile] = field(default_factory=dict)
+
+
 class Registry(Mapping[str, Effect]):
     """The effect library by key; filled when :mod:`casadi_models.effects` is imported."""
 
@@ -356,27 +367,41 @@ class Registry(Mapping[str, Effect]):
         self._effects: dict[str, Effect] = {}
         self._loaded: dict[Path, EffectFile] = {}
         self._former: dict[str, str] = {}
-        self._typed: dict[str, EffectFile] = {}
+        self._everywhere = _Typed()
+        self._scope: ContextVar[_Typed] = ContextVar("typed effects", default=self._everywhere)
 
     def __getitem__(self, key: str) -> Effect:
-        try:
-            return self._effects[self._former.get(key, key)]
-        except KeyError:
-            near = difflib.get_close_matches(str(key), self._effects, 1)
+        name = self._former.get(key, key)
+        found = self._effects.get(name) or self._scope.get().effects.get(name)
+        if found is None:
+            near = difflib.get_close_matches(str(key), list(self), 1)
             hint = f" (did you mean {near[0]!r}?)" if near else ""
-            raise KeyError(
-                f"unknown effect {key!r}{hint}; known: {', '.join(sorted(self._effects))}"
-            ) from None
+            raise KeyError(f"unknown effect {key!r}{hint}; known: {', '.join(sorted(self))}")
+        return found
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._effects)
+        return iter((*self._effects, *tuple(self._scope.get().effects)))
 
     def __len__(self) -> int:
-        return len(self._effects)
+        return len(self._effects) + len(self._scope.get().effects)
+
+    @contextlib.contextmanager
+    def scoped(self) -> Iterator[None]:
+        """A part of the program with typed effects of its own.
+
+        Inside, in this thread or task and in what is started with a copy of its context, the
+        library is what was declared in Python and nothing that was typed as text elsewhere;
+        what is typed inside is not seen outside, and is gone at the end.
+        """
+        before = self._scope.set(_Typed())
+        try:
+            yield
+        finally:
+            self._scope.reset(before)
 
     def add(self, effect: Effect) -> None:
         """Register an effect; a key that exists already is an error."""
-        if effect.key in self._effects:
+        if effect.key in self:
             raise ValueError(f"effect {effect.key!r} is registered already")
         self._effects[effect.key] = effect
         self._former.update(dict.fromkeys(effect.formerly, effect.key))
@@ -395,22 +420,24 @@ class Registry(Mapping[str, Effect]):
         code : bytes
             Python source that declares it, for where the text is not at hand.
         """
-        if effect.key in self._effects and effect.key not in self._typed:
+        if effect.key in self._effects:
             raise ValueError(f"effect {effect.key!r} is in the library already; choose another key")
-        self._effects[effect.key] = effect
         digest = hashlib.sha256(code).hexdigest()
-        self._typed[effect.key] = EffectFile(Path(f"{effect.key}.py"), digest, (effect.key,), code)
+        typed = self._scope.get()
+        typed.files[effect.key] = EffectFile(Path(f"{effect.key}.py"), digest, (effect.key,), code)
+        typed.effects[effect.key] = effect
 
     @property
     def typed(self) -> tuple[EffectFile, ...]:
         """The effects that were typed as text, each as a file that declares it."""
-        return tuple(self._typed.values())
+        return tuple(self._scope.get().files.values())
 
     def forget(self, key: str) -> None:
         """Take an effect that was typed as text out of the library; any other key is an error."""
-        if key not in self._typed:
+        typed = self._scope.get()
+        if key not in typed.effects:
             raise ValueError(f"effect {key!r} was not typed as text")
-        del self._typed[key], self._effects[key]
+        del typed.files[key], typed.effects[key]
 
     @property
     def files(self) -> tuple[EffectFile, ...]:
@@ -418,8 +445,7 @@ class Registry(Mapping[str, Effect]):
         still.
         """
         kept = (
-            replace(f, keys=tuple(k for k in f.keys if k in self._effects))
-            for f in self._loaded.values()
+            replace(f, keys=tuple(k for k in f.keys if k in self)) for f in self._loaded.values()
         )
         return tuple(f for f in kept if f.keys)
 
@@ -437,20 +463,24 @@ class Registry(Mapping[str, Effect]):
         where = path.resolve()
         _only_python(path)
         kept = dict(self._effects)
+        typed = self._scope.get()
+        kept_typed = replace(typed, effects=dict(typed.effects), files=dict(typed.files))
         for key in self._loaded[where].keys if where in self._loaded else ():
-            self._effects.pop(key, None)
-        before = set(self._effects)
+            for held in (self._effects, typed.effects, typed.files):
+                held.pop(key, None)
+        before = set(self)
         module = ModuleType(f"irj_user_effects_{path.stem}")
         module.__file__ = str(path)
         try:
             exec(compile(code, str(path), "exec"), module.__dict__)
-            self._check_references(set(self._effects) - before, path)
-            for key in sorted(set(self._effects) - before):
-                self._effects[key].check()
+            self._check_references(set(self) - before, path)
+            for key in sorted(set(self) - before):
+                self[key].check()
         except BaseException:
             self._effects = kept
+            typed.effects, typed.files = kept_typed.effects, kept_typed.files
             raise
-        keys = tuple(sorted(set(self._effects) - before))
+        keys = tuple(sorted(set(self) - before))
         self._loaded[where] = EffectFile(where, hashlib.sha256(code).hexdigest(), keys, code)
         return self._loaded[where]
 
@@ -463,8 +493,8 @@ class Registry(Mapping[str, Effect]):
     def _check_references(self, keys: set[str], path: Path) -> None:
         """Every effect that a new one names must be in the library."""
         for key in sorted(keys):
-            for other in self._effects[key].related:
-                if other not in self._effects:
+            for other in self[key].related:
+                if other not in self:
                     raise ValueError(
                         f"{path}: effect {key!r} names {other!r}, which is not in the library"
                     )

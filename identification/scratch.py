@@ -8,6 +8,7 @@ up behind itself only.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import hashlib
 import os
@@ -15,6 +16,7 @@ import re
 import shutil
 import tempfile
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import IO, Final
 
@@ -22,6 +24,10 @@ from identification.errors import InputError
 
 _PREFIX: Final = "irj-run-"
 _LOCK: Final = ".lock"
+_ENDS_LATER: Final = "pymp-"
+"""Folders of multiprocessing, which removes them itself when the interpreter ends, and prints a
+trace where they are gone.
+"""
 TRIES: Final = 10
 """Times a lock is tried whose file goes just then."""
 _HELD: Final[dict[str, IO[bytes]]] = {}
@@ -57,6 +63,8 @@ def own_folder() -> Iterator[None]:
     tempfile.tempdir = str(made)
     os.environ["TMPDIR"] = str(made)
     owner = os.getpid()
+    gone = partial(_removed, made, lock, owner)
+    atexit.register(gone)  # before multiprocessing is loaded: called after its own end
     try:
         yield
     finally:
@@ -67,9 +75,28 @@ def own_folder() -> Iterator[None]:
                 os.environ.pop("TMPDIR", None)
             else:
                 os.environ["TMPDIR"] = before[1]
-            shutil.rmtree(made, ignore_errors=True)
-            if lock is not None:
-                lock.close()
+            if any(made.glob(f"{_ENDS_LATER}*")):
+                for left in made.iterdir():
+                    if not left.name.startswith((_ENDS_LATER, _LOCK)):
+                        _rid(left)
+            else:
+                atexit.unregister(gone)
+                gone()
+
+
+def _removed(made: Path, lock: IO[bytes] | None, owner: int) -> None:
+    """Remove the folder of a run, in the process that made it."""
+    if os.getpid() == owner:
+        shutil.rmtree(made, ignore_errors=True)
+        if lock is not None:
+            lock.close()
+
+
+def _rid(left: Path) -> None:
+    if left.is_dir() and not left.is_symlink():
+        shutil.rmtree(left, ignore_errors=True)
+    else:
+        left.unlink(missing_ok=True)
 
 
 def hold(target: Path) -> None:

@@ -108,16 +108,19 @@ def kernel(length: float, dt: float, order: int = 0) -> FloatArray:
     return weights
 
 
-def differentiated_kernel(length: float, dt: float, order: int) -> FloatArray:
+def differentiated_kernel(length: float, dt: float, order: int, step: int = 1) -> FloatArray:
     """Derivative of the cos^4 kernel itself, so that averages of a signal and of its derivative
     agree.
 
-    Shapes and units as in :func:`kernel`; exact for polynomials of degree `order`.
+    Shapes and units as in :func:`kernel`; exact for polynomials of degree `order`. With a `step`
+    the samples at every so many `dt` of the kernel that has all of them, so that an average of
+    these samples and one of all agree, too.
     """
     half = max(order + 2, whole(length / dt / 2))
-    t = np.arange(-half, half + 1) * dt
     width = (2 * half + 2) * dt
-    phase = np.pi * t / width
+    half = max(order + 2, whole(length / (dt * step) / 2))
+    t = np.arange(-half, half + 1) * (dt * step)
+    phase = np.clip(np.pi * t / width, -np.pi / 2, np.pi / 2)
     c, s, a = np.cos(phase), np.sin(phase), np.pi / width
     shapes = (
         c**4,
@@ -354,9 +357,8 @@ class WeakRecord:
     def _sparse(self, order: int) -> Any:
         grid = self.grid
         half, stride = grid.half // grid.step, grid.stride // grid.step
-        return _averages(
-            grid.length, grid.dt * grid.step, order, half, stride, tuple(self.starts.tolist())
-        )
+        kernel_of = (grid.length, grid.dt, order, grid.step)
+        return _averages(kernel_of, half, stride, tuple(self.starts.tolist()))
 
     @property
     def rows(self) -> int:
@@ -365,17 +367,17 @@ class WeakRecord:
 
 
 def _averages(
-    length: float, dt: float, order: int, half: int, stride: int, starts: tuple[int, ...]
+    kernel_of: tuple[float, float, int, int], half: int, stride: int, starts: tuple[int, ...]
 ) -> Any:
     """Matrix (rows, points) of the kernel averages; one for all records of the same grid, as long
     as one of them lives: a record is made again for each shift of its clocks that is tried.
     """
-    key = (length, dt, order, half, stride, starts)
+    key = (kernel_of, half, stride, starts)
     found = _matrices.get(key)
     if found is None:
         from scipy.sparse import csr_array
 
-        weights = differentiated_kernel(length, dt, order)
+        weights = differentiated_kernel(*kernel_of)
         own = len(weights) // 2
         centres = np.concatenate(
             [

@@ -8,7 +8,7 @@ import math
 import secrets
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, Final, final
 
 import numpy as np
@@ -71,6 +71,23 @@ def clean(value: Any) -> Any:
     if isinstance(value, (float, np.floating)):
         return float(value) if math.isfinite(value) else None
     return value.item() if isinstance(value, np.generic) else value
+
+
+@final
+@dataclass(frozen=True)
+class Fitted:
+    """A fitted model as another process can take it: without the symbols of its equations.
+
+    Attributes
+    ----------
+    solution : mapping
+        Attributes of the `Solution`, all but the model.
+    own : mapping
+        Values of the model.
+    """
+
+    solution: Mapping[str, Any]
+    own: Mapping[str, float]
 
 
 @final
@@ -150,6 +167,38 @@ class Analysis:
             self._solved[_mark(step)] = known
         return known
 
+    def begin(self) -> None:
+        """Stand before any fit."""
+        self.solution, self.trials = None, {}
+
+    def stands_on(self, step: StepEntry) -> bool:
+        """Whether the current solution is that of a step of the ledger."""
+        return self.solution is not None and self._solved.get(_mark(step)) is self.solution
+
+    def fitted(self, solution: Solution) -> Fitted:
+        """A solution for another process."""
+        kept = {f.name: getattr(solution, f.name) for f in fields(solution) if f.name != "model"}
+        return Fitted(kept, dict(solution.model.values))
+
+    def known(self, step: StepEntry, fitted: Fitted) -> Solution:
+        """The solution of a step that was fitted in another process, on the same records."""
+        model = replace(self.model_of(step.effects, step.virtual_work), values=dict(fitted.own))
+        made = self._solved[_mark(step)] = Solution(model, **fitted.solution)
+        return made
+
+    @property
+    def ahead(self) -> Mapping[str, tuple[StepEntry, Solution]]:
+        """Candidates that were fitted ahead of the click, beside the current model."""
+        now = self.solution
+        return {k: (v[2], v[1]) for k, v in self._prepared.items() if v[0] is now}
+
+    def prepared_elsewhere(self, label: str, step: StepEntry, fitted: Fitted) -> None:
+        """Take a candidate that another process fitted beside the current model."""
+        now = self.current
+        made = self.known(step, fitted)
+        kept = {k: v for k, v in self._prepared.items() if v[0] is now}
+        self._prepared = {**kept, label: (now, made, step)}
+
     def with_candidate(self, label: str, hint: Mapping[str, Any] | None = None) -> Solution:
         """The current model with an effect beside it: the fit that was made ahead, else a first
         look. Nothing here changes.
@@ -200,11 +249,16 @@ class Analysis:
         model, start = self._with(label, hint)
         return self._looked("add", label, model, start, began)
 
-    def prepare(self, label: str, hint: Mapping[str, Any] | None = None) -> None:
+    def prepare(
+        self,
+        label: str,
+        hint: Mapping[str, Any] | None = None,
+        progress: Progress | None = None,
+    ) -> None:
         """Fit a candidate ahead of the click, so that `add` has it at once."""
         began, now = time.perf_counter(), self.current
         model, start = self._with(label, hint)
-        made = solve(model, self.data, start=start)
+        made = solve(model, self.data, start=start, progress=progress)
         entry = self._entry("add", label, self.data, began, made)
         self._prepared = {
             **{k: v for k, v in self._prepared.items() if v[0] is now},
@@ -222,10 +276,10 @@ class Analysis:
         self.prepare(label)
         return self._prepared[label][2]
 
-    def settle(self, step: StepEntry) -> StepEntry:
+    def settle(self, step: StepEntry, progress: Progress | None = None) -> StepEntry:
         """The whole fit of a step that was only looked at."""
         began, now = time.perf_counter(), self.current
-        made = solve(now.model, self.data, start=now.values)
+        made = solve(now.model, self.data, start=now.values, progress=progress)
         entry = self._entry(step.action, step.label, self.data, began, made)
         self.solution = made
         return replace(entry, names=step.names, separate_by=step.separate_by, id=step.id)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import os
-import signal
 import subprocess
 import sys
 import tempfile
@@ -16,7 +15,7 @@ from typing import Any
 from identification.diagnosis.improve import HOLD_DELAY
 from identification.errors import InputError
 from workbench.page.analysis import Progress
-from workbench.page.live import Live
+from workbench.page.jobs.place import Place
 from workbench.page.report import improvement_of, records_of
 from workbench.page.session import FileEntry, State, StepEntry, write_atomic
 
@@ -109,7 +108,7 @@ def _plain(columns: Mapping[str, Any]) -> dict[str, Any]:
     return {k: dict(v) if isinstance(v, Mapping) else v for k, v in columns.items()}
 
 
-def joint_file(live: Live) -> str:
+def joint_file(live: Place) -> str:
     """The fitted joint, or the joint as it was given where nothing is fitted yet."""
     return live.analysis().to_joint_file() if live.state.steps else live.state.joint_text
 
@@ -124,7 +123,7 @@ def fmu_available() -> bool:
     return importlib.util.find_spec("irj_fmu.build") is not None
 
 
-def report(live: Live, steps: Sequence[StepEntry], folder: Path, progress: Progress) -> Path:
+def report(live: Place, steps: Sequence[StepEntry], folder: Path, progress: Progress) -> Path:
     """Write the HTML report of the session into a folder."""
     from workbench.show.report import write_report
 
@@ -135,11 +134,11 @@ def report(live: Live, steps: Sequence[StepEntry], folder: Path, progress: Progr
     return write_report(result, folder / "report.html", records=(*train, *held))
 
 
-def fmu(live: Live, folder: Path, progress: Progress, kind: str = "plant") -> Path:
+def fmu(live: Place, folder: Path, progress: Progress, kind: str = "plant") -> Path:
     """Build the FMU of the fitted joint (``plant``) or of its online estimator (``estimator``) into
     a folder.
 
-    The build has a process of its own: a cancelled one takes its compiler with it.
+    The build has a process of its own, beside the one that waits for it: ended together.
     """
     source = folder / f"{kind}.toml"
     write_atomic(source, joint_file(live).encode())
@@ -162,7 +161,7 @@ def fmu(live: Live, folder: Path, progress: Progress, kind: str = "plant") -> Pa
 
 
 def _apart(code: str, arguments: Sequence[str], folder: Path) -> None:
-    """Run Python code in a process group of its own; it ends when this thread is stopped.
+    """Run Python code in a process of its own; it is of this process's group, and ends with that.
 
     Raises
     ------
@@ -178,24 +177,15 @@ def _apart(code: str, arguments: Sequence[str], folder: Path) -> None:
             stdout=subprocess.DEVNULL,
             stderr=said,
             env={**os.environ, "PYTHONPATH": paths},
-            start_new_session=True,
         )
         try:
             while process.poll() is None:
                 time.sleep(0.05)
         finally:
             if process.poll() is None:
-                _end(process)
+                process.kill()
+                process.wait()
         if process.returncode:
             said.seek(0)
             lines = said.read().decode(errors="replace").strip().splitlines()
             raise InputError(lines[-1] if lines else f"the build ended with {process.returncode}")
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    """End a process and what it started."""
-    if hasattr(os, "killpg"):
-        os.killpg(process.pid, signal.SIGKILL)
-    else:
-        process.kill()
-    process.wait()

@@ -6,22 +6,22 @@ import contextlib
 import logging
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Final, final
 
 from identification.crash import internal_error
-from identification.data.joint_file import Joint, parse_joint
-from identification.data.plain_text import from_toml
-from identification.data.record import Record
 from identification.errors import InputError
-from workbench.page.analysis import Analysis, Progress
+from workbench.page.analysis import Progress
 from workbench.page.desk.tree import after_input, given
-from workbench.page.records import checked, opened, without_windows
+from workbench.page.jobs.child import Ask, Done
+from workbench.page.jobs.doing import unchanged
+from workbench.page.jobs.place import Change, Place, joint_of
+from workbench.page.jobs.process import Halt, Helper, InternalError
+from workbench.page.records import checked
 from workbench.page.session import FileEntry, Session, State
 from workbench.page.work import CancelledError, Task, Worker
 
-Change = Callable[[State], State]
-Work = Callable[[Progress], Change]
+Here = Callable[[Progress], Change]
 Listener = Callable[[dict[str, Any]], None]
 
 SOON: Final = 200_000
@@ -45,8 +45,7 @@ class Job:
     text: str
     share: float = 0.0
     cancelled: bool = False
-    task: Task | None = None
-    change: Change | None = None
+    halt: Halt = field(default_factory=Halt)
 
     def as_json(self) -> dict[str, Any]:
         """What the page shows."""
@@ -59,8 +58,9 @@ class Job:
 
 
 @final
-class Live:
-    """A session with its records in memory.
+class Live(Place):
+    """A session with its records in memory. What the views draw is computed here; long work has a
+    process of its own.
 
     Parameters
     ----------
@@ -69,25 +69,20 @@ class Live:
 
     Attributes
     ----------
-    kept : mapping of str to (mark, value)
-        Costly results in memory, each with the mark of what it was made from.
+    helper : Helper
+        The process of the session.
     seen : threading.Event
         Set when the newest record was drawn: the check gate lets that go first.
     """
 
     def __init__(self, session: Session) -> None:
-        self.session = session
-        self.state = session.load()
-        self.lock = threading.RLock()
-        self.building = threading.Lock()
+        super().__init__(session, session.load())
         self.job: Job | None = None
         self.error: str | None = None
         self.listeners: set[Listener] = set()
-        self.worker = Worker(f"session {session.id[:6]}")
+        self.helper = Helper(session.folder)
+        self.worker = Worker(f"session {session.id[:6]}", self.helper.close)
         self.seen = threading.Event()
-        self.kept: dict[str, tuple[Any, Any]] = {}
-        self._records: dict[str, Record] = {}
-        self._analysis: Analysis | None = None
         for entry in self.state.files:
             if entry.status == "checking":
                 self._check_soon(entry.id)
@@ -163,38 +158,7 @@ class Live:
         for listener in tuple(self.listeners):
             listener(snapshot)
 
-    def joint(self) -> Joint:
-        """The joint of the session.
-
-        Raises
-        ------
-        InputError
-            None yet, or not a valid one.
-        """
-        return joint_of(self.state)
-
-    # --- records and analysis ---------------------------------------------------------------------
-
-    def examine(self, entry: FileEntry, *, soon: bool = False) -> FileEntry:
-        """Read and check an upload; keeps its record in memory.
-
-        Parameters
-        ----------
-        entry : FileEntry
-        soon : bool
-            A long record may come back with the status ``checking``, to be handed to `check_soon`:
-            it can be looked at.
-        """
-        joint = self._joint_or_none()
-        path = self.session.path_of(entry)
-        made, record = opened(entry, path, self.kind_of(entry), self.columns_of(entry))
-        if record is not None and not (soon and len(record) > SOON):
-            made, record = checked(made, record, self.session.path_of(entry), joint)
-        with self.lock:
-            self._records.pop(entry.id, None)
-            if record is not None:
-                self._records[entry.id] = record
-        return made
+    # --- records ----------------------------------------------------------------------------------
 
     def check_soon(self, entry: FileEntry) -> None:
         """Run the check gate on a record that is shown already; jobs wait for it."""
@@ -206,11 +170,15 @@ class Live:
         self.worker.submit(Task(lambda: self._check(identifier)))
 
     def _check(self, identifier: str) -> None:
+        with self.library():
+            self._checked(identifier)
+
+    def _checked(self, identifier: str) -> None:
         entry = next((f for f in self.state.files if f.id == identifier), None)
         if entry is None or entry.status != "checking":
             return
         self.seen.wait(PATIENCE)
-        record, joint = self._records.get(identifier), self._joint_or_none()
+        record, joint = self._records.get(identifier), self.joint_or_none()
         try:
             if record is None:
                 made = self.examine(entry)
@@ -239,37 +207,6 @@ class Live:
 
         self.change(put)
 
-    def record(self, identifier: str) -> Record:
-        """The record of an upload, read again where it is not in memory.
-
-        Raises
-        ------
-        InputError
-            Unknown, or not readable.
-        """
-        entry = next((f for f in self.state.files if f.id == identifier), None)
-        if entry is None:
-            raise InputError("no such record in this session")
-        if identifier not in self._records:
-            made = self.examine(entry)
-            if identifier not in self._records:
-                raise InputError(made.message or f"{entry.name}: cannot be read")
-        return self._records[identifier]
-
-    def analysis(self) -> Analysis:
-        """The analysis of the state as it is; prepared again after a restart."""
-        with self.building:
-            if self._analysis is None:
-                ready = [f for f in self.state.files if f.status == "ready"]
-                used = [(f.role, without_windows(self.record(f.id), f.left_out)) for f in ready]
-                train = [r for role, r in used if role == "train"]
-                held = [r for role, r in used if role == "held_out"]
-                made = Analysis(self.joint(), train, held)
-                if self.state.steps:
-                    made.restore(self.state.steps[-1])
-                self._analysis = made
-            return self._analysis
-
     def forget(self) -> None:
         """Free the memory; the folder has everything."""
         with self.lock:
@@ -277,26 +214,10 @@ class Live:
                 self._analysis = None
                 self._records.clear()
 
-    @property
-    def has_joint(self) -> bool:
-        """Whether there is a valid joint."""
-        return self._joint_or_none() is not None
-
-    def columns_of(self, entry: FileEntry) -> Mapping[str, Any] | None:
-        """The column map of a record: its own, else that of the joint file, where there is one."""
-        joint = self._joint_or_none()
-        return entry.columns or (joint.columns if joint else None)
-
-    def kind_of(self, entry: FileEntry) -> str:
-        """Kind of the axis: of the joint, else as the record's columns say it."""
-        joint = self._joint_or_none()
-        return joint.kind if joint else entry.kind or "rotary"
-
-    def _joint_or_none(self) -> Joint | None:
-        try:
-            return self.joint()
-        except InputError:
-            return None
+    def close(self) -> None:
+        """End the process of the session; the folder has everything."""
+        self.worker.give_up()
+        self.helper.close()
 
     # --- jobs -------------------------------------------------------------------------------------
 
@@ -308,22 +229,23 @@ class Live:
         self,
         action: str,
         text: str,
-        work: Work,
-        after: Callable[[], None] | None = None,
+        body: Mapping[str, Any],
         *,
-        asked: Mapping[str, Any] | None = None,
+        here: Here | None = None,
+        after: Callable[[], None] | None = None,
     ) -> None:
-        """Run work in the session's thread; its change is applied only if it came to its end.
+        """Begin an action; its change is applied only if it came to its end.
 
         Parameters
         ----------
         action, text : str
-        work : callable
-            ``work(progress) -> change of the state``.
+        body : mapping
+            The request, written into the session's folder until the action has ended.
+        here : callable, optional
+            ``here(progress) -> change`` for short work in the session's thread; without it the
+            process of the session does the action.
         after : callable, optional
             Called when the change is in the state: queues spare work for the next click.
-        asked : mapping, optional
-            The request, written into the session's folder until the work has ended.
 
         Raises
         ------
@@ -333,64 +255,106 @@ class Live:
         with self.lock:
             self._free()
             job = self.job = Job(action, text)
-            job.task = Task(lambda: self._run(job, work))
             self.error = None
-            if asked is not None:
-                with contextlib.suppress(OSError):  # a full disk: the work itself may still do
-                    self.session.begin({"action": action, **asked})
+            with contextlib.suppress(OSError):  # a full disk: the work itself may still do
+                self.session.begin({**body, "action": action})
         self.seen.set()
         self.tell()
-        self.worker.submit(Task(lambda: self._guarded(job, after)))
+        self.worker.submit(Task(lambda: self._guarded(job, body, here, after)))
 
-    def ahead(self, work: Callable[[], None]) -> None:
-        """Queue spare work: given up when a job comes."""
+    def ahead(self, action: str, body: Mapping[str, Any]) -> None:
+        """Queue spare work of the session's process: given up when a job comes."""
+        halt = Halt()
 
         def quiet() -> None:
             try:
-                work()
-            except (InputError, ValueError, ArithmeticError):
+                with self.library():
+                    done = self._done_apart(action, body, lambda text, share: None, halt, True)
+                if halt.either:
+                    return
+                with self.lock:
+                    if done.change is not unchanged:
+                        self.change(done.change)
+                    self._adopt(done)
+            except (InputError, InternalError):
                 _LOG.debug("preparing the next click failed", exc_info=True)
 
-        self.worker.submit(Task(quiet, spare=True))
+        self.worker.submit(Task(quiet, spare=True, stop=halt.soon))
 
-    def _guarded(self, job: Job, after: Callable[[], None] | None) -> None:
-        made = self._analysis
-        before = (made.solution, made.trials) if made is not None else None
-        job.change = None
+    def _done_apart(
+        self,
+        action: str,
+        body: Mapping[str, Any],
+        progress: Progress,
+        halt: Halt,
+        spare: bool = False,
+    ) -> Done:
+        with self.lock:
+            asked = Ask(action, dict(body), self.state, self.fitted_here(), spare)
+        return self.helper.do(asked, progress, halt)
+
+    def _ready_for_views(self) -> None:
+        """Prepare the analysis of this process while the other one works."""
+        with self.library(), contextlib.suppress(InputError, ValueError, ArithmeticError):
+            self.analysis()
+
+    def _adopt(self, done: Done) -> None:
+        """Stand on the model that the process fitted, and keep what it fitted ahead."""
+        with self.lock:
+            self.fitted_elsewhere(done.fitted)
+            if self._analysis is not None and self.state.steps:
+                for label, step, fitted in done.ahead:
+                    self._analysis.prepared_elsewhere(label, step, fitted)
+
+    def _guarded(
+        self,
+        job: Job,
+        body: Mapping[str, Any],
+        here: Here | None,
+        after: Callable[[], None] | None,
+    ) -> None:
+        change: Change | None = None
+        done: Done | None = None
         error: str | None = None
-        try:
-            if job.task is not None:
-                job.task.run()
-        except CancelledError:
-            job.cancelled = True
-        except InputError as problem:
-            error = str(problem)
-        except (
-            Exception
-        ) as problem:  # the page must get a sentence for whatever goes wrong in a fit
-            if not job.cancelled:  # foreign code turns the request to stop into errors of its own
-                error = (
-                    f"{job.action}: {internal_error(problem, f'page: {job.action}')}; the "
-                    "state before it is kept"
-                )
-                _LOG.error(error)
-        if job.cancelled:
-            job.change, error = None, f"{job.action}: cancelled; nothing was changed"
-        done = job.change is not None
-        self._finish(job.change, error, before)
-        if done and after is not None:
-            after()
 
-    def _run(self, job: Job, work: Work) -> None:
         def progress(text: str, share: float) -> None:
             job.text, job.share = text, share
             self.tell()
 
-        job.change = work(progress)
+        with self.library():
+            try:
+                if job.halt.now:
+                    raise CancelledError
+                if here is not None:
+                    change = here(progress)
+                else:
+                    if not self.ready:
+                        threading.Thread(
+                            target=self._ready_for_views, daemon=True, name="views"
+                        ).start()
+                    done = self._done_apart(job.action, body, progress, job.halt)
+                    change = done.change
+            except CancelledError:
+                job.cancelled = True
+            except InputError as problem:
+                error = str(problem)
+            except (
+                Exception
+            ) as problem:  # the page must get a sentence for whatever goes wrong in a fit
+                said = (
+                    str(problem)
+                    if isinstance(problem, InternalError)
+                    else internal_error(problem, f"page: {job.action}")
+                )
+                error = f"{job.action}: {said}; the state before it is kept"
+                _LOG.error(error)
+            if job.cancelled:
+                change, error = None, f"{job.action}: cancelled; nothing was changed"
+            self._finish(change, done, error)
+        if change is not None and after is not None:
+            after()
 
-    def _finish(
-        self, change: Change | None, error: str | None, before: tuple[Any, Any] | None
-    ) -> None:
+    def _finish(self, change: Change | None, done: Done | None, error: str | None) -> None:
         with self.lock:
             if change is not None:
                 try:
@@ -400,16 +364,13 @@ class Live:
                     elif made.joint_text != self.state.joint_text and self._analysis is not None:
                         self._analysis.joint = joint_of(made)
                     self.state = self.session.save(made)
+                    if done is not None:
+                        self._adopt(done)
                 except OSError as problem:
                     error = (
                         f"the session folder cannot be written ({problem.strerror}); free "
                         "some space"
                     )
-            elif self._analysis is not None:
-                if before is not None:
-                    self._analysis.solution, self._analysis.trials = before
-                elif self.state.steps:
-                    self._analysis = None
             self.job, self.error = None, error
             with contextlib.suppress(OSError):
                 self.session.end()
@@ -430,35 +391,15 @@ class Live:
         self.tell()
 
     def cancel(self) -> bool:
-        """Stop the running job at its next line of Python; True where there was one."""
+        """End the running job, and the process that does it; True where there was one."""
         with self.lock:
             job = self.job
-        if job is None or job.task is None:
-            return False
-        job.cancelled = True
+            if job is None:
+                return False
+            job.cancelled = True
         self.tell()
-        job.task.stop()
+        job.halt.at_once()
         return True
 
 
-def joint_of(state: State) -> Joint:
-    """The joint of a state.
-
-    Raises
-    ------
-    InputError
-        None yet, or not a valid one.
-    """
-    if not state.joint_text:
-        raise InputError(
-            "no joint yet: fill in gear ratio, motor constant and model on the Model page"
-        )
-    source = state.joint_source or "joint"
-    return parse_joint(from_toml(state.joint_text, source), source)
-
-
-def hint_for(state: State, label: str) -> Mapping[str, Any] | None:
-    """Start values of a candidate from the diagnosis on disk."""
-    rows = (state.diagnosis or {}).get("ranking", [])
-    found: Mapping[str, Any] | None = next((r for r in rows if r.get("label") == label), None)
-    return found
+__all__ = ["SOON", "BusyError", "Job", "Live"]

@@ -17,7 +17,7 @@ import numpy as np
 from casadi_models import EFFECTS, JointModel
 from identification.errors import InputError
 from workbench.page.analysis import Progress, clean
-from workbench.page.live import Live
+from workbench.page.jobs.place import Place
 from workbench.page.records import decimated
 from workbench.page.session import State, write_atomic
 
@@ -119,7 +119,7 @@ def open_questions(state: State) -> list[dict[str, Any]]:
     return out
 
 
-def plan(live: Live, asked: Request, folder: Path, progress: Progress) -> Path:
+def plan(live: Place, asked: Request, folder: Path, progress: Progress) -> Path:
     """Try the motions of the thesis on the fitted joint in simulation; the best one is a file in
     `folder`.
 
@@ -168,7 +168,7 @@ def plan(live: Live, asked: Request, folder: Path, progress: Progress) -> Path:
     return path
 
 
-def _model(live: Live, label: str) -> tuple[JointModel, str]:
+def _model(live: Place, label: str) -> tuple[JointModel, str]:
     """The joint to simulate, and what was left out of it or assumed."""
     from identification.data.typical import true_values
 

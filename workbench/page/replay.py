@@ -20,7 +20,7 @@ from identification.errors import InputError
 from irj_fmu.estimator.healthy import detector_state, online_readings
 from workbench.cli.online import replay as followed
 from workbench.page.analysis import Progress, clean
-from workbench.page.live import Live
+from workbench.page.jobs.place import Place
 from workbench.page.session import StepEntry, write_atomic
 from workbench.show.replayed import READINGS, Replay
 
@@ -100,7 +100,7 @@ def request_of(body: Mapping[str, Any]) -> Request:
 
 
 def replay(
-    live: Live, steps: Sequence[StepEntry], asked: Request, folder: Path, progress: Progress
+    live: Place, steps: Sequence[StepEntry], asked: Request, folder: Path, progress: Progress
 ) -> Path:
     """Replay a record of the session with its fitted joint; the result is a file in `folder`.
 

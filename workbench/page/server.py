@@ -45,6 +45,7 @@ from workbench.page.input import (
     set_joint,
     start_demo,
 )
+from workbench.page.jobs.process import warm_up
 from workbench.page.live import BusyError, Live
 from workbench.page.security import Guard, loopback_hosts
 from workbench.page.session import Store, safe_name
@@ -103,7 +104,7 @@ class Service:
                 if k != identifier and not live.job and not live.listeners and live.worker.idle
             ]
             for old in spare[: max(0, len(self.lives) - IN_MEMORY)]:
-                del self.lives[old]
+                self.lives.pop(old).close()
             return self.lives[identifier]
 
     def delete(self, identifier: str) -> None:
@@ -120,7 +121,11 @@ class Service:
             if live is not None and live.job is not None:
                 raise BusyError(f"busy: {live.job.text}; wait for it or cancel it")
             self.lives.pop(identifier, None)
+            if live is not None:
+                live.close()
             home.delete(self.store, identifier)
+        for listener in tuple(live.listeners) if live is not None else ():
+            listener({"gone": True})  # other tabs that have it open
 
 
 _LOG = logging.getLogger(__name__)
@@ -133,7 +138,8 @@ def _with_session(service: Service, handler: Handler) -> Callable[[Request], Any
     async def answer(request: Request) -> Response:
         try:
             live = await run_in_threadpool(service.live, request.path_params["sid"])
-            result: Response = await handler(request, live)
+            with live.library():
+                result: Response = await handler(request, live)
             return result
         except KeyError:
             return PlainTextResponse("no such session; start a new one", 404)
@@ -410,7 +416,8 @@ def with_files(root: Path, files: Sequence[str | Path]) -> str:
         name = safe_name(file.name)
         stored = f"{secrets.token_hex(4)}-{name}"
         shutil.copyfile(file, session.files / stored)
-        add_upload(live, name, stored, file.stat().st_size)
+        with live.library():
+            add_upload(live, name, stored, file.stat().st_size)
     return session.id
 
 
@@ -475,6 +482,7 @@ def _warm_up() -> None:
     """Import what the first upload would wait for."""
     for name in ("numpy.ma", "numpy.fft", "identification.data.guess", "scipy.sparse"):
         importlib.import_module(name)
+    warm_up()
 
 
 def _listen(port: int) -> socket.socket:

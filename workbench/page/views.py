@@ -23,7 +23,8 @@ from workbench.page import plan as app_plan
 from workbench.page import replay as app_replay
 from workbench.page.charts.asked import CHART_VIEWS, along, run_starts, said, side_of
 from workbench.page.desk import tree
-from workbench.page.input import folder_of, joint_form
+from workbench.page.input import joint_form
+from workbench.page.jobs.place import folder_of
 from workbench.page.live import Live
 from workbench.page.pattern import pattern
 from workbench.page.records import decimated, plot_time

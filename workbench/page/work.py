@@ -1,25 +1,21 @@
-"""Work beside the page: one thread per session, tasks that stop at their next line of Python."""
+"""Work beside the page: one thread per session, which waits for the process that computes."""
 
 from __future__ import annotations
 
-import ctypes
 import logging
 import threading
-import time
 from collections import deque
 from collections.abc import Callable
 from typing import Final, final
 
 IDLE_SECONDS: Final = 600.0
-"""The thread of a session ends after this long without work."""
+"""The thread of a session ends after this long without work, and its process with it."""
 
 _LOG = logging.getLogger(__name__)
 
 
 class CancelledError(BaseException):
-    """Raised inside a task that was stopped; no `except Exception` of the work can take it for
-    an error.
-    """
+    """Work that was stopped; no `except Exception` can take it for an error."""
 
 
 @final
@@ -31,13 +27,24 @@ class Task:
     work : callable
     spare : bool
         Made ahead of a click: given up when a job comes.
+    stop : callable, optional
+        Lets work that has begun end early; without it such work comes to its end.
     """
 
-    def __init__(self, work: Callable[[], None], spare: bool = False) -> None:
+    def __init__(
+        self,
+        work: Callable[[], None],
+        spare: bool = False,
+        stop: Callable[[], None] | None = None,
+    ) -> None:
         self.work, self.spare = work, spare
-        self.stopped = False
-        self._lock = threading.Lock()
-        self._thread = 0
+        self._stop = stop
+        self._stopped = threading.Event()
+
+    @property
+    def stopped(self) -> bool:
+        """Whether it was told to stop."""
+        return self._stopped.is_set()
 
     def run(self) -> None:
         """Do the work in this thread.
@@ -45,70 +52,34 @@ class Task:
         Raises
         ------
         CancelledError
-            It was stopped; never after this returned.
+            It was stopped before it began, or the work itself says so.
         """
-        try:
-            try:
-                self._enter()
-                self.work()
-            finally:
-                self._leave()
-        except CancelledError:
-            self._leave()  # the request to stop may have come inside the first call
-            raise
+        if self.stopped:
+            raise CancelledError
+        self.work()
 
     def stop(self) -> None:
-        """Stop it at its next line of Python, or before it begins; asks again until it has
-        ended.
-        """
-        with self._lock:
-            if self.stopped:
-                return
-            self.stopped = True
-        if self._ask():
-            threading.Thread(target=self._insist, daemon=True, name="stopping").start()
-
-    def _ask(self) -> bool:
-        """Raise `CancelledError` in the thread that works; False where none does."""
-        with self._lock:
-            if not self._thread:
-                return False
-            ctypes.pythonapi.PyThreadState_SetAsyncExc(
-                ctypes.c_ulong(self._thread), ctypes.py_object(CancelledError)
-            )
-            return True
-
-    def _insist(self) -> None:
-        """An exception inside a finaliser is lost: ask again, less and less often."""
-        pause = 0.2
-        time.sleep(pause)
-        while self._ask():
-            pause = min(1.5 * pause, 2.0)
-            time.sleep(pause)
-
-    def _enter(self) -> None:
-        with self._lock:
-            if self.stopped:
-                raise CancelledError
-            self._thread = threading.get_ident()
-
-    def _leave(self) -> None:
-        with self._lock:
-            if (
-                self._thread and self.stopped
-            ):  # CPython 3.11 under a profiler hangs on a request that was taken back
-                ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(self._thread), None)
-            self._thread = 0
+        """Keep it from beginning, and let it end where it has begun and can."""
+        self._stopped.set()
+        if self._stop is not None:
+            self._stop()
 
 
 @final
 class Worker:
-    """Runs the tasks of one session one after the other, in one thread: what it has compiled
-    stays at hand.
+    """Runs the tasks of one session one after the other, in one thread.
+
+    Parameters
+    ----------
+    name : str
+        Of the thread.
+    idle : callable, optional
+        Called when nothing came for `IDLE_SECONDS`.
     """
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, idle: Callable[[], None] | None = None) -> None:
         self.name = name
+        self._left_idle = idle
         self._tasks: deque[Task] = deque()
         self._now: Task | None = None
         self._ready = threading.Condition()
@@ -146,7 +117,7 @@ class Worker:
                     lambda: bool(self._tasks), IDLE_SECONDS
                 ):
                     self._alive = False
-                    return
+                    break
                 self._now = task = self._tasks.popleft()
             try:
                 task.run()
@@ -156,6 +127,8 @@ class Worker:
                 if not task.stopped:
                     _LOG.exception("a task failed")
             del task
+        if self._left_idle is not None:
+            self._left_idle()
 
 
 __all__ = ["CancelledError", "Task", "Worker"]

@@ -30,10 +30,10 @@ from identification.diagnosis.trials import make_base
 from identification.errors import InputError
 from identification.fitting.engine import solve
 from workbench.page import analysis as app_analysis
-from workbench.page import verbs as app_verbs
 from workbench.page import views as app_views
 from workbench.page.analysis import Analysis
 from workbench.page.demo import demo_files
+from workbench.page.jobs.doing import ACTIONS
 from workbench.page.live import Live
 from workbench.page.pattern import pattern
 from workbench.page.report import improvement_of, records_of
@@ -107,9 +107,8 @@ def test_the_whole_loop_and_the_report_take_the_windows_until_confirmed(
     live = Live(Store(tmp_path).create())
     live._analysis = analysis
     said: list[tuple[str, float]] = []
-    steps = app_verbs._improve(live, lambda text, share: said.append((text, share)))(
-        live.state
-    ).steps
+    change = ACTIONS["improve"](live, {}, lambda text, share: said.append((text, share)))
+    steps = change(live.state).steps
     assert not any(s.exact for s in steps)
     assert len(steps) > 1
     assert records_of(analysis, steps) is analysis.quick

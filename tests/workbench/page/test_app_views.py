@@ -27,7 +27,8 @@ from workbench.page import replay as app_replay
 from workbench.page import verbs as app_verbs
 from workbench.page import views as app_views
 from workbench.page.export import _apart
-from workbench.page.input import add_upload, folder_of, set_joint, start_demo
+from workbench.page.input import add_upload, set_joint, start_demo
+from workbench.page.jobs.place import folder_of
 from workbench.page.live import Live
 from workbench.page.pattern import pattern
 from workbench.page.session import Session, Store
@@ -135,15 +136,15 @@ def test_what_was_fitted_ahead_is_there_at_once(live: Live) -> None:
 # --- spare work and cancelling --------------------------------------------------------------------
 
 
-def spin(seen: list[str], name: str, seconds: float = 20.0) -> Callable[[], None]:
+def waits(seen: list[str], name: str, seconds: float = 20.0) -> Task:
+    """Spare work that ends when it is told to."""
+    told = threading.Event()
+
     def work() -> None:
         seen.append(name)
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            time.sleep(0.001)
-        seen.append(f"{name} ended")
+        seen.append(f"{name} {'stopped' if told.wait(seconds) else 'ended'}")
 
-    return work
+    return Task(work, spare=True, stop=told.set)
 
 
 def until(condition: Callable[[], bool], seconds: float = 10.0) -> None:
@@ -153,36 +154,30 @@ def until(condition: Callable[[], bool], seconds: float = 10.0) -> None:
         time.sleep(0.002)
 
 
-def test_a_task_is_stopped_at_its_next_line_and_never_after_its_end() -> None:
+def test_a_task_is_kept_from_beginning_or_told_to_end_and_never_after_its_end() -> None:
     seen: list[str] = []
-    task = Task(spin(seen, "work"))
-    stopped: list[bool] = []
+    told = threading.Event()
 
-    def body() -> None:
-        try:
-            task.run()
-        except CancelledError:
-            stopped.append(True)
-        time.sleep(0.05)
-        seen.append("thread goes on")
+    def work() -> None:
+        seen.append("work")
+        told.wait(20)
 
-    thread = threading.Thread(target=body)
+    task = Task(work, stop=told.set)
+    thread = threading.Thread(target=task.run)
     thread.start()
     until(lambda: "work" in seen)
     task.stop()
     task.stop()
     thread.join(5)
-    assert stopped == [True]
-    assert seen == ["work", "thread goes on"]
-    late = Task(lambda: None)
+    assert not thread.is_alive()
+    late = Task(lambda: seen.append("late"))
     late.run()
     late.stop()
-    time.sleep(0.01)
     early = Task(lambda: seen.append("early"))
     early.stop()
     with pytest.raises(CancelledError):
         early.run()
-    assert "early" not in seen
+    assert seen == ["work", "late"]
 
 
 def test_no_library_code_can_take_a_cancel_for_an_error() -> None:
@@ -230,14 +225,14 @@ def test_a_profiler_works_beside_the_thread_of_a_session() -> None:
 
 def test_spare_work_gives_way_and_other_work_keeps_its_order() -> None:
     worker, seen = Worker("test"), list[str]()
-    worker.submit(Task(spin(seen, "spare"), spare=True))
+    worker.submit(waits(seen, "spare"))
     worker.submit(Task(lambda: seen.append("spare that waits"), spare=True))
     until(lambda: "spare" in seen)
     worker.submit(Task(lambda: seen.append("first")))
     worker.submit(Task(lambda: 1 / 0 and None))
     worker.submit(Task(lambda: seen.append("second")))
     until(lambda: worker.idle)
-    assert seen == ["spare", "first", "second"]
+    assert seen == ["spare", "spare stopped", "first", "second"]
 
 
 @pytest.mark.parametrize(
@@ -278,29 +273,7 @@ def test_long_work_says_how_far_it_is_and_ends_when_cancelled(
     assert not live.cancel()
 
 
-def test_a_cancelled_build_takes_its_process_with_it(tmp_path: Path) -> None:
-    """The build runs apart; stopping the thread that waits for it ends it and its children."""
-    mark = tmp_path / "pid"
-    code = (
-        f"import os, pathlib, time; pathlib.Path({str(mark)!r}).write_text(str(os.getpid())); "
-        "time.sleep(60)"
-    )
-    task = Task(lambda: _apart(code, [], tmp_path))
-
-    def body() -> None:
-        with pytest.raises(CancelledError):
-            task.run()
-
-    thread = threading.Thread(target=body)
-    thread.start()
-    until(lambda: mark.exists() and bool(mark.read_text()), 20)
-    task.stop()
-    thread.join(10)
-    assert not thread.is_alive()
-    state = subprocess.run(
-        ["ps", "-o", "stat=", "-p", mark.read_text()], capture_output=True, text=True, check=False
-    ).stdout.strip()
-    assert state == "" or state.startswith("Z")
+def test_a_build_says_what_went_wrong(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="what went wrong"):
         _apart("import sys; sys.exit('a line\\nwhat went wrong')", [], tmp_path)
 

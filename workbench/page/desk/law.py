@@ -7,13 +7,14 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any, Final
 
 from casadi_models.text.typed_law import LawError, TypedLaw, derived_key, register
 from identification.data.joint_edit import with_effects
 from identification.data.joint_file import Joint
 from identification.errors import InputError
-from workbench.page.live import Change, Live
+from workbench.page.jobs.place import Change, Place
 from workbench.page.session import State
 
 LONGEST: Final = 500
@@ -31,8 +32,8 @@ def typed(body: Mapping[str, Any], kind: str) -> TypedLaw:
     text, place, given = (str(body.get(k, "")).strip() for k in ("law", "on", "parameters"))
     if not text or not place or not given:
         raise InputError(
-            'law: give the law, as a*tanh(v/b), where it acts, and its parameters, as "a=0..10 '
-            'N.m, b=0.01..1 rad/s"'
+            'law: give the law, as c*tanh(v/w), where it acts, and its parameters, as "c=0..10 '
+            'N.m, w=0.01..1 rad/s"'
         )
     if max(len(text), len(given)) > LONGEST:
         raise InputError(f"law: is longer than {LONGEST} characters; declare it in a file")
@@ -40,7 +41,7 @@ def typed(body: Mapping[str, Any], kind: str) -> TypedLaw:
     return TypedLaw(derived_key(text, (place,), parameters), text, (place,), parameters, kind)
 
 
-def tried(live: Live, body: Mapping[str, Any], progress: Callable[[str, float], None]) -> Change:
+def tried(live: Place, body: Mapping[str, Any], progress: Callable[[str, float], None]) -> Change:
     """Put a law into the library and the joint file, and fit the current model with it.
 
     Raises
@@ -69,13 +70,15 @@ def tried(live: Live, body: Mapping[str, Any], progress: Callable[[str, float], 
         "values": {k: v for k, v in made.values.items() if law.key in k},
     }
 
-    def change(s: State) -> State:
-        key = s.steps[-1].id
-        before = s.found.get(key, {})
-        laws = [*(t for t in before.get("laws", []) if t["label"] != law.key), entry]
-        return replace(s, joint_text=text, found={**s.found, key: {**before, "laws": laws}})
+    return partial(_noted, text, law.key, entry)
 
-    return change
+
+def _noted(text: str, label: str, entry: Mapping[str, Any], s: State) -> State:
+    """The state with a law that was tried on its last step."""
+    key = s.steps[-1].id
+    before = s.found.get(key, {})
+    laws = [*(t for t in before.get("laws", []) if t["label"] != label), entry]
+    return replace(s, joint_text=text, found={**s.found, key: {**before, "laws": laws}})
 
 
 def _kept(text: str, joint: Joint, law: TypedLaw) -> str:

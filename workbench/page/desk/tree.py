@@ -65,7 +65,7 @@ def after_input(before: State, after: State) -> State:
     a branch with the new input is there already, it is taken up again.
     """
     now = given(after)
-    if given(before) == now and not _other_laws(before.joint_text, after.joint_text):
+    if fits_stand(before, after):
         return after
     kept = put_away(before, after)
     back = next((b for b in reversed(kept.branches) if b.steps and given(b) == now), None)
@@ -75,6 +75,13 @@ def after_input(before: State, after: State) -> State:
         return replace(found, files=files, joint_text=text, joint_source=source)
     parent = before.branch if before.steps else before.parent
     return replace(kept.without_fit(), branch=secrets.token_hex(4), parent=parent)
+
+
+def fits_stand(before: State, after: State) -> bool:
+    """Whether a fit of the one state is a fit of the other: equal input, and equal laws behind
+    the same keys.
+    """
+    return given(before) == given(after) and not _other_laws(before.joint_text, after.joint_text)
 
 
 def _other_laws(before: str, after: str) -> bool:
@@ -379,6 +386,7 @@ __all__ = [
     "after_input",
     "compared",
     "continued",
+    "fits_stand",
     "given",
     "on",
     "opened",

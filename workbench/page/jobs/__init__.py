@@ -1,0 +1,1 @@
+"""Long work of the page: in a process of its own, which can be ended at any moment."""
