@@ -18,10 +18,11 @@ import numpy.typing as npt
 
 from identification.balance.drawn_noise import draws_of
 from identification.balance.stacked import noise_believed, stack
+from identification.fitting.covariance import cores
+from identification.fitting.turns import Turns, turns_of
 from identification.fitting.weak_form import WeakForm
 
 FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 MOST_NOISE: Final = 0.9
 """Largest share of the information on a direction that may be noise: the draws know it within 3 %,
@@ -58,31 +59,28 @@ class NoiseProducts:
         grams, scores = np.array(list(self.gram.values())), np.array(list(self.score.values()))
         return np.asarray(grams.sum(axis=0)), np.asarray(scores.sum(axis=0))
 
-    def by_block(
+    def by_window(
         self,
         weights: Mapping[str, FloatArray],
-        block: IntArray,
+        windows: FloatArray,
         taking: Mapping[str, npt.NDArray[np.bool_]],
     ) -> tuple[FloatArray, FloatArray]:
-        """Both for each block of rows, (blocks, p, p) and (blocks, p): by the squares of the
-        weights of its rows that take part.
+        """What falls to the core of each window of the first, (windows, p, p), and to the window of
+        the second, (windows, p): by the squares of the weights of their rows that take part.
 
         Parameters
         ----------
         weights : mapping of str to (rows,) array
-        block : (rows,) int array
-            Block of each row, -1 for none.
+        windows : (windows, rows) array
+            Of :func:`identification.fitting.covariance.windows_over`.
         taking : mapping of str to (rows,) bool array
         """
-        numbers = np.unique(block[block >= 0])
         squares = {b: w**2 * taking[b] for b, w in weights.items()}
-        share = {
-            b: np.array([np.sum(w[block == n]) for n in numbers]) / max(float(w.sum()), 1e-300)
-            for b, w in squares.items()
-        }
+        share = {b: w / max(float(w.sum()), 1e-300) for b, w in squares.items()}
+        core = cores(windows)
         return (
-            np.asarray(sum(share[b][:, None, None] * g for b, g in self.gram.items())),
-            np.asarray(sum(share[b][:, None] * x for b, x in self.score.items())),
+            np.asarray(sum((core @ share[b])[:, None, None] * g for b, g in self.gram.items())),
+            np.asarray(sum((windows @ share[b])[:, None] * x for b, x in self.score.items())),
         )
 
 
@@ -160,7 +158,7 @@ def unbiased(
     bent under it: then shapes stay, or all of it is left out.
 
     The clocks follow from rows within which the joint does not turn: where dry friction turns, the
-    torque hangs on the very instant of the turn.
+    torque hangs on the very instant of the turn.  For the others these instants are unknown.
 
     Parameters
     ----------
@@ -176,10 +174,11 @@ def unbiased(
         # noise about where a load turns makes the twist jump by the whole gap: no small error, and
         # what it adds to products is none of a straight line. Such rows count less already
         return dict(problem.values), no_noise(problem)
-    began = problem.residual(x)
+    turns = turns_of(problem)
+    began = turns.without(problem.residual(x))
     for moving in (moves, moves & ~problem.bent):
-        found, noise = _corrected(problem, x, (low, high), moving)
-        left = found.residual(np.array([found.values[n] for n in found.free]))
+        found, noise = _corrected(problem, x, turns, (low, high), moving)
+        left = turns.without(found.residual(np.array([found.values[n] for n in found.free])))
         share = _largest_share(found, noise, moving)
         if left @ left <= began @ began * (1 + MOST_HIDDEN * share / (1 - share)):
             return dict(found.values), noise
@@ -189,13 +188,14 @@ def unbiased(
 def _corrected(
     problem: WeakForm,
     x: FloatArray,
+    turns: Turns,
     limits: tuple[FloatArray, FloatArray],
     moves: npt.NDArray[np.bool_],
 ) -> tuple[WeakForm, NoiseProducts]:
     """The problem at the solution of its equations without noise, and what noise adds there."""
     clocks, noise, x = problem.clocks, noise_products(problem), x.copy()
     for _ in range(STEPS):
-        rows, jacobian = problem.residual(x), problem.jacobian(x)
+        rows, jacobian = turns.without(problem.residual(x)), turns.without(problem.jacobian(x))
         step = np.zeros(len(x))
         if clocks.any():
             told = problem.one_way
