@@ -2,7 +2,8 @@
 batch]``.
 
 estimator   set six readings, step 1 ms, get all estimates and health; without and with fault
-detection plant       set the current, step 1 ms, get five readings; the same plant written in
+detection, and native; an FMU of pythonfmu alone with the same variables whose step does nothing
+plant       set the current, step 1 ms, get five readings; the same plant written in
 pythonfmu beside it batch       1000 runs of a plant over a parameter, against a plain loop of
 fmpy's simulate_fmu, in the same run
 """
@@ -83,6 +84,33 @@ class PythonPlant(TableSlave):
                 "link_torque": V["stiffness"] * (x[0] - x[2])}
 '''
 
+_EMPTY = '''
+"""As many variables, and a step that does nothing."""
+
+from pythonfmu import Fmi2Causality, Fmi2Slave, Fmi2Variability, Integer, Real
+
+DISCRETE = Fmi2Variability.discrete
+
+
+class Empty(Fmi2Slave):
+    def __init__(self, **kwargs):
+        super().__init__(**kwargs)
+        for name in INPUTS:
+            setattr(self, name, 0.0)
+            self.register_variable(Real(name, causality=Fmi2Causality.input))
+        for i in range(REALS):
+            setattr(self, f"out{i}", 0.0)
+            self.register_variable(Real(f"out{i}", causality=Fmi2Causality.output))
+        for name in ("health", "fault"):
+            setattr(self, name, 0)
+            self.register_variable(
+                Integer(name, causality=Fmi2Causality.output, variability=DISCRETE)
+            )
+
+    def do_step(self, current_time, step_size):
+        return True
+'''
+
 
 def timed(
     path: Path,
@@ -139,12 +167,27 @@ def readings(count: int) -> np.ndarray[Any, Any]:
     return table + noise
 
 
+def _empty(folder: Path, inputs: list[str], reals: int) -> Path:
+    """An FMU of pythonfmu alone whose step does nothing."""
+    from pythonfmu.builder import FmuBuilder
+
+    script = folder / "empty.py"
+    script.write_text(_EMPTY.replace("INPUTS", repr(inputs)).replace("REALS", str(reals)))
+    built: Path = FmuBuilder.build_FMU(script, dest=folder)
+    return built
+
+
 def estimator(folder: Path) -> None:
-    """Cost of the estimator with twelve parameters and three balances."""
+    """Cost of the estimator with twelve parameters and three balances, and of its native twin, as
+    multiples of a step of pythonfmu that does nothing.
+    """
     from identification.data.joint_file import toml_text
+    from irj_fmu.estimator.native import NativeSpec, build_native
 
     joint = replace(reference_joint("irj_ts"), name="bench")
+    inputs, table = ["i_m", "q_m", "w_m", "q_l", "w_l", "tau_l"], readings(20000)
     path = folder / "bench.toml"
+    made = {}
     for about, held in (
         ("without fault detection", start_of(joint)),
         ("with fault detection", joint),
@@ -155,18 +198,25 @@ def estimator(folder: Path) -> None:
             ),
             encoding="utf-8",
         )
-        (made,) = build("estimator", Request(held, path, folder))
-        with Fmu(made) as fmu:
-            names = [n for n in fmu.variables if n.startswith(("theta[", "ratio."))] + [
-                "health",
-                "fault",
-            ]
-        low, mean, top = timed(
-            made, ["i_m", "q_m", "w_m", "q_l", "w_l", "tau_l"], names, readings(20000), 8000
-        )
+        (made[about],) = build("estimator", Request(held, path, folder / about.replace(" ", "_")))
+    made["native, with fault detection"] = build_native(
+        NativeSpec(joint, "bench"), folder / "native.fmu"
+    )
+    with Fmu(made["with fault detection"]) as fmu:
+        names = [n for n in fmu.variables if n.startswith(("theta[", "ratio."))]
+    empty = _empty(folder, inputs, len(names))
+    nothing = timed(
+        empty, inputs, [*(f"out{i}" for i in range(len(names))), "health", "fault"], table, 8000
+    )
+    names += ["health", "fault"]
+    print(f"pythonfmu, a step that does nothing: {nothing[1]:.1f} us of processor time")
+    for about, file in made.items():
+        low, mean, top = timed(file, inputs, names, table, 8000)
+        most = 0.5 if about.startswith("native") else 3.0
         print(
             f"estimator {about}: set + step + get({len(names)}) median {low:.1f} us, mean "
-            f"{mean:.1f} us of processor time, 99 % {top:.0f} us (wanted: 60)"
+            f"{mean:.1f} us of processor time, 99 % {top:.0f} us; {mean / nothing[1]:.2f} times "
+            f"the step that does nothing (wanted: {most:g})"
         )
 
 

@@ -82,3 +82,47 @@ class AffineParts:
 def _scaled(parts: tuple[Line, Expression], by: Any) -> tuple[Line, Expression]:
     line, rest = parts
     return {i: by(slope) for i, slope in line.items()}, rest if rest.is_zero() else by(rest)
+
+
+_COMPARISONS: Final = (ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE)
+
+
+def settled(expression: Expression, p: Expression, values: Expression) -> Expression:
+    """An expression with every comparison of parameters alone decided as it is at given values.
+
+    A law may ask whether an amplitude is above zero. It is linear in that amplitude all the same,
+    but only as long as the answer stays: an expression taken apart at zero would give the other.
+
+    Parameters
+    ----------
+    expression : (n, 1) SX
+    p : (k, 1) SX
+        Symbols of the parameters.
+    values : (k,) array
+        Where the comparisons are decided.
+    """
+    given = ca.symvar(expression)
+    walk = ca.Function("walk", given, [expression])
+    known = {p[i].element_hash() for i in range(p.shape[0])}
+    own = [s.element_hash() in known for s in given]
+    work: dict[int, tuple[Any, bool]] = {}
+    out = ca.SX.zeros(expression.shape[0])
+    rows = walk.sparsity_out(0).row()
+    for k in range(walk.n_instructions()):
+        op, into = walk.instruction_id(k), walk.instruction_output(k)
+        source = walk.instruction_input(k)
+        if op == ca.OP_INPUT:
+            work[into[0]] = given[source[0]], own[source[0]]
+        elif op == ca.OP_CONST:
+            work[into[0]] = ca.SX(walk.instruction_constant(k)), True
+        elif op == ca.OP_OUTPUT:
+            out[rows[into[1]]] = work[source[0]][0]
+        else:
+            taken = [work[i] for i in source]
+            alone = all(free for _, free in taken)
+            operands = [node for node, _ in taken]
+            node = ca.SX.binary(op, *operands) if len(operands) == 2 else ca.SX.unary(op, *operands)
+            if op in _COMPARISONS and alone:
+                (node,) = ca.substitute([node], [p], [ca.SX(values)])
+            work[into[0]] = node, alone
+    return out

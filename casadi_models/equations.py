@@ -14,6 +14,7 @@ from typing import Any, Final, Protocol, final
 
 import casadi as ca
 
+from .affine import AffineParts
 from .parameter import Parameter
 from .signals import Expression, LocalSignals, Signals
 from .term import Term
@@ -189,12 +190,15 @@ class _Builder:
 
     def torsion_rate(self, view: _View) -> Expression:
         """Rate of what twists the gear's damping; made once for all laws of a view."""
+        return time_derivative(self.turned(view), self.symbols.signals)
+
+    def turned(self, view: _View) -> Expression:
+        """Twist whose rate the gear's damping feels."""
         # the approximation (2.58) lets the kinematic error wind up the stiffness only, not the
         # damping
-        twist = view.torsion
-        if not self.model.virtual_work:
-            twist = bare_twist(self.model, view.signals) - view.taken
-        return time_derivative(twist, self.symbols.signals)
+        if self.model.virtual_work:
+            return view.torsion
+        return bare_twist(self.model, view.signals) - view.taken
 
     def beyond(self, view: _View) -> _View:
         """What the laws of the transmission see that act beyond those that take up twist."""
@@ -424,6 +428,48 @@ def carried(
     view = _View(s, bare - error, _zero(), _zero(), _zero())
     torque = builder.total("transmission", replace(view, torsion=twist), rate)
     return torque, builder.torsion_rate(view)
+
+
+def swept(model: Structure, symbols: Symbols) -> tuple[Expression, Expression]:
+    """Torque of the transmission in two parts, the second to be differentiated in time.
+
+    The second is the damping times the part of its twist that is no straight line in the signals (a
+    gap, a kinematic error): an average of its rate over a kernel needs no velocity, and a velocity
+    smoothed over 30 ms knows nothing of a knock in a gap.
+
+    Parameters
+    ----------
+    model : Structure
+    symbols : Symbols
+
+    Returns
+    -------
+    still [N.m] and swept [N.m.s], with ``transmitted = still + d(swept)/dt``
+    """
+    builder, raw = _Builder(model, symbols), symbols.signals
+    s = builder.true_signals()
+    twist = bare_twist(model, s)
+    torsion = twist - builder.total("torsion", _View(s, twist, s.torque, _zero(), _zero()))
+    view = _View(s, torsion, _zero(), _zero(), _zero())
+    load = s.torque if model.load_from == "torque" else builder.gravity(view)
+    view = replace(view, load=load)
+    beyond, rate = builder.beyond(view), ca.SX.sym("rate")
+    states = ca.vertcat(*(z for zs in symbols.memory.values() for z in zs))
+    varying = ca.vertcat(raw.vector(), states, rate)
+    affine, names = AffineParts(raw.vector(), states), Signals.names()
+    still, moved = _zero(), _zero()
+    for t in model.terms:
+        if t.place != "transmission":
+            continue
+        own, values = builder.seen(t, view, beyond), t.bound(symbols.parameters)
+        now = builder.torsion_rate(own)
+        slope = ca.jacobian(t.effect.law(builder.local(t, own, rate), values), rate)
+        straight, bent = affine.split(builder.turned(own))
+        if not (slope.is_zero() or bent.is_zero() or ca.depends_on(slope, varying)):
+            now = sum((by * getattr(raw, _RATES[names[i]]) for i, by in straight.items()), _zero())
+            moved = moved + slope * bent
+        still = still + t.effect.law(builder.local(t, own, now), values)
+    return still, moved
 
 
 @final

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from .energy import total_energy
 from .equations import Equations, Solvable, inverse_dynamics
 from .signals import Expression
-from .solve import affine_solution, carried_torque, rigid_solution, runge_kutta
+from .solve import affine_solution, carried_rate, carried_torque, rigid_solution, runge_kutta
 
 MEMORY_STEP: Final = 1e-6
 """Time over which a memory without a rate of its own is differentiated to its continuous form
@@ -361,7 +361,9 @@ class JointFunctions:
             [right], [ca.vertcat(*(p[i] for i in linear))], [ca.SX.zeros(len(linear), 1)]
         )
         load = carried_torque(e) if elastic else self._carried_rigidly(e)
-        reading = self._reading("torque_sensor", load, ca.SX(0))
+        rate = carried_rate(e)
+        reading = self._reading("torque_sensor", load, rate)
+        matrix, rest = ca.substitute([matrix, rest], [s.torque_rate], [rate])
         matrix, rest = ca.substitute([matrix, rest], [s.torque], [reading])
         matrix, rest = ca.substitute(
             self._substituted(matrix, rest),

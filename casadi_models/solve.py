@@ -49,6 +49,7 @@ def carried_torque(e: Equations, carried: Expression | None = None) -> Expressio
 
     Where the law of the carried torque refers to the torque itself (compliance of the torque sensor
     in series, load-dependent friction on the link), T = f(T) is solved by Newton steps from T = 0.
+    Where it refers to the rate of the torque, that is :func:`carried_rate`.
 
     Parameters
     ----------
@@ -57,7 +58,28 @@ def carried_torque(e: Equations, carried: Expression | None = None) -> Expressio
         f(T); what the transmission carries by default.
     """
     law = e.transmitted if carried is None else carried
-    torque = e.signals.torque
+    (law,) = ca.substitute([law], [e.signals.torque_rate], [carried_rate(e, law)])
+    return _solved(law, e.signals.torque)
+
+
+def carried_rate(e: Equations, carried: Expression | None = None) -> Expression:
+    """Rate of the carried torque where its law refers to it (a damping beside the compliance of the
+    torque sensor), else zero; arguments as in :func:`carried_torque`.
+
+    It is that of the torque without this term, along the motion: damping times compliance is a lag
+    of less than a millisecond, and this is its first order.
+    """
+    law, s = e.transmitted if carried is None else carried, e.signals
+    if not ca.depends_on(law, s.torque_rate):
+        return ca.SX(0)
+    (slow,) = ca.substitute([law], [s.torque_rate], [ca.SX(0)])
+    places = ca.vertcat(s.motor_position, s.link_position)
+    moving = ca.vertcat(s.motor_velocity, s.link_velocity)
+    return ca.jtimes(_solved(slow, s.torque), places, moving)
+
+
+def _solved(law: Expression, torque: Expression) -> Expression:
+    """T from T = law(T)."""
     if not ca.depends_on(law, torque):
         return law
     slope = ca.jacobian(law, torque)

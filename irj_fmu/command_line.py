@@ -233,8 +233,7 @@ def check_output(path: str | Path, inputs: Sequence[str | Path] = ()) -> None:
             with target.open("ab"):
                 pass
         else:
-            with tempfile.TemporaryFile(prefix=".write-", dir=target.absolute().parent):
-                pass
+            _try_to_write(target.absolute().parent)
     except OSError as error:
         raise InputError(
             f"{path}: its folder is not writable ({error.strerror}); write somewhere else"
@@ -242,6 +241,32 @@ def check_output(path: str | Path, inputs: Sequence[str | Path] = ()) -> None:
     keep_inputs([target], inputs)
     if not is_special(target):
         hold(target)
+
+
+def check_folder(path: str | Path) -> None:
+    """Refuse a folder for results that cannot be made or written, before any work is done; it is
+    not made here.
+
+    Raises
+    ------
+    InputError
+        It is a file, or it, or the folder in which it would be made, is not writable.
+    """
+    folder = Path(path)
+    there = next((p for p in (folder, *folder.absolute().parents) if p.exists()), folder)
+    if not there.is_dir():
+        raise InputError(f"{there}: is a file; give the name of a folder for --out")
+    try:
+        _try_to_write(there)
+    except OSError as error:
+        raise InputError(
+            f"{folder}: cannot write there ({error.strerror}); choose a writable folder with --out"
+        ) from None
+
+
+def _try_to_write(folder: Path) -> None:
+    with tempfile.TemporaryFile(prefix=".write-", dir=folder):
+        pass
 
 
 def keep_inputs(targets: Sequence[str | Path], inputs: Sequence[str | Path]) -> None:

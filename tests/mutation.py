@@ -52,6 +52,11 @@ TARGETS: Final[Mapping[str, tuple[str, ...]]] = {
     "identification.diagnosis.trials": (f"{_DIAGNOSIS}/test_trials.py", *_LOOP),
     "identification.diagnosis.session": (f"{_DIAGNOSIS}/test_session.py", *_LOOP),
     "identification.diagnosis.lines": (f"{_DIAGNOSIS}/test_lines.py",),
+    "identification.naming.contest": (
+        "tests/identification/naming/test_odds.py",
+        f"{_DIAGNOSIS}/test_other_payload.py",
+    ),
+    "identification.naming.odds": ("tests/identification/naming/test_odds.py",),
     "identification.fitting.weak_form": (
         "tests/identification/balance/test_weak.py",
         "tests/test_metamorphic.py",

@@ -102,7 +102,7 @@ def test_numpy_twin_agrees_with_the_compiled_integrator() -> None:
     hidden: list[dict[str, float]] = [
         {},
         {"M_V0": 0.0, "L_V0": 0.0, "M_TCA": 3.0, "M_MU": 0.1},
-        {"M_ZS": 2e-3, "M_TS": 9.0, "M_VS": 0.05},
+        {"M_ZS": 2e-3, "M_TS": 9.0, "M_VS": 0.05, "CURVE": 1.0},
         {"HK1": 5e3, "HS1": 3e-4, "HK3": 900.0, "HS3": 1e-3, "GAP": 1e-4},
         {"WIND": 2e-4, "WIND_X": 4e-4, "LAG_T": 90.0},
         {

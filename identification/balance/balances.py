@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Final, final
 
 import casadi as ca
@@ -13,6 +14,7 @@ import numpy.typing as npt
 
 from casadi_models import JointModel, Signals
 from casadi_models.affine import AffineParts
+from casadi_models.equations import swept
 from casadi_models.vectorised import Vectorised
 from identification.balance.kinematic import kinematic_law
 from identification.balance.memory import Law, residuals_of, states_of
@@ -28,11 +30,16 @@ UNROLLED: Final = 200
 """Steps of a memory law in one compiled stretch."""
 
 
-def residual_expressions(model: JointModel, sensing: Sensing) -> dict[str, Expression]:
+def residual_expressions(
+    model: JointModel, sensing: Sensing, transmitted: Expression | None = None
+) -> dict[str, Expression]:
     """Symbolic residual of every balance: what drives minus what the model explains [N.m]; without
-    any torque, what the twist is over what the model explains [rad].
+    any torque, what the twist is over what the model explains [rad]; `transmitted` in place of the
+    laws of the transmission.
     """
     e = model.equations
+    if transmitted is not None:
+        e = replace(e, transmitted=transmitted)
     motor_inertia = e.inertia.get("motor_inertia", ca.SX(0))
     link_inertia = e.inertia.get("link_inertia", ca.SX(0))
     motor = motor_inertia * e.motor_acceleration + e.motor_resistance
@@ -63,6 +70,32 @@ def residual_expressions(model: JointModel, sensing: Sensing) -> dict[str, Expre
             resist = e.motor_resistance + e.link_resistance + e.transmitted
             out[balance] = (e.drive + coupling - total * e.motor_acceleration - resist) / drive_gain
     return out
+
+
+def swept_expressions(
+    model: JointModel, sensing: Sensing
+) -> tuple[dict[str, Expression], dict[str, Expression]]:
+    """Residual of every balance in two parts, still [N.m] and swept [N.m.s]: the residual is the
+    first plus the rate of the second (:func:`casadi_models.equations.swept`).
+
+    Where the torque of the transmission enters with a lever that moves, all is in the first part.
+    """
+    e = model.equations
+    whole = residual_expressions(model, sensing)
+    if sensing.kinematic:
+        return whole, dict.fromkeys(whole, ca.SX(0))
+    still, moved = swept(model, model.symbols)
+    if moved.is_zero():
+        return whole, dict.fromkeys(whole, ca.SX(0))
+    torque = ca.SX.sym("transmitted")
+    varying = ca.vertcat(e.signals.vector(), e.memory, torque)
+    parts, rates = dict(whole), dict.fromkeys(whole, ca.SX(0))
+    for b, r in residual_expressions(model, sensing, torque).items():
+        share = ca.jacobian(r, torque)
+        if not ca.depends_on(share, varying):
+            (parts[b],) = ca.substitute([r], [torque], [still])
+            rates[b] = share * moved
+    return parts, rates
 
 
 def curved_expressions(model: JointModel, sensing: Sensing) -> dict[str, Expression]:

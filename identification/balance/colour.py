@@ -100,16 +100,24 @@ class Part:
         """A course of this noise, shape (count,), at steps of `dt` seconds."""
         if self.memory <= 0:
             return np.asarray(self.size * rng.standard_normal(count))
-        from scipy.signal import lfilter
-
         warm = math.ceil(WARM * self.memory / dt)
         pole = math.exp(-dt / self.memory)
         # of one pole and of two: the sums of the squares of r^k and of (k + 1) r^k
         power = 1 / (1 - pole**2) if self.stages == 1 else (1 + pole**2) / (1 - pole**2) ** 3
         course = rng.standard_normal(count + warm)
         for _ in range(self.stages):
-            course = lfilter([1.0], [1.0, -pole], course)
+            course = _low_passed(course, pole)
         return np.asarray(self.size / math.sqrt(power) * course[warm:])
+
+
+def _low_passed(course: FloatArray, pole: float) -> FloatArray:
+    """The course y with y[k] = pole y[k - 1] + x[k], of the shape of x."""
+    # a triangular solve: scipy.signal has this too, and loads scipy.stats and scipy.optimize
+    from scipy.linalg.blas import dtbsv
+
+    band = np.empty((2, len(course)), order="F")
+    band[0], band[1] = 1.0, -pole
+    return np.asarray(dtbsv(1, band, course, lower=1, diag=1))
 
 
 @final
@@ -232,14 +240,11 @@ def _with_memory(
     """White noise, beside noise of one memory where the readings need it: the shortest one within
     one standard error of them, since what a motion adds looks like a longer one.
     """
-    from scipy.optimize import nnls
-
     m = np.array(spacings, dtype=float)
     error, flat = scatter * power, np.ones(len(m))
 
     def misfit(second: FloatArray) -> tuple[float, FloatArray]:
-        share, left = nnls(np.column_stack([flat, second]) / error[:, None], power / error)
-        return float(left**2), share
+        return _two_shares(np.column_stack([flat, second]) / error[:, None], power / error)
 
     def of_memory(stages: int, longest: float) -> tuple[float, tuple[Part, ...]]:
         fits = [(x, *misfit(_seen(x, stages, spacings))) for x in MEMORIES if x <= longest]
@@ -254,6 +259,20 @@ def _with_memory(
     found = [of_memory(1, np.inf), of_memory(2, m[-1] / SETTLED)]
     left, parts = found[1] if found[1][0] < found[0][0] - CLEARLY**2 else found[0]
     return parts if moving - left >= CLEARLY**2 else (Part(math.sqrt(power[0])),)
+
+
+def _two_shares(columns: FloatArray, power: FloatArray) -> tuple[float, FloatArray]:
+    """Least squares with two shares that are not negative: the sum of squares left, and the shares.
+
+    The columns (n, 2) are not negative and not of one direction, the power (n,) is positive.
+    """
+    both: FloatArray = np.asarray(np.linalg.lstsq(columns, power)[0], dtype=np.float64)
+    if both.min() < 0:
+        # the least on the border: one column alone, the one that leaves less
+        alone = (columns.T @ power) / np.sum(columns**2, axis=0)
+        tried = [np.array([alone[0], 0.0]), np.array([0.0, alone[1]])]
+        both = min(tried, key=lambda share: float(np.sum((columns @ share - power) ** 2)))
+    return float(np.sum((columns @ both - power) ** 2)), both
 
 
 def _seen(memory: float, stages: int, spacings: Sequence[int]) -> FloatArray:

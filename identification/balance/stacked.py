@@ -135,7 +135,7 @@ def floor_rows(
     is a contradiction (the noise of a channel reads too much): it is lowered to that.
     """
     values = settled(model, data.sensing, [*data.train, *records], values)
-    known = {id(w): _drawn_floors(model, data, values, w) for w in (*data.train, *records)}
+    known = {id(w): drawn_floors(model, data, values, w) for w in (*data.train, *records)}
     kept = noise_believed(model, data, values, [known[id(w)] for w in data.train])
     return {
         b: np.concatenate([np.full(w.rows, kept[b] * known[id(w)][b]) for w in records])
@@ -145,10 +145,12 @@ def floor_rows(
     }
 
 
-def _drawn_floors(
+def drawn_floors(
     model: JointModel, data: Dataset, values: Mapping[str, float], record: WeakRecord
 ) -> dict[str, float]:
-    """RMS of what drawn noise changes in each balance of one record."""
+    """RMS of what drawn noise changes in each balance of one record, whatever is left of it [N.m];
+    with the same draws for every model.
+    """
     balances = balances_of(model, data.sensing, wrt=())
     power = dict.fromkeys(balances.balances, 0.0)
     drawn = draws_of(record, data.sources)
@@ -200,7 +202,7 @@ def noise_believed(
     records leave allows, by balance: 1 where there is no contradiction.
     """
     if levels is None:
-        levels = [_drawn_floors(model, data, values, w) for w in data.train]
+        levels = [drawn_floors(model, data, values, w) for w in data.train]
     residual = stack(balances_of(model, data.sensing, wrt=()), data.train, values).residual
     either = _unsure(balances_of(model, data.sensing, wrt=()), data, values, data.train)
     out = dict.fromkeys(residual, 1.0)

@@ -108,16 +108,19 @@ def kernel(length: float, dt: float, order: int = 0) -> FloatArray:
     return weights
 
 
-def differentiated_kernel(length: float, dt: float, order: int) -> FloatArray:
+def differentiated_kernel(length: float, dt: float, order: int, step: int = 1) -> FloatArray:
     """Derivative of the cos^4 kernel itself, so that averages of a signal and of its derivative
     agree.
 
-    Shapes and units as in :func:`kernel`; exact for polynomials of degree `order`.
+    Shapes and units as in :func:`kernel`; exact for polynomials of degree `order`. With a `step`
+    the samples at every so many `dt` of the kernel that has all of them, so that an average of
+    these samples and one of all agree, too.
     """
     half = max(order + 2, whole(length / dt / 2))
-    t = np.arange(-half, half + 1) * dt
     width = (2 * half + 2) * dt
-    phase = np.pi * t / width
+    half = max(order + 2, whole(length / (dt * step) / 2))
+    t = np.arange(-half, half + 1) * (dt * step)
+    phase = np.clip(np.pi * t / width, -np.pi / 2, np.pi / 2)
     c, s, a = np.cos(phase), np.sin(phase), np.pi / width
     shapes = (
         c**4,

@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from statistics import NormalDist
 from typing import Any, Final, final
 
 import numpy as np
@@ -61,6 +62,10 @@ FOLDS: Final = 8
 HELD: Final = 1e-6
 """Standard error of a reference value that was held, as a share of its size: known as far as a
 file's figures go.
+"""
+LEAST_TOLD: Final = 0.05
+"""Share of a value from which the smallest change that could be seen is printed: the viscous
+friction of EMPS differs by as much between its two recordings.
 """
 STEPS: Final = 12
 """Steps of one refit at most: it starts next to its end."""
@@ -162,6 +167,9 @@ class Changes:
     minor : tuple of Change
         A shift that is certain, but smaller than the model's own error: another motion may do as
         much to a model that is not exact.
+    least : mapping of str to float
+        Of each parameter that stayed, gain and offset of the sensors with them: about the smallest
+        change that would have been named, either way, in its unit. A smaller one may be there.
     """
 
     joint: Joint
@@ -176,6 +184,7 @@ class Changes:
     records: tuple[str, ...] = ()
     payload_note: str = ""
     minor: tuple[Change, ...] = ()
+    least: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def unexplained(self) -> tuple[str, ...]:
@@ -190,6 +199,7 @@ class Changes:
             "changed": [c.as_json() for c in self.changes],
             "payload": self.payload.as_json() if self.payload else None,
             "minor": [c.as_json() for c in self.minor],
+            "least": dict(self.least),
             "unchanged": list(self.unchanged),
             "untestable": list(self.untestable),
             "records": list(self.records),
@@ -218,6 +228,7 @@ class Changes:
                 "nothing changed: no parameter moved by more than its band and the error of "
                 "the model itself"
             )
+        yield from self._hidden()
         if self.payload is not None:
             at = (
                 f" at {self.payload.distance:.3g} +- {self.payload.distance_stderr:.2g} m"
@@ -239,6 +250,18 @@ class Changes:
                 f"not explained by any parameter: {b} balance, {e.rms:.3g} {e.unit} left, "
                 f"{e.ratio:.2g} times its noise; see irj improve"
             )
+
+    def _hidden(self) -> Iterable[str]:
+        """What may have moved unseen, where that is more than a small share of the value."""
+        told = []
+        for p in self.model.parameters:
+            least, value = self.least.get(p.name), abs(self.joint.fitted.get(p.name, 0.0))
+            if least is not None and least > LEAST_TOLD * value:
+                share = f" ({100 * least / value:.0f} %)" if value and least < 10 * value else ""
+                size = f"{100 * least:.2g} %" if p.unit == "1" else f"{least:.2g} {p.unit}"
+                told.append(f"{p.name} by less than {size}{share}")
+        if told:
+            yield f"too small to be seen on these records: {', '.join(told)}"
 
 
 NOISE_RATIO: Final = 1.5
@@ -322,8 +345,11 @@ def _prepared(reference: Joint, records: Sequence[Record], tell: Progress) -> _S
     names = tuple(model.parameter_names)
     balances = balances_of(model, data.sensing, wrt=names)
     error = assess(refit.model, data, data.train, refit.values)
-    weights, inexact, shares = _shared(refit, data, error)
+    weights, squares, shares = _shared(refit, data)
     form = WeakForm(balances, data, values, names, weights)
+    ratios = np.array([error.balances[b].ratio for b in balances.balances])
+    noise = squares / np.maximum(ratios, 1.0) ** 2
+    inexact = np.maximum(_left(form, refit) - noise, 0.0)
     return _Search(
         reference,
         model,
@@ -356,30 +382,49 @@ def _calibrations(model: JointModel, data: Dataset) -> list[str]:
     return out
 
 
-def _shared(
-    refit: Solution, data: Dataset, error: Error
-) -> tuple[dict[str, FloatArray], FloatArray, FloatArray]:
-    """Weights of the refit, each row counted as the share of an independent one, and what it leaves
-    over noise.
+def _shared(refit: Solution, data: Dataset) -> tuple[dict[str, FloatArray], FloatArray, FloatArray]:
+    """Weights of the refit, each row counted as the share of an independent one, and what it
+    leaves.
 
     Returns
     -------
     weights : dict of (rows,) array
-    inexact : (balances,) array
-        Sum of squares that is left over the noise with every parameter fitted anew: the model's own
-        error.
+    squares : (balances,) array
     shares : (balances,) array
     """
     balances = balances_of(refit.model, data.sensing, wrt=())
     stacked = stack(balances, data.train, refit.values)
-    weights, inexact, shares = {}, [], []
+    weights, squares, shares = {}, [], []
     for b in balances.balances:
         rows = (stacked.residual[b] * refit.weights[b])[stacked.taking[b]]
         shares.append(effective_share(rows) if len(rows) else 1.0)
         weights[b] = np.asarray(refit.weights[b] * math.sqrt(shares[-1]), dtype=np.float64)
-        ratio = error.balances[b].ratio
-        inexact.append(shares[-1] * float(rows @ rows) * max(0.0, 1 - 1 / max(ratio, 1.0) ** 2))
-    return weights, np.array(inexact), np.array(shares)
+        squares.append(shares[-1] * float(rows @ rows))
+    return weights, np.array(squares), np.array(shares)
+
+
+def _left(form: WeakForm, refit: Solution) -> FloatArray:
+    """Squares that are left in each balance with every parameter fitted anew, gain and offset of
+    the sensors among them: they may have changed too, and a change is no error of the model.
+
+    One linear step from the refit, which has no sensor's gain and offset: they enter nearly so.
+    A gain is a mixture of the others where it scales all of them; the step is the shortest.
+    """
+    x = np.array([refit.values.get(n, form.values[n]) for n in form.free])
+    # a value at its bound stays there
+    moves = [n not in refit.values or refit.stderr.get(n) is not None for n in form.free]
+    stacked = form.stacked(x)
+    columns, rows, sizes = [], [], []
+    for b in form.balances.balances:
+        taking, weight = stacked.taking[b], np.asarray(form.weights[b])
+        columns.append((stacked.jacobian[b] * weight[:, None])[taking][:, moves])
+        rows.append((stacked.residual[b] * weight)[taking])
+        sizes.append(len(rows[-1]))
+    jacobian, residual = np.vstack(columns), np.concatenate(rows)
+    scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
+    step = np.linalg.lstsq(jacobian / scale, -residual, rcond=1e-9)[0]
+    after = (residual + jacobian / scale @ step) ** 2
+    return np.array([float(p.sum()) for p in np.split(after, np.cumsum(sizes)[:-1])])
 
 
 def _nuisances(model: JointModel) -> tuple[str, ...]:
@@ -728,6 +773,43 @@ class _Point:
         beyond = bool(np.any(before - after.sum(axis=0) > self.search.inexact))
         return _Gain(nats, block, fall, beyond, p)
 
+    def least(self, place: int) -> float:
+        """Smallest change of a parameter that would be named beside those that moved, either way
+        (see :class:`_Gain`): certain among all that are tried, with a fall of the RMS on what is
+        left, and more squares than the model's own error.
+        """
+        moved = tuple(sorted({*self.moved, place}))
+        free = self.search.free(moved)
+        count = max(int(np.sum(self.search.shown)), 1)
+        sure = -NormalDist().inv_cdf(FALSE_DISCOVERY / count / 2) * self.errors(moved)[place]
+        per = self._per_square(place, free)
+        left = np.maximum(self.own.sum(axis=0), 1e-300)
+        fall = (1 - LEAST_FALL / 100) ** -2 - 1
+        nats = float(np.sum(per * self._counts / left)) / 2
+        shows = per > 0.0
+        if not shows.any():
+            return math.inf
+        beyond, falls = (
+            math.sqrt(float(np.min(most[shows] / per[shows])))
+            for most in (self.search.inexact, fall * left)
+        )
+        return float(max(sure, beyond, falls, math.sqrt(GAIN / nats)))
+
+    def _per_square(self, place: int, free: Sequence[int]) -> FloatArray:
+        """Squares in each balance that a change of one unit makes, after all else that is free has
+        followed it, (balances,).
+        """
+        others = [i for i in free if i != place]
+        total, noise = self._total
+        whole = np.zeros(len(self.x))
+        whole[place] = 1.0
+        if others:
+            crossed = (total - noise)[np.ix_(others, [place])][:, 0]
+            whole[others] = -inverse(self._normal(total, noise, others)) @ crossed
+        squares = (self.grams - self.noise).sum(axis=0)[:, :-1, :-1]
+        made: FloatArray = np.einsum("i,bij,j->b", whole, squares, whole)
+        return np.maximum(made, 0.0)
+
     def sizes(self, moved: Sequence[int]) -> FloatArray:
         """Change of each parameter with those of `moved` let go, (p,)."""
         return self.away + self._step(*self._total, self.search.free(moved))
@@ -825,6 +907,7 @@ def _result(search: _Search, point: _Point, records: tuple[str, ...]) -> Changes
     data = search.data
     model = search.model.with_values(values)
     still = {names[i] for i in tested} - {names[i] for i in point.moved}
+    least = {names[i]: point.least(i) for i in tested if names[i] in still}
     reference = [
         n
         for n in names
@@ -845,6 +928,7 @@ def _result(search: _Search, point: _Point, records: tuple[str, ...]) -> Changes
         records=records,
         payload_note=note,
         minor=_minor(search, point, rates),
+        least={n: v for n, v in least.items() if math.isfinite(v)},
     )
 
 

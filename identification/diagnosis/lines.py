@@ -41,6 +41,7 @@ from identification.diagnosis.order_tracking import (
     clipped,
     confirmed,
     detrended,
+    everywhere,
     peaks,
     phase_fit,
     refined,
@@ -512,7 +513,12 @@ def find_lines(
             lowest,
             ALPHA / len(SMOOTHED),
         )
-        seen += [(one, p) for p in found if one.held is None or confirmed(p, one.held, len(found))]
+        seen += [
+            (one, p)
+            for p in found
+            if (one.held is None or confirmed(p, one.held, len(found)))
+            and everywhere(p, [x for x in found if x is not p], one.train, named)
+        ]
     # what a position reads wrong stands in every balance of its acceleration, larger: where a
     # balance without shows it, it is there
     seen.sort(key=lambda x: (not x[0].direct, -x[1].prominence))

@@ -57,6 +57,15 @@ ORDER_ERROR: Final = math.sqrt(6.0) / (2 * math.pi)
 the background (Cramer-Rao bound of the frequency of a sine: 0.39)."""
 NAMED_WITHIN: Final = 3.0
 """Standard errors within which a line lies at an order to carry its name."""
+SURE: Final = 2.0
+"""Standard errors beyond a factor :data:`ALIKE` at which a part contradicts the whole; a true line
+is half its size away from that, too."""
+PARTS: Final = 3
+"""Parts of the stroke in which a line is looked at by itself, in each direction: a turn and what
+lies at one end of the stroke are in one of them."""
+ALIKE: Final = 2.0
+"""Times that a line may be larger or smaller in a part than on the whole: half way, on a scale of
+sizes, between a line that is everywhere and one that is in a quarter of the motion."""
 BLOCK: Final = 1.0
 """Length of the blocks of held-out rows that count as independent [s]."""
 KNOTS: Final = 12
@@ -440,3 +449,50 @@ def confirmed(peak: Peak, samples: Samples, candidates: int) -> bool:
         for x in (samples.residual, wave)
     )
     return follows(scores, sizes, ALPHA / max(candidates, 1))
+
+
+def everywhere(
+    peak: Peak, others: Sequence[Peak], samples: Samples, named: Sequence[float] = ()
+) -> bool:
+    """True where a line has its size and its phase in every part of the stroke and in both
+    directions, as far as the noise lets that be seen.
+
+    What repeats with the angle does so wherever the joint is. A motion that turns at the same
+    places each time, or a law that acts at one end, makes peaks over the orders too, and held-out
+    records of the same motion confirm them.
+
+    Parameters
+    ----------
+    peak : Peak
+    others : sequence of Peak
+        Further lines of the same residual, which over a part of the stroke are not independent of
+        this one. Those too near to be told apart there are the side lobes of something local, if
+        they are at no order that is known.
+    samples : Samples
+        Trend taken out.
+    named : sequence of float
+        Orders that are known beforehand.
+    """
+    beside = [
+        p
+        for p in others
+        if abs(p.order - peak.order) > PARTS * peak.apart or any(p.at(h) for h in named)
+    ]
+    used = samples.weight > 0
+    angle, weight, residual = samples.angle[used], samples.weight[used], samples.residual[used]
+    waves = [p.wave(samples)[used] for p in (peak, *beside)]
+    columns = np.column_stack([*waves, np.ones_like(angle)])
+    ends = np.quantile(angle, np.arange(1, PARTS) / PARTS)
+    forward = np.gradient(samples.angle)[used] > 0
+    cells = 2 * np.digitize(angle, ends) + forward
+    noise = float(np.sum(weight * waves[0] ** 2)) / (2 * max(peak.prominence, 1e-300))
+    for cell in range(2 * PARTS):
+        rows = cells == cell
+        gram = (columns[rows] * weight[rows, None]).T @ columns[rows]
+        inverse = np.linalg.pinv(gram, rcond=1e-9, hermitian=True)
+        size = float((inverse @ (columns[rows] * weight[rows, None]).T @ residual[rows])[0])
+        error = SURE * math.sqrt(max(noise * float(inverse[0, 0]), 0.0))
+        told = float(gram[0, 0]) > 0 and float((inverse @ gram)[0, 0]) > 0.5
+        if told and not (size + error >= 1 / ALIKE and size - error <= ALIKE):
+            return False
+    return True

@@ -554,8 +554,8 @@ class Session:
         """The claims with the names that whole fits leave and how sure each is, and the ranking on
         the model that this ends with.
 
-        A name of the model that falls out gives its place to the one that fits best. `stale`: the
-        ranking is that of an earlier model.
+        A name of the model that falls out, or is much less probable than another one, gives its
+        place to the one that fits best. `stale`: the ranking is that of an earlier model.
         """
         self.progress("fitting the names of each claim", 0.8)
         swapped: set[str] = set()
@@ -570,18 +570,20 @@ class Session:
             self._doubted.update(odds.behind)
             best = odds.rivals[0]
             told = replace(claim, confidence=odds.probability)
-            if claim.effects[0] in odds.names:
+            taken = best.label in swapped or any(c.label == best.label for c in standing.claims)
+            if odds.holds(claim.effects[0]) or (taken and claim.effects[0] in odds.names):
                 more = [n for n in odds.names if n != claim.effects[0]]
                 told = replace(told, effects=(claim.effects[0], *more))
                 standing = _Standing(standing.steps, standing.with_claim(position, told))
                 continue
-            if best.label in swapped or any(c.label == best.label for c in standing.claims):
+            if taken:
                 continue
             swapped.add(best.label)
             told = replace(told, effects=odds.names, label=best.label)
             made = self._replay(standing.with_claim(position, told), standing, best.solution.values)
             if len(made.claims) == len(standing.claims):
-                self._refused[claim.label] = odds.behind[claim.label]
+                if claim.label in odds.behind:
+                    self._refused[claim.label] = odds.behind[claim.label]
                 standing, stale = made, True
         if stale:
             base = self.bench.base(standing.now.solution)

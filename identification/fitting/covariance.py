@@ -21,6 +21,10 @@ BLOCK: Final = 1.5
 model count as independent."""
 RANK: Final = 1e-12
 """Share of the largest information, columns scaled alike, below which a direction is rounding."""
+OVERLAP: Final = 4
+"""Windows that hold each row.  A window of Hann's form of two blocks' length has as many degrees of
+freedom as a block; four over each row add to the same everywhere, and so do their squares.
+"""
 LEAST: Final = 1e-3
 """Share of the information on a direction that must be left without a block: less, and that block
 alone tells of it (friction at the one reversal of a record).  Its scatter can say nothing there,
@@ -104,6 +108,79 @@ def wald(gram: FloatArray, scores: FloatArray, amplitudes: FloatArray) -> float:
     return float(fdtrc(count, blocks - count, statistic))
 
 
+def windows_over(times: Sequence[FloatArray]) -> FloatArray:
+    """Weight of each row in each of the windows over which its noise is summed up.
+
+    Noise of an acceleration has no slow part: over a block of time with sharp ends it adds up to
+    what stands at the ends, which the next block takes back.  So windows are tapered and overlap
+    (Welch's estimate of the spectrum of the scores at zero frequency).
+
+    Parameters
+    ----------
+    times : sequence of (rows,) array
+        Centres of the rows of each record [s].
+
+    Returns
+    -------
+    (windows, rows) array
+        Squares add up to 1 for each row.
+    """
+    width = 2 * BLOCK
+    step = width / OVERLAP
+    parts = []
+    for time in times:
+        centre = np.arange(time[0] - width / 2 + step / 2, time[-1] + width / 2, step)
+        away = (time[None, :] - centre[:, None]) / width
+        parts.append(np.where(np.abs(away) < 0.5, np.cos(np.pi * away) ** 2, 0.0))
+    out = np.zeros((sum(len(p) for p in parts), sum(p.shape[1] for p in parts)))
+    row = first = 0
+    for part in parts:
+        out[row : row + len(part), first : first + part.shape[1]] = part
+        row, first = row + len(part), first + part.shape[1]
+    size = np.sqrt(np.sum(out**2, axis=0))
+    return np.asarray(out / np.where(size > 0, size, 1.0), dtype=np.float64)
+
+
+def window_errors(
+    jacobian: FloatArray,
+    residual: FloatArray,
+    windows: FloatArray,
+    noise: tuple[FloatArray, FloatArray] | None = None,
+    whole: FloatArray | None = None,
+) -> FloatArray | None:
+    """Standard errors as :func:`block_errors`, from windows that overlap.
+
+    Parameters
+    ----------
+    jacobian : (n, p) array
+        Weighted, in any scale of its columns.
+    residual : (n,) array
+        Weighted, at the fit.
+    windows : (windows, n) array
+        Of :func:`windows_over`; rows of zeros take part in the fit only.
+    noise : ((windows, p, p) array, (windows, p) array), optional
+        What noise of the columns adds to the products of the columns in the core of each window,
+        and to those with the residual over the window; taken off.
+    whole : (p, p) array, optional
+        Normal matrix of all rows, that of the noise taken off.
+    """
+    scores = windows @ (jacobian * residual[:, None])
+    grams = np.array([jacobian[rows].T @ jacobian[rows] for rows in cores(windows)])
+    if noise is not None:
+        grams, scores = grams - noise[0], scores - noise[1]
+    alike = windows @ windows.T
+    count = float(np.trace(alike)) ** 2 / max(float(np.sum(alike**2)), 1e-300)
+    total = jacobian.T @ jacobian if whole is None else whole
+    return errors_of_blocks(grams, scores, total, count=count)
+
+
+def cores(windows: FloatArray) -> npt.NDArray[np.bool_]:
+    """Rows that are left out with each window, (windows, rows): those in its middle half, which
+    hold as much of the information as the whole window by its weights.
+    """
+    return np.asarray(windows > 0.5 * np.max(windows, initial=0.0), dtype=np.bool_)
+
+
 def block_errors(
     jacobian: FloatArray,
     residual: FloatArray,
@@ -148,7 +225,11 @@ def block_errors(
 
 
 def errors_of_blocks(
-    grams: FloatArray, scores: FloatArray, whole: FloatArray | None = None
+    grams: FloatArray,
+    scores: FloatArray,
+    whole: FloatArray | None = None,
+    *,
+    count: float | None = None,
 ) -> FloatArray | None:
     """The same from what each block adds to the normal equations.
 
@@ -160,6 +241,8 @@ def errors_of_blocks(
         Products of the columns with the residual.
     whole : (p, p) array, optional
         Normal matrix of all rows, where some belong to no block; the sum of `grams` otherwise.
+    count : float, optional
+        Independent blocks that these count as, where they overlap.
 
     Returns
     -------
@@ -167,7 +250,7 @@ def errors_of_blocks(
     """
     from scipy.special import stdtrit
 
-    count = len(grams)
+    count = len(grams) if count is None else count
     if count < FEWEST_BLOCKS:
         return None
     total = grams.sum(axis=0) if whole is None else whole

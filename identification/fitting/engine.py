@@ -32,13 +32,19 @@ from identification.balance.stacked import (
     taking_part,
 )
 from identification.errors import InputError
-from identification.fitting.covariance import block_errors, correlations, known_errors
+from identification.fitting.covariance import (
+    correlations,
+    known_errors,
+    window_errors,
+    windows_over,
+)
 from identification.fitting.errors_in_variables import (
     NoiseProducts,
     unbiased,
     whole_without,
 )
 from identification.fitting.start_values import bounds_of, starts
+from identification.fitting.turns import turns_of
 from identification.fitting.weak_form import WeakForm
 
 __all__ = [
@@ -493,14 +499,16 @@ def _with_errors(
     stacked = problem.stacked(np.array([values[n] for n in free]))
     prior = problem.prior
     x = np.array([values[n] for n in free])
-    j = problem.jacobian(x) * ~np.outer(~problem.one_way, problem.clocks)
-    r = np.concatenate(
-        [*(stacked.residual[b] * weights[b] for b in balances.balances), problem.surprise(x)]
+    turns = turns_of(problem)
+    j = turns.without(problem.jacobian(x)) * ~np.outer(~problem.one_way, problem.clocks)
+    r = turns.without(
+        np.concatenate(
+            [*(stacked.residual[b] * weights[b] for b in balances.balances), problem.surprise(x)]
+        )
     )
-    # what is known beforehand belongs to no block of time: it scatters by itself
-    block = np.concatenate(
-        [np.tile(stacked.block, len(balances.balances)), np.full(len(prior), -1)]
-    )
+    windows = windows_over([w.time for w in problem.data.train])
+    # what is known beforehand belongs to no window of time: it scatters by itself
+    tiled = np.hstack([*[windows] * len(balances.balances), np.zeros((len(windows), len(prior)))])
     norms = np.linalg.norm(j, axis=0)
     smoothing = balances.model.named("smoothing")
     at_bound = _at_bound(balances.model, values, free, limits)
@@ -525,9 +533,9 @@ def _with_errors(
         unit = np.outer(norms[index], norms[index])
         within = np.ix_(index, index)
         whole = whole_without(scaled.T @ scaled, noise.whole[0][within] / unit)
-        grams, scores = noise.by_block(weights, stacked.block, stacked.taking)
+        grams, scores = noise.by_window(weights, windows, stacked.taking)
         apart = (grams[:, index][:, :, index] / unit, scores[:, index] / norms[index])
-        errors = block_errors(scaled, r, block, apart, whole)
+        errors = window_errors(scaled, r, tiled, apart, whole)
         # rows of the prior were made heavier by the share; they scatter as the prior itself does
         unsure = known_errors(whole, prior[:, index] / norms[index]) / math.sqrt(share)
         size = None if errors is None else np.hypot(errors, unsure) / norms[index]

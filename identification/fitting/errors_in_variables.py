@@ -18,15 +18,21 @@ import numpy.typing as npt
 
 from identification.balance.drawn_noise import draws_of
 from identification.balance.stacked import noise_believed, stack
+from identification.fitting.covariance import cores
+from identification.fitting.turns import Turns, turns_of
 from identification.fitting.weak_form import WeakForm
 
 FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 MOST_NOISE: Final = 0.9
 """Largest share of the information on a direction that may be noise: the draws know it within 3 %,
 and what is left must stand clear of that.
 """
+SURE_STEP: Final = 0.01
+"""Least share that counts: a fit has not ended to better than that of its squares."""
+MOST_HIDDEN: Final = 2.0
+"""Times what noise hides in the direction that holds most of it: other directions hide some, too,
+and a correction that diverges leaves powers of ten more."""
 STEPS: Final = 3
 """Newton steps from the least squares: the products change little with the parameters."""
 
@@ -53,31 +59,28 @@ class NoiseProducts:
         grams, scores = np.array(list(self.gram.values())), np.array(list(self.score.values()))
         return np.asarray(grams.sum(axis=0)), np.asarray(scores.sum(axis=0))
 
-    def by_block(
+    def by_window(
         self,
         weights: Mapping[str, FloatArray],
-        block: IntArray,
+        windows: FloatArray,
         taking: Mapping[str, npt.NDArray[np.bool_]],
     ) -> tuple[FloatArray, FloatArray]:
-        """Both for each block of rows, (blocks, p, p) and (blocks, p): by the squares of the
-        weights of its rows that take part.
+        """What falls to the core of each window of the first, (windows, p, p), and to the window of
+        the second, (windows, p): by the squares of the weights of their rows that take part.
 
         Parameters
         ----------
         weights : mapping of str to (rows,) array
-        block : (rows,) int array
-            Block of each row, -1 for none.
+        windows : (windows, rows) array
+            Of :func:`identification.fitting.covariance.windows_over`.
         taking : mapping of str to (rows,) bool array
         """
-        numbers = np.unique(block[block >= 0])
         squares = {b: w**2 * taking[b] for b, w in weights.items()}
-        share = {
-            b: np.array([np.sum(w[block == n]) for n in numbers]) / max(float(w.sum()), 1e-300)
-            for b, w in squares.items()
-        }
+        share = {b: w / max(float(w.sum()), 1e-300) for b, w in squares.items()}
+        core = cores(windows)
         return (
-            np.asarray(sum(share[b][:, None, None] * g for b, g in self.gram.items())),
-            np.asarray(sum(share[b][:, None] * x for b, x in self.score.items())),
+            np.asarray(sum((core @ share[b])[:, None, None] * g for b, g in self.gram.items())),
+            np.asarray(sum((windows @ share[b])[:, None] * x for b, x in self.score.items())),
         )
 
 
@@ -130,13 +133,19 @@ def whole_without(whole: FloatArray, noise: FloatArray) -> FloatArray:
     whole, noise : (p, p) array
         Columns scaled alike; `whole` positive definite but for rounding.
     """
+    share, left = _shares(whole, noise)
+    return np.asarray(left * (1 - np.clip(share, 0.0, MOST_NOISE)) @ left.T, dtype=np.float64)
+
+
+def _shares(whole: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Share of noise in directions that are independent in both matrices, and the directions:
+    columns whose products add up to `whole`."""
     value, vector = np.linalg.eigh(whole)
     kept = value > 1e-12 * value[-1]
     root = vector[:, kept] * np.sqrt(value[kept])
     white = vector[:, kept] / np.sqrt(value[kept])
     share, direction = np.linalg.eigh(white.T @ noise @ white)
-    left = root @ direction
-    return np.asarray(left * (1 - np.clip(share, 0.0, MOST_NOISE)) @ left.T, dtype=np.float64)
+    return share, np.asarray(root @ direction, dtype=np.float64)
 
 
 def unbiased(
@@ -145,8 +154,11 @@ def unbiased(
     """Values at which the normal equations hold without the noise, inside the limits, and what
     noise adds there.
 
+    The correction is one of first order. Where it leaves more than noise can have hidden, a law
+    bent under it: then shapes stay, or all of it is left out.
+
     The clocks follow from rows within which the joint does not turn: where dry friction turns, the
-    torque hangs on the very instant of the turn.
+    torque hangs on the very instant of the turn.  For the others these instants are unknown.
 
     Parameters
     ----------
@@ -158,14 +170,32 @@ def unbiased(
     low, high = (np.array([limits[n][k] for n in problem.free]) for k in (0, 1))
     x = np.array([problem.values[n] for n in problem.free])
     moves = (x > low) & (x < high)
-    clocks = problem.clocks
     if problem.balances.has_gap:
         # noise about where a load turns makes the twist jump by the whole gap: no small error, and
         # what it adds to products is none of a straight line. Such rows count less already
         return dict(problem.values), no_noise(problem)
-    noise = noise_products(problem)
+    turns = turns_of(problem)
+    began = turns.without(problem.residual(x))
+    for moving in (moves, moves & ~problem.bent):
+        found, noise = _corrected(problem, x, turns, (low, high), moving)
+        left = turns.without(found.residual(np.array([found.values[n] for n in found.free])))
+        share = _largest_share(found, noise, moving)
+        if left @ left <= began @ began * (1 + MOST_HIDDEN * share / (1 - share)):
+            return dict(found.values), noise
+    return dict(problem.values), no_noise(problem)
+
+
+def _corrected(
+    problem: WeakForm,
+    x: FloatArray,
+    turns: Turns,
+    limits: tuple[FloatArray, FloatArray],
+    moves: npt.NDArray[np.bool_],
+) -> tuple[WeakForm, NoiseProducts]:
+    """The problem at the solution of its equations without noise, and what noise adds there."""
+    clocks, noise, x = problem.clocks, noise_products(problem), x.copy()
     for _ in range(STEPS):
-        rows, jacobian = problem.residual(x), problem.jacobian(x)
+        rows, jacobian = turns.without(problem.residual(x)), turns.without(problem.jacobian(x))
         step = np.zeros(len(x))
         if clocks.any():
             told = problem.one_way
@@ -173,10 +203,24 @@ def unbiased(
                 jacobian[told], rows[told], noise, moves & ~problem.bent, float(np.mean(told))
             )[clocks]
         step += _newton(jacobian, rows + jacobian @ step, noise, moves & ~clocks)
-        x[moves] = np.clip(x + step, low, high)[moves]
+        x[moves] = np.clip(x + step, *limits)[moves]
         problem = problem.moved(x)
         noise = noise_products(problem)
-    return dict(problem.values), noise
+    return problem, noise
+
+
+def _largest_share(problem: WeakForm, noise: NoiseProducts, moves: npt.NDArray[np.bool_]) -> float:
+    """Largest share of the information on a direction that is noise: of the squares at the true
+    parameters the least squares take at most that away, whatever else they fit.
+    """
+    jacobian = problem.jacobian(np.array([problem.values[n] for n in problem.free]))
+    size = np.linalg.norm(jacobian, axis=0)
+    moved = moves & (size > 1e-12 * size.max(initial=0.0))
+    if not moved.any():
+        return 0.0
+    scaled, unit = jacobian[:, moved] / size[moved], np.outer(size[moved], size[moved])
+    share = _shares(scaled.T @ scaled, noise.whole[0][np.ix_(moved, moved)] / unit)[0]
+    return float(min(max(share.max(), SURE_STEP), MOST_NOISE))
 
 
 def _newton(

@@ -22,6 +22,7 @@ from identification.fitting.covariance import NORMAL, correlations
 from identification.fitting.engine import Solution
 from identification.fitting.information import eliminated, form_of, white_errors
 from identification.fitting.start_values import bounds_of
+from identification.fitting.turns import turns_of
 from identification.fitting.weak_form import WeakForm
 
 FloatArray = npt.NDArray[np.float64]
@@ -37,6 +38,9 @@ WINDOWS: Final = 4
 """Windows of equal time over all training rows."""
 PROFILE_STEPS: Final = 4
 """Refits on each side of a shape: its interval is wanted to some percent of its width."""
+NEAR_END: Final = 0.03
+"""Relative distance of a refit from the end of the interval at which it is the end: those percent.
+"""
 REFITS: Final = 4
 """Gauss-Newton steps of the others in such a refit."""
 CLASSES: Final = ("inertia", "stiffness", "friction", "shape", "other")
@@ -53,10 +57,9 @@ class Trusted:
         `kind` is one of `CLASSES`.
     value : float
     stderr : float or None
-        As the fit states it, from blocks.
+        As the fit states it, from windows of time.
     low, high : float or None
-        95 % interval, from the larger of the errors from blocks and from white rows; for shapes
-        from a profile.
+        95 % interval, from that error; for shapes from a profile.
     records, windows : tuple of (float or None)
         Value on each training record and in each of `WINDOWS` windows, where these tell it.
     partner : str or None
@@ -181,8 +184,11 @@ class _Judge:
         stacked = self.form.stacked(x)
         names = self.form.balances.balances
         weights = solution.weights
-        self.j = np.concatenate([stacked.jacobian[b] * weights[b][:, None] for b in names])
-        self.r = np.concatenate([stacked.residual[b] * weights[b] for b in names])
+        turns = turns_of(self.form)
+        self.j = turns.without(
+            np.concatenate([stacked.jacobian[b] * weights[b][:, None] for b in names])
+        )
+        self.r = turns.without(np.concatenate([stacked.residual[b] * weights[b] for b in names]))
         self.plain = np.concatenate([stacked.jacobian[b] for b in names])
         self.block = np.tile(stacked.block, len(names))
         self.record = np.tile(
@@ -244,13 +250,11 @@ class _Judge:
         if p.name not in self.moving:
             return replace(bare_one, why="at its bound")
         k = self.moving.index(p.name)
-        from_blocks = self.solution.stderr.get(p.name)
+        from_windows = self.solution.stderr.get(p.name)
         white = float(self.white[k])
         if not math.isfinite(white):
             return replace(bare_one, why="flat: no value of it is worse than another")
-        stated = white if from_blocks is None else from_blocks
-        # blocks may agree by chance, and what the model's form takes off shows in none of them
-        error = max(stated, white)
+        error = white if from_windows is None else from_windows
         low, high = value - NORMAL * error, value + NORMAL * error
         if p.is_shape and profiles and error < abs(value):
             low, high = self._profiled(p.name, error, error / white)
@@ -261,7 +265,7 @@ class _Judge:
         verdict, why = self._verdict(p, value, share, rho)
         return replace(
             bare_one,
-            stderr=stated,
+            stderr=error,
             low=low,
             high=high,
             records=tuple(v[p.name] for v in by_record),
@@ -356,7 +360,7 @@ class _Judge:
                     reach = guess if inside < guess < outside else middle
                 else:
                     reach = min(max(guess, 1.2 * reach), 3 * reach)
-                if abs(root / NORMAL - 1) < 0.03:
+                if abs(root / NORMAL - 1) < NEAR_END:
                     break
             ends.append(value * math.exp(sign * reach))
         return ends[0], ends[1]

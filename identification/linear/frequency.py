@@ -54,6 +54,10 @@ SUBSPACE_SAMPLES: Final = 40_000
 STATES: Final = 2_000
 """States over which the physical model is linearised, at most."""
 CURVE_POINTS: Final = 240
+USED_BAND: Final = 0.45
+"""Part of the sampling rate up to which a discrete model is drawn: at the half its curve ends in a
+spike or a zero that the joint does not have.
+"""
 SUBSPACE, PHYSICAL = "subspace model", "physical model"
 
 
@@ -298,7 +302,7 @@ def _subspace_curve(parts: Sequence[Pair], measured: Response, grid: FloatArray)
         )
 
     poles = np.log(np.linalg.eigvals(matrices[0]).astype(complex)) / dt
-    return curve_of(SUBSPACE, response, poles, measured, grid[grid < 0.45 / dt])
+    return curve_of(SUBSPACE, response, poles, measured, grid[grid < USED_BAND / dt])
 
 
 def curve_of(

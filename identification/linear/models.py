@@ -57,6 +57,10 @@ four such periods.
 """
 HELD_PART: Final = 0.25
 """Last part of a stretch on which an order is chosen, or that is held out."""
+SAME_RATE: Final = 0.01
+"""Relative difference of two time steps that are one rate: poles read with either are alike within
+it, which is less than they are known to.
+"""
 ALIKE, PERCENT = 1.1, 0.05
 """A lower order is kept while it leaves at most this much more variance: factor, and percent
 points; as in the choice of a subspace model's order.
@@ -246,7 +250,7 @@ def linear_models(
     names = choose_ports([*records, *held_out], joint, inputs, outputs)
     raw, dt = parts_of(records, joint, names)
     unseen, other = parts_of(held_out, joint, names) if held_out else ([], dt)
-    if abs(other / dt - 1.0) > 0.01:
+    if abs(other / dt - 1.0) > SAME_RATE:
         raise InputError(
             f"the held-out records are sampled every {other:.6g} s, the others every {dt:.6g} s: "
             "resample them alike (irj resample)"

@@ -19,6 +19,8 @@ from identification.linear.triangle import FloatArray, single_thread
 
 # singular values below this part of the largest are rounding
 _FLOOR = 1e-11
+# a response that changes by less over a shot is constant there, beside shares read to a percent
+_CHANGE = 0.01
 # orders whose simulation is tried where the singular values show a clear gap
 _TRIED = 5
 # samples the order choice looks at, before and after the split
@@ -33,7 +35,7 @@ def integrates(radius: float) -> bool:
     """Whether a spectral radius is 1 as far as shots can tell: over one of them a response changes
     by less than a hundredth.
     """
-    return abs(radius - 1.0) < 0.01 / JUDGED
+    return abs(radius - 1.0) < _CHANGE / JUDGED
 
 
 @final

@@ -58,6 +58,8 @@ Compression = Literal["qr", "fast"]
 # growth of an unstable response over a record up to which it is simulated in one piece: of sixteen
 # digits four are left
 _GROWTH = 1e12
+# part of a record to hold out: less is a few periods, more leaves less to fit than to judge
+_HELD_OUT = (0.05, 0.5)
 
 
 class UnstableModelWarning(UserWarning):
@@ -496,8 +498,9 @@ def _check_options(channels: tuple[int, int], dt: float, options: MoespOptions) 
         )
     if options.compression not in get_args(Compression):
         raise InputError(f"compression {options.compression!r} is unknown: choose qr or fast")
-    if not 0.05 <= options.held_out <= 0.5:
-        raise InputError(f"held_out is {options.held_out}: give 0.05 to 0.5")
+    low, high = _HELD_OUT
+    if not low <= options.held_out <= high:
+        raise InputError(f"held_out is {options.held_out}: give {low:g} to {high:g}")
     if options.max_order < 1:
         raise InputError(f"max_order is {options.max_order}: give 1 or more")
     weights = np.array(options.output_weights or (1.0,) * outputs, dtype=np.float64)

@@ -14,7 +14,13 @@ import numpy.typing as npt
 from casadi_models import EFFECTS
 from identification.balance.balances import balances_of
 from identification.balance.dataset import Dataset
-from identification.balance.stacked import INDEPENDENT_SHARE, stack
+from identification.balance.stacked import (
+    INDEPENDENT_SHARE,
+    drawn_floors,
+    rms,
+    stack,
+    taking_part,
+)
 from identification.balance.weak import REST_SHARE, RESTING_SIDES, WeakRecord
 from identification.diagnosis.candidates import offered, shape_grid
 from identification.diagnosis.trials import Trial, make_base, try_candidate
@@ -29,6 +35,8 @@ VALLEY_STEPS: Final = 5
 """Gauss-Newton steps from each point of a grid, to see which valley is the deepest."""
 TURN_WIDTHS: Final = 3.0
 """Smoothing velocities up to which friction has not yet reached its level (to 1 %)."""
+LEAST_VARIANCE: Final = 1e-24
+"""Of a row without noise [N.m squared]: what rounding leaves of torques of 1 N.m."""
 DECIDED: Final = 2.0
 """Normal deviate over blocks of a difference of log-likelihoods from which a name is behind."""
 
@@ -149,19 +157,38 @@ class Contest:
             b: np.minimum.reduce([r.solution.weights[b] for r in self.rivals])
             for b in self.rivals[0].solution.weights
         }
-        costs = [self._cost(r, common) for r in self.rivals]
-        self.leader = self.rivals[int(np.argmin(costs))]
-        self._old = [self._rows(r, data, self.leader.solution.weights) for r in self.rivals]
+        names = self.data.sensing.balances
+        self._scales = _scales(self.rivals, data)
+        left = [
+            {b: r * scale[b] for b, r in _left(rival, data).items()}
+            for rival, scale in zip(self.rivals, self._scales, strict=True)
+        ]
+        everything = {b: np.ones(len(r), dtype=np.bool_) for b, r in left[0].items()}
+        costs = [_cost(r, common, everything) for r in left]
+        best = int(np.argmin(costs))
+        for k, rival in enumerate(self.rivals):  # none may be ahead where the two are compared
+            counted = dict(zip(names, self._calm(self.rivals[best], rival), strict=True))
+            if _cost(left[k], common, counted) < _cost(left[best], common, counted):
+                best = k
+        self.leader = self.rivals[best]
+        own = self._scales[best]
+        self._old = [
+            self._rows(
+                rival,
+                data,
+                {b: w * scale[b] / own[b] for b, w in self.leader.solution.weights.items()},
+            )
+            for rival, scale in zip(self.rivals, self._scales, strict=True)
+        ]
 
-    def _cost(self, rival: Rival, weights: Mapping[str, FloatArray]) -> float:
-        """Log-likelihood of the balances but for its sign, each with a scatter of its own."""
-        model = rival.solution.model
-        balances = balances_of(model, self.data.sensing, wrt=())
-        left = stack(balances, self.data.train, rival.solution.values).residual
-        return sum(
-            len(r) * math.log(max(float(np.linalg.norm(r * weights[b])), 1e-300))
-            for b, r in left.items()
-        )
+    def _calm(self, best: Rival, other: Rival) -> list[npt.NDArray[np.bool_]]:
+        """Rows by which two rivals are compared, one array per balance: those at a turn only where
+        one of the two laws says what happens there.
+        """
+        turns = [turning(best.solution, self.data.train, b) for b in self.data.sensing.balances]
+        if about_turns(best) or about_turns(other):
+            return [np.ones_like(at) for at in turns]
+        return [~at for at in turns]
 
     def _rows(
         self, rival: Rival, data: Dataset, weights: Mapping[str, FloatArray]
@@ -194,12 +221,10 @@ class Contest:
 
         Rows at a turn count only where one of the two laws says what happens there.
         """
-        names = self.data.sensing.balances
-        calm = np.concatenate([~turning(self.leader.solution, self.data.train, b) for b in names])
         best, _, block = self._old[self.rivals.index(self.leader)]
         out = np.zeros((len(self.rivals), 2))
         for k, (rival, (own, _, _)) in enumerate(zip(self.rivals, self._old, strict=True)):
-            counted = np.ones_like(calm) if about_turns(rival) or about_turns(self.leader) else calm
+            counted = np.concatenate(self._calm(self.leader, rival))
             apart = _by_block(own * counted, block) - _by_block(best * counted, block)
             difference = 0.5 * INDEPENDENT_SHARE * apart
             count = len(difference)
@@ -278,6 +303,57 @@ def turning(
             out |= rows.average((slow | turns).astype(np.float64)) > REST_SHARE
         parts.append(out)
     return np.concatenate(parts)
+
+
+def _scales(rivals: Sequence[Rival], data: Dataset) -> list[dict[str, FloatArray]]:
+    """One over the scatter that each row of a rival is entitled to, per balance.
+
+    A law that scales a measured torque passes its noise on with that scale: the residuals of two
+    rivals are no lengths in one unit, and the one with the smaller unit is not the better one. What
+    even the best of them leaves beside noise is the same torque for all.
+    """
+    levels = []
+    for rival in rivals:
+        model, values = rival.solution.model, rival.solution.values
+        known = [drawn_floors(model, data, values, w) for w in data.train]
+        levels.append(
+            {
+                b: np.concatenate(
+                    [np.full(w.rows, at[b]) for w, at in zip(data.train, known, strict=True)]
+                )
+                for b in data.sensing.balances
+            }
+        )
+    out: list[dict[str, FloatArray]] = [{} for _ in rivals]
+    for b in data.sensing.balances:
+        rows = taking_part(b, data.train)
+        beside = min(
+            max(0.0, r.solution.sigma[b] ** 2 - rms(level[b][rows]) ** 2)
+            for r, level in zip(rivals, levels, strict=True)
+        )
+        for scale, level in zip(out, levels, strict=True):
+            scale[b] = 1 / np.sqrt(np.maximum(level[b] ** 2 + beside, LEAST_VARIANCE))
+    return out
+
+
+def _left(rival: Rival, data: Dataset) -> Mapping[str, FloatArray]:
+    """Residual of each balance on the old records."""
+    balances = balances_of(rival.solution.model, data.sensing, wrt=())
+    return stack(balances, data.train, rival.solution.values).residual
+
+
+def _cost(
+    left: Mapping[str, FloatArray],
+    weights: Mapping[str, FloatArray],
+    counted: Mapping[str, npt.NDArray[np.bool_]],
+) -> float:
+    """Log-likelihood of the counted rows of the balances but for its sign, each balance with a
+    scatter of its own."""
+    return sum(
+        np.count_nonzero(counted[b])
+        * math.log(max(float(np.linalg.norm((r * weights[b])[counted[b]])), 1e-300))
+        for b, r in left.items()
+    )
 
 
 def _by_block(residual: FloatArray, block: npt.NDArray[np.int64]) -> FloatArray:

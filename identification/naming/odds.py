@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -47,6 +48,13 @@ class Odds:
     def names(self) -> tuple[str, ...]:
         """Keys of the rivals."""
         return tuple(r.name for r in self.rivals)
+
+    def holds(self, name: str) -> bool:
+        """Whether a name may stand for its set: none is more probable by so much as to count as
+        better (:data:`~identification.naming.contest.FEWEST`).
+        """
+        most = max(self.probability.values(), default=0.0)
+        return name in self.names and self.probability[name] > most * math.exp(-FEWEST)
 
 
 def unmodelled(ranking: Ranking, balance: str) -> float:

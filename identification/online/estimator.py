@@ -572,8 +572,9 @@ class OnlineEstimator:
     def _judge(self, good: list[bool]) -> None:
         """The most severe fault now, and the scores."""
         detector = self.detector
+        alarm, score = self.plant_alarm, self.score
         if detector is not None:
-            self._set(plant_alarm=plant_alarm(detector, self.dt), score=detector.scores())
+            alarm, score = plant_alarm(detector, self.dt), detector.scores()
         missing = [
             not g and (self.needs[i] or (detector is not None and self.present[i]))
             for i, g in enumerate(good)
@@ -585,10 +586,10 @@ class OnlineEstimator:
         )
         if not found and self.estimator is not None and self.is_fitted:
             found = implausible(self.names, self.theta, self.sigma, self.joint.fitted)
-        found = found or self.plant_alarm or (HELD if self.guard.on_probation else NONE)
+        found = found or alarm or (HELD if self.guard.on_probation else NONE)
         if found != self.fault and found:
             self._tell(f"fault {found}")
-        self._set(fault=found)
+        self._set(fault=found, plant_alarm=alarm, score=score)
 
     # --- state ------------------------------------------------------------------------------------
 

@@ -74,9 +74,18 @@ class Pulse:
         before = self._before
         self.jumped = self._any and time - self._time > self._gap
         stopped = self._any and not time > self._time
-        equal = self._any and all(readings[i] == before[i] for i in self._needs)
+        # loops, not generators: this runs at every sample
+        equal = self._any
+        for i in self._needs:
+            if readings[i] != before[i]:
+                equal = False
+                break
         if self._any and not self.still:
-            pace = max((abs(readings[i] - before[i]) for i in self._positions), default=0.0)
+            pace = 0.0
+            for i in self._positions:
+                moved = abs(readings[i] - before[i])
+                if moved > pace:
+                    pace = moved
             self._speed += (pace - self._speed) / PACE
             self._share += (float(equal) - self._share) / MEMORY
         self._same = self._same + 1 if equal or stopped else 0

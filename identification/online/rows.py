@@ -17,8 +17,9 @@ import numpy as np
 import numpy.typing as npt
 
 from casadi_models import JointModel, Signals
+from casadi_models.affine import AffineParts, settled
 from casadi_models.hold import CLOCKS
-from identification.balance.balances import residual_expressions
+from identification.balance.balances import residual_expressions, swept_expressions
 from identification.balance.clocks import USUAL_SKEW
 from identification.balance.sensing import Sensing
 from identification.balance.weak import POSITION_CHAINS, differentiated_kernel, kernel
@@ -88,6 +89,11 @@ class RowMaker:
     alignment : Alignment
         What :class:`identification.online.samples.Samples` does to late channels; :attr:`model` has
         only what it leaves of their delays.
+    needed, averaged : list of int, int
+        Entries of a row, balance by balance, to which the laws at the points add; by the average of
+        so many laws, by the rate of the average of those after them.
+    weights, rate_weights : (points,) array
+        Kernel of the average, and of its rate [1/s].
     uses : (balances, sources) bool array
         Which sampled signals enter which balance.
     """
@@ -114,14 +120,26 @@ class RowMaker:
         signals, p = e.signals.vector(), e.parameters
         columns = [model.parameter_names.index(n) for n in self.names]
         fixed = self._values()
-        stacked: list[Any] = []
-        for r in expressions.values():
-            (free,) = ca.substitute([r], [p], [fixed])
-            slopes = ca.jacobian(r, p)[:, columns]
-            (slopes,) = ca.substitute([slopes], [p], [fixed])
-            stacked += [free, *ca.vertsplit(slopes.T)]
+
+        # every estimated term is there, whatever its size
+        there = [
+            1.0 if n in self.names else v
+            for n, v in zip(model.parameter_names, model.value_vector(), strict=True)
+        ]
+
+        def entries(parts: Mapping[str, Any]) -> Any:
+            stacked: list[Any] = []
+            for whole in parts.values():
+                r = settled(whole, p, there)
+                (free,) = ca.substitute([r], [p], [fixed])
+                slopes = ca.jacobian(r, p)[:, columns]
+                (slopes,) = ca.substitute([slopes], [p], [fixed])
+                stacked += [free, *ca.vertsplit(slopes.T)]
+            return ca.vertcat(*stacked)
+
         self.width = 1 + len(self.names)
-        self._split(ca.vertcat(*stacked), signals, e.memory, fixed)
+        still, swept = swept_expressions(model, sensing)
+        self._split(entries(still), entries(swept), signals, e.memory, fixed)
         self.uses = self._dependence(ca.vertcat(*expressions.values()), signals)
         self._kernels()
         self.slopes = self._slope_function(expressions, signals, p)
@@ -151,8 +169,10 @@ class RowMaker:
             ]
         )
 
-    def _split(self, out: Any, signals: Any, memory: Any, fixed: Any) -> None:
-        """Part that is linear in the signals, and the laws to be evaluated at points."""
+    def _split(self, out: Any, swept: Any, signals: Any, memory: Any, fixed: Any) -> None:
+        """Part that is linear in the signals, and the laws to be evaluated at points: those that
+        are averaged, then those whose rate is.
+        """
         slopes = ca.jacobian(out, signals)
         linear = np.zeros(slopes.shape, dtype=bool)
         for row, column in zip(*slopes.sparsity().get_triplet(), strict=True):
@@ -172,6 +192,10 @@ class RowMaker:
             if not ca.simplify(left).is_zero():
                 self.needed.append(i)
                 rest.append(left)
+        self.averaged = len(rest)
+        moving = [i for i in range(swept.shape[0]) if not ca.simplify(swept[i]).is_zero()]
+        self.needed += moving
+        rest += [swept[i] for i in moving]
         self.laws = ca.vertcat(*rest) if rest else ca.SX(0, 1)
         self.point = self._point_function(self.laws, signals, memory, fixed)
 
@@ -186,9 +210,13 @@ class RowMaker:
         count = coordinates.shape[0]
         steps = ca.SX.sym("steps", count)
         moved: list[Any] = []
+        straight: list[bool] = []
         for i, (term, _, z, view, values) in enumerate(e.memory_terms):
             if term.effect.memory is not None:
-                moved.extend(term.effect.memory(z, steps[i], view, values))
+                own = term.effect.memory(z, steps[i], view, values)
+                affine = AffineParts(ca.vertcat(*z, steps[i]), signals)
+                straight.append(all(affine.split(new)[1].is_zero() for new in own))
+                moved.extend(own)
         after = ca.vertcat(*moved) if moved else ca.SX(0, 1)
         p = e.parameters
         shapes = [self.eta] if self.shapes else []
@@ -204,7 +232,10 @@ class RowMaker:
         )
         at, z, rows = before, held, []
         for k in range(new):
-            here = where(smooth[:, k], fixed)
+            # smoothed, because a bent law rectifies noise; a straight one averages it as the kernel
+            # does and needs the whole motion
+            here, plain = where(smooth[:, k], fixed), where(raw[:, k], fixed)
+            here = ca.vertcat(*(plain[i] if yes else here[i] for i, yes in enumerate(straight)))
             step = (here - at) * (started if k == 0 else 1)
             z = move(z, step, smooth[:, k], fixed, self.timing.dt * self.timing.step)
             at = here
@@ -240,7 +271,8 @@ class RowMaker:
                 at = centre + (t.point_half - (new - 1 - k)) * t.step
                 self.smoothing[order, k, at - own : at + own + 1] = w
         self.raw_at = [centre + (t.point_half - (new - 1 - k)) * t.step for k in range(new)]
-        self.weights = differentiated_kernel(t.length, t.dt * t.step, 0)
+        self.weights = differentiated_kernel(t.length, t.dt, 0, t.step)
+        self.rate_weights = differentiated_kernel(t.length, t.dt, 1, t.step)
         self.place: list[tuple[int, int, int]] = [
             (_NAMES.index(name), order, k)
             for k, source in enumerate(SOURCES)
@@ -360,7 +392,10 @@ class RowMaker:
         self.signals[0] = time - self.timing.delay
         full = self.linear @ self.signals
         if self.needed:
-            full[self.needed] += self.weights @ self._ring
+            many = self.averaged
+            full[self.needed[:many]] += self.weights @ self._ring[:, :many]
+            if many < len(self.needed):
+                full[self.needed[many:]] += self.rate_weights @ self._ring[:, many:]
         if self.made <= self.rows_before_ready:
             return None
         table = full.reshape(len(self.balances), self.width)

@@ -64,7 +64,7 @@ class Timing:
         step = max(1, whole(_POINT_STEP / dt))
         stride = max(step, whole(length / dt / _OVERLAP / step) * step)
         half = len(differentiated_kernel(length, dt, 3)) // 2
-        point_half = len(differentiated_kernel(length, dt * step, 0)) // 2
+        point_half = len(differentiated_kernel(length, dt, 0, step)) // 2
         own = len(kernel(pointwise, dt, 3)) // 2
         reach = max(half, point_half * step + own)
         window = reach + max(half, point_half * step + own) + 1

@@ -115,7 +115,8 @@ class ShapedBalances:
         self._linear_of, self._linear = rows.linear_of, rows.linear.copy()
         self._linear_moves = bool(rows.linear_of.jac_sparsity(0, 0).nnz())
         self._width, self._count = rows.width, len(rows.balances)
-        self._weights = rows.weights.copy()
+        self._weights, self._rate_weights = rows.weights.copy(), rows.rate_weights.copy()
+        self._sweeps = rows.averaged < len(rows.needed)
         self._new = rows.timing.stride // rows.timing.step
         self.lead, self.overlap = rows.rows_before_ready, rows.timing.overlap
         signals = rows.model.equations.signals.vector()
@@ -130,18 +131,19 @@ class ShapedBalances:
 
     def _dense(self, rows: RowMaker) -> Any:
         """All entries, (balances, 1 + parameters), with zero where a law is linear in the
-        signals.
+        signals; below them, where there are any, those whose rate is averaged.
         """
-        laws = ca.SX.zeros(self._count, self._width)
+        laws = ca.SX.zeros(self._count * (1 + self._sweeps), self._width)
         for i, place in enumerate(rows.needed):
-            laws[place // self._width, place % self._width] = rows.laws[i]
+            swept = self._count if i >= rows.averaged else 0
+            laws[swept + place // self._width, place % self._width] = rows.laws[i]
         return laws
 
     def _group(self, rows: RowMaker, laws: Any) -> tuple[tuple[int, ...], tuple[int, ...]]:
         linear = np.any(self._linear != 0, axis=1).reshape(self._count, self._width)
         there = linear | self._filled(rows)
         moved = {
-            int(r) % self._count
+            int(r) % laws.shape[0] % self._count
             for r in ca.jacobian_sparsity(ca.vec(laws), rows.eta).get_triplet()[0]
         }
         if self._linear_moves:
@@ -166,7 +168,8 @@ class ShapedBalances:
         balances: Sequence[int],
         coefficients: Sequence[int],
     ) -> SeparableModel:
-        part = laws[list(balances), :]
+        swept = [self._count + b for b in balances] if self._sweeps else []
+        part = laws[[*balances, *swept], :]
         taken = [signals[i] for i in self.used]
         gone = [signals[i] for i in range(signals.shape[0]) if i not in self.used]
         (part,) = ca.substitute([part], gone, [ca.SX(0)] * len(gone)) if gone else [part]
@@ -180,11 +183,17 @@ class ShapedBalances:
     # --- rows -------------------------------------------------------------------------------------
 
     def _averaged(self, values: FloatArray) -> FloatArray:
-        """Kernel averages (rows, ...) of what was computed at the points (points, ...)."""
+        """Kernel averages (rows, balances, ...) of what was computed at the points (points,
+        balances, ...), with those of the rates that follow it there.
+        """
         taps = len(self._weights)
         windows = sliding_window_view(values, taps, axis=0)[
             self.lead * self._new - taps :: self._new
         ]
+        if self._sweeps:
+            count = windows.shape[1] // 2
+            swept: FloatArray = windows[:, count:] @ self._rate_weights
+            return windows[:, :count] @ self._weights + swept
         found: FloatArray = windows @ self._weights
         return found
 

@@ -50,6 +50,10 @@ class Controller:
     bandwidth: float = 30.0
     damping: float = 0.8
 
+    def gains(self, inertia: float) -> tuple[float, float]:
+        """Drive per error of position and of velocity; the inertia is drive per acceleration."""
+        return inertia * self.bandwidth**2, 2 * self.damping * inertia * self.bandwidth
+
 
 @final
 class Follower:
@@ -103,8 +107,7 @@ class Follower:
         inertia = sum(start[n] for n in model.inertias)
         tuned = controller or Controller()
         self._gains = [
-            inertia * tuned.bandwidth**2,
-            2 * tuned.damping * inertia * tuned.bandwidth,
+            *tuned.gains(inertia),
             inertia,
             sum(start[n] for n in model.named("weight")),
         ]

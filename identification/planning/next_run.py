@@ -260,7 +260,7 @@ def next_run(
     """
     tell = progress or (lambda text, share: None)
     data = found.data
-    refuse_clamped(data)
+    refuse_clamped(data.sensing, data.train_names[0])
     space = workspace_of(data, limits)
     last = found.steps[-1].solution
     simulated = _Simulated(last, data, space)

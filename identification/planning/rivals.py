@@ -23,6 +23,8 @@ FloatArray = npt.NDArray[np.float64]
 
 ROUNDS: Final = 3
 """Gauss-Newton steps in which a rival adapts to a run of another: shapes are no straight lines."""
+SETTLED: Final = 1e-3
+"""Relative fall of the misfit from which another step is taken: a thousandth changes no plan."""
 SURE: Final = 1.6449
 """Normal quantile of 95 %: a run is long enough where so many of them come out above `FEWEST`."""
 
@@ -114,7 +116,7 @@ class Foreseen:
             moved = np.clip(x - step, bounds[:, 0], bounds[:, 1])
             after = form.residual(moved) - true
             reached = cost(moved, after)
-            if not reached < best * (1 - 1e-3):
+            if not reached < best * (1 - SETTLED):
                 best = min(best, reached) if math.isfinite(reached) else best
                 break
             x, left, best = moved, after, reached

@@ -419,21 +419,22 @@ def recorded(
     return Record.from_channels(followed.time, channels, name="planned run", kind=joint.kind)
 
 
-def refuse_clamped(data: Dataset) -> None:
-    """Refuse records of a torque-against-torsion test, and positions without any torque.
+def refuse_clamped(sensing: Sensing, name: str) -> None:
+    """Refuse records of a torque-against-torsion test, and positions without any torque; `name`
+    is that of the first record.
 
     Raises
     ------
     InputError
         The link is clamped, or no torque has a size: no motion can be planned.
     """
-    if data.sensing.kinematic:
+    if sensing.kinematic:
         raise InputError(
-            f"{data.train_names[0]}: two positions without any torque do not say what drives the "
+            f"{name}: two positions without any torque do not say what drives the "
             "joint, and no motion can be planned; record motor_current or motor_torque too"
         )
-    if data.sensing.clamped_link:
+    if sensing.clamped_link:
         raise InputError(
-            f"{data.train_names[0]}: a torque-against-torsion test has no motion to plan; give "
+            f"{name}: a torque-against-torsion test has no motion to plan; give "
             "records of the moving joint"
         )

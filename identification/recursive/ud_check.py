@@ -12,6 +12,7 @@ from identification.recursive.settings import Layout
 from identification.recursive.ud_factor import SX, Factor, Parts, select, total, where
 
 _SHARE_LOW = 1e-10  # regularisation of the information matrix scaled to unit diagonal
+_RETURN = 4.0  # times the share at which it was held that lets a parameter move: no flicker
 
 
 def check_function(layout: Layout, freeze: bool, walking: bool) -> Any:
@@ -233,7 +234,7 @@ def _rank(
         select(
             kept[i],
             ca.logic_not((share[i] <= lowest) * (share[i] < limit) * (best[i] > 0)),
-            config["free"][i] * (share[i] >= 4.0 * limit),
+            config["free"][i] * (share[i] >= _RETURN * limit),
         )
         for i in range(n)
     ]

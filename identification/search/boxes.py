@@ -27,6 +27,9 @@ _HEAD = 4
 _LOWEST = 0.5 + 1e-6
 """Times slope squared over curvature: how far a parabola falls, with room for rounding."""
 
+_THIN = 0.1
+"""Part of a split that must still move its start: a box of fewer floating-point numbers is thin."""
+
 
 @final
 @dataclass(frozen=True, slots=True)
@@ -367,7 +370,7 @@ class BoxTree:
             place = start if place < start else end if place > end else place
         else:
             place = end if place < end else start if place > start else place
-        if place == start or start + 0.1 * (place - start) == start:
+        if place == start or start + _THIN * (place - start) == start:
             return False
         point = box[_HEAD:at_x] + (place,) + box[at_x + 1 : self._y]
         f, found = box[0], self._known.get(point)

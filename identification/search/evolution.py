@@ -34,6 +34,10 @@ FLATTEST: Final = 1e-12
 """
 WORST_CONDITION: Final = 1e14
 """Condition of the covariance beyond which its axes are rounding."""
+STALLED: Final = 1.4
+"""Length of the path, in that of a random one, above which the covariance does not follow it: the
+tutorial's figure, which keeps the axes from growing while the step size does.
+"""
 
 
 @final
@@ -117,7 +121,7 @@ def evolve(evaluate: Evaluator, run: int, start: FloatArray | None) -> tuple[flo
         path_step = (1 - to_mean) * path_step + math.sqrt(to_mean * (2 - to_mean) * mu) * white
         size = float(np.linalg.norm(path_step))
         grown = 1 - (1 - to_mean) ** (2 * generation)
-        slow = size / math.sqrt(grown) < (1.4 + 2 / (n + 1)) * length
+        slow = size / math.sqrt(grown) < (STALLED + 2 / (n + 1)) * length
         path = (1 - to_path) * path + slow * math.sqrt(to_path * (2 - to_path) * mu) * moved
         lost = (1 - slow) * to_path * (2 - to_path)
         covariance = (

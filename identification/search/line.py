@@ -19,6 +19,11 @@ from identification.search.numeric import (
 _SMALL = 0.1
 """Closest distance to a known sample, as a fraction of the interval around it."""
 
+_FAR = 4.0
+"""Times its neighbour's distance from which a best sample is far beyond it: a third of the way is
+then still beyond.
+"""
+
 _START_SAMPLES = 5
 """Samples taken before the search refines around the best one."""
 
@@ -257,7 +262,7 @@ class LineSearch:
             right = a[i + 1] if i < len(a) - 1 else 0.0
             return self._add(-left / 3.0 if left > right else right / 3.0)
         inner = a[i - 1] if a[i] > 0.0 else a[i + 1]
-        if inner == 0.0 or (abs(a[i]) >= 4.0 * abs(inner) and f[i] < f[a.index(0.0)]):
+        if inner == 0.0 or (abs(a[i]) >= _FAR * abs(inner) and f[i] < f[a.index(0.0)]):
             return self._add(a[i] / 3.0)
         return False
 

@@ -25,6 +25,11 @@ _TRUSTED = 0.1
 search.
 """
 
+_POOR = 0.25
+"""Part of the predicted decrease that is missing, or left, where the model is poor: the usual
+quarter and three quarters of a trust region.
+"""
+
 _DIFFERENCE = EPS ** (1.0 / 3.0)
 """Relative spacing of the samples of a central difference."""
 
@@ -324,12 +329,12 @@ class LocalSearch:
                 if (full or len(bound) == n) and not any(left):
                     return model.x, model.f, True
             before = model.f
-            full = abs(ratio - 1.0) > 0.25 or settled
+            full = abs(ratio - 1.0) > _POOR or settled
             x_old = model.x
             model.triple_search(full)
-            if ratio < 0.25:
+            if ratio < _POOR:
                 radius = [0.5 * d for d in radius]
-            elif ratio > 0.75:
+            elif ratio > 1.0 - _POOR:
                 radius = [
                     min(2.0 * d, hi - lo) for d, lo, hi in zip(radius, low, high, strict=True)
                 ]

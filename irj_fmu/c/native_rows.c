@@ -80,8 +80,9 @@ static int make_row(Twin *m, double time) {
     r->signals[0] = time - DELAY;
     for (i = 0; i < N_LINEAR; i++) full[linear_row[i]] += linear_value[i] * r->signals[linear_column[i]];
     for (i = 0; i < N_NEEDED; i++) {
+        const double *weight = i < N_AVERAGED ? point_weight : rate_weight;
         double sum = 0;
-        for (k = 0; k < POINTS; k++) sum += point_weight[k] * r->ring[k][i];
+        for (k = 0; k < POINTS; k++) sum += weight[k] * r->ring[k][i];
         full[needed[i]] += sum;
     }
     if (r->made <= ROWS_BEFORE_READY) return 0;

@@ -260,6 +260,7 @@ def _row_tables(header: _Header, made: OnlineEstimator) -> None:
     header.define("N_NEEDED", len(rows.needed))
     header.define("N_COORDINATES", rows.point.size1_in(2))
     header.define("N_MEMORY", rows.point.size1_in(3))
+    header.define("N_AVERAGED", rows.averaged)
     header.whole("needed", rows.needed)
     place = rows.place
     header.define("PLACES", len(place))
@@ -287,6 +288,7 @@ def _row_tables(header: _Header, made: OnlineEstimator) -> None:
     header.define("SMOOTH_HALF", half)
     header.doubles("smooth_kernel", smoothing)
     header.doubles("point_weight", rows.weights)
+    header.doubles("rate_weight", rows.rate_weights)
     header.doubles("sharp", rows.sharp)
     linear = [
         (i, j)

@@ -18,6 +18,7 @@ import numpy as np
 from identification.balance.weak import kernel
 from identification.data.record import Record
 from identification.errors import InputError
+from identification.planning.follow import Controller
 from irj_fmu.host.signals import FloatArray
 from irj_fmu.imported.correction import CorrectionLaw, Port
 from irj_fmu.imported.port import feedback_of, port_of
@@ -63,7 +64,7 @@ class Tracker:
         self._dt = float(np.median(np.diff(window.time)))
         self._q, self._v = q, smooth_slope(q, self._dt)
         bandwidth = min(BANDWIDTH, 0.25 / self._dt)
-        self._stiff, self._damp = self.inertia * bandwidth**2, 2 * self.inertia * bandwidth
+        self._stiff, self._damp = Controller(bandwidth, damping=1.0).gains(self.inertia)
         self.added = np.zeros(len(q))
         self._last = -1
         self._before = float(q[0]) - self._dt * float(self._v[0])

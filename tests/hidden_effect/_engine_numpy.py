@@ -88,6 +88,17 @@ def _reference(table: FloatArray, t: float, dt: float) -> FloatArray:
     return np.asarray(table[:, k] + (at - k) * (table[:, k + 1] - table[:, k]))
 
 
+def _bulge(table: FloatArray, t: float, dt: float) -> FloatArray:
+    """What the cubic through two samples, with slopes from their neighbours, has over the line."""
+    at = t / dt
+    last = table.shape[1] - 2
+    k = min(int(at), last)
+    f, rise = at - k, table[:, k + 1] - table[:, k]
+    begin = 0.5 * (table[:, k + 1] - table[:, k - 1]) - rise if k > 0 else 0.0 * rise
+    end = 0.5 * (table[:, k + 2] - table[:, k]) - rise if k < last else 0.0 * rise
+    return np.asarray(f * (1.0 - f) * ((1.0 - f) * begin - f * end))
+
+
 class _Fleet:
     """State and parameters of all records, one column each."""
 
@@ -207,6 +218,9 @@ def simulate_fleet(
         moving = t > 0.0
         r = _reference(position, t, step * stride) if moving else position[:, 0]
         dr = _reference(velocity, t, step * stride) if moving else np.zeros(count)
+        if moving and np.any(fleet.p["CURVE"]):
+            r = r + fleet.p["CURVE"] * _bulge(position, t, step * stride)
+            dr = dr + fleet.p["CURVE"] * _bulge(velocity, t, step * stride)
         current[i], torque[i] = fleet.step(t, step, r, dr, _snag(snags, t))
     at = before + stride * np.arange(rows)[:, None]
     column = np.arange(count)

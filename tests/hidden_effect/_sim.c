@@ -68,6 +68,15 @@ static double spring(const double *p, double x, double *in_contact)
     return t;
 }
 
+/* what the cubic through samples a and a + 1, with slopes from their neighbours, has over the line at a + f */
+static double bulge(const double *y, int n, int a, double f)
+{
+    double rise = y[a + 1] - y[a];
+    double begin = a > 0 ? 0.5 * (y[a + 1] - y[a - 1]) - rise : 0.0;
+    double end = a < n - 2 ? 0.5 * (y[a + 2] - y[a]) - rise : 0.0;
+    return f * (1.0 - f) * ((1.0 - f) * begin - f * end);
+}
+
 /* ref, dref: n_ref samples at dt_ref; out: n_out rows of 7 (time, current, q, v, th, w, torque); snag: rows t0, length, torque */
 int simulate(const double *p, const double *ref, const double *dref, int n_ref, double dt_ref, const double *state,
              double h, int stride, int n_pre, int n_out, const double *snag, int n_snag, double *out)
@@ -97,6 +106,10 @@ int simulate(const double *p, const double *ref, const double *dref, int n_ref, 
             f = s - a;
             r = ref[a] + f * (ref[a + 1] - ref[a]);
             dr = dref[a] + f * (dref[a + 1] - dref[a]);
+            if (p[P_CURVE] != 0.0) {
+                r += bulge(ref, n_ref, a, f);
+                dr += bulge(dref, n_ref, a, f);
+            }
         }
         if (p[P_HEAT] != 0.0 && t > 0.0) heat = 1.0 - p[P_HEAT] * (1.0 - exp(-t / p[P_HEAT_TAU]));
         qm = q + 0.5 * h * v; tm = th + 0.5 * h * w; xm = x + 0.5 * h * u;

@@ -94,7 +94,9 @@ def _kuka() -> tuple[list[Table], list[Table]]:
 
 def _quanser() -> tuple[list[Table], list[Table]]:
     table = _csv(SHARED / "quanser_2dsfl" / "ctu_lqr.csv")
-    table["link1_deg"] = table["q1_deg"] - table["defl1_deg"]
+    # the gauge counts the link ahead of the joint as positive: joint minus link, the twist that
+    # speeds the link up, goes with its acceleration (r = 0.76 with this sign, -0.48 with the other)
+    table["link1_deg"] = table["q1_deg"] + table["defl1_deg"]
     half = len(table["t_s"]) // 2
     parts = [{k: v[s] for k, v in table.items()} for s in (slice(0, half), slice(half, None))]
     return parts[:1], parts[1:]
@@ -269,6 +271,12 @@ CHANGED: Final[Mapping[str, Planted]] = {
 """Parameters that move, and the names that are right for them."""
 
 
+def _moved(rig: Rig, effect: str, size: float) -> float:
+    """By how much a planted change moves its parameter, in its unit."""
+    share = {"coulomb": 0.25 * rig.friction, "mass": 0.1 * rig.inertia, "gain": 0.15}
+    return size * share.get(effect, 0.25 * rig.friction)
+
+
 def motion(rig: Rig, table: Table) -> Motion:
     """Smoothed motion of one table; runs are smoothed on their own."""
     q, torque = table[rig.position] * rig.to_si, table[rig.drive] * rig.per_unit
@@ -307,7 +315,7 @@ def write(tables: list[Table], folder: Path, name: str) -> list[Path]:
 @dataclass(frozen=True)
 class Outcome:
     """What was said of one planted effect: claims by set, wrong unmarked names, whether the
-    right one is among them.
+    right one is among them, and whether the answer says itself that it could not have seen it.
     """
 
     rig: str
@@ -318,6 +326,7 @@ class Outcome:
     alone: bool
     wrong: tuple[str, ...]
     said: str
+    unseen: bool = False
 
 
 def _sets(result: Mapping[str, Any]) -> list[tuple[frozenset[str], bool]]:
@@ -453,11 +462,15 @@ def _changed(rig: Rig, effects: list[str], sizes: list[float], folder: Path) -> 
             why = last.partition(" (choose")[0]
             outcomes.append(_refused(rig, effect, size, "changed", why))
             continue
-        moved = json.loads(out.read_text(encoding="utf-8"))["changed"]
+        answer = json.loads(out.read_text(encoding="utf-8"))
+        moved, least = answer["changed"], answer["least"]
         sets = [(str(c["parameter"]), *map(str, c.get("tied_with", ()))) for c in moved]
         wrong = tuple("|".join(names) for names in sets if not set(names) & right)
         good = any(set(names) & right for names in sets)
         said = ", ".join("|".join(names) for names in sets) or "nothing changed"
+        told = [least[n] for n in right if n in least]
+        unseen = not good and bool(told) and min(told) > _moved(rig, effect, size)
+        said += ", too small to be seen" if unseen else ""
         outcomes.append(
             Outcome(
                 rig=rig.name,
@@ -468,6 +481,7 @@ def _changed(rig: Rig, effects: list[str], sizes: list[float], folder: Path) -> 
                 alone=good and all(set(names) <= right for names in sets),
                 wrong=wrong,
                 said=said,
+                unseen=unseen,
             )
         )
     return outcomes
@@ -496,6 +510,8 @@ def table(outcomes: list[Outcome]) -> str:
                 f"{task}: named alone or in its set {good} of {len(asked)}; "
                 f"with a wrong unmarked name {bad} of {len(asked)}"
             )
+            if unseen := sum(o.unseen for o in asked):
+                text[-1] += f"; said to be too small to be seen {unseen}"
     return "\n".join(text) + "\n"
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import io
+import json
 import shlex
 import zipfile
 from collections.abc import Mapping
@@ -14,6 +15,7 @@ import numpy.typing as npt
 import pytest
 
 from casadi_models import EFFECTS, JointModel
+from identification.balance.memory import cache_of
 from identification.balance.sensing import check_alike, sense
 from identification.crash import FOLDER
 from identification.data.joint_file import load_joint
@@ -278,6 +280,14 @@ ARGUMENTS: dict[str, tuple[str, str]] = {
     "a ratio to compute nothing with": ("import J --gear-ratio 1e300 -o O", "gear_ratio = 1e+300"),
     "a calibration on its record": ("accelerometer --up J --down x --json J", "would be lost"),
     "a joint on the one it follows": ("joint new x.fmu --record x --like J -o J", "would be lost"),
+    "a picture in a format it is not": (
+        "linear x --picture O.png",
+        "is written as SVG; name it o.svg",
+    ),
+    "variants in no folder": (
+        "explore x --joint J --held-out y --out /proc/x",
+        "cannot write there",
+    ),
     "a report on a result it reads": ("report x --joint x --beside J -o J", "would be lost"),
 }
 
@@ -383,6 +393,11 @@ ON_A_RUN = {
     "a filter of a high order": ("prefilter R --order 1000 -o O", "more than 3003 are needed"),
     "no sample kept": ("prefilter R --every 0 -o O", "must be at least 1"),
     "one sample kept": (f"prefilter R --every 1{'0' * 30} -o O", "a second one"),
+    "all but nine samples trimmed": ("prefilter R --trim 196 -o O", "8 samples are left"),
+    "a sample of a hundred kept": (
+        "prefilter R --every 100 -o O",
+        "give a smaller --trim or --every",
+    ),
     "one sample for a linear model": ("linear R --every 100000", "give a smaller --every"),
     "volts without end": (
         "accelerometer --up B --down R --column motor_current_A",
@@ -430,6 +445,41 @@ def test_no_drive_is_said_by_what_could_be_recorded(
     joint.write_text(JOINT)
     line = refused(capsys, "track", str(path), "--joint", str(joint))
     assert "no motor_torque, motor_current or motor_voltage says what drives the joint" in line
+    prepared = set(cache_of("prepared").kept)
+    assert "do not say what drives" in refused(capsys, "next", str(path), "--joint", str(joint))
+    assert set(cache_of("prepared").kept) == prepared, "it is said before anything is fitted"
+
+
+RESULT = {"steps": [{}], "verdict": "complete", "records": [], "claims": []}
+HELD = {"held_out": {"relative_error_percent": 1.0, "balances": {}}}
+RESULTS: dict[str, object] = {
+    "steps a number": {**RESULT, "steps": 3},
+    "steps a text": {**RESULT, "steps": "all"},
+    "steps of numbers": {**RESULT, "steps": [3]},
+    "a step of nothing": RESULT,
+    "an error of text": {
+        **RESULT,
+        "steps": [{**HELD, "held_out": {"relative_error_percent": "x", "balances": {}}}],
+    },
+    "balances a list": {
+        **RESULT,
+        "steps": [{**HELD, "held_out": {"relative_error_percent": 1.0, "balances": [1]}}],
+    },
+    "parameters a list": {**RESULT, "steps": [{**HELD, "parameters": [1]}]},
+    "a parameter of nothing": {**RESULT, "steps": [{**HELD, "parameters": {"a": {}}}]},
+}
+
+
+@pytest.mark.parametrize("name", RESULTS)
+def test_a_result_that_is_none(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, joint = tmp_path / "other.json", tmp_path / "j.toml"
+    path.write_text(json.dumps(RESULTS[name]))
+    joint.write_text(JOINT)
+    words = ["--joint", str(joint), "--beside", str(path), "-o", str(tmp_path / "o.html")]
+    line = refused(capsys, "report", "x.csv", "--held-out", "y.csv", *words)
+    assert f"{path}: is no whole result" in line
 
 
 def test_parts_of_a_record_of_a_rigid_joint_are_alike() -> None:

@@ -33,6 +33,7 @@ from identification.diagnosis.outcome import OUTCOMES
 from identification.diagnosis.places import AXIS_TITLES
 from identification.errors import InputError
 from identification.fitting.fit import fit
+from workbench.cli.loop import results_beside
 from workbench.show import results as fragments_html
 from workbench.show.beside import read_result
 from workbench.show.chart import ticks
@@ -252,7 +253,7 @@ def everything(improvement: Improvement) -> Improvement:
 
 def test_the_first_page_tells_all(improvement: Improvement, records: list[Record]) -> None:
     text = render_report(
-        improvement, records=records, author=f"A. Smith {EVIL}", notes="new oil\ncold"
+        improvement, records=records, author=f"A. Smith\x07\x9b {EVIL}", notes="new\0 oil\ncold"
     )
     front = text[text.index('<div class="front">') : text.index('<nav id="details"')]
     said = " ".join("".join(outline(front).text).split())
@@ -267,8 +268,9 @@ def test_the_first_page_tells_all(improvement: Improvement, records: list[Record
     value = next(v for k, v in parameters.items() if "coulomb" in k)
     assert with_error(value["value"], value["stderr"]) in said, "and in numbers"
     assert "s-law" in front, "drawn through the residual"
-    assert "new oil" in said
-    assert f"A. Smith {html.escape(EVIL, quote=True)}" in text
+    assert r"new\x00 oil" in said
+    assert not re.search(r"[\0-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f]", text), "no control character"
+    assert rf"A. Smith\x07\x9b {html.escape(EVIL, quote=True)}" in text
 
 
 def test_a_set_stays_a_set_in_every_part(improvement: Improvement) -> None:
@@ -322,6 +324,11 @@ def test_another_result_stands_beside_with_what_moved(
     later = improve([swing(3, "later", coulomb=1.4)], joint, [swing(4, "held later", coulomb=1.4)])
     file = tmp_path / "later.json"
     file.write_text(json.dumps(later.as_json()), encoding="utf-8")
+    (tmp_path / "before").mkdir()
+    (tmp_path / "before" / file.name).write_text(file.read_text(encoding="utf-8"), encoding="utf-8")
+    both = results_beside([str(file), str(tmp_path / "before" / file.name)])
+    assert len(both) == 2, "two files of one name"
+    assert list(results_beside([str(file)])) == [file.name]
     page = render_report(improvement, beside={EVIL: read_result(file)})
     outline(page)
     assert "<script>alert" not in page

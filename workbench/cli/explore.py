@@ -11,7 +11,7 @@ from typing import Any
 from identification.errors import InputError
 from identification.variants.exploration import Exploration, table_of
 from identification.variants.explore import explore
-from irj_fmu.command_line import finite, keep_inputs, replace_files
+from irj_fmu.command_line import check_folder, finite, keep_inputs, replace_files
 from workbench.cli.files import (
     alike,
     distinct,
@@ -80,8 +80,7 @@ def _writable(folder: Path) -> None:
     """Refuse a folder that cannot be written before any work is done, and Parquet without its
     package.
     """
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder}: is a file; give the name of a folder for --out")
+    check_folder(folder)
     _pyarrow()
 
 

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from identification.balance.sensing import check_alike
+from identification.balance.sensing import Sensing, check_alike
 from identification.data.check.gate import needed, passed
 from identification.data.joint_edit import with_effects
 from identification.data.joint_file import Joint, load_joint, toml_text
@@ -67,11 +67,11 @@ def open_records(paths: Sequence[str], joint: Joint | None) -> tuple[list[Record
 
 def alike(
     paths: Sequence[str], records: Sequence[Record], joint: Joint, *, once: bool = True
-) -> None:
-    """Refuse records that do not let one see the same, or one run given twice: one line that
-    starts with the path.
+) -> Sensing:
+    """What records show; those that do not let one see the same, or one run given twice, are
+    refused in one line that starts with the path.
     """
-    check_alike(records, joint.model(), paths, once=once)
+    return check_alike(records, joint.model(), paths, once=once)
 
 
 def named(error: InputError, path: str, record: Record) -> InputError:
@@ -80,6 +80,8 @@ def named(error: InputError, path: str, record: Record) -> InputError:
 
 
 OUTPUTS: Final = ("json", "output", "report", "truth", "picture")
+RASTERS: Final = (".png", ".jpg", ".jpeg", ".gif", ".webp", ".tif", ".tiff", ".bmp", ".pdf", ".eps")
+"""Endings of pictures that programs open as what they are named."""
 READ: Final = [
     "records",
     "held_out",
@@ -120,6 +122,8 @@ def check_outputs(arguments: Namespace) -> None:
         if str(target) in named and not is_special(target):
             raise InputError(f"{path}: given for two results; give each a file of its own")
         named[str(target)] = option
+        if option == "picture" and target.suffix.lower() in RASTERS:
+            raise InputError(f"{path}: a picture is written as SVG; name it {target.stem}.svg")
 
 
 def _fmu_of(joint: object) -> list[str]:

@@ -151,12 +151,18 @@ def run_demo(arguments: Namespace) -> int:
 
 
 def results_beside(paths: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Results of other runs by the names of their files, read before anything is fitted."""
+    """Results of other runs by the names of their files, by their paths where two have one name;
+    read before anything is fitted.
+    """
     if not paths:
         return {}
     from workbench.show.beside import read_result
 
-    return {Path(p).name: read_result(p) for p in paths}
+    names = [Path(p).name for p in paths]
+    return {
+        p if names.count(name) > 1 else name: read_result(p)
+        for p, name in zip(paths, names, strict=True)
+    }
 
 
 def _write_report(

@@ -11,7 +11,7 @@ from identification.errors import InputError
 from identification.planning.blind import blind_spots
 from identification.planning.motion import Motion
 from identification.planning.next_run import next_run
-from identification.planning.runs import Run
+from identification.planning.runs import Run, refuse_clamped
 from identification.planning.trajectories import Limits
 from workbench.cli.files import (
     alike,
@@ -88,7 +88,7 @@ def _after(arguments: Namespace, limits: Limits) -> dict[str, Any]:
     records, _ = training(arguments.records, arguments.other_payload, joint)
     held, _ = open_records(arguments.held_out, joint)
     paths = [*arguments.records, *arguments.other_payload, *arguments.held_out]
-    alike(paths, [*records, *held], joint)
+    refuse_clamped(alike(paths, [*records, *held], joint), records[0].name)
     improved = improve(records, joint, held, progress=lambda text, s: progress_bar(text, 0.7 * s))
     found = next_run(
         improved, limits=limits, progress=lambda text, s: progress_bar(text, 0.7 + 0.3 * s)

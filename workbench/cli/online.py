@@ -8,6 +8,7 @@ import math
 import sys
 from argparse import Namespace
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -25,6 +26,7 @@ from workbench.cli.files import (
     write_bytes,
     write_json,
 )
+from workbench.cli.renewed import renewed
 from workbench.show.replayed import AFTERMATH, READINGS, UNESTIMATED, Replay
 
 if TYPE_CHECKING:
@@ -60,6 +62,7 @@ def run_track(arguments: Namespace) -> int:
                 found.append(replay(record, joint, None, tried, watch))
         except InputError as error:
             raise named(error, path, record) from None
+    found = [replace(r, events=(*r.events, *renewed(r, joint))) for r in found]
     results = [made.as_json() for made in found]
     for result in results:
         _print_track(result)

@@ -16,6 +16,7 @@ from identification.balance.dataset import load_dataset, prepared_model
 from identification.data.check.channels import LARGEST
 from identification.data.check.checks import Finding, check, repair
 from identification.data.check.gate import inspected, passed
+from identification.data.check.stamps import MINIMUM_SAMPLES
 from identification.data.joint_file import Joint
 from identification.data.prepare import (
     STANDARD_GRAVITY,
@@ -116,6 +117,11 @@ def run_prefilter(arguments: Namespace) -> int:
         smooth = trimmed(smooth, arguments.trim)
     if arguments.every != 1:
         smooth = decimated(smooth, arguments.every)
+    if len(smooth) < MINIMUM_SAMPLES:
+        raise InputError(
+            f"{arguments.records[0]}: {len(smooth)} samples are left, fewer than the "
+            f"{MINIMUM_SAMPLES} of a record; give a smaller --trim or --every, or record longer"
+        )
     _write_record(Path(arguments.output), smooth)
     for note in smooth.provenance.notes:
         print(note)

@@ -230,8 +230,10 @@ def run_diagnose(arguments: Namespace) -> int:
 def _improved(arguments: Namespace, report: str | None, most: int) -> UserImprovement:
     """The loop on files, its report written where one is wanted."""
     from irj_fmu.imported.improve import improve
+    from workbench.cli.loop import results_beside
 
     distinct(training=arguments.records, held_out=arguments.held_out)
+    beside = results_beside(getattr(arguments, "beside", []))
     model, records, _ = _open(arguments)
     held, _ = _records(arguments.held_out, model)
     found = improve(model, records, held, max_additions=most, progress=progress_bar)
@@ -240,7 +242,6 @@ def _improved(arguments: Namespace, report: str | None, most: int) -> UserImprov
         if text not in said:
             print(f"irj: {text}", file=sys.stderr)
     if report:
-        from workbench.cli.loop import results_beside
         from workbench.show.report import write_report
 
         every = [*records, *held]
@@ -251,7 +252,7 @@ def _improved(arguments: Namespace, report: str | None, most: int) -> UserImprov
             command=arguments.command,
             author=getattr(arguments, "author", None) or "",
             notes=getattr(arguments, "notes", None) or "",
-            beside=results_beside(getattr(arguments, "beside", [])),
+            beside=beside,
         )
         print(f"report: {made}")
     return found

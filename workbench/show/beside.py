@@ -35,6 +35,13 @@ def read_result(path: str | Path) -> dict[str, Any]:
         raise InputError(f"{path}: is no result of `irj improve --json`; give one of those")
     if not data["steps"]:
         raise InputError(f"{path}: no model was fitted in this result; nothing can stand beside it")
+    try:  # a file changed by hand is refused here, by all that a table takes from it
+        beside_html(data, {str(path): data})
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{path}: is no whole result of `irj improve --json` ({type(error).__name__}: "
+            f"{error}); write it again with that command"
+        ) from None
     return data
 
 

@@ -47,9 +47,14 @@ STRONG_CORRELATION: Final = 0.95
 SHOWN_PLACES: Final = 4
 
 
+_UNSEEN: Final = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f]")
+"""Control characters, which HTML has no place for."""
+
+
 def text(value: object) -> str:
-    """Any value as escaped text."""
-    return html.escape(str(value), quote=True)
+    """Any value as escaped text; control characters as Python writes them."""
+    shown = _UNSEEN.sub(lambda found: repr(found[0])[1:-1], str(value))
+    return html.escape(shown, quote=True)
 
 
 def table(

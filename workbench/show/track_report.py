@@ -60,7 +60,7 @@ def _headline(replays: Sequence[Replay]) -> tuple[str, str]:
 def _verdict(replays: Sequence[Replay], notes: Sequence[str]) -> str:
     kind, sentence = _headline(replays)
     items = [
-        f"{e['time']:.3f} s: {e['text']} <span class='note'>({text(r.record.name)})</span>"
+        f"{e['time']:.3f} s: {text(e['text'])} <span class='note'>({text(r.record.name)})</span>"
         for r in replays
         for e in r.events[:12]
     ]

@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 
 from identification import Joint, Record, fit
-from identification.balance.colour import ChannelNoise, Part, white
+from identification.balance.colour import ChannelNoise, Part, _two_shares, white
 from identification.balance.noise import noise_of
 from identification.balance.spikes import without_spikes
 from identification.balance.weak import kernel
@@ -149,3 +149,34 @@ def test_what_a_filter_leaves_of_a_noise_is_what_it_leaves_of_its_draws(
     assert noise.after(weights, DT) == pytest.approx(
         np.std(np.convolve(drawn, weights, "valid")), rel=0.02
     )
+
+
+@pytest.mark.parametrize("stages", [1, 2])
+def test_a_drawn_course_is_white_noise_through_low_passes(stages: int) -> None:
+    from scipy.signal import lfilter
+
+    memory, dt = 7e-3, 1e-3
+    course = Part(1.0, memory, stages).draw(np.random.default_rng(5), COUNT, dt)
+    pole = np.exp(-dt / memory)
+    long = np.random.default_rng(5).standard_normal(COUNT + 70)
+    for _ in range(stages):
+        long = lfilter([1.0], [1.0, -pole], long)
+    kept = long[70:]
+    size = float(course @ kept / (kept @ kept))
+    assert np.abs(course - size * kept).max() < 1e-12
+    assert abs(np.std(course) - 1.0) < 0.1
+
+
+def test_two_shares_are_the_least_squares_that_are_not_negative() -> None:
+    from scipy.optimize import nnls
+
+    rng, borders = np.random.default_rng(6), 0
+    for _ in range(200):
+        columns, power = rng.uniform(0.1, 1.0, (8, 2)), rng.uniform(0.1, 1.0, 8)
+        columns[:, 0] = rng.uniform(1.0, 50.0)
+        shares, left = nnls(columns, power)
+        found, mine = _two_shares(columns, power)
+        assert abs(found - left**2) < 1e-12
+        assert np.abs(shares - mine).max() < 1e-12
+        borders += bool(mine.min() == 0.0)
+    assert 10 < borders < 190, "both kinds were there"

@@ -66,7 +66,7 @@ def test_nothing_is_found_where_nothing_is_hidden(tmp_path: Path) -> None:
     assert any("no torque and no current recorded" in w for w in found.warnings)
     assert bode_of(found.steps[-1].solution.model, found.data, [read(folder / "train.csv")]) is None
     with pytest.raises(InputError, match="record motor_current or motor_torque too"):
-        refuse_clamped(found.data)
+        refuse_clamped(found.data.sensing, found.data.train_names[0])
     values, k = found.steps[-1].solution.values, true["stiffness_Nm_per_rad"]
     # the wind-up by the link's own inertia and weight, each over the stiffness
     assert values["link_inertia"] == pytest.approx(true["link_inertia_kg_m2"] / k, rel=0.01)

@@ -128,6 +128,30 @@ def test_the_parameter_that_moved_is_named_alone(
     assert found.after.relative_error_percent < found.before.relative_error_percent
 
 
+def test_what_could_not_be_seen_is_said_with_its_size(reference: Path) -> None:
+    """Twice the smallest change that could be seen is named, and half of it is not."""
+    still = changed(load_joint(reference), record(14))
+    least, coulomb = still.least["motor_coulomb"], TRUE["motor_coulomb"]
+    assert set(still.unchanged) <= set(still.least)
+    assert 0.0 < least < 0.1 * coulomb
+    more, less = (
+        changed(load_joint(reference), record(14, {"motor_coulomb": coulomb + by}))
+        for by in (2.0 * least, 0.5 * least)
+    )
+    assert [c.parameter for c in more.changes] == ["motor_coulomb"]
+    assert "motor_coulomb" not in more.least
+    assert less.changes == ()
+
+
+def test_an_offset_of_the_drive_is_no_error_of_the_model(reference: Path) -> None:
+    """What the refit leaves for want of an offset of the current is not held against naming it."""
+    given = record(15)
+    drive = given["motor_current"]
+    found = changed(load_joint(reference), given.with_channel("motor_current", drive + 0.3))
+    assert [c.parameter for c in found.changes] == ["current_offset"]
+    assert found.changes[0].after == pytest.approx(-0.3 * PER_AMPERE, rel=0.05)
+
+
 def test_the_gain_of_the_drive_is_one_change_and_not_many(reference: Path) -> None:
     found = changed(load_joint(reference), record(11, gain=0.85))
     assert [c.parameter for c in found.changes] == ["motor_constant_error"]

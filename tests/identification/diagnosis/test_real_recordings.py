@@ -69,13 +69,14 @@ def test_emps_parameters_agree_with_the_published_ones() -> None:
 def quanser() -> Improvement:
     data = np.genfromtxt(SHARED / "quanser_2dsfl" / "ctu_lqr.csv", delimiter=",", names=True)
     degree = np.pi / 180
-    # the strain gauge reads positive where the link lags
+    # the gauge reads positive where the link leads: a positive current, which throws the link
+    # back, makes it negative (r = -0.73)
     record = Record.from_channels(
         data["t_s"],
         {
             "motor_current": data["i1_A"],
             "motor_position": data["q1_deg"] * degree,
-            "link_position": (data["q1_deg"] - data["defl1_deg"]) * degree,
+            "link_position": (data["q1_deg"] + data["defl1_deg"]) * degree,
         },
         name="quanser",
     )
@@ -89,12 +90,11 @@ def quanser() -> Improvement:
 
 def test_quanser_is_elastic_with_coulomb_friction_and_not_explained() -> None:
     found = quanser()
-    named = [c.effects[0] for c in found.claims]
-    assert named[0] == "transmission_compliance"
-    assert "coulomb" in named
+    assert found.claims[0].effects == ("coulomb",)
+    assert any("transmission_compliance" in c.effects for c in found.claims[1:])
     errors = [s.held_out.relative_error_percent for s in found.steps]
     assert 37.0 < errors[0] < 41.0
-    assert errors[-1] <= 12.0, "half of the rows are at rest: scored, they read 18 %"
+    assert errors[-1] <= 8.0, "half of the rows are at rest: scored, they read 18 %"
     assert found.verdict == "unexplained"
 
 

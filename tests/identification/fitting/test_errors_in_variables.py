@@ -3,19 +3,29 @@
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from identification import Joint, Record, fit
+from identification import Joint, Record, fit, load_joint, read
 from identification.balance.dataset import load_dataset, prepared_model
 from identification.balance.drawn_noise import LONGEST
 from identification.balance.excitation import attenuation
+from identification.fitting.covariance import (
+    BLOCK,
+    OVERLAP,
+    block_errors,
+    window_errors,
+    windows_over,
+)
 from identification.fitting.errors_in_variables import (
     MOST_NOISE,
     NoiseProducts,
     whole_without,
 )
+from tests.recorded_world._engine import library
+from tests.recorded_world.world import make_case, write_case
 
 DT, JOINTS = 2e-3, 40
 NAMES = ("link_inertia", "link_viscous", "gravity_torque")
@@ -95,10 +105,40 @@ def test_only_certain_noise_is_taken_off_a_normal_matrix() -> None:
     assert left == pytest.approx([1 - MOST_NOISE] * 2)
 
 
-def test_noise_falls_on_the_blocks_whose_rows_take_part() -> None:
+def test_noise_falls_on_the_windows_whose_rows_take_part() -> None:
     products = NoiseProducts({"link": np.eye(2)}, {"link": np.ones(2)})
-    block = np.array([0, 0, 1, 1, -1])
+    windows = np.array([[1.0, 1.0, 0.4, 0.0, 0.0], [0.0, 0.0, 1.0, 1.0, 0.5]])
     weights = {"link": np.array([1.0, 1.0, 1.0, 50.0, 1.0])}
-    gram, score = products.by_block(weights, block, {"link": np.array([1, 1, 1, 0, 1]) > 0})
+    gram, score = products.by_window(weights, windows, {"link": np.array([1, 1, 1, 0, 1]) > 0})
     assert gram[:, 0, 0] == pytest.approx([0.5, 0.25])
-    assert score[:, 1] == pytest.approx([0.5, 0.25])
+    assert score[:, 1] == pytest.approx([0.6, 0.375])
+
+
+def test_noise_without_a_slow_part_is_no_error_of_a_slow_parameter() -> None:
+    """Differences of white noise add up to next to nothing against a constant; white noise to what
+    white noise adds up to."""
+    rng, dt = np.random.default_rng(4), 0.02
+    time = np.arange(4000) * dt
+    windows = windows_over([time[:2000], time[2000:]])
+    np.testing.assert_allclose(np.sum(windows**2, axis=0), 1.0)
+    assert len(windows) < 1.1 * OVERLAP * 80 / (2 * BLOCK) + 2 * OVERLAP
+    columns = np.column_stack([np.ones(4000), np.sin(time)])
+    white = rng.standard_normal(4000)
+    for noise, known in ((white, 4000**-0.5), (np.diff(white, prepend=0.0), 0.0)):
+        left = noise - columns @ np.linalg.lstsq(columns, noise, rcond=None)[0]
+        errors = window_errors(columns, left, windows)
+        assert errors is not None
+        assert abs(errors[0] - known) < 0.35 * 4000**-0.5
+    blocks = block_errors(columns, left, (time // BLOCK).astype(np.int64))
+    assert blocks is not None
+    assert errors[0] < 0.3 * blocks[0]
+
+
+@pytest.mark.skipif(library() is None, reason="no C compiler")
+def test_a_gap_as_small_as_the_encoders_tell_stays_where_the_fit_put_it(tmp_path: Path) -> None:
+    """The correction of first order had led to a stiffness of 2e7 N.m/rad inside a gap of 0."""
+    folder = write_case(make_case(8812, without=("zero",)), tmp_path, "all")
+    joint = load_joint(folder / "joint.toml")
+    found = fit(joint, read(folder / "train.csv", joint=joint))
+    assert found.train.relative_error_percent < 1.0
+    assert 0 < found.solution.values["backlash_stiffness_loss"] < 300.0
