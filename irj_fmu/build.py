@@ -38,14 +38,22 @@ _TRY: Final = (
     "and systems need one: run `pip install ziglang`, or install gcc and pass --cc gcc"
 )
 _SMOKE: Final = """
-import sys
-from fmpy import read_model_description, simulate_fmu
+import os, sys, tempfile
+from fmpy import extract, instantiate_fmu, read_model_description, simulate_fmu
 import numpy as np
 path, step, count = sys.argv[1], float(sys.argv[2]), int(sys.argv[3])
-names = [v.name for v in read_model_description(path).modelVariables if v.causality == "output"]
+described = read_model_description(path)
+names = [v.name for v in described.modelVariables if v.causality == "output"]
+folder = tempfile.mkdtemp(dir=".")
+extract(path, folder)
+made = instantiate_fmu(os.path.abspath(folder), described, "CoSimulation")
 found = simulate_fmu(path, stop_time=step * count, output_interval=step, step_size=step,
-                     output=names,
-                     fmi_type="CoSimulation")
+                     output=names, fmi_type="CoSimulation", fmu_instance=made,
+                     model_description=described)
+getattr(made, f"fmi{described.fmiVersion[0]}FreeInstance")(made.component)
+# the library of pythonfmu releases its interpreter once more at exit unless this was called
+getattr(made.dll, "finalizePythonInterpreter", int)()
+made.freeLibrary()
 if len(found) != count + 1:
     sys.exit(f"{len(found)} of {count + 1} steps")
 for name in names:
@@ -83,6 +91,8 @@ class Request:
         file says, or of the healthy records.
     say : callable
         Called with one sentence per doubt about a record.
+    fmi : {2, 3}
+        Version of FMI, of plants and native estimators.
     """
 
     joint: Joint
@@ -97,6 +107,7 @@ class Request:
     has_torque: bool = True
     sample_time: float | None = None
     say: Callable[[str], object] = lambda _text: None
+    fmi: int = 2
 
 
 def build(
@@ -245,6 +256,7 @@ def _controlled(request: Request, folder: Path) -> list[tuple[Path, str]]:
 def _one_plant(
     request: Request, folder: Path, name: str, *, controller: bool, sensors: bool
 ) -> tuple[Path, str]:
+    from irj_fmu.plant.fmi3 import build_plant_fmi3
     from irj_fmu.plant.joint import PlantOptions, plant_spec
     from irj_fmu.plant.library import build_plant
     from irj_fmu.plant.reference import Motion
@@ -255,18 +267,20 @@ def _one_plant(
         request.joint,
         PlantOptions(controller=controller, motion=motion, sensors=sensors, name=name),
     )
-    path = build_plant(spec, folder / f"{name}.fmu", cc=request.cc, target=targets)
+    maker = {2: build_plant, 3: build_plant_fmi3}[request.fmi]
+    path = maker(spec, folder / f"{name}.fmu", cc=request.cc, target=targets)
     kinds = "co-simulation" if spec.memory else "model exchange and co-simulation"
     return (
         path,
-        f"FMI 2.0 {kinds}, {len(spec.states) + len(spec.memory)} states, {len(spec.parameters)} "
-        "parameters",
+        f"FMI {request.fmi}.0 {kinds}, {len(spec.states) + len(spec.memory)} states, "
+        f"{len(spec.parameters)} parameters",
     )
 
 
 def _estimator(request: Request, folder: Path) -> list[tuple[Path, str]]:
     from identification.online.estimator import OnlineOptions, prepared
     from irj_fmu.estimator.healthy import detector_state
+    from irj_fmu.estimator.notes import estimator_notes
     from irj_fmu.estimator.packed import options_text
     from irj_fmu.estimator.slave import DETECTOR_FILE, JOINT_FILE, OPTIONS_FILE
     from irj_fmu.fmi.package import SlaveSpec, package_slave
@@ -290,6 +304,7 @@ def _estimator(request: Request, folder: Path) -> list[tuple[Path, str]]:
         tuple(_package(p) for p in ("casadi_models", "identification", "irj_fmu")),
         files,
         effects=files_of(request.joint.effects),
+        notes=estimator_notes(request.joint, options),
     )
     packaged = package_slave(spec, folder / f"{name}.fmu", cc=request.cc)
     return [(packaged.path, f"FMI 2.0 co-simulation; {packaged.message}")]
@@ -313,6 +328,7 @@ def _native(request: Request, folder: Path) -> list[tuple[Path, str]]:
     from identification.online.estimator import OnlineOptions
     from irj_fmu.estimator.healthy import detector_state
     from irj_fmu.estimator.native import NativeSpec, build_native
+    from irj_fmu.estimator.native_fmi3 import build_native_fmi3
 
     targets = _compiler(request)
     name = f"{_base(request)}_native"
@@ -320,8 +336,9 @@ def _native(request: Request, folder: Path) -> list[tuple[Path, str]]:
     healthy, step = _healthy(request)
     state = detector_state(request.joint, options, healthy, step, request.say)
     spec = NativeSpec(request.joint, name, options, state, step)
-    path = build_native(spec, folder / f"{name}.fmu", cc=request.cc, target=targets)
-    return [(path, f"FMI 2.0 co-simulation without Python, sample time {step:g} s")]
+    maker = {2: build_native, 3: build_native_fmi3}[request.fmi]
+    path = maker(spec, folder / f"{name}.fmu", cc=request.cc, target=targets)
+    return [(path, f"FMI {request.fmi}.0 co-simulation without Python, sample time {step:g} s")]
 
 
 def _ssp(request: Request, folder: Path) -> list[tuple[Path, str]]:
@@ -404,9 +421,9 @@ def _step(path: Path) -> str:
 
 
 def _runs_here(path: Path) -> bool:
-    from fmpy import platform, supported_platforms
+    from fmpy import platform, platform_tuple, supported_platforms
 
-    return platform in supported_platforms(str(path))
+    return not {platform, platform_tuple}.isdisjoint(supported_platforms(str(path)))
 
 
 def _run(path: Path, command: Sequence[str]) -> None:
@@ -450,6 +467,9 @@ def parser(prog: str = "build_fmu.py") -> OneLineParser:
         help="native: time between two samples, built in (default: that of the records of the fit)",
     )
     made.add_argument(
+        "--fmi", type=int, choices=(2, 3), help="plant, native: version of FMI (default: 2)"
+    )
+    made.add_argument(
         "--controller", action="store_true", help="plant: drive it by a position controller"
     )
     made.add_argument(
@@ -479,6 +499,7 @@ def parser(prog: str = "build_fmu.py") -> OneLineParser:
 
 _OF: Final = {  # options that only some kinds heed
     "sample_time": ("native", "all"),
+    "fmi": ("plant", "native"),
     "controller": ("plant", "all"),
     "sensors": ("plant", "ssp", "all"),
     "healthy": ("estimator", "native", "ssp", "all"),
@@ -517,6 +538,7 @@ def _request(given: argparse.Namespace) -> Request:
         has_torque=not given.no_torque,
         sample_time=given.sample_time,
         say=lambda text: sys.stderr.write(f"irj: {text}\n"),
+        fmi=given.fmi or 2,
     )
     if given.json is not None:
         made = [request.out / name for name in _names(given.kind, _base(request))]

@@ -1,4 +1,4 @@
-/* The same as fmu_hostile.c for FMI 3.0 model exchange: fmu_hostile3 LIBRARY TOKEN REAL_VR STATES */
+/* The same as fmu_hostile.c for FMI 3.0, model exchange and co-simulation: fmu_hostile3 LIBRARY TOKEN REAL_VR STATES */
 #include <dlfcn.h>
 #include <math.h>
 #include <stdio.h>
@@ -87,6 +87,30 @@ static void run(fmi3Instance c, size_t n) {
     check("finite derivatives", isfinite(dx[0]));
 }
 
+static void run_steps(const char *token, size_t n) {
+    fmi3Float64 x[64] = {0}, last = -1;
+    fmi3Boolean flag[5];
+    fmi3Instance c = fInstantiateCoSimulation("a", token, NULL, 0, 0, 0, 0, NULL, 0, NULL, logger, NULL);
+    check("instantiate for co-simulation", c != NULL);
+    if (!c) return;
+    REFUSED(fDoStep(c, 0, 1e-3, 1, flag, flag + 1, flag + 2, &last));
+    REFUSED(fEnterInitializationMode(c, 1, -1, 0, 0, 0));
+    FINE(fEnterInitializationMode(c, 1, 1e-6, 0, 0, 0));
+    FINE(fExitInitializationMode(c));
+    REFUSED(fEnterContinuousTimeMode(c));
+    REFUSED(fEnterEventMode(c));
+    REFUSED(fSetContinuousStates(c, x, n));
+    REFUSED(fDoStep(c, 0, 1e-3, 1, NULL, NULL, NULL, NULL));
+    REFUSED(fDoStep(c, 0, -1, 1, flag, flag + 1, flag + 2, &last));
+    REFUSED(fDoStep(c, 0, NAN, 1, flag, flag + 1, flag + 2, &last));
+    FINE(fDoStep(c, 0, 1e-3, 1, flag, flag + 1, flag + 2, &last));
+    check("the time of the step", fabs(last - 1e-3) < 1e-12);
+    FINE(fTerminate(c));
+    REFUSED(fDoStep(c, 1e-3, 1e-3, 1, flag, flag + 1, flag + 2, &last));
+    FINE(fReset(c));
+    fFreeInstance(c);
+}
+
 int main(int argc, char **argv) {
     const char *token = argv[2];
     fmi3ValueReference vr = (unsigned)atoi(argv[3]), none = 4000000;
@@ -105,7 +129,8 @@ int main(int argc, char **argv) {
     FUNCTIONS(GET)
     NONE(fInstantiateModelExchange("a", "{wrong}", NULL, 0, 0, NULL, logger));
     NONE(fInstantiateModelExchange("a", NULL, NULL, 0, 0, NULL, logger));
-    NONE(fInstantiateCoSimulation("a", token, NULL, 0, 0, 0, 0, NULL, 0, NULL, logger, NULL));
+    NONE(fInstantiateCoSimulation("a", "{wrong}", NULL, 0, 0, 0, 0, NULL, 0, NULL, logger, NULL));
+    NONE(fInstantiateCoSimulation("a", token, NULL, 0, 0, 1, 0, NULL, 0, NULL, logger, NULL));
     NONE(fInstantiateScheduledExecution("a", token, NULL, 0, 0, NULL, logger, NULL, NULL, NULL));
     check("no logger", !fInstantiateModelExchange(NULL, NULL, NULL, 0, 0, NULL, NULL));
 
@@ -165,6 +190,7 @@ int main(int argc, char **argv) {
     REFUSED(fEnterEventMode(c));
     FINE(fReset(c));
     run(c, n);
+    run_steps(token, n);
     on_stranger(NULL);
     on_stranger(garbage);
     fFreeInstance(garbage);

@@ -357,7 +357,7 @@ def parsers() -> list[tuple[str, OneLineParser]]:
         "export": [
             ("irj export [KIND]", build_parser("irj export")),
             ("irj export c, irj export casadi", code_parser("irj export")),
-            ("irj export pair, irj export ssp (an FMU as the model)", export_parser()),
+            ("irj export corrected, pair or ssp (an FMU as the model)", export_parser()),
         ],
         "cosim": [("irj cosim", cosim_parser())],
         "batch": [("irj batch", batch_run.parser())],

@@ -357,9 +357,8 @@ class WeakRecord:
     def _sparse(self, order: int) -> Any:
         grid = self.grid
         half, stride = grid.half // grid.step, grid.stride // grid.step
-        return _averages(
-            grid.length, grid.dt * grid.step, order, half, stride, tuple(self.starts.tolist())
-        )
+        kernel_of = (grid.length, grid.dt, order, grid.step)
+        return _averages(kernel_of, half, stride, tuple(self.starts.tolist()))
 
     @property
     def rows(self) -> int:
@@ -368,17 +367,17 @@ class WeakRecord:
 
 
 def _averages(
-    length: float, dt: float, order: int, half: int, stride: int, starts: tuple[int, ...]
+    kernel_of: tuple[float, float, int, int], half: int, stride: int, starts: tuple[int, ...]
 ) -> Any:
     """Matrix (rows, points) of the kernel averages; one for all records of the same grid, as long
     as one of them lives: a record is made again for each shift of its clocks that is tried.
     """
-    key = (length, dt, order, half, stride, starts)
+    key = (kernel_of, half, stride, starts)
     found = _matrices.get(key)
     if found is None:
         from scipy.sparse import csr_array
 
-        weights = differentiated_kernel(length, dt, order)
+        weights = differentiated_kernel(*kernel_of)
         own = len(weights) // 2
         centres = np.concatenate(
             [

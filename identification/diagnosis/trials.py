@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Final, final
+from typing import Any, Final, final
 
 import numpy as np
 import numpy.typing as npt
@@ -517,9 +517,8 @@ def _score(
     size = np.where(size > 0, size, 1.0)
     added = raw * base.weight[:, None] / size
     grams = _bordered(base, added[base.order])
-    numbers = base.numbers
     total = grams.sum(axis=(0, 1))
-    sse0, sse1 = base.crossed, np.zeros(base.crossed.shape)
+    sse1 = np.zeros(base.crossed.shape)
     for test in base.held_out_folds():
         train = total - grams[test].sum(axis=(0, 1)) if base.folds > 1 else total
         more = signed_fit(train[:-1, :-1], -train[:-1, -1], lows, p, total[:-1, :-1])
@@ -528,6 +527,25 @@ def _score(
     amplitude = delta[own:] / size
     if not np.any(amplitude):
         return None
+    told = _told(base, sse1)
+    where = base.balances.index(told["balance"])
+    held = _held_out_drop(
+        candidate, base, balances=balances, shapes=shapes, delta=delta, size=size, where=where
+    )
+    return Trial(
+        candidate,
+        {**shapes, **dict(zip(candidate.amplitudes, map(float, amplitude), strict=True))},
+        held_out_drop_percent=held,
+        p_value=_wald(added, base, delta),
+        outside=inside,
+        contribution=float(np.sqrt(np.mean((raw[base.balance == where] @ amplitude) ** 2))),
+        **told,
+    )
+
+
+def _told(base: Base, sse1: FloatArray) -> dict[str, Any]:
+    """What a trial says by the sum of squares that it leaves of each block and balance."""
+    sse0, numbers = base.crossed, base.numbers
     per_balance0, per_balance1 = sse0.sum(axis=0), sse1.sum(axis=0)
     rows_in = np.maximum(numbers.sum(axis=0), 1)
     effective = rows_in * base.share
@@ -540,24 +558,14 @@ def _score(
         )
     )
     variance = np.maximum(per_balance1 / rows_in, 1e-300)
-    block_score = ((sse0 - sse1) / (2 * variance) * base.share).sum(axis=1)
-    held = _held_out_drop(
-        candidate, base, balances=balances, shapes=shapes, delta=delta, size=size, where=where
-    )
     drop = 100 * (1 - math.sqrt(per_balance1[where] / max(per_balance0[where], 1e-300)))
-    return Trial(
-        candidate,
-        {**shapes, **dict(zip(candidate.amplitudes, map(float, amplitude), strict=True))},
-        balance=base.balances[where],
-        gain=float(gains.sum()),
-        cv_drop_percent=drop,
-        held_out_drop_percent=held,
-        p_value=_wald(added, base, delta),
-        block_score=block_score,
-        rms=np.sqrt(per_balance1 / rows_in),
-        outside=inside,
-        contribution=float(np.sqrt(np.mean((raw[base.balance == where] @ amplitude) ** 2))),
-        score=float(
+    return {
+        "balance": base.balances[where],
+        "gain": float(gains.sum()),
+        "cv_drop_percent": drop,
+        "block_score": ((sse0 - sse1) / (2 * variance) * base.share).sum(axis=1),
+        "rms": np.sqrt(per_balance1 / rows_in),
+        "score": float(
             np.sum(
                 KERNEL_SHARE
                 * rows_in
@@ -565,7 +573,43 @@ def _score(
                 * np.log(np.maximum(per_balance0, 1e-300) / np.maximum(per_balance1, 1e-300))
             )
         ),
-    )
+    }
+
+
+def by_whole_fit(
+    trial: Trial,
+    base: Base,
+    values: Mapping[str, float],
+    *,
+    left: FloatArray,
+    held_left: FloatArray,
+) -> Trial:
+    """A trial as its whole fit has it, in place of the linear one.
+
+    Parameters
+    ----------
+    trial : Trial
+    base : Base
+        What it was tried on.
+    values : mapping
+        Of the whole fit.
+    left, held_left : (rows,) array
+        What the whole fit leaves of the rows of the base, unweighted.
+    """
+    rows, used = left * base.weight, base.block >= 0
+    sse = np.zeros(base.crossed.shape)
+    np.add.at(sse, (base.block[used], base.balance[used]), rows[used] ** 2)
+    told = _told(base, sse)
+    held = math.nan
+    if len(held_left):
+        here = base.held_balance == base.balances.index(told["balance"])
+        before, after = (
+            (x - base.held_own @ (base.held_own.T @ x))[here]
+            for x in (base.held_residual, held_left * base.held_weight)
+        )
+        held = 100 * (1 - math.sqrt(float(after @ after) / max(float(before @ before), 1e-300)))
+    own = {n: float(values[n]) for n in trial.values}
+    return replace(trial, values=own, held_out_drop_percent=held, **told)
 
 
 def _bordered(base: Base, added: FloatArray) -> FloatArray:

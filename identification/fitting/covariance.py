@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -108,7 +108,7 @@ def wald(gram: FloatArray, scores: FloatArray, amplitudes: FloatArray) -> float:
     return float(fdtrc(count, blocks - count, statistic))
 
 
-def windows_over(times: Sequence[FloatArray]) -> FloatArray:
+def windows_over(times: Sequence[FloatArray]) -> Any:
     """Weight of each row in each of the windows over which its noise is summed up.
 
     Noise of an acceleration has no slow part: over a block of time with sharp ends it adds up to
@@ -122,29 +122,31 @@ def windows_over(times: Sequence[FloatArray]) -> FloatArray:
 
     Returns
     -------
-    (windows, rows) array
+    (windows, rows) sparse array
         Squares add up to 1 for each row.
     """
+    from scipy.sparse import block_diag, csr_array
+
     width = 2 * BLOCK
     step = width / OVERLAP
     parts = []
     for time in times:
-        centre = np.arange(time[0] - width / 2 + step / 2, time[-1] + width / 2, step)
-        away = (time[None, :] - centre[:, None]) / width
-        parts.append(np.where(np.abs(away) < 0.5, np.cos(np.pi * away) ** 2, 0.0))
-    out = np.zeros((sum(len(p) for p in parts), sum(p.shape[1] for p in parts)))
-    row = first = 0
-    for part in parts:
-        out[row : row + len(part), first : first + part.shape[1]] = part
-        row, first = row + len(part), first + part.shape[1]
-    size = np.sqrt(np.sum(out**2, axis=0))
-    return np.asarray(out / np.where(size > 0, size, 1.0), dtype=np.float64)
+        since = (time - time[0]) / step
+        newest = np.floor(since).astype(np.int64)
+        number = newest[:, None] + np.arange(OVERLAP)
+        into = since[:, None] - number + (OVERLAP - 1)  # of a window, in its steps
+        weight = np.sin(np.pi * into / OVERLAP) ** 2
+        weight /= np.linalg.norm(weight, axis=1)[:, None]
+        rows = np.repeat(np.arange(len(time)), OVERLAP)
+        shape = (int(number.max()) + 1, len(time))
+        parts.append(csr_array((weight.ravel(), (number.ravel(), rows)), shape=shape))
+    return csr_array(block_diag(parts))
 
 
 def window_errors(
     jacobian: FloatArray,
     residual: FloatArray,
-    windows: FloatArray,
+    windows: Any,
     noise: tuple[FloatArray, FloatArray] | None = None,
     whole: FloatArray | None = None,
 ) -> FloatArray | None:
@@ -156,7 +158,7 @@ def window_errors(
         Weighted, in any scale of its columns.
     residual : (n,) array
         Weighted, at the fit.
-    windows : (windows, n) array
+    windows : (windows, n) sparse array
         Of :func:`windows_over`; rows of zeros take part in the fit only.
     noise : ((windows, p, p) array, (windows, p) array), optional
         What noise of the columns adds to the products of the columns in the core of each window,
@@ -165,20 +167,24 @@ def window_errors(
         Normal matrix of all rows, that of the noise taken off.
     """
     scores = windows @ (jacobian * residual[:, None])
-    grams = np.array([jacobian[rows].T @ jacobian[rows] for rows in cores(windows)])
+    core = cores(windows)
+    parts = np.split(core.indices, core.indptr[1:-1])
+    grams = np.array([jacobian[rows].T @ jacobian[rows] for rows in parts])
     if noise is not None:
         grams, scores = grams - noise[0], scores - noise[1]
     alike = windows @ windows.T
-    count = float(np.trace(alike)) ** 2 / max(float(np.sum(alike**2)), 1e-300)
+    count = float(alike.trace()) ** 2 / max(float(np.sum(alike.data**2)), 1e-300)
     total = jacobian.T @ jacobian if whole is None else whole
     return errors_of_blocks(grams, scores, total, count=count)
 
 
-def cores(windows: FloatArray) -> npt.NDArray[np.bool_]:
-    """Rows that are left out with each window, (windows, rows): those in its middle half, which
-    hold as much of the information as the whole window by its weights.
+def cores(windows: Any) -> Any:
+    """Rows that are left out with each window, (windows, rows) sparse, 1 or nothing: those in its
+    middle half, which hold as much of the information as the whole window by its weights.
     """
-    return np.asarray(windows > 0.5 * np.max(windows, initial=0.0), dtype=np.bool_)
+    from scipy.sparse import csr_array
+
+    return csr_array(windows > 0.5 * windows.max()).astype(np.float64)
 
 
 def block_errors(

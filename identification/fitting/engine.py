@@ -494,6 +494,8 @@ def _with_errors(
     """Standard errors from blocks of time, without what noise adds to the columns; what cannot be
     identified is said.
     """
+    from scipy.sparse import csr_array, hstack
+
     balances, values, free = problem.balances, problem.values, problem.free
     weights = {b: np.asarray(w, dtype=np.float64) for b, w in problem.weights.items()}
     stacked = problem.stacked(np.array([values[n] for n in free]))
@@ -508,7 +510,8 @@ def _with_errors(
     )
     windows = windows_over([w.time for w in problem.data.train])
     # what is known beforehand belongs to no window of time: it scatters by itself
-    tiled = np.hstack([*[windows] * len(balances.balances), np.zeros((len(windows), len(prior)))])
+    empty = csr_array((windows.shape[0], len(prior)))
+    tiled = csr_array(hstack([*[windows] * len(balances.balances), empty]))
     norms = np.linalg.norm(j, axis=0)
     smoothing = balances.model.named("smoothing")
     at_bound = _at_bound(balances.model, values, free, limits)

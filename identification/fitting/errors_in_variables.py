@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final, final
+from typing import Any, Final, final
 
 import numpy as np
 import numpy.typing as npt
@@ -62,7 +62,7 @@ class NoiseProducts:
     def by_window(
         self,
         weights: Mapping[str, FloatArray],
-        windows: FloatArray,
+        windows: Any,
         taking: Mapping[str, npt.NDArray[np.bool_]],
     ) -> tuple[FloatArray, FloatArray]:
         """What falls to the core of each window of the first, (windows, p, p), and to the window of
@@ -71,7 +71,7 @@ class NoiseProducts:
         Parameters
         ----------
         weights : mapping of str to (rows,) array
-        windows : (windows, rows) array
+        windows : (windows, rows) sparse array
             Of :func:`identification.fitting.covariance.windows_over`.
         taking : mapping of str to (rows,) bool array
         """

@@ -1,7 +1,8 @@
-/* What both FMI 2.0 wrappers answer alike, included by them.
+/* What the FMI 2.0 wrappers answer alike, included by them.
  *
  * Before it stand: Instance with State s (which begins with the GUID), name and logging; GUID; fail(instance, format, ...);
- * restored(instance), called when another state was put into it.
+ * restored(instance), called when another state was put into it. A wrapper round another FMU, which passes calls on,
+ * defines PASSES_ON and answers those of the life cycle and of the FMU state itself.
  */
 
 #include "living.c"
@@ -37,6 +38,7 @@ static void discard(Instance *m) {
     free(m);
 }
 
+#ifndef PASSES_ON
 void fmi2FreeInstance(fmi2Component c) {
     if (!c) return;
     if (dies(&instances, c)) discard(c);
@@ -125,6 +127,8 @@ fmi2Status fmi2DeSerializeFMUstate(fmi2Component c, const fmi2Byte bytes[], size
     memcpy(*state, bytes, sizeof(State));
     return fmi2OK;
 }
+
+#endif
 
 /* ---- co-simulation -------------------------------------------------------- */
 

@@ -1,15 +1,15 @@
-/* FMI 3.0 wrapper, model exchange, round a plant in generated C.
+/* FMI 3.0 wrapper, model exchange and co-simulation, round a plant in generated C.
  *
- * plant_config.h and plant_model.c are those of plant_wrapper.c. Value references run x, dx, u, p, y without gaps;
- * the time comes last. A plant with memory has no FMI 3.0 form.
+ * plant_config.h and plant_model.c are those of plant_wrapper.c. Value references run x, dx, u, p, y, z without gaps;
+ * the time comes last. A plant with memory z runs in co-simulation only.
  */
+#include <math.h>
 #include <stdarg.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
 #include "fmi3Functions.h"
-#include "living.c"
 #include "plant_config.h"
 
 #define CASADI_SYMBOL_EXPORT static
@@ -17,33 +17,33 @@
 
 #define DIM(n) ((n) > 0 ? (n) : 1)
 
-enum { VR_DX = NX, VR_U = 2 * NX, VR_P = VR_U + NU, VR_Y = VR_P + NP, VR_TIME = VR_Y + NY };
+enum { VR_DX = NX, VR_U = 2 * NX, VR_P = VR_U + NU, VR_Y = VR_P + NP, VR_Z = VR_Y + NY, VR_TIME = VR_Z + NZ };
 
-typedef enum { INSTANTIATED = 1, INITIALIZING, EVENTS, CONTINUOUS, TERMINATED } Phase;
+typedef enum { INSTANTIATED = 1, INITIALIZING, EVENTS, CONTINUOUS, STEPPING, TERMINATED } Phase;
+
+#define MAX_SUBSTEPS 2000000L
 
 typedef struct { /* everything that changes; one copy of it is one FMU state */
     char token[40];
     Phase phase;
-    double t, x[DIM(NX)], u[DIM(NU)], p[DIM(NP)];
+    int steps; /* an instance for co-simulation */
+    double t, step, rtol, x[DIM(NX)], u[DIM(NU)], p[DIM(NP)], z[DIM(NZ)];
 } State;
 
 typedef struct {
     State s;
     fmi3InstanceEnvironment environment;
     fmi3LogMessageCallback log;
-    int fresh;
+    int f_is_fresh, y_is_fresh;
     double dx[DIM(NX)], y[DIM(NY)];
     const double *arg[SZ_ARG];
     double *res[SZ_RES];
     double w[DIM(SZ_W)];
     casadi_int iw[DIM(SZ_IW)];
+    double k[7][DIM(NX)], x_new[DIM(NX)], x_stage[DIM(NX)], z_stage[DIM(NZ)], z_new[DIM(NZ)];
 } Plant;
 
-typedef const fmi3ValueReference *References;
-typedef int (*Generated)(const casadi_real **, casadi_real **, casadi_int *, casadi_real *, int);
 
-#define LIVING(call) do { if (!is_alive(&instances, c)) { tell_stranger(call); return fmi3Error; } } while (0)
-#define GIVEN(condition, call) do { if (!(condition)) return fail(c, "%s: a pointer is NULL", call); } while (0)
 
 static fmi3Status fail(Plant *m, const char *format, ...) {
     char text[256];
@@ -56,40 +56,45 @@ static fmi3Status fail(Plant *m, const char *format, ...) {
 }
 
 static void restart(State *s) {
+    const int steps = s->steps;
     memset(s, 0, sizeof *s);
+    s->steps = steps;
+    s->rtol = DEFAULT_TOLERANCE;
     memcpy(s->token, PLANT_GUID, strlen(PLANT_GUID));
     s->phase = INSTANTIATED;
     memcpy(s->x, start_x, sizeof s->x);
     memcpy(s->u, start_u, sizeof s->u);
     memcpy(s->p, start_p, sizeof s->p);
+    memcpy(s->z, start_z, sizeof s->z);
 }
 
-static void evaluate(Plant *m, Generated f, double *out) {
-    m->arg[0] = m->s.x; m->arg[1] = m->s.u; m->arg[2] = m->s.p; m->arg[3] = NULL;
-    m->res[0] = out;
-    f(m->arg, m->res, m->iw, m->w, 0);
-}
+static void stale(Plant *m) { m->f_is_fresh = m->y_is_fresh = 0; }
 
-static void refresh(Plant *m) {
-    if (m->fresh) return;
-    evaluate(m, model_f, m->dx);
-    evaluate(m, model_y, m->y);
-    m->fresh = 1;
-}
+typedef Plant Instance;
+#define TOKEN PLANT_GUID
+static void restored(Plant *m) { stale(m); }
+static void discard(Plant *m) { free(m); }
+#include "fmi3_common.c"
+
+typedef fmi3Status Status;
+#define OK fmi3OK
+#include "plant_integrator.c"
 
 /* ---- life cycle ----------------------------------------------------------- */
 
-const char *fmi3GetVersion(void) { return fmi3Version; }
-
-fmi3Instance fmi3InstantiateModelExchange(fmi3String name, fmi3String token, fmi3String resources, fmi3Boolean visible, fmi3Boolean logging,
-                                          fmi3InstanceEnvironment environment, fmi3LogMessageCallback log) {
+static Plant *instance(int steps, fmi3String token, fmi3InstanceEnvironment environment, fmi3LogMessageCallback log) {
     Plant *m = calloc(1, sizeof *m);
-    (void)name; (void)resources; (void)visible; (void)logging;
     if (!m) return NULL;
+    m->s.steps = steps;
     m->environment = environment;
     m->log = log;
     if (!token || strcmp(token, PLANT_GUID) != 0) {
         fail(m, "instantiate: the token is not that of this library");
+        free(m);
+        return NULL;
+    }
+    if (!steps && NZ > 0) {
+        fail(m, "instantiate: this plant has memory and runs in co-simulation only");
         free(m);
         return NULL;
     }
@@ -99,26 +104,22 @@ fmi3Instance fmi3InstantiateModelExchange(fmi3String name, fmi3String token, fmi
     return NULL;
 }
 
+fmi3Instance fmi3InstantiateModelExchange(fmi3String name, fmi3String token, fmi3String resources, fmi3Boolean visible, fmi3Boolean logging,
+                                          fmi3InstanceEnvironment environment, fmi3LogMessageCallback log) {
+    (void)name; (void)resources; (void)visible; (void)logging;
+    return instance(0, token, environment, log);
+}
+
 fmi3Instance fmi3InstantiateCoSimulation(fmi3String name, fmi3String token, fmi3String resources, fmi3Boolean visible, fmi3Boolean logging,
                                          fmi3Boolean events, fmi3Boolean early, const fmi3ValueReference required[], size_t n,
                                          fmi3InstanceEnvironment environment, fmi3LogMessageCallback log, fmi3IntermediateUpdateCallback update) {
-    if (log) log(environment, fmi3Error, "logStatusError", "instantiate: this FMU is for model exchange");
-    return NULL;
+    (void)name; (void)resources; (void)visible; (void)logging; (void)early; (void)required; (void)n; (void)update;
+    if (events) {
+        if (log) log(environment, fmi3Error, "logStatusError", "instantiate: this FMU has no event mode in co-simulation");
+        return NULL;
+    }
+    return instance(1, token, environment, log);
 }
-
-fmi3Instance fmi3InstantiateScheduledExecution(fmi3String name, fmi3String token, fmi3String resources, fmi3Boolean visible, fmi3Boolean logging,
-                                               fmi3InstanceEnvironment environment, fmi3LogMessageCallback log, fmi3ClockUpdateCallback clock,
-                                               fmi3LockPreemptionCallback lock, fmi3UnlockPreemptionCallback unlock) {
-    if (log) log(environment, fmi3Error, "logStatusError", "instantiate: this FMU is for model exchange");
-    return NULL;
-}
-
-void fmi3FreeInstance(fmi3Instance c) {
-    if (!c) return;
-    if (dies(&instances, c)) free(c);
-    else tell_stranger("fmi3FreeInstance");
-}
-fmi3Status fmi3SetDebugLogging(fmi3Instance c, fmi3Boolean on, size_t n, const fmi3String categories[]) { LIVING("fmi3SetDebugLogging"); return fmi3OK; }
 
 /* between initialization and termination */
 #define EXCHANGING(call) do { \
@@ -134,17 +135,27 @@ static fmi3Status change(Plant *m, Phase from, Phase to, const char *name) {
 
 fmi3Status fmi3EnterInitializationMode(fmi3Instance c, fmi3Boolean has_tolerance, fmi3Float64 tolerance, fmi3Float64 start, fmi3Boolean has_stop, fmi3Float64 stop) {
     LIVING("fmi3EnterInitializationMode");
+    if (has_tolerance && !(tolerance > 0 && tolerance < 1)) return fail(c, "enterInitializationMode: tolerance %g is not between 0 and 1", tolerance);
+    if (has_tolerance) ((Plant *)c)->s.rtol = fmax(tolerance, 1e-13);
     ((Plant *)c)->s.t = start;
     return change(c, INSTANTIATED, INITIALIZING, "enterInitializationMode");
 }
-fmi3Status fmi3ExitInitializationMode(fmi3Instance c) { LIVING("fmi3ExitInitializationMode"); return change(c, INITIALIZING, EVENTS, "exitInitializationMode"); }
+fmi3Status fmi3ExitInitializationMode(fmi3Instance c) {
+    LIVING("fmi3ExitInitializationMode");
+    return change(c, INITIALIZING, ((Plant *)c)->s.steps ? STEPPING : EVENTS, "exitInitializationMode");
+}
 fmi3Status fmi3EnterEventMode(fmi3Instance c) { EXCHANGING("fmi3EnterEventMode"); ((Plant *)c)->s.phase = EVENTS; return fmi3OK; }
 fmi3Status fmi3EnterContinuousTimeMode(fmi3Instance c) { EXCHANGING("fmi3EnterContinuousTimeMode"); ((Plant *)c)->s.phase = CONTINUOUS; return fmi3OK; }
-fmi3Status fmi3Terminate(fmi3Instance c) { EXCHANGING("fmi3Terminate"); ((Plant *)c)->s.phase = TERMINATED; return fmi3OK; }
+fmi3Status fmi3Terminate(fmi3Instance c) {
+    LIVING("fmi3Terminate");
+    if (((Plant *)c)->s.phase <= INITIALIZING || ((Plant *)c)->s.phase == TERMINATED) return fail(c, "fmi3Terminate: called out of order");
+    ((Plant *)c)->s.phase = TERMINATED;
+    return fmi3OK;
+}
 fmi3Status fmi3Reset(fmi3Instance c) {
     LIVING("fmi3Reset");
     restart(&((Plant *)c)->s);
-    ((Plant *)c)->fresh = 0;
+    stale(c);
     return fmi3OK;
 }
 
@@ -158,12 +169,13 @@ fmi3Status fmi3SetFloat64(fmi3Instance c, References vr, size_t n, const fmi3Flo
     if (length != n) return fail(m, "setFloat64: all variables are scalars");
     for (i = 0; i < n; i++) {
         const fmi3ValueReference v = vr[i];
-        if (v < VR_DX) m->s.x[v] = value[i];
+        if (v < VR_DX && m->s.phase < STEPPING) m->s.x[v] = value[i];
         else if (v >= VR_U && v < VR_P) m->s.u[v - VR_U] = value[i];
+        else if (v >= VR_Z && v < VR_TIME && m->s.phase <= INITIALIZING) m->s.z[v - VR_Z] = value[i];
         else if (v >= VR_P && v < VR_Y && (tunable_p[v - VR_P] || m->s.phase <= INITIALIZING)) m->s.p[v - VR_P] = value[i];
         else return fail(m, "setFloat64: variable %u cannot be set in this mode", v);
     }
-    m->fresh = 0;
+    stale(m);
     return fmi3OK;
 }
 
@@ -176,10 +188,11 @@ fmi3Status fmi3GetFloat64(fmi3Instance c, References vr, size_t n, fmi3Float64 v
     for (i = 0; i < n; i++) {
         const fmi3ValueReference v = vr[i];
         if (v < VR_DX) value[i] = m->s.x[v];
-        else if (v < VR_U) { refresh(m); value[i] = m->dx[v - VR_DX]; }
+        else if (v < VR_U) { refresh_f(m); value[i] = m->dx[v - VR_DX]; }
         else if (v < VR_P) value[i] = m->s.u[v - VR_U];
         else if (v < VR_Y) value[i] = m->s.p[v - VR_P];
-        else if (v < VR_TIME) { refresh(m); value[i] = m->y[v - VR_Y]; }
+        else if (v < VR_Z) { refresh_y(m); value[i] = m->y[v - VR_Y]; }
+        else if (v < VR_TIME) value[i] = m->s.z[v - VR_Z];
         else if (v == VR_TIME) value[i] = m->s.t;
         else return fail(m, "getFloat64: there is no variable %u", v);
     }
@@ -206,11 +219,12 @@ NO_VARIABLES(Int64)
 NO_VARIABLES(UInt64)
 NO_VARIABLES(Boolean)
 NO_VARIABLES(String)
-#define REFUSE(text) { LIVING(__func__); return fail(c, text); }
-fmi3Status fmi3GetBinary(fmi3Instance c, References vr, size_t n, size_t sizes[], fmi3Binary v[], size_t k) REFUSE("there are no binary variables")
-fmi3Status fmi3SetBinary(fmi3Instance c, References vr, size_t n, const size_t sizes[], const fmi3Binary v[], size_t k) REFUSE("there are no binary variables")
-fmi3Status fmi3GetClock(fmi3Instance c, References vr, size_t n, fmi3Clock v[]) REFUSE("there are no clocks")
-fmi3Status fmi3SetClock(fmi3Instance c, References vr, size_t n, const fmi3Clock v[]) REFUSE("there are no clocks")
+static void forward(Plant *m, const double *sx, const double *su, const double *sp, double *ddx, double *dy) {
+    m->arg[4] = sx; m->arg[5] = su; m->arg[6] = sp;
+    call4(m, model_df, m->s.x, m->s.u, m->s.z, ddx);
+    m->arg[4] = sx; m->arg[5] = su; m->arg[6] = sp;
+    call4(m, model_dy, m->s.x, m->s.u, m->s.z, dy);
+}
 
 fmi3Status fmi3GetDirectionalDerivative(fmi3Instance c, References unknown, size_t n, References known, size_t k, const fmi3Float64 seed[], size_t seeds,
                                         fmi3Float64 out[], size_t outs) {
@@ -227,76 +241,38 @@ fmi3Status fmi3GetDirectionalDerivative(fmi3Instance c, References unknown, size
         else if (v >= VR_P && v < VR_Y) sp[v - VR_P] += seed[i];
         else if (v != VR_TIME) return fail(m, "getDirectionalDerivative: variable %u is neither state, input nor parameter", v);
     }
-    m->arg[4] = sx; m->arg[5] = su; m->arg[6] = sp;
-    evaluate(m, model_df, ddx);
-    m->arg[4] = sx; m->arg[5] = su; m->arg[6] = sp;
-    evaluate(m, model_dy, dy);
+    forward(m, sx, su, sp, ddx, dy);
     for (i = 0; i < n; i++) {
         const fmi3ValueReference v = unknown[i];
         if (v >= VR_DX && v < VR_U) out[i] = ddx[v - VR_DX];
-        else if (v >= VR_Y && v < VR_TIME) out[i] = dy[v - VR_Y];
+        else if (v >= VR_Y && v < VR_Z) out[i] = dy[v - VR_Y];
         else return fail(m, "getDirectionalDerivative: variable %u is neither derivative nor output", v);
     }
     return fmi3OK;
 }
 
-fmi3Status fmi3GetAdjointDerivative(fmi3Instance c, References u, size_t n, References k, size_t nk, const fmi3Float64 seed[], size_t ns,
-                                    fmi3Float64 out[], size_t no) REFUSE("adjoint derivatives are not provided")
-fmi3Status fmi3GetNumberOfVariableDependencies(fmi3Instance c, fmi3ValueReference v, size_t *n) REFUSE("dependencies are not provided")
-fmi3Status fmi3GetVariableDependencies(fmi3Instance c, fmi3ValueReference v, size_t a[], fmi3ValueReference b[], size_t d[], fmi3DependencyKind e[],
-                                       size_t n) REFUSE("dependencies are not provided")
-
-/* ---- FMU state ------------------------------------------------------------ */
-
-static State *new_state(void) {
-    State *made = malloc(sizeof *made);
-    if (made && born(&states, made)) return made;
-    free(made);
-    return NULL;
-}
-
-fmi3Status fmi3GetFMUState(fmi3Instance c, fmi3FMUState *state) {
-    LIVING("fmi3GetFMUState");
-    GIVEN(state, "getFMUState");
-    if (!is_alive(&states, *state) && !(*state = new_state())) return fail(c, "getFMUState: out of memory");
-    memcpy(*state, &((Plant *)c)->s, sizeof(State));
-    return fmi3OK;
-}
-fmi3Status fmi3SetFMUState(fmi3Instance c, fmi3FMUState state) {
-    LIVING("fmi3SetFMUState");
-    if (!is_alive(&states, state)) return fail(c, "setFMUState: this is no state of this FMU, or it was freed");
-    memcpy(&((Plant *)c)->s, state, sizeof(State));
-    ((Plant *)c)->fresh = 0;
-    return fmi3OK;
-}
-fmi3Status fmi3FreeFMUState(fmi3Instance c, fmi3FMUState *state) {
-    LIVING("fmi3FreeFMUState");
-    if (!state || !*state) return fmi3OK;
-    if (!dies(&states, *state)) return fail(c, "freeFMUState: this is no state of this FMU, or it was freed");
-    free(*state);
-    *state = NULL;
-    return fmi3OK;
-}
-fmi3Status fmi3SerializedFMUStateSize(fmi3Instance c, fmi3FMUState state, size_t *size) { LIVING("fmi3SerializedFMUStateSize"); 
-    if (!is_alive(&states, state)) return fail(c, "serializedFMUStateSize: this is no state of this FMU, or it was freed");
-    GIVEN(size, "serializedFMUStateSize");
-    *size = sizeof(State);
-    return fmi3OK;
-}
-fmi3Status fmi3SerializeFMUState(fmi3Instance c, fmi3FMUState state, fmi3Byte bytes[], size_t size) {
-    LIVING("fmi3SerializeFMUState");
-    if (!is_alive(&states, state)) return fail(c, "serializeFMUState: this is no state of this FMU, or it was freed");
-    GIVEN(bytes, "serializeFMUState");
-    if (size < sizeof(State)) return fail(c, "serializeFMUState: %lu bytes are too few", (unsigned long)size);
-    memcpy(bytes, state, sizeof(State));
-    return fmi3OK;
-}
-fmi3Status fmi3DeserializeFMUState(fmi3Instance c, const fmi3Byte bytes[], size_t size, fmi3FMUState *state) {
-    LIVING("fmi3DeserializeFMUState");
-    GIVEN(bytes && state, "deserializeFMUState");
-    if (size != sizeof(State) || memcmp(bytes, PLANT_GUID, strlen(PLANT_GUID)) != 0) return fail(c, "deserializeFMUState: these bytes are not a state of this FMU");
-    if (!is_alive(&states, *state) && !(*state = new_state())) return fail(c, "deserializeFMUState: out of memory");
-    memcpy(*state, bytes, sizeof(State));
+/* By columns: a plant has few knowns, and the code for the forward ones is there. */
+fmi3Status fmi3GetAdjointDerivative(fmi3Instance c, References unknown, size_t n, References known, size_t k, const fmi3Float64 seed[], size_t seeds,
+                                    fmi3Float64 out[], size_t outs) {
+    LIVING("fmi3GetAdjointDerivative");
+    GIVEN((n == 0 || (unknown && seed)) && (k == 0 || (known && out)), "getAdjointDerivative");
+    Plant *m = c;
+    size_t i, j;
+    if (seeds != n || outs != k) return fail(m, "getAdjointDerivative: all variables are scalars");
+    for (i = 0; i < n; i++)
+        if (!(unknown[i] >= VR_DX && unknown[i] < VR_U) && !(unknown[i] >= VR_Y && unknown[i] < VR_Z))
+            return fail(m, "getAdjointDerivative: variable %u is neither derivative nor output", unknown[i]);
+    for (j = 0; j < k; j++) {
+        double sx[DIM(NX)] = {0}, su[DIM(NU)] = {0}, sp[DIM(NP)] = {0}, dy[DIM(NY)], ddx[DIM(NX)];
+        const fmi3ValueReference v = known[j];
+        if (v < VR_DX) sx[v] = 1;
+        else if (v >= VR_U && v < VR_P) su[v - VR_U] = 1;
+        else if (v >= VR_P && v < VR_Y) sp[v - VR_P] = 1;
+        else if (v != VR_TIME) return fail(m, "getAdjointDerivative: variable %u is neither state, input nor parameter", v);
+        forward(m, sx, su, sp, ddx, dy);
+        out[j] = 0;
+        for (i = 0; i < n; i++) out[j] += seed[i] * (unknown[i] < VR_U ? ddx[unknown[i] - VR_DX] : dy[unknown[i] - VR_Y]);
+    }
     return fmi3OK;
 }
 
@@ -326,7 +302,7 @@ fmi3Status fmi3SetContinuousStates(fmi3Instance c, const fmi3Float64 x[], size_t
     if (check_length(m, n) != fmi3OK) return fmi3Error;
     GIVEN(n == 0 || x, "states");
     memcpy(m->s.x, x, n * sizeof *x);
-    m->fresh = 0;
+    stale(m);
     return fmi3OK;
 }
 fmi3Status fmi3GetContinuousStates(fmi3Instance c, fmi3Float64 x[], size_t n) {
@@ -340,7 +316,7 @@ fmi3Status fmi3GetContinuousStateDerivatives(fmi3Instance c, fmi3Float64 dx[], s
     LIVING("fmi3GetContinuousStateDerivatives");
     if (check_length(c, n) != fmi3OK) return fmi3Error;
     GIVEN(n == 0 || dx, "states");
-    refresh(c);
+    refresh_f(c);
     memcpy(dx, ((Plant *)c)->dx, n * sizeof *dx);
     return fmi3OK;
 }
@@ -355,19 +331,22 @@ fmi3Status fmi3GetEventIndicators(fmi3Instance c, fmi3Float64 z[], size_t n) { L
 fmi3Status fmi3GetNumberOfEventIndicators(fmi3Instance c, size_t *n) { LIVING("fmi3GetNumberOfEventIndicators"); GIVEN(n, "getNumberOfEventIndicators"); *n = 0; return fmi3OK; }
 fmi3Status fmi3GetNumberOfContinuousStates(fmi3Instance c, size_t *n) { LIVING("fmi3GetNumberOfContinuousStates"); GIVEN(n, "getNumberOfContinuousStates"); *n = NX; return fmi3OK; }
 
-/* ---- what other interfaces would need ------------------------------------- */
+/* ---- co-simulation -------------------------------------------------------- */
 
-fmi3Status fmi3EnterConfigurationMode(fmi3Instance c) REFUSE("there is nothing to configure")
-fmi3Status fmi3ExitConfigurationMode(fmi3Instance c) REFUSE("there is nothing to configure")
-fmi3Status fmi3GetIntervalDecimal(fmi3Instance c, References v, size_t n, fmi3Float64 a[], fmi3IntervalQualifier q[]) REFUSE("there are no clocks")
-fmi3Status fmi3GetIntervalFraction(fmi3Instance c, References v, size_t n, fmi3UInt64 a[], fmi3UInt64 b[], fmi3IntervalQualifier q[]) REFUSE("there are no clocks")
-fmi3Status fmi3GetShiftDecimal(fmi3Instance c, References v, size_t n, fmi3Float64 a[]) REFUSE("there are no clocks")
-fmi3Status fmi3GetShiftFraction(fmi3Instance c, References v, size_t n, fmi3UInt64 a[], fmi3UInt64 b[]) REFUSE("there are no clocks")
-fmi3Status fmi3SetIntervalDecimal(fmi3Instance c, References v, size_t n, const fmi3Float64 a[]) REFUSE("there are no clocks")
-fmi3Status fmi3SetIntervalFraction(fmi3Instance c, References v, size_t n, const fmi3UInt64 a[], const fmi3UInt64 b[]) REFUSE("there are no clocks")
-fmi3Status fmi3SetShiftDecimal(fmi3Instance c, References v, size_t n, const fmi3Float64 a[]) REFUSE("there are no clocks")
-fmi3Status fmi3SetShiftFraction(fmi3Instance c, References v, size_t n, const fmi3UInt64 a[], const fmi3UInt64 b[]) REFUSE("there are no clocks")
-fmi3Status fmi3EnterStepMode(fmi3Instance c) REFUSE("this FMU is for model exchange")
-fmi3Status fmi3GetOutputDerivatives(fmi3Instance c, References v, size_t n, const fmi3Int32 o[], fmi3Float64 a[], size_t k) REFUSE("this FMU is for model exchange")
-fmi3Status fmi3DoStep(fmi3Instance c, fmi3Float64 t, fmi3Float64 h, fmi3Boolean n, fmi3Boolean *a, fmi3Boolean *b, fmi3Boolean *d, fmi3Float64 *e) REFUSE("this FMU is for model exchange")
-fmi3Status fmi3ActivateModelPartition(fmi3Instance c, fmi3ValueReference v, fmi3Float64 t) REFUSE("this FMU is for model exchange")
+fmi3Status fmi3DoStep(fmi3Instance c, fmi3Float64 t, fmi3Float64 length, fmi3Boolean no_rollback, fmi3Boolean *events, fmi3Boolean *stop,
+                      fmi3Boolean *early, fmi3Float64 *last) {
+    LIVING("fmi3DoStep");
+    GIVEN(events && stop && early && last, "doStep");
+    Plant *m = c;
+    fmi3Status status;
+    (void)no_rollback;
+    *events = *stop = *early = fmi3False;
+    *last = m->s.t;
+    if (m->s.phase != STEPPING) return fail(m, "doStep: called out of order");
+    if (!(length >= 0) || length > 1e12) return fail(m, "doStep: step size %g is not usable", length);
+    m->s.t = t;
+    status = integrate(m, length);
+    if (status == fmi3OK) *last = m->s.t = t + length;
+    stale(m);
+    return status;
+}

@@ -1,4 +1,5 @@
-/* Model evaluation and the integrator of a plant; included by plant_wrapper.c.
+/* Model evaluation and the integrator of a plant; included by plant_wrapper.c and plant_fmi3.c, which say what Status and OK
+ * are, and MAX_ORDER where inputs have derivatives.
  *
  * Dormand-Prince 5(4), J. Comput. Appl. Math. 6 (1980) 19-26, with the step-size control of
  * Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, section II.4.
@@ -33,11 +34,16 @@ static void remember(Plant *m, const double *x, const double *u, double *out) { 
 #endif
 
 static const double *input_at(Plant *m, double tau) {
+#ifdef MAX_ORDER
     int i;
     if (!m->s.input_is_polynomial) return m->s.u;
     for (i = 0; i < NU; i++) /* Taylor series, FMI 2.0.4 section 4.2.1 */
         m->u_stage[i] = m->s.u[i] + tau * (m->s.du[0][i] + tau / 2 * (m->s.du[1][i] + tau / 3 * m->s.du[2][i]));
     return m->u_stage;
+#else
+    (void)tau;
+    return m->s.u;
+#endif
 }
 
 static void slope(Plant *m, double tau, const double *x, double *out) {
@@ -100,11 +106,11 @@ static void trial(Plant *m, double tau, double h) {
     memcpy(m->x_new, m->x_stage, sizeof m->x_new); /* the seventh stage is the fifth-order result */
 }
 
-static fmi2Status integrate(Plant *m, double length) {
+static Status integrate(Plant *m, double length) {
     State *s = &m->s;
     double tau = 0;
     long count = 0;
-    if (length <= 0) return fmi2OK;
+    if (length <= 0) return OK;
     slope(m, 0, s->x, m->k[0]);
     if (!(s->step > 0)) s->step = first_step(m, length);
     while (tau < length) {
@@ -135,5 +141,5 @@ static fmi2Status integrate(Plant *m, double length) {
         memcpy(m->k[0], m->k[6], sizeof m->k[0]);
         if (last) break;
     }
-    return fmi2OK;
+    return OK;
 }

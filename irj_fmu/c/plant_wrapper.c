@@ -76,6 +76,8 @@ static void restart(State *s) {
     memcpy(s->z, start_z, sizeof s->z);
 }
 
+typedef fmi2Status Status;
+#define OK fmi2OK
 #include "plant_integrator.c"
 
 typedef Plant Instance;

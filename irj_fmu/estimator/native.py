@@ -8,7 +8,7 @@ says that they want one.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, final
@@ -17,6 +17,7 @@ from identification.data.joint_file import Joint
 from identification.errors import InputError
 from identification.online.estimator import OnlineEstimator, OnlineOptions
 from irj_fmu.estimator.native_tables import MAX_WARM_UP, Code, generate
+from irj_fmu.estimator.notes import estimator_notes
 from irj_fmu.estimator.packed import STEP
 from irj_fmu.estimator.slave import estimator_variables, two_step_variables
 from irj_fmu.fmi.archive import content_guid, write_archive
@@ -27,6 +28,7 @@ from irj_fmu.fmi.compiler import (
     header_folder,
     universal_library,
 )
+from irj_fmu.fmi.documentation import beside
 from irj_fmu.fmi.model_description import Description, Entry, model_description, to_bytes
 from irj_fmu.fmi.slave_base import STANDARD
 from irj_fmu.fmi.targets import SHORT_TARGETS, native_targets
@@ -131,6 +133,7 @@ def build_native(
     sources, description = native_sources(spec)
     content = {f"sources/{name}": text for name, text in sources.items()}
     content["modelDescription.xml"] = description
+    content |= beside(description, estimator_notes(spec.joint, spec.options))
     built = {
         triple: compile_library(sources, _MAIN, triple, cc=cc, libraries=("m",))
         for triple in targets
@@ -143,8 +146,21 @@ def build_native(
     return write_archive(out, content)
 
 
-def native_sources(spec: NativeSpec) -> tuple[dict[str, bytes], bytes]:
-    """C sources of the library and modelDescription.xml; nothing is compiled."""
+def described(config: bytes) -> str:
+    """The GUID that a generated native_config.h holds."""
+    found = re.search(rb'NATIVE_GUID "([^"]+)"', config)
+    if found is None:
+        raise ValueError("native_config.h holds no GUID")
+    return found[1].decode()
+
+
+def native_sources(
+    spec: NativeSpec, more: Mapping[str, bytes] | None = None
+) -> tuple[dict[str, bytes], bytes]:
+    """C sources of the library and modelDescription.xml; nothing is compiled.
+
+    `more` holds what else the GUID stands for, by name, where the wrapper is another one.
+    """
     made = OnlineEstimator(
         spec.joint,
         spec.sample_time,
@@ -159,7 +175,13 @@ def native_sources(spec: NativeSpec) -> tuple[dict[str, bytes], bytes]:
 
     code, description = written("")
     guid = content_guid(
-        {**texts, "config": code.config, "model": code.model, "description": description}
+        {
+            **texts,
+            "config": code.config,
+            "model": code.model,
+            "description": description,
+            **(more or {}),
+        }
     )
     code, description = written(guid)
     return texts | {"native_model.c": code.model, "native_config.h": code.config}, description
@@ -195,4 +217,4 @@ def _describe(spec: NativeSpec, variables: Sequence[Variable], guid: str) -> byt
     return to_bytes(model_description(what, [Entry(v) for v in variables]))
 
 
-__all__ = ["NativeSpec", "build_native", "native_sources", "native_variables"]
+__all__ = ["NativeSpec", "build_native", "described", "native_sources", "native_variables"]

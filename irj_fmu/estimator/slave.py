@@ -258,6 +258,7 @@ def _estimates(joint: Joint, names: tuple[str, ...], model: Any) -> list[Variabl
                 f"theta[{i}]",
                 unit,
                 values[name],
+                nominal=abs(values[name]) or None,
                 causality="output",
                 description=f"{name}: {p.meaning}.",
             )

@@ -7,10 +7,14 @@ from dataclasses import dataclass, field
 from typing import final
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
-from irj_fmu.fmi.unit_definitions import add_unit_definitions
+from identification.version import VERSION
+from irj_fmu.fmi.unit_definitions import add_unit_definitions, quantity_of
 from irj_fmu.fmi.variables import Value, Variable, check_unique
 
-GENERATOR = "irj_fmu"
+GENERATOR = f"irj {VERSION}"
+AUTHOR = "the irj authors"
+COPYRIGHT = f"Copyright (c) 2026 {AUTHOR}"
+LICENSE = "MIT; see documentation/licenses"
 _TYPES = {"real": "Real", "integer": "Integer", "boolean": "Boolean", "string": "String"}
 _LOG = {
     "logStatusWarning": "Something the run survives.",
@@ -26,12 +30,15 @@ _LOG = {
 class Entry:
     """One ScalarVariable: its declaration and how the FMU treats its start value.
 
-    `derivative_of` is the 1-based index of the state this is the derivative of.
+    `derivative_of` is the 1-based index of the state this is the derivative of. `depends` holds the
+    1-based indices of the states, inputs and parameters that an output or a derivative depends on;
+    None: it depends on everything.
     """
 
     variable: Variable
     initial: str | None = "exact"
     derivative_of: int | None = None
+    depends: tuple[int, ...] | None = None
 
 
 @final
@@ -68,6 +75,8 @@ def _type_attributes(entry: Entry) -> dict[str, str]:
     variable = entry.variable
     attributes: dict[str, str] = {}
     if variable.kind == "real" and variable.unit:
+        quantity = quantity_of(variable.unit)
+        attributes |= {"quantity": quantity} if quantity else {}
         attributes["unit"] = variable.unit
         if variable.display_unit:
             attributes["displayUnit"] = variable.display_unit
@@ -111,7 +120,23 @@ def _add_structure(root: Element, entries: Sequence[Entry]) -> None:
         if indices:
             node = SubElement(structure, title)
             for index in indices:
-                SubElement(node, "Unknown", {"index": str(index)})
+                depends = entries[index - 1].depends
+                known = {} if depends is None else {"dependencies": " ".join(map(str, depends))}
+                SubElement(node, "Unknown", {"index": str(index), **known})
+
+
+def identity() -> dict[str, str]:
+    """Who made the FMU, with what, and under which licence, as both versions of FMI name it.
+
+    They are those of the code inside; a model's values belong to whoever had them fitted.
+    """
+    return {
+        "author": AUTHOR,
+        "version": VERSION,
+        "copyright": COPYRIGHT,
+        "license": LICENSE,
+        "generationTool": GENERATOR,
+    }
 
 
 def model_description(what: Description, entries: Sequence[Entry]) -> Element:
@@ -125,7 +150,7 @@ def model_description(what: Description, entries: Sequence[Entry]) -> Element:
     check_unique(tuple(entry.variable for entry in entries))
     attributes = {"fmiVersion": "2.0", "modelName": what.name, "guid": what.guid}
     attributes |= {"description": what.description} if what.description else {}
-    attributes |= {"generationTool": GENERATOR, "variableNamingConvention": "structured"}
+    attributes |= identity() | {"variableNamingConvention": "structured"}
     if "ModelExchange" in what.interfaces:
         attributes["numberOfEventIndicators"] = "0"
     root = Element("fmiModelDescription", attributes)

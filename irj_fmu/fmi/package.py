@@ -23,10 +23,11 @@ from identification.errors import InputError
 from irj_fmu.command_line import checkpoint
 from irj_fmu.fmi.archive import content_guid, write_archive
 from irj_fmu.fmi.compiler import compile_library, find_compiler, header_folder
+from irj_fmu.fmi.documentation import Note, beside, licence_of
 
 _HERE = Path(__file__).parent
 _MINIMUM = ("slave_base.py", "variables.py", "unit_definitions.py", "model_description.py")
-_ALONE = ("identification.errors", "casadi_models.quantities")
+_ALONE = ("identification.errors", "identification.version", "casadi_models.quantities")
 """Modules of other packages that those need; each imports nothing of the project."""
 _SHIM_TARGET = "x86_64-linux-gnu"
 _NO_SHIM = (
@@ -58,6 +59,8 @@ class SlaveSpec:
     effects : tuple of EffectFile
         Users' own effects that the model uses: they join the library of the bundled packages.
         Elsewhere the environment variables IRJ_LIBPYTHON and IRJ_SITE_PACKAGES say where they are.
+    notes : tuple of Note
+        Sections of the FMU's documentation.
     """
 
     identifier: str
@@ -66,6 +69,7 @@ class SlaveSpec:
     packages: tuple[Path, ...]
     files: Mapping[str, Path] = field(default_factory=dict)
     effects: tuple[EffectFile, ...] = ()
+    notes: tuple[Note, ...] = ()
 
 
 @final
@@ -119,6 +123,9 @@ def package_slave(
     guid = content_guid(resources | {"identifier": spec.identifier.encode()})
     content = {f"resources/{name}": code for name, code in resources.items()}
     content["modelDescription.xml"] = _describe(spec, resources, guid)
+    content |= beside(
+        content["modelDescription.xml"], spec.notes, {"pythonfmu": licence_of("pythonfmu")}
+    )
     inner = _pythonfmu_binaries()
     note = "holds the shim: runs in Python hosts and C hosts"
     library: bytes | None = None

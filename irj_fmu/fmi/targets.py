@@ -16,6 +16,15 @@ SHORT_TARGETS: Final = {
 }
 """Names of folders below ``binaries/`` to the targets whose libraries lie there."""
 
+FMI3_FOLDERS: Final = {
+    "x86_64-linux-gnu": "x86_64-linux",
+    "aarch64-linux-gnu": "aarch64-linux",
+    "x86_64-windows-gnu": "x86_64-windows",
+    "x86_64-macos": "x86_64-darwin",
+    "aarch64-macos": "aarch64-darwin",
+}
+"""Folders below ``binaries/`` in FMI 3.0, by target."""
+
 
 def native_targets(target: str | Sequence[str] | None) -> tuple[str, ...]:
     """Targets by their names, short ones included.
@@ -44,4 +53,4 @@ def native_targets(target: str | Sequence[str] | None) -> tuple[str, ...]:
     return tuple(dict.fromkeys(found))
 
 
-__all__ = ["SHORT_TARGETS", "native_targets"]
+__all__ = ["FMI3_FOLDERS", "SHORT_TARGETS", "native_targets"]

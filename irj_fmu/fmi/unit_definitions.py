@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import cache
 from xml.etree.ElementTree import Element, SubElement
 
 from casadi_models import quantities
@@ -22,6 +23,32 @@ def base_unit(text: str) -> BaseUnit | None:
         return quantities.base_unit(text, lenient=True)
     except quantities.UnitError:
         return None
+
+
+@cache
+def _quantities() -> dict[tuple[tuple[int, ...], int], str]:
+    """Names of quantities by the exponents of their SI unit; those of rotary motion come first."""
+    found: dict[tuple[tuple[int, ...], int], str] = {}
+    units = [unit for unit in quantities.QUANTITIES.values() if unit != "1"]
+    names = [name for name, unit in quantities.QUANTITIES.items() if unit != "1"]
+    for unit, name in zip(
+        [*units, *map(quantities.linear_unit, units)], [*names, *names], strict=True
+    ):
+        base = quantities.base_unit(unit)
+        found.setdefault((base.exponents, base.unwritten), name)
+    return found
+
+
+def quantity_of(unit: str) -> str | None:
+    """The quantity that a unit measures, as ``AngularVelocity`` for ``rad/s``; None where it has no
+    name of its own.
+
+    An angle is told from a ratio and a torque from an energy by the radians that the unit stands
+    for.
+    """
+    base = base_unit(unit)
+    name = _quantities().get((base.exponents, base.unwritten)) if base is not None else None
+    return "".join(word.capitalize() for word in name.split("_")) if name else None
 
 
 def add_unit_definitions(root: Element, units: Iterable[tuple[str, str | None]]) -> None:

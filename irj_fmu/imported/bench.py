@@ -15,6 +15,7 @@ import numpy as np
 from casadi_models import EFFECTS, Effect, JointModel
 from casadi_models.term import SIDE_INERTIAS
 from identification.balance.balances import balances_of
+from identification.balance.calibration import settled
 from identification.balance.sensing import signals_of
 from identification.balance.stamps import evened
 from identification.balance.weak import WeakRecord, differentiated_kernel, filtered
@@ -27,7 +28,15 @@ from identification.diagnosis.improvement import Step, visible_keys
 from identification.diagnosis.learned import Doubt, Equivalence, LearnedClaim
 from identification.diagnosis.lines import Line
 from identification.diagnosis.locate import Unexplained, locate
-from identification.diagnosis.trials import COLLINEAR, Base, Trial, flatten, make_base
+from identification.diagnosis.session import MOST_RELATIVES, RELATIVE_SHARE
+from identification.diagnosis.trials import (
+    COLLINEAR,
+    Base,
+    Trial,
+    by_whole_fit,
+    flatten,
+    make_base,
+)
 from identification.fitting.assess import BalanceError, Error, assess
 from identification.fitting.engine import Dataset, Solution, solve, stack
 from identification.naming.odds import Odds
@@ -244,7 +253,8 @@ class FmuBench:
     ) -> Ranking:
         """The effects that the FMU can lack."""
         extra = _extra(base.solution.model, self.data)
-        return self._proposed(rank(base, extra, late=late, progress=progress))
+        found = self._proposed(rank(base, extra, late=late, progress=progress))
+        return found if self._only else self._by_whole_fits(found, base)
 
     def tried(self, solution: Solution) -> list[str]:
         """Keys of the effects that the FMU can lack."""
@@ -359,6 +369,46 @@ class FmuBench:
         if self._only and candidate.effect.family not in OUTSIDE:
             return "it cannot ride outside the FMU as a torque"
         return None
+
+    def _by_whole_fits(self, ranking: Ranking, base: Base) -> Ranking:
+        """The ranking with its best trials as their whole fits have them.
+
+        Without the missing effect the FMU's parameters are off by as much as it takes, a tenth
+        under a sensor whose gain is a tenth off, and the balance that is left out of that counts
+        little. From there the right name may look like half of one that needs no other parameter
+        moved.
+        """
+        first = next(
+            (t for t in ranking.everything if t.candidate.label in ranking.significant), None
+        )
+        if first is None or not self._free:
+            return ranking
+        near = [t for t in ranking.everything if t.score >= RELATIVE_SHARE * first.score]
+        again = {t.candidate.label: self._whole(t, base) for t in near[: 1 + MOST_RELATIVES]}
+        every = [again.get(t.candidate.label, t) for t in ranking.everything]
+        every.sort(key=lambda t: -t.score)
+        shown = [again.get(t.candidate.label, t) for t in ranking.trials]
+        shown.sort(key=lambda t: (t.candidate.label not in ranking.significant, -t.score))
+        return replace(ranking, trials=tuple(shown), everything=tuple(every))
+
+    def _whole(self, trial: Trial, base: Base) -> Trial:
+        """A trial by its whole fit, where that is the better one."""
+        solution = self.fitted(trial.candidate.model, {**base.solution.values, **trial.values})
+        data = self.data_of(solution)
+        balances = balances_of(solution.model, data.sensing, wrt=())
+        values = settled(
+            solution.model, data.sensing, [*data.train, *data.held_out], solution.values
+        )
+        left, held = (
+            flatten(stack(balances, records, values), balances.balances)[0]
+            if records
+            else np.empty(0)
+            for records in (data.train, data.held_out)
+        )
+        if len(left) != len(base.weight) or len(held) != len(base.held_weight):
+            return trial
+        whole = by_whole_fit(trial, base, values, left=left, held_left=held)
+        return whole if whole.score > trial.score else trial
 
     def _proposed(self, ranking: Ranking) -> Ranking:
         """The ranking without what is not proposed."""

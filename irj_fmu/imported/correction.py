@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, final
@@ -132,13 +131,72 @@ def correction_of(
     return Correction(made, free, shapes)
 
 
+_SEEN, _NOW, _PLACE, _RATE, _STEP, _BEFORE, _SPEED, _GIVEN, _MEMORY = range(9)
+"""What a law keeps between two calls: whether there was one, its time, position, velocity and step,
+the predicted middle it was read at, the torque it gave; then the memory of its effects.
+"""
+
+
+def law_function(model: JointModel, *, has_velocity: bool) -> Any:
+    """The torque of a correction as a CasADi function, for Python and for generated C.
+
+    The effect resists: its torque is taken off the drive. It is read and held from one call to the
+    next, at the position and velocity that are predicted for the middle of that time: read at its
+    beginning, it would be late by half of it. Without a velocity the difference of positions is
+    taken.
+
+    Parameters
+    ----------
+    model : JointModel
+        As in :class:`Correction`.
+    has_velocity : bool
+
+    Returns
+    -------
+    casadi.Function
+        ``(state, reading, parameters) -> (torque, state)`` as one column: the torque to be added to
+        the drive [N.m] and the next state. The reading is time [s], torque of the drive [N.m],
+        position [rad] and velocity [rad/s], link-referred. The state begins with zeros.
+    """
+    import casadi as ca
+
+    functions = model.functions
+    held = len(functions.memory_names)
+    s, reading = ca.SX.sym("s", _MEMORY + held), ca.SX.sym("reading", 4)
+    p = ca.SX.sym("p", len(model.parameters))
+    time, drive, position, velocity = ca.vertsplit(reading)
+    seen, z, u = s[_SEEN], s[_MEMORY:], ca.vertcat(drive, 0, time)
+
+    def resist(x: Any) -> Any:
+        return drive - functions.dynamics(x, u, p)[1]
+
+    step = ca.if_else(seen, time - s[_NOW], 0)
+    moved = step > 0
+    length = ca.if_else(moved, step, 1)
+    lead, owed = step / 2, 0
+    if not has_velocity:  # the difference is the velocity half a step ago
+        velocity = ca.if_else(moved, (position - s[_PLACE]) / length, 0)
+        lead = step
+        if not held:
+            # at the first sample no velocity was known: what that step lacked follows now
+            half = ca.vertcat((position + s[_PLACE]) / 2, velocity)
+            owed = ca.if_else(ca.logic_and(moved, s[_STEP] == 0), -resist(half) - s[_GIVEN], 0)
+    bend = ca.if_else(ca.logic_and(moved, s[_STEP] > 0), (velocity - s[_RATE]) / length, 0)
+    ahead = velocity + bend * lead
+    middle = position + step / 2 * (velocity + bend * (lead - step / 4))
+    if held:
+        before = ca.vertcat(s[_BEFORE], s[_SPEED])
+        after = functions.memory_step(ca.vertcat(middle, ahead), before, z, u, p, step)
+        z = ca.if_else(moved, after, z)
+    given = -resist(ca.vertcat(middle, ahead, z))
+    new = ca.vertcat(*(1, time, position, velocity, step, middle, ahead, given), z)
+    return ca.Function("law", [s, reading, p], [ca.densify(ca.vertcat(given + owed, new))])
+
+
 @final
 class CorrectionLaw:
-    """The torque of a correction along a run (see :class:`irj_fmu.imported.run.Feedback`).
-
-    The effect resists: its torque is taken off the drive. It is read and held for a millisecond at
-    a time, at the position and velocity that are predicted for the middle of that time: read at its
-    beginning, it would be late by half of it.
+    """The torque of a correction along a run (see :class:`irj_fmu.imported.run.Feedback`), as
+    :func:`law_function` has it, read a millisecond at a time.
 
     Parameters
     ----------
@@ -150,25 +208,21 @@ class CorrectionLaw:
     """
 
     def __init__(self, model: JointModel, port: Port, inputs: int) -> None:
-        import casadi as ca
-
-        functions = model.functions
-        self._held = len(functions.memory_names)
-        p = model.value_vector()
-        x, u = ca.SX.sym("x", 2 + self._held), ca.SX.sym("u", 3)
-        self._resist = Evaluator(
-            ca.Function("resist", [x, u], [ca.densify(u[0] - functions.dynamics(x, u, p)[1])])
-        )
-        self._move: Evaluator | None = None
-        if self._held:
-            before, z, h = ca.SX.sym("before", 2), ca.SX.sym("z", self._held), ca.SX.sym("h")
-            moved = functions.memory_step(x[:2], before, z, u, p, h)
-            self._move = Evaluator(
-                ca.Function("move", [x[:2], before, z, u, h], [ca.densify(moved)])
-            )
-        self.port = port
+        self._model, self.port = model, port
+        self._laws: dict[bool, Evaluator] = {}
         self._extra = np.zeros(inputs)
-        self.restart()
+        self._state = np.zeros(_MEMORY + len(model.functions.memory_names))
+
+    def _law(self, has_velocity: bool) -> Evaluator:
+        found = self._laws.get(has_velocity)
+        if found is None:
+            import casadi as ca
+
+            law = law_function(self._model, has_velocity=has_velocity)
+            s, reading = ca.SX.sym("s", law.numel_in(0)), ca.SX.sym("reading", 4)
+            valued = law(s, reading, self._model.value_vector())
+            found = self._laws[has_velocity] = Evaluator(ca.Function("law", [s, reading], [valued]))
+        return found
 
     def begin(self, window: Window) -> None:
         """Before the first sample of a window."""
@@ -176,10 +230,7 @@ class CorrectionLaw:
 
     def restart(self) -> None:
         """From rest, with empty memory."""
-        self._z = np.zeros(self._held)
-        self._place = self._now = math.nan
-        self._rate = self._step = self._given = 0.0
-        self._before = self._speed = math.nan
+        self._state[:] = 0.0
 
     def __call__(
         self, sample: int, time: float, inputs: FloatArray, outputs: FloatArray
@@ -208,30 +259,10 @@ class CorrectionLaw:
         position, velocity : float
             Link-referred [rad, rad/s]; without a velocity the difference of positions is taken.
         """
-        first = math.isnan(self._now)
-        step = 0.0 if first else time - self._now
-        lead = step / 2
-        owed = 0.0
-        if velocity is None:  # the difference is the velocity half a step ago
-            velocity = 0.0 if step <= 0 else (position - self._place) / step
-            lead = step
-            if step > 0 and self._step == 0 and self._move is None:
-                # at the first sample no velocity was known: what that step lacked follows now
-                half = ((position + self._place) / 2, velocity)
-                owed = -float(self._resist(half, (drive, 0.0, time))[0]) - self._given
-        known = step > 0 and self._step > 0
-        bend = (velocity - self._rate) / step if known else 0.0
-        ahead = velocity + bend * lead
-        middle = position + step / 2 * (velocity + bend * (lead - step / 4))
-        u = (drive, 0.0, time)
-        if self._move is not None and not math.isnan(self._before) and step > 0:
-            self._z = self._move(
-                (middle, ahead), (self._before, self._speed), self._z, u, (step,)
-            ).copy()
-        self._place, self._rate, self._now, self._step = position, velocity, time, step
-        self._before, self._speed = middle, ahead
-        self._given = -float(self._resist((middle, ahead, *self._z), u)[0])
-        return self._given + owed
+        law = self._law(velocity is not None)
+        found = law(self._state, (time, drive, position, velocity or 0.0))
+        self._state[:] = found[1:]
+        return float(found[0])
 
 
 @final
@@ -255,4 +286,4 @@ class Evaluator:
         return self._result
 
 
-__all__ = ["PREFIX", "Correction", "CorrectionLaw", "Port", "correction_of"]
+__all__ = ["PREFIX", "Correction", "CorrectionLaw", "Port", "correction_of", "law_function"]

@@ -20,7 +20,8 @@ from irj_fmu.imported.port import port_of
 from irj_fmu.imported.slave import PAIR_FILE
 from irj_fmu.plant.joint import identifier
 
-KINDS: Final = ("pair", "ssp")
+KINDS: Final = ("corrected", "pair", "ssp")
+"""What a user's FMU with an effect goes out as; the first in C, by :mod:`irj_fmu.corrected`."""
 _INNER: Final = "inner.fmu"
 
 

@@ -1,5 +1,5 @@
-"""Plants as FMI 3.0 model exchange, an extra beside the FMI 2.0 FMUs of
-:mod:`irj_fmu.plant.library`.
+"""Plants as FMI 3.0 model exchange and co-simulation; the model and the integrator are those of
+the FMI 2.0 FMUs of :mod:`irj_fmu.plant.library`.
 """
 
 from __future__ import annotations
@@ -9,41 +9,37 @@ from pathlib import Path
 from typing import Any, Final
 from xml.etree.ElementTree import Element, SubElement
 
-from identification.errors import InputError
 from irj_fmu.fmi.archive import content_guid, write_archive
 from irj_fmu.fmi.compiler import TARGETS, compile_library, find_compiler
-from irj_fmu.fmi.model_description import GENERATOR, to_bytes
-from irj_fmu.fmi.unit_definitions import add_unit_definitions
+from irj_fmu.fmi.documentation import beside
+from irj_fmu.fmi.model_description import identity, to_bytes
+from irj_fmu.fmi.targets import FMI3_FOLDERS
+from irj_fmu.fmi.unit_definitions import add_unit_definitions, quantity_of
 from irj_fmu.fmi.variables import Variable
 from irj_fmu.plant.library import (
+    Known,
     PlantSpec,
     _check,
     _config,
     _generate,
     _parameter,
-    _per_second,
     _targets,
+    dependencies,
+    slopes_of,
 )
 
 _SOURCE: Final = "plant_fmi3.c"
-_FOLDERS: Final = {
-    "x86_64-linux-gnu": "x86_64-linux",
-    "aarch64-linux-gnu": "aarch64-linux",
-    "x86_64-windows-gnu": "x86_64-windows",
-    "x86_64-macos": "x86_64-darwin",
-    "aarch64-macos": "aarch64-darwin",
-}
 
 
 def build_plant_fmi3(
     spec: PlantSpec, out: Path, *, cc: str | None = None, target: str | Sequence[str] | None = None
 ) -> Path:
-    """Build the FMI 3.0 model-exchange FMU of a plant, with directional derivatives and FMU state.
+    """Build the FMI 3.0 FMU of a plant, with directional and adjoint derivatives and FMU state.
 
     Parameters
     ----------
     spec : PlantSpec
-        A plant without displacement memory.
+        With displacement memory it runs in co-simulation only.
     out, cc, target
         As in :func:`irj_fmu.plant.library.build_plant`.
 
@@ -55,27 +51,23 @@ def build_plant_fmi3(
     Raises
     ------
     InputError
-        A plant with memory; no compiler; a folder that cannot be written.
+        Functions and declarations that do not fit; no compiler; a folder that cannot be written.
 
     Notes
     -----
-    Outputs and derivatives state no ``dependencies``, which means that each depends on everything.
-    A list as the standard has it leaves parameters out, and importers then give wrong derivatives
-    with respect to them.
+    The ``dependencies`` of outputs and derivatives are those of the expressions and name parameters
+    too. A list as the standard has it leaves parameters out, and importers then give wrong
+    derivatives with respect to them.
     """
     _check(spec)
-    if spec.memory:
-        raise InputError(
-            f"plant {spec.name}: its displacement memory moves with the steps of a "
-            "co-simulation; FMI 3.0 model exchange cannot hold it"
-        )
     targets = _targets(target)
     for triple in targets:
         find_compiler(triple, cc)
     code, limits = _generate(spec)
     folder = Path(__file__).parents[1] / "c"
     sources = {"plant_model.c": code} | {
-        name: (folder / name).read_bytes() for name in (_SOURCE, "living.c")
+        name: (folder / name).read_bytes()
+        for name in (_SOURCE, "fmi3_common.c", "living.c", "plant_integrator.c")
     }
     token = content_guid(
         {
@@ -88,9 +80,14 @@ def build_plant_fmi3(
     content = {f"sources/{name}": text for name, text in sources.items()}
     content["sources/buildDescription.xml"] = to_bytes(_build_description(spec.name))
     content["modelDescription.xml"] = to_bytes(_describe(spec, token))
+    content |= beside(
+        content["modelDescription.xml"],
+        spec.notes,
+        terminals={"joint": {v.name: v.name for v in spec.outputs}},
+    )
     for triple in targets:
         library = compile_library(sources, _SOURCE, triple, cc=cc, libraries=("m",))
-        content[f"binaries/{_FOLDERS[triple]}/{spec.name}{TARGETS[triple].suffix}"] = library
+        content[f"binaries/{FMI3_FOLDERS[triple]}/{spec.name}{TARGETS[triple].suffix}"] = library
     return write_archive(out, content)
 
 
@@ -110,22 +107,22 @@ def _describe(spec: PlantSpec, token: str) -> Element:
             "modelName": spec.name,
             "instantiationToken": token,
             **({"description": spec.description} if spec.description else {}),
-            "generationTool": GENERATOR,
+            **identity(),
             "variableNamingConvention": "structured",
         },
     )
-    SubElement(
-        root,
-        "ModelExchange",
-        {
-            "modelIdentifier": spec.name,
-            "canGetAndSetFMUState": "true",
-            "canSerializeFMUState": "true",
-            "providesDirectionalDerivatives": "true",
-        },
-    )
-    slopes = [Variable(f"der({v.name})", unit=_per_second(v.unit)) for v in spec.states]
-    groups = (spec.states, slopes, spec.inputs, spec.parameters, spec.outputs)
+    able = {
+        "modelIdentifier": spec.name,
+        "canGetAndSetFMUState": "true",
+        "canSerializeFMUState": "true",
+        "providesDirectionalDerivatives": "true",
+        "providesAdjointDerivatives": "true",
+    }
+    if not spec.memory:
+        SubElement(root, "ModelExchange", able)
+    SubElement(root, "CoSimulation", {**able, "canHandleVariableCommunicationStepSize": "true"})
+    slopes = slopes_of(spec)
+    groups = (spec.states, slopes, spec.inputs, spec.parameters, spec.outputs, spec.memory)
     add_unit_definitions(
         root, [(v.unit, v.display_unit) for group in groups for v in group] + [("s", None)]
     )
@@ -178,6 +175,8 @@ def _describe(spec: PlantSpec, token: str) -> Element:
         (v, {"causality": "output", "variability": "continuous", "initial": "calculated"})
         for v in spec.outputs
     ]
+    held = {"causality": "local", "variability": "continuous", "initial": "exact"}
+    rows += [(v, {**held, "start": repr(float(v.start))}) for v in spec.memory]
     for reference, (variable, more) in enumerate(rows):
         SubElement(node, "Float64", {**_attributes(variable, reference), **more})
     time = Variable("time", "s", description="Time.")
@@ -187,21 +186,32 @@ def _describe(spec: PlantSpec, token: str) -> Element:
         {**_attributes(time, len(rows)), "causality": "independent", "variability": "continuous"},
     )
     structure = SubElement(root, "ModelStructure")
-    first = len(rows) - len(spec.outputs)
-    unknowns = [("Output", first + i) for i in range(len(spec.outputs))] + [
-        ("ContinuousStateDerivative", n + i) for i in range(n)
+    first = len(rows) - len(spec.outputs) - len(spec.memory)
+    rates, readings = dependencies(spec)
+    unknowns = [("Output", first + i, known) for i, known in enumerate(readings)]
+    unknowns += [("ContinuousStateDerivative", n + i, known) for i, known in enumerate(rates)]
+    about = [
+        (title, {"valueReference": str(reference), "dependencies": _references(known, 2 * n)})
+        for title, reference, known in unknowns
     ]
-    for title, reference in unknowns:
-        SubElement(structure, title, {"valueReference": str(reference)})
-    for _, reference in unknowns:
-        SubElement(structure, "InitialUnknown", {"valueReference": str(reference)})
+    for title, attributes in about:
+        SubElement(structure, title, attributes)
+    for _, attributes in about:
+        SubElement(structure, "InitialUnknown", attributes)
     return root
+
+
+def _references(known: Known, first: int) -> str:
+    """Value references of states, and of inputs and parameters from `first` on."""
+    states, others = known
+    return " ".join(map(str, (*states, *(i + first for i in others))))
 
 
 def _attributes(variable: Variable, reference: int) -> dict[str, str]:
     found: dict[str, str] = {"name": variable.name, "valueReference": str(reference)}
     optional: Mapping[str, Any] = {
         "description": variable.description or None,
+        "quantity": quantity_of(variable.unit) if variable.unit else None,
         "unit": variable.unit or None,
         "displayUnit": variable.display_unit if variable.unit else None,
         "min": variable.minimum,

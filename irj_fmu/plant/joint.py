@@ -19,9 +19,11 @@ from casadi_models import JointModel
 from casadi_models.functions import JointFunctions
 from casadi_models.parameter import Parameter
 from casadi_models.quantities import linear_unit
+from casadi_models.text.shown import shown
 from identification.data.channels import channel_unit
 from identification.data.joint_file import Joint
 from identification.errors import InputError
+from irj_fmu.fmi.documentation import Note
 from irj_fmu.fmi.variables import Variable
 from irj_fmu.plant.library import PlantSpec
 from irj_fmu.plant.readings import CHANNELS, Readings
@@ -61,6 +63,9 @@ class PlantOptions:
         Communication step, and time between two values of the noise [s].
     tolerance : float
         Relative tolerance of the integrator where the host names none.
+    payload: bool
+        True: inputs ``payload_inertia`` and, where the model has gravity, ``payload_weight`` add to
+        the link's; a payload that is taken up or put down while the plant runs.
     """
 
     drive: Drive | None = None
@@ -70,6 +75,7 @@ class PlantOptions:
     name: str | None = None
     sample_time: float = 1e-3
     tolerance: float = 1e-9
+    payload: bool = False
 
 
 def identifier(name: str) -> str:
@@ -207,6 +213,19 @@ class _Builder:
             )
         return found
 
+    def _payload(self) -> dict[str, Variable]:
+        """Inputs of a payload, by the parameter that they add to."""
+        if not self.options.payload:
+            return {}
+        added = {self.model.inertias[-1]: ("payload_inertia", "Inertia of the payload.")}
+        for name in self.model.named("weight")[:1]:
+            added[name] = ("payload_weight", "Gravity torque of the payload at a level link.")
+        units = {p.name: p.unit for p in self.own_parameters}
+        return {
+            name: Variable(title, units[name], description=text)
+            for name, (title, text) in added.items()
+        }
+
     def _parameter(
         self, name: str, unit: str, start: float, description: str, low: float | None = None
     ) -> Any:
@@ -222,10 +241,14 @@ class _Builder:
         f, options = self.functions, self.options
         mechanical, memory = self._states(), self._memory()
         size, held = len(mechanical), len(memory)
-        inputs = self._inputs()
+        inputs, payload = self._inputs(), self._payload()
         x = ca.SX.sym("x", size + (0 if self.stepped else held) + self.clocked)
         z = ca.SX.sym("z", held) if self.stepped else ca.SX(0, 1)
-        u, p = ca.SX.sym("u", len(inputs)), ca.SX.sym("p", len(self.own_parameters))
+        every_input = ca.SX.sym("u", len(inputs) + len(payload))
+        u, own = every_input[: len(inputs)], ca.SX.sym("p", len(self.own_parameters))
+        p = ca.SX(own)
+        for i, name in enumerate(payload, len(inputs)):
+            p[self.model.parameter_names.index(name)] += every_input[i]
         clock = x[-1] if self.clocked else ca.SX(0)
         full = ca.vertcat(x[:size], z) if self.stepped else x[: size + held]
         drive = self._drive(x, u, clock)
@@ -245,8 +268,8 @@ class _Builder:
         if options.sensors:
             readings = Readings(self._parameter, clock, options.sample_time)
             channels = [readings.read(*pair) for pair in channels]
-        every = ca.vertcat(p, *(symbol for _, symbol in self.extra))
-        arguments = [x, u, every, *([z] if self.stepped else [])]
+        every = ca.vertcat(own, *(symbol for _, symbol in self.extra))
+        arguments = [x, every_input, every, *([z] if self.stepped else [])]
         states = [*mechanical, *([] if self.stepped else memory)]
         if self.clocked:
             states.append(Variable("state.clock", "s", description="Time since the start."))
@@ -257,7 +280,7 @@ class _Builder:
                 "y", arguments, [ca.densify(ca.vertcat(*(value for _, value in channels)))]
             ),
             states=tuple(states),
-            inputs=tuple(inputs),
+            inputs=(*inputs, *payload.values()),
             parameters=(
                 *(
                     _variable(q, v)
@@ -271,6 +294,7 @@ class _Builder:
             memory=tuple(memory) if self.stepped else (),
             default_step=options.sample_time,
             tolerance=options.tolerance,
+            notes=self._notes(),
         )
 
     def _reference(self, u: Any, clock: Any) -> tuple[Any, Any, Any]:
@@ -378,6 +402,29 @@ class _Builder:
         kept = ca.if_else(duration > 0, moved, z)
         return ca.Function("z", [x, z, u, every, before], [ca.densify(kept)])
 
+    def _notes(self) -> tuple[Note, ...]:
+        """Equations, faults and limits, for a reader."""
+        limits = [
+            "Motor quantities are on the motor shaft, link quantities on the link; parameters and "
+            "states are referred to the link.",
+            "Signs of friction are smooth in the width that the smoothing velocity names.",
+        ]
+        if self.stepped:
+            limits.append(
+                "Displacement memory knows its states only as steps: co-simulation only, and inner "
+                f"steps up to {self.options.sample_time:g} s."
+            )
+        notes = [Note("Equations", shown(self.model), verbatim=True)]
+        if self.options.sensors:
+            notes.append(
+                Note(
+                    "Sensor faults",
+                    "Every reading has parameters for noise, quantisation and faults, named after "
+                    "it. All of them start at none and may be changed while the FMU runs.",
+                )
+            )
+        return (*notes, Note("Limits", "\n\n".join(limits)))
+
     def _description(self) -> str:
         parts = [f"Joint {self.model.name}", f"gear ratio {self.model.gear_ratio:g}"]
         if self.model.effects:
@@ -399,6 +446,7 @@ def _variable(parameter: Parameter, value: float) -> Variable:
         value,
         _bound(parameter.low, value, min),
         _bound(parameter.high, value, max),
+        abs(value) or None,
         description=text,
         variability="tunable",
     )

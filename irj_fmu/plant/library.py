@@ -19,6 +19,7 @@ from irj_fmu.fmi.compiler import (
     native_target,
     universal_library,
 )
+from irj_fmu.fmi.documentation import Note, beside
 from irj_fmu.fmi.model_description import Description, Entry, model_description, to_bytes
 from irj_fmu.fmi.variables import Variability, Variable, check_unique
 
@@ -59,6 +60,8 @@ class PlantSpec:
         Communication step in s; also the largest integrator step where there is memory.
     tolerance : float
         Relative tolerance inside ``doStep`` where the host names none.
+    notes : tuple of Note
+        Sections of its documentation: equations, faults, limits.
     """
 
     name: str
@@ -73,6 +76,7 @@ class PlantSpec:
     memory: tuple[Variable, ...] = ()
     default_step: float = 1e-3
     tolerance: float = DEFAULT_TOLERANCE
+    notes: tuple[Note, ...] = ()
 
 
 def build_plant(
@@ -107,8 +111,9 @@ def build_plant(
     Notes
     -----
     The library holds the CasADi functions and their forward directional derivatives with respect to
-    states, inputs and parameters. Unknowns carry no ``dependencies``, which means that each depends
-    on everything; importers that ask for derivatives with respect to parameters need that.
+    states, inputs and parameters. The ``dependencies`` of outputs and derivatives are those of the
+    expressions. They name parameters too: importers that ask for derivatives with respect to
+    parameters need that.
     """
     _check(spec)
     targets = _targets(target)
@@ -123,6 +128,7 @@ def build_plant(
     sources["plant_config.h"] = _config(spec, limits, guid)
     content = {f"sources/{name}": code for name, code in sources.items()}
     content["modelDescription.xml"] = _describe(spec, guid)
+    content |= beside(content["modelDescription.xml"], spec.notes)
     built = {
         triple: compile_library(sources, "plant_wrapper.c", triple, cc=cc, libraries=("m",))
         for triple in targets
@@ -282,17 +288,23 @@ def _config(spec: PlantSpec, limits: Mapping[str, int], guid: str) -> bytes:
 
 def _describe(spec: PlantSpec, guid: str) -> bytes:
     states = [Entry(replace(v, causality="local", variability="continuous")) for v in spec.states]
+    rates, readings = dependencies(spec)
+    first = 2 * len(spec.states) + 1
     slopes = [
-        Entry(Variable(f"der({v.name})", unit=_per_second(v.unit)), "calculated", index)
-        for index, v in enumerate(spec.states, 1)
+        Entry(variable, "calculated", index, _indices(known, first))
+        for index, (variable, known) in enumerate(zip(slopes_of(spec), rates, strict=True), 1)
     ]
     inputs = [Entry(replace(v, causality="input", variability="continuous")) for v in spec.inputs]
     parameters = [
         Entry(replace(v, causality="parameter", variability=_parameter(v))) for v in spec.parameters
     ]
     outputs = [
-        Entry(replace(v, causality="output", variability="continuous"), "calculated")
-        for v in spec.outputs
+        Entry(
+            replace(v, causality="output", variability="continuous"),
+            "calculated",
+            depends=_indices(known, first),
+        )
+        for v, known in zip(spec.outputs, readings, strict=True)
     ]
     memory = [Entry(replace(v, causality="local", variability="continuous")) for v in spec.memory]
     what = Description(
@@ -313,6 +325,48 @@ def _describe(spec: PlantSpec, guid: str) -> bytes:
     return to_bytes(
         model_description(what, [*states, *slopes, *inputs, *parameters, *outputs, *memory])
     )
+
+
+Known = tuple[tuple[int, ...], tuple[int, ...]]
+"""Positions among the states, and among inputs and parameters one after the other."""
+
+
+def dependencies(spec: PlantSpec) -> tuple[list[Known], list[Known]]:
+    """What each derivative and each output depends on, by the structure of the expressions.
+
+    What has memory depends on the past of its inputs through it, which is no dependency of a moment
+    and is not counted.
+    """
+    import casadi as ca
+
+    found = []
+    for model in (spec.dynamics, spec.output):
+        function, symbol = _expanded(model)
+        arguments = [symbol.sym("a", function.size1_in(i)) for i in range(function.n_in())]
+        rows = [(set[int](), set[int]()) for _ in range(function.numel_out(0))]
+        value = function(*arguments)
+        at = 0
+        for i, argument in enumerate(arguments[:3]):
+            sparsity = ca.jacobian_sparsity(value, argument)
+            for row, column in zip(*sparsity.get_triplet(), strict=True):
+                rows[row][i > 0].add(column + at)
+            at = at + argument.numel() if i else 0
+        found.append([(tuple(sorted(x)), tuple(sorted(other))) for x, other in rows])
+    return found[0], found[1]
+
+
+def _indices(known: Known, first: int) -> tuple[int, ...]:
+    """1-based indices in a description where states come first and inputs from `first` on."""
+    states, others = known
+    return (*(i + 1 for i in states), *(i + first for i in others))
+
+
+def slopes_of(spec: PlantSpec) -> list[Variable]:
+    """Derivatives of the states, as variables."""
+    return [
+        Variable(f"der({v.name})", _per_second(v.unit), description=f"Derivative of {v.name}.")
+        for v in spec.states
+    ]
 
 
 def _parameter(variable: Variable) -> Variability:

@@ -87,6 +87,19 @@ def test_system_opens_and_its_estimator_learns(joint: Path, tmp_path: Path) -> N
     assert abs(found["plant.link_position"]).max() > 1e-3
 
 
+def test_plant_as_fmi_3(joint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "dist"
+    assert main(["plant", "--joint", str(joint), "--out", str(out), "--fmi", "3"]) == 0
+    assert "FMI 3.0 model exchange and co-simulation" in capsys.readouterr().out
+    from fmpy import read_model_description
+
+    found = read_model_description(str(out / "axis_3_plant.fmu"))
+    assert found.fmiVersion == "3.0"
+    assert found.coSimulation is not None
+    said = refused(capsys, "ssp", "--joint", str(joint), "--out", str(out), "--fmi", "3")
+    assert "--fmi" in said
+
+
 @pytest.mark.parametrize("kind", ["plant", pytest.param("estimator", marks=pytest.mark.slow)])
 def test_same_content_same_bytes(kind: str, joint: Path, tmp_path: Path) -> None:
     made = []

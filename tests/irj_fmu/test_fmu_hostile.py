@@ -7,14 +7,19 @@ from __future__ import annotations
 import shutil
 import subprocess
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from identification.online.estimator import OnlineOptions
+from irj_fmu.corrected.build import export_corrected
 from irj_fmu.estimator.native import NativeSpec, build_native
 from irj_fmu.fmi.compiler import find_compiler, header_folder
+from irj_fmu.imported.correction import PREFIX
+from irj_fmu.imported.file import outside_correction
+from irj_fmu.imported.model import load_user_model
 from irj_fmu.plant.fmi3 import build_plant_fmi3
 from irj_fmu.plant.joint import PlantOptions, plant_spec
 from irj_fmu.plant.library import build_plant
@@ -22,7 +27,7 @@ from irj_fmu.plant.reference import reference_joint
 from tests.irj_fmu.test_fmu_package import LOADER, clean_environment, pack
 
 HERE = Path(__file__).parents[1]
-OF_2 = ("plant", "native", "slave")
+OF_2 = ("plant", "native", "slave", "corrected")
 EVERY = (*OF_2, "plant3")
 STRANGER = "the instance is NULL, was freed already or is not of this FMU"
 
@@ -60,6 +65,16 @@ def made(folder: Path, what: str) -> Path:
         return build_native(
             NativeSpec(joint, "native", OnlineOptions(optimise=False), None, 1e-3), path
         )
+    if what == "corrected":  # round a plant that gives its state
+        model = load_user_model(
+            made(folder, "plant"),
+            {"motor_current": "i_m", "motor_position": "motor_position"},
+            joint=joint,
+            kind="cs",
+        )
+        drag = {f"{PREFIX}motor_quadratic_drag": 0.1}
+        law = outside_correction(["quadratic_drag@motor"], model.joint, drag, "here")
+        return export_corrected(replace(model, correction=law), path)
     if what == "slave":  # the shim is that of every estimator
         return pack(folder, name=path.name).path
     spec = plant_spec(joint, PlantOptions(name=what))

@@ -1,5 +1,5 @@
-"""Plants as FMI 3.0 model exchange: the same plant as the FMI 2.0 one, with derivatives that
-importers can trust.
+"""Plants as FMI 3.0: the same plant as the FMI 2.0 one, with derivatives that importers can
+trust.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from fmpy.validation import validate_fmu
 
-from identification.errors import InputError
 from irj_fmu.host.exchange import Stepper
 from irj_fmu.imported.exact import Imported
 from irj_fmu.imported.library import UserFmu, UserInstance
@@ -114,9 +113,58 @@ def test_state_is_kept_and_restored(both: tuple[Path, Path]) -> None:
             assert library.fmi3FreeFMUState(component, ctypes.byref(held)) == 0
 
 
-def test_a_plant_with_displacement_memory_is_refused(tmp_path: Path) -> None:
+def co_simulated(path: Path, names: list[str]) -> np.ndarray:
+    """Outputs of a plant after each step of a swinging current, (50, outputs)."""
+    from fmpy import simulate_fmu
+
+    time = 2e-3 * np.arange(51)
+    drive = np.array(
+        list(zip(time, 5 * np.sin(40 * time), strict=True)), dtype=[("time", float), ("i_m", float)]
+    )
+    found = simulate_fmu(
+        str(path),
+        fmi_type="CoSimulation",
+        stop_time=0.1,
+        output_interval=2e-3,
+        input=drive,
+        output=names,
+    )
+    return np.column_stack([found[n] for n in names])
+
+
+@pytest.mark.parametrize("memory", [False, True])
+def test_co_simulation_equals_that_of_fmi_2(memory: bool, tmp_path: Path) -> None:
     joint = reference_joint("hd3")
-    joint = replace(joint, effects=(*joint.effects, "hysteresis"), fitted={})
-    with pytest.raises(InputError, match="displacement memory"):
-        build_plant_fmi3(plant_spec(joint, PlantOptions(name="memory")), tmp_path / "no.fmu")
-    assert list(tmp_path.iterdir()) == []
+    if memory:
+        joint = replace(joint, effects=(*joint.effects, "hysteresis"), fitted={})
+    spec = plant_spec(joint, PlantOptions(name="same"))
+    names = [v.name for v in (*spec.outputs, *spec.memory)]
+    two = co_simulated(build_plant(spec, tmp_path / "2.fmu"), names)
+    three = build_plant_fmi3(spec, tmp_path / "3.fmu")
+    assert validate_fmu(str(three)) == []
+    assert np.ptp(two, axis=0).max() > 0.1
+    np.testing.assert_allclose(co_simulated(three, names), two, rtol=1e-12, atol=1e-15)
+
+
+def test_adjoint_derivatives_are_the_transposed_directional_ones(both: tuple[Path, Path]) -> None:
+    with UserInstance(UserFmu(both[1]), "me") as instance:
+        instance.begin(0.0)
+        instance.ready()
+        instance.slope(0.0, np.array([0.1, 0.2, 0.3, 0.4]))
+        library, component = instance._library, ctypes.c_void_p(instance._component)
+        references = {v.name: v.valueReference for v in instance.fmu.description.modelVariables}
+        unknown = [references[n] for n in ("der(state.motor_velocity)", "link_torque")]
+        known = [references[n] for n in ("state.link_position", "i_m", "stiffness", "link_inertia")]
+        u, k = (ctypes.c_uint32 * 2)(*unknown), (ctypes.c_uint32 * 4)(*known)
+        matrix, two, four = np.empty((2, 4)), ctypes.c_size_t(2), ctypes.c_size_t(4)
+        for j in range(4):
+            seed, out = (ctypes.c_double * 4)(), (ctypes.c_double * 2)()
+            seed[j] = 1.0
+            arguments = (component, u, two, k, four, seed, four, out, two)
+            assert library.fmi3GetDirectionalDerivative(*arguments) == 0
+            matrix[:, j] = out[:]
+        weights, found = (ctypes.c_double * 2)(0.3, -1.7), (ctypes.c_double * 4)()
+        arguments = (component, u, two, k, four, weights, two, found, four)
+        assert library.fmi3GetAdjointDerivative(*arguments) == 0
+    assert np.count_nonzero(matrix) > 4
+    np.testing.assert_allclose(found[:], np.array([0.3, -1.7]) @ matrix, rtol=1e-14)

@@ -95,6 +95,8 @@ class Make:
     units : tuple of (variable, unit)
     events : int
         Event indicators in the description (FMI 2).
+    fails : int
+        Status of the steps from a tenth of a second on (FMI 2); 0 for none that fails.
     """
 
     version: int = 2
@@ -106,6 +108,7 @@ class Make:
     wrong: bool = False
     units: tuple[tuple[str, str], ...] = ()
     events: int = 0
+    fails: int = 0
 
 
 def build(name: str, folder: Path, make: Make | None = None) -> Path:
@@ -118,6 +121,7 @@ def build(name: str, folder: Path, make: Make | None = None) -> Path:
         return out
     library = folder / f"{tag}.so"
     flags = ["-shared", "-fPIC", "-O2", "-w", f"-DMODEL_{shape.macro}", f'-DGUID="{tag}"']
+    flags += [f"-DFAILS={make.fails}"] if make.fails else []
     flags += [*(["-DSTRICT"] if make.strict else []), *(["-DWRONG"] if make.wrong else [])]
     subprocess.run(
         [

@@ -351,7 +351,10 @@ def export_parser() -> OneLineParser:
         prog="irj export", description="A user's FMU with the effect that rides outside it."
     )
     made.add_argument(
-        "kind", nargs="?", default="pair", help=f"{' or '.join(KINDS)} (default: pair)"
+        "kind",
+        nargs="?",
+        default="pair",
+        help=f"{', '.join(KINDS[:-1])} or {KINDS[-1]} (default: pair); corrected needs no Python",
     )
     made.add_argument("--joint", required=True, metavar="J", help="joint file (TOML)")
     made.add_argument(
@@ -362,13 +365,21 @@ def export_parser() -> OneLineParser:
         help="folder of the results (default: dist)",
     )
     made.add_argument("--cc", help="C compiler")
+    made.add_argument(
+        "--target",
+        help="corrected: platform, as linux64 or win64, or all that the FMU has (default: this "
+        "machine)",
+    )
     made.add_argument("--json", metavar="FILE", help="write what was built as JSON")
     return made
 
 
 @_one_line
 def run_export(arguments: Namespace) -> int:
-    """`irj export [pair|ssp] --joint J`: FMU and correction as one FMU, or as a system."""
+    """`irj export [corrected|pair|ssp] --joint J`: FMU and correction as one FMU, in C or with
+    Python, or as a system.
+    """
+    from irj_fmu.corrected.build import export_corrected
     from irj_fmu.fmi.compiler import find_compiler
     from irj_fmu.imported.export import KINDS, export_pair, export_system
     from irj_fmu.imported.file import load_user_joint
@@ -378,11 +389,13 @@ def run_export(arguments: Namespace) -> int:
     if given.kind not in KINDS:
         raise InputError(
             f"export {given.kind}: the model of {given.joint} is an FMU, which goes out as "
-            f"{' or '.join(KINDS)}; write one of them"
+            f"{', '.join(KINDS[:-1])} or {KINDS[-1]}; write one of them"
         )
+    if given.target is not None and given.kind != "corrected":
+        raise InputError(f"--target: goes with corrected, not with {given.kind}; leave it out")
     model = load_user_joint(given.joint)
     name = identifier(model.joint.name)
-    target = given.out / (f"{name}_pair.fmu" if given.kind == "pair" else f"{name}.ssp")
+    target = given.out / (f"{name}.ssp" if given.kind == "ssp" else f"{name}_{given.kind}.fmu")
     inputs = [given.joint, model.fmu.path]
     keep_inputs([target], inputs)
     if given.json is not None:
@@ -391,11 +404,11 @@ def run_export(arguments: Namespace) -> int:
             raise InputError(f"{given.json}: given for two results; give each a file of its own")
     if given.cc is not None:
         find_compiler(None, given.cc)
-    path = (
-        export_pair(model, target, cc=given.cc)
-        if given.kind == "pair"
-        else export_system(model, target, cc=given.cc)
-    )
+    if given.kind == "corrected":
+        path = export_corrected(model, target, cc=given.cc, target=given.target)
+    else:
+        make = export_pair if given.kind == "pair" else export_system
+        path = make(model, target, cc=given.cc)
     print(path)
     write_json(given.json, {"built": [str(path)]})
     return 0

@@ -22,7 +22,18 @@ from workbench.page.records import guessed_role, surveyed
 from workbench.page.session import FileEntry, State
 
 LARGEST_JOINT: Final = 1 << 20
-NUMBERS: Final = tuple(key.name for key in JOINT.keys if key.kind == "number")
+NUMBERS: Final = {key.name: key for key in JOINT.keys if key.kind == "number"}
+MOST: Final[Mapping[str, float]] = {
+    "gear_ratio": 1e6,
+    "motor_constant": 1e4,
+    "torque_per_current": 1e7,
+    "torque_per_voltage": 1e7,
+}
+"""Largest size of a number of the form. Gear ratio: compound gears end at some 1e4, a spindle of a
+linear axis of 0.1 mm per turn has 6e4 rad/m, a decade is left. Motor constant: the torque motors
+of wind turbines and telescopes give some 1e3 N.m/A, a decade is left; on the link side a gear of
+1e3 multiplies it.
+"""
 DRIVE_TRAIN: Final = {k.name: k.default for k in JOINT.keys if k.name in ("kind", *NUMBERS)}
 """What fitted values are referred through, with its defaults."""
 
@@ -175,6 +186,31 @@ def _number(value: Any, what: str) -> float:
     return found
 
 
+def _plausible(value: Any, key: str) -> float:
+    """A number of the form, in the unit that its field names and of a size that a joint can have.
+
+    Raises
+    ------
+    InputError
+    """
+    unit, text = NUMBERS[key].unit, str(value).strip().replace("−", "-")
+    title = key.replace("_", " ")
+    try:
+        found = float(text.replace(",", ".", 1))
+    except ValueError:
+        want = "a plain number" if unit in ("1", "", None) else f"a plain number in {unit}"
+        raise InputError(f"{title} is {text!r}; give {want}, without words or a unit") from None
+    if not math.isfinite(found):
+        raise InputError(f"{title} is {text!r}; give a finite number")
+    if found and not 1.0 / MOST[key] <= abs(found) <= MOST[key]:
+        size = "large" if abs(found) > 1.0 else "small"
+        raise InputError(
+            f"{title} is {found:g}, too {size} for a joint: {NUMBERS[key].meaning}; correct the "
+            "number or its unit"
+        )
+    return found
+
+
 def set_joint(live: Live, body: Mapping[str, Any]) -> dict[str, Any]:
     """Set the joint from a joint file's text, or from the fields of the form.
 
@@ -231,7 +267,7 @@ def _from_form(body: Mapping[str, Any], previous: Mapping[str, Any]) -> dict[str
         if key in body:
             table.pop(key, None)
             if body[key] not in (None, ""):
-                table[key] = _number(body[key], key)
+                table[key] = _plausible(body[key], key)
     if table.get("gear_ratio") is None:
         raise InputError(
             "gear_ratio is empty; give theta_motor / theta_link with its sign (1 where "

@@ -124,6 +124,8 @@ class Service:
             if live is not None:
                 live.close()
             home.delete(self.store, identifier)
+        for listener in tuple(live.listeners) if live is not None else ():
+            listener({"gone": True})  # other tabs that have it open
 
 
 _LOG = logging.getLogger(__name__)

@@ -197,8 +197,13 @@ def staircase_picture(
         f'<path class="s-after band" fill="{AFTER}" fill-opacity="0.22" stroke="none" d="{area}"/>'
     )
     body += f'<path class="s-after" fill="none" stroke="{AFTER}" stroke-width="2.4" d="{line}"/>'
-    for (a, b, y), v, lines in zip(treads, values, wrapped, strict=True):
-        body += word((a + b) / 2, y - 5, f"{number(v, 3)} %")
+    line_at = frame.up(floor) if floor is not None else None
+    under = [  # the line of the noise would run through these figures: they stand below their tread
+        line_at is not None and y - 18 < line_at < y - 1 and y + 14 <= base - 2
+        for _, _, y in treads
+    ]
+    for (a, b, y), v, lines, low in zip(treads, values, wrapped, under, strict=True):
+        body += word((a + b) / 2, y + 13 if low else y - 5, f"{number(v, 3)} %")
         body += "".join(
             word((a + b) / 2, base + 15 + LINE * k, said) for k, said in enumerate(lines)
         )
@@ -208,7 +213,7 @@ def staircase_picture(
             f'<path class="s-ink" stroke="{INK}" stroke-dasharray="2 3" d="M{LEFT} '
             f'{y:.1f}H{width - RIGHT}"/>'
         )
-        below = y + 12 <= base - 2  # else the words would stand in those of the steps
+        below = y + 12 <= base - 2 and not under[0]  # else they would stand in other words
         at = y + 12 if below else y - 4
         body += word(LEFT + 4, at, f"noise alone: {number(floor, 2)} %", "start")
     fall = " to ".join(f"{number(v, 3)} %" for v in values)

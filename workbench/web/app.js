@@ -21,7 +21,7 @@ async function call(method, path, body, more) {
   if (body) { options.body = JSON.stringify(body); options.headers["Content-Type"] = "application/json"; }
   let answer;
   try { answer = await fetch(path, options); } catch (error) { throw new Error("the server does not answer; is it still running? What was done is kept in the session folder."); }
-  if (!answer.ok) throw new Error((await answer.text()) || `error ${answer.status}`);
+  if (!answer.ok) throw Object.assign(new Error((await answer.text()) || `error ${answer.status}`), { gone: answer.status === 404 && app.id && path.startsWith(base()) && !path.includes("/view/") ? app.id : null });
   const type = answer.headers.get("content-type") || "";
   return type.includes("json") ? answer.json() : answer.text();
 }
@@ -44,8 +44,25 @@ const get = (path) => call("GET", base() + path);
 const post = (path, body) => call("POST", base() + path, body || {});
 
 function fail(error) {
+  if (error.gone && error.gone === app.id) { gone(); return; }
   $("error-text").textContent = error.message || String(error);
   $("error").hidden = false;
+}
+/* The session on the screen is no more: said once, with the ways on. */
+function gone() {
+  if (app.source) app.source.close();
+  app.id = app.state = app.source = app.then = app.waiting = app.upload = null;
+  app.token = (app.token || 0) + 1;
+  if (remembered("irj-session")) remembered("irj-session", "");
+  clearError(); surround();
+  app.plots.forEach((p) => p.destroy());
+  app.plots = [];
+  const main = $("main");
+  main.dataset.view = "gone"; main.dataset.revision = "";
+  main.replaceChildren(...heading("This session was deleted", "It was deleted in another tab or on the page of sessions; its records and fits went with it. The other sessions are as they were."),
+    h("div", { class: "row" }, button("See the sessions", () => open("home"), { kind: "primary", work: false, id: "gone-home" }), button("Start a new session", () => act(fresh), { work: false, id: "gone-fresh" })));
+  document.title = "Session deleted – Joint workbench";
+  main.focus({ preventScroll: true });
 }
 function clearError() { $("error").hidden = true; }
 
@@ -105,6 +122,7 @@ function listen() {
   app.source = new EventSource(base() + "/events");
   app.source.onmessage = (event) => {
     const news = JSON.parse(event.data);
+    if (news.gone) { gone(); return; }
     if (!app.state) return;
     const ended = app.state.job && !news.job;
     app.state.job = news.job;
@@ -121,7 +139,8 @@ function usable(state) {
 
 function surround() {
   const state = app.state;
-  if (!state) return;
+  $("nav").closest("nav").hidden = !state; /* a page without a session has no steps */
+  if (!state) { $("job").hidden = true; $("undo").disabled = $("redo").disabled = true; $("headline").dataset.text = ""; $("headline").replaceChildren(); return; }
   const fitted = state.steps.length > 0, ready = state.files.some((f) => ["ready", "checking"].includes(f.status));
   const can = usable(state);
   const done = { load: ready, model: Boolean(state.joint_text), compare: fitted, diagnose: Boolean(state.diagnosis), ledger: state.steps.length > 1, parameters: false, replay: false, plan: false, export: false };
@@ -150,7 +169,9 @@ function surround() {
 
 /* Each view has its address: back and forward go between them. */
 function open(view, { moved = true } = {}) {
-  const address = `#session=${app.id}&view=${view}`, same = location.hash === address || app.view === null;
+  const main = $("main");
+  if (moved && app.view === view && drawnNow(main)) { scrollTo(0, 0); main.focus({ preventScroll: true }); return; } /* a second click on a step does not close what was opened in it */
+  const address = app.id ? `#session=${app.id}&view=${view}` : `#view=${view}`, same = location.hash === address || app.view === null;
   app.view = view;
   if (moved) try { if (same || !location.hash) history.replaceState(null, "", address); else history.pushState(null, "", address); } catch (error) { location.hash = address; }
   surround();
@@ -162,6 +183,9 @@ function open(view, { moved = true } = {}) {
 /* Where the focus is: by id, else by its place among the elements of its kind. */
 function placeOf(node, main) { return { id: node.id, tag: node.tagName, place: [...main.querySelectorAll(node.tagName)].indexOf(node) }; }
 
+/* Whether the screen shows the view that is open, as the state has it; the list of sessions is asked for again. */
+const drawnNow = (main) => Boolean(app.state) && app.view !== "home" && main.dataset.view === app.view && main.dataset.session === app.id && main.dataset.revision === String(app.state.revision);
+
 /* Draw the view again; the focus stays on the same control. */
 function render(moved) {
   const where = moved ? 0 : scrollY;
@@ -169,11 +193,12 @@ function render(moved) {
   app.plots = [];
   const main = $("main");
   const token = (app.token = (app.token || 0) + 1);
+  delete main.dataset.view; /* what is on the screen is the old one until the new one is drawn */
   Promise.resolve(views[app.view](app.state)).then((nodes) => {
     if (token !== app.token) return;
     const focused = main.contains(document.activeElement) ? placeOf(document.activeElement, main) : null; /* now, not when the drawing began */
     main.replaceChildren(...[nodes].flat(3).filter(Boolean));
-    main.dataset.view = app.view; main.dataset.revision = app.state.revision;
+    main.dataset.view = app.view; main.dataset.session = app.id || ""; main.dataset.revision = app.state ? app.state.revision : "";
     document.title = `${(VIEWS.find((v) => v[0] === app.view) || ["", "Sessions"])[1]} – Joint workbench`;
     surround();
     (app.after || []).forEach((f) => f());
@@ -230,8 +255,12 @@ function remembered(key, value) {
 }
 
 async function enter(id) {
+  const was = { id: app.id, state: app.state, drafts: app.drafts };
   app.id = id; app.state = null; app.drafts = {};
-  app.state = await get("");
+  try { app.state = await get(""); } catch (error) { /* the session that was open stays */
+    Object.assign(app, was);
+    throw error.gone ? new Error("there is no such session any more; see Sessions for those that are kept") : error;
+  }
   remembered("irj-session", id);
   listen();
 }
@@ -255,6 +284,13 @@ async function boot() {
   addEventListener("drop", (e) => { e.preventDefault(); if (e.dataTransfer && e.dataTransfer.files.length) { if (app.view !== "load") open("load"); upload(e.dataTransfer.files); } });
   addEventListener("popstate", () => {
     const asked = new URLSearchParams(location.hash.slice(1)), view = asked.get("view");
+    if (asked.get("home")) { /* the printed address, pasted into an open tab */
+      remembered("irj-home", asked.get("home"));
+      const other = asked.get("session");
+      if (other && other !== app.id) enter(other).then(() => open("load")).catch(fail); else { app.view = null; open("home"); }
+      return;
+    }
+    if (!app.state && view !== "home" && !asked.get("session")) return;
     const shown = () => open(usable(app.state)[view] ? view : "load", { moved: false });
     if (asked.get("session") && asked.get("session") !== app.id) enter(asked.get("session")).then(shown).catch(fail); else if (view) shown();
   });
@@ -267,8 +303,10 @@ async function boot() {
   const asked = new URLSearchParams(location.hash.slice(1));
   const known = asked.get("session") || remembered("irj-session");
   if (asked.get("home")) remembered("irj-home", asked.get("home"));
-  try { if (!known) throw new Error(); await enter(known); } catch (error) { await enter((await call("POST", "/api/session")).id); }
+  let lost = null;
+  try { if (!known) throw new Error(); await enter(known); } catch (error) { if (asked.get("session")) lost = error; await enter((await call("POST", "/api/session")).id); }
   const wanted = asked.get("view");
   open((VIEWS.some(([key]) => key === wanted) && (app.state.steps.length || ["load", "model"].includes(wanted))) || wanted === "home" ? wanted : app.state.steps.length ? "ledger" : "load");
+  if (lost) fail(new Error(`${lost.message}. This is a new session.`));
 }
 addEventListener("DOMContentLoaded", () => boot().catch(fail));

@@ -216,6 +216,16 @@ function leftOut(file, plot) {
 
 /* --- sliders -------------------------------------------------------------------------------------------------- */
 
+/* The number typed into a field, or the sentence that says why it is none: empty is not 0, and bounds are bounds. */
+function typedNumber(text, name, low, high) {
+  const plain = text.trim().replace(",", ".").replace("−", "-"), value = Number(plain);
+  if (!plain) return { problem: `${name} is empty: type a number, or press Back to the fit.` };
+  if (!Number.isFinite(value)) return { problem: `${name}: “${text.trim()}” is not a number.` };
+  if (low != null && value < low) return { problem: `${name} cannot be less than ${digits(low, 4)}.` };
+  if (high != null && value > high) return { problem: `${name} cannot be more than ${digits(high, 4)}.` };
+  return { value };
+}
+
 /* Every parameter as a slider: the held-out error and the residual follow; nothing is changed until it is said. */
 function slidersCard(rows, error) {
   const values = {}, figure = h("output", { class: "figure", id: "slider-error" }, `${digits(error)} %`), charts = h("div", { class: "grid" }), state = { asked: 0, busy: false, again: false };
@@ -236,11 +246,13 @@ function slidersCard(rows, error) {
   const row = ([name, p]) => {
     const size = Math.abs(p.value), spread = Math.max(3 * (p.stderr || 0), 0.5 * size, 1e-9), low = Math.max(p.low ?? -Infinity, p.value - spread), high = Math.min(p.high ?? Infinity, p.value + spread);
     const id = `slide-${name}`, short = (v) => String(Number(v.toPrecision(6)));
-    const typed = h("input", { id: `value-${name}`, value: short(p.value), size: "8", inputmode: "decimal", autocomplete: "off", "aria-label": `Value of ${words(name)} [${unit(p.unit)}]`, onchange: (e) => { const v = Number(e.target.value.replace(",", ".")); if (Number.isFinite(v)) { values[name] = v; input.value = String(v); look(); } } });
-    const hold = button(p.held ? "Release" : "Hold", () => held({ [name]: p.held ? null : typed.value.replace(",", ".") }), { kind: "quiet", id: `hold-${name}`, label: `${p.held ? "Release" : "Hold"} ${words(name)}` });
-    const input = h("input", { type: "range", id, min: String(low), max: String(high), step: String((high - low) / 400), value: String(p.value), "aria-label": `${words(name)} [${unit(p.unit)}]`, oninput: (e) => { values[name] = Number(e.target.value); typed.value = short(values[name]); look(); } });
-    inputs.push(() => { input.value = String(p.value); typed.value = short(p.value); });
-    return h("div", { class: "slide" }, h("label", { for: id, class: "small" }, words(name), h("span", { class: "soft plain" }, ` ${p.side} ${unit(p.unit) ? `[${unit(p.unit)}]` : ""}`)), input, typed, hold);
+    const typed = h("input", { id: `value-${name}`, value: short(p.value), size: "8", inputmode: "decimal", autocomplete: "off", "aria-label": `Value of ${words(name)} [${unit(p.unit)}]`, "aria-describedby": `why-${name}`, onchange: () => { const v = read(); if (v != null) { values[name] = v; input.value = String(v); look(); } } });
+    const why = h("p", { class: "small bad why", id: `why-${name}`, role: "alert", hidden: true });
+    const read = () => { const { value, problem } = typedNumber(typed.value, words(name), p.low, p.high); why.textContent = problem || ""; why.hidden = !problem; typed.setAttribute("aria-invalid", String(Boolean(problem))); return problem ? null : value; };
+    const hold = button(p.held ? "Release" : "Hold", () => { if (p.held) { held({ [name]: null }); return; } const v = read(); if (v != null) held({ [name]: v }); }, { kind: "quiet", id: `hold-${name}`, label: `${p.held ? "Release" : "Hold"} ${words(name)}` });
+    const input = h("input", { type: "range", id, min: String(low), max: String(high), step: String((high - low) / 400), value: String(p.value), "aria-label": `${words(name)} [${unit(p.unit)}]`, oninput: (e) => { values[name] = Number(e.target.value); typed.value = short(values[name]); read(); look(); } });
+    inputs.push(() => { input.value = String(p.value); typed.value = short(p.value); why.hidden = true; typed.removeAttribute("aria-invalid"); });
+    return h("div", { class: "slide" }, h("label", { for: id, class: "small" }, words(name), h("span", { class: "soft plain" }, ` ${p.side} ${unit(p.unit) ? `[${unit(p.unit)}]` : ""}`), p.held ? h("span", { class: "tag" }, "held") : null), input, typed, hold, why);
   };
   const moved = Object.entries(rows).filter(([, p]) => !p.nuisance);
   const reset = () => { for (const k of Object.keys(values)) delete values[k]; inputs.forEach((f) => f()); figure.textContent = `${digits(error)} %`; charts.replaceChildren(); };

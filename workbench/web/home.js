@@ -12,9 +12,16 @@ function stairs(errors) {
   return svg;
 }
 
+/* Without its key the list is not asked for: what to do is said, and the key can be given here. */
+function keyCard(said) {
+  const give = (e) => { e.preventDefault(); const text = $("home-key").value.trim(), key = new URLSearchParams(text.slice(text.indexOf("#") + 1)).get("home") || text; if (key) { remembered("irj-home", key); render(false); } };
+  return [heading("Sessions", said), h("form", { class: "card", id: "need-key", onsubmit: give }, h("p", {}, "Open the address that ", h("code", {}, "irj app"), " printed in its terminal: it ends in ", h("code", {}, "#home="), " and a key. Or paste that address here:"), h("div", { class: "row" }, h("input", { id: "home-key", size: "48", "aria-label": "The address that irj app printed", autocomplete: "off", spellcheck: "false" }), h("button", { type: "submit", class: "primary" }, "Show the sessions")))];
+}
+
 views.home = async () => {
   let found;
-  try { found = await homeCall("GET", "/api/home"); } catch (error) { return [heading("Sessions"), h("p", { class: "note" }, `The list is for whoever started the server: ${error.message}.`)]; }
+  if (!remembered("irj-home")) return keyCard("The list of sessions is for whoever started the server, so that it needs a key.");
+  try { found = await homeCall("GET", "/api/home"); } catch (error) { return keyCard(`The list is not shown: ${error.message}.`); }
   const draft = app.drafts.home || (app.drafts.home = { search: "", sure: null }), list = h("div", { class: "sessions" });
   const called = (s) => s.name || s.joint || (s.files[0] ? s.files[0].replace(/\.[^.]*$/, "") : "session");
   const go = (id) => act(async () => { await enter(id); open(app.state.steps.length ? "ledger" : "load"); });

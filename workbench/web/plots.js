@@ -56,7 +56,8 @@ class SeriesPlot {
     this.host = host; this.fetcher = fetcher; this.title = title || ""; this.local = Boolean(local); this.panels = panels || null; this.side = side || "";
     this.range = null; this.asked = 0; this.plots = []; this.small = null; this.whole = null; this.marks = null; this.onCursor = null;
     this.main = h("div"); this.strip = h("div", { class: "strip", hidden: true });
-    host.replaceChildren(this.main, this.strip, h("div", { class: "row under end" }, saver(this.title || "series", () => this.svg(), () => this.csv())));
+    this.save = h("div", { class: "row under end", hidden: true }, saver(this.title || "series", () => this.svg(), () => this.csv())); /* there is nothing to save before the data came */
+    host.replaceChildren(this.main, this.strip, this.save);
     this.observer = new ResizeObserver(() => {
       if (host.clientWidth) this.plots.forEach((p, k) => p.setSize({ width: host.clientWidth, height: this.height(k) }));
       if (this.small && host.clientWidth) { this.small.setSize({ width: host.clientWidth, height: 74 }); this.mark(); }
@@ -98,7 +99,7 @@ class SeriesPlot {
   redraw() { this.plots.forEach((p) => p.redraw(false)); }
   draw(data) {
     const { of, axis } = this.colours();
-    this.data = data;
+    this.data = data; this.save.hidden = false;
     this.plots.forEach((p) => p.destroy());
     const groups = this.panels ? this.panels.map((names) => data.series.filter((s) => names.includes(s.name))).filter((g) => g.length) : [data.series];
     this.plots = groups.map((group, panel) => {

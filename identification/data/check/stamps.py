@@ -173,8 +173,14 @@ def check_sampling(record: Record) -> list[Finding]:
         findings.append(Finding("refuse", "time_unit", message, "time"))
     elif dt >= _SLOWEST or dt < _FASTEST:
         unit = "ms" if dt >= _SLOWEST else "s"
+        counted = (
+            "does time number the samples? give the period of the clock as the scale of this "
+            "column (0.004 at 250 Hz); "
+            if bool(np.all(steps == 1.0))
+            else ""
+        )
         message = (
-            f"{record.name}: the sampling step is {dt:.4g} s: is time in {unit}? correct "
+            f"{record.name}: the sampling step is {dt:.4g} s: {counted}is time in {unit}? correct "
             "the unit of time"
         )
         findings.append(

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.sparse import csr_array
 
 from identification import Joint, Record, fit, load_joint, read
 from identification.balance.dataset import load_dataset, prepared_model
@@ -107,7 +108,7 @@ def test_only_certain_noise_is_taken_off_a_normal_matrix() -> None:
 
 def test_noise_falls_on_the_windows_whose_rows_take_part() -> None:
     products = NoiseProducts({"link": np.eye(2)}, {"link": np.ones(2)})
-    windows = np.array([[1.0, 1.0, 0.4, 0.0, 0.0], [0.0, 0.0, 1.0, 1.0, 0.5]])
+    windows = csr_array([[1.0, 1.0, 0.4, 0.0, 0.0], [0.0, 0.0, 1.0, 1.0, 0.5]])
     weights = {"link": np.array([1.0, 1.0, 1.0, 50.0, 1.0])}
     gram, score = products.by_window(weights, windows, {"link": np.array([1, 1, 1, 0, 1]) > 0})
     assert gram[:, 0, 0] == pytest.approx([0.5, 0.25])
@@ -120,8 +121,8 @@ def test_noise_without_a_slow_part_is_no_error_of_a_slow_parameter() -> None:
     rng, dt = np.random.default_rng(4), 0.02
     time = np.arange(4000) * dt
     windows = windows_over([time[:2000], time[2000:]])
-    np.testing.assert_allclose(np.sum(windows**2, axis=0), 1.0)
-    assert len(windows) < 1.1 * OVERLAP * 80 / (2 * BLOCK) + 2 * OVERLAP
+    np.testing.assert_allclose((windows * windows).sum(axis=0), 1.0)
+    assert windows.shape[0] < 1.1 * OVERLAP * 80 / (2 * BLOCK) + 2 * OVERLAP
     columns = np.column_stack([np.ones(4000), np.sin(time)])
     white = rng.standard_normal(4000)
     for noise, known in ((white, 4000**-0.5), (np.diff(white, prepend=0.0), 0.0)):

@@ -546,6 +546,15 @@ def test_commands_with_an_fmu_as_the_model(
     assert json.loads((tmp_path / "c.json").read_text())["outputs"]["motor_position"]["ratio"] < 2
     assert irj("export", "pair", "--joint", final, "--out", str(tmp_path)) == 0
     assert (tmp_path / "user_axis_pair.fmu").is_file()
+    assert irj("export", "corrected", "--joint", final, "--out", str(tmp_path)) == 0
+    assert (tmp_path / "user_axis_corrected.fmu").is_file()
+    for words, line in (
+        (("pair", "--target", "win64"), "--target: goes with corrected, not with pair"),
+        (("corrected", "--target", "win64"), "holds no library for win64"),
+        (("corrected", "--target", "vax"), "target 'vax' is not known"),
+    ):
+        with pytest.raises(InputError, match=line):
+            irj("export", *words, "--joint", final, "--out", str(tmp_path))
     with pytest.raises(InputError, match="irj track"):
         irj("track", train, "--joint", final)
 

@@ -80,6 +80,19 @@ def test_a_kinematic_error_is_named_and_nothing_beside_it(path: Path) -> None:
         found.add()
 
 
+def test_a_sensor_gain_and_a_motor_constant_are_a_set_where_all_torques_are_free(
+    path: Path,
+) -> None:
+    """Inertias, friction, gravity and stiffness a tenth larger under a motor that gives a tenth
+    more move alike: only the torque sensor shows a difference, and it may be the one that is off.
+    """
+    record = recorded("torque_sensor_gain", 10.0, 3)
+    found = diagnose(foreign(path), record.window(0, 6), record.window(6, 10))
+    assert [set(c.effects) for c in found.claims] == [
+        {"torque_sensor_gain", "motor_constant_error"}
+    ]
+
+
 def test_what_the_file_says_the_fmu_holds_changes_no_answer(tmp_path: Path) -> None:
     """A slow motion tells friction laws apart badly: beside the FMU's own parameter of the same law
     a listed effect in the balance would be a column that is nearly another.

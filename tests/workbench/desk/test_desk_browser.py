@@ -233,6 +233,9 @@ def test_the_import_shows_what_would_be_odd_before_it_is_used(
 
 
 def test_sessions_are_found_named_and_deleted(address: str, page: Any, root: Path) -> None:
+    from workbench.page.desk import home
+    from workbench.page.session import Store
+
     page.goto(address)
     page.click("#fresh")
     page.wait_for_selector("#demo")
@@ -244,13 +247,11 @@ def test_sessions_are_found_named_and_deleted(address: str, page: Any, root: Pat
     page.set_input_files("#files", str(root / "rig.csv"))
     page.wait_for_selector(".import svg")
     page.click("#home")
-    page.wait_for_selector(".note")
-    assert "irj app printed" in page.inner_text(".note")  # no list without the key
-    key = (root / "home.key").read_text()
-    page.goto(f"{address}#home={key}")
-    page.reload()
-    page.wait_for_selector("#demo, #fit, #staircase, .drop")
-    page.click("#home")
+    page.wait_for_selector("#need-key")
+    assert "irj app printed" in page.inner_text("#need-key")
+    assert page.locator(".session").count() == 0  # no list without the key
+    key = home.key_of(Store(root))
+    page.goto(f"{address}#home={key}")  # in the open tab
     page.wait_for_selector(".session")
     before = page.locator(".session").count()
     page.get_by_label("Name of rig").first.fill("left bench")

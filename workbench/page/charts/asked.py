@@ -22,6 +22,7 @@ from identification.errors import InputError
 from identification.fitting.assess import relative_error_percent
 from identification.fitting.engine import references, stack
 from workbench.page.analysis import Analysis
+from workbench.page.charts.choices import limits_of, within
 from workbench.page.jobs.place import hint_for
 from workbench.page.live import Live
 from workbench.page.records import plot_time
@@ -376,6 +377,8 @@ def _what_if(live: Live, query: Query) -> dict[str, Any]:
         raise InputError("values must be numbers") from None
     if not all(map(math.isfinite, moved.values())):
         raise InputError("values must be finite numbers")
+    limits = limits_of(live)
+    moved = {k: within(k, v, limits) for k, v in moved.items()}
     values = {**now.values, **moved}
     data = analysis.data
     error = relative_error_percent(now.model, data, data.held_out, values)

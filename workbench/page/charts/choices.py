@@ -39,12 +39,35 @@ def held_text(live: Live, held: Any) -> str:
     text = live.analysis().to_joint_file() if live.state.steps else live.state.joint_text
     data = from_toml(text, "joint")
     known = dict(data.get("known", {}))
+    limits = limits_of(live)
     for name, value in held.items():
         known.pop(name, None)
         if value is not None:
-            known[name] = _number(name, value)
+            known[name] = within(name, _number(name, value), limits)
     made = {k: v for k, v in data.items() if k in GIVEN and k != "known"}
     return tables_text(made | ({"known": known} if known else {}))
+
+
+def limits_of(live: Live) -> dict[str, tuple[float, float]]:
+    """Physical bounds of every parameter of the model as it stands; none before the first fit."""
+    if not live.state.steps:
+        return {}
+    return {p.name: (p.low, p.high) for p in live.analysis().current.model.parameters}
+
+
+def within(name: str, value: float, limits: Mapping[str, tuple[float, float]]) -> float:
+    """The value, which is one that the parameter can have.
+
+    Raises
+    ------
+    InputError
+        It is out of the parameter's bounds.
+    """
+    low, high = limits.get(name, (-math.inf, math.inf))
+    if not low <= value <= high:
+        bound = f"less than {low:.4g}" if value < low else f"more than {high:.4g}"
+        raise InputError(f"{name} cannot be {bound}; {value:g} was given")
+    return value
 
 
 def _number(name: str, value: Any) -> float:

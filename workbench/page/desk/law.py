@@ -32,8 +32,8 @@ def typed(body: Mapping[str, Any], kind: str) -> TypedLaw:
     text, place, given = (str(body.get(k, "")).strip() for k in ("law", "on", "parameters"))
     if not text or not place or not given:
         raise InputError(
-            'law: give the law, as a*tanh(v/b), where it acts, and its parameters, as "a=0..10 '
-            'N.m, b=0.01..1 rad/s"'
+            'law: give the law, as c*tanh(v/w), where it acts, and its parameters, as "c=0..10 '
+            'N.m, w=0.01..1 rad/s"'
         )
     if max(len(text), len(given)) > LONGEST:
         raise InputError(f"law: is longer than {LONGEST} characters; declare it in a file")

@@ -1,0 +1,287 @@
+"""A user's FMU and the effect that rides outside it as one FMU that needs no Python.
+
+The FMU lies in it as it came, unpacked; a library in C passes every call on and corrects the drive
+by the same law as the fit (:func:`irj_fmu.imported.correction.law_function`), at the same times.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, final
+
+from identification.errors import InputError
+from irj_fmu.corrected.description import corrected_description, interface
+from irj_fmu.fmi.archive import content_guid, write_archive
+from irj_fmu.fmi.compiler import (
+    TARGETS,
+    compile_library,
+    find_compiler,
+    header_folder,
+    native_target,
+    universal_library,
+)
+from irj_fmu.fmi.targets import native_targets
+from irj_fmu.fmi.variables import Variable
+from irj_fmu.host.run import Number
+from irj_fmu.imported.correction import PREFIX, Correction, law_function
+from irj_fmu.imported.model import UserModel
+from irj_fmu.imported.port import port_of
+from irj_fmu.imported.run import HOLD
+from irj_fmu.imported.slave import correction_variables
+from irj_fmu.plant.joint import identifier
+
+_C: Final = Path(__file__).parents[1] / "c"
+_SOURCES: Final = ("corrected_wrapper.c", "fmi2_common.c", "living.c")
+_LARGEST: Final = 2**32 - 1
+_KINDS: Final = {
+    "real": ("Real",),
+    "integer": ("Integer", "Enumeration"),
+    "boolean": ("Boolean",),
+    "string": ("String",),
+}
+_C_TYPES: Final = {"real": "double", "integer": "int", "boolean": "int"}
+
+
+def export_corrected(
+    model: UserModel, out: Path, *, cc: str | None = None, target: str | Sequence[str] | None = None
+) -> Path:
+    """Write FMU and correction as one FMI 2.0 co-simulation FMU in C.
+
+    It has the variables of the user's FMU, with fitted values as start values, and the parameters
+    of the correction behind them.
+
+    Parameters
+    ----------
+    model : UserModel
+        Its FMU is FMI 2.0 co-simulation and has a library for each target.
+    out : Path
+        File to write, ending in ``.fmu``.
+    cc : str, optional
+        Compiler, see :func:`irj_fmu.fmi.compiler.find_compiler`.
+    target : str or sequence of str, optional
+        See :func:`irj_fmu.fmi.targets.native_targets`; by default this machine. ``"all"`` are those
+        that the user's FMU has.
+
+    Returns
+    -------
+    Path
+        Absolute path of the FMU. The same content gives the same bytes.
+
+    Raises
+    ------
+    InputError
+        No correction; an FMU of another kind or without a library for a target; no compiler; a
+        folder that cannot be written.
+    """
+    name, correction = model.fmu.path.name, model.correction
+    if correction is None:
+        raise InputError(f"{name}: no effect rides outside it; diagnose and add one first")
+    if model.fmu.version != 2 or model.fmu.description.coSimulation is None:
+        raise InputError(
+            f"{name}: a corrected FMU in C needs it as FMI 2.0 co-simulation; export the pair, "
+            "which runs where Python runs"
+        )
+    targets = _present(model) if target == "all" else native_targets(target)
+    libraries = {triple: _library(model, triple) for triple in targets}
+    for triple in targets:
+        find_compiler(triple, cc)
+    header_folder()
+    plan = _plan(model)
+    code, limits = _law(correction, has_velocity=port_of(model).velocity is not None)
+    called = identifier(Path(out).stem)
+    inner = {
+        f"resources/inner/{path.relative_to(model.fmu.folder).as_posix()}": path.read_bytes()
+        for path in sorted(model.fmu.folder.rglob("*"))
+        if path.is_file()
+    }
+    sources = {"corrected_law.c": code} | {n: (_C / n).read_bytes() for n in _SOURCES}
+    about = (
+        f"{model.fmu.description.modelName} with {', '.join(correction.labels)} outside it, "
+        "as a correction of its drive."
+    )
+
+    def described(guid: str) -> bytes:
+        return corrected_description(
+            model.fmu.folder,
+            name=called,
+            guid=guid,
+            about=about,
+            starts=plan.starts,
+            added=plan.added,
+            first=plan.first,
+        )
+
+    def configured(guid: str, library: str) -> bytes:
+        return _config(model, correction, plan, {**limits, **_texts(model, guid, library)})
+
+    guid = content_guid(
+        {**inner, **sources, "description": described(""), "config": configured("", "")}
+    )
+    content = {**inner, "modelDescription.xml": described(guid)}
+    built = {
+        triple: compile_library(
+            {**sources, "corrected_config.h": configured(guid, library)},
+            _SOURCES[0],
+            triple,
+            cc=cc,
+            libraries=("dl", "m"),
+        )
+        for triple, library in libraries.items()
+    }
+    both = ("x86_64-macos", "aarch64-macos")
+    if all(triple in built for triple in both):
+        built[both[0]] = universal_library(built[both[0]], built.pop(both[1]))
+    for triple, binary in built.items():
+        content[f"binaries/{TARGETS[triple].folder}/{called}{TARGETS[triple].suffix}"] = binary
+    return write_archive(out, content)
+
+
+def _present(model: UserModel) -> tuple[str, ...]:
+    """Targets for which the inner FMU has a library."""
+    folder, own = model.fmu.folder / "binaries", model.fmu.description.coSimulation.modelIdentifier
+    found = [t for t, p in TARGETS.items() if (folder / p.folder / f"{own}{p.suffix}").is_file()]
+    return tuple(found) or (native_target(),)
+
+
+def _library(model: UserModel, triple: str) -> str:
+    """The library of the inner FMU for a target, below its folder."""
+    place, folder = TARGETS[triple], model.fmu.folder / "binaries"
+    own = model.fmu.description.coSimulation.modelIdentifier
+    path = folder / place.folder / f"{own}{place.suffix}"
+    if not path.is_file():
+        there = ", ".join(sorted(p.name for p in folder.iterdir())) if folder.is_dir() else "none"
+        raise InputError(
+            f"{model.fmu.path.name}: holds no library for {place.folder}, so nothing corrected can "
+            f"run there; it has {there or 'none'}"
+        )
+    return path.relative_to(model.fmu.folder).as_posix()
+
+
+@final
+@dataclass(frozen=True)
+class _Plan:
+    """Variables of a corrected FMU.
+
+    Attributes
+    ----------
+    starts : mapping
+        New start values of the inner FMU's variables.
+    added : tuple of Variable
+        Parameters of the correction, the time between two readings, what is added to the drive.
+    first : int
+        Value reference of the first of them.
+    """
+
+    starts: Mapping[str, Number]
+    added: tuple[Variable, ...]
+    first: int
+
+
+def _plan(model: UserModel) -> _Plan:
+    drive = model.fmu.variable(model.inputs[port_of(model).input].variable)
+    parameters = correction_variables(model)
+    hold = Variable(
+        f"{PREFIX}sample_time",
+        "s",
+        HOLD,
+        causality="parameter",
+        description="Longest time for which the correction holds.",
+    )
+    what = Variable(f"{PREFIX}added", description=f"What the correction adds to {drive.name}.")
+    added = (*parameters, hold, what)
+    first = 1 + max(int(v.valueReference) for v in model.fmu.description.modelVariables)
+    if first + len(added) > _LARGEST:
+        raise InputError(
+            f"{model.fmu.path.name}: its value references go up to {first - 1}; there is no room "
+            "for those of the correction"
+        )
+    starts = {**model.constants, **{p.name: p.value for p in model.parameters}}
+    return _Plan(starts, added, first)
+
+
+def _law(correction: Correction, *, has_velocity: bool) -> tuple[bytes, dict[str, int]]:
+    """C code of the law and the sizes of its arrays."""
+    import casadi as ca
+
+    law = law_function(correction.model, has_velocity=has_velocity)
+    generator = ca.CodeGenerator("corrected_law", {"with_header": False})
+    generator.add(law)
+    with tempfile.TemporaryDirectory(prefix="irj-code-") as folder:
+        generator.generate(f"{folder}/")
+        code = (Path(folder) / "corrected_law.c").read_bytes()
+    return code, {
+        "NS": law.numel_in(0),
+        "NP": law.numel_in(2),
+        "SZ_ARG": law.sz_arg(),
+        "SZ_RES": law.sz_res(),
+        "SZ_IW": law.sz_iw(),
+        "SZ_W": law.sz_w(),
+    }
+
+
+def _texts(model: UserModel, guid: str, library: str) -> dict[str, str]:
+    """Texts of the configuration, as C has them."""
+    return {
+        "CORRECTED_GUID": json.dumps(guid),
+        "INNER_GUID": json.dumps(str(model.fmu.description.guid)),
+        "INNER_LIBRARY": json.dumps(library, ensure_ascii=False),
+    }
+
+
+def _config(model: UserModel, correction: Correction, plan: _Plan, own: Mapping[str, Any]) -> bytes:
+    port, law = port_of(model), correction.model
+    simulation = interface(model.fmu.folder)
+    variables = model.fmu.description.modelVariables
+    names = law.parameter_names
+    read = [model.outputs[port.output].variable]
+    read += [model.outputs[port.velocity].variable] if port.velocity is not None else []
+    drive = model.inputs[port.input].variable
+
+    def reference(name: str) -> int:
+        return int(model.fmu.variable(name).valueReference)
+
+    defined: dict[str, Any] = {
+        **own,
+        "INNER_STATES": int(simulation.get("canGetAndSetFMUstate") in ("true", "1")),
+        "INNER_BYTES": int(simulation.get("canSerializeFMUstate") in ("true", "1")),
+        "NF": len(correction.free),
+        "VR_LAW": f"{plan.first}u",
+        "VR_DRIVE": f"{reference(drive)}u",
+        "VR_READ": "{" + ", ".join(f"{reference(n)}u" for n in read) + "}",
+        "PER_DRIVE": repr(float(port.torque)),
+        "PER_POSITION": repr(float(port.position)),
+        "PER_RATE": repr(float(port.rate)),
+        "DRIVE_START": repr(model.fmu.start(drive)),
+        "HOLD": repr(HOLD),
+    }
+    lines = ["/* Places, start values and value references of this FMU. */"]
+    lines += [f"#define {key} {value}" for key, value in defined.items()]
+    values = [float(v) for v in law.value_vector()]
+    lines.append(_table("start_p", "double", values))
+    lines.append(_table("free_p", "int", [names.index(n) for n in correction.free]))
+    for kind, types in _KINDS.items():
+        own = {v.name: int(v.valueReference) for v in variables if v.type in types}
+        known = sorted(set(own.values()))
+        lines.append(_table(f"known_{kind}", "fmi2ValueReference", known))
+        lines.append(f"#define N_KNOWN_{kind.upper()} {len(known)}")
+        if kind in _C_TYPES:
+            starts = {own[n]: v for n, v in plan.starts.items() if n in own}
+            lines.append(_table(f"start_{kind}", "fmi2ValueReference", starts))
+            cast = float if kind == "real" else int
+            lines.append(
+                _table(f"start_{kind}_to", _C_TYPES[kind], [cast(v) for v in starts.values()])
+            )
+            lines.append(f"#define N_START_{kind.upper()} {len(starts)}")
+    return ("\n".join(lines) + "\n").encode()
+
+
+def _table(name: str, kind: str, values: Iterable[Number]) -> str:
+    text = ", ".join(repr(v) for v in values) or "0"
+    return f"static const {kind} {name}[] = {{{text}}};"
+
+
+__all__ = ["export_corrected"]

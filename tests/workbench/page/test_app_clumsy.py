@@ -1,0 +1,191 @@
+"""What a clumsy hand does to the page in Debian's Chromium: a session deleted in another tab, a key
+pasted into an open tab, fields with nothing, too much or words in them.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+CHROMIUM = Path(os.environ.get("IRJ_CHROMIUM", "/usr/bin/chromium"))
+CI = bool(os.environ.get("CI"))
+
+playwright_sync = (
+    pytest.importorskip("playwright.sync_api")
+    if not CI
+    else __import__("playwright.sync_api", fromlist=["x"])
+)
+pytestmark = pytest.mark.skipif(
+    not CI and not CHROMIUM.exists(), reason="no chromium here (with CI set this fails)"
+)
+
+
+@dataclass
+class Opened:
+    """A browser on a running server, and what its pages logged as errors."""
+
+    address: str
+    key: str
+    context: Any
+    page: Any
+    problems: list[str]
+
+
+@pytest.fixture(scope="module")
+def opened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Opened]:
+    """The demo, fitted."""
+    import uvicorn
+
+    from workbench.page.desk import home
+    from workbench.page.server import _listen, create_app
+    from workbench.page.session import Store
+
+    root = tmp_path_factory.mktemp("sessions")
+    listening = _listen(0)
+    port = int(listening.getsockname()[1])
+    server = uvicorn.Server(
+        uvicorn.Config(
+            create_app(root, port=port), log_level="error", ws="none", timeout_graceful_shutdown=1
+        )
+    )
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
+    thread.start()
+    address = f"http://127.0.0.1:{port}/"
+    with playwright_sync.sync_playwright() as play:
+        chromium = play.chromium.launch(executable_path=str(CHROMIUM), args=["--no-sandbox"])
+        context = chromium.new_context(viewport={"width": 1280, "height": 860})
+        problems: list[str] = []
+        context.on("weberror", lambda e: problems.append(str(e.error)))
+        context.on("console", lambda m: problems.append(m.text) if m.type == "error" else None)
+        page = context.new_page()
+        page.goto(address)
+        page.click("#demo")
+        page.wait_for_selector("#fit", timeout=60_000)
+        page.click("#fit")
+        drawn(page, "compare")
+        yield Opened(address, home.key_of(Store(root)), context, page, problems)
+        chromium.close()
+    server.should_exit = True
+    thread.join(10)
+    listening.close()
+    assert problems == []
+
+
+def drawn(page: Any, view: str) -> None:
+    page.wait_for_function(
+        "v => document.querySelector('#main').dataset.view === v && !busy() && "
+        "app.state.steps.every((s) => s.settled)",
+        arg=view,
+        timeout=120_000,
+    )
+
+
+def test_a_number_that_is_none_is_said_at_its_field_and_changes_nothing(opened: Opened) -> None:
+    page = opened.page
+    page.click("#nav-parameters")
+    drawn(page, "parameters")
+    shown, joint = page.inner_text("#slider-error"), page.evaluate("app.state.joint_text")
+    for text, said in (
+        ("", "motor coulomb is empty"),
+        ("junk", "“junk” is not a number"),
+        ("-3", "motor coulomb cannot be less than 0"),
+    ):
+        page.fill("#value-motor_coulomb", text)
+        page.click("#hold-motor_coulomb")
+        assert said in page.inner_text("#why-motor_coulomb")
+        assert page.get_attribute("#value-motor_coulomb", "aria-invalid") == "true"
+        assert page.is_hidden("#error")
+        assert page.inner_text("#slider-error") == shown
+        assert page.evaluate("app.state.joint_text") == joint
+    page.fill("#value-motor_coulomb", "15,5")
+    page.keyboard.press("Tab")
+    page.wait_for_function(
+        "was => document.querySelector('#slider-error').textContent !== was", arg=shown
+    )
+    assert page.is_hidden("#why-motor_coulomb")
+    page.click("#hold-motor_coulomb")
+    page.wait_for_function("() => app.state.joint_text.includes('[known]')")
+    drawn(page, "parameters")
+    row = page.locator("main table tr", has_text="motor coulomb").first
+    assert "held" in row.inner_text()
+
+
+def test_the_server_refuses_a_value_out_of_bounds_too(opened: Opened) -> None:
+    page = opened.page
+    asked = (
+        "async ([path, body]) => { try { await (body ? post(path, body) : get(path)); return ''; }"
+        " catch (e) { return e.message; } }"
+    )
+    path = "/view/what-if?values=" + "%7B%22motor_coulomb%22%3A-3%7D"
+    assert "cannot be less than 0" in page.evaluate(asked, [path, None])
+    hold = {"hold": {"motor_coulomb": -3}}
+    assert "cannot be less than 0" in page.evaluate(asked, ["/joint", hold])
+    opened.problems.clear()  # the browser logs an answer of 422
+
+
+def test_a_joint_that_cannot_be_is_refused_at_its_form(opened: Opened) -> None:
+    page = opened.page
+    page.click("#nav-model")
+    drawn(page, "model")
+    joint = page.evaluate("app.state.joint_text")
+    for field, text, said in (
+        ("gear_ratio", "1e9", "gear ratio is 1e+09, too large for a joint"),
+        ("motor_constant", "0.1 kg", "motor constant is '0.1 kg'; give a plain number in N.m/A"),
+    ):
+        before = page.input_value(f"#{field}")
+        page.fill(f"#{field}", text)
+        page.click("#save")
+        page.wait_for_selector("#error:not([hidden])")
+        assert said in page.inner_text("#error-text")
+        page.fill(f"#{field}", before)
+    assert page.evaluate("app.state.joint_text") == joint
+    page.click("#error-close")
+    opened.problems.clear()  # the browser logs an answer of 422
+
+
+def test_a_second_click_on_a_step_keeps_what_was_opened_in_it(opened: Opened) -> None:
+    page = opened.page
+    page.click("#nav-compare")
+    drawn(page, "compare")
+    page.evaluate("document.querySelector('#as-such details.save').open = true")
+    page.click("#nav-compare")
+    assert page.evaluate("document.querySelector('#as-such details.save').open")
+
+
+def test_the_sessions_say_what_to_do_without_their_key_and_take_it_in_an_open_tab(
+    opened: Opened,
+) -> None:
+    page = opened.page
+    page.click("#home")
+    page.wait_for_selector("#need-key")
+    assert "#home=" in page.inner_text("#need-key")
+    assert opened.problems == [], "the list is not asked for without a key"
+    page.evaluate("key => { location.hash = `#home=${key}`; }", opened.key)
+    page.wait_for_selector("#quota")
+
+
+def test_a_session_deleted_in_another_tab_says_so_and_leads_home(opened: Opened) -> None:
+    page = opened.page
+    page.click("#nav-compare")
+    drawn(page, "compare")
+    other = opened.context.new_page()
+    other.goto(opened.address + "#view=home")
+    other.wait_for_selector("#quota")
+    other.get_by_role("button", name="Delete ", exact=False).first.click()
+    other.get_by_role("button", name="for good").click()
+    page.wait_for_function("() => document.querySelector('#main').dataset.view === 'gone'")
+    assert "This session was deleted" in page.inner_text("main")
+    assert page.is_hidden("nav.steps")
+    page.click("#gone-home")
+    page.wait_for_selector("#quota")
+    page.click("#fresh")
+    page.wait_for_selector("#demo")
+    assert page.is_visible("nav.steps")
+    assert opened.problems == []
+    other.close()
