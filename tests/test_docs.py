@@ -96,8 +96,9 @@ def readers(tmp_path_factory: pytest.TempPathFactory) -> dict[Callable[[Path], N
 @pytest.fixture
 def library() -> Iterator[None]:
     """Effects that a page registers are taken out again."""
-    before = {name: dict(entries) for name, entries in vars(EFFECTS).items()}
-    yield
+    before = {n: dict(entries) for n, entries in vars(EFFECTS).items() if isinstance(entries, dict)}
+    with EFFECTS.scoped():
+        yield
     for name, entries in before.items():
         getattr(EFFECTS, name).clear()
         getattr(EFFECTS, name).update(entries)

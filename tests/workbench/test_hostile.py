@@ -7,7 +7,7 @@ import io
 import json
 import shlex
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -293,10 +293,11 @@ ARGUMENTS: dict[str, tuple[str, str]] = {
 
 
 @pytest.fixture(autouse=True)
-def library(monkeypatch: pytest.MonkeyPatch) -> None:
+def library(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Laws and effects of these files do not stay in the library of the other tests."""
-    for name in ("_effects", "_typed"):
-        monkeypatch.setattr(EFFECTS, name, type(getattr(EFFECTS, name))(getattr(EFFECTS, name)))
+    monkeypatch.setattr(EFFECTS, "_effects", dict(EFFECTS._effects))
+    with EFFECTS.scoped():
+        yield
 
 
 @pytest.fixture(autouse=True)
