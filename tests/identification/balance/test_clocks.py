@@ -125,10 +125,11 @@ def test_part_of_a_sample_is_found_too(channel: str, samples: float) -> None:
         samples * DT, abs=3 * float(np.hypot(now["stderr"], was["stderr"]))
     )
     for name in ("motor_viscous", "link_inertia", "stiffness", "gravity_torque", "motor_coulomb"):
-        error = plain.solution.stderr[name]
-        assert error is not None
+        errors = [f.solution.stderr[name] for f in (plain, found)]
+        assert None not in errors
+        # the encoder is read at other instants: its steps are other ones, and so is their error
         assert found.solution.values[name] == pytest.approx(
-            plain.solution.values[name], abs=2 * error
+            plain.solution.values[name], abs=3 * float(np.hypot(*errors))
         ), name
 
 
