@@ -155,7 +155,7 @@ def drawn_floors(
     power = dict.fromkeys(balances.balances, 0.0)
     drawn = draws_of(record, data.sources)
     seen = drawn[0].record
-    either = _unsure(balances, data, values, [seen])
+    either = unsure(balances, data, values, [seen])
     values = values_on(model, record, values)
     for draw in drawn:
         calm = balances.evaluate(draw.calm, values, remembered=seen)
@@ -187,7 +187,7 @@ def sure_levels(model: JointModel, data: Dataset, values: Mapping[str, float]) -
     """
     balances = balances_of(model, data.sensing, wrt=())
     residual = stack(balances, data.train, values).residual
-    either = _unsure(balances, data, values, data.train)
+    either = unsure(balances, data, values, data.train)
     rows = {b: taking_part(b, data.train) for b in residual}
     return {b: _sure_rms(r[rows[b]], either[b][rows[b]]) for b, r in residual.items()}
 
@@ -204,7 +204,7 @@ def noise_believed(
     if levels is None:
         levels = [drawn_floors(model, data, values, w) for w in data.train]
     residual = stack(balances_of(model, data.sensing, wrt=()), data.train, values).residual
-    either = _unsure(balances_of(model, data.sensing, wrt=()), data, values, data.train)
+    either = unsure(balances_of(model, data.sensing, wrt=()), data, values, data.train)
     out = dict.fromkeys(residual, 1.0)
     for b, r in residual.items():
         rows = taking_part(b, data.train)
@@ -233,7 +233,7 @@ def measured(balance: str, record: WeakRecord) -> FloatArray:
     return record.averaged[{"link": "torque", "transmission": "torque"}.get(balance, "drive")]
 
 
-def _unsure(
+def unsure(
     balances: Balances, data: Dataset, values: Mapping[str, float], records: Sequence[WeakRecord]
 ) -> dict[str, FloatArray]:
     """Scatter of each row from where exactly friction changes its sign: it may act either way,
@@ -263,13 +263,17 @@ def row_weights(
     """1/sigma of each row: rows that hang on where exactly friction changes its sign count less
     (`sigma`: of a balance, or of its rows).
     """
-    unsure = _unsure(balances, data, values, records)
-    # a row of which samples were lost averages fewer of them: its variance grows with one over what
-    # is left
-    support = np.sqrt(
-        np.concatenate([np.ones(w.rows) if w.support is None else w.support for w in records])
-    )
-    return {b: support / np.sqrt(sigma[b] ** 2 + unsure[b] ** 2) for b in unsure}
+    either = unsure(balances, data, values, records)
+    support = support_of(records)
+    return {b: support / np.sqrt(sigma[b] ** 2 + either[b] ** 2) for b in either}
+
+
+def support_of(records: Sequence[WeakRecord]) -> FloatArray:
+    """Root of the share of its samples that each row has, (rows,): one of which samples were lost
+    averages fewer of them, and its variance grows with one over what is left.
+    """
+    share = [np.ones(w.rows) if w.support is None else w.support for w in records]
+    return np.asarray(np.sqrt(np.concatenate(share)), dtype=np.float64)
 
 
 def _either_way(

@@ -131,7 +131,9 @@ def windows_over(times: Sequence[FloatArray]) -> Any:
     step = width / OVERLAP
     parts = []
     for time in times:
-        since = (time - time[0]) / step
+        # a run begins again at an earlier time: none of its rows shares a window with the last one
+        apart = np.diff(time)
+        since = np.concatenate([[0.0], np.cumsum(np.where(apart < 0, 2 * width, apart))]) / step
         newest = np.floor(since).astype(np.int64)
         number = newest[:, None] + np.arange(OVERLAP)
         into = since[:, None] - number + (OVERLAP - 1)  # of a window, in its steps

@@ -19,7 +19,9 @@ from identification.balance.stacked import (
     drawn_floors,
     rms,
     stack,
+    support_of,
     taking_part,
+    unsure,
 )
 from identification.balance.weak import REST_SHARE, RESTING_SIDES, WeakRecord
 from identification.diagnosis.candidates import offered, shape_grid
@@ -152,40 +154,36 @@ class Contest:
 
     def __init__(self, rivals: Sequence[Rival], data: Dataset) -> None:
         self.rivals, self.data = tuple(rivals), data
-        # each row by the largest scatter that one of them allows it, to find who fits best
-        common = {
-            b: np.minimum.reduce([r.solution.weights[b] for r in self.rivals])
-            for b in self.rivals[0].solution.weights
-        }
         names = self.data.sensing.balances
-        self._scales = _scales(self.rivals, data)
+        entitled = _entitled(self.rivals, data)
         left = [
-            {b: r * scale[b] for b, r in _left(rival, data).items()}
-            for rival, scale in zip(self.rivals, self._scales, strict=True)
+            {b: r * weight[b] for b, r in _left(rival, data).items()}
+            for rival, weight in zip(self.rivals, entitled, strict=True)
         ]
         everything = {b: np.ones(len(r), dtype=np.bool_) for b, r in left[0].items()}
-        costs = [_cost(r, common, everything) for r in left]
+        costs = [_cost(r, everything) for r in left]
         best = int(np.argmin(costs))
         for k, rival in enumerate(self.rivals):  # none may be ahead where the two are compared
             counted = dict(zip(names, self._calm(self.rivals[best], rival), strict=True))
-            if _cost(left[k], common, counted) < _cost(left[best], common, counted):
+            if _cost(left[k], counted) < _cost(left[best], counted):
                 best = k
         self.leader = self.rivals[best]
-        own = self._scales[best]
+        own = entitled[best]
         self._old = [
             self._rows(
                 rival,
                 data,
-                {b: w * scale[b] / own[b] for b, w in self.leader.solution.weights.items()},
+                {b: w * weight[b] / own[b] for b, w in self.leader.solution.weights.items()},
             )
-            for rival, scale in zip(self.rivals, self._scales, strict=True)
+            for rival, weight in zip(self.rivals, entitled, strict=True)
         ]
 
     def _calm(self, best: Rival, other: Rival) -> list[npt.NDArray[np.bool_]]:
         """Rows by which two rivals are compared, one array per balance: those at a turn only where
         one of the two laws says what happens there.
         """
-        turns = [turning(best.solution, self.data.train, b) for b in self.data.sensing.balances]
+        names = self.data.sensing.balances
+        turns = [turning(best.solution, self.data.train, b) for b in names]
         if about_turns(best) or about_turns(other):
             return [np.ones_like(at) for at in turns]
         return [~at for at in turns]
@@ -305,14 +303,16 @@ def turning(
     return np.concatenate(parts)
 
 
-def _scales(rivals: Sequence[Rival], data: Dataset) -> list[dict[str, FloatArray]]:
-    """One over the scatter that each row of a rival is entitled to, per balance.
+def _entitled(rivals: Sequence[Rival], data: Dataset) -> list[dict[str, FloatArray]]:
+    """One over the scatter that each row of a rival may have, per balance.
 
     A law that scales a measured torque passes its noise on with that scale: the residuals of two
     rivals are no lengths in one unit, and the one with the smaller unit is not the better one. What
-    even the best of them leaves beside noise is the same torque for all.
+    even the best of them leaves beside noise is the same torque for all. Rows that may go either
+    way by a law say little against it, and as much as others against one that says which way.
     """
-    levels = []
+    levels: list[dict[str, FloatArray]] = []
+    either: list[Mapping[str, FloatArray]] = []
     for rival in rivals:
         model, values = rival.solution.model, rival.solution.values
         known = [drawn_floors(model, data, values, w) for w in data.train]
@@ -324,6 +324,8 @@ def _scales(rivals: Sequence[Rival], data: Dataset) -> list[dict[str, FloatArray
                 for b in data.sensing.balances
             }
         )
+        either.append(unsure(balances_of(model, data.sensing, wrt=()), data, values, data.train))
+    support = support_of(data.train)
     out: list[dict[str, FloatArray]] = [{} for _ in rivals]
     for b in data.sensing.balances:
         rows = taking_part(b, data.train)
@@ -331,8 +333,9 @@ def _scales(rivals: Sequence[Rival], data: Dataset) -> list[dict[str, FloatArray
             max(0.0, r.solution.sigma[b] ** 2 - rms(level[b][rows]) ** 2)
             for r, level in zip(rivals, levels, strict=True)
         )
-        for scale, level in zip(out, levels, strict=True):
-            scale[b] = 1 / np.sqrt(np.maximum(level[b] ** 2 + beside, LEAST_VARIANCE))
+        for weight, level, way in zip(out, levels, either, strict=True):
+            variance = level[b] ** 2 + beside + way[b] ** 2
+            weight[b] = support / np.sqrt(np.maximum(variance, LEAST_VARIANCE))
     return out
 
 
@@ -343,16 +346,13 @@ def _left(rival: Rival, data: Dataset) -> Mapping[str, FloatArray]:
 
 
 def _cost(
-    left: Mapping[str, FloatArray],
-    weights: Mapping[str, FloatArray],
-    counted: Mapping[str, npt.NDArray[np.bool_]],
+    weighted: Mapping[str, FloatArray], counted: Mapping[str, npt.NDArray[np.bool_]]
 ) -> float:
     """Log-likelihood of the counted rows of the balances but for its sign, each balance with a
     scatter of its own."""
     return sum(
-        np.count_nonzero(counted[b])
-        * math.log(max(float(np.linalg.norm((r * weights[b])[counted[b]])), 1e-300))
-        for b, r in left.items()
+        np.count_nonzero(counted[b]) * math.log(max(float(np.linalg.norm(r[counted[b]])), 1e-300))
+        for b, r in weighted.items()
     )
 
 
