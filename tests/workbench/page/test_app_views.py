@@ -88,8 +88,10 @@ def held_out_file(live: Live) -> str:
 )
 def test_a_first_look_is_near_the_whole_fit_that_follows_by_itself(live: Live, label: str) -> None:
     live.worker.give_up()
+    wait(live)
     analysis = live.analysis()
     analysis.restore(live.state.steps[0])
+    analysis._prepared.clear()  # spare work may have been done before it was given up
     start, whole = analysis.solution, analysis.data
     first = analysis.add(label)
     assert first.settled is False
@@ -110,12 +112,14 @@ def test_a_first_look_is_near_the_whole_fit_that_follows_by_itself(live: Live, l
 
 def test_the_whole_fit_takes_the_place_of_the_first_look_in_the_ledger(live: Live) -> None:
     live.worker.give_up()
+    wait(live)
+    looks = 1 if "cubic_viscous@motor" in live.analysis().ahead else 2
     revision = live.state.revision
     run(live, "add", label="cubic_viscous@motor")
     step = live.state.steps[-1]
     assert step.settled
     assert step.train["relative_error_percent"] > 0
-    assert live.state.revision >= revision + 2
+    assert live.state.revision >= revision + looks
     assert Session(live.session.folder).load().steps[-1].settled
     run(live, "undo")
     assert len(live.state.steps) == 1
