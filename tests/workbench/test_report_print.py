@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Iterator
 from importlib.resources import as_file, files
@@ -14,19 +13,10 @@ import pytest
 from identification.data.joint_file import load_joint
 from identification.data.read import read
 from identification.diagnosis.improve import improve
+from tests.workbench.chromium import launched, needs_chromium
 from workbench.show.report import write_report
 
-CHROMIUM = Path(os.environ.get("IRJ_CHROMIUM", "/usr/bin/chromium"))
-CI = bool(os.environ.get("CI"))
-
-playwright_sync = (
-    pytest.importorskip("playwright.sync_api")
-    if not CI
-    else __import__("playwright.sync_api", fromlist=["x"])
-)
-pytestmark = pytest.mark.skipif(
-    not CI and not CHROMIUM.exists(), reason="no chromium here (with CI set this fails)"
-)
+pytestmark = needs_chromium
 
 PIXELS = 96 / 25.4
 PAPER = (182 * PIXELS, 267 * PIXELS)
@@ -50,12 +40,10 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def page(report: Path) -> Iterator[Any]:
-    with playwright_sync.sync_playwright() as play:
-        chromium = play.chromium.launch(executable_path=str(CHROMIUM), args=["--no-sandbox"])
+    with launched() as chromium:
         made = chromium.new_page()
         made.goto(report.as_uri())
         yield made
-        chromium.close()
 
 
 def test_the_first_page_is_one_sheet_and_nothing_is_cut(page: Any) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import secrets
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -71,6 +72,9 @@ class Live(Place):
     ----------
     helper : Helper
         The process of the session.
+    begun : str
+        Of the job that was started last: a page knows by it whether a state is from before its
+        job.
     seen : threading.Event
         Set when the newest record was drawn: the check gate lets that go first.
     """
@@ -79,6 +83,7 @@ class Live(Place):
         super().__init__(session, session.load())
         self.job: Job | None = None
         self.error: str | None = None
+        self.begun = ""
         self.listeners: set[Listener] = set()
         self.helper = Helper(session.folder)
         self.worker = Worker(f"session {session.id[:6]}", self.helper.close)
@@ -145,6 +150,7 @@ class Live(Place):
                 "revision": self.state.revision,
                 "job": self.job.as_json() if self.job else None,
                 "error": self.error,
+                "begun": self.begun,
             }
 
     def whole(self) -> dict[str, Any]:
@@ -255,6 +261,7 @@ class Live(Place):
         with self.lock:
             self._free()
             job = self.job = Job(action, text)
+            self.begun = secrets.token_hex(4)
             self.error = None
             with contextlib.suppress(OSError):  # a full disk: the work itself may still do
                 self.session.begin({**body, "action": action})

@@ -75,8 +75,11 @@ async function act(work) {
 /* Start long work; `then` is the view to open when it came to its end. */
 function run(action, body, then) {
   return act(async () => {
-    app.then = then ? { view: then, steps: app.state.steps.length, revision: app.state.revision } : null;
-    try { await post("/run", { action, ...body }); } catch (error) { app.then = null; throw error; }
+    app.then = null;
+    const begun = await post("/run", { action, ...body });
+    if (!then || !app.state) return;
+    app.then = { view: then, begun: begun.begun, revision: begun.revision };
+    arrive(app.state); /* short work may have ended before this answer came */
   });
 }
 
@@ -99,17 +102,29 @@ function goOn() {
 
 function busy() { return Boolean(app.sent || app.upload || (app.state && app.state.job)); }
 
-async function refresh() { adopt(await get("")); }
+/* One question about the state at a time, so that an older answer cannot come after a newer one; who asks while one is under way gets the answer of the next. */
+function refresh() {
+  if (!app.asking) return (app.asking = get("").then(adopt).finally(() => { app.asking = null; }));
+  const next = app.asked || (app.asked = app.asking.catch(() => null).then(() => { app.asked = null; return refresh(); }));
+  return next;
+}
+
+/* Open the view that was asked for with the work, once that has ended: a state from before the work says nothing of it, however late it comes, nor does an error in it. */
+function arrive(state) {
+  const then = app.then;
+  if (!then || state.job || (state.begun !== then.begun && state.revision <= then.revision)) return false;
+  app.then = null;
+  if (state.error) return false;
+  if (typeof then.view === "function") then.view();
+  else if (app.view !== then.view) { open(then.view); return true; }
+  return false;
+}
 
 function adopt(state) {
-  if (app.state && state.id === app.state.id && state.revision < app.state.revision) return;
+  if (state.id !== app.id || (app.state && state.id === app.state.id && state.revision < app.state.revision)) return;
   const changed = !app.state || state.revision !== app.state.revision || state.id !== app.state.id;
   app.state = state;
-  const then = app.then;
-  if (then && !state.job) {
-    app.then = null;
-    if (!state.error && state.revision > then.revision) { if (typeof then.view === "function") then.view(); else if (app.view !== then.view) { open(then.view); return; } }
-  }
+  if (arrive(state)) { goOn(); return; }
   if (state.error) fail(new Error(state.error));
   surround();
   if (changed && !usable(state)[app.view]) open("load");

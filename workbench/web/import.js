@@ -12,7 +12,7 @@ function shapeOf(column) {
 }
 
 function columnMap(f) {
-  const key = `map-${f.id}`, body = h("div", { class: "import" }, h("p", { class: "soft small", role: "status" }, "Looking at the columns …"));
+  const key = `map-${f.id}`, opened = `columns-${f.id}`, body = h("div", { class: "import" }, h("p", { class: "soft small", role: "status" }, "Looking at the columns …"));
   const ask = (request) => post(`/look/${f.id}`, request).then((found) => draw(found, request)).catch((error) => said(error.message));
   const said = (text) => { const node = body.querySelector(".import-problem"); if (node) { node.textContent = text; node.hidden = !text; } else body.replaceChildren(h("p", { class: "bad import-problem" }, text)); };
 
@@ -49,16 +49,17 @@ function columnMap(f) {
     }
     const confirm = () => act(async () => {
       const answer = await post(`/file/${f.id}`, { columns: read(), kind: app.state.joint_text ? "" : kind.value, all: true });
-      if (answer.status === "ready" || answer.status === "checking") app.drafts[key] = null;
+      const taken = answer.status === "ready" || answer.status === "checking";
+      if (taken) app.drafts[opened] = false;
       await refresh();
-      if (app.drafts[key] === null) render(false); else throw new Error(answer.message);
+      if (taken) render(false); else throw new Error(answer.message);
     });
     const whole = [...found.questions, ...found.findings.map((x) => ({ channel: x.channel, text: x.message }))].filter((q) => !q.channel || !found.proposed.some((p) => p.channel === q.channel));
     const focus = document.activeElement && body.contains(document.activeElement) ? document.activeElement.id : null;
     body.replaceChildren(h("div", { class: "row" }, joint, kind, h("span", { class: "soft small" }, `${plural(found.rows, "row")}. Check the guess by what it says of the joint, then use it.`)),
       ...whole.map((q) => h("p", { class: "odd" }, sentence(q.text, q.text.endsWith("?") ? "?" : "."))), h("p", { class: "bad import-problem", hidden: !found.problem }, found.problem),
       h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": `Columns of ${f.name}` }, h("table", { class: "map-table" }, h("thead", {}, h("tr", {}, ["Column", "Shape", "Range", "Channel", "Unit, sign, scale, counts/turn", "Why"].map((t) => h("th", { scope: "col" }, t)))), h("tbody", {}, [...rows, ...extra].map((r) => [r.node, r.more.length ? h("tr", { class: "odd-row" }, h("td", { colspan: "6" }, r.more)) : null])))),
-      h("div", { class: "row gap" }, button(found.same > 1 ? `Use for all ${found.same} files with these columns` : "Use these columns", confirm, { kind: "primary", id: `use-${f.id}` }), f.status === "columns" ? null : button("Close", () => { app.drafts[key] = null; render(false); }, { kind: "quiet", work: false })));
+      h("div", { class: "row gap" }, button(found.same > 1 ? `Use for all ${found.same} files with these columns` : "Use these columns", confirm, { kind: "primary", id: `use-${f.id}` }), f.status === "columns" ? null : button("Close", () => { app.drafts[opened] = false; render(false); }, { kind: "quiet", work: false })));
     if (focus && $(focus)) $(focus).focus({ preventScroll: true });
   }
   ask(app.drafts[key] && (app.drafts[key].columns || app.drafts[key].now || app.drafts[key].number != null) ? app.drafts[key] : {});

@@ -208,12 +208,12 @@ function fileCard(f) {
   const role = h("select", { id: `role-${f.id}`, "aria-label": `Role of ${f.name}`, onchange: (e) => act(async () => { await post(`/file/${f.id}`, { role: e.target.value }); await refresh(); }) }, [["train", "Fit"], ["held_out", "Held out"]].map(([v, t]) => h("option", { value: v, selected: f.role === v }, t)));
   return h("section", { class: "card", "aria-label": f.name }, h("div", { class: "row between" },
     h("div", {}, h("h2", {}, f.name), shown ? h("p", { class: "soft small" }, `${plural(s.samples, "sample")}, ${digits(s.duration, 4)} s, every ${digits(1000 * s.dt, 3)} ms${s.segments > 1 ? `, ${s.segments} stretches` : ""}. ${f.role_reason.charAt(0).toUpperCase()}${f.role_reason.slice(1)}.`) : null),
-    h("div", { class: "row" }, shown ? role : null, f.status === "columns" ? null : button("Columns", () => { app.drafts[`map-${f.id}`] = app.drafts[`map-${f.id}`] ? null : { now: true }; render(false); }, { kind: "quiet", work: false, id: `columns-${f.id}`, label: `Columns of ${f.name}` }), button("Remove", () => act(async () => { await call("DELETE", `${base()}/file/${f.id}`); await refresh(); }), { kind: "quiet", label: `Remove ${f.name}` }))),
+    h("div", { class: "row" }, shown ? role : null, f.status === "columns" ? null : button("Columns", () => { app.drafts[`columns-${f.id}`] = !app.drafts[`columns-${f.id}`]; app.drafts[`map-${f.id}`] = { now: true }; render(false); }, { kind: "quiet", work: false, id: `columns-${f.id}`, label: `Columns of ${f.name}` }), button("Remove", () => act(async () => { await call("DELETE", `${base()}/file/${f.id}`); await refresh(); }), { kind: "quiet", label: `Remove ${f.name}` }))),
     f.status === "refused" ? h("p", { class: "bad" }, f.message) : null,
     f.status === "checking" ? h("p", { class: "small soft", role: "status" }, "Going through the check gate …") : null,
     f.status === "columns" ? columnMap(f) : null,
     bad.length ? h("ul", { class: "findings" }, bad.map((x) => h("li", {}, h("span", { class: `tag ${SEVERITY[x.severity][0]}` }, SEVERITY[x.severity][1]), " ", x.message))) : null,
-    f.status !== "columns" && app.drafts[`map-${f.id}`] ? columnMap(f) : null,
+    f.status !== "columns" && app.drafts[`columns-${f.id}`] ? columnMap(f) : null,
     f.status === "ready" ? h("details", {}, h("summary", {}, bad.length ? `Checked: ${fine.length} fine; columns` : "Checked, nothing to repair; columns"), h("ul", { class: "findings" }, s.columns.map((c) => h("li", {}, c)), s.notes.map((n) => h("li", {}, n)), fine.map((x) => h("li", {}, x.message)))) : null);
 }
 

@@ -12,16 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-CHROMIUM = Path(os.environ.get("IRJ_CHROMIUM", "/usr/bin/chromium"))
-CI = bool(os.environ.get("CI"))
-playwright_sync = (
-    pytest.importorskip("playwright.sync_api")
-    if not CI
-    else __import__("playwright.sync_api", fromlist=["x"])
-)
-pytestmark = pytest.mark.skipif(
-    not CI and not CHROMIUM.exists(), reason="no chromium here (with CI set this fails)"
-)
+from tests.workbench.chromium import launched, needs_chromium
+
+pytestmark = needs_chromium
 
 
 @pytest.fixture(scope="module")
@@ -51,15 +44,13 @@ def address(root: Path) -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    with playwright_sync.sync_playwright() as play:
-        chromium = play.chromium.launch(executable_path=str(CHROMIUM), args=["--no-sandbox"])
+    with launched() as chromium:
         context = chromium.new_context(viewport={"width": 1280, "height": 860})
         problems: list[str] = []
         context.on("weberror", lambda e: problems.append(str(e.error)))
         made = context.new_page()
         made.set_default_timeout(15_000)
         yield made
-        chromium.close()
     assert problems == []
 
 

@@ -16,20 +16,12 @@ from typing import Any
 
 import pytest
 
+from tests.workbench.chromium import CI, launched, needs_chromium
+
 SHARED = Path(__file__).resolve().parents[3].parent / "shared"
-CHROMIUM = Path(os.environ.get("IRJ_CHROMIUM", "/usr/bin/chromium"))
 AXE = os.environ.get("IRJ_AXE", "")
-CI = bool(os.environ.get("CI"))
 
-playwright_sync = (
-    pytest.importorskip("playwright.sync_api")
-    if not CI
-    else __import__("playwright.sync_api", fromlist=["x"])
-)
-
-pytestmark = pytest.mark.skipif(
-    not CI and not CHROMIUM.exists(), reason="no chromium here (with CI set this fails)"
-)
+pytestmark = needs_chromium
 
 
 @dataclass
@@ -103,11 +95,9 @@ class Browser:
 
 @pytest.fixture
 def browser(tmp_path: Path) -> Iterator[Browser]:
-    assert CHROMIUM.exists(), f"{CHROMIUM} is missing"
     shots = Path(os.environ.get("IRJ_SCREENSHOTS", str(tmp_path)))
     shots.mkdir(parents=True, exist_ok=True)
-    with playwright_sync.sync_playwright() as play:
-        chromium = play.chromium.launch(executable_path=str(CHROMIUM), args=["--no-sandbox"])
+    with launched() as chromium:
         context = chromium.new_context(
             viewport={"width": 1280, "height": 860}, accept_downloads=True
         )
@@ -123,7 +113,6 @@ def browser(tmp_path: Path) -> Iterator[Browser]:
             ),
         )
         yield Browser(context.new_page(), shots, problems, context)
-        chromium.close()
     assert problems == []
 
 
@@ -250,7 +239,7 @@ def test_the_loop_on_emps(served: Served, browser: Browser, tmp_path: Path) -> N
     browser.clicks += 1
     browser.click("button:has-text('Use for all 2 files')")
     browser.idle("load")
-    page.wait_for_selector(".map-table", state="detached")
+    assert page.locator(".import").count() == 0, "the columns of both files are confirmed"
     browser.shot("emps-2-load")
     browser.click("#to-model")
     browser.idle("model")

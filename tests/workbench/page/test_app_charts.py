@@ -14,18 +14,11 @@ from typing import Any
 
 import pytest
 
-CHROMIUM = Path(os.environ.get("IRJ_CHROMIUM", "/usr/bin/chromium"))
-AXE = os.environ.get("IRJ_AXE", "")
-CI = bool(os.environ.get("CI"))
+from tests.workbench.chromium import launched, needs_chromium
 
-playwright_sync = (
-    pytest.importorskip("playwright.sync_api")
-    if not CI
-    else __import__("playwright.sync_api", fromlist=["x"])
-)
-pytestmark = pytest.mark.skipif(
-    not CI and not CHROMIUM.exists(), reason="no chromium here (with CI set this fails)"
-)
+AXE = os.environ.get("IRJ_AXE", "")
+
+pytestmark = needs_chromium
 
 
 @pytest.fixture(scope="module")
@@ -51,8 +44,7 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 @pytest.fixture(scope="module")
 def page(address: str) -> Iterator[Any]:
     """The demo, fitted and diagnosed."""
-    with playwright_sync.sync_playwright() as play:
-        chromium = play.chromium.launch(executable_path=str(CHROMIUM), args=["--no-sandbox"])
+    with launched() as chromium:
         context = chromium.new_context(
             viewport={"width": 1280, "height": 860}, accept_downloads=True
         )
@@ -68,7 +60,6 @@ def page(address: str) -> Iterator[Any]:
         made.click("#diagnose")
         idle(made, "diagnose")
         yield made
-        chromium.close()
         assert problems == []
 
 

@@ -4,26 +4,16 @@ pasted into an open tab, fields with nothing, too much or words in them.
 
 from __future__ import annotations
 
-import os
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import pytest
 
-CHROMIUM = Path(os.environ.get("IRJ_CHROMIUM", "/usr/bin/chromium"))
-CI = bool(os.environ.get("CI"))
+from tests.workbench.chromium import launched, needs_chromium
 
-playwright_sync = (
-    pytest.importorskip("playwright.sync_api")
-    if not CI
-    else __import__("playwright.sync_api", fromlist=["x"])
-)
-pytestmark = pytest.mark.skipif(
-    not CI and not CHROMIUM.exists(), reason="no chromium here (with CI set this fails)"
-)
+pytestmark = needs_chromium
 
 
 @dataclass
@@ -57,8 +47,7 @@ def opened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Opened]:
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
     thread.start()
     address = f"http://127.0.0.1:{port}/"
-    with playwright_sync.sync_playwright() as play:
-        chromium = play.chromium.launch(executable_path=str(CHROMIUM), args=["--no-sandbox"])
+    with launched() as chromium:
         context = chromium.new_context(viewport={"width": 1280, "height": 860})
         problems: list[str] = []
         context.on("weberror", lambda e: problems.append(str(e.error)))
@@ -70,7 +59,6 @@ def opened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Opened]:
         page.click("#fit")
         drawn(page, "compare")
         yield Opened(address, home.key_of(Store(root)), context, page, problems)
-        chromium.close()
     server.should_exit = True
     thread.join(10)
     listening.close()
@@ -114,6 +102,29 @@ def test_a_number_that_is_none_is_said_at_its_field_and_changes_nothing(opened: 
     drawn(page, "parameters")
     row = page.locator("main table tr", has_text="motor coulomb").first
     assert "held" in row.inner_text()
+
+
+def test_answers_that_come_late_lose_no_view(opened: Opened) -> None:
+    """Every other answer about the state comes after the news that followed it."""
+    page = opened.page
+    page.click("#nav-parameters")
+    drawn(page, "parameters")
+    page.evaluate(
+        "() => { const fetched = window.fetch; let n = 0; window.fetch = async (path, options) => {"
+        " const answer = await fetched(path, options);"
+        " if (/session\\/[0-9a-f]+$/.test(path) && n++ % 2 === 0)"
+        " await new Promise((go) => setTimeout(go, 700));"
+        " return answer; }; }"
+    )
+    row = page.locator("main table tr", has_text="motor coulomb").first
+    for _ in range(4):  # hold, release, hold, release
+        joint, held = page.evaluate("app.state.joint_text"), "held" in row.inner_text()
+        page.click("#hold-motor_coulomb")
+        page.wait_for_function("was => app.state.joint_text !== was", arg=joint)
+        drawn(page, "parameters")
+        assert ("held" in row.inner_text()) is not held
+    page.reload()
+    drawn(page, "parameters")
 
 
 def test_the_server_refuses_a_value_out_of_bounds_too(opened: Opened) -> None:
