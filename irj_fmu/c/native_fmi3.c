@@ -18,18 +18,7 @@
 #include "native_model.c"
 #include "native_config.h"
 #include "native_fmi3_config.h"
-#include "native_state.h"
-#include "native_rows.c"
-#include "native_watch.c"
-#include "native_algebra.c"
-#include "native_guard.c"
-#include "native_window.c"
-#include "native_residuals.c"
-#include "native_fault.c"
-#include "native_estimator.c"
-
-enum { REAL, INTEGER, BOOLEAN, STRING };
-enum { WRITABLE = 1, PARAMETER = 2, FIXED = 4 };
+#include "native_shared.c"
 
 typedef struct { /* an estimator and its host */
     Twin twin;
@@ -54,18 +43,6 @@ static fmi3Status fail(Twin *m, const char *format, ...) {
     write_log(m, fmi2Error, "logStatusError", format, values);
     va_end(values);
     return fmi3Error;
-}
-
-static void restart(State *s) {
-    memset(s, 0, sizeof *s);
-    memcpy(s->guid, NATIVE_GUID, strlen(NATIVE_GUID));
-    s->phase = INSTANTIATED;
-    s->start = NAN;
-    s->uneven = -INFINITY;
-    memcpy(s->real, start_real, sizeof s->real);
-    memcpy(s->whole, start_whole, sizeof s->whole);
-    memcpy(s->detector.limits, fault_limit, sizeof s->detector.limits);
-    s->detector.margin = 1;
 }
 
 typedef Twin Instance;
@@ -147,13 +124,6 @@ static size_t size_of(Twin *m, fmi3ValueReference v, int wanted, int enumeration
     return 0;
 }
 
-static int may_set(Twin *m, fmi3ValueReference v) { /* 0: the value stays, and the log says so */
-    const int about = access[v];
-    if (m->s.phase < STEPPING || (about & WRITABLE && !(about & FIXED))) return 1;
-    tell(m, v, "variable %u cannot be set after initialization; it keeps its value", v);
-    return 0;
-}
-
 #define VARIABLES(type, wanted, enumeration, place, converted) \
     fmi3Status fmi3Get##type(fmi3Instance c, References vr, size_t n, fmi3##type value[], size_t length) { \
         LIVING("fmi3Get" #type); \
@@ -218,13 +188,9 @@ fmi3Status fmi3SetString(fmi3Instance c, References vr, size_t n, const fmi3Stri
     size_t i;
     if (length != n) return fail(m, "setString: all texts are scalars");
     for (i = 0; i < n; i++) {
-        char *place;
         if (!size_of(m, vr[i], STRING, 0)) return fmi3Error;
         if (!may_set(m, vr[i])) continue;
-        place = m->s.text[text_of[vr[i]]];
-        if (!value[i] || strlen(value[i]) >= MAX_TEXT) return fail(m, "setString: variable %u takes up to %d bytes", vr[i], MAX_TEXT - 1);
-        if (strcmp(place, value[i]) != 0) m->s.changed = 1;
-        strcpy(place, value[i]);
+        if (!take_text(&m->s, vr[i], value[i])) return fail(m, "setString: variable %u takes up to %d bytes", vr[i], MAX_TEXT - 1);
     }
     return fmi3OK;
 }

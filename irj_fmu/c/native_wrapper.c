@@ -17,18 +17,7 @@
 #define CASADI_SYMBOL_EXPORT static
 #include "native_model.c"
 #include "native_config.h"
-#include "native_state.h"
-#include "native_rows.c"
-#include "native_watch.c"
-#include "native_algebra.c"
-#include "native_guard.c"
-#include "native_window.c"
-#include "native_residuals.c"
-#include "native_fault.c"
-#include "native_estimator.c"
-
-enum { REAL, INTEGER, BOOLEAN, STRING };
-enum { WRITABLE = 1, PARAMETER = 2, FIXED = 4 };
+#include "native_shared.c"
 
 static fmi2Status fail(Twin *m, const char *format, ...) {
     va_list values;
@@ -36,18 +25,6 @@ static fmi2Status fail(Twin *m, const char *format, ...) {
     write_log(m, fmi2Error, "logStatusError", format, values);
     va_end(values);
     return fmi2Error;
-}
-
-static void restart(State *s) {
-    memset(s, 0, sizeof *s);
-    memcpy(s->guid, NATIVE_GUID, strlen(NATIVE_GUID));
-    s->phase = INSTANTIATED;
-    s->start = NAN;
-    s->uneven = -INFINITY;
-    memcpy(s->real, start_real, sizeof s->real);
-    memcpy(s->whole, start_whole, sizeof s->whole);
-    memcpy(s->detector.limits, fault_limit, sizeof s->detector.limits);
-    s->detector.margin = 1;
 }
 
 typedef Twin Instance;
@@ -102,13 +79,6 @@ fmi2Status fmi2Reset(fmi2Component c) {
 static int is_kind(Twin *m, fmi2ValueReference v, int wanted) {
     if (v < N_VARIABLES && kind[v] == wanted) return 1;
     fail(m, v < N_VARIABLES ? "variable %u is of another type" : "there is no variable %u", v);
-    return 0;
-}
-
-static int may_set(Twin *m, fmi2ValueReference v) { /* 0: the value stays, and the log says so */
-    const int about = access[v];
-    if (m->s.phase < STEPPING || (about & WRITABLE && !(about & FIXED))) return 1;
-    tell(m, v, "variable %u cannot be set after initialization; it keeps its value", v);
     return 0;
 }
 
@@ -185,13 +155,9 @@ fmi2Status fmi2SetString(fmi2Component c, const fmi2ValueReference vr[], size_t 
     Twin *m = c;
     size_t i;
     for (i = 0; i < n; i++) {
-        char *place;
         if (!is_kind(m, vr[i], STRING)) return fmi2Error;
         if (!may_set(m, vr[i])) continue;
-        place = m->s.text[text_of[vr[i]]];
-        if (!value[i] || strlen(value[i]) >= MAX_TEXT) return fail(m, "setString: variable %u takes up to %d bytes", vr[i], MAX_TEXT - 1);
-        if (strcmp(place, value[i]) != 0) m->s.changed = 1;
-        strcpy(place, value[i]);
+        if (!take_text(&m->s, vr[i], value[i])) return fail(m, "setString: variable %u takes up to %d bytes", vr[i], MAX_TEXT - 1);
     }
     return fmi2OK;
 }

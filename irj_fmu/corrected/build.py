@@ -22,9 +22,8 @@ from irj_fmu.fmi.compiler import (
     find_compiler,
     header_folder,
     native_target,
-    universal_library,
 )
-from irj_fmu.fmi.targets import native_targets
+from irj_fmu.fmi.targets import binaries, native_targets
 from irj_fmu.fmi.variables import Variable
 from irj_fmu.host.run import Number
 from irj_fmu.imported.correction import PREFIX, Correction, law_function
@@ -132,12 +131,7 @@ def export_corrected(
         )
         for triple, library in libraries.items()
     }
-    both = ("x86_64-macos", "aarch64-macos")
-    if all(triple in built for triple in both):
-        built[both[0]] = universal_library(built[both[0]], built.pop(both[1]))
-    for triple, binary in built.items():
-        content[f"binaries/{TARGETS[triple].folder}/{called}{TARGETS[triple].suffix}"] = binary
-    return write_archive(out, content)
+    return write_archive(out, content | binaries(built, called))
 
 
 def _present(model: UserModel) -> tuple[str, ...]:

@@ -22,16 +22,14 @@ from irj_fmu.estimator.packed import STEP
 from irj_fmu.estimator.slave import estimator_variables, two_step_variables
 from irj_fmu.fmi.archive import content_guid, write_archive
 from irj_fmu.fmi.compiler import (
-    TARGETS,
     compile_library,
     find_compiler,
     header_folder,
-    universal_library,
 )
 from irj_fmu.fmi.documentation import beside
 from irj_fmu.fmi.model_description import Description, Entry, model_description, to_bytes
 from irj_fmu.fmi.slave_base import STANDARD
-from irj_fmu.fmi.targets import SHORT_TARGETS, native_targets
+from irj_fmu.fmi.targets import binaries, native_targets
 from irj_fmu.fmi.variables import Variable
 
 _C: Final = Path(__file__).parents[1] / "c"
@@ -40,6 +38,7 @@ _SOURCES: Final = (
     _MAIN,
     "fmi2_common.c",
     "living.c",
+    "native_shared.c",
     "native_state.h",
     "native_rows.c",
     "native_watch.c",
@@ -138,12 +137,7 @@ def build_native(
         triple: compile_library(sources, _MAIN, triple, cc=cc, libraries=("m",))
         for triple in targets
     }
-    both = SHORT_TARGETS["darwin64"]
-    if all(triple in built for triple in both):
-        built[both[0]] = universal_library(built[both[0]], built.pop(both[1]))
-    for triple, library in built.items():
-        content[f"binaries/{TARGETS[triple].folder}/{spec.name}{TARGETS[triple].suffix}"] = library
-    return write_archive(out, content)
+    return write_archive(out, content | binaries(built, spec.name))
 
 
 def described(config: bytes) -> str:

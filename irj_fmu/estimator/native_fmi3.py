@@ -26,11 +26,11 @@ from identification.online.watch import READINGS
 from irj_fmu.estimator.native import NativeSpec, described, native_sources, native_variables
 from irj_fmu.estimator.notes import estimator_notes
 from irj_fmu.fmi.archive import write_archive
-from irj_fmu.fmi.compiler import TARGETS, compile_library, find_compiler
+from irj_fmu.fmi.compiler import compile_library, find_compiler
 from irj_fmu.fmi.documentation import beside
 from irj_fmu.fmi.model_description import identity, to_bytes
 from irj_fmu.fmi.slave_base import Health
-from irj_fmu.fmi.targets import FMI3_FOLDERS, native_targets
+from irj_fmu.fmi.targets import binaries, native_targets
 from irj_fmu.fmi.unit_definitions import add_unit_definitions, quantity_of
 from irj_fmu.fmi.variables import Variable
 
@@ -143,10 +143,11 @@ def build_native_fmi3(
         estimator_notes(spec.joint, spec.options),
         terminals={"joint": terminal},
     )
-    for triple in targets:
-        library = compile_library(sources, _MAIN, triple, cc=cc, libraries=("m",))
-        content[f"binaries/{FMI3_FOLDERS[triple]}/{spec.name}{TARGETS[triple].suffix}"] = library
-    return write_archive(out, content)
+    built = {
+        triple: compile_library(sources, _MAIN, triple, cc=cc, libraries=("m",))
+        for triple in targets
+    }
+    return write_archive(out, content | binaries(built, spec.name, version=3))
 
 
 def _table(found: Sequence[Slot], count: int) -> bytes:

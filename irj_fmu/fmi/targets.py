@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 from identification.errors import InputError
-from irj_fmu.fmi.compiler import TARGETS, native_target
+from irj_fmu.fmi.compiler import TARGETS, native_target, universal_library
 
 SHORT_TARGETS: Final = {
     "linux64": ("x86_64-linux-gnu",),
@@ -53,4 +53,27 @@ def native_targets(target: str | Sequence[str] | None) -> tuple[str, ...]:
     return tuple(dict.fromkeys(found))
 
 
-__all__ = ["FMI3_FOLDERS", "SHORT_TARGETS", "native_targets"]
+def binaries(built: Mapping[str, bytes], name: str, *, version: int = 2) -> dict[str, bytes]:
+    """Libraries by their paths in an FMU.
+
+    Parameters
+    ----------
+    built : mapping of str to bytes
+        Library of each target.
+    name : str
+        Model identifier.
+    version : int
+        Of FMI: in 2 both macOS targets together are one library for both processors.
+    """
+    libraries = dict(built)
+    both = SHORT_TARGETS["darwin64"]
+    if version == 2 and all(triple in libraries for triple in both):
+        libraries[both[0]] = universal_library(libraries[both[0]], libraries.pop(both[1]))
+    folders = FMI3_FOLDERS if version == 3 else {t: TARGETS[t].folder for t in libraries}
+    return {
+        f"binaries/{folders[triple]}/{name}{TARGETS[triple].suffix}": library
+        for triple, library in libraries.items()
+    }
+
+
+__all__ = ["FMI3_FOLDERS", "SHORT_TARGETS", "binaries", "native_targets"]

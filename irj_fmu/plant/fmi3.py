@@ -10,10 +10,10 @@ from typing import Any, Final
 from xml.etree.ElementTree import Element, SubElement
 
 from irj_fmu.fmi.archive import content_guid, write_archive
-from irj_fmu.fmi.compiler import TARGETS, compile_library, find_compiler
+from irj_fmu.fmi.compiler import compile_library, find_compiler
 from irj_fmu.fmi.documentation import beside
 from irj_fmu.fmi.model_description import identity, to_bytes
-from irj_fmu.fmi.targets import FMI3_FOLDERS
+from irj_fmu.fmi.targets import binaries, native_targets
 from irj_fmu.fmi.unit_definitions import add_unit_definitions, quantity_of
 from irj_fmu.fmi.variables import Variable
 from irj_fmu.plant.library import (
@@ -23,7 +23,6 @@ from irj_fmu.plant.library import (
     _config,
     _generate,
     _parameter,
-    _targets,
     dependencies,
     slopes_of,
 )
@@ -60,7 +59,7 @@ def build_plant_fmi3(
     derivatives with respect to them.
     """
     _check(spec)
-    targets = _targets(target)
+    targets = native_targets(target)
     for triple in targets:
         find_compiler(triple, cc)
     code, limits = _generate(spec)
@@ -85,10 +84,11 @@ def build_plant_fmi3(
         spec.notes,
         terminals={"joint": {v.name: v.name for v in spec.outputs}},
     )
-    for triple in targets:
-        library = compile_library(sources, _SOURCE, triple, cc=cc, libraries=("m",))
-        content[f"binaries/{FMI3_FOLDERS[triple]}/{spec.name}{TARGETS[triple].suffix}"] = library
-    return write_archive(out, content)
+    built = {
+        triple: compile_library(sources, _SOURCE, triple, cc=cc, libraries=("m",))
+        for triple in targets
+    }
+    return write_archive(out, content | binaries(built, spec.name, version=3))
 
 
 def _build_description(name: str) -> Element:

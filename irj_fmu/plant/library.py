@@ -12,15 +12,13 @@ from typing import TYPE_CHECKING, Any, final
 from identification.errors import InputError
 from irj_fmu.fmi.archive import content_guid, write_archive
 from irj_fmu.fmi.compiler import (
-    TARGETS,
     compile_library,
     find_compiler,
     header_folder,
-    native_target,
-    universal_library,
 )
 from irj_fmu.fmi.documentation import Note, beside
 from irj_fmu.fmi.model_description import Description, Entry, model_description, to_bytes
+from irj_fmu.fmi.targets import binaries, native_targets
 from irj_fmu.fmi.variables import Variability, Variable, check_unique
 
 if TYPE_CHECKING:
@@ -94,7 +92,7 @@ def build_plant(
         Compiler: a command such as ``gcc``, or ``zig`` for the ziglang package. By default what is
         found.
     target : str or sequence of str, optional
-        Keys of `irj_fmu.fmi.compiler.TARGETS`, or ``"all"``; by default this machine. Both macOS
+        See :func:`irj_fmu.fmi.targets.native_targets`; by default this machine. Both macOS
         targets together make one library for both processors.
 
     Returns
@@ -116,7 +114,7 @@ def build_plant(
     parameters need that.
     """
     _check(spec)
-    targets = _targets(target)
+    targets = native_targets(target)
     for triple in targets:
         find_compiler(triple, cc)
     header_folder()
@@ -133,20 +131,7 @@ def build_plant(
         triple: compile_library(sources, "plant_wrapper.c", triple, cc=cc, libraries=("m",))
         for triple in targets
     }
-    both = ("x86_64-macos", "aarch64-macos")
-    if all(triple in built for triple in both):
-        built[both[0]] = universal_library(built[both[0]], built.pop(both[1]))
-    for triple, library in built.items():
-        content[f"binaries/{TARGETS[triple].folder}/{spec.name}{TARGETS[triple].suffix}"] = library
-    return write_archive(out, content)
-
-
-def _targets(target: str | Sequence[str] | None) -> tuple[str, ...]:
-    if target is None:
-        return (native_target(),)
-    if target == "all":
-        return tuple(TARGETS)
-    return (target,) if isinstance(target, str) else tuple(target)
+    return write_archive(out, content | binaries(built, spec.name))
 
 
 def _check(spec: PlantSpec) -> None:
