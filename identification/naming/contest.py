@@ -160,8 +160,8 @@ class Contest:
             {b: r * weight[b] for b, r in _left(rival, data).items()}
             for rival, weight in zip(self.rivals, entitled, strict=True)
         ]
-        everything = {b: np.ones(len(r), dtype=np.bool_) for b, r in left[0].items()}
-        costs = [_cost(r, everything) for r in left]
+        self._taking = {b: taking_part(b, data.train) for b in names}
+        costs = [_cost(r, self._taking) for r in left]
         best = int(np.argmin(costs))
         for k, rival in enumerate(self.rivals):  # none may be ahead where the two are compared
             counted = dict(zip(names, self._calm(self.rivals[best], rival), strict=True))
@@ -179,14 +179,15 @@ class Contest:
         ]
 
     def _calm(self, best: Rival, other: Rival) -> list[npt.NDArray[np.bool_]]:
-        """Rows by which two rivals are compared, one array per balance: those at a turn only where
-        one of the two laws says what happens there.
+        """Rows by which two rivals are compared, one array per balance: those that take part, and
+        at a turn only where one of the two laws says what happens there.
         """
-        names = self.data.sensing.balances
-        turns = [turning(best.solution, self.data.train, b) for b in names]
         if about_turns(best) or about_turns(other):
-            return [np.ones_like(at) for at in turns]
-        return [~at for at in turns]
+            return list(self._taking.values())
+        return [
+            taking & ~turning(best.solution, self.data.train, b)
+            for b, taking in self._taking.items()
+        ]
 
     def _rows(
         self, rival: Rival, data: Dataset, weights: Mapping[str, FloatArray]
