@@ -1,4 +1,4 @@
-"""The one covariance behind every "+-": from blocks of time, honest with few blocks too; and from
+"""The one covariance behind every "+-": from windows or blocks of time, honest with few, too; and from
 the information alone where there is no residual yet or its noise is known to be white.
 """
 

@@ -78,7 +78,7 @@ class Solution:
     model : JointModel
         With the fitted values.
     values, stderr : mapping
-        Every parameter; standard errors from blocks (None for fixed, nuisance or unidentifiable
+        Every parameter; standard errors from windows of time (None for fixed, nuisance or unidentifiable
         ones).
     free : tuple of str
     weights : mapping of str to (rows,) array
@@ -491,7 +491,7 @@ def _with_errors(
     noise: NoiseProducts,
     share: float,
 ) -> Solution:
-    """Standard errors from blocks of time, without what noise adds to the columns; what cannot be
+    """Standard errors from windows of time, without what noise adds to the columns; what cannot be
     identified is said.
     """
     from scipy.sparse import csr_array, hstack
