@@ -1,5 +1,5 @@
-"""The one covariance behind every "+-": from windows or blocks of time, honest with few, too; and from
-the information alone where there is no residual yet or its noise is known to be white.
+"""The one covariance behind every "+-": from windows or blocks of time, honest with few, too; and
+from the information alone where there is no residual yet or its noise is known to be white.
 """
 
 from __future__ import annotations

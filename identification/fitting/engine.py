@@ -78,8 +78,8 @@ class Solution:
     model : JointModel
         With the fitted values.
     values, stderr : mapping
-        Every parameter; standard errors from windows of time (None for fixed, nuisance or unidentifiable
-        ones).
+        Every parameter; standard errors from windows of time (None for fixed, nuisance or
+        unidentifiable ones).
     free : tuple of str
     weights : mapping of str to (rows,) array
         1/sigma of each training row.
