@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from identification.balance.balances import Balances
+from identification.balance.calibration import settled
 from identification.balance.excitation import rest_note
 from identification.balance.rest import rest_check, rest_warnings
 from identification.data.check.gate import gate_warnings, gated
@@ -126,37 +127,45 @@ def compare(fitted: Fit, records: Record | Sequence[Record], *, linear: bool = T
         units.
     """
     given = gated([records] if isinstance(records, Record) else list(records), fitted.joint)
+    unseen = not any(_same(r, seen) for r in given for seen in fitted.records)
+    # records of its own are judged as the loop judges the training records, others as it judges
+    # held-out ones: one figure for one state
+    train, held = (list(fitted.records), given) if unseen else (given, [])
     data = load_dataset(
-        given, [], fitted.joint, fitted.model, kernel=fitted.data.kernel, like=fitted.data.sensing
+        train,
+        held,
+        fitted.joint,
+        fitted.model,
+        kernel=fitted.data.kernel,
+        like=fitted.data.sensing,
     )
-    bench = JointBench(fitted.joint, data, given, [], like=fitted.data.sensing)
+    compared = data.held_out if unseen else data.train
+    bench = JointBench(fitted.joint, data, train, held, like=fitted.data.sensing)
+    values = settled(fitted.model, data.sensing, [*data.train, *compared], fitted.solution.values)
     error = bench.judged(
-        fitted.solution,
-        assess(fitted.model, data, data.train, fitted.solution.values),
-        held_out=False,
+        fitted.solution, assess(fitted.model, data, compared, values), held_out=unseen
     )
-    both = replace(fitted.data, held_out=data.train, held_out_names=data.train_names)
-    refuse_unlike(both, error.relative_error_percent)
-    stacked = stack(
-        Balances(fitted.model, data.sensing, wrt=()), data.train, fitted.solution.values
+    refuse_unlike(
+        replace(fitted.data, held_out=compared, held_out_names=tuple(r.name for r in given)),
+        error.relative_error_percent,
     )
+    stacked = stack(Balances(fitted.model, data.sensing, wrt=()), compared, values)
     residual = stacked.residual
     places = places_of(stacked.shown, gather(data))
-    time = np.concatenate([w.time for w in data.train])
+    time = np.concatenate([w.time for w in compared])
     sigma = {b: max(error.balances[b].floor, 1e-12) for b in residual}
     power = sum((residual[b] / sigma[b]) ** 2 for b in residual)
-    counts = np.cumsum([0, *(int(w.stretch.max(initial=0)) + 1 for w in data.train)])
+    counts = np.cumsum([0, *(int(w.stretch.max(initial=0)) + 1 for w in compared)])
     stretch = np.concatenate(
-        [w.stretch + first for w, first in zip(data.train, counts[:-1], strict=True)]
+        [w.stretch + first for w, first in zip(compared, counts[:-1], strict=True)]
     )
     worst = _worst(time, np.asarray(power), stretch)
-    unseen = not any(_same(r, seen) for r in given for seen in fitted.records)
     floor = {b: e.floor for b, e in error.balances.items()}
     above = None
     if linear:  # the one place that fits models without physics: no other verb loads them
         from identification.linear.ceiling import ceiling
 
-        above = ceiling(fitted.data, data.train, residual, floor, unseen=unseen)
+        above = ceiling(fitted.data, compared, residual, floor, unseen=unseen)
     return Comparison(
         ", ".join(r.name for r in given),
         error,
@@ -164,9 +173,9 @@ def compare(fitted: Fit, records: Record | Sequence[Record], *, linear: bool = T
         worst_window=worst,
         whiteness={b: _lagged(r[stacked.taking[b]]) for b, r in residual.items()},
         linear=above,
-        at_rest=data.at_rest(),
+        at_rest=data.at_rest(compared),
         at_rest_beyond=rest_warnings(
-            rest_check(fitted.model, data, data.train, fitted.solution.values),
+            rest_check(fitted.model, data, compared, values),
             "N.m" if data.joint.kind == "rotary" else "N",
         ),
         warnings=gate_warnings(given),
