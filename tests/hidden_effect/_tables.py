@@ -133,7 +133,9 @@ def checks(
     section 6).
     """
     singles = [o for o in outcomes if o.group == "single"]
-    none, pairs, outside = (_scores(outcomes, g) for g in ("none", "pair", "outside"))
+    none, pairs, triples, outside = (
+        _scores(outcomes, g) for g in ("none", "pair", "triple", "outside")
+    )
     rows = _single_checks(singles, size, dirt, torque_sensor, one_sided) if singles else []
     if none:
         false = _share(sum(x.extra > 0 for x in none), len(none))
@@ -167,6 +169,20 @@ def checks(
         extra = sum(x.extra for x in pairs) / len(pairs)
         rows.append(
             Check("pair: extra claims per set", extra, 0.4 if dirt else 0.15, False, len(pairs))
+        )
+    if triples:
+        hidden = sum(len(x.hidden) for x in triples)
+        recall = _share(sum(x.in_set_class for x in triples), hidden)
+        rows.append(Check("triple: recall by class, %", recall, 90.0, True, hidden))
+        exact = sum(x.in_set_class == len(x.hidden) and not x.extra for x in triples)
+        rows.append(
+            Check(
+                "triple: all three and nothing else, %",
+                _share(exact, len(triples)),
+                60.0,
+                True,
+                len(triples),
+            )
         )
     if outside:
         n = len(outside)
@@ -289,9 +305,13 @@ def _remarks(outcomes: Sequence[Outcome]) -> list[str]:
             remarks.append(f"- {o.label}, seed {o.seed}: error: {o.error}")
             continue
         s = o.score
-        missed = o.group in {"single", "pair"} and s.in_set < len(s.hidden)
+        missed = o.group in {"single", "pair", "triple"} and s.in_set < len(s.hidden)
         if missed or s.extra or (o.group == "outside" and not (s.balance_right and s.axis_right)):
-            words = [f"in set {s.in_set}/{len(s.hidden)}"] if o.group in {"single", "pair"} else []
+            words = (
+                [f"in set {s.in_set}/{len(s.hidden)}"]
+                if o.group in {"single", "pair", "triple"}
+                else []
+            )
             words += (
                 [f"extra {' '.join('{' + ', '.join(n) + '}' for n in s.extra_names)}"]
                 if s.extra

@@ -45,6 +45,21 @@ PAIRS: tuple[tuple[str, str], ...] = (
     ("stribeck", "cyclic_torque"),
     ("torque_sensor_offset", "lugre"),
 )
+TRIPLES: tuple[tuple[str, str, str], ...] = (
+    ("torque_ripple", "cubic_stiffness", "stribeck"),
+    ("stribeck", "hysteresis", "added_spring"),
+    ("motor_constant_error", "kinematic_error", "quadratic_drag"),
+    ("thermal_friction", "backlash", "cyclic_torque"),
+    ("asymmetric_coulomb", "piecewise_stiffness", "cyclic_friction"),
+    ("current_offset", "soft_windup", "lugre"),
+    ("cubic_viscous", "cubic_stiffness", "torque_sensor_gain"),
+    ("load_dependent_friction", "kinematic_error", "asymmetric_viscous"),
+    ("torque_ripple", "backlash", "quadratic_drag"),
+    ("stribeck", "soft_windup", "cyclic_torque"),
+    ("lugre", "hysteresis", "asymmetric_viscous"),
+    ("added_spring", "piecewise_stiffness", "motor_constant_error"),
+)
+"""One effect of the drive or the sensors, one of the transmission, one of either side."""
 RECORDS = {"both": ("", "2"), "first": ("",), "second": ("2",)}
 NO_GAIN_WITHOUT_SENSOR = NEEDS_TORQUE_SENSOR | {"motor_constant_error"}
 
@@ -152,8 +167,8 @@ def run_job(job: Job) -> Outcome:
 
 def plan_jobs(options: argparse.Namespace, cache: Path) -> list[Job]:
     """The cases that the options ask for."""
-    chosen = options.effects.split(",") if options.effects else list(LIBRARY)
-    unknown = [e for e in chosen if e not in LIBRARY]
+    effects = options.effects.split(",") if options.effects else list(LIBRARY)
+    unknown = [e for e in effects if e not in LIBRARY]
     if unknown:
         raise SystemExit(
             f"--effects: not in the generator: {', '.join(unknown)}; it has {', '.join(LIBRARY)}"
@@ -164,13 +179,18 @@ def plan_jobs(options: argparse.Namespace, cache: Path) -> list[Job]:
     )
     seeds = range(options.start, options.start + options.seeds)
     cases: list[tuple[str, str | tuple[str, ...] | None, int]] = [
-        ("single", e, s) for e in chosen if e not in hidden for s in seeds
+        ("single", e, s) for e in effects if e not in hidden for s in seeds
     ]
     cases += [("none", None, options.start + s) for s in range(options.none)]
+    sums: tuple[tuple[str, tuple[tuple[str, ...], ...], int], ...] = (
+        ("pair", PAIRS, options.pairs),
+        ("triple", TRIPLES, options.triples),
+    )
     cases += [
-        ("pair", PAIRS[i % len(PAIRS)], options.start + i // len(PAIRS))
-        for i in range(options.pairs)
-        if not hidden & set(PAIRS[i % len(PAIRS)])
+        (group, chosen[i % len(chosen)], options.start + i // len(chosen))
+        for group, chosen, count in sums
+        for i in range(count)
+        if not hidden & set(chosen[i % len(chosen)])
     ]
     if not options.one_sided:
         cases += [
@@ -245,6 +265,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--effects", help="comma-separated keys (default: all)")
     p.add_argument("--none", type=int, default=40, help="cases with nothing hidden")
     p.add_argument("--pairs", type=int, default=12, help="cases with two hidden effects")
+    p.add_argument("--triples", type=int, default=0, help="cases with three hidden effects")
     p.add_argument("--outside", type=int, default=3, help="cases of each kind outside the library")
     p.add_argument("--no-torque-sensor", action="store_true")
     p.add_argument(
