@@ -44,9 +44,6 @@ KERNEL_SHARE: Final = 0.4
 """Share of rows that count as independent under white noise: four rows per kernel length."""
 
 
-NO_COLUMN: Final = 1e-12
-"""Size of a column, as a share of the largest one, below which it is rounding."""
-
 UNSEEN: Final = 1.0
 """Standard deviations, over all rows together, by which a change of a shape by all of its size must
 move them to be seen at all."""
@@ -216,8 +213,8 @@ def make_base(solution: Solution, data: Dataset) -> Base:
     towards = np.concatenate([np.ones(len(free)), list(signs.values())])
     jw = j * towards * weight[:, None]
     norms = np.linalg.norm(jw, axis=0)
-    alive = norms > NO_COLUMN * max(float(norms.max(initial=0.0)), 1e-300)
-    alive &= ~_unseen_sizes(solution, names, norms)
+    # sizes of columns in unlike units say nothing of each other
+    alive = (norms > 0) & ~_unseen_sizes(solution, names, norms)
     back = alive & (np.arange(len(norms)) >= len(free))
     alive[len(free) :] = False
     inward = jw[:, back] / norms[back]

@@ -119,8 +119,6 @@ COLLINEAR: Final = 1e4
 """Growth of a parameter's error by the others from which it is not identified: all but one part in
 1e8 of its column's power is theirs.
 """
-NO_COLUMN: Final = 1e-12
-"""Size of a column, as a share of the largest one, below which it is rounding."""
 AT_BOUND: Final = 1e-9
 """Relative distance from a bound within which a parameter stands at it: rounding of the step."""
 
@@ -515,18 +513,11 @@ def _with_errors(
     norms = np.linalg.norm(j, axis=0)
     smoothing = balances.model.named("smoothing")
     at_bound = _at_bound(balances.model, values, free, limits)
-    usable = np.array(
-        [
-            norm > NO_COLUMN * norms.max(initial=0.0) and n not in at_bound
-            for n, norm in zip(free, norms, strict=True)
-        ]
-    )
+    usable = np.array([norm > 0 and n not in at_bound for n, norm in zip(free, norms, strict=True)])
     stderr: dict[str, float | None] = dict.fromkeys(values)
     correlation: dict[str, tuple[str, float]] = {}
     unidentified = [
-        n
-        for n, norm in zip(free, norms, strict=True)
-        if norm <= NO_COLUMN * norms.max(initial=0.0) and n not in smoothing
+        n for n, norm in zip(free, norms, strict=True) if norm <= 0 and n not in smoothing
     ]
     # without stiffness the link would fall off: the twist follows no torque of these records
     unidentified += [n for n in balances.model.named("stiffness") if n in at_bound]

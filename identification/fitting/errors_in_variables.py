@@ -215,7 +215,7 @@ def _largest_share(problem: WeakForm, noise: NoiseProducts, moves: npt.NDArray[n
     """
     jacobian = problem.jacobian(np.array([problem.values[n] for n in problem.free]))
     size = np.linalg.norm(jacobian, axis=0)
-    moved = moves & (size > 1e-12 * size.max(initial=0.0))
+    moved = moves & (size > 0)
     if not moved.any():
         return 0.0
     scaled, unit = jacobian[:, moved] / size[moved], np.outer(size[moved], size[moved])
@@ -233,7 +233,7 @@ def _newton(
     """Step of the parameters that move to where these rows, less a share of the noise, hold."""
     out = np.zeros(len(moves))
     size = np.linalg.norm(jacobian, axis=0)
-    moved = moves & (size > 1e-12 * size.max(initial=0.0))
+    moved = moves & (size > 0)
     if not moved.any():  # everything is known
         return out
     scaled, unit = jacobian[:, moved] / size[moved], np.outer(size[moved], size[moved])

@@ -47,8 +47,9 @@ KEPT: Final = 0.9
 """Share of the promised fall that makes the next step bolder: between this and `LEAST_SHARE` the
 damping is right as it is."""
 DEAD: Final = 1e-12
-"""A column smaller than this share of the largest moves nothing that rounding would not move
-too."""
+"""Share of a column that the blocks' own unknowns leave of it, below which it is rounding. Columns
+are held against themselves alone: one in N.m per rad^3 is 1e-13 of one in N.m per rad and moves as
+much."""
 RANK: Final = 1e-13
 """Singular values below this share of the largest are rounding; the step of least length is taken
 there."""
@@ -344,10 +345,12 @@ def triangles_of_products(products: FloatArray) -> FloatArray:
     """The same from products of the columns, (blocks, k, k): half the digits, for rows that were
     never kept."""
     size = np.sqrt(np.einsum("bii->bi", products))
-    size = np.where(size > 0, size, 1.0)
+    empty = size <= 0
+    size = np.where(empty, 1.0, size)
     k = products.shape[1]
     scaled = products / (size[:, :, None] * size[:, None, :]) + RIDGE * k * np.eye(k)
     lower = np.linalg.cholesky(scaled)
+    size = np.where(empty, 0.0, size)
     return np.asarray(lower.transpose(0, 2, 1) * size[:, None, :], dtype=np.float64)
 
 
@@ -369,7 +372,10 @@ def eliminated(triangles: FloatArray, unknowns: int) -> Linear:
         back = np.linalg.pinv(inner / size[:, None, :], rcond=RANK) @ across / size[:, :, None]
     rest = common_rows(triangles, unknowns)
     small = triangle_of(rest.reshape(-1, rest.shape[2])) if len(rest) > 1 else rest[0]
-    return Linear(small[:-1, :-1], small[:-1, -1], back, float(np.sum(across[:, :, -1] ** 2)))
+    columns = small[:-1, :-1]
+    before = np.linalg.norm(triangles[:, :, unknowns:-1], axis=(0, 1))
+    columns = columns * (np.linalg.norm(columns, axis=0) > DEAD * before)
+    return Linear(columns, small[:-1, -1], back, float(np.sum(across[:, :, -1] ** 2)))
 
 
 def common_rows(triangles: FloatArray, unknowns: int) -> FloatArray:
@@ -400,7 +406,7 @@ def bounded_step(
         Relative to columns of unit length.
     """
     norms = np.linalg.norm(triangle, axis=0)
-    alive = norms > DEAD * max(float(norms.max(initial=0.0)), 1e-300)
+    alive = norms > 0
     scale = np.where(alive, norms, 1.0)
     down, up = room[0] * scale, room[1] * scale
     a = np.vstack([triangle / scale, math.sqrt(damping) * np.eye(len(scale))])

@@ -374,3 +374,24 @@ def test_an_effect_belongs_to_the_balance_that_it_helps_most(key: str, elastic: 
     best = falls[base.balances.index(found.balance)]
     assert best == pytest.approx(max(falls), abs=1e-6)
     assert found.score == pytest.approx(KERNEL_SHARE / 2 * sum(falls), rel=1e-3, abs=1e-3)
+
+
+@pytest.mark.parametrize("twist", [1.0, 0.5, 0.1])
+def test_the_base_holds_every_parameter_whatever_its_unit(twist: float) -> None:
+    """A column in N.m per rad^3 beside one in N.m per rad: with less twist it is 1e-13 of the other
+    and moves as many deviations.
+    """
+    folder = Path(__file__).resolve().parents[3] / "workbench" / "demo"
+    joint = load_joint(folder / "joint.toml")
+    record, _ = passed(read(folder / "train.npz", joint.columns, joint.kind), joint)
+    record = record.take(slice(0, 3000))
+    motor = record["motor_position"] / joint.gear_ratio
+    stiffer = record.with_channel(
+        "link_position", motor - twist * (motor - record["link_position"])
+    )
+    model = prepared_model(joint, stiffer).add("cubic_stiffness")
+    data = load_dataset([stiffer], [], joint, model)
+    solution = solve(model, data)
+    assert "cubic_stiffness" not in solution.at_bound
+    assert solution.stderr["cubic_stiffness"] is not None
+    assert "cubic_stiffness" in make_base(solution, data).names

@@ -156,7 +156,7 @@ def test_a_bounded_step_is_the_minimum_in_the_box() -> None:
     rng = np.random.default_rng(0)
     for count in (1, 2, 5, 9):
         for _ in range(20):
-            rows = rng.standard_normal((30, count)) * 10.0 ** rng.uniform(-4, 4, count)
+            rows = rng.standard_normal((30, count)) * 10.0 ** rng.uniform(-12, 12, count)
             target = rng.standard_normal(30)
             size = np.linalg.norm(rows, axis=0)
             room = -rng.exponential(0.1, count) / size, rng.exponential(0.1, count) / size
@@ -330,3 +330,22 @@ def test_certified_values_of_nist_come_out(name: str, far: bool) -> None:
     assert found.outcome in (Outcome.SETTLED, Outcome.EXACT), found
     assert found.cost == pytest.approx(certified.square, rel=1e-9 if name != "Lanczos3" else 1e-8)
     assert found.x == pytest.approx(certified.values, rel=1e-6)
+
+
+def test_what_the_unknowns_of_blocks_explain_moves_nothing_in_any_unit() -> None:
+    """A column of rad^3 is no smaller for the unit of the one beside it; one that the blocks' own
+    unknowns hold is rounding however large it was.
+    """
+    rng = np.random.default_rng(7)
+    rows = rng.standard_normal((3, 40, 5))  # own unknown, three parameters, residual
+    rows[:, :, 2] = rows[:, :, 0] * np.array([1.0, -2.0, 0.5])[:, None]
+    plain = eliminated(np.array([triangle_of(block) for block in rows]), 1)
+    units = np.array([1.0, 1e-13, 1.0, 1e13, 1.0])
+    scaled = eliminated(np.array([triangle_of(block) for block in rows * units]), 1)
+    size = np.linalg.norm(scaled.triangle, axis=0) / units[1:-1]
+    assert size == pytest.approx(np.linalg.norm(plain.triangle, axis=0), rel=1e-9)
+    assert [bool(x) for x in size > 0] == [True, False, True]
+    room = np.full(3, -INF), np.full(3, INF)
+    one, other = (bounded_step(x.triangle, x.target, room, 1e-14) for x in (plain, scaled))
+    assert other * units[1:-1] == pytest.approx(one, rel=1e-9)
+    assert one[1] == 0.0
