@@ -72,7 +72,8 @@ asked for.
 LEAST_ADDED_DROP: Final = 2.0
 """Fall of a balance's held-out RMS that an addition must bring after its whole fit [%]."""
 EXPLAINED_SHARE: Final = 0.5
-"""Share of a balance's power over the floor below which a claim is one in part."""
+"""Share of what a claim explains and what is left over the floor at the end, taken together, below
+which it is one in part: what is left may then be what it stands for."""
 LOCATED_SHARE: Final = 50.0
 """Share of what is left that one variable must hold before a table over it is set against the
 claims [%].
@@ -376,7 +377,10 @@ class Session:
         where = self.bench.places(end, error, lines, RATIO_LIMIT) if over else []
         # a curve stands for what no name explains: not while a name would be the next
         learned = self.bench.learned(end, error) if over and following is None else ()
-        judged = [self._partial(c, steps[0], end, where) for c in claims]
+        judged = [
+            self._partial(c, before, after, end, where)
+            for c, (before, after) in zip(claims, itertools.pairwise(steps), strict=True)
+        ]
         held = self.bench.held_against(claims, end)
         curves = [e.curve for e in held.values() if e.curve is not None]
         doubts = self.bench.artefacts(end, [*curves, *(c.curve for c in learned)], steps[0])
@@ -809,20 +813,18 @@ class Session:
         )
 
     def _partial(
-        self, claim: Claim, first: Step, last: Step, where: Sequence[Unexplained]
+        self, claim: Claim, before: Step, after: Step, last: Step, where: Sequence[Unexplained]
     ) -> Claim:
-        """A claim is partial where its balance stays over the floor and it explains less than
-        half, or no more than a table over one variable.
+        """A claim is partial where its balance stays over the floor and it explains less than is
+        left there at the end, or no more than a table over one variable.
         """
         left = next((u for u in where if u.balance == claim.balance), None)
         if left is None:
             return claim
-        before, after = (
-            first.held_out.balances[claim.balance],
-            last.held_out.balances[claim.balance],
-        )
-        over = before.rms**2 - before.floor**2
-        share = (before.rms**2 - after.rms**2) / over if over > 0 else 1.0
+        old, new, end = (s.held_out.balances[claim.balance] for s in (before, after, last))
+        own = max(old.rms**2 - new.rms**2, 0.0)
+        over = max(end.rms**2 - end.floor**2, 0.0)
+        share = own / (own + over) if own + over > 0 else 1.0
         partial = share < EXPLAINED_SHARE or claim.effect.stage == "late"
         if not partial and left.share_percent >= LOCATED_SHARE and not claim.effect.common:
             partial = is_absorbed(claim, left, last.solution, self.data)
