@@ -40,6 +40,9 @@ HOLD_NAME: Final = hold.HOLD_NAME
 ONE_SIDED_KERNEL: Final = 0.2
 LINK_BALANCES: Final = frozenset({"link", "sum", "axis"})
 POINTWISE_KERNELS: Final = (0.01, 0.014, 0.02, 0.03)
+SHORT_KERNELS: Final = (2, 4, 6)
+"""Kernels in samples that are shorter than those: a fine encoder needs none, and any kernel rounds
+off the turn at which friction changes its sign within a sample."""
 STILL: Final = 3.0
 """Pointwise speed of a side at rest, in standard deviations of its noise: 0.3 % of samples at
 rest lie above.
@@ -402,11 +405,9 @@ def pointwise_kernel(
         or [np.zeros(1)]
     )
     fast = float(np.quantile(change, 0.99)) / (lag * dt)
-    for length in POINTWISE_KERNELS:
-        if (
-            6 * dt <= length < longest
-            and noise.after(kernel(length, dt, 1), dt) <= VELOCITY_NOISE * fast
-        ):
+    short = [n * dt for n in SHORT_KERNELS if n * dt < POINTWISE_KERNELS[0]]
+    for length in (*short, *(x for x in POINTWISE_KERNELS if x >= SHORT_KERNELS[0] * dt)):
+        if length < longest and noise.after(kernel(length, dt, 1), dt) <= VELOCITY_NOISE * fast:
             return length
     return max(longest, 6 * dt)
 

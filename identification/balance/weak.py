@@ -91,7 +91,7 @@ def kernel(length: float, dt: float, order: int = 0) -> FloatArray:
     (k,) array, k odd
         Weights that reproduce the derivative of polynomials up to `order` + 1 exactly.
     """
-    half = max(order + 2, whole(length / dt / 2))
+    half = max(1 if order == 1 else order + 2, whole(length / dt / 2))  # 1: central difference
     t = np.arange(-half, half + 1) * dt
     width = (2 * half + 2) * dt
     window = np.cos(np.pi * t / width) ** 4
