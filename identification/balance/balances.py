@@ -293,13 +293,14 @@ class Balances:
             return np.zeros(data.rows)
         return self._flight.rows(data, [float(values[n]) for n in self.names])
 
+    def slopes(self, values: Mapping[str, float]) -> dict[str, dict[str, float]]:
+        """By balance, the signals that enter it linearly and how strongly."""
+        return self._plain.slopes(self.balances, [float(values[n]) for n in self.names])
+
     def entering(self, values: Mapping[str, float]) -> dict[str, frozenset[str]]:
         """By balance, the signals that its residual depends on at the given parameter values."""
-        p = [float(values[n]) for n in self.names]
-        return {
-            b: frozenset(self._plain.slopes(self.balances, p)[b]) | self._plain.bent(i)
-            for i, b in enumerate(self.balances)
-        }
+        slopes = self.slopes(values)
+        return {b: frozenset(slopes[b]) | self._plain.bent(i) for i, b in enumerate(self.balances)}
 
 
 @final

@@ -134,6 +134,7 @@ def excerpt(record: WeakRecord) -> tuple[WeakRecord, IntArray]:
         starts=np.concatenate([[0], np.cumsum([len(p) for p in points])]).astype(np.int64),
         curved=of(record.curved, which),
         rest=of(record.rest, which),
+        between=of(record.between, which),
         support=None if record.support is None else record.support[which],
     )
     return pieces, which

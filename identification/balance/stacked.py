@@ -30,6 +30,8 @@ TURN_SHARE: Final = 0.25
 either way.
 """
 
+SURE_JUMP: Final = 3.0
+"""Standard deviations of noise from which what alternates from sample to sample is a jump."""
 NORMAL_MEDIAN: Final = 0.6745
 """Median of the absolute value of a normal variable of unit deviation."""
 WEIGHINGS: Final = 12
@@ -236,11 +238,17 @@ def measured(balance: str, record: WeakRecord) -> FloatArray:
 def unsure(
     balances: Balances, data: Dataset, values: Mapping[str, float], records: Sequence[WeakRecord]
 ) -> dict[str, FloatArray]:
-    """Scatter of each row from where exactly friction changes its sign: it may act either way,
-    or be spread over a turn [N.m].
+    """Scatter of each row from where exactly friction changes its sign, which may act either way
+    or be spread over a turn, and from when exactly a torque jumped between two samples [N.m].
     """
     names = balances.model.named("smoothing")
     either = _either_way(balances.model, data, values, records)
+    either = {
+        b: np.hypot(x, jumps)
+        for (b, x), jumps in zip(
+            either.items(), _between_samples(balances, data, values, records), strict=True
+        )
+    }
     if data.sensing.kinematic:
         settled_values = settled(balances.model, data.sensing, records, values)
         flying = [balances.flight(w, values_on(balances.model, w, settled_values)) for w in records]
@@ -310,6 +318,35 @@ def _either_way(
         for b in balances:
             if b in out:
                 out[b] = np.hypot(out[b], held)
+    return out
+
+
+def _between_samples(
+    balances: Balances, data: Dataset, values: Mapping[str, float], records: Sequence[WeakRecord]
+) -> list[FloatArray]:
+    """Scatter of the rows of each balance of the sensing from jumps of a measured torque between
+    two samples [N.m].
+
+    A jump at an instant that nobody knows, even over a sample, moves the average by ``weight *
+    jump / sqrt(12)``; the samples with every other one turned round hold ``weight * jump / 2`` of
+    it, and noise as strong as that of the average.
+    """
+    slopes = balances_of(balances.model, data.sensing, wrt=()).slopes(values)
+    out = []
+    for b in data.sensing.balances:
+        parts = []
+        for w in records:
+            entering = [(slopes[b].get(c, 0.0), c) for c in w.between]
+            told = sum((k * w.between[c] for k, c in entering), np.zeros(w.rows))
+            noise = math.hypot(
+                *(
+                    k * data.sources[c].after(w.grid.alternating, w.grid.dt)
+                    for k, c in entering
+                    if c in data.sources
+                )
+            )
+            parts.append(np.sqrt(np.maximum(told**2 - (SURE_JUMP * noise) ** 2, 0.0) / 3))
+        out.append(np.concatenate(parts) if parts else np.empty(0))
     return out
 
 

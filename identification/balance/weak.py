@@ -33,6 +33,9 @@ POSITION_CHAINS: Final = {
 }
 """Measured signals and the signals that follow from them by derivatives."""
 
+TORQUES: Final = ("torque", "drive", "coupling_torque")
+"""Measured signals that may jump between two samples."""
+
 HIGHEST_DERIVATIVE: Final = 4
 CLAIM_KERNEL: Final = 0.06
 """Length of the balances' kernel [s]."""
@@ -168,6 +171,14 @@ class Grid:
     half: int
     pointwise: Mapping[str, float]
 
+    @property
+    def alternating(self) -> FloatArray:
+        """The kernel with every other weight turned round: nothing is left of what the samples
+        resolve, and half of the weight of a sample of what jumps between two of them.
+        """
+        weights = differentiated_kernel(self.length, self.dt, 0)
+        return np.asarray(weights * (-1.0) ** np.arange(len(weights)), dtype=np.float64)
+
     def velocity_noise(self, source: str, noise: ChannelNoise) -> float:
         """Standard deviation of the pointwise velocity of that position under its noise [1/s]."""
         return noise.after(kernel(self.pointwise[source], self.dt, 1), self.dt)
@@ -229,6 +240,9 @@ class WeakRecord:
         Second derivative of the average of every signal where it was asked for.
     rest : mapping of str to (rows,) array
         Kernel average of "this side stands still" (0 to 1), by side: motor, link.
+    between : mapping of str to (rows,) array
+        What the average of a measured torque over every other sample differs by from that over the
+        samples between them, halved.
     support : (rows,) array, optional
         Share of each row's kernel that was measured and not bridged; 1 everywhere where it is None.
     name : str
@@ -248,6 +262,7 @@ class WeakRecord:
     masked: frozenset[str] = frozenset()
     curved: Mapping[str, FloatArray] = field(default_factory=dict)
     rest: Mapping[str, FloatArray] = field(default_factory=dict)
+    between: Mapping[str, FloatArray] = field(default_factory=dict)
     support: FloatArray | None = None
     name: str = ""
     shifts: Mapping[str, float] = field(default_factory=dict)
@@ -473,6 +488,13 @@ def prepare(
             points[name] = smooth[name] = np.concatenate(
                 [values[s][::step] for s in long_enough] or [np.empty(0)]
             )
+    between = {
+        n: before.between[n]
+        if before is not None and n in over
+        else grid.correlate(signals[n], grid.alternating)
+        for n in TORQUES
+        if n in signals
+    }
     stamps = grid.pick(time)
     numbers = np.concatenate(
         [
@@ -492,6 +514,7 @@ def prepare(
         block=np.where(inside, blocks + first_block, -1),
         starts=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
         curved=bent,
+        between=between,
     )
 
 
