@@ -79,7 +79,11 @@ def noise_level(
 
 
 def spaced_levels(
-    values: FloatArray, segments: Sequence[slice], level: float, spacings: Sequence[int]
+    values: FloatArray,
+    segments: Sequence[slice],
+    level: float,
+    spacings: Sequence[int],
+    measured: npt.NDArray[np.bool_] | None = None,
 ) -> list[float]:
     """`noise_level` of even samples from fourth differences over several spacings.
 
@@ -94,6 +98,8 @@ def spaced_levels(
         Over one sample.
     spacings : sequence of int
         Increasing.
+    measured : (n,) bool array, optional
+        False where a lost sample is bridged: such a value is in no difference that counts.
 
     Returns
     -------
@@ -105,7 +111,10 @@ def spaced_levels(
     out = []
     for spacing in spacings:
         left = [
-            _spaced(values[s], spacing)[_clear(jumps[s], 4 * spacing)]
+            _spaced(values[s], spacing)[
+                _clear(jumps[s], 4 * spacing)
+                & (True if measured is None else _all_there(measured[s], spacing))
+            ]
             for s in segments
             if s.stop - s.start > 8 * spacing
         ]
@@ -138,6 +147,12 @@ def _mark(
             jumps[s.start + 2 * m : s.stop - 2 * m][over] = 1.0
 
 
+def _all_there(measured: npt.NDArray[np.bool_], m: int) -> npt.NDArray[np.bool_]:
+    """Which differences over m samples are of five measured ones."""
+    count = len(measured) - 4 * m
+    return np.asarray(np.all([measured[k * m : k * m + count] for k in range(5)], axis=0))
+
+
 def _clear(jumps: FloatArray, length: int) -> npt.NDArray[np.bool_]:
     """Which stretches of so many steps hold no mark."""
     total = np.concatenate([[0.0], np.cumsum(jumps)])
@@ -165,21 +180,19 @@ def noise_of(record: Record, signal: str, values: FloatArray, ratio: float) -> C
     """
     known = _LEVELS.setdefault(record, {})
     if (signal, ratio) not in known:
-        segments, time = tuple(record.segments()), record.time
-        if record.measured is not None and not record.measured.all():
-            edges = np.concatenate(
-                [[0], np.cumsum([int(record.measured[s].sum()) for s in segments])]
-            ).tolist()
-            segments = tuple(slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True))
-            values, time = values[record.measured], time[record.measured]
-        level = noise_level(values, segments, time)
-        steps = np.concatenate([np.diff(time[s]) for s in segments] or [np.empty(0)])
+        stretches, time, there = tuple(record.segments()), record.time, record.measured
+        steps = np.concatenate([np.diff(time[s]) for s in stretches] or [np.empty(0)])
         even = len(steps) > 0 and np.ptp(steps) <= EVEN * float(np.median(steps))
+        level = 0.0
+        if even and there is not None and not there.all():
+            # a difference across a hole is as long as several: of a motion it holds more
+            (level,) = spaced_levels(values, stretches, np.inf, [1], there)
+        level = level or noise_level(values, stretches, time)
         known[signal, ratio] = white(level)
         if even and level > 0:
             dt = float(np.median(steps))
-            further = spaced_levels(values, segments, level, spacings_of(dt)[1:])
-            longest = max(segments, key=lambda s: s.stop - s.start)
+            further = spaced_levels(values, stretches, level, spacings_of(dt)[1:], there)
+            longest = max(stretches, key=lambda s: s.stop - s.start)
             known[signal, ratio] = coloured(values, longest, dt, [level, *further])
     return known[signal, ratio]
 

@@ -89,6 +89,12 @@ SLOW_KERNEL: Final = 0.03
 is drawn [s]: quantisation wipes out both.
 """
 NORMAL_95: Final = 1.96
+PIECES: Final = 4
+"""Parts of a block of which each has a speed: of a quarter of a second."""
+SAME_SPEED: Final = 0.1
+"""Change of the speed, as a share, from which on a hum of 10 Hz is out of step with the angle after
+a second.
+"""
 MOVING: Final = 0.05
 """Weight, as a share of the largest, above which a sample belongs to the motion."""
 
@@ -228,7 +234,7 @@ def at_every_sample(
         points=points,
         smooth=smooth,
         time=points["time"],
-        block=_seconds(points["time"], starts),
+        block=_in_step(points["time"], points["motor_position"], starts),
         starts=starts,
         name="" if like is None else like.name,
         shifts={p: k * dt for p, k in late.items()},
@@ -256,15 +262,35 @@ def _filtered(values: FloatArray, starts: IntArray, weights: FloatArray) -> Floa
     return out
 
 
-def _seconds(time: FloatArray, starts: IntArray) -> IntArray:
-    """Number of the second of each sample; segments share none."""
+def _in_step(time: FloatArray, position: FloatArray, starts: IntArray) -> IntArray:
+    """Number of the block of each sample: a second, or as long as the joint runs at one speed in
+    one direction; segments share none.
+
+    At one speed a hum keeps its phase to the angle from one end to the other: such a stretch tells
+    once, and not once a second, whether what is left follows the angle.
+    """
     out = np.zeros(len(time), dtype=np.int64)
-    first = 0
-    for a, b in zip(starts[:-1], starts[1:], strict=True):
-        if b > a:
-            out[a:b] = first + ((time[a:b] - time[a]) / BLOCK).astype(np.int64)
-            first = int(out[b - 1]) + 1
+    number = -1
+    for a, b in itertools.pairwise(starts.tolist()):
+        piece = ((time[a:b] - time[a : a + 1]) * (PIECES / BLOCK)).astype(np.int64)
+        edges = [a, *(a + 1 + np.flatnonzero(np.diff(piece))).tolist(), b]
+        speeds: list[float] = []
+        for first, last in itertools.pairwise(edges):
+            apart = time[last - 1] - time[first]
+            speed = float(position[last - 1] - position[first]) / apart if apart > 0 else 0.0
+            if not speeds or (len(speeds) >= PIECES and not _one_speed([*speeds, speed])):
+                number, speeds = number + 1, []
+            speeds.append(speed)
+            out[first:last] = number
     return out
+
+
+def _one_speed(speeds: Sequence[float]) -> bool:
+    """True where no speed is more than a part :data:`SAME_SPEED` under the highest, all in one
+    direction.
+    """
+    low, high = sorted((min(speeds), max(speeds)), key=abs)
+    return low * high > 0 and low / high > 1 - SAME_SPEED
 
 
 @final

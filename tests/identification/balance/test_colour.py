@@ -10,6 +10,7 @@ from identification import Joint, Record, fit
 from identification.balance.colour import ChannelNoise, Part, _two_shares, white
 from identification.balance.noise import noise_of
 from identification.balance.spikes import without_spikes
+from identification.balance.stamps import evened
 from identification.balance.weak import kernel
 from identification.fitting.assess import assess
 from identification.fitting.engine import load_dataset, prepared_model
@@ -121,6 +122,31 @@ def test_the_true_model_leaves_its_floor_under_every_kind_of_noise(kind: str) ->
             assess(solution.model, data, data.train, solution.values).balances["link"].ratio
         )
     assert all(0.85 < r < 1.2 for r in ratios), ratios
+
+
+@pytest.mark.parametrize("kind", ["white", "filtered", "hum", "heavy"])
+@pytest.mark.parametrize(("late", "lost"), [(0.0, 0.05), (0.1, 0.0), (0.1, 0.05), (0.05, 0.1)])
+def test_late_and_lost_samples_do_not_hide_the_colour_of_the_noise(
+    kind: str, late: float, lost: float
+) -> None:
+    # sampled at its stamps, brought to an even grid: what the cubics leave of a noise is smoother
+    # than the noise, and a bridge is smoother still
+    rng = np.random.default_rng(11)
+    q, torque = motion()
+    stamps = TIME + DT * np.clip(late * rng.standard_normal(COUNT), -0.4, 0.4)
+    make = KINDS[kind].noise
+    kept = rng.random(COUNT) >= lost
+    kept[[0, -1]] = True
+    channels = {
+        "link_position": np.interp(stamps, TIME, q) + POSITION * make(rng, COUNT),
+        "link_torque": np.interp(stamps, TIME, torque) + TORQUE * make(rng, COUNT),
+    }
+    one = evened(Record.from_channels(stamps[kept], {c: x[kept] for c, x in channels.items()}))
+    assert one.measured is not None
+    data = load_dataset([one], [], JOINT, prepared_model(JOINT, one), kernel=0.12)
+    solution = fit(JOINT, [one]).solution
+    ratio = assess(solution.model, data, data.train, solution.values).balances["link"].ratio
+    assert 0.8 < ratio < 1.25, ratio
 
 
 def test_noise_through_two_filters_in_a_row_is_read_too() -> None:

@@ -13,8 +13,15 @@ import pytest
 
 from benchmarks.lines import Case, Result, results
 from identification import Record, load_joint, read
+from identification.balance.sensing import sense
 from identification.data.joint_file import Joint, parse_joint, toml_text
-from identification.diagnosis.lines import Line, find_lines, named_orders, orders_of
+from identification.diagnosis.lines import (
+    Line,
+    at_every_sample,
+    find_lines,
+    named_orders,
+    orders_of,
+)
 from identification.diagnosis.order_tracking import ALPHA, Samples, confirmed, peaks, spectrum
 from identification.errors import InputError
 from identification.fitting.engine import load_dataset, prepared_model, solve
@@ -109,6 +116,27 @@ def test_a_line_that_held_out_samples_do_not_have_is_not_confirmed() -> None:
     assert sum(confirmed(line, swinging(s), 1) for s in range(2, 42)) <= 3
     opposite = replace(swinging(1, 2.3, 0.25), residual=-swinging(1, 2.3, 0.25).residual)
     assert not confirmed(line, opposite, 1)
+
+
+def test_a_line_of_which_held_out_samples_have_next_to_nothing_is_not_confirmed() -> None:
+    line = peaks(swinging(0, 2.3, 0.25), 6.0)[0]
+    quiet = [swinging(1, 2.3, size) for size in (0.25, 0.01)]
+    quiet = [replace(s, residual=line.wave(s) * size) for s, size in zip(quiet, (1.0, 0.05))]
+    assert [confirmed(line, s, 1) for s in quiet] == [True, False]
+
+
+@pytest.mark.parametrize(("slow", "blocks"), [(True, 8), (False, 40)])
+def test_what_runs_at_one_speed_tells_once_a_pass(slow: bool, blocks: int) -> None:
+    # at one speed a hum keeps its phase to the angle from one end to the other
+    dt = 4e-3
+    time = dt * np.arange(10_000)
+    passes = np.abs((time / 5.0) % 2.0 - 1.0)
+    angle = 2.0 * (passes if slow else np.sin(0.9 * time) + 0.3 * np.sin(2.9 * time))
+    joint = Joint(name="arm", gear_ratio=1.0, model_name="hd1", effects=("viscous@link",))
+    record = Record.from_channels(time, {"link_position": angle, "link_torque": 0 * time})
+    sensing = sense(record, prepared_model(joint, record))
+    made = at_every_sample(record, joint, sensing).block
+    assert abs(len(np.unique(made)) - blocks) <= 1
 
 
 def test_rest_counts_for_nothing() -> None:
