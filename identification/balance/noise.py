@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Final
 from weakref import WeakKeyDictionary
 
@@ -79,7 +80,11 @@ def noise_level(
 
 
 def spaced_levels(
-    values: FloatArray, segments: Sequence[slice], level: float, spacings: Sequence[int]
+    values: FloatArray,
+    segments: Sequence[slice],
+    level: float,
+    spacings: Sequence[int],
+    there: npt.NDArray[np.bool_] | None = None,
 ) -> list[float]:
     """`noise_level` of even samples from fourth differences over several spacings.
 
@@ -94,6 +99,8 @@ def spaced_levels(
         Over one sample.
     spacings : sequence of int
         Increasing.
+    there : (n,) bool array, optional
+        Samples that were measured: a difference that holds another one does not count.
 
     Returns
     -------
@@ -101,16 +108,18 @@ def spaced_levels(
         Zero from the spacing on over which too few are left.
     """
     jumps = np.zeros(len(values))
+    there = np.ones(len(values), dtype=bool) if there is None else there
     _mark(jumps, values, segments, 1, JUMP * level)
     out = []
     for spacing in spacings:
+        long = [s for s in segments if s.stop - s.start > 8 * spacing]
         left = [
-            _spaced(values[s], spacing)[_clear(jumps[s], 4 * spacing)]
-            for s in segments
-            if s.stop - s.start > 8 * spacing
+            _spaced(values[s], spacing)[_clear(jumps[s], 4 * spacing) & _five(there[s], spacing)]
+            for s in long
         ]
         squares = np.concatenate([*left, np.empty(0)]) ** 2
-        if len(squares) < FEWEST_LEFT * len(values):
+        share = _share_of_five(there, long, spacing)
+        if not len(squares) or len(squares) < FEWEST_LEFT * share * len(values):
             break
         count = int(KEPT * (len(squares) - 1)) + 1
         smallest = np.partition(squares, count - 1)[:count]
@@ -126,6 +135,19 @@ def _spaced(x: FloatArray, m: int) -> FloatArray:
         (second[: -2 * m] - 2 * second[m:-m] + second[2 * m :]) / np.sqrt(FOURTH_GAIN),
         dtype=np.float64,
     )
+
+
+def _five(there: npt.NDArray[np.bool_], m: int) -> npt.NDArray[np.bool_]:
+    """Where all five samples of a fourth difference over m samples were measured."""
+    count = len(there) - 4 * m
+    found = np.all([there[k * m : k * m + count] for k in range(5)], axis=0)
+    return np.asarray(found, dtype=np.bool_)
+
+
+def _share_of_five(there: npt.NDArray[np.bool_], segments: Sequence[slice], m: int) -> float:
+    """Share of the fourth differences over m samples whose five samples were measured."""
+    found = [_five(there[s], m) for s in segments if s.stop - s.start > 4 * m]
+    return float(np.mean(np.concatenate(found))) if found else 0.0
 
 
 def _mark(
@@ -165,23 +187,31 @@ def noise_of(record: Record, signal: str, values: FloatArray, ratio: float) -> C
     """
     known = _LEVELS.setdefault(record, {})
     if (signal, ratio) not in known:
-        segments, time = tuple(record.segments()), record.time
-        if record.measured is not None and not record.measured.all():
-            edges = np.concatenate(
-                [[0], np.cumsum([int(record.measured[s].sum()) for s in segments])]
-            ).tolist()
-            segments = tuple(slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True))
-            values, time = values[record.measured], time[record.measured]
-        level = noise_level(values, segments, time)
-        steps = np.concatenate([np.diff(time[s]) for s in segments] or [np.empty(0)])
-        even = len(steps) > 0 and np.ptp(steps) <= EVEN * float(np.median(steps))
-        known[signal, ratio] = white(level)
-        if even and level > 0:
-            dt = float(np.median(steps))
-            further = spaced_levels(values, segments, level, spacings_of(dt)[1:])
-            longest = max(segments, key=lambda s: s.stop - s.start)
-            known[signal, ratio] = coloured(values, longest, dt, [level, *further])
+        known[signal, ratio] = _estimated(record, values)
     return known[signal, ratio]
+
+
+def _estimated(record: Record, values: FloatArray) -> ChannelNoise:
+    """Noise of a signal, from differences that hold no bridged sample: a bridge is smoother than a
+    reading.
+    """
+    segments, there = tuple(record.segments()), record.measured
+    if there is None:
+        there = np.ones(len(values), dtype=bool)
+    edges = np.concatenate([[0], np.cumsum([int(there[s].sum()) for s in segments])]).tolist()
+    dense = tuple(slice(a, b) for a, b in pairwise(edges))
+    level = noise_level(values[there], dense, record.time[there])
+    steps = np.concatenate([np.diff(record.time[s]) for s in segments] or [np.empty(0)])
+    even = len(steps) > 0 and np.ptp(steps) <= EVEN * float(np.median(steps))
+    if not even or level <= 0:
+        return white(level)
+    dt, longest = float(np.median(steps)), max(segments, key=lambda s: s.stop - s.start)
+    share = _share_of_five(there, segments, 1)
+    if share < 1:
+        # differences across a gap reach further, and those of noise with a memory are larger there
+        level = spaced_levels(values, segments, level, [1], there)[0] or level
+    further = spaced_levels(values, segments, level, spacings_of(dt)[1:], there)
+    return coloured(values, longest, dt, [level, *further], share)
 
 
 def _fourth(x: FloatArray, time: FloatArray | None) -> FloatArray:
