@@ -14,7 +14,14 @@ from casadi_models.term import Term
 from identification.balance.balances import balances_of
 from identification.balance.calibration import settled
 from identification.balance.dataset import HOLD_NAME, Dataset, without
-from identification.balance.stacked import references, rms, row_weights, stack, taking_part
+from identification.balance.stacked import (
+    drawn_floors,
+    references,
+    rms,
+    row_weights,
+    stack,
+    taking_part,
+)
 from identification.diagnosis.trials import make_base
 from identification.fitting.engine import Solution, stepped
 
@@ -26,6 +33,8 @@ within 1 % of a converged fit (`python -m benchmarks.explore`)."""
 LEAST_DELAY: Final = 1.0
 """Samples up to which a late channel is no effect: a logger reads its channels, and holds its
 commands, somewhere within a sample."""
+TORQUES: Final = ("drive", "torque")
+"""Measured signals whose scale a balance has: what is left of it has the same."""
 
 
 @final
@@ -37,17 +46,42 @@ class Weighting:
     ----------
     like : Solution
     held : mapping of str to (rows,) array
+    passed : (balances,) array
+        What this fit passes on of noise of the measured torques (:func:`passed_on`).
     """
 
     like: Solution
     held: Mapping[str, FloatArray]
+    passed: FloatArray
 
     @classmethod
     def of(cls, like: Solution, data: Dataset) -> Weighting:
         """The weighting of a fit."""
         balances = balances_of(like.model, data.sensing, wrt=())
         values = settled(like.model, data.sensing, data.held_out, like.values)
-        return cls(like, row_weights(balances, data, values, like.sigma, data.held_out))
+        return cls(
+            like,
+            row_weights(balances, data, values, like.sigma, data.held_out),
+            passed_on(like, data),
+        )
+
+    def unit(self, solution: Solution, data: Dataset) -> FloatArray:
+        """Length of a balance's residual under a variant that is 1 under this fit, (balances,).
+
+        A law that takes a share of a measured torque scales the whole balance, noise and errors of
+        the model with it: what is left is shorter and no smaller.
+        """
+        own = passed_on(solution, data)
+        known = (own > 0) & (self.passed > 0)
+        return np.asarray(np.where(known, own, 1.0) / np.where(known, self.passed, 1.0))
+
+
+def passed_on(solution: Solution, data: Dataset) -> FloatArray:
+    """RMS of what noise of the measured torques makes of each balance of the training records,
+    (balances,).
+    """
+    found = [drawn_floors(solution.model, data, solution.values, w, TORQUES) for w in data.train]
+    return np.array([rms(np.array([f[b] for f in found])) for b in data.sensing.balances])
 
 
 @final
@@ -58,9 +92,12 @@ class Held:
     Attributes
     ----------
     squares, rows : (blocks, balances) arrays
-        Weighted squares of each block, and how many rows it has.
+        Weighted squares of each block in the variant's units (:meth:`Weighting.unit`), and how many
+        rows it has.
     rms : (balances,) array
-        In the units of the weights.
+        In the units of the weights and the variant.
+    unit : (balances,) array
+        These units of the variant.
     relative_error_percent : float
         100 norm(residual) / norm(measured).
     """
@@ -68,6 +105,7 @@ class Held:
     squares: FloatArray
     rows: FloatArray
     rms: FloatArray
+    unit: FloatArray
     relative_error_percent: float
 
 
@@ -120,7 +158,7 @@ def refitted(
     return Refit(
         solution,
         cost,
-        np.vstack([_padded(base.crossed, data.blocks), seen.squares]),
+        np.vstack([_padded(base.crossed / seen.unit**2, data.blocks), seen.squares]),
         np.vstack([_padded(base.numbers, data.blocks), seen.rows]),
         seen,
     )
@@ -142,10 +180,13 @@ def held_of(solution: Solution, data: Dataset, weighting: Weighting) -> Held:
     left = np.concatenate([residual[b][taking[b]] for b in balances.balances])
     size = np.concatenate([measured[b][taking[b]] for b in balances.balances])
     squares, rows = _by_block(data, residual, weighting)
+    unit = weighting.unit(solution, data)
+    size_of = [rms((residual[b] * weighting.held[b])[taking[b]]) for b in balances.balances]
     return Held(
-        squares,
+        squares / unit**2,
         rows,
-        np.array([rms((residual[b] * weighting.held[b])[taking[b]]) for b in balances.balances]),
+        np.array(size_of) / unit,
+        unit,
         100 * float(np.linalg.norm(left)) / (float(np.linalg.norm(size)) or 1e-300),
     )
 
