@@ -5,7 +5,7 @@ weights.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, final
 
@@ -146,30 +146,14 @@ def floor_rows(
 
 
 def drawn_floors(
-    model: JointModel,
-    data: Dataset,
-    values: Mapping[str, float],
-    record: WeakRecord,
-    channels: Collection[str] | None = None,
+    model: JointModel, data: Dataset, values: Mapping[str, float], record: WeakRecord
 ) -> dict[str, float]:
     """RMS of what drawn noise changes in each balance of one record, whatever is left of it [N.m];
     with the same draws for every model.
-
-    Parameters
-    ----------
-    model : JointModel
-    data : Dataset
-    values : mapping of str to float
-    record : WeakRecord
-    channels : collection of str, optional
-        Signals that have noise; all of them otherwise.
     """
     balances = balances_of(model, data.sensing, wrt=())
     power = dict.fromkeys(balances.balances, 0.0)
-    noise = data.sources
-    if channels is not None:
-        noise = {c: n for c, n in noise.items() if c in channels}
-    drawn = draws_of(record, noise)
+    drawn = draws_of(record, data.sources)
     seen = drawn[0].record
     either = unsure(balances, data, values, [seen])
     values = values_on(model, record, values)
