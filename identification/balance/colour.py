@@ -189,7 +189,9 @@ def spacings_of(dt: float) -> list[int]:
     return [m for m in SPACINGS if m == 1 or m * dt <= REACH]
 
 
-def coloured(values: FloatArray, part: slice, dt: float, levels: Sequence[float]) -> ChannelNoise:
+def coloured(
+    values: FloatArray, part: slice, dt: float, levels: Sequence[float], share: float = 1.0
+) -> ChannelNoise:
     """Noise of a channel from its fourth differences.
 
     Parameters
@@ -203,9 +205,11 @@ def coloured(values: FloatArray, part: slice, dt: float, levels: Sequence[float]
     levels : sequence of float
         Deviations of white noise with the same fourth differences over each of
         :func:`spacings_of`; zeros where that is not known.
+    share : float
+        Share of the differences that hold measured samples only.
     """
     spacings, level = spacings_of(dt), levels[0]
-    if level <= 0 or len(spacings) < FEWEST_SPACINGS or part.stop - part.start < FEWEST:
+    if level <= 0 or len(spacings) < FEWEST_SPACINGS or share * (part.stop - part.start) < FEWEST:
         return white(level)
     count = sum(1 for x in levels if x > 0)
     if count < FEWEST_SPACINGS:
@@ -229,7 +233,7 @@ def coloured(values: FloatArray, part: slice, dt: float, levels: Sequence[float]
     spacings, rest = [m for m, u in zip(spacings, use, strict=True) if u], rest[use]
     if float(np.median(rest[1:])) < COLOURED * rest[0]:
         return ChannelNoise(level, (Part(math.sqrt(rest[0])),), lines)
-    samples = part.stop - part.start
+    samples = share * (part.stop - part.start)
     found = _with_memory(rest, spacings, dt, SCATTER * float(np.sqrt(SAMPLES / samples)))
     return ChannelNoise(level, found, lines)
 

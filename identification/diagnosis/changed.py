@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import pairwise
 from statistics import NormalDist
 from typing import Any, Final, final
 
@@ -24,6 +25,7 @@ from identification.balance.balances import balances_of
 from identification.balance.calibration import names_of_runs, of_run
 from identification.balance.dataset import HOLD_NAME, Dataset, load_dataset, prepared_model
 from identification.balance.noise import effective_share
+from identification.balance.stacked import taking_part
 from identification.data.joint_file import Joint
 from identification.data.prepare import STANDARD_GRAVITY
 from identification.data.record import Record
@@ -31,7 +33,14 @@ from identification.diagnosis.candidates import observable
 from identification.diagnosis.claims import FALSE_DISCOVERY, GAIN, LARGEST_SET
 from identification.errors import InputError
 from identification.fitting.assess import Error, assess
-from identification.fitting.covariance import FEWEST_BLOCKS, errors_of_blocks, inverse
+from identification.fitting.covariance import (
+    FEWEST_BLOCKS,
+    cores,
+    errors_of_windows,
+    independent,
+    inverse,
+    windows_over,
+)
 from identification.fitting.engine import Solution, solve, stack
 from identification.fitting.errors_in_variables import noise_products, unbiased, whole_without
 from identification.fitting.start_values import bounds_of
@@ -509,6 +518,16 @@ class _Search:
         return np.where(np.isfinite(self.spread), self.spread, self.unsure)
 
     @cached_property
+    def windows(self) -> Any:
+        """Windows of time over the rows of a balance, from which errors are stated."""
+        return windows_over([w.time for w in self.data.train])
+
+    @cached_property
+    def independent(self) -> float:
+        """Number of independent windows that these count as."""
+        return independent(self.windows)
+
+    @cached_property
     def _limits(self) -> dict[str, tuple[float, float]]:
         """Bounds, wide enough for the reference itself."""
         limits = bounds_of(self.model, {}, self.data)
@@ -646,55 +665,95 @@ class _Gain:
 @final
 @dataclass(frozen=True)
 class _Point:
-    """A refit with its normal equations by block and balance.
+    """A refit with its normal equations: by block and balance, from which gains are told, and over
+    windows of time, from which errors are.
 
     Attributes
     ----------
     x : (p,) array
     moved : tuple of int
         Places of the parameters that are let go.
-    grams, noise : (blocks, balances, p + 1, p + 1) array
-        Products of the columns and, last, the residual; and what noise adds to them, beyond what it
-        adds to the squares that the reference leaves.
-    rows : (balances,) array
-        Rows of each balance.
+    columns : mapping of str to (rows, p + 1) array
+        Weighted columns of each balance and, last, the residual; zero where a row takes no part.
+    added : mapping of str to (p + 1, p + 1) array
+        What noise adds to their products, beyond what it adds to the squares that the reference
+        leaves.
+    block : (rows,) int array
+        -1 for rows that touch two blocks.
     """
 
     search: _Search
     x: FloatArray
     moved: tuple[int, ...]
-    grams: FloatArray
-    noise: FloatArray
-    rows: FloatArray
+    columns: Mapping[str, FloatArray]
+    added: Mapping[str, FloatArray]
+    block: IntArray
 
     @classmethod
     def at(cls, search: _Search, x: FloatArray, moved: tuple[int, ...]) -> _Point:
-        """The point with its normal equations."""
+        """The point with its rows."""
         form = search.form
         stacked = form.stacked(x)
-        count = int(stacked.block.max()) + 1
-        names = form.balances.balances
-        grams = np.zeros((count, len(names), len(x) + 1, len(x) + 1))
-        rows, noise = np.zeros(len(names)), np.zeros_like(grams)
+        columns, added = {}, {}
         drawn, back = noise_products(form.moved(x)), search.start - x
-        for k, b in enumerate(names):
-            score, added = drawn.score[b], drawn.gram[b]
-            own = -back @ (2 * score + added @ back)
-            whole = np.block([[added, score[:, None]], [score[None, :], np.full((1, 1), own)]])
-            power = np.asarray(form.weights[b]) ** 2
-            taken = float(power[stacked.taking[b]].sum())
-            used = stacked.taking[b] & (stacked.block >= 0)
-            full = (
-                np.column_stack([stacked.jacobian[b], stacked.residual[b]])
-                * np.asarray(form.weights[b])[:, None]
+        for b in form.balances.balances:
+            score, gram = drawn.score[b], drawn.gram[b]
+            own = -back @ (2 * score + gram @ back)
+            added[b] = np.block([[gram, score[:, None]], [score[None, :], np.full((1, 1), own)]])
+            weight = np.asarray(form.weights[b]) * stacked.taking[b]
+            columns[b] = (
+                np.column_stack([stacked.jacobian[b], stacked.residual[b]]) * weight[:, None]
             )
+        return cls(search, x, moved, columns, added, stacked.block)
+
+    def _noise_share(self, balance: str) -> FloatArray:
+        """Share of what noise adds that falls to each row of a balance, (rows,)."""
+        power = np.asarray(self.search.form.weights[balance]) ** 2
+        power = power * taking_part(balance, self.search.data.train)
+        return np.asarray(power / max(float(power.sum()), 1e-300))
+
+    @cached_property
+    def _by_block(self) -> tuple[FloatArray, FloatArray]:
+        """Products of the columns, and what noise adds to them, (blocks, balances, p + 1, p + 1)
+        each.
+        """
+        count, size = int(self.block.max()) + 1, len(self.x) + 1
+        grams = np.zeros((count, len(self.columns), size, size))
+        noise = np.zeros_like(grams)
+        for k, (b, full) in enumerate(self.columns.items()):
+            share = self._noise_share(b)
             for block in range(count):
-                part = full[used & (stacked.block == block)]
-                grams[block, k] = part.T @ part
-                here = used & (stacked.block == block)
-                noise[block, k] = whole * float(power[here].sum() / max(taken, 1e-300))
-            rows[k] = float(np.sum(used))
-        return cls(search, x, moved, grams, noise, rows)
+                here = self.block == block
+                grams[block, k] = full[here].T @ full[here]
+                noise[block, k] = self.added[b] * float(share[here].sum())
+        return grams, noise
+
+    @property
+    def grams(self) -> FloatArray:
+        """Products of the columns within each block and balance."""
+        return self._by_block[0]
+
+    @property
+    def noise(self) -> FloatArray:
+        """What noise adds to them."""
+        return self._by_block[1]
+
+    @cached_property
+    def _by_window(self) -> tuple[FloatArray, FloatArray]:
+        """Products of the columns within the core of each window, and over the window by its
+        weights, (windows, p + 1, p + 1) each, less what noise adds.
+        """
+        windows = self.search.windows
+        size = len(self.x) + 1
+        core, whole = (np.zeros((windows.shape[0], size, size)) for _ in range(2))
+        for b, full in self.columns.items():
+            share = self._noise_share(b)
+            for out, weights in ((core, cores(windows)), (whole, windows)):
+                for k, (first, end) in enumerate(pairwise(weights.indptr.tolist())):
+                    rows, weight = weights.indices[first:end], weights.data[first:end]
+                    out[k] += (full[rows] * weight[:, None]).T @ full[rows]
+                    out[k] -= self.added[b] * float(weight @ share[rows])
+        return core, whole
 
     @property
     def away(self) -> FloatArray:
@@ -722,15 +781,16 @@ class _Point:
 
     @cached_property
     def _total(self) -> tuple[FloatArray, FloatArray]:
-        """Normal equations over all blocks and balances, and the noise in them."""
-        return self.grams.sum(axis=(0, 1)), self.noise.sum(axis=(0, 1))
+        """Normal equations over all rows of all balances, and the noise in them."""
+        full = np.concatenate(list(self.columns.values()))
+        return full.T @ full, np.asarray(np.sum(list(self.added.values()), axis=0))
 
     def squares(self, moved: Sequence[int]) -> FloatArray:
         """Sum of squares of each block and balance under the step that the other folds give,
         (blocks, balances).
         """
         free = self.search.free(moved)
-        total, noise = self._total
+        total, noise = self.grams.sum(axis=(0, 1)), self.noise.sum(axis=(0, 1))
         count = len(self.grams)
         folds = min(FOLDS, count)
         out = np.zeros(self.grams.shape[:2])
@@ -754,8 +814,11 @@ class _Point:
 
     @property
     def _counts(self) -> FloatArray:
-        """Independent rows of each balance."""
-        return np.asarray(self.rows * self.search.shares)
+        """Independent rows of each balance, of those that belong to a block."""
+        inside = self.block >= 0
+        train = self.search.data.train
+        rows = [float(np.sum(taking_part(b, train) & inside)) for b in self.columns]
+        return np.array(rows) * self.search.shares
 
     def gain(self, group: Sequence[int]) -> _Gain:
         """What letting a group go brings."""
@@ -806,7 +869,7 @@ class _Point:
         if others:
             crossed = (total - noise)[np.ix_(others, [place])][:, 0]
             whole[others] = -inverse(self._normal(total, noise, others)) @ crossed
-        squares = (self.grams - self.noise).sum(axis=0)[:, :-1, :-1]
+        squares = (self.grams - self.noise).sum(axis=0)[:, :-1, :-1]  # rows that gains are told by
         made: FloatArray = np.einsum("i,bij,j->b", whole, squares, whole)
         return np.maximum(made, 0.0)
 
@@ -818,9 +881,9 @@ class _Point:
         """Standard errors of the changes of all that is free, in their order (see
         :meth:`_Search.free`).
 
-        Three parts: the scatter between blocks; the standard error of the reference value; and
-        those of the values that are held, as far as an error there would have moved this one.  In
-        other coordinates, x = `turned` @ new, where these are given.
+        Three parts: the scatter between windows of time; the standard error of the reference value;
+        and those of the values that are held, as far as an error there would have moved this one.
+        In other coordinates, x = `turned` @ new, where these are given.
         """
         free = self.search.free(moved)
         if not free:
@@ -829,9 +892,9 @@ class _Point:
         held = [i for i in range(len(self.x)) if i not in free and np.isfinite(errors[i])]
         total, noise = self._total
         step = self._step(total, noise, free)
-        grams = (self.grams - self.noise).sum(axis=1)
-        scores = (grams[:, :-1, -1] + grams[:, :-1, :-1] @ step)[:, free]
-        grams = grams[:, :-1, :-1]
+        core, whole = self._by_window
+        scores = (whole[:, :-1, -1] + whole[:, :-1, :-1] @ step)[:, free]
+        grams = core[:, :-1, :-1]
         normal = self._normal(total, noise, free)
         pulled = -inverse(normal) @ (total - noise)[np.ix_(free, held)] * errors[held]
         own = np.where(np.isin(free, moved), self.search.spread[free], 0.0)
@@ -841,8 +904,8 @@ class _Point:
             grams, scores = np.einsum("ia,bij,jc->bac", turned, grams, turned), scores @ turned
             pulled, normal = back @ pulled, turned.T @ normal @ turned
             own = np.sqrt((back**2) @ own**2)
-        blocks = errors_of_blocks(grams, scores, normal)
-        found = np.zeros(len(free)) if blocks is None else blocks
+        windows = errors_of_windows(grams, scores, normal, self.search.independent)
+        found = np.zeros(len(free)) if windows is None else windows
         return np.asarray(np.sqrt(found**2 + own**2 + np.sum(pulled**2, axis=1)))
 
     def errors(self, moved: Sequence[int]) -> FloatArray:

@@ -30,7 +30,7 @@ from identification.diagnosis.curve import (
 from identification.diagnosis.places import AXIS_TITLES, Branch, Place
 from identification.diagnosis.trials import Base, make_base
 from identification.fitting.assess import Error
-from identification.fitting.covariance import block_errors
+from identification.fitting.covariance import window_errors, windows_over
 from identification.fitting.engine import Solution
 
 FloatArray = npt.NDArray[np.float64]
@@ -426,12 +426,15 @@ def _gone(solution: Solution, start: Solution | None) -> list[Doubt]:
 
 
 def _held_back(solution: Solution, data: Dataset) -> list[Doubt]:
+    from scipy.sparse import hstack
+
     base = make_base(solution, data)
     count = base.inward.shape[1]
     if not count:
         return []
     both = np.column_stack([base.jacobian, base.inward])
-    errors = block_errors(both, base.residual, base.block)
+    windows = windows_over([w.time for w in data.train])
+    errors = window_errors(both, base.residual, hstack([windows] * len(base.balances), "csr"))
     if errors is None:
         return []
     step = np.linalg.lstsq(both, -base.residual, rcond=None)[0]

@@ -1,5 +1,5 @@
-"""The one covariance behind every "+-": from windows or blocks of time, honest with few, too; and
-from the information alone where there is no residual yet or its noise is known to be white.
+"""The one covariance behind every "+-": from windows of time, honest with few, too; and from the
+information alone where there is no residual yet or its noise is known to be white.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
 FEWEST_BLOCKS: Final = 4
-"""Blocks below which their scatter says nothing."""
+"""Blocks, or independent windows, below which their scatter says nothing."""
 BLOCK: Final = 1.5
 """Length of a block [s]: some periods of the slowest modes of a joint, after which errors of a
 model count as independent."""
@@ -26,12 +26,12 @@ OVERLAP: Final = 4
 freedom as a block; four over each row add to the same everywhere, and so do their squares.
 """
 LEAST: Final = 1e-3
-"""Share of the information on a direction that must be left without a block: less, and that block
+"""Share of the information on a direction that must be left without a window: less, and it
 alone tells of it (friction at the one reversal of a record).  Its scatter can say nothing there,
 and the other parameters do not hang on it."""
 HALF: Final = 0.5
 """Share of a parameter's variance in such a direction from which on the parameter is the one that
-a single block tells of."""
+a single window tells of."""
 MOST_TIED: Final = 0.999
 """Largest correlation of neighbouring samples that a short record can tell from 1."""
 NORMAL: Final = 1.959964
@@ -152,7 +152,8 @@ def window_errors(
     noise: tuple[FloatArray, FloatArray] | None = None,
     whole: FloatArray | None = None,
 ) -> FloatArray | None:
-    """Standard errors as :func:`block_errors`, from windows that overlap.
+    """Standard error of each parameter of a least-squares fit whose rows depend on each other
+    within windows of time.
 
     Parameters
     ----------
@@ -167,6 +168,10 @@ def window_errors(
         and to those with the residual over the window; taken off.
     whole : (p, p) array, optional
         Normal matrix of all rows, that of the noise taken off.
+
+    Returns
+    -------
+    (p,) array, or None with fewer than `FEWEST_BLOCKS` independent windows.
     """
     scores = windows @ (jacobian * residual[:, None])
     core = cores(windows)
@@ -174,10 +179,14 @@ def window_errors(
     grams = np.array([jacobian[rows].T @ jacobian[rows] for rows in parts])
     if noise is not None:
         grams, scores = grams - noise[0], scores - noise[1]
-    alike = windows @ windows.T
-    count = float(alike.trace()) ** 2 / max(float(np.sum(alike.data**2)), 1e-300)
     total = jacobian.T @ jacobian if whole is None else whole
-    return errors_of_blocks(grams, scores, total, count=count)
+    return errors_of_windows(grams, scores, total, independent(windows))
+
+
+def independent(windows: Any) -> float:
+    """Number of independent windows that these, which overlap, count as."""
+    alike = windows @ windows.T
+    return float(alike.trace()) ** 2 / max(float(np.sum(alike.data**2)), 1e-300)
 
 
 def cores(windows: Any) -> Any:
@@ -189,82 +198,38 @@ def cores(windows: Any) -> Any:
     return csr_array(windows > 0.5 * windows.max()).astype(np.float64)
 
 
-def block_errors(
-    jacobian: FloatArray,
-    residual: FloatArray,
-    block: IntArray,
-    noise: tuple[FloatArray, FloatArray] | None = None,
-    whole: FloatArray | None = None,
+def errors_of_windows(
+    grams: FloatArray, scores: FloatArray, whole: FloatArray, count: float
 ) -> FloatArray | None:
-    """Standard error of each parameter of a least-squares fit whose rows depend on each other
-    within blocks.
+    """The same from what each window holds of the normal equations.
 
-    The leave-one-block-out form of the sandwich (Bell and McCaffrey 2002, Survey Methodology
-    28:169), widened by the ratio of Student's t over blocks - 1 degrees of freedom to the normal
-    at 95 %: twice the error is a 95 % band.
+    The form of the sandwich that leaves out one window after the other (Bell and McCaffrey 2002,
+    Survey Methodology 28:169), widened by the ratio of Student's t over count - 1 degrees of
+    freedom to the normal at 95 %: twice the error is a 95 % band.
 
     Parameters
     ----------
-    jacobian : (n, p) array
-        Weighted, in any scale of its columns.
-    residual : (n,) array
-        Weighted, at the fit.
-    block : (n,) int array
-        Block of each row, -1 for none: such rows take part in the fit only.
-    noise : ((blocks, p, p) array, (blocks, p) array), optional
-        What noise of the columns adds to the products of each block; taken off.
-    whole : (p, p) array, optional
-        Normal matrix of all rows, that of the noise taken off.
+    grams : (windows, p, p) array
+        Products of the columns within the core of each window (:func:`cores`); unknowns of that
+        time alone eliminated.
+    scores : (windows, p) array
+        Products of the columns with the residual over the window.
+    whole : (p, p) array
+        Normal matrix of all rows.
+    count : float
+        Independent windows (:func:`independent`).
 
     Returns
     -------
-    (p,) array, or None with fewer than `FEWEST_BLOCKS` blocks.
-    """
-    numbers = np.unique(block[block >= 0])
-    if len(numbers) < FEWEST_BLOCKS:
-        return None
-    order = np.argsort(block, kind="stable")
-    parts = np.split(order, np.searchsorted(block[order], numbers))[1:]
-    grams = np.array([jacobian[rows].T @ jacobian[rows] for rows in parts])
-    scores = np.array([jacobian[rows].T @ residual[rows] for rows in parts])
-    if noise is not None:
-        grams, scores = grams - noise[0], scores - noise[1]
-    return errors_of_blocks(grams, scores, jacobian.T @ jacobian if whole is None else whole)
-
-
-def errors_of_blocks(
-    grams: FloatArray,
-    scores: FloatArray,
-    whole: FloatArray | None = None,
-    *,
-    count: float | None = None,
-) -> FloatArray | None:
-    """The same from what each block adds to the normal equations.
-
-    Parameters
-    ----------
-    grams : (blocks, p, p) array
-        Products of the columns within each block; unknowns of the block alone eliminated.
-    scores : (blocks, p) array
-        Products of the columns with the residual.
-    whole : (p, p) array, optional
-        Normal matrix of all rows, where some belong to no block; the sum of `grams` otherwise.
-    count : float, optional
-        Independent blocks that these count as, where they overlap.
-
-    Returns
-    -------
-    (p,) array, or None with fewer than `FEWEST_BLOCKS` blocks.
+    (p,) array, or None with fewer than `FEWEST_BLOCKS` independent windows.
     """
     from scipy.special import stdtrit
 
-    count = len(grams) if count is None else count
     if count < FEWEST_BLOCKS:
         return None
-    total = grams.sum(axis=0) if whole is None else whole
-    size = np.sqrt(np.maximum(np.diag(total), 0.0))
+    size = np.sqrt(np.maximum(np.diag(whole), 0.0))
     size = np.where(size > 0, size, 1.0)
-    scaled, pushed = total / np.outer(size, size), scores / size
+    scaled, pushed = whole / np.outer(size, size), scores / size
     left = np.linalg.pinv(scaled - grams / np.outer(size, size), rcond=RANK, hermitian=True)
     shifts = np.einsum("bij,bj->bi", left, pushed)
     value, vector = np.linalg.eigh(scaled)
@@ -380,23 +345,3 @@ def correlations(gram: FloatArray) -> tuple[FloatArray, FloatArray]:
     together = np.asarray(scaled / np.outer(spread, spread), dtype=np.float64)
     np.fill_diagonal(together, 0.0)
     return np.asarray(spread, dtype=np.float64), together
-
-
-def block_numbers(time: FloatArray, length: float) -> IntArray:
-    """Number of the block of each instant: a new one after `length`, and where the time jumps back
-    (another record).
-
-    Parameters
-    ----------
-    time : (n,) array
-        Start of each window, record after record [s].
-    length : float
-        Length of a block [s].
-    """
-    numbers = np.zeros(len(time), dtype=np.int64)
-    begun = time[0] if len(time) else 0.0
-    for k in range(1, len(time)):
-        new = time[k] < time[k - 1] or time[k] - begun >= length * (1 - 1e-9)
-        numbers[k] = numbers[k - 1] + new
-        begun = time[k] if new else begun
-    return numbers

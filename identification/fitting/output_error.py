@@ -21,7 +21,12 @@ from identification.balance.dataset import HOLD_NAME, run_name
 from identification.data.record import Record
 from identification.errors import InputError
 from identification.fitting.assess import assess
-from identification.fitting.covariance import BLOCK, block_numbers, errors_of_blocks
+from identification.fitting.covariance import (
+    cores,
+    errors_of_windows,
+    independent,
+    windows_over,
+)
 from identification.fitting.engine import row_weights
 from identification.fitting.fit import Fit
 from identification.fitting.least_squares import common_rows, least_squares, triangles_of_products
@@ -148,16 +153,20 @@ class OutputError:
         return least_squares(alone, [], local=local, iterations=1).local
 
     def errors(self, x: FloatArray, local: FloatArray) -> list[float]:
-        """Standard errors of the free parameters from blocks of windows; infinite with too few
-        blocks.
+        """Standard errors of the free parameters, the initial states of each window of the
+        simulation eliminated; infinite where the record is too short for them.
         """
         data, unknowns = self.shooting.data, self.shooting.states
         rest = common_rows(self.triangles(x, local), unknowns)
         products = rest.transpose(0, 2, 1) @ rest
-        block = block_numbers(data.inputs[5, :: data.length], BLOCK)
-        summed = np.zeros((int(block[-1]) + 1, *products.shape[1:]))
-        np.add.at(summed, block, products)
-        found = errors_of_blocks(summed[:, :-1, :-1], summed[:, :-1, -1])
+        columns, scores = products[:, :-1, :-1], products[:, :-1, -1]
+        windows = windows_over([data.inputs[5, :: data.length]])
+        found = errors_of_windows(
+            np.tensordot(cores(windows).toarray(), columns, axes=1),
+            windows @ scores,
+            columns.sum(axis=0),
+            independent(windows),
+        )
         return [math.inf] * len(self.shooting.free) if found is None else found.tolist()
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final, final
 
 import numpy as np
@@ -12,9 +12,15 @@ import numpy.typing as npt
 from casadi_models import JointModel
 from casadi_models.term import Term
 from identification.balance.balances import balances_of
-from identification.balance.calibration import settled
+from identification.balance.calibration import settled, values_on
 from identification.balance.dataset import HOLD_NAME, Dataset, without
-from identification.balance.stacked import references, rms, row_weights, stack, taking_part
+from identification.balance.stacked import (
+    references,
+    rms,
+    row_weights,
+    stack,
+    taking_part,
+)
 from identification.diagnosis.trials import make_base
 from identification.fitting.engine import Solution, stepped
 
@@ -26,6 +32,8 @@ within 1 % of a converged fit (`python -m benchmarks.explore`)."""
 LEAST_DELAY: Final = 1.0
 """Samples up to which a late channel is no effect: a logger reads its channels, and holds its
 commands, somewhere within a sample."""
+TORQUES: Final = ("drive", "torque")
+"""Measured signals whose scale a balance has: what is left of it has the same."""
 
 
 @final
@@ -37,17 +45,74 @@ class Weighting:
     ----------
     like : Solution
     held : mapping of str to (rows,) array
+    passed : mapping of str to (rows,) array
+        What this fit passes on of noise of the measured torques (:func:`passed_on`), training and
+        then held-out rows.
     """
 
     like: Solution
     held: Mapping[str, FloatArray]
+    passed: Mapping[str, FloatArray]
 
     @classmethod
     def of(cls, like: Solution, data: Dataset) -> Weighting:
         """The weighting of a fit."""
         balances = balances_of(like.model, data.sensing, wrt=())
         values = settled(like.model, data.sensing, data.held_out, like.values)
-        return cls(like, row_weights(balances, data, values, like.sigma, data.held_out))
+        return cls(
+            like,
+            row_weights(balances, data, values, like.sigma, data.held_out),
+            passed_on(like, data),
+        )
+
+    def units(self, solution: Solution, data: Dataset) -> dict[str, FloatArray]:
+        """Length that the residual of each row has under a variant where it is 1 under this fit,
+        training and then held-out rows, (rows,) each.
+
+        A law that takes a share of a measured torque scales the whole balance, noise and errors of
+        the model with it: what is left is shorter and no smaller.
+        """
+        own = passed_on(solution, data)
+        return {
+            b: np.where((x > 0) & (own[b] > 0), own[b], 1.0)
+            / np.where((x > 0) & (own[b] > 0), x, 1.0)
+            for b, x in self.passed.items()
+        }
+
+
+def passed_on(solution: Solution, data: Dataset) -> dict[str, FloatArray]:
+    """What a standard deviation of the measured torques makes of each row of the balances, training
+    and then held-out rows, (rows,) each.
+    """
+    model, records = solution.model, [*data.train, *data.held_out]
+    balances = balances_of(model, data.sensing, wrt=())
+    values = settled(model, data.sensing, records, solution.values)
+    found: dict[str, list[FloatArray]] = {b: [] for b in balances.balances}
+    for record in records:
+        own = values_on(model, record, values)
+        before = balances.evaluate(record, own)
+        power = {b: np.zeros(record.rows) for b in found}
+        for channel in TORQUES:
+            if channel not in data.sources or channel not in record.points:
+                continue
+            size = data.sources[channel].level
+            moved = replace(
+                record,
+                points=_higher(record.points, channel, size),
+                smooth=_higher(record.smooth, channel, size),
+                averaged=_higher(record.averaged, channel, size),
+            )
+            after = balances.evaluate(moved, own, remembered=record)
+            for b in power:
+                power[b] += (after[b][0] - before[b][0]) ** 2
+        for b, squares in power.items():
+            found[b].append(np.sqrt(squares))
+    return {b: np.concatenate(parts) for b, parts in found.items()}
+
+
+def _higher(signals: Mapping[str, FloatArray], channel: str, size: float) -> dict[str, FloatArray]:
+    """The signals with one of them higher by so much."""
+    return {**signals, channel: signals[channel] + size}
 
 
 @final
@@ -58,9 +123,10 @@ class Held:
     Attributes
     ----------
     squares, rows : (blocks, balances) arrays
-        Weighted squares of each block, and how many rows it has.
+        Weighted squares of each block in the variant's units (:meth:`Weighting.units`), and how
+        many rows it has.
     rms : (balances,) array
-        In the units of the weights.
+        In the units of the weights and the variant.
     relative_error_percent : float
         100 norm(residual) / norm(measured).
     """
@@ -115,7 +181,9 @@ def refitted(
         key=lambda f: f[1],
     )
     solution, cost = found
-    base = make_base(solution, data)
+    units = weighting.units(solution, data)
+    own = {b: w / units[b][: len(w)] for b, w in solution.weights.items()}
+    base = make_base(replace(solution, weights=own), data)
     seen = held_of(solution, data, weighting)
     return Refit(
         solution,
@@ -141,27 +209,28 @@ def held_of(solution: Solution, data: Dataset, weighting: Weighting) -> Held:
     measured = references(data, data.held_out)
     left = np.concatenate([residual[b][taking[b]] for b in balances.balances])
     size = np.concatenate([measured[b][taking[b]] for b in balances.balances])
-    squares, rows = _by_block(data, residual, weighting)
+    units = weighting.units(solution, data)
+    weighted = {
+        b: r * weighting.held[b] / units[b][len(units[b]) - len(r) :] for b, r in residual.items()
+    }
+    squares, rows = _by_block(data, weighted)
     return Held(
         squares,
         rows,
-        np.array([rms((residual[b] * weighting.held[b])[taking[b]]) for b in balances.balances]),
+        np.array([rms(weighted[b][taking[b]]) for b in balances.balances]),
         100 * float(np.linalg.norm(left)) / (float(np.linalg.norm(size)) or 1e-300),
     )
 
 
-def _by_block(
-    data: Dataset, residual: Mapping[str, FloatArray], weighting: Weighting
-) -> tuple[FloatArray, FloatArray]:
+def _by_block(data: Dataset, weighted: Mapping[str, FloatArray]) -> tuple[FloatArray, FloatArray]:
     """Weighted squares of each held-out block and balance, and how many rows it has."""
     number = np.concatenate([w.block for w in data.held_out])
     inside = number >= 0
     which, place = np.unique(number[inside], return_inverse=True)
     squares, rows = [], []
-    for b, r in residual.items():
+    for b, r in weighted.items():
         taking = taking_part(b, data.held_out)[inside].astype(np.float64)
-        weighted = (r * weighting.held[b])[inside]
-        squares.append(np.bincount(place, taking * weighted**2, len(which)))
+        squares.append(np.bincount(place, taking * r[inside] ** 2, len(which)))
         rows.append(np.bincount(place, taking, len(which)))
     return np.array(squares, dtype=np.float64).T, np.array(rows, dtype=np.float64).T
 

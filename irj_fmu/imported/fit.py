@@ -15,7 +15,12 @@ import numpy as np
 
 from identification.data.record import Record
 from identification.errors import InputError
-from identification.fitting.covariance import BLOCK, block_errors, correlations, process_errors
+from identification.fitting.covariance import (
+    correlations,
+    process_errors,
+    window_errors,
+    windows_over,
+)
 from identification.fitting.least_squares import least_squares, triangle_of
 from irj_fmu.host.run import FmuError
 from irj_fmu.host.signals import FloatArray
@@ -348,24 +353,22 @@ class Solver:
         return used
 
     def errors(self) -> tuple[dict[str, float | None], dict[str, tuple[str, float]]]:
-        """Standard errors from blocks of time, and correlations."""
+        """Standard errors from windows of time, and correlations."""
         n = len(self.names)
         stderr: dict[str, float | None] = dict.fromkeys(self.values)
         if not n:
             return stderr, {}
-        parts, blocks, first = [], [], 0
+        parts, times = [], []
         for w, rows in zip(self.windows, self._problem().rows(self._x(), self.starts), strict=True):
             starts = rows.shape[1] - n - 1
             norms = np.linalg.norm(rows[:, :starts], axis=0)
             q = np.linalg.qr(rows[:, :starts] / np.where(norms > 0, norms, 1.0))[0]
             parts.append(rows[:, starts:] - q @ (q.T @ rows[:, starts:]))
-            block = first + np.floor((w.time - w.time[0]) / BLOCK + 1e-9).astype(np.int64)
-            blocks.append(np.repeat(block, w.outputs.shape[1]))
-            first = int(block[-1]) + 1
+            times.append(np.repeat(w.time, w.outputs.shape[1]))
         rows = np.concatenate(parts)
         theta, r = rows[:, :n], rows[:, n]
         spread, together = correlations(theta.T @ theta)
-        found = block_errors(theta, r, np.concatenate(blocks))
+        found = window_errors(theta, r, windows_over(times))
         if found is None:
             left = [
                 (w.outputs - y) / self.sigma

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -10,7 +12,7 @@ from identification import Joint, Record, fit
 from identification.balance.colour import ChannelNoise, Part, _two_shares, white
 from identification.balance.noise import noise_of
 from identification.balance.spikes import without_spikes
-from identification.balance.stamps import evened
+from identification.balance.stamps import bridged, evened
 from identification.balance.weak import kernel
 from identification.fitting.assess import assess
 from identification.fitting.engine import load_dataset, prepared_model
@@ -73,6 +75,24 @@ def test_noise_through_a_filter_is_read_with_its_memory(corner: float, within: f
     assert 1 / within < np.sqrt(slow) / (TORQUE / np.sqrt(np.pi * corner)) < within
     again = found.draw(rng, COUNT, DT)
     assert read(torque + again).level == pytest.approx(found.level, rel=0.1)
+
+
+@pytest.mark.parametrize("lost", [0.01, 0.05, 0.2])
+@pytest.mark.parametrize("corner", [20.0, 50.0])
+def test_lost_samples_take_nothing_off_a_noise_with_a_memory(corner: float, lost: float) -> None:
+    rng = np.random.default_rng(int(corner + 100 * lost))
+    channel = motion()[1] + TORQUE * filtered(corner)(rng, COUNT)
+    there = rng.random(COUNT) >= lost
+    which = np.where(there, np.cumsum(there) - 1, -1)
+    held = bridged(TIME[there], channel[there, None], TIME, which)[:, 0]
+    whole = Record.from_channels(TIME, {"link_torque": held})
+    found = noise_of(replace(whole, measured=there), "torque", held, 1.0)
+    slow, known = (
+        np.sqrt(sum(p.size**2 * max(2 * p.stages * p.memory, DT) for p in n.parts))
+        for n in (found, read(channel))
+    )
+    assert slow == pytest.approx(known, rel=0.2)
+    assert found.level == pytest.approx(read(channel).level, rel=0.05)
 
 
 def test_hum_is_told_from_noise_and_a_motion_has_none() -> None:

@@ -16,7 +16,7 @@ from identification.balance.noise import noise_level
 from identification.balance.weak import prepare
 from identification.diagnosis.improvement import judged_drop, made_worse
 from identification.fitting.assess import BalanceError, Error, assess
-from identification.fitting.covariance import FEWEST_BLOCKS, block_errors
+from identification.fitting.covariance import BLOCK, window_errors, windows_over
 from identification.fitting.engine import load_dataset, prepared_model, rms
 from tests.identification.diagnosis.test_other_payload import FAST, JOINT, record
 
@@ -54,35 +54,37 @@ def test_each_record_has_the_floor_of_its_own_rate(factor: int) -> None:
     )
 
 
+STEP = 0.02
+"""Between rows [s]."""
+
+
 @pytest.mark.parametrize("blocks", [5, 10, 40])
-def test_twice_the_error_is_a_band_of_95_percent_with_few_blocks_too(blocks: int) -> None:
+def test_twice_the_error_is_a_band_of_95_percent_with_few_windows_too(blocks: int) -> None:
     rng = np.random.default_rng(blocks)
-    each, parameters, kernel = 60, 6, np.ones(5) / 5
-    rows = blocks * each
-    # columns that vary slowly, as in a joint: within a block they depend on each other
+    parameters, kernel = 6, np.ones(5) / 5
+    rows = round(blocks * BLOCK / STEP)
+    # columns that vary slowly, as in a joint: within a window they depend on each other
     jacobian = np.column_stack(
         [np.sin(0.01 * (k + 1) * np.arange(rows) + k) for k in range(parameters)]
     )
-    block = np.repeat(np.arange(blocks), each)
+    windows = windows_over([STEP * np.arange(rows)])
     inverse = np.linalg.inv(jacobian.T @ jacobian)
     inside = total = 0
     for _ in range(300):
         noise = np.convolve(rng.standard_normal(rows + 4), kernel, mode="valid")
         found = inverse @ (jacobian.T @ noise)
-        error = block_errors(jacobian, noise - jacobian @ found, block)
+        error = window_errors(jacobian, noise - jacobian @ found, windows)
         assert error is not None
         inside += int(np.sum(np.abs(found) < 2 * error))
         total += parameters
     assert 0.92 < inside / total < 0.995
 
 
-def test_too_few_blocks_give_no_error() -> None:
+def test_too_few_windows_give_no_error() -> None:
     rng = np.random.default_rng(0)
-    block = np.repeat(np.arange(FEWEST_BLOCKS - 1), 20)
-    assert (
-        block_errors(rng.standard_normal((len(block), 2)), rng.standard_normal(len(block)), block)
-        is None
-    )
+    time = np.arange(0.0, 2 * BLOCK, STEP)
+    rows = rng.standard_normal((len(time), 3))
+    assert window_errors(rows[:, :2], rows[:, 2], windows_over([time])) is None
 
 
 def test_a_short_record_is_fitted_without_standard_errors() -> None:
@@ -112,19 +114,20 @@ def test_what_noise_would_take_off_an_inertia_is_said_and_taken_off() -> None:
         assert any("link inertia by about" in w for w in excitation_warnings(data))
 
 
-def test_a_direction_that_one_block_alone_tells_of_does_not_spoil_the_errors_of_the_others() -> (
+def test_a_direction_that_one_window_alone_tells_of_does_not_spoil_the_errors_of_the_others() -> (
     None
 ):
     rng = np.random.default_rng(5)
-    block = np.repeat(np.arange(20), 30)
-    jacobian = rng.standard_normal((len(block), 3))
-    jacobian[:, 2] = np.where(block == 7, jacobian[:, 2] + jacobian[:, 0], 0.0)
-    noise = rng.standard_normal(len(block))
+    time = np.arange(0.0, 20 * BLOCK, STEP)
+    once = np.abs(time - 10 * BLOCK) < BLOCK / 6
+    jacobian = rng.standard_normal((len(time), 3))
+    jacobian[:, 2] = np.where(once, jacobian[:, 2] + jacobian[:, 0], 0.0)
+    noise, windows = rng.standard_normal(len(time)), windows_over([time])
     found = np.linalg.lstsq(jacobian, noise, rcond=None)[0]
-    together = block_errors(jacobian, noise - jacobian @ found, block)
+    together = window_errors(jacobian, noise - jacobian @ found, windows)
     without = jacobian[:, :2]
-    alone = block_errors(
-        without, noise - without @ np.linalg.lstsq(without, noise, rcond=None)[0], block
+    alone = window_errors(
+        without, noise - without @ np.linalg.lstsq(without, noise, rcond=None)[0], windows
     )
     assert together is not None
     assert alone is not None

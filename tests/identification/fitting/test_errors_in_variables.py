@@ -16,7 +16,6 @@ from identification.balance.excitation import attenuation
 from identification.fitting.covariance import (
     BLOCK,
     OVERLAP,
-    block_errors,
     window_errors,
     windows_over,
 )
@@ -130,9 +129,6 @@ def test_noise_without_a_slow_part_is_no_error_of_a_slow_parameter() -> None:
         errors = window_errors(columns, left, windows)
         assert errors is not None
         assert abs(errors[0] - known) < 0.35 * 4000**-0.5
-    blocks = block_errors(columns, left, (time // BLOCK).astype(np.int64))
-    assert blocks is not None
-    assert errors[0] < 0.3 * blocks[0]
 
 
 @pytest.mark.skipif(library() is None, reason="no C compiler")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -18,13 +19,14 @@ from identification.diagnosis.session import Session
 from identification.diagnosis.trials import Trial, try_candidate
 from identification.variants.choice import Judged, front_of, score_of, tied_with_best
 from identification.variants.lattice import assembled, nodes_of, together
-from identification.variants.refit import Weighting, refitted
+from identification.variants.refit import Weighting, held_of, refitted
 from identification.variants.screen import PER_PARAMETER, Screen
 from tests.hidden_effect.generator import generate_case
 from workbench.cli.main import main
 from workbench.show.front import exploration_picture
 
 DEMO = Path(str(files("workbench"))) / "demo"
+SHARE = 0.2
 HIDDEN = "stribeck"
 """What the demo's records hide."""
 
@@ -143,6 +145,32 @@ def test_a_variant_is_within_one_percent_of_its_converged_fit() -> None:
         few = refitted(model, data, start, weighting)
         many = refitted(model, data, start, weighting, steps=40)
         np.testing.assert_allclose(few.held.rms, many.held.rms, rtol=0.01)
+
+
+def test_a_law_that_only_scales_a_balance_gains_nothing() -> None:
+    """Friction that takes .8 of the load, and a fifth of all else, shorten the link balance."""
+    data, start = session().data, session().start()
+    model = start.model
+    for label in ("load_dependent_friction@link", "load_dependent_presliding@link"):
+        model = model.add(label)
+    own = {n for t in start.model.terms if t.place == "link" for n in t.names}
+    of_link = (own | {"link_inertia"}) - set(model.named("smoothing"))
+    values = {
+        **{p.name: p.start if p.is_shape else 0.0 for p in model.parameters},
+        **start.values,
+        **{n: SHARE * start.values[n] for n in of_link},
+        "link_load_friction_difference": 1 - SHARE,
+        "link_load_presliding_distance": 1e-6,
+    }
+    shorter = replace(start, model=model.with_values(values), values=values)
+    weighting = Weighting.of(start, data)
+    plain, found = (held_of(s, data, weighting) for s in (start, shorter))
+    at, units = data.sensing.balances.index("link"), weighting.units(shorter, data)
+    assert all(np.allclose(x, 1.0) for x in weighting.units(start, data).values())
+    assert float(np.median(units["link"])) == pytest.approx(SHARE, rel=0.02)
+    assert all(np.allclose(x, 1.0) for b, x in units.items() if b != "link")
+    assert found.relative_error_percent < plain.relative_error_percent
+    assert found.rms[at] > plain.rms[at]
 
 
 def test_parts_that_do_not_go_together_are_never_in_one_variant() -> None:
