@@ -40,9 +40,12 @@ HOLD_NAME: Final = hold.HOLD_NAME
 ONE_SIDED_KERNEL: Final = 0.2
 LINK_BALANCES: Final = frozenset({"link", "sum", "axis"})
 POINTWISE_KERNELS: Final = (0.01, 0.014, 0.02, 0.03)
-SHORT_KERNELS: Final = (2, 4, 6)
-"""Kernels in samples that are shorter than those: a fine encoder needs none, and any kernel rounds
-off the turn at which friction changes its sign within a sample."""
+SHORT_KERNELS: Final = (2, 4)
+"""Kernels in samples: a fine encoder needs no longer one, and every kernel rounds off the turn at
+which friction changes its sign within a sample."""
+SHORT_NOISE: Final = 2e-4
+"""Noise of the velocity by such a kernel, as a share of the record's speed: friction changes its
+sign over a hundredth of that speed and less, and rest is told from motion there."""
 STILL: Final = 3.0
 """Pointwise speed of a side at rest, in standard deviations of its noise: 0.3 % of samples at
 rest lie above.
@@ -411,9 +414,9 @@ def pointwise_kernel(
         or [np.zeros(1)]
     )
     fast = float(np.quantile(change, 0.99)) / (lag * dt)
-    short = [n * dt for n in SHORT_KERNELS if n * dt < POINTWISE_KERNELS[0]]
-    for length in (*short, *(x for x in POINTWISE_KERNELS if x >= SHORT_KERNELS[0] * dt)):
-        if length < longest and noise.after(kernel(length, dt, 1), dt) <= VELOCITY_NOISE * fast:
+    short = [(n * dt, SHORT_NOISE) for n in SHORT_KERNELS]
+    for length, share in (*short, *((x, VELOCITY_NOISE) for x in POINTWISE_KERNELS if x >= 6 * dt)):
+        if length < longest and noise.after(kernel(length, dt, 1), dt) <= share * fast:
             return length
     return max(longest, 6 * dt)
 
