@@ -7,6 +7,7 @@ either side of a kink, and looks like that of a straight line.
 
 from __future__ import annotations
 
+from operator import neg
 from typing import Any, Final, final
 
 import casadi as ca
@@ -50,12 +51,13 @@ class AffineParts:
         if op in _THROUGH:
             return _scaled(self.split(first), lambda x: _THROUGH[op] * x)
         if op in (ca.OP_ADD, ca.OP_SUB):
-            sign = 1.0 if op == ca.OP_ADD else -1.0
             line, rest = self.split(first)
             more, left = self.split(expression.dep(1))
-            return {
-                i: line.get(i, ca.SX(0)) + sign * more.get(i, ca.SX(0)) for i in {**line, **more}
-            }, rest + sign * left
+            if op == ca.OP_SUB:
+                more, left = _scaled((more, left), neg)
+            both = {**line, **more}
+            both.update({i: line[i] + more[i] for i in line.keys() & more.keys()})
+            return both, rest + left
         if op == ca.OP_MUL:
             for factor, other in ((first, expression.dep(1)), (expression.dep(1), first)):
                 if not self._varying(factor):

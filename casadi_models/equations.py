@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from types import SimpleNamespace
 from typing import Any, Final, Protocol, final
 
@@ -189,8 +190,18 @@ class _Builder:
     symbols: Symbols
 
     def torsion_rate(self, view: _View) -> Expression:
-        """Rate of what twists the gear's damping; made once for all laws of a view."""
-        return time_derivative(self.turned(view), self.symbols.signals)
+        """Rate of what twists the gear's damping; made once for all views that see the same."""
+        s = view.signals
+        seen = (s.motor_position, s.link_position, view.torsion, view.taken)
+        key = tuple(x.element_hash() for x in seen)
+        if key not in self._rates:
+            # a hash is an address: what it names must stay
+            self._rates[key] = seen, time_derivative(self.turned(view), self.symbols.signals)
+        return self._rates[key][1]
+
+    @cached_property
+    def _rates(self) -> dict[tuple[int, ...], tuple[tuple[Expression, ...], Expression]]:
+        return {}
 
     def turned(self, view: _View) -> Expression:
         """Twist whose rate the gear's damping feels."""
@@ -272,6 +283,8 @@ class _Builder:
         """
         raw = self.symbols.signals
         chain = [getattr(raw, c) for c in channels]
+        if not any(t.place == place for t in self.model.terms):
+            return dict(zip(channels[:-1], chain[:-1], strict=True))
         offset = self.total(place, _View(raw, _zero(), _zero(), _zero(), _zero()))
         out = {}
         for i, c in enumerate(channels[:-1]):

@@ -6,6 +6,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Any, Final, final
 
 import casadi as ca
@@ -102,13 +103,11 @@ def curved_expressions(model: JointModel, sensing: Sensing) -> dict[str, Express
     """What enters the balances by its second derivative in time [N.m.s2]: the lag of a load
     that is not recorded.
     """
+    if not model.lagging_load:
+        return {}
     e = model.equations
     lag = e.load_lag / ca.jacobian(e.drive, e.signals.drive)
-    return (
-        {b: lag if b == "axis" else ca.SX(0) for b in sensing.balances}
-        if model.lagging_load
-        else {}
-    )
+    return {b: lag if b == "axis" else ca.SX(0) for b in sensing.balances}
 
 
 @final
@@ -233,11 +232,6 @@ class Balances:
         expressions = residual_expressions(model, sensing)
         columns = [self.names.index(n) for n in self.wrt]
         self.balances = tuple(expressions)
-        # what stands in no balance moves nothing, whatever its value
-        entries = ca.jacobian_sparsity(
-            ca.vertcat(*expressions.values()), model.equations.parameters
-        ).get_triplet()[1]
-        self.holding: frozenset[str] = frozenset(self.names[i] for i in set(entries))
         curved = curved_expressions(model, sensing)
         self._plain = _Part(model, expressions, columns, columns_only=columns_only)
         self._curved = _Part(model, curved, columns, columns_only=columns_only) if curved else None
@@ -245,6 +239,17 @@ class Balances:
         self._flight = Flight(model) if sensing.kinematic else None
         self._law = Law(model.structure)
         self.law = Law(model.structure, sensing, columns_only)
+
+    @cached_property
+    def holding(self) -> frozenset[str]:
+        """Parameters that stand in a balance: what stands in none moves nothing, whatever its
+        value.
+        """
+        expressions = residual_expressions(self.model, self.sensing)
+        entries = ca.jacobian_sparsity(
+            ca.vertcat(*expressions.values()), self.model.equations.parameters
+        ).get_triplet()[1]
+        return frozenset(self.names[i] for i in set(entries))
 
     def memory_values(self, data: WeakRecord, values: Mapping[str, float]) -> FloatArray:
         """Internal states of displacement-memory effects at the points, (states, points); not
