@@ -18,6 +18,7 @@ from identification.balance.calibration import bare, of_run, settled, values_on
 from identification.balance.colour import ChannelNoise
 from identification.balance.dataset import Dataset
 from identification.balance.drawn_noise import draws_of
+from identification.balance.memory import numbers_of
 from identification.balance.weak import Grid, WeakRecord, whole
 
 FloatArray = npt.NDArray[np.float64]
@@ -139,7 +140,8 @@ def floor_rows(
     is a contradiction (the noise of a channel reads too much): it is lowered to that.
     """
     values = settled(model, data.sensing, [*data.train, *records], values)
-    known = {id(w): drawn_floors(model, data, values, w) for w in (*data.train, *records)}
+    every = {id(w): w for w in (*data.train, *records)}
+    known = {mark: drawn_floors(model, data, values, w) for mark, w in every.items()}
     kept = noise_believed(model, data, values, [known[id(w)] for w in data.train])
     return {
         b: np.concatenate([np.full(w.rows, kept[b] * known[id(w)][b]) for w in records])
@@ -151,16 +153,29 @@ def floor_rows(
 
 def drawn_floors(
     model: JointModel, data: Dataset, values: Mapping[str, float], record: WeakRecord
-) -> dict[str, float]:
+) -> Mapping[str, float]:
     """RMS of what drawn noise changes in each balance of one record, whatever is left of it [N.m];
     with the same draws for every model.
     """
     balances = balances_of(model, data.sensing, wrt=())
+    given = (tuple(sorted(values.items())), tuple(sorted(data.sources.items(), key=_first)))
+    return numbers_of(
+        record, (balances.law, *given), lambda: _drawn_floors(balances, data, values, record)
+    )
+
+
+def _first(item: tuple[str, ChannelNoise]) -> str:
+    return item[0]
+
+
+def _drawn_floors(
+    balances: Balances, data: Dataset, values: Mapping[str, float], record: WeakRecord
+) -> dict[str, float]:
     power = dict.fromkeys(balances.balances, 0.0)
     drawn = draws_of(record, data.sources)
     seen = drawn[0].record
     either = unsure(balances, data, values, [seen])
-    values = values_on(model, record, values)
+    values = values_on(balances.model, record, values)
     for draw in drawn:
         calm = balances.evaluate(draw.calm, values, remembered=seen)
         noisy = balances.evaluate(draw.noisy, values)
