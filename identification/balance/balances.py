@@ -159,7 +159,7 @@ class _Part:
         }
         rest = ca.vertcat(*(zeroed[i] for i in self.needed)) if self.needed else ca.SX(0, 1)
         self._rest = Vectorised(
-            ca.Function("rest", [signals, e.memory, parameters], [ca.densify(rest)])
+            ca.Function("rest", [signals, e.memory, parameters], [ca.cse(ca.densify(rest))])
         )
         self.remembers = bool(e.memory_terms) and ca.jacobian_sparsity(rest, e.memory).nnz() > 0
 
