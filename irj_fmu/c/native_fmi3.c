@@ -85,6 +85,7 @@ fmi3Status fmi3EnterInitializationMode(fmi3Instance c, fmi3Boolean has_tolerance
     LIVING("fmi3EnterInitializationMode");
     Twin *m = c;
     if (m->s.phase != INSTANTIATED) return fail(m, "enterInitializationMode: called out of order");
+    if (has_tolerance && !(tolerance > 0)) return fail(m, "enterInitializationMode: a tolerance of %g", tolerance);
     m->s.start = start;
     m->s.phase = INITIALIZING;
     return fmi3OK;

@@ -28,8 +28,7 @@ from irj_fmu.fmi.variables import Variable
 from irj_fmu.host.run import Number
 from irj_fmu.imported.correction import PREFIX, Correction, law_function
 from irj_fmu.imported.model import UserModel
-from irj_fmu.imported.port import port_of
-from irj_fmu.imported.run import HOLD
+from irj_fmu.imported.port import hold_of, port_of
 from irj_fmu.imported.slave import correction_variables
 from irj_fmu.plant.joint import identifier
 
@@ -181,7 +180,7 @@ def _plan(model: UserModel) -> _Plan:
     hold = Variable(
         f"{PREFIX}sample_time",
         "s",
-        HOLD,
+        hold_of(model),
         causality="parameter",
         description="Longest time for which the correction holds.",
     )
@@ -250,7 +249,7 @@ def _config(model: UserModel, correction: Correction, plan: _Plan, own: Mapping[
         "PER_POSITION": repr(float(port.position)),
         "PER_RATE": repr(float(port.rate)),
         "DRIVE_START": repr(model.fmu.start(drive)),
-        "HOLD": repr(HOLD),
+        "HOLD": repr(hold_of(model)),
     }
     lines = ["/* Places, start values and value references of this FMU. */"]
     lines += [f"#define {key} {value}" for key, value in defined.items()]

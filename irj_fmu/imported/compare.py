@@ -8,6 +8,7 @@ from identification.data.record import Record
 from irj_fmu.imported.fit import Solver, UserFit, simulator_of
 from irj_fmu.imported.model import UserModel, listed
 from irj_fmu.imported.outputs import UserComparison, comparison_of, noise_of
+from irj_fmu.imported.port import coupled
 
 
 def compare(model: UserModel | UserFit, records: Record | Sequence[Record]) -> UserComparison:
@@ -30,6 +31,7 @@ def compare(model: UserModel | UserFit, records: Record | Sequence[Record]) -> U
     model = model.model if isinstance(model, UserFit) else model
     given = listed(records)
     windows = model.windows(given)
+    model = model if model.coupling is not None else coupled(model, windows)
     simulator, _ = simulator_of(model, windows)
     solver = Solver(model, windows, simulator, noise_of(model, given), frozen=True)
     if model.starts:

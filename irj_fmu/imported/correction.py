@@ -11,7 +11,7 @@ import numpy as np
 from casadi_models import JointModel
 from casadi_models.term import TOTAL_INERTIA
 from irj_fmu.host.signals import FloatArray
-from irj_fmu.imported.run import Window
+from irj_fmu.imported.run import HOLD, Window
 
 PREFIX: Final = "correction."
 """Before the names of a correction's parameters, so that they never meet those of the FMU."""
@@ -193,6 +193,31 @@ def law_function(model: JointModel, *, has_velocity: bool) -> Any:
     return ca.Function("law", [s, reading, p], [ca.densify(ca.vertcat(given + owed, new))])
 
 
+def steepest(
+    model: JointModel, drive: FloatArray, position: FloatArray, velocity: FloatArray
+) -> float:
+    """Largest slope of a correction's torque over velocity, in size [N.m.s/rad].
+
+    Parameters
+    ----------
+    model : JointModel
+        As in :class:`Correction`.
+    drive, position, velocity : (n,) arrays
+        Where it is looked for, link-referred [N.m, rad, rad/s].
+    """
+    import casadi as ca
+
+    functions = model.functions
+    held = len(functions.memory_names)
+    x, drives = ca.SX.sym("x", 2 + held), ca.SX.sym("drive")
+    p = ca.DM(model.value_vector())
+    torque = drives - functions.dynamics(x, ca.vertcat(drives, 0, 0), p)[1]
+    slope = ca.Function("slope", [x, drives], [ca.densify(ca.jacobian(torque, x)[:, 1])])
+    states = np.vstack([position, velocity, np.zeros((held, len(velocity)))])
+    found = np.asarray(slope.map(len(velocity))(states, drive[None, :]))
+    return float(np.max(np.abs(found), initial=0.0, where=np.isfinite(found)))
+
+
 @final
 class CorrectionLaw:
     """The torque of a correction along a run (see :class:`irj_fmu.imported.run.Feedback`), as
@@ -205,10 +230,12 @@ class CorrectionLaw:
     port : Port
     inputs : int
         Number of inputs.
+    hold : float
+        Longest time for which the torque may hold [s].
     """
 
-    def __init__(self, model: JointModel, port: Port, inputs: int) -> None:
-        self._model, self.port = model, port
+    def __init__(self, model: JointModel, port: Port, inputs: int, hold: float = HOLD) -> None:
+        self._model, self.port, self.hold = model, port, hold
         self._laws: dict[bool, Evaluator] = {}
         self._extra = np.zeros(inputs)
         self._state = np.zeros(_MEMORY + len(model.functions.memory_names))
@@ -286,4 +313,12 @@ class Evaluator:
         return self._result
 
 
-__all__ = ["PREFIX", "Correction", "CorrectionLaw", "Port", "correction_of", "law_function"]
+__all__ = [
+    "PREFIX",
+    "Correction",
+    "CorrectionLaw",
+    "Port",
+    "correction_of",
+    "law_function",
+    "steepest",
+]

@@ -21,6 +21,7 @@ from identification.errors import InputError
 from irj_fmu.imported.correction import PREFIX, Correction, correction_of
 from irj_fmu.imported.file_schema import BOUNDS, CHANNEL, MODEL, START
 from irj_fmu.imported.model import Mapped, UserModel, load_user_model
+from irj_fmu.imported.port import noted
 
 if TYPE_CHECKING:
     from irj_fmu.imported.fit import UserFit
@@ -106,7 +107,8 @@ def load_user_joint(path: str | Path) -> UserModel:
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     outside = _outside(table.get("outside", []), joint, fitted, path)
-    made = replace(model, correction=outside)
+    coupling = _number(table.get("coupling"), f"{path}: [model] coupling")
+    made = noted(replace(model, correction=outside, coupling=coupling))
     strangers = [k for k in fitted if k not in made.values and not k.startswith(PREFIX)]
     note = (
         f"{path}: [fitted] {', '.join(strangers)}: [model.parameters] has no such name; the "
@@ -266,6 +268,8 @@ def user_joint_text(
         lines.append(f"window = {model.window!r}")
     if model.correction is not None:
         lines.append("outside = [" + ", ".join(f'"{e}"' for e in model.correction.labels) + "]")
+        if model.coupling is not None:
+            lines.append(f"coupling = {model.coupling!r}")
     lines += [
         "",
         "[model.channels]",

@@ -32,6 +32,13 @@ MODEL: Final = Schema(
             "effects that ride outside the FMU, off its drive",
             form="list of texts",
         ),
+        Key(
+            "coupling",
+            "number",
+            "longest time for which the slope of their torque lets it hold; a fit writes it",
+            unit="s",
+            absent="found by the fit",
+        ),
         Key("channels", "any", "see below", form="table"),
         Key("parameters", "any", "see below", form="table"),
         Key("start", "any", "see below", form="table"),

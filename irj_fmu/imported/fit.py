@@ -27,6 +27,7 @@ from irj_fmu.host.signals import FloatArray
 from irj_fmu.imported.exact import Exact, NotExact
 from irj_fmu.imported.model import UserModel, listed, start_values
 from irj_fmu.imported.outputs import UserComparison, comparison_of, noise_of
+from irj_fmu.imported.port import coupled, hold_of
 from irj_fmu.imported.run import Window
 from irj_fmu.imported.sensitivity import BlackBox, Simulator, scale_of
 
@@ -40,6 +41,13 @@ each parameter.
 _SPREAD: Final = 1e5
 """Standard deviation, in units of what a column alone would have, beyond which a parameter
 cannot be told from others.
+"""
+
+_COUPLINGS: Final = 3
+"""Times the fit begins anew with a shorter coupling, as the law outside the FMU got steeper."""
+_FINER: Final = 0.7
+"""A shorter coupling than this share of the one in use is taken up: within it the law still acts
+at less than one and a half times the slope that its coupling was chosen for.
 """
 
 
@@ -154,11 +162,17 @@ def fit(
     say = progress or (lambda _text, _share: None)
     windows = model.windows(given)
     say(f"taking up {model.fmu.path.name}", 0.02)
-    simulator, method = simulator_of(model, windows, exact)
-    solver = Solver(model, windows, simulator, noise_of(model, given))
-    used = solver.solve(iterations, say)
+    model, used = coupled(model, windows), 0
+    for _ in range(_COUPLINGS):
+        simulator, method = simulator_of(model, windows, exact)
+        solver = Solver(model, windows, simulator, noise_of(model, given))
+        used += solver.solve(iterations, say)
+        fitted = model.with_values(solver.values)
+        finer = coupled(fitted, windows)
+        if hold_of(finer) > _FINER * hold_of(model):
+            break
+        model = finer
     say("standard errors", 0.95)
-    fitted = model.with_values(solver.values)
     stderr, correlation = solver.errors()
     bounds = model.bounds()
     at_bound = tuple(

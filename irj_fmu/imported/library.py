@@ -116,6 +116,18 @@ class UserFmu:
             raise InputError(f"{self.path.name}: has {what}; export it for co-simulation")
         return tuple(found)
 
+    def grain(self, kind: Kind) -> float | None:
+        """The fixed step of a co-simulation, of which it takes whole multiples only [s]; None where
+        it takes any step, or does not say which.
+        """
+        own = self.description.coSimulation
+        if kind != "cs" or own is None:
+            return None
+        fixed = getattr(own, "fixedInternalStepSize", None)
+        if fixed is None and not own.canHandleVariableCommunicationStepSize:
+            fixed = getattr(self.description.defaultExperiment, "stepSize", None)
+        return float(fixed) if fixed is not None and float(fixed) > 0 else None
+
     def promises_derivatives(self) -> bool:
         """True where model exchange is said to give directional derivatives."""
         from xml.etree import ElementTree

@@ -81,6 +81,9 @@ class UserModel:
     kind : {"me", "cs"}
     correction : Correction or None
         An effect of the library that rides outside the FMU.
+    coupling : float or None
+        Longest time for which the slope of its torque lets it hold [s]
+        (:func:`irj_fmu.imported.port.coupled`); None where that is not known.
     notes : tuple of str
         What was assumed.
     """
@@ -96,6 +99,7 @@ class UserModel:
     hold: bool = True
     kind: Kind = "me"
     correction: Correction | None = None
+    coupling: float | None = None
     notes: tuple[str, ...] = ()
 
     @property

@@ -1,15 +1,31 @@
-"""Where a correction torque acts on a user's FMU, and where its position is read."""
+"""Where a correction torque acts on a user's FMU, where its position is read, and for how long the
+torque may hold.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Final
 
+import numpy as np
+
 from identification.errors import InputError
-from irj_fmu.imported.correction import CorrectionLaw, Port
+from irj_fmu.imported.correction import CorrectionLaw, Port, steepest
 from irj_fmu.imported.model import DRIVES, UserModel
+from irj_fmu.imported.run import HOLD, Runner, Window
 
 POSITIONS: Final = ("motor_position", "link_position")
+SHORTEST: Final = HOLD / 64
+"""Shortest time for which a torque outside the FMU holds [s]: a run then takes 64 times as many
+calls, and a law that asks for less is a step rather than a slope.
+"""
+_PULSE: Final = 10
+_TOO_STEEP: Final = "is so steep over velocity that its torque may hold for"
+_PLACES: Final = 5
+_SPEEDS: Final = 200
+_SLOWEST: Final = 1e-5
+"""Slowest velocity at which the slope of a law is looked for, as a share of the fastest."""
 
 
 def port_of(model: UserModel) -> Port:
@@ -75,8 +91,148 @@ def feedback_of(model: UserModel, values: Mapping[str, float]) -> CorrectionLaw 
     if model.correction is None:
         return None
     return CorrectionLaw(
-        model.correction.with_values(values).model, port_of(model), len(model.inputs)
+        model.correction.with_values(values).model,
+        port_of(model),
+        len(model.inputs),
+        hold_of(model),
     )
 
 
-__all__ = ["POSITIONS", "feedback_of", "port_of"]
+def hold_of(model: UserModel) -> float:
+    """Longest time for which a torque outside the FMU holds [s]."""
+    return HOLD if model.coupling is None else min(max(model.coupling, SHORTEST), HOLD)
+
+
+def coupled(model: UserModel, windows: Sequence[Window]) -> UserModel:
+    """The model with the time for which the torque outside it may hold, at its present values.
+
+    A torque T(w) that is read at a velocity and held for a time H is an explicit step of the
+    velocity: it stays in phase up to H = J / max|dT/dw| and turns unstable at twice that. J is the
+    inertia that the drive meets within such a time. Where the FMU's own step is longer than that a
+    note says so.
+
+    Parameters
+    ----------
+    model : UserModel
+    windows : sequence of Window
+        Where drive, position and velocity have been, and where the FMU starts.
+    """
+    if model.correction is None:
+        return model
+    port = port_of(model)
+    drive = np.concatenate([w.inputs[:, port.input] for w in windows]) * port.torque
+    place = np.concatenate([w.outputs[:, port.output] for w in windows]) * port.position
+    fastest = max(_fastest(w, port) for w in windows)
+    if not fastest > 0:
+        return model
+    speeds = fastest * np.geomspace(_SLOWEST, 1.0, _SPEEDS)
+    speeds = np.concatenate([-speeds[::-1], [0.0], speeds])
+    at = np.quantile(drive, [0.0, 0.5, 1.0]), np.quantile(place, np.linspace(0, 1, _PLACES))
+    every = [x.ravel() for x in np.meshgrid(*at, speeds, indexing="ij")]
+    slope = steepest(model.correction.model, every[0], every[1], every[2])
+    inertia = _met(model, windows, port)
+    if not slope > 0 or inertia is None:
+        return noted(replace(model, coupling=None))
+    return noted(replace(model, coupling=inertia / slope))
+
+
+def noted(model: UserModel) -> UserModel:
+    """The model with a note where the torque outside it cannot follow its own slope."""
+    limit, grain = model.coupling or np.inf, model.fmu.grain(model.kind)
+    shortest = max(SHORTEST, grain or 0.0)
+    kept = tuple(n for n in model.notes if _TOO_STEEP not in n)
+    if limit >= shortest * (1 - 1e-6):
+        return replace(model, notes=kept)
+    labels = ", ".join(model.correction.labels) if model.correction is not None else ""
+    why = (
+        f"its fixed step of {1e3 * grain:.3g} ms is longer; export it with a shorter step or for "
+        "model exchange"
+        if grain is not None and grain > SHORTEST
+        else f"{1e3 * SHORTEST:.3g} ms is taken; give the law a wider smoothing velocity"
+    )
+    note = (
+        f"{model.fmu.path.name}: {labels} outside it {_TOO_STEEP} {1e3 * limit:.2g} ms, and {why}"
+    )
+    return replace(model, notes=(*kept, note))
+
+
+def _fastest(window: Window, port: Port) -> float:
+    """Largest velocity of a window, link-referred [rad/s]."""
+    if port.velocity is not None:
+        return float(np.max(np.abs(window.outputs[:, port.velocity] * port.rate)))
+    # over several samples: the noise of one difference of positions would stand above the motion
+    step = min(_PULSE, len(window.time) - 1)
+    q, t = window.outputs[:, port.output] * port.position, window.time
+    return float(np.max(np.abs((q[step:] - q[:-step]) / (t[step:] - t[:-step]))))
+
+
+def _met(model: UserModel, windows: Sequence[Window], port: Port) -> float | None:
+    """Least inertia that the drive meets at the start of a few windows, within two steps of the
+    coupling: behind a gear that gives way it is that of the motor [kg.m2].
+    """
+    runner, values = model.runner(), {p.name: p.value for p in model.parameters}
+    size = float(np.max(np.abs([np.max(np.abs(w.inputs[:, port.input])) for w in windows])))
+    step = max(HOLD, model.fmu.grain(model.kind) or 0.0)
+    found = []
+    for w in windows[:: max(1, len(windows) // _PLACES)]:
+        first = slice(0, 3)
+        short = Window(
+            w.time[0] + step * np.arange(3), w.inputs[first], w.outputs[first], w.start, w.record
+        )
+        try:
+            inertia = inertia_of(runner, short, values, port, size=size)
+        except InputError:  # nothing moves from there: another start will tell
+            continue
+        found.append(abs(inertia * port.torque / port.position))
+    return min(found, default=None)
+
+
+def inertia_of(
+    runner: Runner,
+    window: Window,
+    values: Mapping[str, float],
+    port: Port,
+    *,
+    size: float | None = None,
+) -> float:
+    """Input per acceleration of the position, from the answer to a step at the start of a window.
+
+    Parameters
+    ----------
+    size : float, optional
+        Of the step; by default as large as the input of the window varies.
+
+    Raises
+    ------
+    InputError
+        Where the input does not move the position.
+    """
+    n = min(_PULSE, len(window.time))
+    size = size or float(np.std(window.inputs[:, port.input])) or 1.0
+    moved = window.inputs[:n].copy()
+    moved[:, port.input] += size
+    short = Window(window.time[:n], window.inputs[:n], window.outputs[:n], window.start)
+    pushed = Window(window.time[:n], moved, window.outputs[:n], window.start)
+    answer = (runner.run(pushed, values) - runner.run(short, values))[:, port.output]
+    t = window.time[:n] - window.time[0]
+    acceleration = float(answer @ (t**2 / 2) / np.sum((t**2 / 2) ** 2)) / size
+    if not abs(acceleration) * size * float(t[-1]) ** 2 > 1e-12 * max(
+        1.0, float(np.ptp(window.outputs[:, port.output]))
+    ):
+        raise InputError(
+            f"{runner.fmu.path.name}: its drive input does not move its position; check the "
+            "channels that are mapped"
+        )
+    return 1.0 / acceleration
+
+
+__all__ = [
+    "POSITIONS",
+    "SHORTEST",
+    "coupled",
+    "feedback_of",
+    "hold_of",
+    "inertia_of",
+    "noted",
+    "port_of",
+]

@@ -26,7 +26,7 @@ an output.
 SUBSTEPS: Final = (1, 2, 4, 8)
 _TRIED: Final = 2000
 HOLD: Final = 1e-3
-"""Longest time for which what is fed back holds [s]."""
+"""Longest time for which what is fed back holds, where its slope asks for nothing shorter [s]."""
 
 
 @final
@@ -56,7 +56,16 @@ class Window:
 
 
 class Feedback(Protocol):
-    """Something outside the FMU that reads its outputs and adds to its inputs."""
+    """Something outside the FMU that reads its outputs and adds to its inputs.
+
+    Attributes
+    ----------
+    hold : float
+        Longest time for which what it adds may hold [s].
+    """
+
+    @property
+    def hold(self) -> float: ...
 
     def begin(self, window: Window) -> None:
         """Before the first sample of a window."""
@@ -174,7 +183,7 @@ class Runner:
             if feedback is None:
                 x = self._advance(stepper, now, end, x)
                 continue
-            parts = max(1, math.ceil((end - now) / HOLD - 1e-6))
+            parts = parts_of(end - now, feedback.hold, self.fmu.grain(self.kind))
             for i in range(parts):
                 at = now + i * (end - now) / parts
                 ins.array[:] = held + feedback(k, at, held, instance.read(outs) if i else table[k])
@@ -216,6 +225,23 @@ class Runner:
         return x
 
 
+def parts_of(length: float, hold: float, grain: float | None) -> int:
+    """Equal parts of a sample, none longer than `hold` where the FMU's own step allows it.
+
+    Parameters
+    ----------
+    length, hold : float
+        [s]
+    grain : float or None
+        The FMU takes whole multiples of this step only [s].
+    """
+    wanted = max(1, math.ceil(length / hold - 1e-6))
+    if grain is None:
+        return wanted
+    most = max(1, round(length / grain))
+    return next((p for p in range(wanted, most + 1) if most % p == 0), most)
+
+
 def shortened(window: Window) -> Window:
     """At most the first samples of a window, enough to try a step length on."""
     n = slice(0, _TRIED)
@@ -228,4 +254,14 @@ def agrees(found: FloatArray, reference: FloatArray) -> bool:
     return bool(np.all(np.abs(found - reference).max(axis=0) <= SAME * spread))
 
 
-__all__ = ["ATOL", "HOLD", "RTOL", "Feedback", "Runner", "Window", "agrees", "shortened"]
+__all__ = [
+    "ATOL",
+    "HOLD",
+    "RTOL",
+    "Feedback",
+    "Runner",
+    "Window",
+    "agrees",
+    "parts_of",
+    "shortened",
+]

@@ -16,7 +16,7 @@ from irj_fmu.host.run import FmuError
 from irj_fmu.imported.correction import PREFIX, CorrectionLaw
 from irj_fmu.imported.file import load_user_joint
 from irj_fmu.imported.model import UserModel
-from irj_fmu.imported.port import feedback_of, port_of
+from irj_fmu.imported.port import feedback_of, hold_of, port_of
 
 PAIR_FILE: Final = "pair.toml"
 _STATE: Final = {"canGetAndSetFMUstate": "false", "canSerializeFMUstate": "false"}
@@ -93,6 +93,7 @@ class Pair(TableSlave):
         folder = Path(str(kwargs.get("resources") or "."))
         self._model = load_user_joint(folder / PAIR_FILE)
         self.__dict__["variables"] = pair_variables(self._model)
+        self.__dict__["default_sample_time"] = hold_of(self._model)
         self._instance: Any = None
         self._time = 0.0
         super().__init__(**kwargs)

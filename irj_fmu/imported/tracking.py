@@ -21,8 +21,8 @@ from identification.errors import InputError
 from identification.planning.follow import Controller
 from irj_fmu.host.signals import FloatArray
 from irj_fmu.imported.correction import CorrectionLaw, Port
-from irj_fmu.imported.port import feedback_of, port_of
-from irj_fmu.imported.run import Runner, Window
+from irj_fmu.imported.port import feedback_of, inertia_of, port_of
+from irj_fmu.imported.run import HOLD, Runner, Window
 
 if TYPE_CHECKING:
     from irj_fmu.imported.model import UserModel
@@ -31,7 +31,6 @@ BANDWIDTH: Final = 60.0
 """Of the controller [rad/s], or a quarter of the sample rate where that is lower; its damping
 ratio is 1.
 """
-_PULSE: Final = 10
 _SETTLE: Final = 10.0
 """Time constants of the controller that are left out at the start of each stretch."""
 
@@ -55,6 +54,7 @@ class Tracker:
         self, port: Port, inputs: int, inertia: float, law: CorrectionLaw | None = None
     ) -> None:
         self.port, self.inertia, self.law = port, inertia, law
+        self.hold = HOLD if law is None else law.hold
         self._extra = np.zeros(inputs)
         self.added: FloatArray = np.empty(0)
 
@@ -95,33 +95,6 @@ def smooth_slope(values: FloatArray, dt: float, length: float = 0.03) -> FloatAr
     padded = np.pad(values, half, mode="reflect", reflect_type="odd")
     found: FloatArray = np.correlate(padded, weights[middle - half : middle + half + 1], "valid")
     return found
-
-
-def inertia_of(runner: Runner, window: Window, values: Mapping[str, float], port: Port) -> float:
-    """Input per acceleration of the position, from the answer to a step at the start of a window.
-
-    Raises
-    ------
-    InputError
-        Where the input does not move the position.
-    """
-    n = min(_PULSE, len(window.time))
-    size = float(np.std(window.inputs[:, port.input])) or 1.0
-    moved = window.inputs[:n].copy()
-    moved[:, port.input] += size
-    short = Window(window.time[:n], window.inputs[:n], window.outputs[:n], window.start)
-    pushed = Window(window.time[:n], moved, window.outputs[:n], window.start)
-    answer = (runner.run(pushed, values) - runner.run(short, values))[:, port.output]
-    t = window.time[:n] - window.time[0]
-    acceleration = float(answer @ (t**2 / 2) / np.sum((t**2 / 2) ** 2)) / size
-    if not abs(acceleration) * size * float(t[-1]) ** 2 > 1e-12 * max(
-        1.0, float(np.ptp(window.outputs[:, port.output]))
-    ):
-        raise InputError(
-            f"{runner.fmu.path.name}: its drive input does not move its position; check the "
-            "channels that are mapped"
-        )
-    return 1.0 / acceleration
 
 
 @final
@@ -210,4 +183,4 @@ def _joined(
     return made.without("run")
 
 
-__all__ = ["BANDWIDTH", "Following", "Tracker", "inertia_of", "smooth_slope"]
+__all__ = ["BANDWIDTH", "Following", "Tracker", "smooth_slope"]

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import csv
+import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from examples import exchange, fleet, two_joints
+from tests.irj_fmu.test_fmu_package import ecos
 
 
 @pytest.fixture(scope="module")
@@ -36,6 +40,30 @@ def test_each_estimator_finds_the_stiffness_and_no_fault_where_none_is(
 def test_the_slipping_encoder_and_the_payload_are_told(system: dict[str, float]) -> None:
     assert 0 < system["shoulder: link encoder told after [s]"] < 0.1
     assert 0 < system["elbow: change of the joint told after [s]"] < 3.0
+
+
+def test_the_system_runs_in_another_host(
+    system: dict[str, float], folder: Path, tmp_path: Path
+) -> None:
+    """A host passes outputs on before or after a step: what that may change is one step's way."""
+    done = subprocess.run(
+        [str(ecos(tmp_path)), "simulate", "--path", str(folder / "two_joints.ssp")]
+        + ["--stopTime", "0.5", "--stepSize", str(two_joints.STEP)],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    with (tmp_path / "two_joints.csv").open() as file:
+        names, *rows = csv.reader(file)
+    here = two_joints.run(folder, 0.5)
+    for name in two_joints.NAMES:
+        at = [n.strip() for n in names].index(f"{name}::link_position[REAL]")
+        there = np.array([float(row[at]) for row in rows])
+        own = here[f"{name}.link_position"]
+        assert len(there) == len(own) == 250
+        assert np.ptp(there) > 0.1
+        assert np.abs(there - own).max() < np.abs(np.diff(own)).max()
 
 
 def test_every_part_can_be_taken_out_and_validates(system: dict[str, float], folder: Path) -> None:

@@ -4,6 +4,7 @@ never a crash.
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 import zipfile
@@ -16,6 +17,7 @@ import pytest
 from identification.online.estimator import OnlineOptions
 from irj_fmu.corrected.build import export_corrected
 from irj_fmu.estimator.native import NativeSpec, build_native
+from irj_fmu.estimator.native_fmi3 import build_native_fmi3
 from irj_fmu.fmi.compiler import find_compiler, header_folder
 from irj_fmu.imported.correction import PREFIX
 from irj_fmu.imported.file import outside_correction
@@ -28,7 +30,12 @@ from tests.irj_fmu.test_fmu_package import LOADER, clean_environment, pack
 
 HERE = Path(__file__).parents[1]
 OF_2 = ("plant", "native", "slave", "corrected")
-EVERY = (*OF_2, "plant3")
+OF_3 = ("plant3", "native3")
+EVERY = (*OF_2, *OF_3)
+C_LIBRARY = {"libc", "libm", "libdl", "libpthread", "ld-linux-x86-64", "ld-linux-aarch64"}
+CHROOT = shutil.which("chroot")
+NOBODY = 65534
+"""A user without rights, by number: the small root folder has no names."""
 STRANGER = "the instance is NULL, was freed already or is not of this FMU"
 
 
@@ -61,10 +68,9 @@ def made(folder: Path, what: str) -> Path:
     if path.exists():
         return path
     joint = reference_joint("hd3")
-    if what == "native":
-        return build_native(
-            NativeSpec(joint, "native", OnlineOptions(optimise=False), None, 1e-3), path
-        )
+    if what in ("native", "native3"):
+        spec = NativeSpec(joint, what, OnlineOptions(optimise=False), None, 1e-3)
+        return build_native(spec, path) if what == "native" else build_native_fmi3(spec, path)
     if what == "corrected":  # round a plant that gives its state
         model = load_user_model(
             made(folder, "plant"),
@@ -77,8 +83,8 @@ def made(folder: Path, what: str) -> Path:
         return export_corrected(replace(model, correction=law), path)
     if what == "slave":  # the shim is that of every estimator
         return pack(folder, name=path.name).path
-    spec = plant_spec(joint, PlantOptions(name=what))
-    return build_plant(spec, path) if what == "plant" else build_plant_fmi3(spec, path)
+    plant = plant_spec(joint, PlantOptions(name=what))
+    return build_plant(plant, path) if what == "plant" else build_plant_fmi3(plant, path)
 
 
 def command(programs: dict[int, Path], folder: Path, what: str) -> list[str]:
@@ -95,10 +101,9 @@ def command(programs: dict[int, Path], folder: Path, what: str) -> list[str]:
         for v in description.modelVariables
         if v.causality == "output" and v.type in ("Real", "Float64")
     )
-    if what == "plant3":
-        library = (
-            place / "binaries" / platform_tuple / f"{description.modelExchange.modelIdentifier}.so"
-        )
+    if what in OF_3:
+        own = description.coSimulation.modelIdentifier
+        library = place / "binaries" / platform_tuple / f"{own}.so"
         return [
             str(programs[3]),
             str(library),
@@ -136,6 +141,43 @@ def test_the_plant_in_model_exchange_stands_it_too(programs: dict[int, Path], fo
     refused = {text for text in done.stdout.splitlines() if not text.endswith(" failed")}
     assert done.returncode == 1, done.stderr[-2000:]
     assert refused == {"fDoStep(c, 1e-3 * i, 1e-3, 1)", "fDoStep(other, 3e-3, 1e-3, 1)"}
+
+
+@pytest.mark.skipif(
+    not hasattr(os, "geteuid") or os.geteuid() != 0 or CHROOT is None,
+    reason="a root folder of its own needs the rights of root",
+)
+@pytest.mark.parametrize("what", [w for w in EVERY if w != "slave"])
+def test_they_run_for_another_user_where_nothing_is_but_the_c_library(
+    programs: dict[int, Path], folder: Path, tmp_path: Path, what: str
+) -> None:
+    """A root folder with the C library, the probe and the FMU: none of the builder's paths."""
+    line = command(programs, folder, what)
+    place, own = folder / f"{what} ü #1", Path("/Größe und Maß")
+    shutil.copytree(place, tmp_path / own.name)
+    loaded = {p for x in (Path(line[0]), *place.rglob("*.so")) for p in loaded_by(x)}
+    assert {p.name.split(".")[0] for p in loaded} <= C_LIBRARY
+    for needed in loaded:
+        inside = tmp_path / needed.relative_to("/")
+        inside.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(needed, inside)
+    shutil.copy(line[0], tmp_path / "probe")
+    tmp_path.chmod(0o755)
+    moved = ["/probe", str(own / Path(line[1]).relative_to(place))]
+    rest = line[2:] if what in OF_3 else [(own / "resources").as_uri(), *line[3:]]
+    done = subprocess.run(
+        [str(CHROOT), f"--userspec={NOBODY}:{NOBODY}", str(tmp_path), *moved, *rest],
+        env={"LC_ALL": "C"},
+        capture_output=True,
+        text=True,
+    )
+    assert (done.returncode, done.stdout) == (0, "0 failed\n"), done.stdout + done.stderr[-2000:]
+
+
+def loaded_by(program: Path) -> list[Path]:
+    """Libraries that a program or a library loads, and what loads them."""
+    said = subprocess.run(["ldd", str(program)], capture_output=True, text=True, check=True).stdout
+    return [Path(word) for word in said.split() if word.startswith("/")]
 
 
 @pytest.mark.slow

@@ -59,6 +59,9 @@ fmi2Status fmi2DoStep(fmi2Component c, fmi2Real t, fmi2Real h, fmi2Boolean n) {
 #ifdef FAILS
     if (t > 0.0995) return FAILS;
 #endif
+#ifdef STEP
+    if (fabs(h - STEP) > 1e-9) return fmi2Error;
+#endif
     model_advance(M, h);
     return fmi2OK;
 }

@@ -97,6 +97,8 @@ class Make:
         Event indicators in the description (FMI 2).
     fails : int
         Status of the steps from a tenth of a second on (FMI 2); 0 for none that fails.
+    step : float
+        The only step that it takes [s] (FMI 2); 0 for any.
     """
 
     version: int = 2
@@ -109,6 +111,7 @@ class Make:
     units: tuple[tuple[str, str], ...] = ()
     events: int = 0
     fails: int = 0
+    step: float = 0.0
 
 
 def build(name: str, folder: Path, make: Make | None = None) -> Path:
@@ -122,6 +125,7 @@ def build(name: str, folder: Path, make: Make | None = None) -> Path:
     library = folder / f"{tag}.so"
     flags = ["-shared", "-fPIC", "-O2", "-w", f"-DMODEL_{shape.macro}", f'-DGUID="{tag}"']
     flags += [f"-DFAILS={make.fails}"] if make.fails else []
+    flags += [f"-DSTEP={make.step!r}"] if make.step else []
     flags += [*(["-DSTRICT"] if make.strict else []), *(["-DWRONG"] if make.wrong else [])]
     subprocess.run(
         [
@@ -189,7 +193,7 @@ def _two(name: str, guid: str, shape: Shape, make: Make) -> str:
     ]
     lines += [
         f'<{k} modelIdentifier="{name}" providesDirectionalDerivative="{promise}" '
-        'canHandleVariableCommunicationStepSize="true"/>'
+        f'canHandleVariableCommunicationStepSize="{str(not make.step).lower()}"/>'
         if k == "CoSimulation"
         else f'<{k} modelIdentifier="{name}" providesDirectionalDerivative="{promise}"/>'
         for k in reversed(make.kinds)
@@ -198,6 +202,8 @@ def _two(name: str, guid: str, shape: Shape, make: Make) -> str:
     if units:
         named = [f'<Unit name="{unit}"/>' for unit in sorted(set(units.values()))]
         lines.append(f"<UnitDefinitions>{''.join(named)}</UnitDefinitions>")
+    if make.step:
+        lines.append(f'<DefaultExperiment stepSize="{make.step!r}"/>')
     lines.append("<ModelVariables>")
     rows = _rows(name, shape, make)
     for n, vr, causality, variability, initial, start, state in rows:

@@ -147,6 +147,9 @@ def run_fit(arguments: Namespace) -> int:
 
     model, records, warnings = _open(arguments)
     fitted = fit(model, records, progress=progress_bar)
+    for note in fitted.model.notes:
+        if note not in model.notes:
+            print(f"irj: {note}", file=sys.stderr)
     print(fitted.method)
     _print_outputs(fitted.train)
     _print_parameters(fitted.parameters)
