@@ -44,7 +44,7 @@ from workbench.page.first import first_look
 from workbench.page.records import thinned
 from workbench.page.session import StepEntry
 from workbench.show.pictures import place_chart
-from workbench.show.words import headline
+from workbench.show.words import headline, title_of
 
 FloatArray = npt.NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -291,7 +291,7 @@ class Analysis:
         try:
             model = without(now.model, label)
         except (KeyError, ValueError) as error:
-            raise InputError(f"{label}: {error.args[0]}") from None
+            raise InputError(f"{title_of(label)}: {error.args[0]}") from None
         return self._looked("remove", label, model, now.values, began)
 
     def _with(
@@ -304,7 +304,7 @@ class Analysis:
         try:
             model = trial.candidate.model if trial else with_effect(now.model, label)
         except (KeyError, ValueError) as error:
-            raise InputError(f"{label}: {error.args[0]}") from None
+            raise InputError(f"{title_of(label)}: {error.args[0]}") from None
         if not trial and hint and "virtual_work" in hint:
             model = replace(model, virtual_work=bool(hint["virtual_work"]))
         return model, values

@@ -20,6 +20,7 @@ from workbench.page.analysis import Progress, clean
 from workbench.page.jobs.place import Place
 from workbench.page.records import decimated
 from workbench.page.session import State, write_atomic
+from workbench.show.words import title_of
 
 if TYPE_CHECKING:
     from identification.planning.trajectories import Excitation
@@ -195,7 +196,7 @@ def _model(live: Place, label: str) -> tuple[JointModel, str]:
         try:
             model = model.add(label)
         except (KeyError, ValueError) as error:
-            raise InputError(f"plan: {label}: {error.args[0]}") from None
+            raise InputError(f"plan: {title_of(label)}: {error.args[0]}") from None
     remembering = {t.label for t in model.terms if t.effect.memory is not None}
     for name in sorted(remembering):
         model = model.drop(name)

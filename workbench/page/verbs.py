@@ -12,6 +12,7 @@ from workbench.page.desk import tree
 from workbench.page.jobs.place import Change
 from workbench.page.live import Live
 from workbench.page.session import State
+from workbench.show.words import title_of
 
 PREPARED: Final = 6
 """Best candidates that are fitted ahead of the click after a diagnosis."""
@@ -44,7 +45,8 @@ def run(live: Live, action: str, body: Mapping[str, Any]) -> None:
         Unknown action, or another one is running.
     """
     label = str(body.get("label", ""))
-    texts = {**_TEXTS, "add": f"adding {label}", "remove": f"removing {label}"}
+    title = title_of(label)
+    texts = {**_TEXTS, "add": f"adding: {title}", "remove": f"removing: {title}"}
     if action not in texts:
         raise InputError(f"unknown action {action!r}; known: {', '.join(texts)}")
     if action in ("add", "remove") and not label:

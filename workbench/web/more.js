@@ -1,7 +1,7 @@
 "use strict";
 /* Physics or sensor, online replay, planning: the views beside the loop. */
 const seconds = (v) => `${digits(v, 3)} s`;
-const words = (name) => name.replace(/_/g, " ");
+const words = (name) => name.replace(/#\d+/g, "").replace(/_/g, " ");
 const field = (id, label, value, hint, more) => h("div", { class: "field" }, h("label", { for: id }, label), h("input", { id, value: value == null ? "" : String(value), "aria-describedby": `${id}-hint`, autocomplete: "off", inputmode: "decimal", ...more }), h("span", { class: "small soft", id: `${id}-hint` }, hint));
 const choice = (id, label, options, chosen, hint, onchange) => h("div", { class: "field" }, h("label", { for: id }, label), h("select", { id, onchange, "aria-describedby": hint ? `${id}-hint` : null }, options.map(([v, t]) => h("option", { value: v, selected: v === chosen }, t))), hint && h("span", { class: "small soft", id: `${id}-hint` }, hint));
 

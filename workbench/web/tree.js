@@ -48,14 +48,14 @@ function fitsTable(found) {
   const [a, b] = found.steps, changed = found.values.filter((v) => v.first !== v.second), cell = (v) => h("td", { class: "num" }, v == null ? "–" : digits(v, 4));
   return h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Two fits compared" }, h("table", {}, h("caption", {}, "Two fits side by side"), h("thead", {}, h("tr", {}, h("th", { scope: "col" }, ""), h("th", { scope: "col", class: "num" }, stepTitle(a)), h("th", { scope: "col", class: "num" }, stepTitle(b)))),
     h("tbody", {}, h("tr", { class: "now" }, h("th", { scope: "row" }, "Held-out error [%]"), cell(a.error), cell(b.error)), h("tr", {}, h("th", { scope: "row" }, "Only in it"), found.only.map((o) => h("td", {}, o.length ? o.map(effectTitle).join(", ") : "–"))),
-      changed.map((v) => h("tr", {}, h("th", { scope: "row" }, v.name.replace(/_/g, " ")), cell(v.first), cell(v.second))))));
+      changed.map((v) => h("tr", {}, h("th", { scope: "row" }, words(v.name)), cell(v.first), cell(v.second))))));
 }
 
 /* A law of one's own: typed in one line, fitted at once to what the model leaves, kept in the joint file. */
 function lawCard(state) {
   const draft = app.drafts.law || (app.drafts.law = { law: "", on: "motor", parameters: "" });
   const field = (key, label, placeholder, size) => h("input", { id: `law-${key}`, value: draft[key], placeholder, size, "aria-label": label, autocomplete: "off", spellcheck: "false", oninput: (e) => { draft[key] = e.target.value; } });
-  const place = h("select", { id: "law-on", "aria-label": "Where it acts", onchange: (e) => { draft.on = e.target.value; } }, app.config.places.map((p) => h("option", { value: p, selected: p === draft.on }, p.replace(/_/g, " "))));
+  const place = h("select", { id: "law-on", "aria-label": "Where it acts", onchange: (e) => { draft.on = e.target.value; } }, app.config.places.map((p) => h("option", { value: p, selected: p === draft.on }, words(p))));
   const row = (t) => h("li", {}, h("div", { class: "row between" }, h("span", {}, h("code", {}, t.law), ` on ${t.on.replace(/_/g, " ")}: the held-out error ${t.after < t.before ? "falls" : "goes"} from ${digits(t.before)} to `, h("strong", {}, `${digits(t.after)} %`)),
     button("Add", () => run("add", { label: t.label }, "ledger"), { kind: t.after < t.before ? "primary" : "", id: `add-${t.label}`, label: `Add ${t.law}` })));
   return h("form", { class: "card", id: "own-law", onsubmit: (e) => { e.preventDefault(); $("try-law").click(); } }, h("h2", {}, "A law of your own"), h("div", { class: "row" }, field("law", "Law", "c*tanh(v/w)", "28"), place, field("parameters", "Parameters with ranges and units", "c=0..10 N.m, w=0.01..1 rad/s", "34"),

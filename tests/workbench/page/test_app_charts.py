@@ -277,3 +277,33 @@ def test_a_window_is_left_out_and_taken_back(page: Any) -> None:
     page.click("#take-back-0")
     page.wait_for_function("() => app.state.files.every((f) => !f.left_out.length)")
     page.wait_for_function("() => app.state.steps.length > 0")  # the branch before it is back
+
+
+INTERNAL = re.compile(r"\b[a-z]\w*#\d|\b[a-z]+@[a-z]+\b|\b[a-z0-9]+(?:_[a-z0-9]+)+\b(?!\.\w)")
+"""A mark of an instance, a label with its place, or a name of the code; files have an ending."""
+
+TO_WRITE = re.compile(r"give \w+(?: or \w+)* in \[known\]")
+"""Keys that the reader is asked to write into the joint file stand as they are written there."""
+
+
+def test_neither_the_job_nor_these_views_show_a_name_of_the_code(page: Any) -> None:
+    page.evaluate(
+        "() => { app.told = []; const seen = () => app.told.push($('job-text').textContent);"
+        "new MutationObserver(seen).observe($('job-text'), { childList: true }); }"
+    )
+    page.evaluate("() => run('add', { label: 'cubic_viscous@motor' }, 'ledger')")
+    idle(page, "ledger")
+    told = page.evaluate("() => app.told")
+    assert any(text.startswith("adding") for text in told)
+    assert [text for text in told if INTERNAL.search(text)] == []
+    records = {Path(n).stem for n in page.evaluate("() => app.state.files.map((f) => f.name)")}
+    found: dict[str, set[str]] = {}
+    for view in ("compare", "diagnose", "parameters", "replay", "plan"):
+        idle(page, page.evaluate("() => app.view"))
+        page.click(f"#nav-{view}")
+        idle(page, view)
+        shown = page.evaluate("() => $('main').innerText")
+        assert len(shown) > 100
+        shown = TO_WRITE.sub("", shown)
+        found[view] = set(INTERNAL.findall(shown)) - records
+    assert not any(found.values()), found
