@@ -5,14 +5,12 @@ A skew of a sample is no small number: its Taylor series in the model would chan
 the second order of a torque, which no derivative shows, the skew itself. An encoder is shifted by
 whole samples, which leaves its noise as it is, and has the second order in the model; torques are
 interpolated: their noise changes above a quarter of the sampling rate, which no kernel passes.
-Where a torque is late through a low-pass, as the current of most drives is, its rate in the model
-makes it good, and no shift.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from typing import Final
 
 import numpy as np
@@ -39,13 +37,8 @@ USUAL_SKEW: Final = 1.0
 """Standard deviation of a skew before the records are asked [samples]: sources are read once in a
 cycle. It decides only what the records do not tell.
 """
-CHAIN: Final = ("link_position_sensor", "torque_sensor", "drive")
-"""Order in which the channels are put right: a torque of the link is late against the motion of the
-link, and that of the drive against the motor and the torque of the link. All at once, each would
-follow where another one was before.
-"""
 SHIFTS: Final = 4
-"""Rounds in which shifts are looked for: a twist follows a torque that is late."""
+"""Rounds in which shifts are looked for: one channel's comes out wrong while another is late."""
 NEAR: Final = 0.05
 """Lateness that is left to the model [samples]: its square is under a hundredth."""
 ENCODERS: Final = frozenset({"link_position_sensor"})
@@ -132,11 +125,7 @@ def cubic(f: float) -> tuple[float, float, float, float]:
 
 
 def in_time(
-    make: Callable[[Mapping[str, float]], WeakRecord],
-    places: Iterable[str],
-    noise: Callable[[str, float], float],
-    *,
-    torque: bool,
+    make: Callable[[Mapping[str, float]], WeakRecord], places: Iterable[str], torque: bool
 ) -> WeakRecord:
     """A record whose late channels are shifted.
 
@@ -146,139 +135,60 @@ def in_time(
         Makes the rows with the channels of some places shifted by so many samples.
     places : iterable of str
         Whose channels may be shifted.
-    noise : callable
-        Variance that the noise of a place's channel gives the rows, its rate times a lateness [s]
-        added.
     torque : bool
         Whether the torque of the link is measured.
     """
     shifts: dict[str, float] = {}
-    made, wanted = make(shifts), [p for p in CHAIN if p in set(places)]
+    made, wanted = make(shifts), tuple(places)
     for _ in range(SHIFTS):
-        before = dict(shifts)
+        moved = dict(shifts)
         for place in wanted:
-            late = _late(made, place, wanted, torque=torque) / made.grid.dt
+            late = _late(made, place, torque=torque) / made.grid.dt
             step = round(late) if place in ENCODERS else late if abs(late) > NEAR else 0.0
-            if step:
-                shifts = {**shifts, place: shifts.get(place, 0.0) + step}
-                shifts = {p: k for p, k in shifts.items() if k}
-                made = make(shifts)
-        if shifts == before:
+            moved[place] = moved.get(place, 0.0) + step
+        if moved == shifts:
             break
-    for name in [p for p, k in shifts.items() if p not in ENCODERS and abs(k) <= MOST_SKEW]:
-        # a shift of zero keeps the rows: what is compared are the same instants
-        low_passed = {**shifts, name: 0.0}
-        other = make(low_passed)
-        louder = noise(name, shifts[name] * made.grid.dt) - noise(name, 0.0)
-        left = _left(made, name, wanted, torque=torque)
-        if _leaves_less(other, made, name, louder, torque=torque, left=left):
-            shifts, made = low_passed, other
+        shifts = {p: k for p, k in moved.items() if k}
+        made = make(shifts)
     return made
 
 
-def _leaves_less(
-    one: WeakRecord,
-    other: WeakRecord,
-    place: str,
-    louder: float,
-    *,
-    torque: bool,
-    left: float,
-) -> bool:
-    """True where the balance of a sensor is certainly better met with `one` than with `other`,
-    beside the variance by which noise is louder in `one`.
-
-    Both are late by the same time in first order. A reading that waits is the true value of an
-    earlier instant; one through a low-pass is made good by its rate, and nothing is left of higher
-    order. A shift of the latter leaves half the square of the lateness times the second derivative.
-    """
-    kept = one_way(one)
-    rest = [_rest(*_parts(made, place, kept, torque=torque, left=left)) for made in (one, other)]
-    gain = np.array(
-        [
-            float(b @ b - a @ a) + louder * len(a)
-            for a, b in zip(*(np.array_split(x, STRETCHES) for x in rest), strict=True)
-        ]
-    )
-    error = math.sqrt(STRETCHES / (STRETCHES - 1)) * float(np.linalg.norm(gain - gain.mean()))
-    return float(gain.sum()) > SURE * error
-
-
-def _parts(
-    made: WeakRecord,
-    place: str,
-    kept: npt.NDArray[np.bool_],
-    *,
-    torque: bool,
-    left: float = 0.0,
-) -> tuple[FloatArray, list[FloatArray], FloatArray]:
-    """Reading of a torque, what it follows from, and the column of its lateness, in the rows
-    `kept`.
-    """
-    a = {n: x[kept] for n, x in made.averaged.items()}
-    if place == "torque_sensor":
-        return a["torque"], _motion(a, "link"), -a["torque_rate"]
-    load = [a["torque"] + left * a["torque_rate"]] if torque else []
-    return a["drive"], [*_motion(a, "motor"), *load], -a["drive_rate"]
-
-
-def _motion(a: Mapping[str, FloatArray], side: str) -> list[FloatArray]:
-    """What the torques of a side follow from."""
-    q, v = a[f"{side}_position"], a[f"{side}_velocity"]
-    return [np.ones(len(v)), v, np.sign(v), a[f"{side}_acceleration"], np.sin(q), np.cos(q)]
-
-
-def _rest(values: FloatArray, others: list[FloatArray], column: FloatArray) -> FloatArray:
-    """What is left of the values beside all columns."""
-    basis, _ = np.linalg.qr(_scaled(np.column_stack([*others, column])))
-    return np.asarray(values - basis @ (basis.T @ values))
-
-
 def one_way(record: WeakRecord) -> npt.NDArray[np.bool_]:
-    """Rows within which the joint moves and does not turn, shape (rows,): where dry friction turns
-    it has a rate that no lateness explains, and at rest it takes any value. All rows in which it
-    moves where hardly any is such a row.
+    """Rows within which the joint does not turn, shape (rows,): where dry friction turns it has a
+    rate that no lateness explains. All rows where hardly any is such a row.
     """
-    moving = ~record.resting("motor")
     same = np.abs(record.average(np.sign(record.points["motor_velocity"]))) > 1 - ONE_WAY
-    return np.asarray(moving & same if np.mean(moving & same) > FEW else moving)
+    return np.asarray(same if np.mean(same) > FEW else np.ones(record.rows, dtype=np.bool_))
 
 
-def _left(made: WeakRecord, place: str, places: Sequence[str], *, torque: bool) -> float:
-    """Time by which the torque that loads the drive is late once it is in time with the encoder of
-    the link, of which a part of a sample is left [s].
-    """
-    if place != "drive" or "link_position_sensor" not in places:
-        return 0.0
-    left, wide, _ = lateness(made, "link_position_sensor", torque=torque)
-    return left if math.isfinite(wide) else 0.0
-
-
-def _late(made: WeakRecord, place: str, places: Sequence[str], *, torque: bool) -> float:
+def _late(made: WeakRecord, place: str, *, torque: bool) -> float:
     """Time by which a channel is certainly late [s]."""
-    left = _left(made, place, places, torque=torque)
-    late, error, _ = lateness(made, place, torque=torque, left=left)
+    late, error, _ = lateness(made, place, torque=torque)
     least = 0.5 * made.grid.dt if place in ENCODERS else 0.0
     sure = abs(late) - SURE * error > least
     return late if sure else 0.0
 
 
-def lateness(
-    made: WeakRecord, place: str, *, torque: bool, left: float = 0.0
-) -> tuple[float, float, float]:
+def lateness(made: WeakRecord, place: str, *, torque: bool) -> tuple[float, float, float]:
     """Time by which a channel is late, its standard error, and the part of it that viscous friction
-    may be [s]: reading = what it follows from, less the time times its rate. `left`: by which the
-    torque that loads the drive is late [s].
+    may be [s]: reading = what it follows from, less the time times its rate.
     """
     kept = one_way(made)
     a = {n: x[kept] for n, x in made.averaged.items()}
 
-    if place not in ENCODERS:
-        return *_slope(*_parts(made, place, kept, torque=torque, left=left)), 0.0
+    def motion(side: str) -> list[FloatArray]:
+        q, v = a[f"{side}_position"], a[f"{side}_velocity"]
+        return [np.ones(len(v)), v, np.sign(v), a[f"{side}_acceleration"], np.sin(q), np.cos(q)]
+
+    if place == "torque_sensor":
+        return *_slope(a["torque"], motion("link"), -a["torque_rate"]), 0.0
+    if place == "drive":
+        load = [a["torque"]] if torque else []
+        return *_slope(a["drive"], [*motion("motor"), *load], -a["drive_rate"]), 0.0
     effort, twist = a.get("torque" if torque else "drive"), a["motor_position"] - a["link_position"]
     if effort is None:  # nothing tells friction of the link from lateness
         return 0.0, math.inf, 0.0
-    one, v, _, bend, *_ = _motion(a, "link")
+    one, v, _, bend, *_ = motion("link")
     late, error = _slope(twist, [one, effort, bend, np.sign(v)], v)
     if torque:
         return late, error, 0.0

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
-from scipy.signal import lfilter
 
 from identification import Improvement, Record, fit, improve, load_joint, read
 from identification.balance.calibration import values_on
@@ -174,54 +173,3 @@ def test_whole_samples_are_taken_off_the_rows_and_not_off_the_value() -> None:
     values = dict.fromkeys(model.parameter_names, 0.0) | {f"link_encoder_skew[{rows.name}]": 0.008}
     left = values_on(model, rows, values)["link_encoder_skew"]
     assert left == pytest.approx(0.008 - 3 * run.dt)
-
-
-def shifts(samples: dict[str, float], *, low_pass: float = 0.0) -> dict[str, float]:
-    """Samples by which the channels of a run are shifted; `low_pass`: memory of a filter of the
-    current, in samples.
-    """
-    t, run = motion()
-    rng = np.random.default_rng(7)
-    drive = run.drive / PER_AMPERE
-    if low_pass:
-        pole = float(np.exp(-1.0 / low_pass))
-        drive = lfilter([1.0 - pole], [1.0, -pole], drive - drive[0]) + drive[0]
-    exact = {
-        "motor_current": drive,
-        "motor_position": run.states[:, 0] * RATIO,
-        "link_position": run.states[:, 2],
-        "link_torque": run.torque,
-    }
-    noise = {"motor_current": 0.004, "motor_position": 1e-4, "link_position": 1e-5}
-    channels = {
-        name: CubicSpline(t, x)(t - samples.get(name, 0.0) * DT)
-        + rng.normal(0, noise.get(name, 0.02), len(t))
-        for name, x in exact.items()
-    }
-    record = Record.from_channels(t, channels, name="run").take(np.arange(len(t)) >= 10)
-    data = load_dataset([record], [], JOINT, prepared_model(JOINT, record))
-    return {place: x / DT for place, x in data.train[0].shifts.items()}
-
-
-@cache
-def held() -> float:
-    """Samples by which the drive is ahead of its reading where nothing is late: its command is
-    held.
-    """
-    return shifts({})["drive"]
-
-
-@pytest.mark.parametrize("late", [1.4, 1.6, 2.3])
-def test_channels_are_put_in_time_along_their_chain(late: float) -> None:
-    # only the encoder of the link is late; what the torque is held against is its shifted reading
-    found = shifts({"link_position": late})
-    whole = round(late)
-    assert found["link_position_sensor"] == pytest.approx(whole, abs=1e-6)
-    assert found["torque_sensor"] == pytest.approx(whole - late, abs=0.1)
-    assert found["drive"] == pytest.approx(held(), abs=0.1)
-
-
-@pytest.mark.parametrize("memory", [1.5, 3.0])
-def test_a_current_through_a_low_pass_is_not_shifted(memory: float) -> None:
-    assert shifts({}, low_pass=memory)["drive"] == 0.0
-    assert shifts({"motor_current": memory})["drive"] == pytest.approx(memory + held(), abs=0.1)
