@@ -18,7 +18,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import CodeType, ModuleType, SimpleNamespace
 from typing import Any, Final, Literal, final, get_args
 
 import casadi as ca
@@ -472,7 +472,7 @@ class Registry(Mapping[str, Effect]):
         module = ModuleType(f"irj_user_effects_{path.stem}")
         module.__file__ = str(path)
         try:
-            exec(compile(code, str(path), "exec"), module.__dict__)
+            exec(_compiled(code, path), module.__dict__)
             self._check_references(set(self) - before, path)
             for key in sorted(set(self) - before):
                 self[key].check()
@@ -545,6 +545,16 @@ def _only_python(path: Path) -> None:
 
 
 EFFECTS: Final = Registry()
+
+
+def _compiled(code: bytes, path: Path) -> CodeType:
+    """The code of a user's file; a null byte in it is a SyntaxError on every Python (a ValueError
+    on some).
+    """
+    try:
+        return compile(code, str(path), "exec")
+    except ValueError as error:
+        raise SyntaxError(str(error)) from None
 
 
 def effect(
