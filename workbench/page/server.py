@@ -68,6 +68,7 @@ PAGE: Final = {
     "/import.js": (WEB / "import.js", "text/javascript; charset=utf-8"),
     "/tree.js": (WEB / "tree.js", "text/javascript; charset=utf-8"),
     "/preview.js": (WEB / "preview.js", "text/javascript; charset=utf-8"),
+    "/known.js": (WEB / "known.js", "text/javascript; charset=utf-8"),
     "/charts.js": (WEB / "charts.js", "text/javascript; charset=utf-8"),
     "/plots.js": (WEB / "plots.js", "text/javascript; charset=utf-8"),
     "/uPlot.js": (ASSETS / "uPlot.iife.min.js", "text/javascript; charset=utf-8"),

@@ -22,6 +22,7 @@ from workbench.page import export as app_export
 from workbench.page import plan as app_plan
 from workbench.page import replay as app_replay
 from workbench.page.charts.asked import CHART_VIEWS, along, run_starts, said, side_of
+from workbench.page.charts.choices import known_fields
 from workbench.page.desk import tree
 from workbench.page.input import joint_form
 from workbench.page.jobs.place import folder_of
@@ -184,7 +185,11 @@ def _fits(live: Live, query: Query) -> dict[str, Any]:
 
 
 def _joint(live: Live, query: Query) -> dict[str, Any]:
-    return {"text": live.state.joint_text, "form": joint_form(live.state.joint_text)}
+    return {
+        "text": live.state.joint_text,
+        "form": joint_form(live.state.joint_text),
+        "known": known_fields(live),
+    }
 
 
 def _code(live: Live, query: Query) -> dict[str, Any]:
