@@ -448,6 +448,15 @@ def parser() -> OneLineParser:
     )
     tracked.add_argument("--report", metavar="FILE", help="write the HTML report")
     tracked.add_argument(
+        "--follow",
+        type=float,
+        nargs="?",
+        const=10.0,
+        metavar="SECONDS",
+        help="the record is still being written: follow it, and print what is found at once, until "
+        "it has not grown for SECONDS (10)",
+    )
+    tracked.add_argument(
         "--inject",
         metavar="SENSOR:KIND:START[:SIZE[:END]]",
         action="append",
