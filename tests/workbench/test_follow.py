@@ -15,7 +15,7 @@ from identification import load_joint, read
 from identification.data.joint_file import Joint
 from identification.errors import InputError
 from identification.faults.types import FaultEvent, Verdict
-from workbench.cli.follow import LOOKS, Growing, follow
+from workbench.cli.following.growing import LOOKS, Growing, follow
 from workbench.cli.main import main
 from workbench.cli.online import limits, replay
 from workbench.show.replayed import Replay, standing

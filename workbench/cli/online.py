@@ -28,9 +28,9 @@ from workbench.cli.files import (
     write_bytes,
     write_json,
 )
-from workbench.cli.follow import Growing, follow
+from workbench.cli.following.growing import Growing, follow
+from workbench.cli.following.stepper import Stepper, arrays_of, fault_text
 from workbench.cli.renewed import renewed
-from workbench.cli.stepper import Stepper, arrays_of, fault_text
 from workbench.show.replayed import READINGS, UNESTIMATED, Replay, standing
 
 if TYPE_CHECKING:

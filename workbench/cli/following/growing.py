@@ -18,7 +18,7 @@ from identification.data.record import Record
 from identification.errors import InputError
 from irj_fmu.estimator.healthy import online_readings
 from workbench.cli.files import needed
-from workbench.cli.stepper import Stepper, arrays_of
+from workbench.cli.following.stepper import Stepper, arrays_of
 from workbench.show.replayed import READINGS, Replay
 
 if TYPE_CHECKING:
