@@ -15,6 +15,7 @@ from identification import load_joint, read
 from identification.data.joint_file import Joint
 from identification.errors import InputError
 from identification.faults.types import FaultEvent, Verdict
+from workbench.cli.following import growing
 from workbench.cli.following.growing import LOOKS, Growing, follow
 from workbench.cli.main import main
 from workbench.cli.online import limits, replay
@@ -110,6 +111,23 @@ def test_a_growing_file_gives_what_the_whole_record_gives(joint_file: Path, tmp_
         assert standing(then.verdicts).startswith("Link position at 9")
 
 
+def test_a_long_recording_is_thinned_and_no_peak_is_lost(
+    joint_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    joint, text = load_joint(joint_file), lines(faulty=True)
+    whole = list(followed(tmp_path / "a.csv", joint, text))[-1]
+    monkeypatch.setattr(growing, "LOOKS", 40)
+    thin = list(followed(tmp_path / "b.csv", joint, text))[-1]
+    assert 40 < len(thin.looks) <= 81 < len(whole.looks)
+    assert thin.record.time[0] == whole.record.time[0]
+    assert (np.diff(thin.record.time) > 0).all()
+    ended = whole.record.time <= thin.record.time[-1]
+    np.testing.assert_allclose(thin.scores.max(axis=0), whole.scores[ended].max(axis=0))
+    at = np.searchsorted(whole.time, thin.time)
+    np.testing.assert_array_equal(whole.time[at], thin.time)
+    np.testing.assert_array_equal(whole.values[at], thin.values)
+
+
 def test_the_terminal_says_it_while_the_file_grows(
     joint_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -154,10 +172,12 @@ def test_what_stands_is_what_was_not_withdrawn() -> None:
     link, torque = event(Verdict.SENSOR, "link_position"), event(Verdict.DROPOUT, "torque")
     assert standing([armed]) == "No reading was doubted."
     assert standing([armed], watched=False) == "Sensor faults were not looked for."
-    assert standing([armed, (9.0, link)]) == f"Link position at 9 s: {Verdict.SENSOR}"
+    assert standing([armed, (9.0, link)]) == (
+        "Link position at 9 s: a sensor failed; its reading is replaced by the estimate."
+    )
     both = [(9.0, link), (10.0, torque), (11.0, event(Verdict.RECOVERED, "link_position"))]
     assert standing(both) == (
-        f"Torque at 10 s: {Verdict.DROPOUT} "
+        "Torque at 10 s: a reading is missing; it is replaced by the estimate. "
         "Withdrawn: link position, said at 9 s, withdrawn at 11 s."
     )
     assert standing([both[0], both[2]]).startswith("No reading is doubted any more: link position")

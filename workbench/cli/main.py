@@ -618,6 +618,13 @@ def parser() -> OneLineParser:
         "files", nargs="*", metavar="FILES", help="records and a joint file to begin with"
     )
     app.add_argument("--port", type=_port, default=0, help="port of the page (0: any free one)")
+    app.add_argument(
+        "--follow",
+        metavar="FILE",
+        action="append",
+        default=[],
+        help="a CSV file that is being written: the Replay page can follow it",
+    )
     app.add_argument("--no-browser", action="store_true", help="print the address, open nothing")
     text = "completion of verbs and options for your shell"
     completed = verbs.add_parser("completion", help=text, description=text)

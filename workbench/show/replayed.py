@@ -67,8 +67,13 @@ def standing(verdicts: Sequence[tuple[float, FaultEvent]], *, watched: bool = Tr
     )
     if not held:
         return f"No reading is doubted any more: {taken}." if taken else "No reading was doubted."
-    told = " ".join(f"{_named(e)} at {t:.4g} s: {e.verdict}" for t, e in held.values())
+    told = " ".join(f"{_named(e)} at {t:.4g} s: {_inside(e.verdict)}" for t, e in held.values())
     return f"{told[0].upper()}{told[1:]}" + (f" Withdrawn: {taken}." if taken else "")
+
+
+def _inside(verdict: Verdict) -> str:
+    """The words of a verdict as they stand after a colon."""
+    return f"{verdict.value[0].lower()}{verdict.value[1:]}"
 
 
 def _named(event: FaultEvent) -> str:

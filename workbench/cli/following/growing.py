@@ -181,22 +181,26 @@ class _Run:
                     "begins anew needs a file of its own"
                 )
             self.last = now
-            if not stepper.feed(now, rows[k], valid[k]):
+            looked = stepper.feed(now, rows[k], valid[k])
+            if not self.rows and not looked:  # times count from the first sample
+                stepper.looks.append((0, [0.0] * len(READINGS)))
+            elif not looked:
                 continue
             replaced = detector.replaced if detector is not None else (False,) * len(READINGS)
             used = stepper.estimator.readings if detector is not None else rows[k]
             self.rows.append((now, readings[k], np.array(used), np.array(replaced)))
-        while len(self.rows) > 2 * LOOKS and len(self.rows) % 2 == 0:
+        while len(self.rows) > 2 * LOOKS and len(self.rows) % 2:
             self._thin()
 
     def _thin(self) -> None:
-        """Every other look, with the larger score of the two."""
+        """The first look and every other one after it, with the larger score of the two."""
         stepper = self.stepper
         kept = [
             (b[0], [max(x, y) for x, y in zip(a[1], b[1], strict=True)])
-            for a, b in zip(stepper.looks[::2], stepper.looks[1::2], strict=True)
+            for a, b in zip(stepper.looks[1::2], stepper.looks[2::2], strict=True)
         ]
-        self.rows = self.rows[1::2]
+        kept.insert(0, stepper.looks[0])
+        self.rows = self.rows[::2]
         times = {row[0] for row in self.rows}
         stepper.looks = kept
         stepper.course = [c for c in stepper.course if c[0] in times]
