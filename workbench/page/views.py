@@ -23,6 +23,7 @@ from workbench.page import plan as app_plan
 from workbench.page import replay as app_replay
 from workbench.page.charts.asked import CHART_VIEWS, along, run_starts, said, side_of
 from workbench.page.charts.choices import known_fields
+from workbench.page.charts.payload import payload_view
 from workbench.page.desk import tree
 from workbench.page.desk.sources import allowed
 from workbench.page.input import joint_form
@@ -264,5 +265,6 @@ VIEWS: Final[Mapping[str, Callable[[Any, Query], Any]]] = {
     "replay": _replay,
     "plan": _plan,
     "motion.csv": _motion,
+    "payload": payload_view,
     **CHART_VIEWS,
 }

@@ -4,6 +4,7 @@ page where an effect asks for it, and on the Model page.
 
 from __future__ import annotations
 
+import math
 import os
 import threading
 import tomllib
@@ -137,6 +138,40 @@ def test_a_known_inertia_is_given_where_the_diagnosis_asks_for_it(page: Any) -> 
     assert page.evaluate("Boolean(app.state.diagnosis)")
     now = page.evaluate("app.state.diagnosis.not_testable.map((n) => n.effect)")
     assert "extra_inertia" not in now
+
+
+def test_another_payload_moves_inertia_and_weight_together(page: Any) -> None:
+    """5 kg at 0.4 m: 0.8 kg.m2 and 19.6 N.m more; the fit itself stays."""
+    idle(page)
+    page.click("#nav-parameters")
+    idle(page, "parameters")
+    fitted = page.evaluate("get('/view/parameters')")
+    error = page.inner_text("#slider-error")
+    page.fill("#payload-distance", "0.4")
+    page.fill("#payload-mass", "5")
+    page.keyboard.press("Tab")
+    page.wait_for_function(
+        "was => document.querySelector('#slider-error').textContent !== was", arg=error
+    )
+    value = {n: float(page.input_value(f"#value-{n}")) for n in ("link_inertia", "gravity_torque")}
+    assert value["link_inertia"] - fitted["link_inertia"]["value"] == pytest.approx(0.8, rel=1e-3)
+    weight = fitted["gravity_torque"]["value"], fitted["gravity_cosine"]["value"]
+    more = 5 * 9.80665 * 0.4 * weight[0] / math.hypot(*weight)
+    assert value["gravity_torque"] - weight[0] == pytest.approx(more, rel=1e-3)
+    assert float(page.inner_text("#slider-error").split()[0]) > float(error.split()[0])
+    page.wait_for_function(
+        "() => document.querySelector('#sliders').textContent.includes('link balance: with')"
+    )
+    shot(page, "payload", "#payload")
+    assert page.evaluate("get('/view/parameters')") == fitted
+
+    page.fill("#payload-mass", "-5000")
+    page.keyboard.press("Tab")
+    page.wait_for_selector("#error:not([hidden])")
+    assert "no inertia left" in page.inner_text("#error-text")
+    page.click("#slider-reset")
+    assert page.input_value("#payload-mass") == "0"
+    assert page.inner_text("#slider-error") == error
 
 
 def test_what_is_known_is_given_changed_and_taken_back_on_the_model_page(page: Any) -> None:
