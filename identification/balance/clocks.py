@@ -5,6 +5,8 @@ A skew of a sample is no small number: its Taylor series in the model would chan
 the second order of a torque, which no derivative shows, the skew itself. An encoder is shifted by
 whole samples, which leaves its noise as it is, and has the second order in the model; torques are
 interpolated: their noise changes above a quarter of the sampling rate, which no kernel passes.
+Where a torque is late through a low-pass, as the current of most drives is, its rate in the model
+makes it good, and no shift.
 """
 
 from __future__ import annotations
@@ -43,6 +45,8 @@ NEAR: Final = 0.05
 """Lateness that is left to the model [samples]: its square is under a hundredth."""
 ENCODERS: Final = frozenset({"link_position_sensor"})
 """Places whose readings are shifted by whole samples."""
+LOW_PASSED: Final = frozenset({"drive"})
+"""Places whose readings may come through a low-pass in place of late: drives filter their current."""
 SURE: Final = 3.0
 """Standard errors by which a channel must be late (an encoder: later than half a sample)."""
 ONE_WAY: Final = 1e-3
@@ -125,7 +129,11 @@ def cubic(f: float) -> tuple[float, float, float, float]:
 
 
 def in_time(
-    make: Callable[[Mapping[str, float]], WeakRecord], places: Iterable[str], torque: bool
+    make: Callable[[Mapping[str, float]], WeakRecord],
+    places: Iterable[str],
+    noise: Callable[[str, float], float],
+    *,
+    torque: bool,
 ) -> WeakRecord:
     """A record whose late channels are shifted.
 
@@ -135,6 +143,9 @@ def in_time(
         Makes the rows with the channels of some places shifted by so many samples.
     places : iterable of str
         Whose channels may be shifted.
+    noise : callable
+        Variance that the noise of a place's channel gives the rows, its rate times a lateness [s]
+        added.
     torque : bool
         Whether the torque of the link is measured.
     """
@@ -150,7 +161,61 @@ def in_time(
             break
         shifts = {p: k for p, k in moved.items() if k}
         made = make(shifts)
+    for place in LOW_PASSED & shifts.keys():
+        # a shift of zero keeps the rows: what is compared are the same instants
+        unshifted = {**shifts, place: 0.0}
+        other = make(unshifted)
+        louder = noise(place, shifts[place] * made.grid.dt) - noise(place, 0.0)
+        if _leaves_less(other, made, place, louder, torque=torque):
+            shifts, made = unshifted, other
     return made
+
+
+def _leaves_less(
+    one: WeakRecord, other: WeakRecord, place: str, louder: float, *, torque: bool
+) -> bool:
+    """True where the balance of a sensor is certainly better met with `one` than with `other`,
+    beside the variance by which noise is louder in `one`.
+
+    Both are late by the same time in first order. A reading that waits is the true value of an
+    earlier instant; one through a low-pass is made good by its rate, and nothing is left of higher
+    order. A shift of the latter leaves half the square of the lateness times the second derivative.
+    """
+    kept = one_way(one)
+    rest = [_rest(*_parts(made, place, kept, torque=torque)) for made in (one, other)]
+    gain = np.array(
+        [
+            float(b @ b - a @ a) + louder * len(a)
+            for a, b in zip(*(np.array_split(x, STRETCHES) for x in rest), strict=True)
+        ]
+    )
+    error = math.sqrt(STRETCHES / (STRETCHES - 1)) * float(np.linalg.norm(gain - gain.mean()))
+    return float(gain.sum()) > SURE * error
+
+
+def _parts(
+    made: WeakRecord, place: str, kept: npt.NDArray[np.bool_], *, torque: bool
+) -> tuple[FloatArray, list[FloatArray], FloatArray]:
+    """Reading of a torque, what it follows from, and the column of its lateness, in the rows
+    `kept`.
+    """
+    a = {n: x[kept] for n, x in made.averaged.items()}
+    if place == "torque_sensor":
+        return a["torque"], _motion(a, "link"), -a["torque_rate"]
+    load = [a["torque"]] if torque else []
+    return a["drive"], [*_motion(a, "motor"), *load], -a["drive_rate"]
+
+
+def _motion(a: Mapping[str, FloatArray], side: str) -> list[FloatArray]:
+    """What the torques of a side follow from."""
+    q, v = a[f"{side}_position"], a[f"{side}_velocity"]
+    return [np.ones(len(v)), v, np.sign(v), a[f"{side}_acceleration"], np.sin(q), np.cos(q)]
+
+
+def _rest(values: FloatArray, others: list[FloatArray], column: FloatArray) -> FloatArray:
+    """What is left of the values beside all columns."""
+    basis, _ = np.linalg.qr(_scaled(np.column_stack([*others, column])))
+    return np.asarray(values - basis @ (basis.T @ values))
 
 
 def one_way(record: WeakRecord) -> npt.NDArray[np.bool_]:
@@ -174,21 +239,13 @@ def lateness(made: WeakRecord, place: str, *, torque: bool) -> tuple[float, floa
     may be [s]: reading = what it follows from, less the time times its rate.
     """
     kept = one_way(made)
+    if place not in ENCODERS:
+        return *_slope(*_parts(made, place, kept, torque=torque)), 0.0
     a = {n: x[kept] for n, x in made.averaged.items()}
-
-    def motion(side: str) -> list[FloatArray]:
-        q, v = a[f"{side}_position"], a[f"{side}_velocity"]
-        return [np.ones(len(v)), v, np.sign(v), a[f"{side}_acceleration"], np.sin(q), np.cos(q)]
-
-    if place == "torque_sensor":
-        return *_slope(a["torque"], motion("link"), -a["torque_rate"]), 0.0
-    if place == "drive":
-        load = [a["torque"]] if torque else []
-        return *_slope(a["drive"], [*motion("motor"), *load], -a["drive_rate"]), 0.0
     effort, twist = a.get("torque" if torque else "drive"), a["motor_position"] - a["link_position"]
     if effort is None:  # nothing tells friction of the link from lateness
         return 0.0, math.inf, 0.0
-    one, v, _, bend, *_ = motion("link")
+    one, v, _, bend, *_ = _motion(a, "link")
     late, error = _slope(twist, [one, effort, bend, np.sign(v)], v)
     if torque:
         return late, error, 0.0

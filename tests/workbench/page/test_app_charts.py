@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from tests.workbench.chromium import launched, needs_chromium
+from tests.workbench.chromium import context_of, launched, needs_chromium
 
 AXE = os.environ.get("IRJ_AXE", "")
 
@@ -45,8 +45,8 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 def page(address: str) -> Iterator[Any]:
     """The demo, fitted and diagnosed."""
     with launched() as chromium:
-        context = chromium.new_context(
-            viewport={"width": 1280, "height": 860}, accept_downloads=True
+        context = context_of(
+            chromium, viewport={"width": 1280, "height": 860}, accept_downloads=True
         )
         problems: list[str] = []
         context.on("weberror", lambda e: problems.append(str(e.error)))
