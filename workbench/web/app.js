@@ -2,7 +2,7 @@
 /* The page's state, its talk with the server, and what surrounds the views. */
 const VIEWS = [["load", "Load"], ["model", "Model"], ["compare", "Compare"], ["diagnose", "Diagnose"], ["ledger", "Improve"], ["parameters", "Parameters"], ["replay", "Replay"], ["plan", "Plan"], ["export", "Export"]];
 const $ = (id) => document.getElementById(id);
-const app = { id: null, config: null, state: null, view: "load", source: null, plots: [], cleanup: [], then: null, sent: false, drafts: {}, preview: null, first: null, sending: null, upload: null };
+const app = { id: null, config: null, state: null, view: "load", source: null, plots: [], cleanup: [], then: null, sent: false, doing: [], acted: Promise.resolve(), drafts: {}, preview: null, first: null, sending: null, upload: null };
 
 function h(tag, attributes, ...children) {
   const node = document.createElement(tag);
@@ -66,10 +66,15 @@ function gone() {
 }
 function clearError() { $("error").hidden = true; }
 
-async function act(work) {
-  if (app.sent) return;
-  app.sent = true; clearError(); surround();
-  try { await work(); } catch (error) { fail(error); } finally { app.sent = false; surround(); goOn(); }
+/* Ask the server for something. What is asked for while another answer is under way follows it, in order: a field that was changed would show what the server never heard of. The same work twice is once. */
+function act(work) {
+  if (app.doing.includes(work)) return app.acted;
+  app.doing.push(work);
+  app.sent = true;
+  return (app.acted = app.acted.then(async () => {
+    clearError(); surround();
+    try { await work(); } catch (error) { fail(error); } finally { app.doing.shift(); app.sent = app.doing.length > 0; surround(); goOn(); }
+  }));
 }
 
 /* Start long work; `then` is the view to open when it came to its end. */
