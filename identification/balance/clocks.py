@@ -46,7 +46,7 @@ NEAR: Final = 0.05
 ENCODERS: Final = frozenset({"link_position_sensor"})
 """Places whose readings are shifted by whole samples."""
 LOW_PASSED: Final = frozenset({"drive"})
-"""Places whose readings may come through a low-pass in place of late: drives filter their current."""
+"""Places whose readings may come through a low-pass and not late: drives filter their current."""
 SURE: Final = 3.0
 """Standard errors by which a channel must be late (an encoder: later than half a sample)."""
 ONE_WAY: Final = 1e-3
@@ -62,7 +62,7 @@ BIWEIGHT: Final = 4.685
 REWEIGHTED: Final = 15
 """Rounds of reweighting: the columns are fixed to a thousandth after ten."""
 NODES: Final = 24
-"""Nodes of the friction that is none of a clock, each with the same share of the samples: a dozen in
+"""Nodes of the friction that is none of a clock, each with the same share of the samples: twelve in
 each direction follow a Stribeck curve."""
 STRETCHES: Final = 8
 """Stretches of a record whose slopes are compared."""

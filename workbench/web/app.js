@@ -66,14 +66,14 @@ function gone() {
 }
 function clearError() { $("error").hidden = true; }
 
-/* Ask the server for something. What is asked for while another answer is under way follows it, in order: a field that was changed would show what the server never heard of. The same work twice is once. */
+/* Ask the server for something. What is asked for while another answer is under way follows it, in order: a field that was changed would show what the server never heard of. The same work twice is once. Tells whether it was done. */
 function act(work) {
   if (app.doing.includes(work)) return app.acted;
   app.doing.push(work);
   app.sent = true;
   return (app.acted = app.acted.then(async () => {
     clearError(); surround();
-    try { await work(); } catch (error) { fail(error); } finally { app.doing.shift(); app.sent = app.doing.length > 0; surround(); goOn(); }
+    try { await work(); return true; } catch (error) { fail(error); return false; } finally { app.doing.shift(); app.sent = app.doing.length > 0; surround(); goOn(); }
   }));
 }
 

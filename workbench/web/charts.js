@@ -204,7 +204,7 @@ function againstCard(files) {
 }
 
 /* Hold parameters at values, or let them free: the model as it stands is fitted again on a branch of its own. */
-const held = (values) => act(async () => { await post("/joint", { hold: values, source: app.state.joint_source || "joint" }); await refresh(); }).then(() => { if ($("error").hidden) run("fit", {}, "parameters"); });
+const held = (values) => act(async () => { await post("/joint", { hold: values, source: app.state.joint_source || "joint" }); await refresh(); }).then((done) => { if (done) run("fit", {}, "parameters"); });
 
 /* Windows of a record that no fit takes: the one that is shown is left out, each can be taken back. */
 function leftOut(file, plot) {
@@ -241,9 +241,9 @@ function slidersCard(rows, error) {
         charts.replaceChildren(...made.charts.map((c) => h("figure", { class: "place" }, h("figcaption", {}, `${c.balance} balance: with the sliders (◆), with the fit (■)`), new ServedChart(c.chart, { name: `${c.balance} residual with the sliders` }).node)));
         figure.dataset.milliseconds = String(Math.round(performance.now() - began));
       } /* else: the sliders went back to the fit meanwhile */
-    } catch (e) { fail(e); }
+    } catch (e) { if (figure.isConnected) fail(e); } /* else: the fit that was asked is no more */
     state.busy = false;
-    if (state.again) { state.again = false; look(); } else figure.removeAttribute("aria-busy");
+    if (state.again && figure.isConnected) { state.again = false; look(); } else figure.removeAttribute("aria-busy");
   };
   const inputs = [];
   const row = ([name, p]) => {

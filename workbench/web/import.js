@@ -59,7 +59,7 @@ function columnMap(f) {
     body.replaceChildren(h("div", { class: "row" }, joint, kind, h("span", { class: "soft small" }, `${plural(found.rows, "row")}. Check the guess by what it says of the joint, then use it.`)),
       ...whole.map((q) => h("p", { class: "odd" }, sentence(q.text, q.text.endsWith("?") ? "?" : "."))), h("p", { class: "bad import-problem", hidden: !found.problem }, found.problem),
       h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": `Columns of ${f.name}` }, h("table", { class: "map-table" }, h("thead", {}, h("tr", {}, ["Column", "Shape", "Range", "Channel", "Unit, sign, scale, counts/turn", "Why"].map((t) => h("th", { scope: "col" }, t)))), h("tbody", {}, [...rows, ...extra].map((r) => [r.node, r.more.length ? h("tr", { class: "odd-row" }, h("td", { colspan: "6" }, r.more)) : null])))),
-      h("div", { class: "row gap" }, button(found.same > 1 ? `Use for all ${found.same} files with these columns` : "Use these columns", confirm, { kind: "primary", id: `use-${f.id}` }), f.status === "columns" ? null : button("Close", () => { app.drafts[opened] = false; render(false); }, { kind: "quiet", work: false })));
+      h("div", { class: "row gap" }, button(found.same > 1 ? `Use for all ${found.same} files with these columns` : "Use these columns", confirm, { kind: "primary", id: `use-${f.id}`, key: `use-${f.id}-${JSON.stringify(request)}` }), f.status === "columns" ? null : button("Close", () => { app.drafts[opened] = false; render(false); }, { kind: "quiet", work: false })));
     if (focus && $(focus)) $(focus).focus({ preventScroll: true });
   }
   ask(app.drafts[key] && (app.drafts[key].columns || app.drafts[key].now || app.drafts[key].number != null) ? app.drafts[key] : {});
