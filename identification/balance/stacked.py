@@ -31,6 +31,10 @@ TURN_SHARE: Final = 0.25
 either way.
 """
 
+FEW_SAMPLES: Final = 5
+"""Samples under which a kernel of the velocity tells little more than a step from one sample to the
+next."""
+
 SURE_JUMP: Final = 3.0
 """Standard deviations of noise from which what alternates from sample to sample is a jump."""
 NORMAL_MEDIAN: Final = 0.6745
@@ -325,9 +329,7 @@ def _either_way(
         )
         shares = []
         for w in records:
-            either = _either_direction(
-                w.points[f"{place}_velocity"], sources[source], w.grid, source
-            ).astype(float)
+            either = _either_direction(w, place, sources[source]).astype(float)
             shares.append(w.average(either))
             if lag:
                 shares[-1] = shares[-1] + lag * (np.abs(w.curving) @ either)
@@ -372,22 +374,31 @@ def sticking_torque(model: JointModel, values: Mapping[str, float], place: str) 
     return float(sum(abs(values[n]) for n in model.named("static", place)))
 
 
-def _either_direction(
-    velocity: FloatArray, noise: ChannelNoise, grid: Grid, source: str
-) -> npt.NDArray[np.bool_]:
-    """Points at which the direction is not known: slower than the noise, or nearer to a turn
-    than its kernel tells when it was.
+def _either_direction(record: WeakRecord, place: str, noise: ChannelNoise) -> npt.NDArray[np.bool_]:
+    """Points at which the direction is not known: slower than the noise, nearer to a turn than
+    its kernel tells when it was, or, where the kernel is no longer than a few samples, between a
+    move one way and one the other: dry friction makes a corner of a turn, or holds the joint
+    there, and a velocity across it says nothing.
     """
+    grid, source = record.grid, f"{place}_position"
+    velocity = record.points[f"{place}_velocity"]
     slow = np.abs(velocity) < 3 * grid.velocity_noise(source, noise)
     turns = np.diff(np.sign(velocity), append=velocity[-1]) != 0
-    reach = max(
-        0, whole(TURN_SHARE * (grid.pointwise[source] - TURN_KERNEL) / (grid.step * grid.dt))
-    )
+    apart = grid.step * grid.dt
+    reach = max(0, whole(TURN_SHARE * (grid.pointwise[source] - TURN_KERNEL) / apart))
     near = (
         np.convolve(turns, np.ones(2 * reach), "same") > 0
         if reach
         else np.zeros(len(velocity), dtype=bool)
     )
+    if grid.pointwise[source] < FEW_SAMPLES * grid.dt:
+        moved = np.diff(record.points[source])
+        one_step = np.zeros(grid.step + 1)
+        one_step[0], one_step[-1] = -1.0, 1.0
+        sure = 3 * noise.after(one_step, grid.dt)
+        way = np.sign(moved) * (np.abs(moved) > sure)
+        before, after = np.append(way[:1], way), np.append(way, way[-1:])
+        near |= (before != after) | (before == 0)
     return np.asarray(slow | near)
 
 

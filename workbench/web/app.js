@@ -82,9 +82,9 @@ function run(action, body, then) {
   return act(async () => {
     app.then = null;
     const begun = await post("/run", { action, ...body });
-    if (!then || !app.state) return;
-    app.then = { view: then, begun: begun.begun, revision: begun.revision };
-    arrive(app.state); /* short work may have ended before this answer came */
+    if (!app.state) return;
+    if (then) app.then = { view: then, begun: begun.begun, revision: begun.revision };
+    await refresh(); /* from now on the page knows that it runs, or, where it was short, that it has ended */
   });
 }
 
@@ -241,6 +241,7 @@ async function showPreview(file, data) {
 async function upload(files) {
   clearError();
   const list = [...files].sort((a, b) => b.name.endsWith(".toml") - a.name.endsWith(".toml"));
+  await app.acted; /* a session that is being opened is the one they are for */
   for (const file of list) {
     if (file.size > app.config.max_upload) { fail(new Error(`${file.name}: ${Math.round(file.size / 1e6)} MB is over the limit of ${Math.round(app.config.max_upload / 1e6)} MB; cut it, save it as NPZ, or start with: irj app FILE`)); continue; }
     app.upload = { text: `sending ${file.name}`, share: 0 };
