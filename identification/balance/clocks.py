@@ -173,6 +173,8 @@ def in_time(
         shifts = {p: k for p, k in moved.items() if k}
         made = make(shifts)
     for place in LOW_PASSED & shifts.keys():
+        if abs(shifts[place]) > MOST_SKEW:
+            continue  # what is later is no filter of a drive
         # a shift of zero keeps the rows: what is compared are the same instants
         unshifted = {**shifts, place: 0.0}
         other = make(unshifted)
@@ -211,7 +213,7 @@ def _any_friction(record: WeakRecord, kept: npt.NDArray[np.bool_]) -> FloatArray
     says nothing of a clock.
     """
     points = record.points["motor_velocity"]
-    moving = points[points != 0.0]
+    moving = points[points != 0.0] if np.any(points) else points
     nodes = np.unique(np.quantile(moving, np.linspace(0.0, 1.0, NODES)))
     hats = [np.interp(points, nodes, unit) for unit in np.eye(len(nodes))]
     return np.column_stack([record.average(hat)[kept] for hat in hats])

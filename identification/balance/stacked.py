@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, final
 
 import numpy as np
@@ -19,7 +19,7 @@ from identification.balance.colour import ChannelNoise
 from identification.balance.dataset import Dataset
 from identification.balance.drawn_noise import draws_of
 from identification.balance.memory import numbers_of
-from identification.balance.weak import Grid, WeakRecord, whole
+from identification.balance.weak import WeakRecord, whole
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -30,6 +30,9 @@ TURN_SHARE: Final = 0.25
 """Share of what a kernel is longer than that by which the instant of a turn may be wrong,
 either way.
 """
+
+SCALED: Final = ("drive", "torque")
+"""Measured signals whose scale a balance has: what is left of it has the same."""
 
 FEW_SAMPLES: Final = 5
 """Samples under which a kernel of the velocity tells little more than a step from one sample to the
@@ -246,6 +249,46 @@ def references(data: Dataset, records: Sequence[WeakRecord]) -> dict[str, FloatA
     torque is measured, the twist about its middle.
     """
     return {b: np.concatenate([measured(b, w) for w in records]) for b in data.sensing.balances}
+
+
+def passed_on(
+    model: JointModel, data: Dataset, values: Mapping[str, float]
+) -> dict[str, FloatArray]:
+    """What a standard deviation of the measured torques makes of each row of the balances, training
+    and then held-out rows, (rows,) each.
+
+    A law that takes a share of a measured torque scales the whole balance, noise and errors of the
+    model with it: what is left is shorter and no smaller.
+    """
+    records = [*data.train, *data.held_out]
+    balances = balances_of(model, data.sensing, wrt=())
+    values = settled(model, data.sensing, records, values)
+    found: dict[str, list[FloatArray]] = {b: [] for b in balances.balances}
+    for record in records:
+        own = values_on(model, record, values)
+        before = balances.evaluate(record, own)
+        power = {b: np.zeros(record.rows) for b in found}
+        for channel in SCALED:
+            if channel not in data.sources or channel not in record.points:
+                continue
+            size = data.sources[channel].level
+            moved = replace(
+                record,
+                points=_higher(record.points, channel, size),
+                smooth=_higher(record.smooth, channel, size),
+                averaged=_higher(record.averaged, channel, size),
+            )
+            after = balances.evaluate(moved, own, remembered=record)
+            for b in power:
+                power[b] += (after[b][0] - before[b][0]) ** 2
+        for b, squares in power.items():
+            found[b].append(np.sqrt(squares))
+    return {b: np.concatenate(parts) for b, parts in found.items()}
+
+
+def _higher(signals: Mapping[str, FloatArray], channel: str, size: float) -> dict[str, FloatArray]:
+    """The signals with one of them higher by so much."""
+    return {**signals, channel: signals[channel] + size}
 
 
 def measured(balance: str, record: WeakRecord) -> FloatArray:

@@ -18,6 +18,7 @@ from identification.balance.balances import Balances, balances_of
 from identification.balance.calibration import bare, names_of_runs, settled, within_limits
 from identification.balance.dataset import HOLD_NAME
 from identification.balance.noise import effective_share
+from identification.balance.stacked import passed_on
 from identification.balance.weak import WeakRecord
 from identification.diagnosis.candidates import Candidate, NotTestable, shape_grid
 from identification.fitting.covariance import wald
@@ -155,6 +156,11 @@ class Base:
         ):
             np.matmul(left[first:end].T, right[first:end], out=out[b, k])
         return out
+
+    @cached_property
+    def passed(self) -> dict[str, FloatArray]:
+        """What the base passes on of the measured torques, row by row."""
+        return passed_on(self.solution.model, self.data, self.solution.values)
 
     @cached_property
     def plain(self) -> FloatArray:
@@ -525,19 +531,42 @@ def _score(
     if not np.any(amplitude):
         return None
     told = _told(base, sse1)
+    values = {**shapes, **dict(zip(candidate.amplitudes, map(float, amplitude), strict=True))}
+    unit = np.ones(len(base.balances))
+    if told["gain"] > 0:
+        unit = _unit(candidate, base, values)
+        told = _told(base, sse1 / unit**2)
     where = base.balances.index(told["balance"])
     held = _held_out_drop(
         candidate, base, balances=balances, shapes=shapes, delta=delta, size=size, where=where
     )
     return Trial(
         candidate,
-        {**shapes, **dict(zip(candidate.amplitudes, map(float, amplitude), strict=True))},
-        held_out_drop_percent=held,
+        values,
+        held_out_drop_percent=100 - (100 - held) / float(unit[where]),
         p_value=_wald(added, base, delta),
         outside=inside,
         contribution=float(np.sqrt(np.mean((raw[base.balance == where] @ amplitude) ** 2))),
         **told,
     )
+
+
+def _unit(candidate: Candidate, base: Base, values: Mapping[str, float]) -> FloatArray:
+    """Length that what is left of each balance has under a candidate where it is 1 under the base,
+    (balances,): where the torque of the link follows from the motion, a wrong gain of it only takes
+    its noise away.
+    """
+    model, data = candidate.model, base.data
+    started = {p.name: p.start for p in model.parameters}
+    own = passed_on(model, data, {**started, **base.solution.values, **values})
+    rows = len(base.block) // len(base.balances)
+    taking = (base.block >= 0).reshape(len(base.balances), rows)
+    out = []
+    for k, b in enumerate(base.balances):
+        kept = taking[k] & (base.passed[b][:rows] > 0) & (own[b][:rows] > 0)
+        share = own[b][:rows][kept] / base.passed[b][:rows][kept]
+        out.append(math.sqrt(float(np.mean(share**2))) if len(share) else 1.0)
+    return np.array(out)
 
 
 def _told(base: Base, sse1: FloatArray) -> dict[str, Any]:
@@ -571,42 +600,6 @@ def _told(base: Base, sse1: FloatArray) -> dict[str, Any]:
             )
         ),
     }
-
-
-def by_whole_fit(
-    trial: Trial,
-    base: Base,
-    values: Mapping[str, float],
-    *,
-    left: FloatArray,
-    held_left: FloatArray,
-) -> Trial:
-    """A trial as its whole fit has it, in place of the linear one.
-
-    Parameters
-    ----------
-    trial : Trial
-    base : Base
-        What it was tried on.
-    values : mapping
-        Of the whole fit.
-    left, held_left : (rows,) array
-        What the whole fit leaves of the rows of the base, unweighted.
-    """
-    rows, used = left * base.weight, base.block >= 0
-    sse = np.zeros(base.crossed.shape)
-    np.add.at(sse, (base.block[used], base.balance[used]), rows[used] ** 2)
-    told = _told(base, sse)
-    held = math.nan
-    if len(held_left):
-        here = base.held_balance == base.balances.index(told["balance"])
-        before, after = (
-            (x - base.held_own @ (base.held_own.T @ x))[here]
-            for x in (base.held_residual, held_left * base.held_weight)
-        )
-        held = 100 * (1 - math.sqrt(float(after @ after) / max(float(before @ before), 1e-300)))
-    own = {n: float(values[n]) for n in trial.values}
-    return replace(trial, values=own, held_out_drop_percent=held, **told)
 
 
 def _bordered(base: Base, added: FloatArray) -> FloatArray:

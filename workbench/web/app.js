@@ -320,6 +320,10 @@ async function boot() {
     const key = e.key.toLowerCase(), asked = key === "y" || (key === "z" && e.shiftKey) ? "redo" : key === "z" ? "undo" : null;
     if (asked && !$(asked).disabled) { e.preventDefault(); run(asked); }
   });
+  await act(start); /* what is clicked meanwhile follows */
+}
+
+async function start() {
   app.config = await call("GET", "/api/config");
   const asked = new URLSearchParams(location.hash.slice(1));
   const known = asked.get("session") || remembered("irj-session");

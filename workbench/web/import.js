@@ -47,13 +47,16 @@ function columnMap(f) {
       if (half && !(half.parts.channel.value && half.parts.formula.value.trim()) && !(event.target === half.parts.channel && !event.target.value)) return;
       const columns = read(); if (Object.keys(columns).length) ask({ columns, kind: kind.value, number: found.number });
     }
-    const confirm = () => act(async () => {
-      const answer = await post(`/file/${f.id}`, { columns: read(), kind: app.state.joint_text ? "" : kind.value, all: true });
-      const taken = answer.status === "ready" || answer.status === "checking";
-      if (taken) app.drafts[opened] = false;
-      await refresh();
-      if (taken) render(false); else throw new Error(answer.message);
-    });
+    const confirm = () => {
+      app.drafts[opened] = false; /* now: who opens it again before the answer has come is right */
+      return act(async () => {
+        const answer = await post(`/file/${f.id}`, { columns: read(), kind: app.state.joint_text ? "" : kind.value, all: true });
+        const taken = answer.status === "ready" || answer.status === "checking";
+        await refresh();
+        if (!taken) throw new Error(answer.message);
+        render(false);
+      }).then((done) => { if (!done) app.drafts[opened] = true; });
+    };
     const whole = [...found.questions, ...found.findings.map((x) => ({ channel: x.channel, text: x.message }))].filter((q) => !q.channel || !found.proposed.some((p) => p.channel === q.channel));
     const focus = document.activeElement && body.contains(document.activeElement) ? document.activeElement.id : null;
     body.replaceChildren(h("div", { class: "row" }, joint, kind, h("span", { class: "soft small" }, `${plural(found.rows, "row")}. Check the guess by what it says of the joint, then use it.`)),

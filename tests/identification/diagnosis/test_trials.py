@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +14,7 @@ from scipy.stats import f as fisher
 
 from casadi_models import EFFECTS
 from identification.balance.balances import balances_of
+from identification.balance.stacked import passed_on
 from identification.data.check.gate import passed
 from identification.data.joint_file import Joint, load_joint
 from identification.data.read import read
@@ -30,6 +32,7 @@ from identification.diagnosis.trials import (
     try_candidate,
 )
 from identification.fitting.engine import load_dataset, prepared_model, solve
+from tests.recorded_world.world import TROUBLES, make_case, write_case
 from tests.smooth_laws import COULOMB, Law, record
 
 FloatArray = npt.NDArray[np.float64]
@@ -367,10 +370,18 @@ def test_an_effect_belongs_to_the_balance_that_it_helps_most(key: str, elastic: 
             more = np.append(plain, 0.0)
         before[tested] += (own @ plain)[tested]
         after[tested] += (both @ more)[tested]
+    model, values = found.candidate.model, {**base.solution.values, **found.values}
+    started = {p.name: p.start for p in model.parameters}
+    own_noise = passed_on(base.solution.model, base.data, base.solution.values)
+    noise = passed_on(model, base.data, {**started, **values})
     falls = []
-    for k in range(len(base.balances)):
+    for k, b in enumerate(base.balances):
         rows = used & (base.balance == k)
-        falls.append(rows.sum() * math.log(np.sum(before[rows] ** 2) / np.sum(after[rows] ** 2)))
+        kept = rows.reshape(len(base.balances), -1)[k]
+        n = len(kept)
+        unit = np.mean((noise[b][:n][kept] / own_noise[b][:n][kept]) ** 2)
+        left = np.sum(before[rows] ** 2) / (np.sum(after[rows] ** 2) / unit)
+        falls.append(rows.sum() * math.log(left))
     best = falls[base.balances.index(found.balance)]
     assert best == pytest.approx(max(falls), abs=1e-6)
     assert found.score == pytest.approx(KERNEL_SHARE / 2 * sum(falls), rel=1e-3, abs=1e-3)
@@ -395,3 +406,20 @@ def test_the_base_holds_every_parameter_whatever_its_unit(twist: float) -> None:
     assert "cubic_stiffness" not in solution.at_bound
     assert solution.stderr["cubic_stiffness"] is not None
     assert "cubic_stiffness" in make_base(solution, data).names
+
+
+def test_a_gain_that_only_takes_noise_away_is_none() -> None:
+    """The torque of the link follows from the motion on this axis; what is left of it is noise."""
+    case = make_case(60104, without=[t for t in TROUBLES if t != "noise"], names=())
+    with TemporaryDirectory() as folder:
+        written = write_case(case, Path(folder), "all")
+        joint = load_joint(written / "joint.toml")
+        run = read(written / "train.csv", joint=joint)
+    model = prepared_model(joint, run)
+    data = load_dataset([run], [], joint, model)
+    base = make_base(solve(model, data), data)
+    found = try_candidate(candidate(base, "torque_sensor_gain", "torque_sensor"), base)
+    assert isinstance(found, Trial)
+    assert abs(found.values["torque_sensor_gain"]) > 0.1  # a slope over a column of noise
+    assert abs(found.cv_drop_percent) < 2.0
+    assert found.gain < 20.0
