@@ -49,6 +49,8 @@ UNSEEN: Final = 1.0
 """Standard deviations, over all rows together, by which a change of a shape by all of its size must
 move them to be seen at all."""
 
+MINOR_DROP: Final = 2.5
+"""Cross-validated fall from which a small effect is told [%]: a quarter of what a claim asks."""
 DEPENDENT: Final = 1e-9
 """Singular value, as a share of the largest one, below which columns are dependent: far over the
 rounding of their sums, far below what records can show.
@@ -533,7 +535,7 @@ def _score(
     told = _told(base, sse1)
     values = {**shapes, **dict(zip(candidate.amplitudes, map(float, amplitude), strict=True))}
     unit = np.ones(len(base.balances))
-    if told["gain"] > 0:
+    if told["cv_drop_percent"] >= MINOR_DROP:
         unit = _unit(candidate, base, values)
         told = _told(base, sse1 / unit**2)
     where = base.balances.index(told["balance"])
