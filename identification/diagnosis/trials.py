@@ -635,6 +635,42 @@ def _told(base: Base, sse1: FloatArray) -> dict[str, Any]:
     }
 
 
+def by_whole_fit(
+    trial: Trial,
+    base: Base,
+    values: Mapping[str, float],
+    *,
+    left: FloatArray,
+    held_left: FloatArray,
+) -> Trial:
+    """A trial as its whole fit has it, in place of the linear one.
+
+    Parameters
+    ----------
+    trial : Trial
+    base : Base
+        What it was tried on.
+    values : mapping
+        Of the whole fit.
+    left, held_left : (rows,) array
+        What the whole fit leaves of the rows of the base, unweighted.
+    """
+    rows, used = left * base.weight, base.block >= 0
+    sse = np.zeros(base.crossed.shape)
+    np.add.at(sse, (base.block[used], base.balance[used]), rows[used] ** 2)
+    told = _told(base, sse)
+    held = math.nan
+    if len(held_left):
+        here = base.held_balance == base.balances.index(told["balance"])
+        before, after = (
+            (x - base.held_own @ (base.held_own.T @ x))[here]
+            for x in (base.held_residual, held_left * base.held_weight)
+        )
+        held = 100 * (1 - math.sqrt(float(after @ after) / max(float(before @ before), 1e-300)))
+    own = {n: float(values[n]) for n in trial.values}
+    return replace(trial, values=own, held_out_drop_percent=held, **told)
+
+
 def _bordered(base: Base, added: FloatArray) -> FloatArray:
     """Products within each block and balance with a candidate's columns between those of the
     base and the residual.
