@@ -57,7 +57,7 @@ function knownAsk(item, rows) {
     const typed = knownAll(host), [[name, entry]] = Object.entries(typed);
     const { problem } = typedNumber(entry.value, words(name), null, null);
     if (problem) { fail(new Error(problem)); $(`${prefix}-${name}-value`).focus(); return; }
-    act(async () => { await post("/joint", { hold: typed, source: app.state.joint_source || "joint" }); await refresh(); }).then(() => { if ($("error").hidden) run("fit", {}, "diagnose"); });
+    act(async () => { await post("/joint", { hold: typed, source: app.state.joint_source || "joint" }); await refresh(); }).then((done) => { if (done) run("fit", {}, "diagnose"); });
   };
   return h("div", { class: "asked" }, which, host, button("Give it and fit again", give, { id: `${prefix}-give`, label: `Give it and fit again, for ${item.title}` }));
 }
