@@ -28,10 +28,20 @@ UNSEEN_TURN: Final = (
 @final
 @dataclass(frozen=True)
 class NotTestable:
-    """An effect that these records cannot show, and why."""
+    """An effect that these records cannot show, and why.
+
+    Attributes
+    ----------
+    effect : str
+    why : str
+        What is said.
+    asks : tuple of str
+        Parameters, one of which must be known for it.
+    """
 
     effect: str
     why: str
+    asks: tuple[str, ...] = ()
 
 
 @final
@@ -127,7 +137,7 @@ def offered(
             continue
         why = _why_not(effect, model, data)
         if why:
-            refused.append(NotTestable(effect.key, why))
+            refused.append(NotTestable(effect.key, why, _asked(effect, model, data, why)))
             continue
         places = [
             p
@@ -226,6 +236,16 @@ def _why_not(effect: Effect, model: JointModel, data: Dataset) -> str:
         )
     there = _conditions(data)
     return next((r.why for r in effect.requires if not r.met(there)), "")
+
+
+def _asked(effect: Effect, model: JointModel, data: Dataset, why: str) -> tuple[str, ...]:
+    """Parameters, one of which must be known so that this reason goes."""
+    there = _conditions(data)
+    unmet = next((r for r in effect.requires if not r.met(there)), None)
+    if unmet is None or unmet.why != why:
+        return ()
+    wanted = tuple(c for c in unmet.any_of if c not in (TORQUE_SENSOR, SECOND_BALANCE))
+    return model.inertias if wanted == (ANYTHING_KNOWN,) else wanted
 
 
 def _conditions(data: Dataset) -> frozenset[str]:

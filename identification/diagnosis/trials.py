@@ -13,13 +13,14 @@ from typing import Any, Final, final
 import numpy as np
 import numpy.typing as npt
 
-from casadi_models import Effect, JointModel
+from casadi_models import EFFECTS, Effect, JointModel
 from identification.balance.balances import Balances, balances_of
 from identification.balance.calibration import bare, names_of_runs, settled, within_limits
 from identification.balance.dataset import HOLD_NAME
 from identification.balance.noise import effective_share
 from identification.balance.stacked import drawn_floors, passed_on, rms, taking_part
 from identification.balance.weak import WeakRecord
+from identification.data.formats import words
 from identification.diagnosis.candidates import Candidate, NotTestable, shape_grid
 from identification.fitting.covariance import wald
 from identification.fitting.engine import Dataset, Solution, Stacked, row_weights, stack
@@ -504,7 +505,9 @@ def _refined(
 def _collinear_reason(candidate: Candidate) -> str:
     if candidate.effect.is_delay:
         return "what is late up to 3.5 samples is in the calibration already"
-    names = ", ".join(candidate.effect.confused_with) or "what the model has already"
+    alike = candidate.effect.confused_with
+    titles = ", ".join(EFFECTS[n].title if n in EFFECTS else words(n) for n in alike)
+    names = titles or "what the model has already"
     separate = (
         f"; {candidate.effect.separate_by} would separate them"
         if candidate.effect.separate_by

@@ -448,6 +448,15 @@ def parser() -> OneLineParser:
     )
     tracked.add_argument("--report", metavar="FILE", help="write the HTML report")
     tracked.add_argument(
+        "--follow",
+        type=float,
+        nargs="?",
+        const=10.0,
+        metavar="SECONDS",
+        help="the record is still being written: follow it, and print what is found at once, until "
+        "it has not grown for SECONDS (10)",
+    )
+    tracked.add_argument(
         "--inject",
         metavar="SENSOR:KIND:START[:SIZE[:END]]",
         action="append",
@@ -609,6 +618,13 @@ def parser() -> OneLineParser:
         "files", nargs="*", metavar="FILES", help="records and a joint file to begin with"
     )
     app.add_argument("--port", type=_port, default=0, help="port of the page (0: any free one)")
+    app.add_argument(
+        "--follow",
+        metavar="FILE",
+        action="append",
+        default=[],
+        help="a CSV file that is being written: the Replay page can follow it",
+    )
     app.add_argument("--no-browser", action="store_true", help="print the address, open nothing")
     text = "completion of verbs and options for your shell"
     completed = verbs.add_parser("completion", help=text, description=text)

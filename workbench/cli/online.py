@@ -9,11 +9,13 @@ import sys
 from argparse import Namespace
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
+from identification.data.formats import words
 from identification.errors import InputError
 from irj_fmu.command_line import counted
 from irj_fmu.estimator.healthy import online_readings
@@ -26,14 +28,16 @@ from workbench.cli.files import (
     write_bytes,
     write_json,
 )
+from workbench.cli.following.growing import Growing, follow
+from workbench.cli.following.stepper import Stepper, arrays_of, fault_text
 from workbench.cli.renewed import renewed
-from workbench.show.replayed import AFTERMATH, READINGS, UNESTIMATED, Replay
+from workbench.show.replayed import READINGS, UNESTIMATED, Replay, standing
 
 if TYPE_CHECKING:
     from identification.data.joint_file import Joint
     from identification.data.record import Record
     from identification.faults.bank import FaultBank
-    from identification.faults.detector import Fault, FaultEvent
+    from identification.faults.detector import Fault
     from identification.planning.trajectories import Selection
 
 FloatArray = npt.NDArray[np.float64]
@@ -45,6 +49,8 @@ POINTS: Final = 400
 def run_track(arguments: Namespace) -> int:
     """`irj track`: 1 where ``--fail-on-fault`` was given and a fault was found."""
     joint = open_joint(arguments.joint)
+    if getattr(arguments, "follow", None) is not None:
+        return _run_follow(arguments, joint)
     tried = [parse_fault(text) for text in getattr(arguments, "inject", None) or []]
     records, raw, warnings = _open_doubtful(arguments.records, joint)
     healthy, more = open_records(arguments.healthy, joint)
@@ -79,6 +85,38 @@ def run_track(arguments: Namespace) -> int:
         )
         print(f"{page}: report written")
     return 1 if arguments.fail_on_fault and any(r["events"] for r in results) else 0
+
+
+def _run_follow(arguments: Namespace, joint: Joint) -> int:
+    """`irj track --follow`: what is said is printed as it is said, and what stands at the end."""
+    if len(arguments.records) != 1 or arguments.inject or arguments.report:
+        raise InputError(
+            "--follow: give one record, without --inject and --report; track it again with them "
+            "when it is complete"
+        )
+    if not arguments.follow > 0:
+        raise InputError(f"--follow {arguments.follow:g}: give seconds above 0")
+    healthy, warnings = open_records(arguments.healthy, joint)
+    said, made = 0, None
+    with Growing(Path(arguments.records[0]), joint) as source:
+        try:
+            for made in follow(
+                source, joint, lambda first: limits(joint, first, healthy), quiet=arguments.follow
+            ):
+                for time, event in made.verdicts[said:]:
+                    names = ", ".join(words(n) for n in event.sensors)
+                    print(f"{time:.6g} s: {names + ': ' if names else ''}{event.verdict}")
+                    sys.stdout.flush()
+                said = len(made.verdicts)
+        except KeyboardInterrupt:
+            sys.stderr.write("irj: stopped; this is what came until then\n")
+    if made is None:
+        return 130
+    result = made.as_json()
+    _print_track(result)
+    print(f"  {standing(made.verdicts, watched=made.watched)}")
+    write_json(arguments.json, {"records": [result], "warnings": warnings})
+    return 1 if arguments.fail_on_fault and result["events"] else 0
 
 
 def _banks(
@@ -312,57 +350,19 @@ def replay(
         valid = (np.array(valid) & ~failed).tolist()
     rows = np.nan_to_num(readings).tolist()
     every = max(1, len(even) // POINTS)
-    course: list[tuple[float, FloatArray, FloatArray, FloatArray]] = []
-    looks: list[tuple[int, list[float]]] = []
-    events: list[dict[str, Any]] = []
-    verdicts: list[tuple[float, FaultEvent]] = []
-    fault, detector = 0, estimator.detector
+    stepper = Stepper(estimator, every, told=judged is None)
+    detector = estimator.detector
     for part in even.segments():
-        estimator.reset()
-        told = None
-        worst = [0.0] * len(READINGS)
-        before: tuple[bool, ...] = (False,) * len(READINGS)
-        quiet = [-math.inf] * len(READINGS)
+        stepper.restart()
         for k in range(part.start, part.stop):
-            now = float(even.time[k])
-            estimator.update(now, rows[k], valid[k])
-            worst = [max(a, b) for a, b in zip(worst, estimator.score, strict=True)]
-            codes = []
+            looked = stepper.feed(float(even.time[k]), rows[k], valid[k])
             if detector is not None:
-                if detector.last_event is not told:
-                    verdicts += [(now, e) for e in _since(detector.events, told)]
-                    told = detector.last_event
-                replaced = detector.replaced
-                used[k], failed[k] = estimator.readings, replaced
-                if replaced != before:
-                    codes = [
-                        i + (1 if valid[k][i] else 11)
-                        for i in range(len(READINGS))
-                        if replaced[i] and not before[i]
-                    ]
-                    quiet = [
-                        now + AFTERMATH if r or b else q
-                        for r, b, q in zip(replaced, before, quiet, strict=True)
-                    ]
-                    before = replaced
-            if judged is None and estimator.fault != fault:
-                fault = estimator.fault
-                # a reading that is replaced has been reported when that began
-                known = fault not in (7, 8, 9) and (
-                    before[fault % 10 - 1] or now < quiet[fault % 10 - 1]
-                )
-                codes += [fault] if fault and not known else []
-            events += [{"time": now, "fault": code, "text": fault_text(code)} for code in codes]
-            if (k + 1) % every:
-                continue
-            looks.append((k, worst))
-            worst = [0.0] * len(READINGS)
-            if not estimator.warming_up:
-                course.append(
-                    (now, estimator.theta.copy(), estimator.sigma.copy(), estimator.ratio.copy())
-                )
-            progress(f"tracking {record.name}", (k + 1) / len(even))
+                used[k], failed[k] = estimator.readings, detector.replaced
+            if looked:
+                progress(f"tracking {record.name}", (k + 1) / len(even))
         progress(f"tracking {record.name}", part.stop / len(even))
+    course, looks, verdicts = stepper.course, stepper.looks, stepper.verdicts
+    events = stepper.events
     if judged is not None:
         events = [_bank_event(e) for e in judged.events]
     if not course and not events:
@@ -376,10 +376,7 @@ def replay(
             f"{record.name}: {even.duration:.3g} s {where} for the first window of "
             f"{options.warm_up:g} s; give a longer record"
         )
-    widths = ((), (len(estimator.names),), (len(estimator.names),), (len(estimator.balances),))
-    time, values, sigmas, ratios = (
-        np.array([row[i] for row in course]).reshape(-1, *w) for i, w in enumerate(widths)
-    )
+    time, values, sigmas, ratios = arrays_of(course, estimator)
     return Replay(
         even,
         estimator,
@@ -403,12 +400,6 @@ def replay(
     )
 
 
-def _since(events: Sequence[FaultEvent], known: FaultEvent | None) -> Sequence[FaultEvent]:
-    """Events after one that is known; all where the detector has started anew."""
-    places = [k for k, e in enumerate(events) if e is known]
-    return events[places[-1] + 1 :] if places else events
-
-
 def _bank_event(event: dict[str, Any]) -> dict[str, Any]:
     """An event of a bank with the words of its code."""
     from identification.faults.detector import SENSORS
@@ -419,27 +410,6 @@ def _bank_event(event: dict[str, Any]) -> dict[str, Any]:
         names = [READINGS[SENSORS.index(n)] for n in event["sensors"]]
         text = f"{' or '.join(names)} failed; the readings cannot tell which"
     return {"time": event["time"], "fault": event["fault"], "text": text, "first": event["first"]}
-
-
-def fault_text(code: int) -> str:
-    """What a fault code means, in words."""
-    if code == 7:
-        return "motor current sensor failed or motor friction changed"
-    if code == 8:
-        return "the joint changed, the sensors agree with each other"
-    if code == 9:
-        return (
-            "the readings cannot be those of the joint, or stand still while it moves; the "
-            "estimate is held"
-        )
-    kind, sensor = divmod(code, 10)
-    what = (
-        "sensor failed",
-        "reading missing",
-        "reading constant while the joint moves",
-        "reading of wrong scale",
-    )[kind]
-    return f"{READINGS[sensor - 1]}: {what}"
 
 
 def _print_track(result: dict[str, Any]) -> None:

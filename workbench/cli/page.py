@@ -16,5 +16,5 @@ def run_app(arguments: Namespace) -> int:
             f"the page needs {(error.name or 'starlette').partition('.')[0]}; install it with: "
             "pip install 'irj[app]'"
         ) from None
-    serve(arguments.files, arguments.port, not arguments.no_browser)
+    serve(arguments.files, arguments.port, not arguments.no_browser, follow=arguments.follow)
     return 0

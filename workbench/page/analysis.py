@@ -372,7 +372,12 @@ class Analysis:
                 "claim": claim,
                 "unit": unit,
                 "not_testable": [
-                    {"effect": n.effect, "title": EFFECTS[n.effect].title, "why": n.why}
+                    {
+                        "effect": n.effect,
+                        "title": EFFECTS[n.effect].title,
+                        "why": n.why,
+                        "asks": list(n.asks),
+                    }
                     for n in ranking.not_testable
                 ],
             }

@@ -15,7 +15,7 @@ from identification.data.joint_file import parse_joint
 from identification.data.joint_schema import JOINT
 from identification.data.plain_text import from_toml, tables_text
 from identification.errors import InputError
-from workbench.page.charts.choices import held_text, windows_of
+from workbench.page.charts.choices import held_text, known_entry, windows_of
 from workbench.page.desk.tree import LONGEST_NAME, given, opened, remarked, used_files
 from workbench.page.live import SOON, Live
 from workbench.page.records import guessed_role, surveyed
@@ -273,7 +273,15 @@ def _from_form(body: Mapping[str, Any], previous: Mapping[str, Any]) -> dict[str
             "gear_ratio is empty; give theta_motor / theta_link with its sign (1 where "
             "everything is measured on one side)"
         )
-    whole = {**previous, "joint": table}
+    typed = body.get("known", {})
+    if not isinstance(typed, Mapping) or not all(isinstance(e, Mapping) for e in typed.values()):
+        raise InputError("known must be a table of parameters, each with its fields")
+    given_before: Mapping[str, Any] = previous.get("known", {})
+    entries = {n: known_entry(n, e, given_before.get(n)) for n, e in typed.items()}
+    changed = {n: e for n, e in entries.items() if e and e != _as_entry(given_before.get(n))}
+    gone = {n for n, e in entries.items() if not e}
+    stays = {n: e for n, e in given_before.items() if n not in gone and n not in changed}
+    whole = {**previous, "joint": table, "known": stays}
     if any(before.get(k, v) != table.get(k, v) for k, v in DRIVE_TRAIN.items()):
         for part in ("fitted", "calibration", "provenance"):
             whole.pop(part, None)
@@ -282,8 +290,13 @@ def _from_form(body: Mapping[str, Any], previous: Mapping[str, Any]) -> dict[str
     except InputError as error:
         if "[known]" not in str(error):
             raise
-        whole["known"] = {k: v for k, v in whole["known"].items() if _fits(whole, k, v)}
-    return whole
+        whole["known"] = {k: v for k, v in stays.items() if _fits(whole, k, v)}
+    whole["known"] = {**whole["known"], **changed}  # what is typed now is refused, not left out
+    return {k: v for k, v in whole.items() if k != "known" or v}
+
+
+def _as_entry(given: Any) -> Any:
+    return given if isinstance(given, Mapping) else {"value": given}
 
 
 def _fits(whole: Mapping[str, Any], name: str, entry: Any) -> bool:

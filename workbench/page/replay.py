@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import math
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,11 +19,14 @@ from identification.data.plain_text import from_toml
 from identification.data.record import Record
 from identification.errors import InputError
 from irj_fmu.estimator.healthy import detector_state, online_readings
+from workbench.cli.following.growing import Growing
+from workbench.cli.following.growing import follow as growing
 from workbench.cli.online import replay as followed
 from workbench.page.analysis import Progress, clean
+from workbench.page.desk.sources import source_of, stopped
 from workbench.page.jobs.place import Place
 from workbench.page.session import StepEntry, write_atomic
-from workbench.show.replayed import READINGS, Replay
+from workbench.show.replayed import READINGS, Replay, standing
 
 if TYPE_CHECKING:
     from identification.faults.detector import Fault
@@ -40,6 +44,8 @@ SHARE: Final = {"bias": 0.1, "noise": 0.1, "spike": 0.3, "drift": 0.02}
 """Size of a tried fault as a share of the reading's range (of a drift: per second)."""
 GAIN: Final = 0.2
 FILE: Final = "replay.json"
+REWRITTEN: Final = 0.5
+"""Time between two writings of what a growing file gives [s]: half of that between two looks."""
 
 
 @final
@@ -126,37 +132,90 @@ def replay(
         )
     tried, note = _tried(part, joint, asked)
     progress("taking the limits from the records of the fit", 0.02)
-    healthy = [f.id for f in live.state.files if f.status == "ready" and f.role == "train"]
-    dt = part.resampled().dt
-    mark = (steps[-1].values, steps[-1].effects, healthy, round(dt, 9))
-    known = live.kept.get("limits")
-    if known is None or known[0] != mark:
-        known = live.kept["limits"] = (
-            mark,
-            _limits(joint, options, [live.record(i) for i in healthy], dt),
-        )
-    state, why = known[1]
+    state, why = _limits_here(live, steps, joint, options, part.resampled().dt)
     made = followed(
         part, joint, state, tried, progress=lambda text, share: progress(text, 0.05 + 0.9 * share)
     )
+    asked_for = {"file": asked.file, "sensor": asked.sensor, "kind": asked.kind}
+    return _kept(folder, made, steps, {"note": note, "no_detector": why, "asked": asked_for})
+
+
+def follow(
+    live: Place, steps: Sequence[StepEntry], name: str, folder: Path, progress: Progress
+) -> Path:
+    """Follow a file that is being written with the fitted joint; the result in `folder` is written
+    anew as it grows.
+
+    Raises
+    ------
+    InputError
+        Nothing is fitted; the file may not be followed, or cannot be used.
+    """
+    if not steps:
+        raise InputError("follow: fit first, the estimator starts from the fitted joint")
+    path = source_of(live.session.folder.parent, name)
+    joint = parse_joint(from_toml(live.analysis().to_joint_file(), "joint"), "joint")
+    why, made, written = "", None, 0.0
+
+    def state_of(first: Record) -> bytes | None:
+        from identification.online.estimator import OnlineOptions
+
+        nonlocal why
+        progress("taking the limits from the records of the fit", 0.0)
+        options = OnlineOptions(
+            has_link=first.has("link_position"), has_torque=first.has("link_torque")
+        )
+        state, why = _limits_here(live, steps, joint, options, first.dt)
+        return state
+
+    stopped(folder)  # what was asked of an earlier one
+    (folder / FILE).unlink(missing_ok=True)
+    progress(f"waiting for {path.name}", 0.0)
+    with Growing(path, joint) as source:
+        for made in growing(source, joint, state_of, stop=lambda: stopped(folder)):
+            now = float(made.record.time[-1])
+            progress(f"following {path.name}, {now:.0f} s", 0.0)
+            if len(made.time) and time.monotonic() - written > REWRITTEN:
+                written = time.monotonic()
+                _kept(folder, made, steps, {"no_detector": why, "live": True})
+    if made is None:
+        raise InputError(f"follow: nothing came into {path.name}; start the recording first")
+    return _kept(folder, made, steps, {"no_detector": why})
+
+
+def _kept(folder: Path, made: Replay, steps: Sequence[StepEntry], more: Mapping[str, Any]) -> Path:
     estimator = made.estimator
     found = clean(
         {
             **_result(made),
-            "record": whole.name,
+            "record": made.record.name,
             "effects": list(steps[-1].effects),
             "start": float(made.record.time[0]),
-            "note": note,
-            "no_detector": why,
+            "note": "",
             "detector": estimator.detector is not None,
-            "asked": {"file": asked.file, "sensor": asked.sensor, "kind": asked.kind},
             "unit": "s",
             "readings": [r for r, there in zip(READINGS, estimator.present, strict=True) if there],
+            **more,
         }
     )
     path = folder / FILE
     write_atomic(path, json.dumps(found, allow_nan=False).encode())
     return path
+
+
+def _limits_here(
+    live: Place, steps: Sequence[StepEntry], joint: Joint, options: OnlineOptions, dt: float
+) -> tuple[bytes | None, str]:
+    """As `_limits`, from the records of the fit, and kept for the next replay of the same model."""
+    healthy = [f.id for f in live.state.files if f.status == "ready" and f.role == "train"]
+    sensors = (options.has_link, options.has_torque)
+    mark = (steps[-1].values, steps[-1].effects, healthy, round(dt, 9), sensors)
+    known = live.kept.get("limits")
+    if known is None or known[0] != mark:
+        found = _limits(joint, options, [live.record(i) for i in healthy], dt)
+        known = live.kept["limits"] = (mark, found)
+    state, why = known[1]
+    return state, why
 
 
 def _part(record: Record, asked: Request) -> Record:
@@ -270,6 +329,7 @@ def _result(made: Replay) -> dict[str, Any]:
             {"time": time - origin, "text": str(e.verdict), "about": list(e.sensors)}
             for time, e in made.verdicts
         ],
+        "standing": standing([(t - origin, e) for t, e in made.verdicts], watched=made.watched),
         "parameters": {
             name: {
                 "value": float(made.values[-1, i]),
@@ -293,4 +353,4 @@ def stored(folder: Path) -> dict[str, Any]:
     return found
 
 
-__all__ = ["READINGS", "TRIED", "Request", "replay", "request_of", "stored"]
+__all__ = ["READINGS", "TRIED", "Request", "follow", "replay", "request_of", "stored"]

@@ -35,7 +35,7 @@ from identification.data.plain_text import from_json
 from identification.errors import InputError
 from irj_fmu.command_line import system_refusal
 from workbench.page import verbs as app_verbs
-from workbench.page.desk import home, tree
+from workbench.page.desk import home, sources, tree
 from workbench.page.input import (
     add_upload,
     change_tree,
@@ -45,6 +45,7 @@ from workbench.page.input import (
     set_joint,
     start_demo,
 )
+from workbench.page.jobs.place import folder_of
 from workbench.page.jobs.process import warm_up
 from workbench.page.live import BusyError, Live
 from workbench.page.security import Guard, loopback_hosts
@@ -68,6 +69,7 @@ PAGE: Final = {
     "/import.js": (WEB / "import.js", "text/javascript; charset=utf-8"),
     "/tree.js": (WEB / "tree.js", "text/javascript; charset=utf-8"),
     "/preview.js": (WEB / "preview.js", "text/javascript; charset=utf-8"),
+    "/known.js": (WEB / "known.js", "text/javascript; charset=utf-8"),
     "/charts.js": (WEB / "charts.js", "text/javascript; charset=utf-8"),
     "/plots.js": (WEB / "plots.js", "text/javascript; charset=utf-8"),
     "/uPlot.js": (ASSETS / "uPlot.iife.min.js", "text/javascript; charset=utf-8"),
@@ -291,6 +293,11 @@ async def _cancel(request: Request, live: Live) -> Response:
     return _json({"cancelled": live.cancel()})
 
 
+async def _stop(request: Request, live: Live) -> Response:
+    await run_in_threadpool(sources.ask_stop, folder_of(live))
+    return _json({})
+
+
 async def _view(request: Request, live: Live) -> Response:
     view = VIEWS.get(request.path_params["view"])
     if view is None:
@@ -378,6 +385,7 @@ def create_app(
         at("/demo", _demo, "POST"),
         at("/run", _run, "POST"),
         at("/cancel", _cancel, "POST"),
+        at("/stop", _stop, "POST"),
         at("/view/{view}", _view),
     ]
     return Guard(Starlette(routes=routes), hosts or loopback_hosts(port))
@@ -428,6 +436,7 @@ def serve(
     *,
     root: Path | None = None,
     say: Callable[[str], None] | None = None,
+    follow: Sequence[str | Path] = (),
 ) -> None:
     """Serve the app on 127.0.0.1 until it is interrupted; prints its address on one line.
 
@@ -442,6 +451,8 @@ def serve(
         Folder of the sessions (`default_root`).
     say : callable, optional
         Gets the line with the address in place of standard output.
+    follow : sequence of path
+        Files that are being written, which the Replay page may follow.
 
     Raises
     ------
@@ -457,6 +468,7 @@ def serve(
     listening = _listen(port)
     port = int(listening.getsockname()[1])
     key = home.key_of(Store(folder))
+    sources.allow(folder, follow)
     tail = f"#home={key}" + (f"&session={with_files(folder, files)}" if files else "")
     address = f"http://127.0.0.1:{port}/{tail}"
     if say is not None:

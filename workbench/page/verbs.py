@@ -27,6 +27,7 @@ _TEXTS: Final = {
     "improve": "running the whole loop",
     "law": "trying your law",
     "replay": "replaying a record",
+    "follow": "following a file that is being written",
     "plan": "planning a motion",
     "report": "writing the report",
     "plant": "building the FMU of the joint",

@@ -22,7 +22,10 @@ from workbench.page import export as app_export
 from workbench.page import plan as app_plan
 from workbench.page import replay as app_replay
 from workbench.page.charts.asked import CHART_VIEWS, along, run_starts, said, side_of
+from workbench.page.charts.choices import known_fields
+from workbench.page.charts.payload import payload_view
 from workbench.page.desk import tree
+from workbench.page.desk.sources import allowed
 from workbench.page.input import joint_form
 from workbench.page.jobs.place import folder_of
 from workbench.page.live import Live
@@ -152,6 +155,7 @@ def _replay(live: Live, query: Query) -> dict[str, Any]:
         "sensors": app_replay.READINGS,
         "faults": app_replay.TRIED,
         "seconds": app_replay.MOST_SECONDS,
+        "sources": allowed(live.session.folder.parent),
     }
 
 
@@ -184,7 +188,11 @@ def _fits(live: Live, query: Query) -> dict[str, Any]:
 
 
 def _joint(live: Live, query: Query) -> dict[str, Any]:
-    return {"text": live.state.joint_text, "form": joint_form(live.state.joint_text)}
+    return {
+        "text": live.state.joint_text,
+        "form": joint_form(live.state.joint_text),
+        "known": known_fields(live),
+    }
 
 
 def _code(live: Live, query: Query) -> dict[str, Any]:
@@ -257,5 +265,6 @@ VIEWS: Final[Mapping[str, Callable[[Any, Query], Any]]] = {
     "replay": _replay,
     "plan": _plan,
     "motion.csv": _motion,
+    "payload": payload_view,
     **CHART_VIEWS,
 }

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, Final, final
 
 import numpy as np
 import numpy.typing as npt
 
+from identification.data.formats import words
 from identification.data.record import Record
 from identification.faults.detector import Fault, FaultEvent
+from identification.faults.types import Verdict
 from identification.online.estimator import OnlineEstimator
 
 FloatArray = npt.NDArray[np.float64]
@@ -31,6 +33,51 @@ READINGS: Final = (
     "link velocity",
     "torque",
 )
+
+
+def standing(verdicts: Sequence[tuple[float, FaultEvent]], *, watched: bool = True) -> str:
+    """What of the detector's verdicts holds at the end, as one sentence: a verdict about readings
+    that agree again is withdrawn.
+
+    Parameters
+    ----------
+    verdicts : sequence of (time [s], FaultEvent)
+        In the order in which they were said.
+    watched : bool
+        Whether faults were looked for.
+    """
+    if not watched:
+        return "Sensor faults were not looked for."
+    held: dict[tuple[str, ...], tuple[float, FaultEvent]] = {}
+    withdrawn: list[tuple[str, float, float]] = []
+    for time, event in verdicts:
+        if event.verdict is Verdict.ARMED:
+            continue
+        if event.verdict is not Verdict.RECOVERED:
+            held.setdefault(event.sensors, (time, event))
+            continue
+        back = set(event.sensors)
+        for sensors in [s for s in held if back & set(s)]:
+            began, before = held.pop(sensors)
+            withdrawn.append((_named(before), began, time))
+            if left := tuple(n for n in sensors if n not in back):
+                held[left] = (began, replace(before, sensors=left))
+    taken = "; ".join(
+        f"{name}, said at {a:.4g} s, withdrawn at {b:.4g} s" for name, a, b in withdrawn
+    )
+    if not held:
+        return f"No reading is doubted any more: {taken}." if taken else "No reading was doubted."
+    told = " ".join(f"{_named(e)} at {t:.4g} s: {_inside(e.verdict)}" for t, e in held.values())
+    return f"{told[0].upper()}{told[1:]}" + (f" Withdrawn: {taken}." if taken else "")
+
+
+def _inside(verdict: Verdict) -> str:
+    """The words of a verdict as they stand after a colon."""
+    return f"{verdict.value[0].lower()}{verdict.value[1:]}"
+
+
+def _named(event: FaultEvent) -> str:
+    return " or ".join(words(n) for n in event.sensors) or "the readings"
 
 
 @final

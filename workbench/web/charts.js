@@ -245,7 +245,11 @@ function slidersCard(rows, error) {
     state.busy = false;
     if (state.again && figure.isConnected) { state.again = false; look(); } else figure.removeAttribute("aria-busy");
   };
-  const inputs = [];
+  const inputs = [], set = {};
+  /* A mass on the link moves its inertia and its weight together. */
+  const load = async () => { const turn = state.turn; try { clearError(); const made = await get(`/view/payload?mass=${encodeURIComponent($("payload-mass").value)}&distance=${encodeURIComponent($("payload-distance").value)}`); if (turn !== state.turn) return; for (const [k, v] of Object.entries(made.values)) if (set[k]) set[k](v); look(); } catch (e) { fail(e); } };
+  const turning = !Object.values(rows).some((p) => p.unit === "kg");
+  const payload = h("fieldset", { class: "known", id: "payload" }, h("legend", {}, "Another payload", h("span", { class: "small soft plain" }, " on the link; negative: taken off")), [["mass", "Mass [kg]"], ["distance", "From the joint's axis [m]"]].filter(([k]) => turning || k === "mass").map(([k, t]) => h("label", { class: "small pick", for: `payload-${k}` }, t, h("input", { id: `payload-${k}`, value: "0", inputmode: "decimal", autocomplete: "off", onchange: load }))), turning ? null : h("input", { type: "hidden", id: "payload-distance", value: "0" }));
   const row = ([name, p]) => {
     const size = Math.abs(p.value), spread = Math.max(3 * (p.stderr || 0), 0.5 * size, 1e-9), low = Math.max(p.low ?? -Infinity, p.value - spread), high = Math.min(p.high ?? Infinity, p.value + spread);
     const id = `slide-${name}`, short = (v) => String(Number(v.toPrecision(6)));
@@ -254,10 +258,11 @@ function slidersCard(rows, error) {
     const read = () => { const { value, problem } = typedNumber(typed.value, words(name), p.low, p.high); why.textContent = problem || ""; why.hidden = !problem; typed.setAttribute("aria-invalid", String(Boolean(problem))); return problem ? null : value; };
     const hold = button(p.held ? "Release" : "Hold", () => { if (p.held) { held({ [name]: null }); return; } const v = read(); if (v != null) held({ [name]: v }); }, { kind: "quiet", id: `hold-${name}`, label: `${p.held ? "Release" : "Hold"} ${words(name)}` });
     const input = h("input", { type: "range", id, min: String(low), max: String(high), step: String((high - low) / 400), value: String(p.value), "aria-label": `${words(name)} [${unit(p.unit)}]`, oninput: (e) => { values[name] = Number(e.target.value); typed.value = short(values[name]); read(); look(); } });
+    set[name] = (v) => { values[name] = v; input.min = String(Math.min(Number(input.min), v)); input.max = String(Math.max(Number(input.max), v)); input.step = "any"; input.value = String(v); typed.value = short(v); read(); };
     inputs.push(() => { input.value = String(p.value); typed.value = short(p.value); why.hidden = true; typed.removeAttribute("aria-invalid"); });
     return h("div", { class: "slide" }, h("label", { for: id, class: "small" }, words(name), h("span", { class: "soft plain" }, ` ${p.side} ${unit(p.unit) ? `[${unit(p.unit)}]` : ""}`), p.held ? h("span", { class: "tag" }, "held") : null), input, typed, hold, why);
   };
   const moved = Object.entries(rows).filter(([, p]) => !p.nuisance);
-  const reset = () => { state.turn += 1; state.again = false; for (const k of Object.keys(values)) delete values[k]; inputs.forEach((f) => f()); figure.textContent = `${digits(error)} %`; charts.replaceChildren(); };
-  return h("section", { class: "card", id: "sliders" }, h("h2", {}, "What if?"), h("p", { class: "soft small" }, "Move a parameter: the held-out error and the residual follow at once. The fit stays as it is. Hold fixes a parameter at its value, typed or slid, and fits the model again as a new branch."), h("div", { class: "two" }, h("div", {}, moved.map(row), button("Back to the fit", reset, { kind: "quiet", work: false, id: "slider-reset" })), h("div", {}, h("p", { class: "soft" }, "Held-out error"), figure, charts)));
+  const reset = () => { state.turn += 1; state.again = false; for (const k of Object.keys(values)) delete values[k]; inputs.forEach((f) => f()); payload.querySelectorAll("input").forEach((i) => { i.value = "0"; }); figure.textContent = `${digits(error)} %`; charts.replaceChildren(); };
+  return h("section", { class: "card", id: "sliders" }, h("h2", {}, "What if?"), h("p", { class: "soft small" }, "Move a parameter: the held-out error and the residual follow at once. The fit stays as it is. Hold fixes a parameter at its value, typed or slid, and fits the model again as a new branch."), h("div", { class: "two" }, h("div", {}, moved.map(row), payload, button("Back to the fit", reset, { kind: "quiet", work: false, id: "slider-reset" })), h("div", {}, h("p", { class: "soft" }, "Held-out error"), figure, charts)));
 }

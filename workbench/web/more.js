@@ -95,11 +95,14 @@ function followed(name, p, time, end) {
 }
 
 views.replay = async (state) => {
-  const { last, sensors, faults, seconds: length } = await get("/view/replay"), files = state.files.filter((f) => f.status === "ready"), draft = app.drafts.replay || (app.drafts.replay = {});
+  const { last, sensors, faults, seconds: length, sources } = await get("/view/replay"), following = Boolean(state.job && state.job.action === "follow"), files = state.files.filter((f) => f.status === "ready"), draft = app.drafts.replay || (app.drafts.replay = {});
   const usual = files.find((f) => f.role === "held_out") || files[0], file = files.find((f) => f.id === draft.file) || usual, kind = draft.kind || "none";
   const keep = (key) => (e) => { draft[key] = e.target.value; if (key === "kind" || key === "file") render(false); };
   const go = () => run("replay", { file: $("replay-file").value, first: $("replay-from").value, seconds: $("replay-length").value, kind: $("replay-kind").value, sensor: $("replay-sensor") ? $("replay-sensor").value : sensors[3], at: $("replay-at") ? $("replay-at").value : "" });
-  const form = h("form", { class: "card", onsubmit: (e) => { e.preventDefault(); }, oninput: (e) => { const k = { "replay-from": "first", "replay-length": "seconds", "replay-at": "at" }[e.target.id]; if (k) draft[k] = e.target.value; } },
+  if (following) later(() => setTimeout(() => { if (app.view === "replay" && app.state && app.state.job && app.state.job.action === "follow" && $("main").dataset.view === "replay") render(false); }, 1000)); /* what came since is drawn every second, until the job ends */
+  const live = sources.length ? h("section", { class: "card", id: "live" }, h("h2", {}, "Live"), h("p", { class: "soft small" }, "A file that a logger is writing: the estimator follows it as it grows, until it rests for ten seconds."), h("div", { class: "row" },
+    following ? button("Stop following", () => post("/stop").catch(fail), { work: false, id: "follow-stop" }) : [h("select", { id: "follow-file", "aria-label": "File that is being written" }, sources.map((s) => h("option", { value: s }, s.split(/[\\/]/).pop()))), button("Follow", () => run("follow", { source: $("follow-file").value }).then(() => render(false)), { id: "follow" })])) : null;
+  const form = following ? null : h("form", { class: "card", onsubmit: (e) => { e.preventDefault(); }, oninput: (e) => { const k = { "replay-from": "first", "replay-length": "seconds", "replay-at": "at" }[e.target.id]; if (k) draft[k] = e.target.value; } },
     h("div", { class: "fields" },
       choice("replay-file", "Record", files.map((f) => [f.id, f.name]), file.id, `${seconds(file.summary.duration)} long`, keep("file")),
       field("replay-from", "From [s]", draft.first ?? 0, "after its begin"), field("replay-length", "Length [s]", draft.seconds ?? Math.min(length, Math.ceil(file.summary.duration)), "the first 7 s warm up"),
@@ -108,13 +111,13 @@ views.replay = async (state) => {
       kind === "none" ? null : field("replay-at", "From then on [s]", draft.at ?? "", "empty: at 60 %")),
     button("Replay", go, { kind: "primary", id: "replay" }));
   const head = heading("Online replay", "The estimator that the FMU carries, fed sample by sample: what it would have said while the joint ran. It starts from the fitted joint, follows its parameters, and doubts readings that disagree with the others.");
-  if (!last.time) return [head, form];
+  if (!last.time) return [head, live, form];
   const stale = last.effects.join() !== state.steps[state.steps.length - 1].effects.join();
   const marks = last.verdicts.filter((v) => v.about.length), host = h("div", { class: "plot" });
   later(() => { const plot = new SeriesPlot(host, () => Promise.resolve({ time: last.time, full: true, series: Object.entries(last.ratio).map(([b, v]) => ({ name: b, unit: "× floor", values: v })) }), { title: "Residual over floor of each balance", local: true }); app.plots.push(plot); plot.show(null).catch(fail); });
-  const verdict = !last.detector ? "Sensor faults were not looked for" : marks.length ? `${words(marks[0].about.join(" or "))}: ${marks[0].text.charAt(0).toLowerCase()}${marks[0].text.slice(1)}` : "No reading was doubted";
-  return [head, form, stale ? h("p", { class: "note" }, "This replay belongs to an earlier model; replay again.") : null,
-    h("section", { class: "card", id: "timeline" }, h("h2", {}, "Fault timeline"), h("p", {}, h("strong", {}, verdict.charAt(0).toUpperCase() + verdict.slice(1)), marks.length ? ` At ${seconds(marks[0].time)}.` : ` ${last.record}, ${seconds(last.end)}.`), last.note ? h("p", { class: "note small" }, last.note) : null, last.no_detector ? h("p", { class: "note small" }, `${last.no_detector.charAt(0).toUpperCase()}${last.no_detector.slice(1)}.`) : null,
+  const verdict = last.standing ? last.standing.replace(/\.$/, "") : !last.detector ? "Sensor faults were not looked for" : marks.length ? `${words(marks[0].about.join(" or "))}: ${marks[0].text.charAt(0).toLowerCase()}${marks[0].text.slice(1)}` : "No reading was doubted";
+  return [head, live, form, stale ? h("p", { class: "note" }, "This replay belongs to an earlier model; replay again.") : null,
+    h("section", { class: "card", id: "timeline" }, h("h2", {}, "Fault timeline"), h("p", {}, h("strong", { id: "standing" }, sentence(verdict)), ` ${last.record}, ${seconds(last.end)}${last.live ? " so far" : ""}.`), last.note ? h("p", { class: "note small" }, last.note) : null, last.no_detector ? h("p", { class: "note small" }, `${last.no_detector.charAt(0).toUpperCase()}${last.no_detector.slice(1)}.`) : null,
       timeline(last), h("p", { class: "small soft" }, "Shade: largest residual that holds the reading, as a share of its limit (full height: at the limit). Bar: declared failed and replaced by the estimate."),
       last.verdicts.length > 1 || marks.length ? h("details", { open: last.verdicts.length < 5 }, h("summary", {}, `What it said (${last.verdicts.length})`), h("ul", { class: "findings" }, last.verdicts.map((v) => h("li", {}, h("strong", {}, seconds(v.time)), " ", v.about.length ? `${words(v.about.join(", "))}: ` : "", v.text)))) : null),
     h("section", { class: "card" }, h("h2", {}, "Residual over floor"), h("p", { class: "soft small" }, "1 × means that only noise is left. It is the mean over the last two seconds."), host),

@@ -37,7 +37,7 @@ const views = {
   },
 
   async model(state) {
-    const { text, form } = await get("/view/joint"), seen = state.files.find((f) => f.kind);
+    const { text, form, known } = await get("/view/joint"), seen = state.files.find((f) => f.kind);
     if (!form.kind && seen) form.kind = seen.kind;
     const own = (m) => app.config.models[m] || [];
     const side = (k) => { /* the units of the drive, for a rotary or a linear axis */
@@ -53,7 +53,7 @@ const views = {
     const read = () => ({
       name: $("name").value, kind: document.querySelector("[name=kind]:checked").value, gear_ratio: $("gear_ratio").value, motor_constant: $("motor_constant").value,
       torque_per_current: $("torque_per_current").value, torque_per_voltage: $("torque_per_voltage").value, model: $("model").value,
-      effects: [...document.querySelectorAll("[name=effect]:checked")].map((c) => c.value),
+      effects: [...document.querySelectorAll("[name=effect]:checked")].map((c) => c.value), known: knownAll(node),
     });
     let edited = !text;
     const save = async () => { if ($("joint-text").value !== text) await post("/joint", { text: $("joint-text").value, source: state.joint_source || "joint" }); else if (edited) await post("/joint", read()); };
@@ -70,6 +70,7 @@ const views = {
         h("fieldset", {}, h("legend", {}, "Effects in it from the start"), h("div", { class: "checks" }, common.map((k) => box(k, effectTitle(k))), exact.map((k) => box(k, effectTitle(k)))),
           h("details", { open: others.some((e) => chosen.has(e.key)) }, h("summary", {}, `All others (${others.length})`), h("div", { class: "checks" }, others.map((e) => box(e.key, e.title))))),
         h("details", {}, h("summary", {}, "As joint file (TOML), with known values and column map"), h("label", { for: "joint-text" }, "Joint file"), h("textarea", { id: "joint-text", spellcheck: "false", value: text })))),
+      knownCard(known),
       h("div", { class: "row" }, button("Save and fit", () => act(async () => { await save(); await refresh(); }).then((done) => { if (done) run("fit", {}, "compare"); }), { kind: "primary", id: "save-fit", off: !state.files.some((f) => ["ready", "checking", "columns"].includes(f.status)) }),
         button("Save", () => act(async () => { await save(); await refresh(); }), { id: "save" })));
     return [heading("Model", "What is known about the joint, and the model to start from. Everything else has a start value and bounds derived from the records."), node];
@@ -105,8 +106,8 @@ const views = {
     ];
   },
 
-  diagnose(state) {
-    const d = state.diagnosis;
+  async diagnose(state) {
+    const d = state.diagnosis, asks = d && d.not_testable.some((n) => n.asks && n.asks.length), { known } = asks ? await get("/view/joint") : { known: [] };
     const again = button(d ? "Diagnose again" : "Diagnose", () => run("diagnose", {}, "diagnose"), { kind: d ? "" : "primary", id: "diagnose" });
     if (!d) return [h("div", { class: "row between head" }, h("div", {}, heading("What is missing?", "Every effect of the library is tried in every place of the current model, and judged on blocks and records it was not fitted to.")), again)];
     const clear = d.ranking.filter((r) => r.significant), faint = d.ranking.filter((r) => !r.significant), said = d.claim, fallOf = (r) => (said && said.label === r.label ? said.held_out_drop_percent : r.held_out_drop_percent) || 0, most = Math.max(1, ...d.ranking.map(fallOf)); /* what is claimed was fitted wholly: its figure is the one in the sentence, too */
@@ -132,7 +133,7 @@ const views = {
       clear.length ? h("div", { class: "two ranking" }, h("div", { class: "card" }, h("h2", {}, "Ranked effects"), h("p", { class: "soft small" }, "The bar is the fall of the residual on held-out records if the effect is added to the model as it stands. Falls do not add up: add one, then diagnose again."), h("ol", { class: "ranked" }, clear.map(row))), panel.node) : null,
       faint.length ? h("details", { class: "card" }, h("summary", {}, `Not to be told from chance, or too small (${faint.length})`), h("ol", { class: "ranked" }, faint.map((r, k) => row(r, k + clear.length)))) : null,
       d.refused && d.refused.length ? h("details", { class: "card", id: "refused" }, h("summary", {}, `Why not another? (${d.refused.length})`), h("ul", {}, d.refused.map((r) => h("li", {}, h("strong", {}, effectTitle(r.effect)), r.why.startsWith("with ") ? `: ${r.why}.` : `: it ${r.why}.`)))) : null,
-      d.not_testable.length ? h("details", { class: "card" }, h("summary", {}, `Not testable with these records (${d.not_testable.length})`), h("ul", {}, d.not_testable.map((n) => h("li", {}, h("strong", {}, n.title), `: ${n.why}.`)))) : null,
+      d.not_testable.length ? h("details", { class: "card" }, h("summary", {}, `Not testable with these records (${d.not_testable.length})`), h("ul", {}, d.not_testable.map((n) => h("li", {}, h("strong", {}, n.title), `: ${n.why}.`, n.asks && n.asks.length ? knownAsk(n, known) : null)))) : null,
       glossaryCard(),
     ];
   },

@@ -82,6 +82,17 @@ def open_csv(path: Path) -> Table:
     )
 
 
+def head_of(path: Path) -> int:
+    """Number of lines before the first row of numbers.
+
+    Raises
+    ------
+    InputError
+        No table of numbers.
+    """
+    return _layout(path).skip
+
+
 def _decode(path: Path) -> tuple[str, list[str], bool]:
     with path.open("rb") as stream:
         head = stream.read(_HEAD_BYTES)

@@ -302,7 +302,8 @@ def test_what_the_model_has_already_is_not_testable(base: Base) -> None:
     said = try_candidate(replace(twin, shapes=()), with_it)
     assert isinstance(said, NotTestable)
     assert said.effect == "cyclic_torque"
-    assert said.why.startswith("on these records it cannot be told from ")
+    alike = ", ".join(EFFECTS[k].title for k in EFFECTS["cyclic_torque"].confused_with)
+    assert said.why.startswith(f"on these records it cannot be told from {alike}; ")
     assert said.why.endswith(f"{EFFECTS['cyclic_torque'].separate_by} would separate them")
 
 

@@ -378,7 +378,7 @@ def _what_if(live: Live, query: Query) -> dict[str, Any]:
     if not all(map(math.isfinite, moved.values())):
         raise InputError("values must be finite numbers")
     limits = limits_of(live)
-    moved = {k: within(k, v, limits) for k, v in moved.items()}
+    moved = {k: within(k, v, limits) for k, v in moved.items() if v != now.values[k]}
     values = {**now.values, **moved}
     data = analysis.data
     error = relative_error_percent(now.model, data, data.held_out, values)

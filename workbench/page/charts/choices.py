@@ -1,5 +1,5 @@
-"""What is chosen in a plot and changes the input of the fit: a parameter that is held, windows that
-are left out.
+"""What is chosen on the page and changes the input of the fit: what is known of a parameter, and
+windows that are left out.
 """
 
 from __future__ import annotations
@@ -8,6 +8,8 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
+from casadi_models.term import INERTIAS
+from identification.data.formats import words
 from identification.data.plain_text import from_toml, tables_text
 from identification.errors import InputError
 from workbench.page.live import Live
@@ -15,6 +17,12 @@ from workbench.page.live import Live
 GIVEN: Final = ("joint", "known", "columns", "effects", "laws")
 """Tables of a joint file that say what is given; the others say what a fit made of it."""
 MOST_WINDOWS: Final = 50
+NUMBERS: Final = ("value", "low", "high")
+"""Keys of an entry of [known] that are numbers."""
+REMARKS: Final = ("source", "note")
+"""Keys of an entry of [known] that the page does not ask for."""
+NOT_GIVEN: Final = ("smoothing", "range")
+"""Roles of parameters that no catalogue states."""
 
 
 def held_text(live: Live, held: Any) -> str:
@@ -26,8 +34,9 @@ def held_text(live: Live, held: Any) -> str:
     Parameters
     ----------
     live : Live
-    held : mapping of str to number or None
-        None lets a parameter free.
+    held : mapping of str to number, mapping or None
+        A number is the value, link-referred and in SI; a mapping is an entry of [known] as a joint
+        file has it (``value``, ``low``, ``high``, ``unit``, ``side``). None lets a parameter free.
 
     Raises
     ------
@@ -38,14 +47,72 @@ def held_text(live: Live, held: Any) -> str:
         raise InputError("hold: say which parameter at which value")
     text = live.analysis().to_joint_file() if live.state.steps else live.state.joint_text
     data = from_toml(text, "joint")
-    known = dict(data.get("known", {}))
+    as_typed = from_toml(live.state.joint_text, "joint").get("known", {})
+    known = {**data.get("known", {}), **as_typed}  # with the units and sources they were given in
     limits = limits_of(live)
     for name, value in held.items():
         known.pop(name, None)
-        if value is not None:
+        if isinstance(value, Mapping):
+            if entry := known_entry(name, value, as_typed.get(name)):
+                known[name] = entry
+        elif value is not None:
             known[name] = within(name, _number(name, value), limits)
     made = {k: v for k, v in data.items() if k in GIVEN and k != "known"}
     return tables_text(made | ({"known": known} if known else {}))
+
+
+def known_entry(name: str, given: Mapping[str, Any], before: Any = None) -> dict[str, Any]:
+    """An entry of [known] from the fields of the page; empty where no number was typed.
+
+    Parameters
+    ----------
+    name : str
+    given : mapping
+        ``value``, ``low``, ``high``, ``unit``, ``side``, as text or number.
+    before : number or mapping, optional
+        The entry it replaces: its remarks stay.
+
+    Raises
+    ------
+    InputError
+        A field that is no number.
+    """
+    out: dict[str, Any] = {}
+    for key in NUMBERS:
+        text = str(given.get(key, "") if given.get(key) is not None else "").strip()
+        if text:
+            plain = text.replace("\N{MINUS SIGN}", "-").replace(",", ".", 1)
+            out[key] = _number(f"{words(name)}, {key}", plain)
+    if not out:
+        return {}
+    out |= {k: text for k in ("unit", "side") if (text := str(given.get(k) or "").strip())}
+    old = before if isinstance(before, Mapping) else {}
+    return out | {k: old[k] for k in REMARKS if k in old}
+
+
+def known_fields(live: Live) -> list[dict[str, Any]]:
+    """What the page asks of each parameter of the joint: ``name``, ``meaning``, ``unit``, ``given``
+    (the entry of [known] as it was typed, empty without one). Empty without a joint.
+    """
+    joint = live.joint_or_none()
+    if joint is None:
+        return []
+    model = live.analysis().current.model if live.state.steps else joint.model()
+    given = from_toml(live.state.joint_text, "joint").get("known", {})
+    inertias = [p.for_kind(model.kind) for p in INERTIAS.values()]
+    found = {p.name: p for p in (*inertias, *model.parameters) if p.role not in NOT_GIVEN}
+    rows = []
+    for name, p in found.items():
+        entry = given.get(name, {})
+        rows.append(
+            {
+                "name": name,
+                "meaning": p.meaning.strip(),
+                "unit": p.unit,
+                "given": dict(entry) if isinstance(entry, Mapping) else {"value": entry},
+            }
+        )
+    return rows
 
 
 def limits_of(live: Live) -> dict[str, tuple[float, float]]:

@@ -112,6 +112,15 @@ def replay(place: Place, body: Body, progress: Progress) -> Change:
     return partial(_with_steps, steps)
 
 
+def follow(place: Place, body: Body, progress: Progress) -> Change:
+    """A file that is being written, through the online estimator."""
+    from workbench.page import replay as app_replay
+
+    steps = _settled(place, progress)
+    app_replay.follow(place, steps, str(body.get("source", "")), folder_of(place), progress)
+    return partial(_with_steps, steps)
+
+
 def plan(place: Place, body: Body, progress: Progress) -> Change:
     """The next experiment."""
     from workbench.page import plan as app_plan
@@ -146,6 +155,7 @@ ACTIONS: Final[Mapping[str, Callable[[Place, Body, Progress], Change]]] = {
     "improve": improve,
     "law": law,
     "replay": replay,
+    "follow": follow,
     "plan": plan,
     "report": lambda place, body, progress: export(place, "report", progress),
     "plant": lambda place, body, progress: export(place, "plant", progress),

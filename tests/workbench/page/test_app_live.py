@@ -1,0 +1,159 @@
+"""A file that is being written, followed on the Replay page, in Debian's Chromium."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Iterator
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.workbench.chromium import launched, needs_chromium
+
+AXE = os.environ.get("IRJ_AXE", "")
+SHOTS = os.environ.get("IRJ_SHOTS", "")
+DEMO = Path(str(files("workbench"))) / "demo"
+FAULT = (9.0, 10.5)
+"""From when to when the link encoder is off [s]."""
+
+pytestmark = needs_chromium
+
+
+def idle(page: Any, view: str = "") -> None:
+    """Wait until nothing was asked for, nothing runs, and the screen shows the state."""
+    page.wait_for_function(
+        "v => (!v || document.querySelector('#main').dataset.view === v) && !app.sent && "
+        "!app.waiting && !app.asking && !app.then && app.state && !app.state.job && "
+        "app.state.steps.every((s) => s.settled) && "
+        "document.querySelector('#main').dataset.revision === String(app.state.revision)",
+        arg=view,
+        timeout=120_000,
+    )
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("sessions")
+
+
+@pytest.fixture(scope="module")
+def growing(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("live") / "live.csv"
+
+
+@pytest.fixture(scope="module")
+def page(root: Path, growing: Path) -> Iterator[Any]:
+    """The demo with what it lacks, fitted."""
+    import uvicorn
+
+    from workbench.page.desk.sources import allow
+    from workbench.page.server import _listen, create_app
+
+    listening = _listen(0)
+    port = int(listening.getsockname()[1])
+    allow(root, [growing])
+    app = create_app(root, port=port)
+    server = uvicorn.Server(
+        uvicorn.Config(app, log_level="error", ws="none", timeout_graceful_shutdown=1)
+    )
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
+    thread.start()
+    try:
+        with launched() as chromium:
+            made = chromium.new_context(viewport={"width": 1280, "height": 860}).new_page()
+            made.goto(f"http://127.0.0.1:{port}/")
+            made.click("#demo")
+            made.wait_for_selector("#fit", timeout=60_000)
+            made.click("#fit")
+            idle(made, "compare")
+            made.evaluate("run('add', { label: 'stribeck@motor' }, 'ledger')")
+            made.wait_for_function("() => app.state.steps.length === 2", timeout=60_000)
+            idle(made, "ledger")
+            yield made
+            idle(made)
+    finally:
+        server.should_exit = True
+        thread.join(10)
+        listening.close()
+
+
+def lines() -> list[str]:
+    with np.load(DEMO / "held_out.npz") as archive:
+        table = {k: archive[k].astype(float) for k in archive.files}
+    keep = table["time_s"] - table["time_s"][0] < 14.0
+    table = {k: v[keep] for k, v in table.items()}
+    off = (table["time_s"] >= FAULT[0]) & (table["time_s"] < FAULT[1])
+    table["link_position_rad"] = table["link_position_rad"] + 0.05 * off
+    rows = np.column_stack(list(table.values()))
+    return [",".join(table), *(",".join(f"{v:.12g}" for v in row) for row in rows.tolist())]
+
+
+def shot(page: Any, name: str) -> None:
+    if not SHOTS:
+        return
+    for theme in ("light", "dark"):
+        for width in (1280, 375):
+            page.set_viewport_size({"width": width, "height": 860})
+            page.evaluate("t => theme(t)", theme)
+            page.screenshot(path=f"{SHOTS}/{name}-{theme}-{width}.png")
+    page.evaluate("theme('light')")
+    page.set_viewport_size({"width": 1280, "height": 860})
+
+
+def test_a_growing_file_is_followed_and_its_verdict_withdrawn_in_the_headline(
+    page: Any, growing: Path
+) -> None:
+    """The logger stands still while the link encoder is off, so that the page must say it then;
+    what comes after shows the encoder healthy.
+    """
+    text = lines()
+    times = np.array([float(row.split(",", 1)[0]) for row in text[1:]])
+    cut = 1 + int(np.searchsorted(times, FAULT[1] - 0.5))
+    growing.write_text("\n".join(text[:cut]) + "\n" + text[cut][:9])
+    page.click("#nav-replay")
+    idle(page, "replay")
+    page.click("#follow")
+    page.wait_for_function(
+        "() => (document.querySelector('#standing') || {}).textContent"
+        "?.startsWith('Link position at 9')",
+        timeout=60_000,
+    )
+    assert page.evaluate("app.state.job.action") == "follow"
+    assert "so far" in page.inner_text("#timeline")
+    shot(page, "live")
+
+    with growing.open("a") as stream:
+        stream.write(text[cut][9:] + "\n" + "\n".join(text[cut + 1 :]) + "\n")
+    page.wait_for_function(
+        "() => (document.querySelector('#standing') || {}).textContent"
+        "?.startsWith('No reading is doubted any more: link position, said at 9')",
+        timeout=60_000,
+    )
+    began = time.monotonic()
+    page.click("#follow-stop")
+    idle(page, "replay")
+    assert time.monotonic() - began < 8, "it was stopped, and did not wait until the file rests"
+    assert page.locator("#error").is_hidden()
+    page.wait_for_selector("#follow")
+    assert "withdrawn at" in page.inner_text("#standing")
+    assert "so far" not in page.inner_text("#timeline")
+    shot(page, "followed")
+    if AXE:
+        page.evaluate(Path(AXE).read_text(encoding="utf-8"))
+        found = page.evaluate("() => axe.run(document)")
+        assert [(v["id"], n["html"][:160]) for v in found["violations"] for n in v["nodes"]] == []
+
+
+def test_no_other_file_can_be_followed(page: Any, growing: Path) -> None:
+    idle(page)
+    secret = growing.with_name("secret.csv")
+    secret.write_text("\n".join(lines()))
+    page.evaluate("path => run('follow', { source: path })", str(secret))
+    page.wait_for_selector("#error:not([hidden])", timeout=60_000)
+    idle(page)
+    assert "was not named when the page was started" in page.inner_text("#error-text")

@@ -1,0 +1,63 @@
+"""Files that are being written, which a page may follow: those that were named where the server was
+started, and no other, since whoever reaches the page could otherwise read any file.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from identification.errors import InputError
+from workbench.page.session import write_atomic
+
+FILE: Final = "follow.json"
+STOP: Final = "follow.stop"
+
+
+def allow(root: Path, paths: Sequence[str | Path]) -> None:
+    """Let the sessions under a root follow these files, and no others any more."""
+    names = [str(Path(p).absolute()) for p in paths]
+    write_atomic(root / FILE, json.dumps(names).encode())
+
+
+def allowed(root: Path) -> list[str]:
+    """The paths that may be followed."""
+    try:
+        found = json.loads((root / FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return []
+    return [str(p) for p in found] if isinstance(found, list) else []
+
+
+def source_of(root: Path, name: str) -> Path:
+    """One of them by its name.
+
+    Raises
+    ------
+    InputError
+        It is none of them.
+    """
+    found = next((p for p in allowed(root) if p == name), None)
+    if found is None:
+        raise InputError(
+            "follow: this file was not named when the page was started; start it with "
+            "irj app --follow FILE"
+        )
+    return Path(found)
+
+
+def ask_stop(exports: Path) -> None:
+    """Let a file that is followed be complete as it stands."""
+    write_atomic(exports / STOP, b"")
+
+
+def stopped(exports: Path) -> bool:
+    """Whether it was asked for, once."""
+    found = (exports / STOP).is_file()
+    (exports / STOP).unlink(missing_ok=True)
+    return found
+
+
+__all__ = ["allow", "allowed", "ask_stop", "source_of", "stopped"]

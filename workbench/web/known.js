@@ -1,0 +1,63 @@
+"use strict";
+/* What is known of a parameter, as fields: on the Model page all of them, on the Diagnose page those that an effect asks for. */
+const KNOWN_SIDES = [["link", "link side"], ["motor", "motor shaft"]];
+const KNOWN_KEYS = ["value", "low", "high", "unit", "side"];
+
+/* One field of one parameter; `say` is read aloud with it. */
+function knownField(id, label, row, key) {
+  const given = row.given[key];
+  const say = `${label} of ${words(row.name)}`;
+  const control = key === "side"
+    ? h("select", { id, "aria-label": say }, [...KNOWN_SIDES, ...(given && !KNOWN_SIDES.some(([v]) => v === given) ? [[given, given]] : [])].map(([v, t]) => h("option", { value: v, selected: v === (given || "link") }, t)))
+    : h("input", { id, value: given == null ? (key === "unit" ? row.unit : "") : String(given), autocomplete: "off", inputmode: key === "unit" ? "text" : "decimal", "aria-label": say });
+  return h("label", { class: "small pick", for: id }, label, control);
+}
+
+const KNOWN_LABELS = { value: "Value", low: "or at least", high: "and at most", unit: "Unit", side: "Stated for" };
+
+function knownRow(row, prefix, keys = KNOWN_KEYS) {
+  return h("fieldset", { class: "known", "data-name": row.name }, h("legend", {}, words(row.name), h("span", { class: "small soft plain" }, ` ${row.meaning}`)), keys.map((k) => knownField(`${prefix}-${row.name}-${k}`, KNOWN_LABELS[k], row, k)));
+}
+
+/* The fields of one row as they stand; a side that nobody chose is not written. */
+function knownTyped(node) {
+  const out = {};
+  for (const key of KNOWN_KEYS) {
+    const control = node.querySelector(`[id$="-${key}"]`);
+    if (control && !(key === "side" && control.value === "link")) out[key] = control.value;
+  }
+  return out;
+}
+const knownAll = (root) => Object.fromEntries([...root.querySelectorAll("fieldset.known")].map((n) => [n.dataset.name, knownTyped(n)]));
+
+/* The card of the Model page: what is given stands there, a parameter is added by its name. */
+function knownCard(rows) {
+  if (!rows.length) return null;
+  const given = rows.filter((r) => Object.keys(r.given).length), others = rows.filter((r) => !given.includes(r));
+  const list = h("div", {}, given.map((r) => knownRow(r, "known")));
+  const pick = h("select", { id: "known-pick", "aria-label": "Parameter that is known" }, others.map((r) => h("option", { value: r.name }, words(r.name))));
+  const add = button("Give it", () => {
+    const row = others.find((r) => r.name === pick.value);
+    if (!row) return;
+    list.append(knownRow(row, "known"));
+    pick.querySelector(`option[value="${row.name}"]`).remove();
+    $(`known-${row.name}-value`).focus();
+  }, { work: false, id: "known-add" });
+  return h("section", { class: "card", id: "known" }, h("h2", {}, "What is known"), h("p", { class: "soft small" }, "From a catalogue, CAD or a scale. A value is kept as it stands; bounds let the fit move between them. Empty fields take it back."), list,
+    others.length ? h("div", { class: "row" }, pick, add) : null);
+}
+
+/* Under an effect that needs a known parameter: its fields, and the fit with it. The model as it stands is fitted again on a branch of its own. */
+function knownAsk(item, rows) {
+  const asked = item.asks.map((name) => rows.find((r) => r.name === name)).filter(Boolean), prefix = `ask-${item.effect}`;
+  if (!asked.length) return null;
+  const host = h("div", {}, knownRow(asked[0], prefix, ["value", "unit", "side"]));
+  const which = asked.length < 2 ? null : h("select", { id: `${prefix}-which`, "aria-label": `Which is known, for ${item.title}`, onchange: (e) => host.replaceChildren(knownRow(asked.find((r) => r.name === e.target.value), prefix, ["value", "unit", "side"])) }, asked.map((r) => h("option", { value: r.name }, words(r.name))));
+  const give = () => {
+    const typed = knownAll(host), [[name, entry]] = Object.entries(typed);
+    const { problem } = typedNumber(entry.value, words(name), null, null);
+    if (problem) { fail(new Error(problem)); $(`${prefix}-${name}-value`).focus(); return; }
+    act(async () => { await post("/joint", { hold: typed, source: app.state.joint_source || "joint" }); await refresh(); }).then((done) => { if (done) run("fit", {}, "diagnose"); });
+  };
+  return h("div", { class: "asked" }, which, host, button("Give it and fit again", give, { id: `${prefix}-give`, label: `Give it and fit again, for ${item.title}` }));
+}
