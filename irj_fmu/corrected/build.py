@@ -33,7 +33,13 @@ from irj_fmu.imported.slave import correction_variables
 from irj_fmu.plant.joint import identifier
 
 _C: Final = Path(__file__).parents[1] / "c"
-_SOURCES: Final = ("corrected_wrapper.c", "fmi2_common.c", "living.c")
+_SOURCES: Final = (
+    "corrected_wrapper.c",
+    "corrected_inner.c",
+    "corrected_state.h",
+    "fmi2_common.c",
+    "living.c",
+)
 _LARGEST: Final = 2**32 - 1
 _KINDS: Final = {
     "real": ("Real",),
