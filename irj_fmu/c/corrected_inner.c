@@ -120,16 +120,18 @@ static Status answered(Instance *m, Status status, const char *call) {
 
 #define HAS(name, call) if (!inner_##name) return fail(m, call ": the inner FMU lacks " VERSION #name)
 
-static int is_known(const Reference *table, size_t n, Reference vr) {
+/* Where a reference stands in a table; n where it is not there. */
+static size_t place_of(const Reference *table, size_t n, Reference vr) {
     size_t low = 0, high = n;
     while (low < high) {
         const size_t middle = (low + high) / 2;
         if (table[middle] < vr) low = middle + 1;
         else high = middle;
     }
-    return low < n && table[low] == vr;
+    return low < n && table[low] == vr ? low : n;
 }
 
+static int is_known(const Reference *table, size_t n, Reference vr) { return place_of(table, n, vr) < n; }
 static int is_passed_on(Reference vr) { return vr != VR_DRIVE && is_known(known_real, N_KNOWN_REAL, vr); }
 
 static size_t count_passed_on(const Reference vr[], size_t n) {

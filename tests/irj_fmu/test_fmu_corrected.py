@@ -130,6 +130,22 @@ def test_the_corrected_fmu_gives_what_the_fit_gives(
         assert np.abs(found - wanted).max() < SAME
 
 
+@pytest.mark.parametrize("label", ["quadratic_drag@motor", "lugre@motor"])
+def test_fmi_3_gives_what_fmi_2_gives(folder: Path, label: str) -> None:
+    """Two wrappers of one law, round the same model in two versions."""
+    found = []
+    for version in (2, 3):
+        model = axis(folder, label, make=Make(version, CS, strict=True))
+        path = export_corrected(model, folder / f"version{version}.fmu")
+        assert f'fmiVersion="{version}.0"' in zipfile.ZipFile(path).read(
+            "modelDescription.xml"
+        ).decode("utf-8")
+        window = driven(model, [0.3, 0.1], 4e-3)
+        found.append(in_fmpy(path, model, window, {"q": 0.3, "w": 0.1}))
+        assert np.abs(found[-1] - expected(model, window)).max() < SAME
+    assert np.abs(found[0] - found[1]).max() < 1e-12
+
+
 def test_units_of_the_foreign_joint_are_those_of_its_ports(folder: Path) -> None:
     """A joint with gear, drive on the motor shaft, in two laws."""
     model = with_law(
@@ -251,12 +267,12 @@ def test_the_same_content_gives_the_same_bytes_and_another_guid_where_a_value_di
 def test_what_cannot_be_corrected_in_c_is_said_in_one_line(folder: Path) -> None:
     bare = axis(folder)
     drag = axis(folder, "quadratic_drag@motor")
-    three = UserFmu(build("Axis", folder, Make(3, CS)))
     exchange = UserFmu(build("Axis", folder, Make(2, ("ModelExchange",))))
+    other = UserFmu(build("Axis", folder, Make(3, ("ModelExchange",))))
     for model, target, line in (
         (bare, None, "no effect rides outside it"),
-        (replace(drag, fmu=three), None, "needs it as FMI 2.0 co-simulation; export the pair"),
-        (replace(drag, fmu=exchange), None, "needs it as FMI 2.0 co-simulation; export the pair"),
+        (replace(drag, fmu=exchange), None, "needs it as co-simulation; export the pair"),
+        (replace(drag, fmu=other), None, "needs it as co-simulation; export the pair"),
         (drag, "win64", "holds no library for win64, so nothing corrected can run there; it has "),
     ):
         with pytest.raises(InputError, match=line) as told:
