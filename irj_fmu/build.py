@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
+import math
 import os
 import subprocess
 import sys
@@ -93,6 +94,8 @@ class Request:
         Called with one sentence per doubt about a record.
     fmi : {2, 3}
         Version of FMI, of plants and native estimators.
+    cross_check : bool
+        Of a plant: the folder of the FMI Cross-Check, too.
     """
 
     joint: Joint
@@ -108,6 +111,7 @@ class Request:
     sample_time: float | None = None
     say: Callable[[str], object] = lambda _text: None
     fmi: int = 2
+    cross_check: bool = False
 
 
 def build(
@@ -156,6 +160,8 @@ def build(
                     path.replace(final_path)
                     done.append(final_path)
                     say(f"{final_path} ({note}; validated, {ran})")
+                    if request.cross_check:
+                        done += _cross_check(request, final_path, say)
     except OSError as error:
         raise InputError(
             f"{request.out}: cannot write there ({error.strerror or error}); choose a writable "
@@ -351,14 +357,10 @@ def _ssp(request: Request, folder: Path) -> list[tuple[Path, str]]:
         request, folder, f"{base}_plant", controller=False, sensors=request.sensors
     )
     estimator = _estimator(request, folder)[0][0]
-    by_current = request.joint.torque_per_current is not None
-    scale = request.joint.torque_per_current if by_current else request.joint.gear_ratio
-    tones = [size / abs(float(scale or 1.0)) for size in (60.0, 30.0, 10.0)]
-    spec = multisine_source(
-        tones, (0.2, 0.7, 2.3), (0.0, 1.0, 2.0), unit="A" if by_current else "N.m"
-    )
+    drive, tones = _drive(request)
+    amplitudes, frequencies, phases = zip(*tones, strict=True)
+    spec = multisine_source(amplitudes, frequencies, phases, unit="A" if drive == "i_m" else "N.m")
     source = build_plant(spec, folder / "source.fmu", cc=request.cc)
-    drive = "i_m" if by_current else "tau_m"
     channels = {
         "q_m": "motor_position",
         "w_m": "motor_velocity",
@@ -377,6 +379,34 @@ def _ssp(request: Request, folder: Path) -> list[tuple[Path, str]]:
     )
     path = write_ssp(system, folder / f"{base}.ssp")
     return [(path, "SSP 1.0: source, plant, estimator")]
+
+
+def _cross_check(request: Request, fmu: Path, say: Callable[[str], object]) -> list[Path]:
+    from irj_fmu.cross_check import write_cross_check
+
+    if not _runs_here(fmu):
+        raise InputError(
+            f"{fmu}: the reference solution is computed here, and it holds no library for this "
+            "machine; give --target all, or leave out --cross-check"
+        )
+    drive, tones = _drive(request)
+
+    def signal(time: float) -> float:
+        return sum(a * math.sin(2 * math.pi * f * time + shift) for a, f, shift in tones)
+
+    made = write_cross_check(fmu, request.out, {drive: signal})
+    for place in sorted({path.parent for path in made}):
+        say(f"{place} (cross-check: FMU, reference, options)")
+    return made
+
+
+def _drive(request: Request) -> tuple[str, list[tuple[float, float, float]]]:
+    """Drive input of a plant, and tones for it: amplitude, frequency [Hz], phase [rad]."""
+    by_current = request.joint.torque_per_current is not None
+    scale = request.joint.torque_per_current if by_current else request.joint.gear_ratio
+    sizes = [size / abs(float(scale or 1.0)) for size in (60.0, 30.0, 10.0)]
+    tones = list(zip(sizes, (0.2, 0.7, 2.3), (0.0, 1.0, 2.0), strict=True))
+    return ("i_m" if by_current else "tau_m"), tones
 
 
 def _package(name: str) -> Path:
@@ -493,6 +523,12 @@ def parser(prog: str = "build_fmu.py") -> OneLineParser:
     made.add_argument(
         "--no-torque", action="store_true", help="estimators: the joint has no torque sensor"
     )
+    made.add_argument(
+        "--cross-check",
+        action="store_true",
+        help="plant, FMI 2.0: also a folder with inputs, reference solution and options, by the "
+        "rules of the FMI Cross-Check",
+    )
     made.add_argument("--json", type=Path, metavar="FILE", help="write what was built as JSON")
     return made
 
@@ -500,6 +536,7 @@ def parser(prog: str = "build_fmu.py") -> OneLineParser:
 _OF: Final = {  # options that only some kinds heed
     "sample_time": ("native", "all"),
     "fmi": ("plant", "native"),
+    "cross_check": ("plant",),
     "controller": ("plant", "all"),
     "sensors": ("plant", "ssp", "all"),
     "healthy": ("estimator", "native", "ssp", "all"),
@@ -524,6 +561,8 @@ def _request(given: argparse.Namespace) -> Request:
             )
     if given.sample_time is not None and not 1e-5 <= given.sample_time <= 1.0:
         raise InputError(f"--sample-time {given.sample_time:g}: give 0.00001 to 1 s")
+    if given.cross_check and given.fmi == 3:
+        raise InputError("--cross-check: its rules are for FMI 2.0; leave out --fmi 3")
     joint = load_joint(given.joint)
     request = Request(
         joint=joint,
@@ -539,6 +578,7 @@ def _request(given: argparse.Namespace) -> Request:
         sample_time=given.sample_time,
         say=lambda text: sys.stderr.write(f"irj: {text}\n"),
         fmi=given.fmi or 2,
+        cross_check=given.cross_check,
     )
     if given.json is not None:
         made = [request.out / name for name in _names(given.kind, _base(request))]
