@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, final
 
@@ -31,6 +31,8 @@ from irj_fmu.fmi.compiler import find_compiler
 
 if TYPE_CHECKING:
     from identification.data.record import Record
+    from irj_fmu.fmi.related import Related
+    from irj_fmu.plant.library import PlantSpec
 
 KINDS: Final = ("estimator", "plant", "native", "ssp", "all")
 _TRY: Final = (
@@ -96,6 +98,9 @@ class Request:
         Version of FMI, of plants and native estimators.
     cross_check : bool
         Of a plant: the folder of the FMI Cross-Check, too.
+    held_out, report : Path, optional
+        Of a plant: a record that the fit did not see, and the report of the fit, that go into it
+        with the joint file.
     """
 
     joint: Joint
@@ -112,6 +117,14 @@ class Request:
     say: Callable[[str], object] = lambda _text: None
     fmi: int = 2
     cross_check: bool = False
+    held_out: Path | None = None
+    report: Path | None = None
+
+    @property
+    def inputs(self) -> tuple[Path, ...]:
+        """Files that are read."""
+        more = (self.held_out, self.report)
+        return (self.source, *self.healthy, *(path for path in more if path is not None))
 
 
 def build(
@@ -142,7 +155,7 @@ def build(
         raise InputError(f"{kind!r} cannot be built; choose one of {', '.join(KINDS)}")
     keep_inputs(
         [request.out / name for name in _names(kind, _base(request))],
-        [request.source, *request.healthy],
+        list(request.inputs),
     )
     made_folders = _prepare(request.out)
     hold(request.out)
@@ -273,6 +286,8 @@ def _one_plant(
         request.joint,
         PlantOptions(controller=controller, motion=motion, sensors=sensors, name=name),
     )
+    if request.held_out is not None or request.report is not None:
+        spec = replace(spec, related=_related(request, spec))
     maker = {2: build_plant, 3: build_plant_fmi3}[request.fmi]
     path = maker(spec, folder / f"{name}.fmu", cc=request.cc, target=targets)
     kinds = "co-simulation" if spec.memory else "model exchange and co-simulation"
@@ -281,6 +296,44 @@ def _one_plant(
         f"FMI {request.fmi}.0 {kinds}, {len(spec.states) + len(spec.memory)} states, "
         f"{len(spec.parameters)} parameters",
     )
+
+
+def _related(request: Request, spec: PlantSpec) -> tuple[Related, ...]:
+    """The joint file, the report of the fit and a held-out record as files of the plant."""
+    from irj_fmu.estimator.healthy import read_healthy
+    from irj_fmu.fmi.related import Related, experiment_files
+    from irj_fmu.plant.measured import measured_run
+
+    def content(path: Path) -> bytes:
+        try:
+            return path.read_bytes()
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+
+    found = [
+        Related(
+            "joint.toml",
+            content(request.source),
+            "application/toml",
+            "model",
+            "Joint file: structure, fitted values with errors, and which records they are from.",
+        )
+    ]
+    if request.report is not None:
+        kind = "text/html" if request.report.suffix in (".html", ".htm") else "text/plain"
+        found.append(
+            Related(
+                f"report{request.report.suffix}",
+                content(request.report),
+                kind,
+                "report",
+                "Report of the fit.",
+            )
+        )
+    if request.held_out is not None:
+        (record,) = read_healthy([request.held_out], request.joint, request.say)
+        found += experiment_files(measured_run(record, spec, request.joint.gear_ratio))
+    return tuple(found)
 
 
 def _estimator(request: Request, folder: Path) -> list[tuple[Path, str]]:
@@ -524,6 +577,19 @@ def parser(prog: str = "build_fmu.py") -> OneLineParser:
         "--no-torque", action="store_true", help="estimators: the joint has no torque sensor"
     )
     made.add_argument(
+        "--held-out",
+        type=Path,
+        metavar="RECORD",
+        help="plant: a record that the fit did not see; inside the FMU it is an experiment with "
+        "stimuli and reference (FMI-LS-REF)",
+    )
+    made.add_argument(
+        "--report",
+        type=Path,
+        metavar="FILE",
+        help="plant: the report of the fit, which goes into the FMU (FMI-LS-REF)",
+    )
+    made.add_argument(
         "--cross-check",
         action="store_true",
         help="plant, FMI 2.0: also a folder with inputs, reference solution and options, by the "
@@ -537,6 +603,8 @@ _OF: Final = {  # options that only some kinds heed
     "sample_time": ("native", "all"),
     "fmi": ("plant", "native"),
     "cross_check": ("plant",),
+    "held_out": ("plant",),
+    "report": ("plant",),
     "controller": ("plant", "all"),
     "sensors": ("plant", "ssp", "all"),
     "healthy": ("estimator", "native", "ssp", "all"),
@@ -579,10 +647,12 @@ def _request(given: argparse.Namespace) -> Request:
         say=lambda text: sys.stderr.write(f"irj: {text}\n"),
         fmi=given.fmi or 2,
         cross_check=given.cross_check,
+        held_out=given.held_out,
+        report=given.report,
     )
     if given.json is not None:
         made = [request.out / name for name in _names(given.kind, _base(request))]
-        check_output(given.json, [request.source, *request.healthy])
+        check_output(given.json, list(request.inputs))
         if given.json.absolute() in [path.absolute() for path in made]:
             raise InputError(f"{given.json}: given for two results; give each a file of its own")
     return request

@@ -14,6 +14,7 @@ import numpy as np
 from identification.errors import InputError
 from identification.version import VERSION
 from irj_fmu.command_line import replace_files
+from irj_fmu.fmi.related import csv_text
 from irj_fmu.host.exchange import Exchange, simulate_me
 from irj_fmu.host.fmu import Fmu, Instance
 from irj_fmu.host.run import Trajectory, Wiring, simulate_cs
@@ -90,12 +91,12 @@ def write_cross_check(fmu: Path, out: Path, drives: Mapping[str, Signal]) -> lis
             found = _run(opened, kind, inputs, outputs, step)
             content = {
                 f"{name}.fmu": Path(fmu).read_bytes(),
-                f"{name}_ref.csv": _csv(found.time, {n: found[n] for n in outputs}),
+                f"{name}_ref.csv": csv_text(found.time, {n: found[n] for n in outputs}),
                 f"{name}_ref.opt": _options(kind, step),
                 "README.md": _readme(name, kind, step, bool(inputs)),
             }
             if inputs:
-                content[f"{name}_in.csv"] = _csv(time, {n: t.values for n, t in inputs.items()})
+                content[f"{name}_in.csv"] = csv_text(time, {n: t.values for n, t in inputs.items()})
             for platform in platforms:
                 place = Path(out) / "fmus" / "2.0" / kind / platform / TOOL / VERSION / name
                 done += replace_files(place, content)
@@ -140,14 +141,6 @@ def _run(
         found = simulate_cs(instance, wiring, step=step, stop=STOP)
     each = round(EVERY / step)
     return Trajectory(rows, {n: found[f"fmu.{n}"][::each] for n in outputs})
-
-
-def _csv(time: FloatArray, columns: Mapping[str, FloatArray]) -> bytes:
-    lines = [",".join(f'"{n}"' for n in ("time", *columns))]
-    table = np.column_stack([time, *columns.values()])
-    # the times as they are meant: 0.07, not 0.07000000000000001
-    lines += [",".join([f"{row[0]:.6g}", *map(repr, row[1:])]) for row in table.tolist()]
-    return ("\n".join(lines) + "\n").encode()
 
 
 def _options(kind: str, step: float) -> bytes:
