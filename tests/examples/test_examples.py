@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -64,6 +65,49 @@ def test_the_system_runs_in_another_host(
         assert len(there) == len(own) == 250
         assert np.ptp(there) > 0.1
         assert np.abs(there - own).max() < np.abs(np.diff(own)).max()
+
+
+LIBCOSIM = """
+import sys
+import numpy as np
+from libcosimpy.CosimExecution import CosimExecution
+from libcosimpy.CosimObserver import CosimObserver
+path, out, step, stop, *wanted = sys.argv[1:]
+execution = CosimExecution.from_ssp_file(ssp_path=path, step_size=round(float(step) * 1e9))
+infos = execution.slave_infos()
+index = {infos[i].name.decode(): infos[i].index for i in range(execution.num_slaves())}
+places = [(index[name], int(at)) for name, at in (w.split("=") for w in wanted)]
+observer = CosimObserver.create_last_value()
+assert execution.add_observer(observer)
+rows = []
+for _ in range(round(float(stop) / float(step))):
+    assert execution.step()
+    rows.append([observer.last_real_values(i, [at])[0] for i, at in places])
+np.save(out, np.array(rows))
+"""
+
+
+def test_the_system_runs_in_libcosim_as_in_fmpy(
+    system: dict[str, float], folder: Path, tmp_path: Path
+) -> None:
+    """The same as in ecos: a joint is nowhere further off than it moves in one step."""
+    from fmpy import read_model_description
+
+    wanted = []
+    for name in two_joints.NAMES:
+        about = read_model_description(str(folder / f"{name}.fmu"))
+        at = next(v.valueReference for v in about.modelVariables if v.name == "link_position")
+        wanted.append(f"{name}={at}")
+    command = [sys.executable, "-c", LIBCOSIM, str(folder / "two_joints.ssp")]
+    command += [str(tmp_path / "found.npy"), str(two_joints.STEP), "0.5", *wanted]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    there, here = np.load(tmp_path / "found.npy"), two_joints.run(folder, 0.5)
+    for i, name in enumerate(two_joints.NAMES):
+        own = here[f"{name}.link_position"]
+        assert len(there) == len(own) == 250
+        assert np.ptp(there[:, i]) > 0.1
+        assert np.abs(there[:, i] - own).max() < np.abs(np.diff(own)).max()
 
 
 def test_every_part_can_be_taken_out_and_validates(system: dict[str, float], folder: Path) -> None:
