@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
+import math
 import os
 import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, final
 
@@ -30,6 +31,8 @@ from irj_fmu.fmi.compiler import find_compiler
 
 if TYPE_CHECKING:
     from identification.data.record import Record
+    from irj_fmu.fmi.related import Related
+    from irj_fmu.plant.library import PlantSpec
 
 KINDS: Final = ("estimator", "plant", "native", "ssp", "all")
 _TRY: Final = (
@@ -93,6 +96,11 @@ class Request:
         Called with one sentence per doubt about a record.
     fmi : {2, 3}
         Version of FMI, of plants and native estimators.
+    cross_check : bool
+        Of a plant: the folder of the FMI Cross-Check, too.
+    held_out, report : Path, optional
+        Of a plant: a record that the fit did not see, and the report of the fit, that go into it
+        with the joint file.
     """
 
     joint: Joint
@@ -108,6 +116,15 @@ class Request:
     sample_time: float | None = None
     say: Callable[[str], object] = lambda _text: None
     fmi: int = 2
+    cross_check: bool = False
+    held_out: Path | None = None
+    report: Path | None = None
+
+    @property
+    def inputs(self) -> tuple[Path, ...]:
+        """Files that are read."""
+        more = (self.held_out, self.report)
+        return (self.source, *self.healthy, *(path for path in more if path is not None))
 
 
 def build(
@@ -138,7 +155,7 @@ def build(
         raise InputError(f"{kind!r} cannot be built; choose one of {', '.join(KINDS)}")
     keep_inputs(
         [request.out / name for name in _names(kind, _base(request))],
-        [request.source, *request.healthy],
+        list(request.inputs),
     )
     made_folders = _prepare(request.out)
     hold(request.out)
@@ -156,6 +173,8 @@ def build(
                     path.replace(final_path)
                     done.append(final_path)
                     say(f"{final_path} ({note}; validated, {ran})")
+                    if request.cross_check:
+                        done += _cross_check(request, final_path, say)
     except OSError as error:
         raise InputError(
             f"{request.out}: cannot write there ({error.strerror or error}); choose a writable "
@@ -267,6 +286,8 @@ def _one_plant(
         request.joint,
         PlantOptions(controller=controller, motion=motion, sensors=sensors, name=name),
     )
+    if request.held_out is not None or request.report is not None:
+        spec = replace(spec, related=_related(request, spec))
     maker = {2: build_plant, 3: build_plant_fmi3}[request.fmi]
     path = maker(spec, folder / f"{name}.fmu", cc=request.cc, target=targets)
     kinds = "co-simulation" if spec.memory else "model exchange and co-simulation"
@@ -275,6 +296,44 @@ def _one_plant(
         f"FMI {request.fmi}.0 {kinds}, {len(spec.states) + len(spec.memory)} states, "
         f"{len(spec.parameters)} parameters",
     )
+
+
+def _related(request: Request, spec: PlantSpec) -> tuple[Related, ...]:
+    """The joint file, the report of the fit and a held-out record as files of the plant."""
+    from irj_fmu.estimator.healthy import read_healthy
+    from irj_fmu.fmi.related import Related, experiment_files
+    from irj_fmu.plant.measured import measured_run
+
+    def content(path: Path) -> bytes:
+        try:
+            return path.read_bytes()
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+
+    found = [
+        Related(
+            "joint.toml",
+            content(request.source),
+            "application/toml",
+            "model",
+            "Joint file: structure, fitted values with errors, and which records they are from.",
+        )
+    ]
+    if request.report is not None:
+        kind = "text/html" if request.report.suffix in (".html", ".htm") else "text/plain"
+        found.append(
+            Related(
+                f"report{request.report.suffix}",
+                content(request.report),
+                kind,
+                "report",
+                "Report of the fit.",
+            )
+        )
+    if request.held_out is not None:
+        (record,) = read_healthy([request.held_out], request.joint, request.say)
+        found += experiment_files(measured_run(record, spec, request.joint.gear_ratio))
+    return tuple(found)
 
 
 def _estimator(request: Request, folder: Path) -> list[tuple[Path, str]]:
@@ -351,14 +410,10 @@ def _ssp(request: Request, folder: Path) -> list[tuple[Path, str]]:
         request, folder, f"{base}_plant", controller=False, sensors=request.sensors
     )
     estimator = _estimator(request, folder)[0][0]
-    by_current = request.joint.torque_per_current is not None
-    scale = request.joint.torque_per_current if by_current else request.joint.gear_ratio
-    tones = [size / abs(float(scale or 1.0)) for size in (60.0, 30.0, 10.0)]
-    spec = multisine_source(
-        tones, (0.2, 0.7, 2.3), (0.0, 1.0, 2.0), unit="A" if by_current else "N.m"
-    )
+    drive, tones = _drive(request)
+    amplitudes, frequencies, phases = zip(*tones, strict=True)
+    spec = multisine_source(amplitudes, frequencies, phases, unit="A" if drive == "i_m" else "N.m")
     source = build_plant(spec, folder / "source.fmu", cc=request.cc)
-    drive = "i_m" if by_current else "tau_m"
     channels = {
         "q_m": "motor_position",
         "w_m": "motor_velocity",
@@ -377,6 +432,34 @@ def _ssp(request: Request, folder: Path) -> list[tuple[Path, str]]:
     )
     path = write_ssp(system, folder / f"{base}.ssp")
     return [(path, "SSP 1.0: source, plant, estimator")]
+
+
+def _cross_check(request: Request, fmu: Path, say: Callable[[str], object]) -> list[Path]:
+    from irj_fmu.cross_check import write_cross_check
+
+    if not _runs_here(fmu):
+        raise InputError(
+            f"{fmu}: the reference solution is computed here, and it holds no library for this "
+            "machine; give --target all, or leave out --cross-check"
+        )
+    drive, tones = _drive(request)
+
+    def signal(time: float) -> float:
+        return sum(a * math.sin(2 * math.pi * f * time + shift) for a, f, shift in tones)
+
+    made = write_cross_check(fmu, request.out, {drive: signal})
+    for place in sorted({path.parent for path in made}):
+        say(f"{place} (cross-check: FMU, reference, options)")
+    return made
+
+
+def _drive(request: Request) -> tuple[str, list[tuple[float, float, float]]]:
+    """Drive input of a plant, and tones for it: amplitude, frequency [Hz], phase [rad]."""
+    by_current = request.joint.torque_per_current is not None
+    scale = request.joint.torque_per_current if by_current else request.joint.gear_ratio
+    sizes = [size / abs(float(scale or 1.0)) for size in (60.0, 30.0, 10.0)]
+    tones = list(zip(sizes, (0.2, 0.7, 2.3), (0.0, 1.0, 2.0), strict=True))
+    return ("i_m" if by_current else "tau_m"), tones
 
 
 def _package(name: str) -> Path:
@@ -493,6 +576,25 @@ def parser(prog: str = "build_fmu.py") -> OneLineParser:
     made.add_argument(
         "--no-torque", action="store_true", help="estimators: the joint has no torque sensor"
     )
+    made.add_argument(
+        "--held-out",
+        type=Path,
+        metavar="RECORD",
+        help="plant: a record that the fit did not see; inside the FMU it is an experiment with "
+        "stimuli and reference (FMI-LS-REF)",
+    )
+    made.add_argument(
+        "--report",
+        type=Path,
+        metavar="FILE",
+        help="plant: the report of the fit, which goes into the FMU (FMI-LS-REF)",
+    )
+    made.add_argument(
+        "--cross-check",
+        action="store_true",
+        help="plant, FMI 2.0: also a folder with inputs, reference solution and options, by the "
+        "rules of the FMI Cross-Check",
+    )
     made.add_argument("--json", type=Path, metavar="FILE", help="write what was built as JSON")
     return made
 
@@ -500,6 +602,9 @@ def parser(prog: str = "build_fmu.py") -> OneLineParser:
 _OF: Final = {  # options that only some kinds heed
     "sample_time": ("native", "all"),
     "fmi": ("plant", "native"),
+    "cross_check": ("plant",),
+    "held_out": ("plant",),
+    "report": ("plant",),
     "controller": ("plant", "all"),
     "sensors": ("plant", "ssp", "all"),
     "healthy": ("estimator", "native", "ssp", "all"),
@@ -524,6 +629,8 @@ def _request(given: argparse.Namespace) -> Request:
             )
     if given.sample_time is not None and not 1e-5 <= given.sample_time <= 1.0:
         raise InputError(f"--sample-time {given.sample_time:g}: give 0.00001 to 1 s")
+    if given.cross_check and given.fmi == 3:
+        raise InputError("--cross-check: its rules are for FMI 2.0; leave out --fmi 3")
     joint = load_joint(given.joint)
     request = Request(
         joint=joint,
@@ -539,10 +646,13 @@ def _request(given: argparse.Namespace) -> Request:
         sample_time=given.sample_time,
         say=lambda text: sys.stderr.write(f"irj: {text}\n"),
         fmi=given.fmi or 2,
+        cross_check=given.cross_check,
+        held_out=given.held_out,
+        report=given.report,
     )
     if given.json is not None:
         made = [request.out / name for name in _names(given.kind, _base(request))]
-        check_output(given.json, [request.source, *request.healthy])
+        check_output(given.json, list(request.inputs))
         if given.json.absolute() in [path.absolute() for path in made]:
             raise InputError(f"{given.json}: given for two results; give each a file of its own")
     return request

@@ -20,7 +20,7 @@ from casadi_models.vectorised import Vectorised
 from identification.balance.kinematic import kinematic_law
 from identification.balance.memory import Law, residuals_of, states_of
 from identification.balance.sensing import Sensing
-from identification.balance.weak import WeakRecord
+from identification.balance.weak import PAIR, WeakRecord
 
 FloatArray = npt.NDArray[np.float64]
 Expression = Any
@@ -385,6 +385,11 @@ class Memory:
         )
         self._states = int(e.memory.shape[0])
         self._used = sorted(set(ca.jacobian_sparsity(after, signals).get_triplet()[1]))
+        of_torsion = [
+            {_NAMES[k] for k in ca.jacobian_sparsity(x, signals).get_triplet()[1]} >= set(PAIR)
+            for x in coordinates
+        ]
+        self._of_torsion = np.flatnonzero(of_torsion)
         kept = ca.vertcat(*(signals[i] for i in self._used)) if self._used else ca.SX(0, 1)
         one: Any = ca.Function("one", [e.memory, steps, kept, e.parameters, e.clock], [after])
         self.coordinates = Vectorised(
@@ -412,6 +417,12 @@ class Memory:
             if name in data.smooth:
                 matrix[i] = data.smooth[name]
         where = self.coordinates(count, matrix, p)
+        if data.paired and len(self._of_torsion):
+            both = matrix.copy()
+            for name, values in data.paired.items():
+                both[_NAMES.index(name)] = values
+            where = where.copy()
+            where[self._of_torsion] = self.coordinates(count, both, p)[self._of_torsion]
         out = np.zeros((self._states, count))
         for first, last in zip(data.starts[:-1], data.starts[1:], strict=True):
             out[:, first:last] = self.follow(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -22,6 +23,7 @@ from identification.balance.stamps import evened
 from identification.balance.weak import (
     CLAIM_KERNEL,
     KERNEL_SAMPLES,
+    PAIR,
     POSITION_CHAINS,
     WeakRecord,
     differentiated_kernel,
@@ -54,6 +56,9 @@ PREPARED: Final = 16_000_000
 """Values of prepared records that a thread keeps (128 MB): two records of 40 s at 1 kHz at every
 kernel of the verdict.
 """
+TWIST_NOISE: Final = 5e-4
+"""Noise of the torsion that a law with memory may follow, as a share of the torsion's size: a tenth
+of the narrowest width that is tried for such a law."""
 VELOCITY_NOISE: Final = 2e-3
 """Noise of a pointwise velocity, as a share of the record's speed, that is small enough."""
 
@@ -231,7 +236,7 @@ def _once(
         made = weak_record(
             record, joint, sensing, length, first_block, curved=curved, late=late, known=known
         )
-        tables = (made.averaged, made.points, made.smooth, made.curved)
+        tables = (made.averaged, made.points, made.smooth, made.curved, made.paired)
         return replace(made, name=run_name(record)), sum(
             x.size for table in tables for x in table.values()
         )
@@ -301,6 +306,7 @@ def weak_record(
         c: pointwise_kernel(signals[c], segments, record.dt, longest, own)
         for c, own in noise.items()
     }
+    torsion = torsion_kernel(signals, segments, record.dt, pointwise, noise)
 
     last: list[tuple[Mapping[str, float], WeakRecord]] = []
 
@@ -315,6 +321,7 @@ def weak_record(
             length=length,
             first_block=first_block,
             pointwise=pointwise,
+            torsion=torsion,
             curved=curved,
             before=before,
             same=set(signals) - changed,
@@ -359,7 +366,7 @@ def _with_rests(made: WeakRecord, noise: Mapping[str, ChannelNoise]) -> WeakReco
     would wear their state down, since they count every step, whatever its sign.
     """
     out: dict[str, FloatArray] = {}
-    smooth = dict(made.smooth)
+    smooth, paired = dict(made.smooth), dict(made.paired)
     for side in ("motor", "link"):
         source = f"{side}_position"
         if source not in noise:
@@ -367,17 +374,21 @@ def _with_rests(made: WeakRecord, noise: Mapping[str, ChannelNoise]) -> WeakReco
         still_speed = STILL * made.grid.velocity_noise(source, noise[source])
         slow = np.abs(made.points[f"{side}_velocity"]) <= still_speed
         shortest = max(1, whole(made.grid.pointwise[source] / (made.grid.step * made.grid.dt)))
-        still, held = np.zeros(len(slow)), made.smooth[source].copy()
+        still = np.zeros(len(slow))
+        tables = [t for t in (smooth, paired) if source in t]
+        for t in tables:
+            t[source] = t[source].copy()
         for first, last in zip(made.starts[:-1], made.starts[1:], strict=True):
             edges = np.flatnonzero(np.diff(np.concatenate([[False], slow[first:last], [False]])))
             for begin, end in edges.reshape(-1, 2):
                 if end - begin >= shortest:
                     rows = slice(first + begin, first + end)
                     still[rows] = 1.0
-                    held[rows] = np.linspace(held[rows.start], held[rows.stop - 1], end - begin)
-        smooth[source] = held
+                    for t in tables:
+                        held = t[source]
+                        held[rows] = np.linspace(held[rows.start], held[rows.stop - 1], end - begin)
         out[side] = made.average(still) if still.any() else np.zeros(made.rows)
-    return replace(made, rest=out, smooth=smooth)
+    return replace(made, rest=out, smooth=smooth, paired=paired)
 
 
 def _loudness(noise: ChannelNoise) -> float:
@@ -419,6 +430,34 @@ def pointwise_kernel(
         if length < longest and noise.after(kernel(length, dt, 1), dt) <= share * fast:
             return length
     return max(longest, 6 * dt)
+
+
+def torsion_kernel(
+    signals: Mapping[str, FloatArray],
+    segments: tuple[slice, ...],
+    dt: float,
+    pointwise: Mapping[str, float],
+    noise: Mapping[str, ChannelNoise],
+) -> float:
+    """Kernel of both positions for laws that follow their difference [s]: the shortest one whose
+    noise does not matter beside the widths of such laws, no longer than those of the velocities;
+    0 where there are not two positions.
+
+    A law with memory counts every turn of the torsion, and a longer kernel takes its corners off.
+    """
+    if not set(PAIR) <= set(noise):
+        return 0.0
+    motor, link = (np.concatenate([signals[c][s] for s in segments]) for c in PAIR)
+    twist = motor - link
+    span = float(np.quantile(np.abs(twist - np.median(twist)), 0.99))
+    longest = max(pointwise[c] for c in PAIR)
+    for length in (*(n * dt for n in SHORT_KERNELS), *POINTWISE_KERNELS):
+        if length >= longest:
+            break
+        weights = kernel(length, dt, 0)
+        if math.hypot(*(noise[c].after(weights, dt) for c in PAIR)) <= TWIST_NOISE * span:
+            return length
+    return longest
 
 
 def _ranges(data: Sequence[WeakRecord], clamped: bool) -> dict[str, float]:

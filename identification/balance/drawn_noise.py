@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from identification.balance.colour import ChannelNoise
-from identification.balance.weak import POSITION_CHAINS, WeakRecord, filtered
+from identification.balance.weak import POSITION_CHAINS, WeakRecord, filtered, paired
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -129,6 +129,7 @@ def excerpt(record: WeakRecord) -> tuple[WeakRecord, IntArray]:
         averaged=of(record.averaged, which),
         points=of(record.points, where),
         smooth=of(record.smooth, where),
+        paired=of(record.paired, where),
         time=record.time[which],
         block=record.block[which],
         starts=np.concatenate([[0], np.cumsum([len(p) for p in points])]).astype(np.int64),
@@ -150,6 +151,7 @@ def _drawn(
     ]
     drawn = {c: noise[c].draw(rng, count, grid.dt) for c in present}
     averaged, points, smooth, curved = filtered(grid, drawn, curved=bool(record.curved))
+    also = paired(grid, {c: drawn.get(c, np.zeros(count)) for c in record.paired})
     calm = replace(record, points={**record.points, **record.smooth})
     return Draw(
         record,
@@ -160,6 +162,7 @@ def _drawn(
             averaged=_plus(record.averaged, averaged),
             points=_plus(calm.points, points),
             smooth=_plus(record.smooth, smooth),
+            paired=_plus(record.paired, also),
             curved=_plus(record.curved, curved),
         ),
     )

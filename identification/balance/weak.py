@@ -33,6 +33,9 @@ POSITION_CHAINS: Final = {
 }
 """Measured signals and the signals that follow from them by derivatives."""
 
+PAIR: Final = ("motor_position", "link_position")
+"""Positions of which the difference is the torsion."""
+
 TORQUES: Final = ("torque", "drive", "coupling_torque")
 """Measured signals that may jump between two samples."""
 
@@ -161,6 +164,9 @@ class Grid:
         Samples left out at either end of a stretch.
     pointwise : mapping of str to float
         Kernel length of the derivatives inside nonlinear laws, by measured signal [s].
+    torsion : float
+        Kernel length of both positions where a memory operator follows their difference [s]; at 0
+        each has its own.
     """
 
     length: float
@@ -170,6 +176,7 @@ class Grid:
     segments: tuple[slice, ...]
     half: int
     pointwise: Mapping[str, float]
+    torsion: float = 0.0
 
     @property
     def alternating(self) -> FloatArray:
@@ -228,6 +235,9 @@ class WeakRecord:
         Signals where nonlinear laws are evaluated.
     smooth : mapping of str to (points,) array
         The same, positions smoothed too: input of memory operators.
+    paired : mapping of str to (points,) array
+        Both positions smoothed by one kernel: input of memory operators of the torsion, which is
+        small beside either. Empty where each has its own.
     time : (rows,) array
         Centre of each row [s].
     block : (rows,) int array
@@ -266,6 +276,7 @@ class WeakRecord:
     support: FloatArray | None = None
     name: str = ""
     shifts: Mapping[str, float] = field(default_factory=dict)
+    paired: Mapping[str, FloatArray] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return one_line(self)
@@ -419,6 +430,7 @@ def prepare(
     *,
     length: float = 0.06,
     pointwise: float | Mapping[str, float] = 0.03,
+    torsion: float = 0.0,
     block: float = 1.5,
     overlap: int = 4,
     first_block: int = 0,
@@ -441,6 +453,8 @@ def prepare(
         Kernel of the balances [s].
     pointwise : float or mapping of str to float
         Kernel of the derivatives inside nonlinear laws, one for all or by measured signal [s].
+    torsion : float
+        As in :class:`Grid`.
     block : float
         Length of the blocks that count as independent [s].
     overlap : int
@@ -470,7 +484,14 @@ def prepare(
     half = step * int(np.ceil(reach / step))
     long_enough = tuple(s for s in segments if s.stop - s.start > 2 * half + stride)
     grid = Grid(
-        length, dt, stride=stride, step=step, segments=long_enough, half=half, pointwise=short
+        length,
+        dt,
+        stride=stride,
+        step=step,
+        segments=long_enough,
+        half=half,
+        pointwise=short,
+        torsion=torsion,
     )
     over = set(same) if before is not None and before.grid == grid else set[str]()
     found = filtered(grid, {n: x for n, x in signals.items() if n not in over}, curved=curved)
@@ -515,7 +536,23 @@ def prepare(
         starts=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
         curved=bent,
         between=between,
+        paired=paired(grid, signals),
     )
+
+
+def paired(grid: Grid, signals: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+    """Both positions as :class:`WeakRecord` has them for laws that follow the torsion; empty where
+    there are not two of them or each has its own kernel.
+
+    Two kernels would take two different shares off a turn of the motor, and what is left of it is
+    no torsion.
+    """
+    if grid.torsion <= 0 or not set(PAIR) <= set(signals):
+        return {}
+    return {
+        c: _pointwise(signals[c], grid.segments, grid.torsion, grid.dt, 0, grid.step)[1]
+        for c in PAIR
+    }
 
 
 def filtered(

@@ -229,15 +229,17 @@ def least_squares(
     at = _Point.of(rows, np.clip(first, low, high), own)
     begun = at.cost
     evaluations, used, damping = 1, 0, FIRST_DAMPING
+    held = np.zeros(len(own))
     outcome = Outcome.ITERATIONS if math.isfinite(begun) else Outcome.NOT_FINITE
     while outcome is Outcome.ITERATIONS and used < iterations:
         if at.cost <= NOTHING_LEFT * begun:
             outcome = Outcome.EXACT
             break
         used += 1
-        linear = _linear(rows, at, logs)
+        triangles = rows.triangles(at.x, at.local)
         small = tolerance * at.cost
         for _ in range(MOST_REFUSALS):
+            linear = _linear(triangles, at, logs, held)
             step = bounded_step(linear.triangle, linear.target, box.room(at.x), damping)
             promised = linear.fall(step)
             trial = _Point.of(rows, box.moved(at.x, step), at.local + linear.own_step(step))
@@ -246,20 +248,29 @@ def least_squares(
                 trial = at.each_better(trial)
             gained = at.cost - trial.cost
             if gained >= LEAST_SHARE * promised - ROUNDING * at.cost:
+                held = np.where(trial.costs > at.costs, held, held / LOWER)
+                held[held < RAISED_DAMPING] = 0.0
                 at, damping = trial, _eased(damping, gained, promised)
                 outcome = Outcome.SETTLED if min(promised, gained) <= small else outcome
                 break
             if promised <= small:
                 outcome = Outcome.SETTLED
                 break
-            damping = max(damping * RAISE, RAISED_DAMPING)
+            rose = trial.costs > at.costs
+            if own.shape[1]:
+                held = np.where(rose, np.maximum(held * RAISE, RAISED_DAMPING), held)
+            # where the other blocks gain what was promised the common step is good, and those that
+            # rose are too curved in their own unknowns
+            others = float(np.sum(at.costs[~rose] - trial.costs[~rose]))
+            if not own.shape[1] or others < LEAST_SHARE * promised:
+                damping = max(damping * RAISE, RAISED_DAMPING)
         else:
             # blocks whose own unknowns are off hold up the common step: these first, each block
             # for itself
             settled = at.each_better(_Point.of(rows, at.x, at.local + linear.own_step(0.0 * step)))
             evaluations += 1
             outcome = Outcome.STUCK if at.cost - settled.cost <= WORTH * at.cost else outcome
-            at, damping = settled, FIRST_DAMPING
+            at, damping, held = settled, FIRST_DAMPING, np.zeros(len(own))
     edge = (at.x <= low) | (at.x >= high)
     return Minimum(
         at.x,
@@ -325,13 +336,37 @@ class _Box:
         return np.asarray(np.clip(new, self.low, self.high), dtype=np.float64)
 
 
-def _linear(rows: LocalProblem, at: _Point, logs: BoolArray) -> Linear:
-    """The rows to first order around a point; slopes of logarithmic parameters per unit of the
-    logarithm."""
-    linear = eliminated(rows.triangles(at.x, at.local), at.local.shape[1])
+def _linear(triangles: FloatArray, at: _Point, logs: BoolArray, held: FloatArray) -> Linear:
+    """The rows to first order around a point, the own unknowns of each block held back by its
+    damping; slopes of logarithmic parameters per unit of the logarithm."""
+    unknowns = at.local.shape[1]
+    linear = eliminated(held_back(triangles, unknowns, held), unknowns)
     factor = np.where(logs, at.x, 1.0)
     back = linear.back * np.append(factor, 1.0)
     return Linear(linear.triangle * factor, linear.target, back, linear.unsettled)
+
+
+def held_back(triangles: FloatArray, unknowns: int, damping: FloatArray) -> FloatArray:
+    """Triangles of blocks whose own unknowns pay for their steps.
+
+    A block whose own unknowns are off where its rows are curved, such as a window of time that
+    starts at a turn, takes too long a step of them, whatever the damping of the common parameters.
+
+    Parameters
+    ----------
+    triangles : (blocks, k, k) array
+    unknowns : int
+        First columns that are the block's own.
+    damping : (blocks,) array
+        Relative to columns of unit length; 0 leaves a block as it is.
+    """
+    out = triangles.copy() if damping.any() else triangles
+    for i in np.flatnonzero(damping):
+        price = np.zeros((unknowns, triangles.shape[2]))
+        size = np.linalg.norm(triangles[i, :, :unknowns], axis=0)
+        np.fill_diagonal(price, math.sqrt(damping[i]) * size)
+        out[i] = triangle_of(np.vstack([triangles[i], price]))
+    return out
 
 
 def triangle_of(rows: FloatArray) -> FloatArray:

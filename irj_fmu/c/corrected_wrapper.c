@@ -12,43 +12,10 @@
  *   known_real, known_integer, known_boolean, known_string: its value references, ascending.
  * corrected_law.c (written by CasADi): law(state, reading, parameters) -> (torque, state).
  */
-#include <math.h>
-#include <stdarg.h>
-#include <stdio.h>
-#include <stdlib.h>
-#include <string.h>
-
 #include "fmi2Functions.h"
 #include "corrected_config.h"
 
-#ifdef _WIN32
-#include <windows.h>
-#define LONGEST_PATH 32768
-#else
-#include <dlfcn.h>
-#include <limits.h>
-#define LONGEST_PATH PATH_MAX
-#ifndef RTLD_DEEPBIND /* its names are looked up in itself first: both libraries have the same */
-#define RTLD_DEEPBIND 0
-#endif
-#endif
-
-#define CASADI_SYMBOL_EXPORT static
-#include "corrected_law.c"
-
-#define DIM(n) ((n) > 0 ? (n) : 1)
-#define MAX_SUBSTEPS 2000000L
-
-enum { VR_HOLD = VR_LAW + NF, VR_ADDED, VR_END };
-
-typedef enum { INSTANTIATED = 1, INITIALIZING, STEPPING, TERMINATED } Phase;
-
-typedef struct { /* what changes on this side; the inner FMU has the rest */
-    char guid[40];
-    Phase phase;
-    double t, hold, drive, added;
-    double law[NS], p[DIM(NP)];
-} State;
+#include "corrected_state.h"
 
 typedef struct {
     State s;
@@ -84,65 +51,19 @@ typedef Corrected Instance;
 
 /* ---- the inner FMU -------------------------------------------------------- */
 
+#define FMI(name) fmi2##name
+#define VERSION "fmi2"
 #define NEEDED(X) \
     X(Instantiate) X(FreeInstance) X(SetupExperiment) X(EnterInitializationMode) X(ExitInitializationMode) \
     X(Terminate) X(Reset) X(GetReal) X(SetReal) X(DoStep)
 #define USEFUL(X) \
     X(SetDebugLogging) X(GetInteger) X(GetBoolean) X(GetString) X(SetInteger) X(SetBoolean) X(SetString) \
     X(GetFMUstate) X(SetFMUstate) X(FreeFMUstate) X(SerializedFMUstateSize) X(SerializeFMUstate) X(DeSerializeFMUstate)
-#define DECLARE(name) static fmi2##name##TYPE *inner_##name;
-NEEDED(DECLARE)
-USEFUL(DECLARE)
-
-static char lock; /* over what follows */
-static unsigned long users;
-static void *library;
-static void (*finalizer)(void);
-static char place[3 * LONGEST_PATH + 16], problem[512]; /* place: resources of the inner FMU, as a URI */
-
-static void acquire(void) { while (__atomic_test_and_set(&lock, __ATOMIC_ACQUIRE)) {} }
-static void release(void) { __atomic_clear(&lock, __ATOMIC_RELEASE); }
-
-#ifdef _WIN32
-static void *symbol(const char *name) { return (void *)GetProcAddress((HMODULE)library, name); }
-static void close_library(void) { FreeLibrary((HMODULE)library); }
-
-static int own_path(char *path) { /* UTF-8, with slashes */
-    static wchar_t wide[LONGEST_PATH];
-    HMODULE own;
-    DWORD n;
-    if (!GetModuleHandleExW(GET_MODULE_HANDLE_EX_FLAG_FROM_ADDRESS | GET_MODULE_HANDLE_EX_FLAG_UNCHANGED_REFCOUNT, (LPCWSTR)&own_path, &own)) return 0;
-    n = GetModuleFileNameW(own, wide, LONGEST_PATH);
-    if (!n || n >= LONGEST_PATH || !WideCharToMultiByte(CP_UTF8, 0, wide, -1, path, LONGEST_PATH, NULL, NULL)) return 0;
-    for (; *path; path++)
-        if (*path == '\\') *path = '/';
-    return 1;
-}
-
-static int open_library(char *path) {
-    static wchar_t wide[LONGEST_PATH];
-    char *c;
-    for (c = path; *c; c++)
-        if (*c == '/') *c = '\\';
-    library = MultiByteToWideChar(CP_UTF8, 0, path, -1, wide, LONGEST_PATH) ? (void *)LoadLibraryExW(wide, NULL, LOAD_WITH_ALTERED_SEARCH_PATH) : NULL;
-    if (!library) snprintf(problem, sizeof problem, "Windows refuses %s with error %lu", INNER_LIBRARY, (unsigned long)GetLastError());
-    return library != NULL;
-}
-#else
-static void *symbol(const char *name) { return dlsym(library, name); }
-static void close_library(void) { dlclose(library); }
-
-static int own_path(char *path) {
-    Dl_info info;
-    return dladdr((void *)&own_path, &info) && info.dli_fname && realpath(info.dli_fname, path);
-}
-
-static int open_library(char *path) {
-    library = dlopen(path, RTLD_NOW | RTLD_LOCAL | RTLD_DEEPBIND);
-    if (!library) snprintf(problem, sizeof problem, "%s", dlerror());
-    return library != NULL;
-}
-#endif
+#define PASS_GET(m, vr, n, values, length) inner_GetReal((m)->inner, vr, n, values)
+#define PASS_SET(m, vr, n, values, length) inner_SetReal((m)->inner, vr, n, values)
+#define ENDED(m) 0
+typedef fmi2Byte Byte;
+#include "corrected_inner.c"
 
 /* percent-encoded: some FMUs follow nothing else */
 static void note_place(const char *folder) {
@@ -154,86 +75,15 @@ static void note_place(const char *folder) {
     strcpy(to, "/resources");
 }
 
-static int load(void) {
-    static char path[LONGEST_PATH + 1], whole[LONGEST_PATH + sizeof INNER_LIBRARY + 32];
-    char *slash;
-    int i;
-    if (!own_path(path)) {
-        snprintf(problem, sizeof problem, "the folder of this library is not known");
-        return 0;
-    }
-    for (i = 0; i < 3; i++) /* binaries/PLATFORM/library */
-        if ((slash = strrchr(path, '/'))) *slash = 0;
-    snprintf(whole, sizeof whole, "%s/resources/inner", path);
-    note_place(whole);
-    strcat(whole, "/" INNER_LIBRARY);
-    if (!open_library(whole)) return 0;
-#define RESOLVE(name) *(void **)&inner_##name = symbol("fmi2" #name);
-    NEEDED(RESOLVE)
-    USEFUL(RESOLVE)
-#define MUST(name) if (!inner_##name) { snprintf(problem, sizeof problem, "it lacks fmi2" #name); close_library(); library = NULL; return 0; }
-    NEEDED(MUST)
-    *(void **)&finalizer = symbol("finalizePythonInterpreter");
-    return 1;
-}
-
-static int enter(void) { /* one more instance */
-    int fine;
-    acquire();
-    fine = library || load();
-    users += fine;
-    release();
-    return fine;
-}
-
-static void leave(void) { /* one less; without any the library goes, so that its files can be deleted */
-    acquire();
-    if (--users == 0) {
-        if (finalizer) finalizer(); /* it would be late at exit; such a library stays mapped anyway */
-        else {
-            close_library();
-            library = NULL;
-        }
-    }
-    release();
-}
-
-/* ---- what the inner FMU answers ------------------------------------------- */
-
-static fmi2Status answered(Corrected *m, fmi2Status status, const char *call) {
-    if (status <= fmi2Warning) return status;
-    fail(m, "%s: the inner FMU answers with status %d (3 is an error)", call, (int)status);
-    if (status == fmi2Fatal) m->dead = 1;
-    return status == fmi2Fatal ? fmi2Fatal : fmi2Error;
-}
-
 /* alive, and the inner FMU may be called */
 #define USABLE(call) \
     LIVING("fmi2" call); \
     Corrected *m = c; \
     if (m->dead) return fail(m, call ": the inner FMU has met a fatal error; free the instance")
 
-#define HAS(name, call) if (!inner_##name) return fail(m, call ": the inner FMU lacks fmi2" #name)
-
-static int is_known(const fmi2ValueReference *table, size_t n, fmi2ValueReference vr) {
-    size_t low = 0, high = n;
-    while (low < high) {
-        const size_t middle = (low + high) / 2;
-        if (table[middle] < vr) low = middle + 1;
-        else high = middle;
-    }
-    return low < n && table[low] == vr;
-}
-
 static fmi2Status set_starts(Corrected *m) {
-    State *s = &m->s;
     fmi2Status status = fmi2OK;
-    memset(s, 0, sizeof *s);
-    memcpy(s->guid, CORRECTED_GUID, strlen(CORRECTED_GUID));
-    s->phase = INSTANTIATED;
-    s->hold = HOLD;
-    s->drive = DRIVE_START;
-    memcpy(s->p, start_p, sizeof s->p);
+    start_anew(&m->s);
     if (N_START_REAL) status = answered(m, inner_SetReal(m->inner, start_real, N_START_REAL, start_real_to), "fitted values");
     if (status <= fmi2Warning && N_START_INTEGER)
         status = inner_SetInteger ? answered(m, inner_SetInteger(m->inner, start_integer, N_START_INTEGER, start_integer_to), "start values") : fail(m, "the inner FMU lacks fmi2SetInteger");
@@ -316,39 +166,12 @@ fmi2Status fmi2Reset(fmi2Component c) {
 
 /* ---- variables ------------------------------------------------------------ */
 
-static int is_passed_on(fmi2ValueReference vr) { return vr != VR_DRIVE && is_known(known_real, N_KNOWN_REAL, vr); }
-
-static size_t count_passed_on(const fmi2ValueReference vr[], size_t n) {
-    size_t i = 0;
-    while (i < n && is_passed_on(vr[i])) i++;
-    return i;
-}
-
 static fmi2Status set_one(Corrected *m, fmi2ValueReference vr, double value) {
-    State *s = &m->s;
-    double sum;
-    if (is_passed_on(vr)) return answered(m, inner_SetReal(m->inner, &vr, 1, &value), "setReal");
-    if (vr == VR_DRIVE) {
-        s->drive = value;
-        sum = value + s->added;
-        return answered(m, inner_SetReal(m->inner, &vr, 1, &sum), "setReal");
-    }
-    if (vr < VR_LAW || vr >= VR_ADDED) return fail(m, "setReal: variable %u is unknown or cannot be set", vr);
-    if (s->phase > INITIALIZING) return fail(m, "setReal: variable %u cannot be set in this phase", vr);
-    if (!isfinite(value) || (vr == VR_HOLD && value <= 0)) return fail(m, "setReal: variable %u cannot be %g", vr, value);
-    *(vr == VR_HOLD ? &s->hold : &s->p[free_p[vr - VR_LAW]]) = value;
-    return fmi2OK;
+    return is_passed_on(vr) ? answered(m, inner_SetReal(m->inner, &vr, 1, &value), "setReal") : set_own(m, vr, value, "setReal");
 }
 
 static fmi2Status get_one(Corrected *m, fmi2ValueReference vr, double *value) {
-    State *s = &m->s;
-    if (is_passed_on(vr)) return answered(m, inner_GetReal(m->inner, &vr, 1, value), "getReal");
-    if (vr == VR_DRIVE) *value = s->drive;
-    else if (vr == VR_HOLD) *value = s->hold;
-    else if (vr == VR_ADDED) *value = s->added;
-    else if (vr >= VR_LAW && vr < VR_HOLD) *value = s->p[free_p[vr - VR_LAW]];
-    else return fail(m, "getReal: there is no variable %u", vr);
-    return fmi2OK;
+    return is_passed_on(vr) ? answered(m, inner_GetReal(m->inner, &vr, 1, value), "getReal") : get_own(m, vr, value, "getReal");
 }
 
 fmi2Status fmi2SetReal(fmi2Component c, const fmi2ValueReference vr[], size_t n, const fmi2Real value[]) {
@@ -405,158 +228,20 @@ fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2ValueReferenc
 
 /* ---- FMU state ------------------------------------------------------------ */
 
-typedef struct {
-    State s;
-    unsigned long serial; /* of the instance it belongs to */
-    fmi2FMUstate inner;
-} Saved;
-
-#define OF_THIS(state, call) do { \
-    if (!is_alive(&states, state) || ((Saved *)(state))->serial != m->serial) \
-        return fail(m, call ": this is no state of this instance, or it was freed"); \
-} while (0)
-#define STATES(call) do { if (!INNER_STATES) return fail(m, call ": the inner FMU does not give its state"); } while (0)
-#define BYTES(call) do { if (!INNER_BYTES) return fail(m, call ": the inner FMU does not give its state as bytes"); } while (0)
-
-static Saved *saved_for(Corrected *m, fmi2FMUstate *state) { /* the one that is there, or a new one */
-    Saved *made;
-    if (is_alive(&states, *state) && ((Saved *)*state)->serial == m->serial) return *state;
-    if (!(made = calloc(1, sizeof *made))) return NULL;
-    made->serial = m->serial;
-    if (born(&states, made)) return made;
-    free(made);
-    return NULL;
-}
-
-static fmi2Status kept(Corrected *m, fmi2FMUstate *state, Saved *saved, fmi2Status status) {
-    if (status <= fmi2Warning) *state = saved;
-    else if (saved != *state && dies(&states, saved)) free(saved);
-    (void)m;
-    return status;
-}
-
-fmi2Status fmi2GetFMUstate(fmi2Component c, fmi2FMUstate *state) {
-    Saved *saved;
-    USABLE("GetFMUstate");
-    GIVEN(state, "getFMUstate");
-    STATES("getFMUstate");
-    HAS(GetFMUstate, "getFMUstate");
-    if (!(saved = saved_for(m, state))) return fail(m, "getFMUstate: out of memory");
-    saved->s = m->s;
-    return kept(m, state, saved, answered(m, inner_GetFMUstate(m->inner, &saved->inner), "getFMUstate"));
-}
-
-fmi2Status fmi2SetFMUstate(fmi2Component c, fmi2FMUstate state) {
-    fmi2Status status;
-    USABLE("SetFMUstate");
-    OF_THIS(state, "setFMUstate");
-    HAS(SetFMUstate, "setFMUstate");
-    status = answered(m, inner_SetFMUstate(m->inner, ((Saved *)state)->inner), "setFMUstate");
-    if (status <= fmi2Warning) m->s = ((Saved *)state)->s;
-    return status;
-}
-
-fmi2Status fmi2FreeFMUstate(fmi2Component c, fmi2FMUstate *state) {
-    fmi2Status status = fmi2OK;
-    USABLE("FreeFMUstate");
-    if (!state || !*state) return fmi2OK;
-    OF_THIS(*state, "freeFMUstate");
-    if (inner_FreeFMUstate) status = answered(m, inner_FreeFMUstate(m->inner, &((Saved *)*state)->inner), "freeFMUstate");
-    if (dies(&states, *state)) free(*state);
-    *state = NULL;
-    return status;
-}
-
-fmi2Status fmi2SerializedFMUstateSize(fmi2Component c, fmi2FMUstate state, size_t *size) {
-    fmi2Status status;
-    USABLE("SerializedFMUstateSize");
-    OF_THIS(state, "serializedFMUstateSize");
-    GIVEN(size, "serializedFMUstateSize");
-    BYTES("serializedFMUstateSize");
-    HAS(SerializedFMUstateSize, "serializedFMUstateSize");
-    status = answered(m, inner_SerializedFMUstateSize(m->inner, ((Saved *)state)->inner, size), "serializedFMUstateSize");
-    *size += sizeof(State);
-    return status;
-}
-
-fmi2Status fmi2SerializeFMUstate(fmi2Component c, fmi2FMUstate state, fmi2Byte bytes[], size_t size) {
-    size_t needed = 0;
-    fmi2Status status;
-    USABLE("SerializeFMUstate");
-    OF_THIS(state, "serializeFMUstate");
-    GIVEN(bytes, "serializeFMUstate");
-    HAS(SerializeFMUstate, "serializeFMUstate");
-    status = fmi2SerializedFMUstateSize(c, state, &needed);
-    if (status > fmi2Warning) return status;
-    if (size < needed) return fail(m, "serializeFMUstate: %lu bytes are too few", (unsigned long)size);
-    memcpy(bytes, &((Saved *)state)->s, sizeof(State));
-    return answered(m, inner_SerializeFMUstate(m->inner, ((Saved *)state)->inner, bytes + sizeof(State), size - sizeof(State)), "serializeFMUstate");
-}
-
-fmi2Status fmi2DeSerializeFMUstate(fmi2Component c, const fmi2Byte bytes[], size_t size, fmi2FMUstate *state) {
-    Saved *saved;
-    USABLE("DeSerializeFMUstate");
-    GIVEN(bytes && state, "deSerializeFMUstate");
-    BYTES("deSerializeFMUstate");
-    HAS(DeSerializeFMUstate, "deSerializeFMUstate");
-    if (size <= sizeof(State) || memcmp(bytes, GUID, strlen(GUID)) != 0)
-        return fail(m, "deSerializeFMUstate: these bytes are not a state of this FMU");
-    if (!(saved = saved_for(m, state))) return fail(m, "deSerializeFMUstate: out of memory");
-    memcpy(&saved->s, bytes, sizeof(State));
-    return kept(m, state, saved, answered(m, inner_DeSerializeFMUstate(m->inner, bytes + sizeof(State), size - sizeof(State), &saved->inner), "deSerializeFMUstate"));
-}
+fmi2Status fmi2GetFMUstate(fmi2Component c, fmi2FMUstate *state) { USABLE("GetFMUstate"); return get_state(m, state); }
+fmi2Status fmi2SetFMUstate(fmi2Component c, fmi2FMUstate state) { USABLE("SetFMUstate"); return set_state(m, state); }
+fmi2Status fmi2FreeFMUstate(fmi2Component c, fmi2FMUstate *state) { USABLE("FreeFMUstate"); return free_state(m, state); }
+fmi2Status fmi2SerializedFMUstateSize(fmi2Component c, fmi2FMUstate state, size_t *size) { USABLE("SerializedFMUstateSize"); return size_of_state(m, state, size); }
+fmi2Status fmi2SerializeFMUstate(fmi2Component c, fmi2FMUstate state, fmi2Byte bytes[], size_t size) { USABLE("SerializeFMUstate"); return bytes_of_state(m, state, bytes, size); }
+fmi2Status fmi2DeSerializeFMUstate(fmi2Component c, const fmi2Byte bytes[], size_t size, fmi2FMUstate *state) { USABLE("DeSerializeFMUstate"); return state_of_bytes(m, bytes, size, state); }
 
 /* ---- co-simulation -------------------------------------------------------- */
 
-/* Reads the inner FMU with the host's drive, then gives it the corrected one. */
-static fmi2Status correct(Corrected *m, double at) {
-    static const fmi2ValueReference drive = VR_DRIVE, read[] = VR_READ;
-    State *s = &m->s;
-    double found[2] = {0, 0}, reading[4], out[1 + NS], sum;
-    fmi2Status status = answered(m, inner_SetReal(m->inner, &drive, 1, &s->drive), "doStep");
-    if (status <= fmi2Warning) status = answered(m, inner_GetReal(m->inner, read, sizeof read / sizeof *read, found), "doStep");
-    if (status > fmi2Warning) return status;
-    reading[0] = at;
-    reading[1] = s->drive * PER_DRIVE;
-    reading[2] = found[0] * PER_POSITION;
-    reading[3] = found[1] * PER_RATE;
-    m->arg[0] = s->law;
-    m->arg[1] = reading;
-    m->arg[2] = s->p;
-    m->res[0] = out;
-    law(m->arg, m->res, m->iw, m->w, 0);
-    if (!isfinite(out[0])) return fail(m, "doStep: the correction is not finite at t = %g s; drive %g, position %g, velocity %g of the inner FMU", at, s->drive, found[0], found[1]);
-    memcpy(s->law, out + 1, sizeof s->law);
-    s->added = out[0] / PER_DRIVE;
-    sum = s->drive + s->added;
-    return answered(m, inner_SetReal(m->inner, &drive, 1, &sum), "doStep");
+static fmi2Status pass_step(Corrected *m, double at, double length, int no_rollback) {
+    return inner_DoStep(m->inner, at, length, no_rollback);
 }
 
-fmi2Status fmi2DoStep(fmi2Component c, fmi2Real t, fmi2Real length, fmi2Boolean no_rollback) {
-    fmi2Status status = fmi2OK, one;
-    long i, count;
-    USABLE("DoStep");
-    if (m->s.phase != STEPPING) return fail(m, "doStep: called out of order");
-    if (!isfinite(t) || !(length >= 0) || length / m->s.hold > MAX_SUBSTEPS) return fail(m, "doStep: time %g s or step size %g s is not usable", t, length);
-    count = (long)ceil(length / m->s.hold - 1e-6);
-    if (count < 1) count = 1;
-    for (i = 0; i < count; i++) {
-        const double at = t + i * length / count, end = i + 1 < count ? t + (i + 1) * length / count : t + length;
-        one = length > 0 ? correct(m, at) : fmi2OK;
-        if (one <= fmi2Warning) {
-            const fmi2Status stepped = inner_DoStep(m->inner, at, end - at, no_rollback);
-            if (stepped > fmi2Warning) fail(m, "doStep: the inner FMU fails at t = %g s", at);
-            one = answered(m, stepped, "doStep");
-        }
-        if (one > fmi2Warning) {
-            m->s.phase = TERMINATED; /* part of the step is done: another state or a reset goes on from here */
-            return one;
-        }
-        m->s.t = end;
-        if (one > status) status = one;
-    }
-    return status;
-}
+fmi2Status fmi2DoStep(fmi2Component c, fmi2Real t, fmi2Real length, fmi2Boolean no_rollback) { USABLE("DoStep"); return advance(m, t, length, no_rollback); }
 
 fmi2Status fmi2SetRealInputDerivatives(fmi2Component c, const fmi2ValueReference vr[], size_t n, const fmi2Integer order[], const fmi2Real value[]) {
     USABLE("SetRealInputDerivatives");

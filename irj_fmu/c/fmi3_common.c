@@ -1,7 +1,8 @@
 /* What both FMI 3.0 wrappers answer alike, included by them.
  *
  * Before it stand: Instance with State s (which begins with the token), environment and log; TOKEN; fail(instance, format,
- * ...); restored(instance), called when another state was put into it.
+ * ...); restored(instance), called when another state was put into it. A wrapper round another FMU, which passes calls on, defines
+ * PASSES_ON and answers those of the life cycle, of binary variables and of the FMU state itself.
  */
 
 #include "living.c"
@@ -21,19 +22,23 @@ fmi3Instance fmi3InstantiateScheduledExecution(fmi3String name, fmi3String token
     return NULL;
 }
 
+#ifndef PASSES_ON
 void fmi3FreeInstance(fmi3Instance c) {
     if (!c) return;
     if (dies(&instances, c)) discard(c);
     else tell_stranger("fmi3FreeInstance");
 }
 fmi3Status fmi3SetDebugLogging(fmi3Instance c, fmi3Boolean on, size_t n, const fmi3String categories[]) { LIVING("fmi3SetDebugLogging"); return fmi3OK; }
+#endif
 
 /* ---- no such variables -------------------------------------------------- */
 
-fmi3Status fmi3GetBinary(fmi3Instance c, References vr, size_t n, size_t sizes[], fmi3Binary v[], size_t k) REFUSE("there are no binary variables")
-fmi3Status fmi3SetBinary(fmi3Instance c, References vr, size_t n, const size_t sizes[], const fmi3Binary v[], size_t k) REFUSE("there are no binary variables")
 fmi3Status fmi3GetClock(fmi3Instance c, References vr, size_t n, fmi3Clock v[]) REFUSE("there are no clocks")
 fmi3Status fmi3SetClock(fmi3Instance c, References vr, size_t n, const fmi3Clock v[]) REFUSE("there are no clocks")
+
+#ifndef PASSES_ON
+fmi3Status fmi3GetBinary(fmi3Instance c, References vr, size_t n, size_t sizes[], fmi3Binary v[], size_t k) REFUSE("there are no binary variables")
+fmi3Status fmi3SetBinary(fmi3Instance c, References vr, size_t n, const size_t sizes[], const fmi3Binary v[], size_t k) REFUSE("there are no binary variables")
 
 /* ---- FMU state ------------------------------------------------------------ */
 
@@ -88,6 +93,8 @@ fmi3Status fmi3DeserializeFMUState(fmi3Instance c, const fmi3Byte bytes[], size_
     memcpy(*state, bytes, sizeof(State));
     return fmi3OK;
 }
+
+#endif
 
 /* ---- what other interfaces would need ------------------------------------- */
 

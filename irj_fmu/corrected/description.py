@@ -22,14 +22,20 @@ _KEPT: Final = (
     "canBeInstantiatedOnlyOncePerProcess",
     "canGetAndSetFMUstate",
     "canSerializeFMUstate",
+    "canGetAndSetFMUState",
+    "canSerializeFMUState",
+    "fixedInternalStepSize",
 )
 """What a corrected FMU can do as far as the inner one can; nothing else is promised."""
+_OTHERS: Final = ("ModelExchange", "ScheduledExecution")
+_EVENTS: Final = ("EventIndicator", "ClockedState")
+"""Parts of a structure that belong to these."""
 _BEFORE_LOG: Final = ("ModelExchange", "CoSimulation", "UnitDefinitions", "TypeDefinitions")
 _ERRORS: Final = "logStatusError"
 
 
 def interface(folder: Path) -> Element:
-    """The co-simulation interface in the description of an extracted FMI 2.0 FMU."""
+    """The co-simulation interface in the description of an extracted FMU."""
     found = _root(folder).find("CoSimulation")
     if found is None:
         raise InputError(f"{folder}: modelDescription.xml has no CoSimulation")
@@ -76,10 +82,12 @@ def corrected_description(
     root = _root(folder)
     for key in _GONE:
         root.attrib.pop(key, None)
-    root.attrib |= {"modelName": name, "guid": guid, "description": about}
+    token = "guid" if "guid" in root.attrib else "instantiationToken"
+    root.attrib |= {"modelName": name, token: guid, "description": about}
     root.set("generationTool", GENERATOR)
-    for exchange in root.findall("ModelExchange"):
-        root.remove(exchange)
+    for other in [found for tag in _OTHERS for found in root.findall(tag)]:
+        root.remove(other)
+    _without_events(root)
     _interface(root, name)
     variables = root.find("ModelVariables")
     if variables is None:
@@ -87,7 +95,8 @@ def corrected_description(
     for scalar in variables:
         value = starts.get(scalar.get("name", ""))
         if value is not None:
-            scalar[0].set("start", _start(scalar[0].tag, value))
+            typed = scalar[0] if scalar.tag == "ScalarVariable" else scalar
+            typed.set("start", _start(typed.tag, value))
     taken = {scalar.get("name") for scalar in variables}
     for reference, variable in enumerate(added, first):
         if variable.name in taken:
@@ -104,7 +113,24 @@ def corrected_description(
 def _start(kind: str, value: Number) -> str:
     if kind == "Boolean":
         return str(bool(value)).lower()
-    return repr(float(value) if kind == "Real" else int(value))
+    return repr(float(value) if kind in ("Real", "Float64", "Float32") else int(value))
+
+
+def _without_events(root: Element) -> None:
+    """FMI 3.0: a structure without what only other interfaces have."""
+    structure = root.find("ModelStructure")
+    if structure is None:
+        return
+    gone = {
+        found.get("valueReference")
+        for tag in _EVENTS
+        for found in structure.findall(tag)
+        if found.get("valueReference") is not None
+    }
+    for found in list(structure):
+        initial = found.tag == "InitialUnknown" and found.get("valueReference") in gone
+        if found.tag in _EVENTS or initial:
+            structure.remove(found)
 
 
 def _interface(root: Element, name: str) -> None:
@@ -123,20 +149,20 @@ def _interface(root: Element, name: str) -> None:
 
 def _declare(variables: Element, variable: Variable, reference: int) -> None:
     local = variable.causality == "local"
-    scalar = SubElement(
-        variables,
-        "ScalarVariable",
-        {
-            "name": variable.name,
-            "valueReference": str(reference),
-            "description": variable.description,
-            "causality": variable.causality,
-            "variability": variable.stated_variability,
-            "initial": "calculated" if local else "exact",
-        },
-    )
+    about = {
+        "name": variable.name,
+        "valueReference": str(reference),
+        "description": variable.description,
+        "causality": variable.causality,
+        "variability": variable.stated_variability,
+        "initial": "calculated" if local else "exact",
+    }
     unit = {"unit": variable.unit} if variable.unit else {}
-    SubElement(scalar, "Real", unit if local else {**unit, "start": repr(float(variable.start))})
+    value = unit if local else {**unit, "start": repr(float(variable.start))}
+    if variables.find("ScalarVariable") is None:  # FMI 3.0
+        SubElement(variables, "Float64", {**about, **value})
+    else:
+        SubElement(SubElement(variables, "ScalarVariable", about), "Real", value)
 
 
 def _place(root: Element, tag: str, after: Sequence[str]) -> Element:

@@ -13,13 +13,12 @@ from xml.etree.ElementTree import Element, SubElement
 from identification.errors import InputError
 from irj_fmu.fmi.archive import write_archive
 from irj_fmu.fmi.model_description import to_bytes
+from irj_fmu.fmi.parameter_set import SSC, SSV, add_parameters, parameter_set
 from irj_fmu.fmi.variables import Variable
 from irj_fmu.host.run import Fmu
 from irj_fmu.plant.library import PlantSpec
 
 _SSD = "http://ssp-standard.org/SSP1/SystemStructureDescription"
-_SSC = "http://ssp-standard.org/SSP1/SystemStructureCommon"
-_SSV = "http://ssp-standard.org/SSP1/SystemStructureParameterValues"
 PARAMETERS = "resources/parameters.ssv"
 _OMS = "https://raw.githubusercontent.com/OpenModelica/OMSimulator/master/schema/oms.xsd"
 
@@ -74,8 +73,8 @@ def write_ssp(system: System, out: Path) -> Path:
         "ssd:SystemStructureDescription",
         {
             "xmlns:ssd": _SSD,
-            "xmlns:ssc": _SSC,
-            "xmlns:ssv": _SSV,
+            "xmlns:ssc": SSC,
+            "xmlns:ssv": SSV,
             "name": system.name,
             "version": "1.0",
         },
@@ -96,13 +95,10 @@ def write_ssp(system: System, out: Path) -> Path:
         keys = ("startElement", "startConnector", "endElement", "endConnector")
         SubElement(connections, "ssd:Connection", dict(zip(keys, ends, strict=True)))
     if system.parameters:
-        values = Element(
-            "ssv:ParameterSet", {"xmlns:ssv": _SSV, "xmlns:ssc": _SSC, **_set_attributes(system)}
+        content[PARAMETERS] = parameter_set(
+            system.name,
+            {key: (variables[key].type, value) for key, value in system.parameters.items()},
         )
-        _entries(
-            values, {key: (variables[key].type, value) for key, value in system.parameters.items()}
-        )
-        content[PARAMETERS] = to_bytes(values)
     _annotate(top, system)
     SubElement(root, "ssd:DefaultExperiment", {"startTime": "0.0", "stopTime": repr(system.stop)})
     content["SystemStructure.ssd"] = to_bytes(root)
@@ -151,23 +147,13 @@ def _component(elements: Element, name: str, variables: Mapping[str, Any], syste
     owner = SubElement(
         SubElement(binding, "ssd:ParameterValues"), "ssv:ParameterSet", _set_attributes(system)
     )
-    _entries(
+    add_parameters(
         owner, {variables[key].name: (variables[key].type, value) for key, value in values.items()}
     )
 
 
 def _set_attributes(system: System) -> dict[str, str]:
     return {"name": system.name, "version": "1.0"}
-
-
-def _entries(owner: Element, values: Mapping[str, tuple[str, float]]) -> None:
-    entries = SubElement(owner, "ssv:Parameters")
-    for name, (kind, value) in values.items():
-        SubElement(
-            SubElement(entries, "ssv:Parameter", {"name": name}),
-            f"ssv:{kind}",
-            {"value": repr(value)},
-        )
 
 
 def _annotate(top: Element, system: System) -> None:

@@ -39,17 +39,16 @@ from identification.diagnosis.trials import (
 )
 from identification.fitting.assess import BalanceError, Error, assess
 from identification.fitting.engine import Dataset, Solution, solve, stack
+from identification.fitting.least_squares import bounded_step
 from identification.naming.odds import Odds
 from irj_fmu.host.signals import FloatArray
 
 if TYPE_CHECKING:
     from casadi_models.term import Term
 
-ROUNDS: Final = 3
-"""Steps of a whole fit in which the parameters of the FMU follow: they enter nearly linearly."""
-EXACT: Final = 2
-"""The last of these rounds, in which the FMU runs at its moved parameters: before them its change
-is taken as linear."""
+MOST_ROUNDS: Final = 12
+"""Steps of a whole fit in which the parameters of the FMU follow, at most: a fit by the outputs
+that lacked a loop of the gear had the damping at three times its value, and six took it back."""
 OUTSIDE: Final = ("friction", "torque")
 """Families of effects that can ride outside an FMU as a torque."""
 
@@ -205,15 +204,19 @@ class FmuBench:
         """The whole fit of balances with more terms, the FMU's parameters moved along."""
         if not again and model.structure in self._fits:
             return self._fits[model.structure]
-        sizes, data = np.zeros(len(self._free)), self.data
+        sizes, data, exact = np.zeros(len(self._free)), self.data, True
         solution = solve(model, data, start=start)
         names = [f.name for f in self._free]
-        for number in range(ROUNDS if self._free else 0):
-            sizes = self._moved(solution, data, sizes)
+        for number in range(MOST_ROUNDS if self._free else 0):
+            sizes, certain = self._moved(solution, data, sizes)
+            if exact and not certain:
+                break
+            # the first step is a large one, which the change of one unit tells well enough
+            exact = number > 0
             data = (
-                self._at(sizes)
-                if number < ROUNDS - EXACT
-                else self._remade(dict(zip(names, sizes.tolist(), strict=True)))
+                self._remade(dict(zip(names, sizes.tolist(), strict=True)))
+                if exact
+                else self._at(sizes)
             )
             solution = solve(model, data, start=solution.values)
         self._known[id(solution)] = solution, data
@@ -342,8 +345,12 @@ class FmuBench:
             out.append((rows(self._with(data, sizes)) - before) / f.step)
         return out
 
-    def _moved(self, solution: Solution, data: Dataset, sizes: FloatArray) -> FloatArray:
-        """The FMU's parameters after a Gauss-Newton step of all that is free."""
+    def _moved(
+        self, solution: Solution, data: Dataset, sizes: FloatArray
+    ) -> tuple[FloatArray, bool]:
+        """The FMU's parameters after a Gauss-Newton step of all that is free, within their
+        bounds, and whether it takes more squares than noise would give it.
+        """
         base = make_base(solution, data)
         q, found = base.orthonormal, []
         for column in self._columns(solution, data):
@@ -355,9 +362,15 @@ class FmuBench:
         apart = columns - q @ (q.T @ columns)
         left, singular, right = np.linalg.svd(apart, full_matrices=False)
         kept = singular > COLLINEAR
-        change = -(right[kept].T / singular[kept]) @ (left[:, kept].T @ base.residual)
+        triangle = singular[kept, None] * right[kept]
+        target = left[:, kept].T @ base.residual
         low, high = (np.array([getattr(f, n) for f in self._free]) for n in ("low", "high"))
-        return np.asarray(np.clip(sizes + change / norms, low, high), dtype=np.float64)
+        room = ((low - sizes) * norms, (high - sizes) * norms)
+        change = bounded_step(triangle, target, room, 0.0)
+        fall = float(target @ target - np.sum((triangle @ change + target) ** 2))
+        squares = float(base.residual @ base.residual)
+        chance = squares * int(kept.sum()) / float(np.sum(base.share[base.balance]))
+        return np.clip(sizes + change / norms, low, high), fall > chance
 
     def _why_not(self, candidate: Candidate) -> str | None:
         """Why a candidate is not proposed; None where it is."""

@@ -220,8 +220,8 @@ def diagnose(
     outside = replace(prepared_model(joint, before[0]), lagging_load=False)
     steep = [left.steep(r) for r in every] if isinstance(left, Restart) else []
 
-    def prepared(given: Sequence[Record]) -> Dataset:
-        made = load_dataset(given[:count], given[count:], joint, outside)
+    def prepared(given: Sequence[Record], now: Joint = joint) -> Dataset:
+        made = load_dataset(given[:count], given[count:], now, outside)
         return without_steep(replace(made, note=note), given, steep)
 
     data = prepared(before)
@@ -246,7 +246,14 @@ def diagnose(
 
     def remade(added: Mapping[str, float]) -> Dataset:
         at = {n: values[n] + x for n, x in added.items()}
-        return prepared([left.record(r, at) for r in every])
+        if not isinstance(left, Restart):
+            return prepared([left.record(r, at) for r in every])
+        inertias = left.inertias_at(at)
+        known = {n: Known(value=size) for n, size in left.sizes_of(inertias).items()}
+        return prepared(
+            [left.record(r, at, inertias) for r in every],
+            replace(joint, known={**joint.known, **known}),
+        )
 
     bench = FmuBench(
         outside, data, free, remade, inside=inside, own_inertias=own, only_torque=bool(why)

@@ -182,7 +182,10 @@ class Restart:
     @property
     def sizes(self) -> dict[str, float]:
         """Inertias and stiffness of the joint that is left, by the names of its parameters."""
-        found = self.inertias
+        return self.sizes_of(self.inertias)
+
+    def sizes_of(self, found: Inertias) -> dict[str, float]:
+        """The same of other inertias."""
         if len(self.sides) == 1:
             return {"inertia": found.motor}
         sizes = {
@@ -192,7 +195,19 @@ class Restart:
         }
         return {**sizes, "structural_damping": found.damping} if found.damping else sizes
 
-    def record(self, record: Record, values: Mapping[str, float] | None = None) -> Record:
+    def inertias_at(self, values: Mapping[str, float]) -> Inertias:
+        """Inertias and stiffness with other parameters of the FMU."""
+        own = {**self.values, **{k: v for k, v in values.items() if k in self.values}}
+        found = self._probed(own)
+        # with or without a damper it is the same joint
+        return found if self.inertias.damping else replace(found, damping=0.0)
+
+    def record(
+        self,
+        record: Record,
+        values: Mapping[str, float] | None = None,
+        inertias: Inertias | None = None,
+    ) -> Record:
         """A record of the joint that is left (see the head of this module), link torque on the
         link side, motor torque on the motor shaft.
 
@@ -201,8 +216,11 @@ class Restart:
         record : Record
         values : mapping, optional
             Parameters of the FMU, in place of the model's.
+        inertias : Inertias, optional
+            Of the joint that is left, in place of those of the model's parameters. A torque that
+            the FMU lacks has its size in the balances where they are those of the values.
         """
-        model, sides, found = self.model, self.sides, self.inertias
+        model, sides, found = self.model, self.sides, inertias or self.inertias
         own = {**self.values, **{k: v for k, v in (values or {}).items() if k in self.values}}
         law = feedback_of(model, {**model.values, **(values or {})})
         parts: list[dict[str, FloatArray]] = []

@@ -13,6 +13,7 @@ from irj_fmu.fmi.archive import content_guid, write_archive
 from irj_fmu.fmi.compiler import compile_library, find_compiler
 from irj_fmu.fmi.documentation import beside
 from irj_fmu.fmi.model_description import identity, to_bytes
+from irj_fmu.fmi.related import layered
 from irj_fmu.fmi.targets import binaries, native_targets
 from irj_fmu.fmi.unit_definitions import add_unit_definitions, quantity_of
 from irj_fmu.fmi.variables import Variable
@@ -84,6 +85,7 @@ def build_plant_fmi3(
         spec.notes,
         terminals={"joint": {v.name: v.name for v in spec.outputs}},
     )
+    content |= layered(spec.related)
     built = {
         triple: compile_library(sources, _SOURCE, triple, cc=cc, libraries=("m",))
         for triple in targets

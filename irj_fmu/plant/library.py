@@ -18,6 +18,7 @@ from irj_fmu.fmi.compiler import (
 )
 from irj_fmu.fmi.documentation import Note, beside
 from irj_fmu.fmi.model_description import Description, Entry, model_description, to_bytes
+from irj_fmu.fmi.related import Related, layered
 from irj_fmu.fmi.targets import binaries, native_targets
 from irj_fmu.fmi.variables import Variability, Variable, check_unique
 
@@ -60,6 +61,8 @@ class PlantSpec:
         Relative tolerance inside ``doStep`` where the host names none.
     notes : tuple of Note
         Sections of its documentation: equations, faults, limits.
+    related : tuple of Related
+        Files that belong to it, inside the FMU.
     """
 
     name: str
@@ -75,6 +78,7 @@ class PlantSpec:
     default_step: float = 1e-3
     tolerance: float = DEFAULT_TOLERANCE
     notes: tuple[Note, ...] = ()
+    related: tuple[Related, ...] = ()
 
 
 def build_plant(
@@ -126,7 +130,7 @@ def build_plant(
     sources["plant_config.h"] = _config(spec, limits, guid)
     content = {f"sources/{name}": code for name, code in sources.items()}
     content["modelDescription.xml"] = _describe(spec, guid)
-    content |= beside(content["modelDescription.xml"], spec.notes)
+    content |= beside(content["modelDescription.xml"], spec.notes) | layered(spec.related)
     built = {
         triple: compile_library(sources, "plant_wrapper.c", triple, cc=cc, libraries=("m",))
         for triple in targets

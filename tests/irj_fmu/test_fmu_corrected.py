@@ -14,7 +14,10 @@ import pytest
 
 from identification.data.joint_file import Joint
 from identification.errors import InputError
+from identification.online.estimator import OnlineOptions
 from irj_fmu.corrected.build import export_corrected
+from irj_fmu.estimator.native import NativeSpec
+from irj_fmu.estimator.native_fmi3 import build_native_fmi3
 from irj_fmu.fmi.compiler import find_compiler, header_folder
 from irj_fmu.imported.correction import PREFIX
 from irj_fmu.imported.file import outside_correction
@@ -22,6 +25,7 @@ from irj_fmu.imported.library import UserFmu
 from irj_fmu.imported.model import UserModel, load_user_model
 from irj_fmu.imported.port import feedback_of
 from irj_fmu.imported.run import Window
+from irj_fmu.plant.reference import reference_joint
 from tests.user_fmus.make import Make, build
 from tests.user_fmus.plant import foreign
 
@@ -128,6 +132,75 @@ def test_the_corrected_fmu_gives_what_the_fit_gives(
         bare = expected(replace(model, correction=None), window)
         assert np.abs(wanted - bare).max() > 1e-3
         assert np.abs(found - wanted).max() < SAME
+
+
+@pytest.mark.parametrize("label", ["quadratic_drag@motor", "lugre@motor"])
+def test_fmi_3_gives_what_fmi_2_gives(folder: Path, label: str) -> None:
+    """Two wrappers of one law, round the same model in two versions."""
+    found = []
+    for version in (2, 3):
+        model = axis(folder, label, make=Make(version, CS, strict=True))
+        path = export_corrected(model, folder / f"version{version}.fmu")
+        assert f'fmiVersion="{version}.0"' in zipfile.ZipFile(path).read(
+            "modelDescription.xml"
+        ).decode("utf-8")
+        window = driven(model, [0.3, 0.1], 4e-3)
+        found.append(in_fmpy(path, model, window, {"q": 0.3, "w": 0.1}))
+        assert np.abs(found[-1] - expected(model, window)).max() < SAME
+    assert np.abs(found[0] - found[1]).max() < 1e-12
+
+
+def test_arrays_and_other_types_of_fmi_3_go_through(folder: Path) -> None:
+    """An estimator has whole numbers, flags, texts and arrays; the law beside it is zero."""
+    from fmpy import read_model_description
+    from fmpy.fmi3 import FMU3Slave
+
+    joint = reference_joint("hd3")
+    spec = NativeSpec(joint, "watch", OnlineOptions(optimise=False), None, 1e-3)
+    bare = load_user_model(
+        build_native_fmi3(spec, folder / "watch.fmu"),
+        {"motor_current": "i_m", "motor_position": "q_l_hat"},
+        joint=joint,
+        kind="cs",
+    )
+    law = outside_correction(
+        ["quadratic_drag@motor"], joint, {f"{PREFIX}motor_quadratic_drag": 0.0}, "here"
+    )
+    outer = export_corrected(replace(bare, correction=law), folder / "watched.fmu")
+    found = []
+    for path in (bare.fmu.path, outer):
+        place = folder / f"{path.stem} apart"
+        with zipfile.ZipFile(path) as archive:
+            archive.extractall(place)
+        about: Any = read_model_description(str(place))
+        at = {v.name: v.valueReference for v in about.modelVariables}
+        fmu = FMU3Slave(
+            guid=about.guid,
+            unzipDirectory=str(place),
+            modelIdentifier=about.coSimulation.modelIdentifier,
+            instanceName="one",
+        )
+        fmu.instantiate()
+        fmu.enterInitializationMode()
+        fmu.exitInitializationMode()
+        read = ["i_m", "q_m", "w_m", "q_l", "w_l", "tau_l"]
+        for k in range(40):
+            values = [np.sin(0.3 * k + j) for j in range(len(read))]
+            fmu.setFloat64([at[n] for n in read], values)
+            fmu.setBoolean([at["enable"], at["valid.q_l"]], [True, k % 2 == 0])
+            fmu.doStep(k * 1e-3, 1e-3)
+        # the drive is the wrapper's own, the arrays are the FMU's: one call for both
+        theta = fmu.getFloat64([at["i_m"], at["theta"], at["ratio.motor"], at["sigma"]], 24)
+        more = fmu.getInt32([at["n_samples"], at["n_rows"]]), fmu.getInt64([at["health"]])
+        texts = fmu.getString([at["joint_file"]]), fmu.getBoolean([at["alarm"]])
+        found.append((list(theta), *map(list, more), *map(list, texts)))
+        assert len(found[-1][0]) == 24
+        with pytest.raises(Exception, match="getFloat64|GetFloat64"):
+            fmu.getFloat64([at["i_m"], at["theta"]], 3)
+        fmu.terminate()
+        fmu.freeInstance()
+    assert found[0] == found[1]
+    assert found[0][1][0] == 40
 
 
 def test_units_of_the_foreign_joint_are_those_of_its_ports(folder: Path) -> None:
@@ -251,12 +324,22 @@ def test_the_same_content_gives_the_same_bytes_and_another_guid_where_a_value_di
 def test_what_cannot_be_corrected_in_c_is_said_in_one_line(folder: Path) -> None:
     bare = axis(folder)
     drag = axis(folder, "quadratic_drag@motor")
-    three = UserFmu(build("Axis", folder, Make(3, CS)))
     exchange = UserFmu(build("Axis", folder, Make(2, ("ModelExchange",))))
+    other = UserFmu(build("Axis", folder, Make(3, ("ModelExchange",))))
+    sized = folder / "sized"
+    with zipfile.ZipFile(build("Axis", folder, Make(3, CS))) as archive:
+        archive.extractall(sized)
+    about = (sized / "modelDescription.xml").read_text()
+    more = (
+        '<UInt64 name="size" valueReference="99" causality="structuralParameter" '
+        'variability="fixed" start="2"/></ModelVariables>'
+    )
+    (sized / "modelDescription.xml").write_text(about.replace("</ModelVariables>", more))
     for model, target, line in (
         (bare, None, "no effect rides outside it"),
-        (replace(drag, fmu=three), None, "needs it as FMI 2.0 co-simulation; export the pair"),
-        (replace(drag, fmu=exchange), None, "needs it as FMI 2.0 co-simulation; export the pair"),
+        (replace(drag, fmu=exchange), None, "needs it as co-simulation; export the pair"),
+        (replace(drag, fmu=other), None, "needs it as co-simulation; export the pair"),
+        (replace(drag, fmu=UserFmu(sized)), None, "size is a structural parameter, which"),
         (drag, "win64", "holds no library for win64, so nothing corrected can run there; it has "),
     ):
         with pytest.raises(InputError, match=line) as told:

@@ -30,7 +30,7 @@ from tests.irj_fmu.test_fmu_package import LOADER, clean_environment, pack
 
 HERE = Path(__file__).parents[1]
 OF_2 = ("plant", "native", "slave", "corrected")
-OF_3 = ("plant3", "native3")
+OF_3 = ("plant3", "native3", "corrected3")
 EVERY = (*OF_2, *OF_3)
 C_LIBRARY = {"libc", "libm", "libdl", "libpthread", "ld-linux-x86-64", "ld-linux-aarch64"}
 CHROOT = shutil.which("chroot")
@@ -71,9 +71,9 @@ def made(folder: Path, what: str) -> Path:
     if what in ("native", "native3"):
         spec = NativeSpec(joint, what, OnlineOptions(optimise=False), None, 1e-3)
         return build_native(spec, path) if what == "native" else build_native_fmi3(spec, path)
-    if what == "corrected":  # round a plant that gives its state
+    if what in ("corrected", "corrected3"):  # round a plant that gives its state
         model = load_user_model(
-            made(folder, "plant"),
+            made(folder, what.replace("corrected", "plant")),
             {"motor_current": "i_m", "motor_position": "motor_position"},
             joint=joint,
             kind="cs",
@@ -109,7 +109,7 @@ def command(programs: dict[int, Path], folder: Path, what: str) -> list[str]:
             str(library),
             description.instantiationToken,
             str(readable.valueReference),
-            str(description.numberOfContinuousStates),
+            str(description.numberOfContinuousStates if description.modelExchange else 0),
         ]
     library = place / "binaries" / platform / f"{description.coSimulation.modelIdentifier}.so"
     return [

@@ -80,7 +80,14 @@ NOISE: Final = {"motor_position": 1e-4, "link_position": 2e-6, "link_torque": 0.
 """Of the encoders on their shafts [rad] and of the torque sensor [N.m]."""
 
 
-def recorded(hidden: str | None, seconds: float, seed: int, dt: float = 1e-3) -> Record:
+def recorded(
+    hidden: str | None,
+    seconds: float,
+    seed: int,
+    dt: float = 1e-3,
+    *,
+    noise: Mapping[str, float] = NOISE,
+) -> Record:
     """A record of the joint with an effect that its foreign model lacks."""
     label, values = HIDDEN[hidden] if hidden else ("", {})
     effects = ("viscous@motor", "coulomb@motor", "gravity", *([label] if label else []))
@@ -102,7 +109,8 @@ def recorded(hidden: str | None, seconds: float, seed: int, dt: float = 1e-3) ->
         "link_position": run.states[:, 2],
         "link_torque": run.torque,
     }
-    read = {n: x + NOISE[n] * rng.standard_normal(len(x)) for n, x in channels.items()}
+    noise = {**NOISE, **noise}
+    read = {n: x + noise[n] * rng.standard_normal(len(x)) for n, x in channels.items()}
     return Record.from_channels(
         time, {"motor_torque": run.drive / GEAR, **read}, name=hidden or "nothing"
     )

@@ -17,7 +17,9 @@ from irj_fmu.command_line import OneLineParser, check_output, keep_inputs, repla
 from workbench.cli.files import open_joint, write_json
 
 CODE_KINDS: Final = ("c", "casadi")
-TAKES: Final = ("--joint", "--out", "--cc", "--target", "--sample-time", "--json")
+TAKES: Final = (
+    *("--joint", "--out", "--cc", "--target", "--sample-time", "--json", "--held-out", "--report"),
+)
 """Options that take one word."""
 FUNCTIONS: Final = ("dynamics", "regressor", "jacobian", "energy")
 

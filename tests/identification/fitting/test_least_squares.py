@@ -233,6 +233,44 @@ def test_eliminating_the_unknowns_of_blocks_changes_nothing() -> None:
     assert abs(rough.triangle) == pytest.approx(abs(exact.triangle), rel=1e-5)
 
 
+@dataclass
+class Lines:
+    """Lines of one slope; each block has an offset of its own, which bends in the curved ones."""
+
+    t: np.ndarray
+    y: np.ndarray
+    curved: np.ndarray
+
+    def rows(self, x: np.ndarray, local: np.ndarray) -> np.ndarray:
+        out = []
+        for (a,), y, bent in zip(local, self.y, self.curved, strict=True):
+            root = np.sqrt(1 + a**2) if bent else 1.0
+            slope = np.full_like(self.t, 10 / root**3)
+            out.append(np.column_stack([slope, self.t, x[0] * self.t + 10 * a / root - y]))
+        return np.stack(out)
+
+    def costs(self, x: np.ndarray, local: np.ndarray) -> np.ndarray:
+        return np.asarray(np.sum(self.rows(x, local)[:, :, -1] ** 2, axis=1))
+
+    def triangles(self, x: np.ndarray, local: np.ndarray) -> np.ndarray:
+        return np.array([triangle_of(block) for block in self.rows(x, local)])
+
+
+def test_a_block_that_is_curved_in_its_own_unknown_does_not_hold_up_the_others() -> None:
+    """Its full step runs from 2 to -8 and raises the sum: no damping of the common slope helps."""
+    t = np.linspace(-1, 1, 21)
+    rng = np.random.default_rng(8)
+    noise = 0.01 * rng.standard_normal((5, len(t)))
+    lines = Lines(t, 2.0 * t + noise, np.array([False, False, True, False, False]))
+    local = np.array([[0.0], [0.0], [2.0], [0.0], [0.0]])
+    found = least_squares(lines, [1.9], local=local, tolerance=1e-10)
+    assert found.outcome is Outcome.SETTLED
+    # all offsets and the slope by linear least squares: there is one minimum
+    best = float(np.sum((noise @ t) / np.sum(5 * t**2)))
+    assert found.x[0] == pytest.approx(2.0 + best, abs=1e-7)
+    assert abs(found.local).max() < 1e-2
+
+
 # --- NIST ----------------------------------------------------------------------------------------
 # ----------------------
 

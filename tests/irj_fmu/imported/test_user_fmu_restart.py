@@ -16,7 +16,7 @@ from irj_fmu.imported.restart import Restart
 from tests.irj_fmu.imported.test_user_fmu import DRAG, axis, axis_model
 from tests.irj_fmu.imported.test_user_fmu import TRUTH as AXIS
 from tests.user_fmus.make import Make, build, check
-from tests.user_fmus.plant import TRUTH, foreign, recorded
+from tests.user_fmus.plant import OWN, TRUTH, foreign, recorded
 
 
 @pytest.fixture(scope="module")
@@ -78,6 +78,20 @@ def test_a_kinematic_error_is_named_and_nothing_beside_it(path: Path) -> None:
     assert after.rms < 0.05 * before.rms
     with pytest.raises(InputError, match="only a torque at the drive rides outside"):
         found.add()
+
+
+def test_a_loop_of_the_gear_is_told_where_a_fit_without_it_left_the_fmu(path: Path) -> None:
+    """Fitted by its outputs alone, the FMU has three times the damping and an inertia that is off:
+    three steps from there left 20 times the floor, and two names that are none.
+    """
+    off = {"motor_inertia": 1.05, "link_inertia": 0.98, "stiffness": 1.13, "damping": 3.0}
+    model = foreign(path).with_values({n: OWN[n] * x for n, x in off.items()})
+    found = diagnose(model, recorded("hysteresis", 8.0, 11), recorded("hysteresis", 4.0, 12))
+    assert [c.effects for c in found.claims] == [("hysteresis",)]
+    ratios = found.diagnosis.found.steps[-1].held_out.balances
+    assert {b: e.ratio < 2.0 for b, e in ratios.items()} == dict.fromkeys(ratios, True)
+    # one inertia for both sides of a balance: the FMU's own, where the fit has moved it
+    assert max(ratios[b].ratio for b in ("motor", "link")) < 1.2
 
 
 def test_a_sensor_gain_and_a_motor_constant_are_a_set_where_all_torques_are_free(

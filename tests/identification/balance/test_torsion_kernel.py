@@ -1,0 +1,77 @@
+"""Laws with memory of the torsion follow both positions through one kernel."""
+
+import numpy as np
+import pytest
+
+from casadi_models.joint import TWIST
+from identification.balance.dataset import TWIST_NOISE
+from identification.balance.weak import kernel
+from identification.data.joint_file import Joint
+from identification.data.record import Record
+from identification.fitting.assess import RATIO_LIMIT, assess
+from identification.fitting.engine import load_dataset, prepared_model, solve
+from tests.user_fmus.plant import GEAR, HIDDEN, TRUTH, recorded
+
+LAWS = ("viscous@motor", "coulomb@motor", "gravity")
+JOINT = Joint(
+    name="axis",
+    gear_ratio=GEAR,
+    model_name="hd1",
+    effects=(TWIST, "structural_damping", *LAWS, "hysteresis"),
+)
+
+
+@pytest.fixture(scope="module")
+def exact() -> Record:
+    """Positions without the noise of encoders: each test adds its own."""
+    return recorded("hysteresis", 8.0, 3, noise={"motor_position": 0.0, "link_position": 0.0})
+
+
+def noisy(exact: Record, motor: float, link: float) -> Record:
+    """The record with such noise of the two positions, both in radians of the link."""
+    rng = np.random.default_rng(5)
+    for channel, size in (("motor_position", motor * GEAR), ("link_position", link)):
+        values = exact[channel] + size * rng.standard_normal(len(exact))
+        exact = exact.with_channel(channel, values)
+    return exact
+
+
+@pytest.mark.parametrize(
+    ("motor", "link"), [(1e-8, 2e-6), (1e-6, 1e-9), (1e-6, 2e-6)], ids=["link", "motor", "both"]
+)
+def test_a_loop_of_the_torsion_is_seen_whichever_encoder_is_the_finer(
+    exact: Record, motor: float, link: float
+) -> None:
+    """Each position smoothed by what its own noise asks for: 3 to 36 times the floor."""
+    record = noisy(exact, motor, link)
+    model = prepared_model(JOINT, record)
+    data = load_dataset([record], [], JOINT, model)
+    found = solve(model, data, start={**TRUTH, **HIDDEN["hysteresis"][1]})
+    error = assess(model, data, data.train, found.values)
+    assert error.balances["transmission"].ratio < RATIO_LIMIT
+    assert found.values["hysteresis_width"] == pytest.approx(1e-4, rel=0.02)
+
+
+def test_a_coarse_encoder_keeps_the_kernel_of_its_velocity(exact: Record) -> None:
+    fine, coarse = (noisy(exact, size, 2 * size) for size in (1e-6, 2e-5))
+    kernels = []
+    for record in (fine, coarse):
+        data = load_dataset([record], [], JOINT, prepared_model(JOINT, record))
+        grid = data.train[0].grid
+        kernels.append(grid.torsion)
+        assert grid.torsion <= max(grid.pointwise[c] for c in ("motor_position", "link_position"))
+        twist = record["motor_position"] / GEAR - record["link_position"]
+        left = np.sqrt(5) * (1e-6 if record is fine else 2e-5)
+        left *= np.linalg.norm(kernel(grid.torsion, record.dt, 0))
+        assert left <= TWIST_NOISE * np.ptp(twist) or record is coarse
+    assert kernels[0] < kernels[1]
+
+
+def test_both_positions_stand_still_alike_where_the_joint_turns_as_one(exact: Record) -> None:
+    """A rigid turn of both sides is no torsion, whatever the two velocities ask for."""
+    record = noisy(exact, 1e-8, 2e-6).with_channel(
+        "link_position", noisy(exact, 1e-8, 2e-6)["motor_position"] / GEAR
+    )
+    data = load_dataset([record], [], JOINT, prepared_model(JOINT, record))
+    paired = data.train[0].paired
+    assert np.abs(paired["motor_position"] - paired["link_position"]).max() < 1e-12
