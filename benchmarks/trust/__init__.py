@@ -4,7 +4,7 @@ Joints of the independent generator (tests/hidden_effect) with known values.  Fi
 model is fitted to 48 s of records, and the 95 % intervals of `irj trust` are held against the
 truth, by class of parameter, on motions that turn and on one that goes one way.  Second part:
 `improve` runs on joints with one hidden effect, and how often a name is right is held against the
-chance that was stated for it.
+chance that was stated for it.  ``--page FILE`` writes both as a page (docs/reliability.md).
 """
 
 from __future__ import annotations
@@ -243,7 +243,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--start", type=int, default=9000, help="first seed")
     parser.add_argument("--size", type=float, default=1.0, help="factor on the effects")
     parser.add_argument("--dirt", action="store_true", help="small disturbances in every record")
-    parser.add_argument("--keep", type=Path, help="file of outcomes: those in it are not run again")
+    parser.add_argument("--keep", type=Path, help="file of outcomes of this version: not run again")
     parser.add_argument("--page", type=Path, help="file to write the tables to, as Markdown")
     words = sys.argv[1:] if argv is None else list(argv)
     given = parser.parse_args(words)

@@ -161,9 +161,9 @@ def page(command: str, conditions: str, seen: Sequence[Seen], stated: Sequence[S
         ("All names of all claims", list(stated)),
     ):
         if own:
-            lines += ["", f"## {title}", *_chances(own)]
+            lines += ["", f"## {title}", "", *_chances(own)]
     if seen:
-        lines += ["", "## 95 % intervals", *_intervals(seen)]
+        lines += ["", "## 95 % intervals", "", *_intervals(seen)]
     return "\n".join(lines) + "\n"
 
 
