@@ -4,22 +4,25 @@ Joints of the independent generator (tests/hidden_effect) with known values.  Fi
 model is fitted to 48 s of records, and the 95 % intervals of `irj trust` are held against the
 truth, by class of parameter, on motions that turn and on one that goes one way.  Second part:
 `improve` runs on joints with one hidden effect, and how often a name is right is held against the
-chance that was stated for it.
+chance that was stated for it.  ``--page FILE`` writes both as a page (docs/reliability.md).
 """
 
 from __future__ import annotations
 
 import argparse
-import math
+import shlex
+import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 from types import MappingProxyType
-from typing import Final, final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from benchmarks.next_run import record_of
+from benchmarks.trust.reliability import Kept, Seen, Stated, brier, page, skill, tenths, wilson
 from identification import Joint, improve
 from identification.fitting.engine import load_dataset, prepared_model, solve
 from identification.fitting.trust import CLASSES, trust
@@ -62,18 +65,6 @@ SLOWEST, FASTEST = 0.15, 1.0
 SIZES: Final = (1.0, 0.3, 0.15)
 """Sizes of the hidden effects of the second table, in turn: large ones have one name, and nothing
 to learn from."""
-
-
-@final
-@dataclass(frozen=True)
-class Seen:
-    """One interval against the truth."""
-
-    name: str
-    kind: str
-    motion: str
-    inside: bool
-    deviate: float
 
 
 def joint_of(case: Case, effects: tuple[str, ...] = ()) -> Joint:
@@ -133,24 +124,21 @@ def intervals(effect: str, seed: int, motion: str, *, dirt: bool, size: float) -
     return out
 
 
-def wilson(right: int, count: int) -> tuple[float, float]:
-    """95 % interval of a share [%]."""
-    if not count:
-        return 0.0, 100.0
-    z, share = 1.96, right / count
-    centre = (share + z**2 / (2 * count)) / (1 + z**2 / count)
-    half = z * math.sqrt(share * (1 - share) / count + (z / (2 * count)) ** 2) / (1 + z**2 / count)
-    return 100 * (centre - half), 100 * (centre + half)
-
-
-def coverage(given: argparse.Namespace) -> None:
-    """First table."""
+def coverage(given: argparse.Namespace, kept: Kept) -> list[Seen]:
+    """First table; its intervals."""
     seen: list[Seen] = []
     for k in range(given.joints):
         effect = list(HIDDEN)[k % len(HIDDEN)]
         small = given.size if k % 3 else 0.4 * given.size
         for motion in MOTIONS:
-            seen += intervals(effect, given.start + k, motion, dirt=given.dirt, size=small)
+            of = {
+                "effect": effect,
+                "seed": given.start + k,
+                "motion": motion,
+                "dirt": given.dirt,
+                "size": small,
+            }
+            seen += kept.found({"part": "intervals", **of}, Seen, partial(intervals, **of))
     print(f"95 % intervals of {given.joints} joints{' with disturbances' * given.dirt}")
     print("                               motion   intervals  cover  95 % range of it  deviates")
     for kind in CLASSES:
@@ -159,6 +147,7 @@ def coverage(given: argparse.Namespace) -> None:
         for n in sorted({s.name for s in own}):
             for motion in MOTIONS:
                 line(f"  {n}", motion, [s for s in own if s.name == n and s.motion == motion])
+    return seen
 
 
 def line(label: str, motion: str, seen: Sequence[Seen]) -> None:
@@ -175,26 +164,6 @@ def line(label: str, motion: str, seen: Sequence[Seen]) -> None:
     )
 
 
-@final
-@dataclass(frozen=True)
-class Stated:
-    """A name that `improve` claimed.
-
-    Attributes
-    ----------
-    chance : float
-        As it stated it.
-    right : bool
-    first, alone : bool
-        It is the first of its set; the only one.
-    """
-
-    chance: float
-    right: bool
-    first: bool
-    alone: bool
-
-
 def claimed(effect: str, seed: int, *, dirt: bool, size: float) -> list[Stated]:
     """What `improve` says of one joint with one hidden effect."""
     case = simulate_case(effect, seed, size=size, dirt=dirt)
@@ -208,18 +177,8 @@ def claimed(effect: str, seed: int, *, dirt: bool, size: float) -> list[Stated]:
     ]
 
 
-def skill(stated: Sequence[Stated]) -> float:
-    """Brier skill over a constant: 1 less the mean square error over that of the share that is
-    right [%]."""
-    chance = np.array([s.chance for s in stated])
-    right = np.array([s.right for s in stated], dtype=np.float64)
-    constant = float(np.mean((right - right.mean()) ** 2))
-    error = float(np.mean((chance - right) ** 2))
-    return 100 * (1 - error / constant) if constant > 0 else math.nan
-
-
-def names(given: argparse.Namespace) -> None:
-    """Second table."""
+def names(given: argparse.Namespace, kept: Kept) -> tuple[list[Stated], int]:
+    """Second table; its names, and the number of joints without one."""
     stated: list[Stated] = []
     missed = 0
     effects = list(LIBRARY)
@@ -227,7 +186,8 @@ def names(given: argparse.Namespace) -> None:
         # a stride without a common factor with the number of effects: a few joints see all kinds
         effect = effects[(7 * k) % len(effects)]
         size = given.size * SIZES[k % len(SIZES)]
-        found = claimed(effect, given.start + 500 + k, dirt=given.dirt, size=size)
+        of = {"effect": effect, "seed": given.start + 500 + k, "dirt": given.dirt, "size": size}
+        found = kept.found({"part": "names", **of}, Stated, partial(claimed, **of))
         missed += not found
         stated += found
     print(
@@ -236,37 +196,70 @@ def names(given: argparse.Namespace) -> None:
         f"{', with disturbances' * given.dirt}; {missed} without a name"
     )
     print("chance stated   names  mean stated  right  95 % range of it")
-    for low in np.arange(0.0, 0.95, 0.1):
-        own = [s for s in stated if low <= s.chance < low + 0.1 + 1e-9 * (low > 0.85)]
-        if own:
-            right = sum(s.right for s in own)
-            span = wilson(right, len(own))
-            mean = 100 * np.mean([s.chance for s in own])
-            print(
-                f"{100 * low:3.0f} to {100 * low + 10:3.0f} %   {len(own):5d}       "
-                f"{mean:5.1f} %  {100 * right / len(own):3.0f} %  "
-                f"{span[0]:.0f} to {span[1]:.0f} %"
-            )
+    for low, own in tenths(stated):
+        right = sum(s.right for s in own)
+        span = wilson(right, len(own))
+        mean = 100 * np.mean([s.chance for s in own])
+        print(
+            f"{low:3d} to {low + 10:3d} %   {len(own):5d}       "
+            f"{mean:5.1f} %  {100 * right / len(own):3.0f} %  {span[0]:.0f} to {span[1]:.0f} %"
+        )
     first = [s for s in stated if s.first]
     alone = [s for s in stated if s.alone]
+    print(f"Brier score: all names {brier(stated):.3f}, first names {brier(first):.3f}")
     print(f"Brier skill: all names {skill(stated):.0f} %, first names {skill(first):.0f} %")
     print(
         f"one name: {sum(s.right for s in alone)} of {len(alone)} right, of {len(first)} claims; "
         f"claims that hold the truth: {sum(s.right for s in stated)}"
     )
+    return stated, missed
+
+
+def conditions(given: argparse.Namespace, missed: int) -> str:
+    """What the page was made from, in sentences."""
+    sizes = ", ".join(f"{given.size * s:g}" for s in SIZES)
+    said = [
+        "Joints of the independent generator (`tests/hidden_effect`), first seed "
+        f"{given.start}, {'with' if given.dirt else 'without'} small disturbances."
+    ]
+    if given.names:
+        said.append(
+            f"Names: `improve` on {given.names} joints with one hidden effect of {sizes} times its "
+            f"size; {missed} of them got no name."
+        )
+    if given.joints:
+        said.append(
+            f"Intervals: the true model fitted to {given.joints} joints, on motions that turn and "
+            "on one that goes one way."
+        )
+    return " ".join(said)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Print both tables."""
+    """Print both tables, and write them as a page."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--joints", type=int, default=40, help="joints of the first table")
     parser.add_argument("--names", type=int, default=12, help="joints of the second table")
     parser.add_argument("--start", type=int, default=9000, help="first seed")
     parser.add_argument("--size", type=float, default=1.0, help="factor on the effects")
     parser.add_argument("--dirt", action="store_true", help="small disturbances in every record")
-    given = parser.parse_args(argv)
-    if given.joints:
-        coverage(given)
-    if given.names:
-        names(given)
+    parser.add_argument("--keep", type=Path, help="file of outcomes of this version: not run again")
+    parser.add_argument("--page", type=Path, help="file to write the tables to, as Markdown")
+    words = sys.argv[1:] if argv is None else list(argv)
+    given = parser.parse_args(words)
+    kept = Kept(given.keep)
+    seen = coverage(given, kept) if given.joints else []
+    stated, missed = names(given, kept) if given.names else ([], 0)
+    if given.page is not None:
+        command = shlex.join(["python", "-m", "benchmarks.trust", *_without(words, "--keep")])
+        given.page.write_text(
+            page(command, conditions(given, missed), seen, stated), encoding="utf-8"
+        )
     return 0
+
+
+def _without(words: Sequence[str], option: str) -> list[str]:
+    """Words of a command line but those of an option with one value: what is kept where does not
+    change the figures."""
+    at = [k for k, w in enumerate(words) if w == option]
+    return [w for k, w in enumerate(words) if k not in at and k - 1 not in at]
