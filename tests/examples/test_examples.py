@@ -42,6 +42,11 @@ def test_the_slipping_encoder_and_the_payload_are_told(system: dict[str, float])
     assert 0 < system["elbow: change of the joint told after [s]"] < 3.0
 
 
+@pytest.mark.parametrize("parameter", ["link_inertia", "gravity_torque"])
+def test_the_payload_is_taken_over(parameter: str, system: dict[str, float]) -> None:
+    assert abs(system[f"elbow: {parameter} with its payload found over true"] - 1) < 0.01
+
+
 def test_the_system_runs_in_another_host(
     system: dict[str, float], folder: Path, tmp_path: Path
 ) -> None:
