@@ -250,6 +250,12 @@ def figures(out: Path) -> dict[str, float]:
         )
     told["shoulder: link encoder told after [s]"] = first(found, "shoulder", 4) - FAILS_AT
     told["elbow: change of the joint told after [s]"] = first(found, "elbow", 8) - TAKEN_AT
+    for number, parameter, more in zip(
+        (2, 8), ("link_inertia", "gravity_torque"), PAYLOAD, strict=True
+    ):
+        now = float(found[f"elbow_estimator.theta[{number}]"][-1])
+        truth = models["elbow"].fitted[parameter] + more
+        told[f"elbow: {parameter} with its payload found over true"] = now / truth
     for name in NAMES:
         fault = found[f"{name}_estimator.fault"][found["time"] < TAKEN_AT]
         told[f"{name}: samples with a fault before"] = float(np.count_nonzero(fault))
@@ -263,7 +269,7 @@ def main() -> int:
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
         for text, value in figures(given.out or Path(scratch)).items():
-            print(f"{text:45s} {value:.6g}")
+            print(f"{text:58s} {value:.6g}")
     return 0
 
 

@@ -115,9 +115,7 @@ class OnlineEstimator:
         self.model, self.sensing = prepared(joint, self.options)
         self.rows = RowMaker(self.model, self.sensing, dt, held_parameters(joint))
         self.names, self.balances = self.rows.names, self.rows.balances
-        self.guard = Guard(
-            self.names, self.balances, self.rows.timing.stride * dt, self.model.inertias
-        )
+        self.guard = Guard(self.names, self.balances, self.rows.timing.stride * dt)
         self._plain_rows, self.two_step = self.rows, make_two_step(joint, self.rows, self.options)
         has_link = self.options.has_link
         self.present = (True, True, True, has_link, has_link, self.options.has_torque)
@@ -471,7 +469,7 @@ class OnlineEstimator:
         noise = self.estimator.engine_for("noise").part("fast", "noise")
         np.maximum(noise, check.least**2, out=noise)
         self._set(strained=self._now.strained + 1 if check.over.any() else 0)
-        shown = self._guarded(self.guard, theta, check.weighted_error, check.least, on)
+        shown = self._guarded(self.guard, theta, check, on)
         self._set(theta=self._within(shown))
         if (
             self.two_step is not None
@@ -668,14 +666,14 @@ class OnlineEstimator:
         self,
         guard: Guard,
         theta: FloatArray,
-        error: FloatArray,
-        least: FloatArray,
+        check: RowCheck,
         on: BoolArray,
     ) -> FloatArray:
         """The estimate to show after a row; a recursion that follows a failed sensor is held."""
         if self.estimator is None:
             return self.theta
-        told = guard.step(self.estimator, theta, error, np.maximum(least, self.level), on)
+        level = np.maximum(check.least, self.level)
+        told = guard.step(self.estimator, theta, check.weighted_error, level, on, check.signals)
         if told:
             self._tell(f"estimate {told}")
         if told == "back":
@@ -700,9 +698,7 @@ class OnlineEstimator:
         self._set(strained=0)
         if found.eta is None:
             return
-        trusted = (
-            found.good and found.estimator is not None and guard.plausible(found.estimator.theta)
-        )
+        trusted = found.good and found.estimator is not None and guard.plausible
         if guard.on_probation and not trusted:
             return
         self.rows = two.reshaped(found.eta, found.deviation, self.rows)

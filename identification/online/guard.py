@@ -2,9 +2,9 @@
 
 Where the residuals leave their level at once, the recursion goes on, but the estimate shown is the
 one from before. It is taken up again as it was when the residuals come back (the failure was
-temporary). The new one is accepted when it explains the readings and the change can be one of the
-joint: it shows in one balance, and no inertia has moved with the friction of its side. A failed
-sensor shows in several balances, or scales an inertia.
+temporary). The new one is accepted when it explains the readings, the change shows in one balance,
+and no failed sensor explains it as well: neither a gain and an offset of the torque of that balance
+nor those of its motion. These are fitted to the residuals since, beside the new parameters.
 """
 
 from __future__ import annotations
@@ -30,10 +30,13 @@ _ACCEPT: Final = 3.0
 """Time constant of the residuals; age of what is gone back to; time in which residuals must be
 back, or explained [s].
 """
-_INERTIA: Final = 0.05
 _EXPLAINED: Final = 0.5
 """Share of the limit under which a new estimate explains the readings: a half, so that residuals
-that hover at the limit do not pass for explained."""
+that hover at the limit do not pass for explained. A failed sensor explains them by the same
+measure."""
+_SINGULAR: Final = 1e-9
+"""Share of a signal's mean square that varies at least, for its gain to be told from its offset; a
+thousand times the rounding of the sums."""
 _LONG_AGO: Final = -1_000_000
 _PLAIN: Final = (
     "on_probation",
@@ -45,7 +48,38 @@ _PLAIN: Final = (
     "_new",
     "_over",
     "_on",
+    "_sums",
+    "_limits",
 )
+
+
+_SUMS: Final = 10
+"""Sums of each balance: rows, squares of residual and weight, and of torque and motion their
+squares and their products with weight and residual."""
+
+
+def sensor_explains(sums: Sequence[float], limit: float) -> bool:
+    """True where gain and offset of the torque or of the motion leave less of the residuals than
+    the limit.
+
+    Parameters
+    ----------
+    sums : (10,) sequence of float
+        Rows, then sums of e e, w e, w w, x x, x w, x e, m m, m w and m e, where e is the residual,
+        w the weight of the row, x the torque and m what the motion makes of it, both weighted.
+    limit : float
+        Root mean square [N.m].
+    """
+    rows, ee, we, ww = sums[:4]
+    if not ww > 0.0:
+        return True
+    least = ee - we * we / ww
+    for square, mean, product in (sums[4:7], sums[7:10]):
+        own = square - mean * mean / ww
+        if own > _SINGULAR * square:
+            shared = product - mean * we / ww
+            least = min(least, ee - we * we / ww - shared * shared / own)
+    return least <= limit * limit * rows
 
 
 @final
@@ -58,8 +92,6 @@ class Guard:
         Parameters and balances.
     period : float
         Time between rows [s].
-    inertias : sequence of str
-        Those of the parameters that must stay positive.
 
     Attributes
     ----------
@@ -70,15 +102,13 @@ class Guard:
         Rows since the probation began.
     """
 
-    def __init__(
-        self, names: Sequence[str], balances: Sequence[str], period: float, inertias: Sequence[str]
-    ) -> None:
-        self.inertias = [i for i, n in enumerate(names) if n in inertias]
+    def __init__(self, names: Sequence[str], balances: Sequence[str], period: float) -> None:
         self._count, self._size = len(balances), len(names)
         self._rate = min(1.0, period / _MEMORY)
         self._age, self._wait_back, self._wait_accept = (
             max(1, round(t / period)) for t in (_AGE, _BACK, _ACCEPT)
         )
+        self._forget = 1.0 - 1.0 / self._wait_accept
         self.reset()
 
     def reset(self) -> None:
@@ -87,6 +117,8 @@ class Guard:
         self._back = self._explained = self._next = self.held_for = 0
         self._fast, self._new = [0.0] * self._count, [0.0] * self._count
         self._over, self._on = [_LONG_AGO] * self._count, [True] * self._count
+        self._sums = [[0.0] * _SUMS for _ in range(self._count)]
+        self._limits = [0.0] * self._count
         self.theta = np.zeros(self._size)
         self._kept: list[bytes] = []
 
@@ -103,6 +135,7 @@ class Guard:
         error: FloatArray,
         level: FloatArray,
         on: BoolArray,
+        signals: FloatArray,
     ) -> str:
         """Judge the recursion after a row.
 
@@ -118,6 +151,8 @@ class Guard:
             Size the residuals have when all is well.
         on : (balances,) bool array
             Balances whose readings were all there.
+        signals : (3, balances) array
+            :attr:`identification.online.row_check.RowCheck.signals` of the row.
 
         Returns
         -------
@@ -125,6 +160,7 @@ class Guard:
             What happened: "", "held", "back" or "accepted".
         """
         flags, limits = on.tolist(), [_LIMIT * v for v in level.tolist()]
+        self._limits = limits
         lost = any(was and not now for was, now in zip(self._on, flags, strict=True))
         self._on = flags
         over = self._follow(self._fast, error.tolist(), limits)
@@ -135,13 +171,14 @@ class Guard:
             self.held_for if now else then for now, then in zip(over, self._over, strict=True)
         ]
         self._back = 0 if True in over else self._back + 1
+        self._remember(error.tolist(), signals.tolist())
         unexplained = self._follow(self._new, estimator.error.tolist(), limits, share=_EXPLAINED)
         self._explained = 0 if True in unexplained else self._explained + 1
         if self._back >= self._wait_back:
             self._restore(estimator)
             self.on_probation = False
             return "back"
-        if self._explained >= self._wait_accept and self.plausible(theta):
+        if self._explained >= self._wait_accept and self.plausible:
             self.start(estimator)
             return "accepted"
         return ""
@@ -175,6 +212,7 @@ class Guard:
             self._over = [0 if now else _LONG_AGO for now in over]
             self._new = list(self._fast)
             self._back = self._explained = self.held_for = 0
+            self._sums = [[0.0] * _SUMS for _ in range(self._count)]
             self.theta = self._before(estimator)
             return "held"
         if lost:  # rows before a failure was noticed may hold it
@@ -211,12 +249,29 @@ class Guard:
             and sum(self.held_for - then < self._wait_accept for then in self._over) > 1
         )
 
-    def plausible(self, theta: FloatArray) -> bool:
-        """True where the joint itself may have changed from the estimate shown to `theta`."""
+    @property
+    def plausible(self) -> bool:
+        """True where the joint itself may have changed: one balance only, and no failed sensor
+        explains its residuals.
+        """
         if self.several:
             return False
-        at = self.inertias
-        return bool(np.all(np.abs(theta[at] - self.theta[at]) <= _INERTIA * np.abs(self.theta[at])))
+        return not any(
+            sensor_explains(sums, _EXPLAINED * limit)
+            for sums, limit, then in zip(self._sums, self._limits, self._over, strict=True)
+            if self.held_for - then < self._wait_accept
+        )
+
+    def _remember(self, errors: list[float], signals: list[list[float]]) -> None:
+        """Sums of products of the residual, the signals of its balance and one, in place."""
+        torques, motions, weights = signals
+        for b, use in enumerate(self._on):
+            if use:
+                e, x, m, w = errors[b], torques[b], motions[b], weights[b]
+                new = (1.0, e * e, w * e, w * w, x * x, x * w, x * e, m * m, m * w, m * e)
+                self._sums[b] = [
+                    self._forget * old + more for old, more in zip(self._sums[b], new, strict=True)
+                ]
 
     def figures(self) -> dict[str, float]:
         """Limits and times [rows], for the native twin."""
@@ -227,7 +282,9 @@ class Guard:
             "AGE": self._age,
             "BACK": self._wait_back,
             "ACCEPT": self._wait_accept,
-            "INERTIA": _INERTIA,
+            "FORGET": self._forget,
+            "SINGULAR": _SINGULAR,
+            "SUMS": _SUMS,
             "EXPLAINED": _EXPLAINED,
             "LONG_AGO": _LONG_AGO,
         }

@@ -33,7 +33,18 @@ _INTO: Final = (
     "torque",
     "floor_share",
 )
-_OUT: Final = ("error", "weighted_error", "square", "torque", "least", "ratio", "over", "y", "h")
+_OUT: Final = (
+    "error",
+    "weighted_error",
+    "square",
+    "torque",
+    "least",
+    "ratio",
+    "over",
+    "y",
+    "h",
+    "signals",
+)
 
 
 @final
@@ -59,6 +70,9 @@ class RowCheck:
         [N.m]; residual over that; 1 where the residual is over its limit.
     y, h : (balances,) and (balances, parameters) array
         The row times its weights.
+    signals : (3, balances) array
+        Torque, what the motion makes of it (all but friction torques), and one, times the weights:
+        what a gain or an offset of a reading adds to the residual.
     function, weight : casadi.Function
         The whole check, and (shares, parameters, size of the residuals) -> weights.
     """
@@ -83,6 +97,10 @@ class RowCheck:
         self.weight = _weight_function(balances, parameters, friction, feels)
         weight = self.weight(v["share"], v["theta"], size)
         error = v["y"] - v["h"].T @ v["theta"]
+        moves = ca.DM.ones(parameters)
+        for j in (j for side in friction for j in side):
+            moves[j] = 0.0
+        motion = v["h"].T @ (moves * v["theta"])
         left, use = weight * error, v["on"]
         square = ca.if_else(use, v["square"] + rate * (left * left - v["square"]), v["square"])
         torque = ca.if_else(
@@ -103,12 +121,14 @@ class RowCheck:
             over,
             weight * v["y"],
             v["h"] * ca.repmat(weight.T, parameters, 1),
+            ca.horzcat(weight * v["reference"], weight * motion, weight),
         )
         self.function = ca.Function("row_check", list(v.values()), [ca.densify(e) for e in out])
         self._into = [
             np.zeros((balances, parameters) if name == "h" else v[name].numel()) for name in _INTO
         ]
-        found = [np.zeros((balances, parameters) if name == "h" else balances) for name in _OUT]
+        shapes = {"h": (balances, parameters), "signals": (3, balances)}
+        found = [np.zeros(shapes.get(name, (balances,))) for name in _OUT]
         self._buffer, self._trigger = self.function.buffer()
         for i, item in enumerate(self._into):
             self._buffer.set_arg(i, item.data)
@@ -124,6 +144,7 @@ class RowCheck:
             self.over,
             self.y,
             self.h,
+            self.signals,
         ) = found
 
     def __call__(self, *given: Any) -> None:

@@ -151,7 +151,7 @@ static int check_row(Twin *m, const int on[N_BALANCES]) {
     Checked *c = &m->checked;
     double share[2], use[N_BALANCES], reference[N_BALANCES], over[N_BALANCES];
     const double *const into[] = {m->y, m->h, s->theta, share, use, s->floor, s->first_level, reference, s->square, s->torque, &s->floor_share};
-    double *const out[] = {c->error, c->weighted, c->square, c->torque, c->least, s->ratio, over, c->y, c->h};
+    double *const out[] = {c->error, c->weighted, c->square, c->torque, c->least, s->ratio, over, c->y, c->h, c->signals};
     int b, any = 0;
     standstill(m, share);
     for (b = 0; b < N_BALANCES; b++) {
@@ -217,7 +217,7 @@ static int take_row(Twin *m, double time, int enable) {
     s->strained = over ? s->strained + 1 : 0;
     s->reoptimise = s->strained >= CONFIRM_ROWS;
     for (b = 0; b < N_BALANCES; b++) size[b] = fmax(m->checked.least[b], s->first_level[b]);
-    if (guard_step(s, theta, m->checked.weighted, size, on) == BACK) {
+    if (guard_step(s, theta, &m->checked, size, on) == BACK) {
         for (b = 0; b < N_BALANCES; b++) s->square[b] = s->first_level[b] * s->first_level[b];
         s->strained = 0;
     }

@@ -66,18 +66,45 @@ static int guard_follow(Guard *g, double squares[N_BALANCES], const double error
     return any;
 }
 
-/* True where the joint itself may have changed from the estimate shown to theta. */
-static int guard_plausible(const Guard *g, const double theta[N_THETA]) {
-    int b, i, several = 0;
+/* sensor_explains: gain and offset of the torque or of the motion leave less of the residuals than the limit. */
+static int sensor_explains(const double sums[GUARD_SUMS], double limit) {
+    const double rows = sums[0], ee = sums[1], we = sums[2], ww = sums[3];
+    double least;
+    int i;
+    if (!(ww > 0)) return 1;
+    least = ee - we * we / ww;
+    for (i = 4; i < GUARD_SUMS; i += 3) {
+        const double square = sums[i], mean = sums[i + 1], product = sums[i + 2], own = square - mean * mean / ww;
+        if (own > GUARD_SINGULAR * square) {
+            const double shared = product - mean * we / ww;
+            least = fmin(least, ee - we * we / ww - shared * shared / own);
+        }
+    }
+    return least <= limit * limit * rows;
+}
+
+/* True where the joint itself may have changed: one balance only, and no failed sensor explains its residuals. */
+static int guard_plausible(const Guard *g, const double limits[N_BALANCES]) {
+    int b, several = 0;
     for (b = 0; b < N_BALANCES; b++) several += g->held_for - g->over[b] < GUARD_ACCEPT;
     if (g->on_probation && several > 1) return 0;
-    for (i = 0; i < N_THETA; i++)
-        if (is_inertia[i] && fabs(theta[i] - g->theta[i]) > GUARD_INERTIA * fabs(g->theta[i])) return 0;
+    for (b = 0; b < N_BALANCES; b++)
+        if (g->held_for - g->over[b] < GUARD_ACCEPT && sensor_explains(g->sums[b], GUARD_EXPLAINED * limits[b])) return 0;
     return 1;
 }
 
+static void guard_remember(Guard *g, const Checked *c) {
+    int b, i;
+    for (b = 0; b < N_BALANCES; b++) {
+        const double e = c->weighted[b], x = c->signals[b], m = c->signals[N_BALANCES + b], w = c->signals[2 * N_BALANCES + b];
+        const double more[GUARD_SUMS] = {1, e * e, w * e, w * w, x * x, x * w, x * e, m * m, m * w, m * e};
+        if (!g->on[b]) continue;
+        for (i = 0; i < GUARD_SUMS; i++) g->sums[b][i] = GUARD_FORGET * g->sums[b][i] + more[i];
+    }
+}
+
 /* Judge the recursion after a row; it may be put back. */
-static int guard_step(State *s, const double theta[N_THETA], const double error[N_BALANCES], const double level[N_BALANCES], const int on[N_BALANCES]) {
+static int guard_step(State *s, const double theta[N_THETA], const Checked *checked, const double level[N_BALANCES], const int on[N_BALANCES]) {
     Guard *g = &s->guard;
     double limits[N_BALANCES];
     int over[N_BALANCES], unexplained[N_BALANCES], lost = 0, any, b;
@@ -86,13 +113,14 @@ static int guard_step(State *s, const double theta[N_THETA], const double error[
         lost |= g->on[b] && !on[b];
     }
     memcpy(g->on, on, sizeof g->on);
-    any = guard_follow(g, g->quick, error, limits, 1.0, over);
+    any = guard_follow(g, g->quick, checked->weighted, limits, 1.0, over);
     if (!g->on_probation) {
         if (any) {
             g->on_probation = 1;
             for (b = 0; b < N_BALANCES; b++) g->over[b] = over[b] ? 0 : GUARD_LONG_AGO;
             memcpy(g->fresh, g->quick, sizeof g->fresh);
             g->back = g->explained = g->held_for = 0;
+            memset(g->sums, 0, sizeof g->sums);
             estimate_of(s, &g->kept[0], g->theta);
             return HELD_NOW;
         }
@@ -112,6 +140,7 @@ static int guard_step(State *s, const double theta[N_THETA], const double error[
     for (b = 0; b < N_BALANCES; b++)
         if (over[b]) g->over[b] = g->held_for;
     g->back = any ? 0 : g->back + 1;
+    guard_remember(g, checked);
     any = guard_follow(g, g->fresh, s->rls.fast + FAST_ERROR, limits, GUARD_EXPLAINED, unexplained);
     g->explained = any ? 0 : g->explained + 1;
     if (g->back >= GUARD_BACK) {
@@ -119,7 +148,7 @@ static int guard_step(State *s, const double theta[N_THETA], const double error[
         g->on_probation = 0;
         return BACK;
     }
-    if (g->explained >= GUARD_ACCEPT && guard_plausible(g, theta)) {
+    if (g->explained >= GUARD_ACCEPT && guard_plausible(g, limits)) {
         guard_start(s);
         return ACCEPTED;
     }

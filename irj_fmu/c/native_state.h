@@ -55,6 +55,7 @@ typedef struct { /* Guard */
     int on_probation, on[N_BALANCES];
     Count back, explained, next, held_for, over[N_BALANCES];
     double quick[N_BALANCES], fresh[N_BALANCES], theta[N_THETA];
+    double sums[N_BALANCES][GUARD_SUMS];
     Recursion kept[2];
 } Guard;
 
@@ -99,7 +100,7 @@ typedef struct {
 
 typedef struct { /* RowCheck: what a row says before the recursion takes it */
     double error[N_BALANCES], weighted[N_BALANCES], square[N_BALANCES], torque[N_BALANCES], least[N_BALANCES];
-    double y[N_BALANCES], h[N_BALANCES * N_THETA];
+    double y[N_BALANCES], h[N_BALANCES * N_THETA], signals[3 * N_BALANCES];
 } Checked;
 
 typedef struct {

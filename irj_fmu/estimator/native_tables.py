@@ -375,7 +375,6 @@ def _recursion_tables(header: _Header, made: OnlineEstimator) -> None:
     header.whole("reference_signal", made.reference)
     for key, value in made.guard.figures().items():
         header.define(f"GUARD_{key}", value)
-    header.whole("is_inertia", (int(i in made.guard.inertias) for i in range(n)), "unsigned char")
     header.doubles("usual_range", made.rows.usual)
     header.doubles("lowest", made.low)
     header.doubles("highest", made.high)

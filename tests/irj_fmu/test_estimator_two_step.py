@@ -304,7 +304,7 @@ def guard_run(
     theta, offset = np.array([4.0, 20.0, 10.0, 9.0]), 0.0
     settings = Settings(sample_time=0.016, drift=3e-3, alarm_drift=1.0)
     est = RecursiveLeastSquares(theta, np.abs(theta), outputs=2, names=names, settings=settings)
-    guard = Guard(names, ("motor", "link"), 0.016, names[::2])
+    guard = Guard(names, ("motor", "link"), 0.016)
     est.update(np.zeros(2), np.zeros((2, 4)))
     guard.start(est)
     told, level, before = [], np.full(2, 0.05), theta
@@ -317,18 +317,22 @@ def guard_run(
         y = h @ theta + offset + 0.05 * rng.normal(size=2)
         error = y - h @ guard.theta
         est.update(y, h)
-        told.append(guard.step(est, est.theta, error, level, np.ones(2, dtype=bool)))
+        signals = np.array([y, h @ guard.theta, np.ones(2)])
+        told.append(guard.step(est, est.theta, error, level, np.ones(2, dtype=bool), signals))
     return [t for t in told if t], guard.theta, before
 
 
 def test_guard_accepts_what_a_joint_can_do() -> None:
-    """Friction that rises is followed; a disturbance of both balances is held off, and gone
-    back from bit by bit.
+    """Friction that rises and a payload are followed; a disturbance of both balances, or the gain
+    of one torque, is held off, and gone back from bit by bit.
     """
     healthy = np.array([4.0, 20.0, 10.0, 9.0])
     told, theta, _ = guard_run({300: (np.array([4.0, 30.0, 10.0, 9.0]), 0.0)}, 900)
     assert told == ["held", "accepted"]
     assert theta == pytest.approx([4.0, 30.0, 10.0, 9.0], rel=0.02)
+    told, theta, _ = guard_run({300: (np.array([4.0, 20.0, 14.0, 9.0]), 0.0)}, 900)
+    assert told == ["held", "accepted"]  # a payload
+    assert theta == pytest.approx([4.0, 20.0, 14.0, 9.0], rel=0.02)
     told, theta, before = guard_run({300: (healthy, 5.0), 600: (healthy, 0.0)}, 700)
     assert told == ["held", "back"]
     assert theta == pytest.approx(before, rel=0.01)
