@@ -46,6 +46,11 @@ def test_the_slipping_encoder_and_the_payload_are_told(system: dict[str, float])
     assert 0 < system["elbow: change of the joint told after [s]"] < 3.0
 
 
+@pytest.mark.parametrize("parameter", ["link_inertia", "gravity_torque"])
+def test_the_payload_is_taken_over(parameter: str, system: dict[str, float]) -> None:
+    assert abs(system[f"elbow: {parameter} with its payload found over true"] - 1) < 0.01
+
+
 LIBCOSIM = """
 import sys
 import numpy as np
@@ -89,15 +94,6 @@ def in_ecos(
     path: Path, names: tuple[str, ...], step: float, stop: float, place: Path
 ) -> np.ndarray:
     """The same in ecos."""
-@pytest.mark.parametrize("parameter", ["link_inertia", "gravity_torque"])
-def test_the_payload_is_taken_over(parameter: str, system: dict[str, float]) -> None:
-    assert abs(system[f"elbow: {parameter} with its payload found over true"] - 1) < 0.01
-
-
-def test_the_system_runs_in_another_host(
-    system: dict[str, float], folder: Path, tmp_path: Path
-) -> None:
-    """A host passes outputs on before or after a step: what that may change is one step's way."""
     done = subprocess.run(
         [str(ecos(place)), "simulate", "--path", str(path)]
         + ["--stopTime", str(stop), "--stepSize", str(step)],
