@@ -574,7 +574,9 @@ def _unit(
     model = candidate.model
     own = {p.name: p.start for p in model.parameters} | dict(base.solution.values)
     moves = delta[: base.parts[0]] / base.norms
-    own |= {n: own[n] + float(d) for n, d in zip(base.names, moves, strict=True)} | dict(values)
+    # parameters of a foreign FMU are columns of the base and none of the joint's
+    moved = zip(base.names, moves, strict=True)
+    own |= {n: own[n] + float(d) for n, d in moved if n in own} | dict(values)
     pairs = (
         (_noise_alone(model, base.data, own), base.noise_alone),
         (_torques_alone(model, base.data, own), base.torques_alone),
