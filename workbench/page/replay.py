@@ -155,7 +155,7 @@ def follow(
         raise InputError("follow: fit first, the estimator starts from the fitted joint")
     path = source_of(live.session.folder.parent, name)
     joint = parse_joint(from_toml(live.analysis().to_joint_file(), "joint"), "joint")
-    why, made, written = "", None, 0.0
+    why, made, written, shown = "", None, 0.0, -math.inf
 
     def state_of(first: Record) -> bytes | None:
         from identification.online.estimator import OnlineOptions
@@ -175,8 +175,9 @@ def follow(
         for made in growing(source, joint, state_of, stop=lambda: stopped(folder)):
             now = float(made.record.time[-1])
             progress(f"following {path.name}, {now:.0f} s", 0.0)
-            if len(made.time) and time.monotonic() - written > REWRITTEN:
-                written = time.monotonic()
+            fresh = now > shown and time.monotonic() - written > REWRITTEN
+            if len(made.time) and fresh:
+                written, shown = time.monotonic(), now
                 _kept(folder, made, steps, {"no_detector": why, "live": True})
     if made is None:
         raise InputError(f"follow: nothing came into {path.name}; start the recording first")

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from tests.workbench.chromium import launched, needs_chromium
+from tests.workbench.chromium import context_of, launched, needs_chromium
 
 AXE = os.environ.get("IRJ_AXE", "")
 SHOTS = os.environ.get("IRJ_SHOTS", "")
@@ -40,7 +40,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     thread.start()
     try:
         with launched() as chromium:
-            made = chromium.new_context(viewport={"width": 1280, "height": 860}).new_page()
+            made = context_of(chromium, viewport={"width": 1280, "height": 860}).new_page()
             made.goto(f"http://127.0.0.1:{port}/")
             made.click("#demo")
             made.wait_for_selector("#fit", timeout=60_000)

@@ -103,8 +103,8 @@ def follow(
     quiet: float = QUIET,
     stop: Callable[[], bool] = lambda: False,
 ) -> Iterator[Replay]:
-    """What the online estimator makes of a growing file: a `Replay` whenever rows came, the last
-    one when the file has not grown for `quiet` seconds.
+    """What the online estimator makes of a growing file: a `Replay` after every look at the file
+    since its first rows came, until it has not grown for `quiet` seconds.
 
     Its record and its readings are those at the looks, so that memory does not grow with the file.
 
@@ -130,14 +130,14 @@ def follow(
     while True:
         record = source.new()
         if record is not None:
-            last = time.monotonic()
             if run is None:
                 run = _Run(record, joint, detector_state(record))
             run.take(record)
-            if run.rows:
-                yield run.replay()
+            last = time.monotonic()
         elif time.monotonic() - last > quiet:
             break
+        if run is not None:
+            yield run.replay()
         if stop():
             break
         if record is None:
