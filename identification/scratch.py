@@ -14,6 +14,7 @@ import hashlib
 import os
 import re
 import shutil
+import signal
 import tempfile
 from collections.abc import Iterator
 from functools import partial
@@ -43,6 +44,24 @@ _LEFT: Final = re.compile(
 def outer_folder() -> Path:
     """Folder for temporary files that outlive the run."""
     return Path(_OUTER[0] if _OUTER else tempfile.gettempdir())
+
+
+@contextlib.contextmanager
+def folder_beside(place: Path, prefix: str) -> Iterator[str]:
+    """A temporary folder in a place, removed at its end: a signal that ends the run waits until the
+    folder is one that is removed.
+    """
+    mask = getattr(signal, "pthread_sigmask", None)  # not on Windows
+    before = mask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM}) if mask else None
+    try:
+        made = tempfile.TemporaryDirectory(prefix=prefix, dir=place)
+        with made as name:
+            if mask:
+                mask(signal.SIG_SETMASK, before)
+            yield name
+    finally:
+        if mask:
+            mask(signal.SIG_SETMASK, before)
 
 
 @contextlib.contextmanager

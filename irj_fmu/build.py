@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final, final
 from identification.data.joint_file import Joint, load_joint
 from identification.data.own_effects import files_of
 from identification.errors import InputError
-from identification.scratch import hold
+from identification.scratch import folder_beside, hold
 from irj_fmu.command_line import (
     OneLineParser,
     check_output,
@@ -144,7 +144,7 @@ def build(
     hold(request.out)
     done: list[Path] = []
     try:
-        with tempfile.TemporaryDirectory(prefix=".build-", dir=request.out) as temporary:
+        with folder_beside(request.out, ".build-") as temporary:
             for maker in _makers(kind):
                 for path, note in maker(request, Path(temporary)):
                     ran = (

@@ -5,6 +5,8 @@ A skew of a sample is no small number: its Taylor series in the model would chan
 the second order of a torque, which no derivative shows, the skew itself. An encoder is shifted by
 whole samples, which leaves its noise as it is, and has the second order in the model; torques are
 interpolated: their noise changes above a quarter of the sampling rate, which no kernel passes.
+Where a torque is late through a low-pass, as the current of most drives is, its rate in the model
+makes it good, and no shift.
 """
 
 from __future__ import annotations
@@ -43,12 +45,25 @@ NEAR: Final = 0.05
 """Lateness that is left to the model [samples]: its square is under a hundredth."""
 ENCODERS: Final = frozenset({"link_position_sensor"})
 """Places whose readings are shifted by whole samples."""
+LOW_PASSED: Final = frozenset({"drive"})
+"""Places whose readings may come through a low-pass and not late: drives filter their current."""
 SURE: Final = 3.0
 """Standard errors by which a channel must be late (an encoder: later than half a sample)."""
 ONE_WAY: Final = 1e-3
 """Share of a row's kernel in which the joint may move the other way."""
 FEW: Final = 0.1
 """Share of such rows below which a motion turns all the time: then its turns tell the clocks."""
+DEVIATION: Final = 1.4826
+"""Standard deviation of a normal value over the median of its size."""
+BIWEIGHT: Final = 4.685
+"""Deviations from which a row says nothing: 95 % of the efficiency of least squares on normal noise
+(Holland, Welsch 1977).
+"""
+REWEIGHTED: Final = 15
+"""Rounds of reweighting: the columns are fixed to a thousandth after ten."""
+NODES: Final = 24
+"""Nodes of the friction that is none of a clock, each with the same share of the samples: twelve in
+each direction follow a Stribeck curve."""
 STRETCHES: Final = 8
 """Stretches of a record whose slopes are compared."""
 
@@ -125,7 +140,11 @@ def cubic(f: float) -> tuple[float, float, float, float]:
 
 
 def in_time(
-    make: Callable[[Mapping[str, float]], WeakRecord], places: Iterable[str], torque: bool
+    make: Callable[[Mapping[str, float]], WeakRecord],
+    places: Iterable[str],
+    noise: Callable[[str, float], float],
+    *,
+    torque: bool,
 ) -> WeakRecord:
     """A record whose late channels are shifted.
 
@@ -135,6 +154,9 @@ def in_time(
         Makes the rows with the channels of some places shifted by so many samples.
     places : iterable of str
         Whose channels may be shifted.
+    noise : callable
+        Variance that the noise of a place's channel gives the rows, its rate times a lateness [s]
+        added.
     torque : bool
         Whether the torque of the link is measured.
     """
@@ -150,7 +172,92 @@ def in_time(
             break
         shifts = {p: k for p, k in moved.items() if k}
         made = make(shifts)
+    for place in LOW_PASSED & shifts.keys():
+        if abs(shifts[place]) > MOST_SKEW:
+            continue  # what is later is no filter of a drive
+        # a shift of zero keeps the rows: what is compared are the same instants
+        unshifted = {**shifts, place: 0.0}
+        other = make(unshifted)
+        louder = noise(place, shifts[place] * made.grid.dt) - noise(place, 0.0)
+        if _leaves_less(other, made, place, louder, torque=torque):
+            shifts, made = unshifted, other
     return made
+
+
+def _leaves_less(
+    one: WeakRecord, other: WeakRecord, place: str, louder: float, *, torque: bool
+) -> bool:
+    """True where the balance of a sensor is better met with `one` than with `other`, beside the
+    variance by which noise is louder in `one`. Neither is the rule: the likelier is taken.
+
+    Both are late by the same time in first order. A reading that waits is the true value of an
+    earlier instant; one through a low-pass is made good by its rate, and nothing is left of higher
+    order. A shift of the latter leaves half the square of the lateness times the second derivative.
+
+    Rows that neither meets, as those of slow motion whose friction is not the law's, say nothing:
+    the sum of squares that is compared is Tukey's, bounded.
+    """
+    kept = one_way(one)
+    friction = _any_friction(one, kept)
+    parts = [_parts(made, place, kept, torque=torque) for made in (one, other)]
+    rest = [_rest(values, [*others, friction], column) for values, others, column in parts]
+    scale = min(DEVIATION * float(np.median(np.abs(x))) for x in rest)
+    if not scale:
+        return False
+    met, unmet = (float(np.sum(_bounded(x / scale))) for x in rest)
+    return unmet - met + louder / scale**2 * len(rest[0]) > 0.0
+
+
+def _any_friction(record: WeakRecord, kept: npt.NDArray[np.bool_]) -> FloatArray:
+    """Columns of a free curve over the velocity, shape (rows, nodes): whatever friction there is
+    says nothing of a clock.
+    """
+    points = record.points["motor_velocity"]
+    moving = points[points != 0.0] if np.any(points) else points
+    nodes = np.unique(np.quantile(moving, np.linspace(0.0, 1.0, NODES)))
+    hats = [np.interp(points, nodes, unit) for unit in np.eye(len(nodes))]
+    return np.column_stack([record.average(hat)[kept] for hat in hats])
+
+
+def _parts(
+    made: WeakRecord, place: str, kept: npt.NDArray[np.bool_], *, torque: bool
+) -> tuple[FloatArray, list[FloatArray], FloatArray]:
+    """Reading of a torque, what it follows from, and the column of its lateness, in the rows
+    `kept`.
+    """
+    a = {n: x[kept] for n, x in made.averaged.items()}
+    if place == "torque_sensor":
+        return a["torque"], _motion(a, "link"), -a["torque_rate"]
+    load = [a["torque"]] if torque else []
+    return a["drive"], [*_motion(a, "motor"), *load], -a["drive_rate"]
+
+
+def _motion(a: Mapping[str, FloatArray], side: str) -> list[FloatArray]:
+    """What the torques of a side follow from."""
+    q, v = a[f"{side}_position"], a[f"{side}_velocity"]
+    return [np.ones(len(v)), v, np.sign(v), a[f"{side}_acceleration"], np.sin(q), np.cos(q)]
+
+
+def _rest(values: FloatArray, others: list[FloatArray], column: FloatArray) -> FloatArray:
+    """What is left of the values beside all columns, those that most rows agree on."""
+    matrix = _scaled(np.column_stack([*others, column]))
+    weight = np.ones(len(values))
+    rest = values
+    for _ in range(REWEIGHTED):
+        root = np.sqrt(weight)
+        solution, *_ = np.linalg.lstsq(matrix * root[:, None], values * root, rcond=None)
+        rest = values - matrix @ solution
+        scale = DEVIATION * float(np.median(np.abs(rest)))
+        if not scale:
+            break
+        weight = np.maximum(1.0 - (rest / (BIWEIGHT * scale)) ** 2, 0.0) ** 2
+    return np.asarray(rest)
+
+
+def _bounded(x: FloatArray) -> FloatArray:
+    """Tukey's bounded square: x^2 near zero, a third of `BIWEIGHT`^2 far away."""
+    inside = np.minimum((x / BIWEIGHT) ** 2, 1.0)
+    return np.asarray(BIWEIGHT**2 / 3.0 * (1.0 - (1.0 - inside) ** 3))
 
 
 def one_way(record: WeakRecord) -> npt.NDArray[np.bool_]:
@@ -175,20 +282,17 @@ def lateness(made: WeakRecord, place: str, *, torque: bool) -> tuple[float, floa
     """
     kept = one_way(made)
     a = {n: x[kept] for n, x in made.averaged.items()}
-
-    def motion(side: str) -> list[FloatArray]:
-        q, v = a[f"{side}_position"], a[f"{side}_velocity"]
-        return [np.ones(len(v)), v, np.sign(v), a[f"{side}_acceleration"], np.sin(q), np.cos(q)]
-
-    if place == "torque_sensor":
-        return *_slope(a["torque"], motion("link"), -a["torque_rate"]), 0.0
-    if place == "drive":
-        load = [a["torque"]] if torque else []
-        return *_slope(a["drive"], [*motion("motor"), *load], -a["drive_rate"]), 0.0
+    if place not in ENCODERS:
+        found = _slope(*_parts(made, place, kept, torque=torque))
+        if place == "torque_sensor" and "drive" in a:
+            # it loads the drive, too: where the encoder of the link is coarse, that tells more
+            others = [*_motion(a, "motor"), a["torque"], a["drive_rate"]]
+            found = _both(found, _slope(a["drive"], others, a["torque_rate"]))
+        return *found, 0.0
     effort, twist = a.get("torque" if torque else "drive"), a["motor_position"] - a["link_position"]
     if effort is None:  # nothing tells friction of the link from lateness
         return 0.0, math.inf, 0.0
-    one, v, _, bend, *_ = motion("link")
+    one, v, _, bend, *_ = _motion(a, "link")
     late, error = _slope(twist, [one, effort, bend, np.sign(v)], v)
     if torque:
         return late, error, 0.0
@@ -197,6 +301,19 @@ def lateness(made: WeakRecord, place: str, *, torque: bool) -> tuple[float, floa
     soft, _ = _slope(twist, [one, v, bend], effort)
     apart = min(abs(friction * soft), abs(late))
     return math.copysign(abs(late) - apart, late), error, apart
+
+
+def _both(one: tuple[float, float], other: tuple[float, float]) -> tuple[float, float]:
+    """Mean of two estimates with standard errors; where they contradict each other by more than
+    these, its error is larger as much (R. Birge 1932).
+    """
+    pairs = [(x, e) for x, e in (one, other) if 0 < e < math.inf]
+    if len(pairs) < 2:
+        return pairs[0] if pairs else one
+    weights = [e**-2 for _, e in pairs]
+    mean = sum(w * x for w, (x, _) in zip(weights, pairs, strict=True)) / sum(weights)
+    apart = abs(one[0] - other[0]) / math.hypot(one[1], other[1])
+    return mean, max(1.0, apart) / math.sqrt(sum(weights))
 
 
 def _slope(values: FloatArray, others: list[FloatArray], column: FloatArray) -> tuple[float, float]:

@@ -323,10 +323,16 @@ def weak_record(
         last.append((dict(shifts), made))
         return made
 
+    def spread(place: str, lateness: float) -> float:
+        plain, rate = (differentiated_kernel(length, record.dt, order) for order in (0, 1))
+        return noise[SIGNAL[place]].after(plain + lateness * rate, record.dt) ** 2
+
     if known is not None:
         made = made_with({p: round(k / record.dt, 9) for p, k in known.items()})
     else:
-        made = in_time(made_with, late, sensing.has_torque) if late else made_with({})
+        made = (
+            in_time(made_with, late, spread, torque=sensing.has_torque) if late else made_with({})
+        )
     made = _with_rests(made, noise)
     if record.measured is not None and not record.measured.all():
         made = replace(

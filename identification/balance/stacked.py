@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, final
 
 import numpy as np
@@ -19,7 +19,7 @@ from identification.balance.colour import ChannelNoise
 from identification.balance.dataset import Dataset
 from identification.balance.drawn_noise import draws_of
 from identification.balance.memory import numbers_of
-from identification.balance.weak import Grid, WeakRecord, whole
+from identification.balance.weak import WeakRecord, whole
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -30,6 +30,13 @@ TURN_SHARE: Final = 0.25
 """Share of what a kernel is longer than that by which the instant of a turn may be wrong,
 either way.
 """
+
+SCALED: Final = ("drive", "torque")
+"""Measured signals whose scale a balance has: what is left of it has the same."""
+
+FEW_SAMPLES: Final = 5
+"""Samples under which a kernel of the velocity tells little more than a step from one sample to the
+next."""
 
 SURE_JUMP: Final = 3.0
 """Standard deviations of noise from which what alternates from sample to sample is a jump."""
@@ -244,6 +251,46 @@ def references(data: Dataset, records: Sequence[WeakRecord]) -> dict[str, FloatA
     return {b: np.concatenate([measured(b, w) for w in records]) for b in data.sensing.balances}
 
 
+def passed_on(
+    model: JointModel, data: Dataset, values: Mapping[str, float]
+) -> dict[str, FloatArray]:
+    """What a standard deviation of the measured torques makes of each row of the balances, training
+    and then held-out rows, (rows,) each.
+
+    A law that takes a share of a measured torque scales the whole balance, noise and errors of the
+    model with it: what is left is shorter and no smaller.
+    """
+    records = [*data.train, *data.held_out]
+    balances = balances_of(model, data.sensing, wrt=())
+    values = settled(model, data.sensing, records, values)
+    found: dict[str, list[FloatArray]] = {b: [] for b in balances.balances}
+    for record in records:
+        own = values_on(model, record, values)
+        before = balances.evaluate(record, own)
+        power = {b: np.zeros(record.rows) for b in found}
+        for channel in SCALED:
+            if channel not in data.sources or channel not in record.points:
+                continue
+            size = data.sources[channel].level
+            moved = replace(
+                record,
+                points=_higher(record.points, channel, size),
+                smooth=_higher(record.smooth, channel, size),
+                averaged=_higher(record.averaged, channel, size),
+            )
+            after = balances.evaluate(moved, own, remembered=record)
+            for b in power:
+                power[b] += (after[b][0] - before[b][0]) ** 2
+        for b, squares in power.items():
+            found[b].append(np.sqrt(squares))
+    return {b: np.concatenate(parts) for b, parts in found.items()}
+
+
+def _higher(signals: Mapping[str, FloatArray], channel: str, size: float) -> dict[str, FloatArray]:
+    """The signals with one of them higher by so much."""
+    return {**signals, channel: signals[channel] + size}
+
+
 def measured(balance: str, record: WeakRecord) -> FloatArray:
     """What :func:`references` says of one record."""
     if balance == "kinematic":
@@ -325,9 +372,7 @@ def _either_way(
         )
         shares = []
         for w in records:
-            either = _either_direction(
-                w.points[f"{place}_velocity"], sources[source], w.grid, source
-            ).astype(float)
+            either = _either_direction(w, place, sources[source]).astype(float)
             shares.append(w.average(either))
             if lag:
                 shares[-1] = shares[-1] + lag * (np.abs(w.curving) @ either)
@@ -372,22 +417,31 @@ def sticking_torque(model: JointModel, values: Mapping[str, float], place: str) 
     return float(sum(abs(values[n]) for n in model.named("static", place)))
 
 
-def _either_direction(
-    velocity: FloatArray, noise: ChannelNoise, grid: Grid, source: str
-) -> npt.NDArray[np.bool_]:
-    """Points at which the direction is not known: slower than the noise, or nearer to a turn
-    than its kernel tells when it was.
+def _either_direction(record: WeakRecord, place: str, noise: ChannelNoise) -> npt.NDArray[np.bool_]:
+    """Points at which the direction is not known: slower than the noise, nearer to a turn than
+    its kernel tells when it was, or, where the kernel is no longer than a few samples, between a
+    move one way and one the other: dry friction makes a corner of a turn, or holds the joint
+    there, and a velocity across it says nothing.
     """
+    grid, source = record.grid, f"{place}_position"
+    velocity = record.points[f"{place}_velocity"]
     slow = np.abs(velocity) < 3 * grid.velocity_noise(source, noise)
     turns = np.diff(np.sign(velocity), append=velocity[-1]) != 0
-    reach = max(
-        0, whole(TURN_SHARE * (grid.pointwise[source] - TURN_KERNEL) / (grid.step * grid.dt))
-    )
+    apart = grid.step * grid.dt
+    reach = max(0, whole(TURN_SHARE * (grid.pointwise[source] - TURN_KERNEL) / apart))
     near = (
         np.convolve(turns, np.ones(2 * reach), "same") > 0
         if reach
         else np.zeros(len(velocity), dtype=bool)
     )
+    if grid.pointwise[source] < FEW_SAMPLES * grid.dt:
+        moved = np.diff(record.points[source])
+        one_step = np.zeros(grid.step + 1)
+        one_step[0], one_step[-1] = -1.0, 1.0
+        sure = 3 * noise.after(one_step, grid.dt)
+        way = np.sign(moved) * (np.abs(moved) > sure)
+        before, after = np.append(way[:1], way), np.append(way, way[-1:])
+        near |= (before != after) | (before == 0)
     return np.asarray(slow | near)
 
 

@@ -13,7 +13,7 @@ from casadi_models import EFFECTS, Effect
 from identification.balance.clocks import MOST_SKEW, carrier
 from identification.data.formats import chances
 from identification.diagnosis.candidates import Candidate, NotTestable, offered
-from identification.diagnosis.trials import Base, Trial, try_candidate
+from identification.diagnosis.trials import MINOR_DROP, Base, Trial, try_candidate
 
 MAJOR_DROP: Final = 10.0
 """Cross-validated fall of a balance's RMS that a claim must bring [%]. Chosen on simulated joints
@@ -32,8 +32,6 @@ FALSE_DISCOVERY: Final = 0.05
 """Share of false names among those that the tests pass (Benjamini and Hochberg); the usual one. It
 is not enough by itself: the search over shapes makes the p-values too small by a factor of three.
 """
-MINOR_DROP: Final = 2.5
-"""Cross-validated fall from which a small effect is told [%]: a quarter of a claim's."""
 MINOR_HELD_OUT: Final = 2.0
 """The same on held-out records [%]."""
 MINOR_GAIN: Final = 100.0

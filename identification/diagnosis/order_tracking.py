@@ -143,6 +143,11 @@ class Peak:
         """Size of the line."""
         return math.hypot(self.sine, self.cosine)
 
+    @property
+    def certainty(self) -> float:
+        """Power over that of its standard error: the prominence, or less where blocks disagree."""
+        return 0.5 * (self.amplitude / max(self.amplitude_error, 1e-300)) ** 2
+
     def wave(self, samples: Samples) -> FloatArray:
         """The line as the samples show it."""
         return samples.seen(
@@ -368,7 +373,7 @@ def peaks(
         ratio = power / level
         free = np.where((orders >= low) & (orders <= highest), ratio, 0.0)
         k = int(np.argmax(free))
-        found = None
+        found, least = None, anywhere
         if free[k] > anywhere:
             found = _peak(refined(orders, power, k), left, float(free[k]), apart)
         else:
@@ -379,10 +384,13 @@ def peaks(
             ]
             best = max(near, key=lambda x: x[1], default=(0.0, 0.0))
             if best[1] > by_name:
+                least = by_name
                 found = _peak(best[0], left, best[1], apart)
         if found is None:
             break
-        out.append(found)
+        # a stretch of the motion that is loud by itself stands over the background, too
+        if found.certainty > least:
+            out.append(found)
         left = replace(left, residual=left.residual - found.wave(left))
     return out
 
@@ -456,7 +464,8 @@ def confirmed(peak: Peak, samples: Samples, candidates: int) -> bool:
     size, count = float(scores.sum() / sizes.sum()), len(names)
     spread = float(np.linalg.norm(scores - size * sizes)) * math.sqrt(count / (count - 1))
     error = SURE * spread / float(sizes.sum())
-    return size + error >= 1 / ALIKE and size - error <= ALIKE
+    # with less than half of the size they are worse off with the line than without
+    return size >= 1 / ALIKE and size - error <= ALIKE
 
 
 def everywhere(

@@ -12,9 +12,10 @@ import numpy.typing as npt
 from casadi_models import JointModel
 from casadi_models.term import Term
 from identification.balance.balances import balances_of
-from identification.balance.calibration import settled, values_on
+from identification.balance.calibration import settled
 from identification.balance.dataset import HOLD_NAME, Dataset, without
 from identification.balance.stacked import (
+    passed_on,
     references,
     rms,
     row_weights,
@@ -32,8 +33,6 @@ within 1 % of a converged fit (`python -m benchmarks.explore`)."""
 LEAST_DELAY: Final = 1.0
 """Samples up to which a late channel is no effect: a logger reads its channels, and holds its
 commands, somewhere within a sample."""
-TORQUES: Final = ("drive", "torque")
-"""Measured signals whose scale a balance has: what is left of it has the same."""
 
 
 @final
@@ -62,7 +61,7 @@ class Weighting:
         return cls(
             like,
             row_weights(balances, data, values, like.sigma, data.held_out),
-            passed_on(like, data),
+            passed_on(like.model, data, like.values),
         )
 
     def units(self, solution: Solution, data: Dataset) -> dict[str, FloatArray]:
@@ -72,47 +71,12 @@ class Weighting:
         A law that takes a share of a measured torque scales the whole balance, noise and errors of
         the model with it: what is left is shorter and no smaller.
         """
-        own = passed_on(solution, data)
+        own = passed_on(solution.model, data, solution.values)
         return {
             b: np.where((x > 0) & (own[b] > 0), own[b], 1.0)
             / np.where((x > 0) & (own[b] > 0), x, 1.0)
             for b, x in self.passed.items()
         }
-
-
-def passed_on(solution: Solution, data: Dataset) -> dict[str, FloatArray]:
-    """What a standard deviation of the measured torques makes of each row of the balances, training
-    and then held-out rows, (rows,) each.
-    """
-    model, records = solution.model, [*data.train, *data.held_out]
-    balances = balances_of(model, data.sensing, wrt=())
-    values = settled(model, data.sensing, records, solution.values)
-    found: dict[str, list[FloatArray]] = {b: [] for b in balances.balances}
-    for record in records:
-        own = values_on(model, record, values)
-        before = balances.evaluate(record, own)
-        power = {b: np.zeros(record.rows) for b in found}
-        for channel in TORQUES:
-            if channel not in data.sources or channel not in record.points:
-                continue
-            size = data.sources[channel].level
-            moved = replace(
-                record,
-                points=_higher(record.points, channel, size),
-                smooth=_higher(record.smooth, channel, size),
-                averaged=_higher(record.averaged, channel, size),
-            )
-            after = balances.evaluate(moved, own, remembered=record)
-            for b in power:
-                power[b] += (after[b][0] - before[b][0]) ** 2
-        for b, squares in power.items():
-            found[b].append(np.sqrt(squares))
-    return {b: np.concatenate(parts) for b, parts in found.items()}
-
-
-def _higher(signals: Mapping[str, FloatArray], channel: str, size: float) -> dict[str, FloatArray]:
-    """The signals with one of them higher by so much."""
-    return {**signals, channel: signals[channel] + size}
 
 
 @final

@@ -18,6 +18,17 @@ playwright_sync = (
     if not CI
     else __import__("playwright.sync_api", fromlist=["x"])
 )
+LATE = int(os.environ.get("IRJ_LATE", "0"))
+"""Every answer of the server reaches the page later, by a time between nothing and this many
+milliseconds: what passes on a quick machine only by chance fails here."""
+
+HOLD_BACK = (
+    "{ const fetched = window.fetch; window.fetch = async (...asked) => {"
+    " const answer = await fetched(...asked);"
+    " await new Promise((go) => setTimeout(go, Math.random() * LATE));"
+    " return answer; }; }"
+)
+
 needs_chromium = pytest.mark.skipif(
     not CI and not CHROMIUM.exists(), reason="no chromium here (with CI set this fails)"
 )
@@ -31,3 +42,11 @@ def launched() -> Iterator[Any]:
         chromium = play.chromium.launch(executable_path=str(CHROMIUM), args=["--no-sandbox"])
         yield chromium
         chromium.close()
+
+
+def context_of(chromium: Any, **options: Any) -> Any:
+    """A context of the browser; options as its own."""
+    context = chromium.new_context(**options)
+    if LATE:
+        context.add_init_script(HOLD_BACK.replace("LATE", str(LATE)))
+    return context

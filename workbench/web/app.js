@@ -2,7 +2,7 @@
 /* The page's state, its talk with the server, and what surrounds the views. */
 const VIEWS = [["load", "Load"], ["model", "Model"], ["compare", "Compare"], ["diagnose", "Diagnose"], ["ledger", "Improve"], ["parameters", "Parameters"], ["replay", "Replay"], ["plan", "Plan"], ["export", "Export"]];
 const $ = (id) => document.getElementById(id);
-const app = { id: null, config: null, state: null, view: "load", source: null, plots: [], cleanup: [], then: null, sent: false, drafts: {}, preview: null, first: null, sending: null, upload: null };
+const app = { id: null, config: null, state: null, view: "load", source: null, plots: [], cleanup: [], then: null, sent: false, doing: [], acted: Promise.resolve(), drafts: {}, preview: null, first: null, sending: null, upload: null };
 
 function h(tag, attributes, ...children) {
   const node = document.createElement(tag);
@@ -66,10 +66,15 @@ function gone() {
 }
 function clearError() { $("error").hidden = true; }
 
-async function act(work) {
-  if (app.sent) return;
-  app.sent = true; clearError(); surround();
-  try { await work(); } catch (error) { fail(error); } finally { app.sent = false; surround(); goOn(); }
+/* Ask the server for something. What is asked for while another answer is under way follows it, in order: a field that was changed would show what the server never heard of. The same work twice is once. Tells whether it was done. */
+function act(work) {
+  if (app.doing.includes(work)) return app.acted;
+  app.doing.push(work);
+  app.sent = true;
+  return (app.acted = app.acted.then(async () => {
+    clearError(); surround();
+    try { await work(); return true; } catch (error) { fail(error); return false; } finally { app.doing.shift(); app.sent = app.doing.length > 0; surround(); goOn(); }
+  }));
 }
 
 /* Start long work; `then` is the view to open when it came to its end. */
@@ -77,9 +82,9 @@ function run(action, body, then) {
   return act(async () => {
     app.then = null;
     const begun = await post("/run", { action, ...body });
-    if (!then || !app.state) return;
-    app.then = { view: then, begun: begun.begun, revision: begun.revision };
-    arrive(app.state); /* short work may have ended before this answer came */
+    if (!app.state) return;
+    if (then) app.then = { view: then, begun: begun.begun, revision: begun.revision };
+    await refresh(); /* from now on the page knows that it runs, or, where it was short, that it has ended */
   });
 }
 
@@ -236,6 +241,7 @@ async function showPreview(file, data) {
 async function upload(files) {
   clearError();
   const list = [...files].sort((a, b) => b.name.endsWith(".toml") - a.name.endsWith(".toml"));
+  await app.acted; /* a session that is being opened is the one they are for */
   for (const file of list) {
     if (file.size > app.config.max_upload) { fail(new Error(`${file.name}: ${Math.round(file.size / 1e6)} MB is over the limit of ${Math.round(app.config.max_upload / 1e6)} MB; cut it, save it as NPZ, or start with: irj app FILE`)); continue; }
     app.upload = { text: `sending ${file.name}`, share: 0 };
@@ -314,6 +320,10 @@ async function boot() {
     const key = e.key.toLowerCase(), asked = key === "y" || (key === "z" && e.shiftKey) ? "redo" : key === "z" ? "undo" : null;
     if (asked && !$(asked).disabled) { e.preventDefault(); run(asked); }
   });
+  await act(start); /* what is clicked meanwhile follows */
+}
+
+async function start() {
   app.config = await call("GET", "/api/config");
   const asked = new URLSearchParams(location.hash.slice(1));
   const known = asked.get("session") || remembered("irj-session");

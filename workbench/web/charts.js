@@ -204,7 +204,7 @@ function againstCard(files) {
 }
 
 /* Hold parameters at values, or let them free: the model as it stands is fitted again on a branch of its own. */
-const held = (values) => act(async () => { await post("/joint", { hold: values, source: app.state.joint_source || "joint" }); await refresh(); }).then(() => { if ($("error").hidden) run("fit", {}, "parameters"); });
+const held = (values) => act(async () => { await post("/joint", { hold: values, source: app.state.joint_source || "joint" }); await refresh(); }).then((done) => { if (done) run("fit", {}, "parameters"); });
 
 /* Windows of a record that no fit takes: the one that is shown is left out, each can be taken back. */
 function leftOut(file, plot) {
@@ -228,19 +228,22 @@ function typedNumber(text, name, low, high) {
 
 /* Every parameter as a slider: the held-out error and the residual follow; nothing is changed until it is said. */
 function slidersCard(rows, error) {
-  const values = {}, figure = h("output", { class: "figure", id: "slider-error" }, `${digits(error)} %`), charts = h("div", { class: "grid" }), state = { asked: 0, busy: false, again: false };
+  const values = {}, figure = h("output", { class: "figure", id: "slider-error" }, `${digits(error)} %`), charts = h("div", { class: "grid" }), state = { turn: 0, busy: false, again: false };
   const look = async () => {
     if (state.busy) { state.again = true; return; }
     state.busy = true;
-    const began = performance.now();
+    figure.setAttribute("aria-busy", "true");
+    const began = performance.now(), turn = state.turn;
     try {
       const made = await get(`/view/what-if?values=${encodeURIComponent(JSON.stringify(values))}`);
-      figure.textContent = made.relative_error_percent == null ? "no number" : `${digits(made.relative_error_percent)} %`;
-      charts.replaceChildren(...made.charts.map((c) => h("figure", { class: "place" }, h("figcaption", {}, `${c.balance} balance: with the sliders (◆), with the fit (■)`), new ServedChart(c.chart, { name: `${c.balance} residual with the sliders` }).node)));
-      figure.dataset.milliseconds = String(Math.round(performance.now() - began));
-    } catch (e) { fail(e); }
+      if (turn === state.turn) {
+        figure.textContent = made.relative_error_percent == null ? "no number" : `${digits(made.relative_error_percent)} %`;
+        charts.replaceChildren(...made.charts.map((c) => h("figure", { class: "place" }, h("figcaption", {}, `${c.balance} balance: with the sliders (◆), with the fit (■)`), new ServedChart(c.chart, { name: `${c.balance} residual with the sliders` }).node)));
+        figure.dataset.milliseconds = String(Math.round(performance.now() - began));
+      } /* else: the sliders went back to the fit meanwhile */
+    } catch (e) { if (figure.isConnected) fail(e); } /* else: the fit that was asked is no more */
     state.busy = false;
-    if (state.again) { state.again = false; look(); }
+    if (state.again && figure.isConnected) { state.again = false; look(); } else figure.removeAttribute("aria-busy");
   };
   const inputs = [];
   const row = ([name, p]) => {
@@ -255,6 +258,6 @@ function slidersCard(rows, error) {
     return h("div", { class: "slide" }, h("label", { for: id, class: "small" }, words(name), h("span", { class: "soft plain" }, ` ${p.side} ${unit(p.unit) ? `[${unit(p.unit)}]` : ""}`), p.held ? h("span", { class: "tag" }, "held") : null), input, typed, hold, why);
   };
   const moved = Object.entries(rows).filter(([, p]) => !p.nuisance);
-  const reset = () => { for (const k of Object.keys(values)) delete values[k]; inputs.forEach((f) => f()); figure.textContent = `${digits(error)} %`; charts.replaceChildren(); };
+  const reset = () => { state.turn += 1; state.again = false; for (const k of Object.keys(values)) delete values[k]; inputs.forEach((f) => f()); figure.textContent = `${digits(error)} %`; charts.replaceChildren(); };
   return h("section", { class: "card", id: "sliders" }, h("h2", {}, "What if?"), h("p", { class: "soft small" }, "Move a parameter: the held-out error and the residual follow at once. The fit stays as it is. Hold fixes a parameter at its value, typed or slid, and fits the model again as a new branch."), h("div", { class: "two" }, h("div", {}, moved.map(row), button("Back to the fit", reset, { kind: "quiet", work: false, id: "slider-reset" })), h("div", {}, h("p", { class: "soft" }, "Held-out error"), figure, charts)));
 }

@@ -47,19 +47,22 @@ function columnMap(f) {
       if (half && !(half.parts.channel.value && half.parts.formula.value.trim()) && !(event.target === half.parts.channel && !event.target.value)) return;
       const columns = read(); if (Object.keys(columns).length) ask({ columns, kind: kind.value, number: found.number });
     }
-    const confirm = () => act(async () => {
-      const answer = await post(`/file/${f.id}`, { columns: read(), kind: app.state.joint_text ? "" : kind.value, all: true });
-      const taken = answer.status === "ready" || answer.status === "checking";
-      if (taken) app.drafts[opened] = false;
-      await refresh();
-      if (taken) render(false); else throw new Error(answer.message);
-    });
+    const confirm = () => {
+      app.drafts[opened] = false; /* now: who opens it again before the answer has come is right */
+      return act(async () => {
+        const answer = await post(`/file/${f.id}`, { columns: read(), kind: app.state.joint_text ? "" : kind.value, all: true });
+        const taken = answer.status === "ready" || answer.status === "checking";
+        await refresh();
+        if (!taken) throw new Error(answer.message);
+        render(false);
+      }).then((done) => { if (!done) app.drafts[opened] = true; });
+    };
     const whole = [...found.questions, ...found.findings.map((x) => ({ channel: x.channel, text: x.message }))].filter((q) => !q.channel || !found.proposed.some((p) => p.channel === q.channel));
     const focus = document.activeElement && body.contains(document.activeElement) ? document.activeElement.id : null;
     body.replaceChildren(h("div", { class: "row" }, joint, kind, h("span", { class: "soft small" }, `${plural(found.rows, "row")}. Check the guess by what it says of the joint, then use it.`)),
       ...whole.map((q) => h("p", { class: "odd" }, sentence(q.text, q.text.endsWith("?") ? "?" : "."))), h("p", { class: "bad import-problem", hidden: !found.problem }, found.problem),
       h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": `Columns of ${f.name}` }, h("table", { class: "map-table" }, h("thead", {}, h("tr", {}, ["Column", "Shape", "Range", "Channel", "Unit, sign, scale, counts/turn", "Why"].map((t) => h("th", { scope: "col" }, t)))), h("tbody", {}, [...rows, ...extra].map((r) => [r.node, r.more.length ? h("tr", { class: "odd-row" }, h("td", { colspan: "6" }, r.more)) : null])))),
-      h("div", { class: "row gap" }, button(found.same > 1 ? `Use for all ${found.same} files with these columns` : "Use these columns", confirm, { kind: "primary", id: `use-${f.id}` }), f.status === "columns" ? null : button("Close", () => { app.drafts[opened] = false; render(false); }, { kind: "quiet", work: false })));
+      h("div", { class: "row gap" }, button(found.same > 1 ? `Use for all ${found.same} files with these columns` : "Use these columns", confirm, { kind: "primary", id: `use-${f.id}`, key: `use-${f.id}-${JSON.stringify(request)}` }), f.status === "columns" ? null : button("Close", () => { app.drafts[opened] = false; render(false); }, { kind: "quiet", work: false })));
     if (focus && $(focus)) $(focus).focus({ preventScroll: true });
   }
   ask(app.drafts[key] && (app.drafts[key].columns || app.drafts[key].now || app.drafts[key].number != null) ? app.drafts[key] : {});

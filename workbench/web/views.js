@@ -1,7 +1,7 @@
 "use strict";
 /* One function per view: from the state to the nodes of the main region. */
 const later = (f) => { (app.after = app.after || []).push(f); };
-const button = (text, onclick, { kind = "", id, off, work = true, label } = {}) => h("button", { type: "button", class: kind, id, onclick: work ? whenIdle(id || label || text, onclick) : onclick, "aria-label": label, "data-work": work ? "1" : null, "data-off": off ? "1" : null, disabled: Boolean(off) }, text);
+const button = (text, onclick, { kind = "", id, off, work = true, label, key } = {}) => h("button", { type: "button", class: kind, id, onclick: work ? whenIdle(key || id || label || text, onclick) : onclick, "aria-label": label, "data-work": work ? "1" : null, "data-off": off ? "1" : null, disabled: Boolean(off) }, text);
 const sentence = (text, end = ".") => text.charAt(0).toUpperCase() + text.slice(1) + (text.endsWith(end) ? "" : end);
 const plural = (n, one, many) => `${n.toLocaleString("en")} ${n === 1 ? one : many || one + "s"}`;
 const effectTitle = (label) => { const [key, at] = label.split("#")[0].split("@"), e = app.config.effects.find((x) => x.key === key); return (e ? e.title : key.replace(/_/g, " ")) + (at ? ` (${at.replace(/_/g, " ")})` : ""); };
@@ -70,7 +70,7 @@ const views = {
         h("fieldset", {}, h("legend", {}, "Effects in it from the start"), h("div", { class: "checks" }, common.map((k) => box(k, effectTitle(k))), exact.map((k) => box(k, effectTitle(k)))),
           h("details", { open: others.some((e) => chosen.has(e.key)) }, h("summary", {}, `All others (${others.length})`), h("div", { class: "checks" }, others.map((e) => box(e.key, e.title))))),
         h("details", {}, h("summary", {}, "As joint file (TOML), with known values and column map"), h("label", { for: "joint-text" }, "Joint file"), h("textarea", { id: "joint-text", spellcheck: "false", value: text })))),
-      h("div", { class: "row" }, button("Save and fit", () => act(async () => { await save(); await refresh(); }).then(() => { if ($("error").hidden) run("fit", {}, "compare"); }), { kind: "primary", id: "save-fit", off: !state.files.some((f) => ["ready", "checking", "columns"].includes(f.status)) }),
+      h("div", { class: "row" }, button("Save and fit", () => act(async () => { await save(); await refresh(); }).then((done) => { if (done) run("fit", {}, "compare"); }), { kind: "primary", id: "save-fit", off: !state.files.some((f) => ["ready", "checking", "columns"].includes(f.status)) }),
         button("Save", () => act(async () => { await save(); await refresh(); }), { id: "save" })));
     return [heading("Model", "What is known about the joint, and the model to start from. Everything else has a start value and bounds derived from the records."), node];
   },

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import numpy.typing as npt
@@ -17,12 +18,15 @@ from identification.data.check.gate import passed
 from identification.data.joint_file import Joint, load_joint
 from identification.data.read import read
 from identification.diagnosis.candidates import Candidate, NotTestable
+from identification.diagnosis.claims import MAJOR_DROP
 from identification.diagnosis.trials import (
     FOLDS,
     KERNEL_SHARE,
+    MINOR_DROP,
     Base,
     Trial,
     _refined,
+    _unit,
     columns,
     effective_share,
     make_base,
@@ -30,6 +34,7 @@ from identification.diagnosis.trials import (
     try_candidate,
 )
 from identification.fitting.engine import load_dataset, prepared_model, solve
+from tests.recorded_world.world import TROUBLES, make_case, write_case
 from tests.smooth_laws import COULOMB, Law, record
 
 FloatArray = npt.NDArray[np.float64]
@@ -367,13 +372,27 @@ def test_an_effect_belongs_to_the_balance_that_it_helps_most(key: str, elastic: 
             more = np.append(plain, 0.0)
         before[tested] += (own @ plain)[tested]
         after[tested] += (both @ more)[tested]
-    falls = []
-    for k in range(len(base.balances)):
-        rows = used & (base.balance == k)
-        falls.append(rows.sum() * math.log(np.sum(before[rows] ** 2) / np.sum(after[rows] ** 2)))
-    best = falls[base.balances.index(found.balance)]
-    assert best == pytest.approx(max(falls), abs=1e-6)
-    assert found.score == pytest.approx(KERNEL_SHARE / 2 * sum(falls), rel=1e-3, abs=1e-3)
+
+    def falls(unit: FloatArray) -> list[float]:
+        out = []
+        for k in range(len(base.balances)):
+            rows = used & (base.balance == k)
+            left = np.sum(before[rows] ** 2) / (np.sum(after[rows] ** 2) / unit[k] ** 2)
+            out.append(rows.sum() * math.log(left))
+        return out
+
+    plain_falls = falls(np.ones(len(base.balances)))
+    rows = used & (base.balance == int(np.argmax(plain_falls)))
+    lower = 100 * (1 - math.sqrt(np.sum(after[rows] ** 2) / np.sum(before[rows] ** 2)))
+    unit = np.ones(len(base.balances))
+    if lower >= MINOR_DROP:  # else nothing is told of it
+        whole = np.linalg.lstsq(both[used], -base.residual[used], rcond=None)[0]
+        unit = _unit(found.candidate, base, found.values, whole)
+        assert np.all((unit > 0.5) & (unit <= 1.0))
+    told = falls(unit)
+    best = told[base.balances.index(found.balance)]
+    assert best == pytest.approx(max(told), abs=1e-6)
+    assert found.score == pytest.approx(KERNEL_SHARE / 2 * sum(told), rel=1e-3, abs=1e-3)
 
 
 @pytest.mark.parametrize("twist", [1.0, 0.5, 0.1])
@@ -395,3 +414,19 @@ def test_the_base_holds_every_parameter_whatever_its_unit(twist: float) -> None:
     assert "cubic_stiffness" not in solution.at_bound
     assert solution.stderr["cubic_stiffness"] is not None
     assert "cubic_stiffness" in make_base(solution, data).names
+
+
+def test_a_gain_that_only_takes_noise_away_is_none() -> None:
+    """The torque of the link follows from the motion on this axis; what is left of it is noise."""
+    case = make_case(60104, without=[t for t in TROUBLES if t != "noise"], names=())
+    with TemporaryDirectory() as folder:
+        written = write_case(case, Path(folder), "all")
+        joint = load_joint(written / "joint.toml")
+        run = read(written / "train.csv", joint=joint)
+    model = prepared_model(joint, run)
+    data = load_dataset([run], [], joint, model)
+    base = make_base(solve(model, data), data)
+    found = try_candidate(candidate(base, "torque_sensor_gain", "torque_sensor"), base)
+    assert isinstance(found, Trial)
+    assert abs(found.values["torque_sensor_gain"]) > 0.1  # a slope over a column of noise
+    assert found.cv_drop_percent < MAJOR_DROP / 2  # 20 % of the residual's own length

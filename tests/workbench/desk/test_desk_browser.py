@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.workbench.chromium import launched, needs_chromium
+from tests.workbench.chromium import context_of, launched, needs_chromium
 
 pytestmark = needs_chromium
 
@@ -45,7 +45,7 @@ def address(root: Path) -> Iterator[str]:
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     with launched() as chromium:
-        context = chromium.new_context(viewport={"width": 1280, "height": 860})
+        context = context_of(chromium, viewport={"width": 1280, "height": 860})
         problems: list[str] = []
         context.on("weberror", lambda e: problems.append(str(e.error)))
         made = context.new_page()

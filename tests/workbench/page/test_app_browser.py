@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from tests.workbench.chromium import CI, launched, needs_chromium
+from tests.workbench.chromium import CI, context_of, launched, needs_chromium
 
 SHARED = Path(__file__).resolve().parents[3].parent / "shared"
 AXE = os.environ.get("IRJ_AXE", "")
@@ -98,8 +98,8 @@ def browser(tmp_path: Path) -> Iterator[Browser]:
     shots = Path(os.environ.get("IRJ_SCREENSHOTS", str(tmp_path)))
     shots.mkdir(parents=True, exist_ok=True)
     with launched() as chromium:
-        context = chromium.new_context(
-            viewport={"width": 1280, "height": 860}, accept_downloads=True
+        context = context_of(
+            chromium, viewport={"width": 1280, "height": 860}, accept_downloads=True
         )
         problems: list[str] = []
         context.on("weberror", lambda e: problems.append(str(e.error)))

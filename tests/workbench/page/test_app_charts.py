@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from tests.workbench.chromium import launched, needs_chromium
+from tests.workbench.chromium import context_of, launched, needs_chromium
 
 AXE = os.environ.get("IRJ_AXE", "")
 
@@ -45,8 +45,8 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 def page(address: str) -> Iterator[Any]:
     """The demo, fitted and diagnosed."""
     with launched() as chromium:
-        context = chromium.new_context(
-            viewport={"width": 1280, "height": 860}, accept_downloads=True
+        context = context_of(
+            chromium, viewport={"width": 1280, "height": 860}, accept_downloads=True
         )
         problems: list[str] = []
         context.on("weberror", lambda e: problems.append(str(e.error)))
@@ -211,9 +211,8 @@ def test_a_slider_shows_the_held_out_error_at_once_and_changes_nothing(page: Any
     )
     page.evaluate(slide, 1.1)
     page.wait_for_selector("#sliders svg")
-    page.wait_for_timeout(200)
     page.evaluate(slide, 1.05)
-    page.wait_for_timeout(400)
+    page.wait_for_selector("#slider-error:not([aria-busy])")
     shown = float(page.inner_text("#slider-error").split()[0])
     exact = page.evaluate(
         "() => get('/view/what-if?values=' + encodeURIComponent(JSON.stringify("
@@ -221,7 +220,9 @@ def test_a_slider_shows_the_held_out_error_at_once_and_changes_nothing(page: Any
     )
     assert shown == pytest.approx(exact["relative_error_percent"], rel=0.01)
     assert shown > float(before.split()[0])
+    page.evaluate(slide, 1.05)  # its answer comes after the next click
     page.click("#slider-reset")
+    page.wait_for_selector("#slider-error:not([aria-busy])")
     assert page.inner_text("#slider-error") == before
     same = page.evaluate("() => get('/view/what-if?values={}')")
     assert same["relative_error_percent"] == pytest.approx(float(before.split()[0]), rel=2e-3)
@@ -277,6 +278,7 @@ def test_a_window_is_left_out_and_taken_back(page: Any) -> None:
     page.click("#take-back-0")
     page.wait_for_function("() => app.state.files.every((f) => !f.left_out.length)")
     page.wait_for_function("() => app.state.steps.length > 0")  # the branch before it is back
+    idle(page, "load")
 
 
 INTERNAL = re.compile(r"\b[a-z]\w*#\d|\b[a-z]+@[a-z]+\b|\b[a-z0-9]+(?:_[a-z0-9]+)+\b(?!\.\w)")

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from tests.workbench.chromium import launched, needs_chromium
+from tests.workbench.chromium import context_of, launched, needs_chromium
 
 pytestmark = needs_chromium
 
@@ -48,7 +48,7 @@ def opened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Opened]:
     thread.start()
     address = f"http://127.0.0.1:{port}/"
     with launched() as chromium:
-        context = chromium.new_context(viewport={"width": 1280, "height": 860})
+        context = context_of(chromium, viewport={"width": 1280, "height": 860})
         problems: list[str] = []
         context.on("weberror", lambda e: problems.append(str(e.error)))
         context.on("console", lambda m: problems.append(m.text) if m.type == "error" else None)
