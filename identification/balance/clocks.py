@@ -283,12 +283,7 @@ def lateness(made: WeakRecord, place: str, *, torque: bool) -> tuple[float, floa
     kept = one_way(made)
     a = {n: x[kept] for n, x in made.averaged.items()}
     if place not in ENCODERS:
-        found = _slope(*_parts(made, place, kept, torque=torque))
-        if place == "torque_sensor" and "drive" in a:
-            # it loads the drive, too: where the encoder of the link is coarse, that tells more
-            others = [*_motion(a, "motor"), a["torque"], a["drive_rate"]]
-            found = _both(found, _slope(a["drive"], others, a["torque_rate"]))
-        return *found, 0.0
+        return *_slope(*_parts(made, place, kept, torque=torque)), 0.0
     effort, twist = a.get("torque" if torque else "drive"), a["motor_position"] - a["link_position"]
     if effort is None:  # nothing tells friction of the link from lateness
         return 0.0, math.inf, 0.0
@@ -301,19 +296,6 @@ def lateness(made: WeakRecord, place: str, *, torque: bool) -> tuple[float, floa
     soft, _ = _slope(twist, [one, v, bend], effort)
     apart = min(abs(friction * soft), abs(late))
     return math.copysign(abs(late) - apart, late), error, apart
-
-
-def _both(one: tuple[float, float], other: tuple[float, float]) -> tuple[float, float]:
-    """Mean of two estimates with standard errors; where they contradict each other by more than
-    these, its error is larger as much (R. Birge 1932).
-    """
-    pairs = [(x, e) for x, e in (one, other) if 0 < e < math.inf]
-    if len(pairs) < 2:
-        return pairs[0] if pairs else one
-    weights = [e**-2 for _, e in pairs]
-    mean = sum(w * x for w, (x, _) in zip(weights, pairs, strict=True)) / sum(weights)
-    apart = abs(one[0] - other[0]) / math.hypot(one[1], other[1])
-    return mean, max(1.0, apart) / math.sqrt(sum(weights))
 
 
 def _slope(values: FloatArray, others: list[FloatArray], column: FloatArray) -> tuple[float, float]:

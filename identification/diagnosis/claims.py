@@ -260,13 +260,14 @@ def _major(trial: Trial, base: Base) -> bool:
         if base.solution.model.load_compliance(base.solution.values) > 0
         else MAJOR_DROP
     )
-    if trial.gain <= GAIN or trial.cv_drop_percent < least:
+    drop = trial.beyond_noise(trial.cv_drop_percent)
+    if trial.gain <= GAIN or drop < least:
         return False
-    held = trial.held_out_drop_percent
+    held = trial.beyond_noise(trial.held_out_drop_percent)
     if not math.isnan(held) and held < (COMMON_DROP / 2 if common else HELD_OUT_DROP):
         return False
     if trial.effect.stage == "late":
-        return trial.cv_drop_percent >= LATE_DROP and (math.isnan(held) or held >= LATE_DROP)
+        return drop >= LATE_DROP and (math.isnan(held) or held >= LATE_DROP)
     if trial.effect.is_delay:
         model, place = base.solution.model, trial.candidate.place
         name = carrier(model, place)
@@ -358,12 +359,12 @@ def minor_claims(ranking: Ranking, base: Base) -> list[Trial]:
         if (
             t.candidate.label in ranking.significant
             or t.score < MINOR_GAIN
-            or t.cv_drop_percent < MINOR_DROP
+            or t.beyond_noise(t.cv_drop_percent) < MINOR_DROP
         ):
             continue
         if (
             math.isnan(t.held_out_drop_percent)
-            or t.held_out_drop_percent < MINOR_HELD_OUT
+            or t.beyond_noise(t.held_out_drop_percent) < MINOR_HELD_OUT
             or t.p_value > MINOR_P
         ):
             continue

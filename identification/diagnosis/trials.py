@@ -369,7 +369,7 @@ class Trial:
     balance : str
         Balance where it helps most.
     gain : float
-        Cross-validated log-likelihood gain [nats].
+        Cross-validated log-likelihood gain [nats], in units of what noise alone leaves.
     cv_drop_percent, held_out_drop_percent : float
         Fall of the RMS in the affected balance.
     p_value : float
@@ -385,6 +385,8 @@ class Trial:
     score : float
         Log-likelihood gain if only the kernel's overlap tied the rows together: order of the
         ranking [nats].
+    unit : float
+        What noise alone leaves of its balance, over what it leaves under the base; at most 1.
     """
 
     candidate: Candidate
@@ -399,6 +401,11 @@ class Trial:
     outside: float
     contribution: float
     score: float
+    unit: float = 1.0
+
+    def beyond_noise(self, drop_percent: float) -> float:
+        """A fall of the RMS [%] in units of what noise alone leaves."""
+        return 100.0 - (100.0 - drop_percent) / self.unit
 
     def __repr__(self) -> str:
         return (
@@ -543,21 +550,22 @@ def _score(
     told = _told(base, sse1)
     values = {**shapes, **dict(zip(candidate.amplitudes, map(float, amplitude), strict=True))}
     unit = np.ones(len(base.balances))
-    if told["cv_drop_percent"] >= MINOR_DROP:
-        unit = _unit(candidate, base, values, delta)
-        told = _told(base, sse1 / unit**2)
     where = base.balances.index(told["balance"])
+    if told["cv_drop_percent"] >= MINOR_DROP:
+        # where it does not help, it need not be paid for
+        unit[where] = _unit(candidate, base, values, delta)[where]
     held = _held_out_drop(
         candidate, base, balances=balances, shapes=shapes, delta=delta, size=size, where=where
     )
     return Trial(
         candidate,
         values,
-        held_out_drop_percent=100 - (100 - held) / float(unit[where]),
+        held_out_drop_percent=held,
         p_value=_wald(added, base, delta),
         outside=inside,
         contribution=float(np.sqrt(np.mean((raw[base.balance == where] @ amplitude) ** 2))),
-        **told,
+        unit=float(unit[where]),
+        **{**told, "gain": _told(base, sse1 / unit**2)["gain"]},
     )
 
 
@@ -573,7 +581,7 @@ def _unit(
     """
     model = candidate.model
     own = {p.name: p.start for p in model.parameters} | dict(base.solution.values)
-    moves = delta[: base.parts[0]] / base.norms
+    moves = delta[: len(base.names)] / base.norms  # further columns are no parameters
     # parameters of a foreign FMU are columns of the base and none of the joint's
     moved = zip(base.names, moves, strict=True)
     own |= {n: own[n] + float(d) for n, d in moved if n in own} | dict(values)
