@@ -194,9 +194,10 @@ def usual(
             middle, place = 0.0, CLOCKS[n].place
             if place in ENCODERS and not torque:
                 late, error, _ = lateness(w, place, torque=torque)
-                if abs(late) > SURE * error:
+                whole = w.shifts.get(place, 0.0) + late  # what was taken off, and what is left
+                if abs(whole) > SURE * error:
                     most = MOST_SKEW * w.grid.dt
-                    middle = min(max(w.shifts.get(place, 0.0) + late, -most), most)
+                    middle = min(max(whole, -most), most)
             out[of_run(n, w)] = middle, USUAL_SKEW * w.grid.dt
     return out
 

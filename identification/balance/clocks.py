@@ -2,9 +2,9 @@
 the balances are made, what is left of it is fitted with the model.
 
 A skew of a sample is no small number: its Taylor series in the model would change the inertias, and
-the second order of a torque, which no derivative shows, the skew itself. An encoder is shifted by
-whole samples, which leaves its noise as it is, and has the second order in the model; torques are
-interpolated: their noise changes above a quarter of the sampling rate, which no kernel passes.
+the second order of an acceleration or a torque, which no derivative shows, the skew itself.
+Readings are interpolated: their noise changes above a quarter of the sampling rate, which no kernel
+passes.
 Where a torque is late through a low-pass, as the current of most drives is, its rate in the model
 makes it good, and no shift.
 """
@@ -20,6 +20,14 @@ import numpy.typing as npt
 
 from casadi_models import JointModel
 from casadi_models.hold import CLOCKS
+from identification.balance.beside import (
+    DEVIATION,
+    any_curve,
+    bounded,
+    motion_of,
+    rest_beside,
+    scaled,
+)
 from identification.balance.weak import WeakRecord
 
 FloatArray = npt.NDArray[np.float64]
@@ -41,29 +49,28 @@ cycle. It decides only what the records do not tell.
 """
 SHIFTS: Final = 4
 """Rounds in which shifts are looked for: one channel's comes out wrong while another is late."""
-NEAR: Final = 0.05
-"""Lateness that is left to the model [samples]: its square is under a hundredth."""
+NEAR: Final = 0.1
+"""Lateness that is left to the model [samples]: half its square, which the series of a torque and
+that of an acceleration in the model lack, is under a hundredth.
+"""
 ENCODERS: Final = frozenset({"link_position_sensor"})
-"""Places whose readings are shifted by whole samples."""
+"""Places whose readings are positions."""
 LOW_PASSED: Final = frozenset({"drive"})
 """Places whose readings may come through a low-pass and not late: drives filter their current."""
 SURE: Final = 3.0
-"""Standard errors by which a channel must be late (an encoder: later than half a sample)."""
+"""Standard errors by which a channel must be late."""
+UNLIKE: Final = 2.0
+"""Standard errors from which a lateness read through the motor is certainly another: 5 %."""
 ONE_WAY: Final = 1e-3
 """Share of a row's kernel in which the joint may move the other way."""
+CREEP: Final = 0.05
+"""Share of a record's speed below which friction is turning, whatever its law: a Stribeck velocity
+and the width of a smooth turn are hundredths of the speed of a useful record.
+"""
+FAST: Final = 0.99
+"""Quantile of the speeds that is the speed of a record."""
 FEW: Final = 0.1
 """Share of such rows below which a motion turns all the time: then its turns tell the clocks."""
-DEVIATION: Final = 1.4826
-"""Standard deviation of a normal value over the median of its size."""
-BIWEIGHT: Final = 4.685
-"""Deviations from which a row says nothing: 95 % of the efficiency of least squares on normal noise
-(Holland, Welsch 1977).
-"""
-REWEIGHTED: Final = 15
-"""Rounds of reweighting: the columns are fixed to a thousandth after ten."""
-NODES: Final = 24
-"""Nodes of the friction that is none of a clock, each with the same share of the samples: twelve in
-each direction follow a Stribeck curve."""
 STRETCHES: Final = 8
 """Stretches of a record whose slopes are compared."""
 
@@ -142,7 +149,7 @@ def cubic(f: float) -> tuple[float, float, float, float]:
 def in_time(
     make: Callable[[Mapping[str, float]], WeakRecord],
     places: Iterable[str],
-    noise: Callable[[str, float], float],
+    noise: Callable[[WeakRecord, str, float], float],
     *,
     torque: bool,
 ) -> WeakRecord:
@@ -155,8 +162,8 @@ def in_time(
     places : iterable of str
         Whose channels may be shifted.
     noise : callable
-        Variance that the noise of a place's channel gives the rows, its rate times a lateness [s]
-        added.
+        Variance that the noise of a place's channel gives the rows of a record, its rate times a
+        lateness [s] added.
     torque : bool
         Whether the torque of the link is measured.
     """
@@ -166,7 +173,7 @@ def in_time(
         moved = dict(shifts)
         for place in wanted:
             late = _late(made, place, torque=torque) / made.grid.dt
-            step = round(late) if place in ENCODERS else late if abs(late) > NEAR else 0.0
+            step = late if abs(late) > NEAR else 0.0
             moved[place] = moved.get(place, 0.0) + step
         if moved == shifts:
             break
@@ -178,7 +185,8 @@ def in_time(
         # a shift of zero keeps the rows: what is compared are the same instants
         unshifted = {**shifts, place: 0.0}
         other = make(unshifted)
-        louder = noise(place, shifts[place] * made.grid.dt) - noise(place, 0.0)
+        late = shifts[place] * made.grid.dt
+        louder = noise(made, place, late) - noise(made, place, 0.0)
         if _leaves_less(other, made, place, louder, torque=torque):
             shifts, made = unshifted, other
     return made
@@ -198,99 +206,83 @@ def _leaves_less(
     the sum of squares that is compared is Tukey's, bounded.
     """
     kept = one_way(one)
-    friction = _any_friction(one, kept)
+    friction = any_curve(one, "motor_velocity", kept)
     parts = [_parts(made, place, kept, torque=torque) for made in (one, other)]
-    rest = [_rest(values, [*others, friction], column) for values, others, column in parts]
+    rest = [rest_beside(values, [*others, friction, column]) for values, others, column in parts]
     scale = min(DEVIATION * float(np.median(np.abs(x))) for x in rest)
     if not scale:
         return False
-    met, unmet = (float(np.sum(_bounded(x / scale))) for x in rest)
+    met, unmet = (float(np.sum(bounded(x / scale))) for x in rest)
     return unmet - met + louder / scale**2 * len(rest[0]) > 0.0
 
 
-def _any_friction(record: WeakRecord, kept: npt.NDArray[np.bool_]) -> FloatArray:
-    """Columns of a free curve over the velocity, shape (rows, nodes): whatever friction there is
-    says nothing of a clock.
-    """
-    points = record.points["motor_velocity"]
-    moving = points[points != 0.0] if np.any(points) else points
-    nodes = np.unique(np.quantile(moving, np.linspace(0.0, 1.0, NODES)))
-    hats = [np.interp(points, nodes, unit) for unit in np.eye(len(nodes))]
-    return np.column_stack([record.average(hat)[kept] for hat in hats])
-
-
 def _parts(
-    made: WeakRecord, place: str, kept: npt.NDArray[np.bool_], *, torque: bool
+    made: WeakRecord,
+    place: str,
+    kept: npt.NDArray[np.bool_],
+    *,
+    torque: bool,
+    through_motor: bool = False,
 ) -> tuple[FloatArray, list[FloatArray], FloatArray]:
     """Reading of a torque, what it follows from, and the column of its lateness, in the rows
-    `kept`.
+    `kept`; `through_motor`: as far as the motion of the motor tells that of the link.
     """
     a = {n: x[kept] for n, x in made.averaged.items()}
     if place == "torque_sensor":
-        return a["torque"], _motion(a, "link"), -a["torque_rate"]
+        motion, column = motion_of(a, "link"), -a["torque_rate"]
+        if through_motor:
+            through = scaled(np.column_stack([*motion_of(a, "motor"), column]))
+            motion = [through @ np.linalg.lstsq(through, x, rcond=None)[0] for x in motion]
+        return a["torque"], motion, column
     load = [a["torque"]] if torque else []
-    return a["drive"], [*_motion(a, "motor"), *load], -a["drive_rate"]
-
-
-def _motion(a: Mapping[str, FloatArray], side: str) -> list[FloatArray]:
-    """What the torques of a side follow from."""
-    q, v = a[f"{side}_position"], a[f"{side}_velocity"]
-    return [np.ones(len(v)), v, np.sign(v), a[f"{side}_acceleration"], np.sin(q), np.cos(q)]
-
-
-def _rest(values: FloatArray, others: list[FloatArray], column: FloatArray) -> FloatArray:
-    """What is left of the values beside all columns, those that most rows agree on."""
-    matrix = _scaled(np.column_stack([*others, column]))
-    weight = np.ones(len(values))
-    rest = values
-    for _ in range(REWEIGHTED):
-        root = np.sqrt(weight)
-        solution, *_ = np.linalg.lstsq(matrix * root[:, None], values * root, rcond=None)
-        rest = values - matrix @ solution
-        scale = DEVIATION * float(np.median(np.abs(rest)))
-        if not scale:
-            break
-        weight = np.maximum(1.0 - (rest / (BIWEIGHT * scale)) ** 2, 0.0) ** 2
-    return np.asarray(rest)
-
-
-def _bounded(x: FloatArray) -> FloatArray:
-    """Tukey's bounded square: x^2 near zero, a third of `BIWEIGHT`^2 far away."""
-    inside = np.minimum((x / BIWEIGHT) ** 2, 1.0)
-    return np.asarray(BIWEIGHT**2 / 3.0 * (1.0 - (1.0 - inside) ** 3))
+    return a["drive"], [*motion_of(a, "motor"), *load], -a["drive_rate"]
 
 
 def one_way(record: WeakRecord) -> npt.NDArray[np.bool_]:
-    """Rows within which the joint does not turn, shape (rows,): where dry friction turns it has a
-    rate that no lateness explains. All rows where hardly any is such a row.
+    """Rows within which the joint neither turns nor creeps, shape (rows,): where dry friction turns
+    it has a rate that no lateness explains. All rows where hardly any is such a row.
     """
-    same = np.abs(record.average(np.sign(record.points["motor_velocity"]))) > 1 - ONE_WAY
+    speed = np.abs(record.points["motor_velocity"])
+    creeps = speed < CREEP * np.quantile(speed, FAST)
+    way = np.where(creeps, 0.0, np.sign(record.points["motor_velocity"]))
+    same = np.abs(record.average(way)) > 1 - ONE_WAY
     return np.asarray(same if np.mean(same) > FEW else np.ones(record.rows, dtype=np.bool_))
 
 
 def _late(made: WeakRecord, place: str, *, torque: bool) -> float:
     """Time by which a channel is certainly late [s]."""
     late, error, _ = lateness(made, place, torque=torque)
-    least = 0.5 * made.grid.dt if place in ENCODERS else 0.0
-    sure = abs(late) - SURE * error > least
-    return late if sure else 0.0
+    return late if abs(late) > SURE * error else 0.0
 
 
 def lateness(made: WeakRecord, place: str, *, torque: bool) -> tuple[float, float, float]:
     """Time by which a channel is late, its standard error, and the part of it that viscous friction
     may be [s]: reading = what it follows from, less the time times its rate.
+
+    The rate of a torque explains some of the noise of the link's acceleration, and is found too
+    large for it. Read through the motion of the motor (two-stage least squares) it is not, but
+    known less well; so that is taken where the two are certainly unlike (Hausman 1978).
     """
     kept = one_way(made)
     a = {n: x[kept] for n, x in made.averaged.items()}
     if place not in ENCODERS:
-        return *_slope(*_parts(made, place, kept, torque=torque)), 0.0
+        late, error = _slope(*_parts(made, place, kept, torque=torque))
+        if place == "torque_sensor" and "motor_position" in a:
+            sure = _slope(*_parts(made, place, kept, torque=torque, through_motor=True))
+            if abs(late - sure[0]) > UNLIKE * sure[1]:
+                late, error = sure
+            # read against the link's encoder, which may itself be late by less than it is shifted
+            own, own_error, _ = lateness(made, "link_position_sensor", torque=torque)
+            late, error = late + own, math.hypot(error, own_error)
+        return late, error, 0.0
     effort, twist = a.get("torque" if torque else "drive"), a["motor_position"] - a["link_position"]
     if effort is None:  # nothing tells friction of the link from lateness
         return 0.0, math.inf, 0.0
-    one, v, _, bend, *_ = _motion(a, "link")
-    late, error = _slope(twist, [one, effort, bend, np.sign(v)], v)
+    one, v, _, bend, *_ = motion_of(a, "link")
     if torque:
-        return late, error, 0.0
+        # a damped transmission gives way late, too
+        return *_slope(twist, [one, effort, a["torque_rate"], np.sign(v)], v), 0.0
+    late, error = _slope(twist, [one, effort, a["drive_rate"], bend, np.sign(v)], v)
     # the twist under viscous friction is such a lateness too
     friction, _ = _slope(effort, [one, np.sign(v), bend], v)
     soft, _ = _slope(twist, [one, v, bend], effort)
@@ -302,7 +294,7 @@ def _slope(values: FloatArray, others: list[FloatArray], column: FloatArray) -> 
     """Slope over a column beside others, with its standard error: rows depend on each other, so it
     is that of leaving one of a few stretches out.
     """
-    basis, _ = np.linalg.qr(_scaled(np.column_stack(others)))
+    basis, _ = np.linalg.qr(scaled(np.column_stack(others)))
     own = column - basis @ (basis.T @ column)
     rest = values - basis @ (basis.T @ values)
     powers = np.array([float(x @ x) for x in np.array_split(own, STRETCHES)])
@@ -321,10 +313,6 @@ def _slope(values: FloatArray, others: list[FloatArray], column: FloatArray) -> 
     without = (products.sum() - products) / (power - powers)
     error = math.sqrt((STRETCHES - 1) / STRETCHES * float(np.sum((without - without.mean()) ** 2)))
     return slope, error
-
-
-def _scaled(matrix: FloatArray) -> FloatArray:
-    return np.asarray(matrix / np.maximum(np.linalg.norm(matrix, axis=0), 1e-300))
 
 
 __all__ = [

@@ -23,6 +23,8 @@ REACH: Final = 0.0202
 for its clock: they hold frequencies above 25 Hz, where a motion has little but the few samples
 around a turn.
 """
+CALM_REACH: Final = 2 * REACH
+"""The same where the joint is calm: what its acceleration holds there is slower than 12 Hz."""
 SPACINGS: Final = (1, 2, 3, 4, 6, 8, 12, 16)
 """Samples between the five that make a fourth difference."""
 MEMORIES: Final = tuple(float(x) for x in np.geomspace(0.5, 40.0, 23))
@@ -182,15 +184,22 @@ def white(level: float) -> ChannelNoise:
     return ChannelNoise(level, (Part(level),))
 
 
-def spacings_of(dt: float) -> list[int]:
+def spacings_of(dt: float, *, calm: bool = False) -> list[int]:
     """Spacings of the fourth differences that tell the colour of a channel, in samples of `dt`
-    seconds; too few to tell it where the logger is slow.
+    seconds; too few to tell it where the logger is slow. They reach farther where the joint is
+    `calm`.
     """
-    return [m for m in SPACINGS if m == 1 or m * dt <= REACH]
+    return [m for m in SPACINGS if m == 1 or m * dt <= (CALM_REACH if calm else REACH)]
 
 
 def coloured(
-    values: FloatArray, part: slice, dt: float, levels: Sequence[float], share: float = 1.0
+    values: FloatArray,
+    part: slice,
+    dt: float,
+    levels: Sequence[float],
+    share: float = 1.0,
+    *,
+    calm: bool = False,
 ) -> ChannelNoise:
     """Noise of a channel from its fourth differences.
 
@@ -206,9 +215,11 @@ def coloured(
         Deviations of white noise with the same fourth differences over each of
         :func:`spacings_of`; zeros where that is not known.
     share : float
-        Share of the differences that hold measured samples only.
+        Share of the samples that count.
+    calm : bool
+        Whether these are those at which the joint is calm.
     """
-    spacings, level = spacings_of(dt), levels[0]
+    spacings, level = spacings_of(dt, calm=calm), levels[0]
     if level <= 0 or len(spacings) < FEWEST_SPACINGS or share * (part.stop - part.start) < FEWEST:
         return white(level)
     count = sum(1 for x in levels if x > 0)
@@ -292,26 +303,42 @@ def _seen(memory: float, stages: int, spacings: Sequence[int]) -> FloatArray:
 def _lines(values: FloatArray, part: slice, dt: float) -> tuple[tuple[float, float], ...]:
     """Amplitude and frequency of the lines that stand out of the longest stretch."""
     # differences take the slow motion out, which the window would not keep apart
-    course = np.diff(values[part], 2)
+    found = [
+        (size / (2 * np.sin(np.pi * frequency * dt)) ** 2, frequency)
+        for size, frequency in lines_in(np.diff(values[part], 2), dt, LOWEST_LINE)
+    ]
+    # more of them are a comb, as pulses of the motion make one
+    return tuple(sorted(found, reverse=True)) if len(found) <= MOST_LINES else ()
+
+
+def lines_in(course: FloatArray, dt: float, lowest: float) -> list[tuple[float, float]]:
+    """Amplitude and frequency [Hz] of the lines that stand out of a course (n,) at steps of `dt`
+    seconds, from a lowest frequency on: pure ones, which hold one frequency from end to end.
+    """
     count = len(course)
+    if not count:
+        return []
     window = np.sin(np.pi * (np.arange(count) + 0.5) / count) ** 4
     power = np.abs(np.fft.rfft((course - course.mean()) * window)) ** 2
     frequency = np.fft.rfftfreq(count, dt)
-    first = max(int(np.searchsorted(frequency, LOWEST_LINE)), AROUND)
+    first = max(int(np.searchsorted(frequency, lowest)), AROUND)
     found: list[tuple[float, float]] = []
-    usual = float(np.median(power[first:])) if first < len(power) else 0.0
-    for k in np.flatnonzero(power[first:-AROUND] > STANDS_OUT * usual) + first:
+    least = STANDS_OUT * float(np.median(power[first:])) if first < len(power) else 0.0
+    for k in np.flatnonzero(power[first:-AROUND] > least) + first:
         near = power[k - AROUND : k + AROUND + 1]
         around = float(np.median(near))
         own = float(near[AROUND - WIDTH : AROUND + WIDTH + 1].sum()) - (2 * WIDTH + 1) * around
-        over = float(np.sum(np.maximum(near - around / np.log(2), 0.0)))
+        usual = around / np.log(2)
+        # noise alone is over its mean by one in e of it
+        over = float(
+            np.sum(np.maximum(near - usual, 0.0)) - (len(near) - 2 * WIDTH - 1) * usual / np.e
+        )
         if power[k] < near.max() or power[k] < STANDS_OUT * around or own < PURE * over:
             continue
-        gain = (2 * np.sin(np.pi * frequency[k] * dt)) ** 2
         # all power of a line in a window: (size/2)^2 n sum of its squares
-        size = 2 * np.sqrt(own / (count * float(np.sum(window**2)))) / gain
+        size = 2 * np.sqrt(own / (count * float(np.sum(window**2))))
         found.append((float(size), float(frequency[k])))
-    return tuple(sorted(found, reverse=True)[:MOST_LINES])
+    return found
 
 
-__all__ = ["ChannelNoise", "Part", "coloured", "spacings_of", "white"]
+__all__ = ["MOST_LINES", "ChannelNoise", "Part", "coloured", "lines_in", "spacings_of", "white"]

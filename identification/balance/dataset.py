@@ -15,9 +15,11 @@ from casadi_models import JointModel, hold
 from identification.balance.calibration import named_late, unknowns_of
 from identification.balance.clocks import SIGNAL, in_time, places_of, shifted
 from identification.balance.colour import ChannelNoise, white
+from identification.balance.contacts import TOLD_BY, restored
 from identification.balance.memory import cache_of
 from identification.balance.noise import noise_of
 from identification.balance.sensing import Sensing, adapt, check_alike, sense, signals_of
+from identification.balance.slow_noise import SlowNoise, slow_noise_of
 from identification.balance.spikes import without_spikes
 from identification.balance.stamps import evened
 from identification.balance.weak import (
@@ -200,7 +202,10 @@ def load_dataset(
                 f"{held_out[0].name}: the joint stands still in every held-out record; give one "
                 "in which it moves"
             )
-    found = [measured_sources(r, joint, sensing) for r in train]
+    found = [
+        _with_slow(measured_sources(r, joint, sensing), slow_noise_of(made))
+        for r, made in zip(train, prepared, strict=False)
+    ]
     noise = {c: float(np.median([one[c].level for one in found])) for c in found[0]}
     # colours are those of the record in the middle
     colours = {c: sorted((one[c] for one in found), key=_loudness)[len(found) // 2] for c in noise}
@@ -296,9 +301,9 @@ def weak_record(
     noise = measured_sources(record, joint, sensing)
     record = evened(record)
     segments = tuple(record.segments())
+    read = signals_of(record, joint, sensing)
     signals = {
-        c: without_spikes(x, segments, noise[c].level) if c in noise else x
-        for c, x in signals_of(record, joint, sensing).items()
+        c: without_spikes(x, segments, noise[c].level) if c in noise else x for c, x in read.items()
     }
     length = max(length, KERNEL_SAMPLES * record.dt)
     longest = length / 2 if length <= CLAIM_KERNEL else 0.06
@@ -330,9 +335,10 @@ def weak_record(
         last.append((dict(shifts), made))
         return made
 
-    def spread(place: str, lateness: float) -> float:
+    def spread(made: WeakRecord, place: str, lateness: float) -> float:
         plain, rate = (differentiated_kernel(length, record.dt, order) for order in (0, 1))
-        return noise[SIGNAL[place]].after(plain + lateness * rate, record.dt) ** 2
+        own = _with_slow(noise, slow_noise_of(made))[SIGNAL[place]]
+        return own.after(plain + lateness * rate, record.dt) ** 2
 
     if known is not None:
         made = made_with({p: round(k / record.dt, 9) for p, k in known.items()})
@@ -340,6 +346,17 @@ def weak_record(
         made = (
             in_time(made_with, late, spread, torque=sensing.has_torque) if late else made_with({})
         )
+    mended = {c: signals[c] for c in TOLD_BY if c in signals and signals[c] is not read[c]}
+    if mended:
+        shifts = {p: k / record.dt for p, k in made.shifts.items()}
+
+        def remade(torques: Mapping[str, FloatArray]) -> WeakRecord:
+            signals.update(torques)
+            last.clear()
+            return made_with(shifts)
+
+        late_by = {SIGNAL[p]: k for p, k in shifts.items()}
+        made = restored(made, mended, read, late_by, remade)
     made = _with_rests(made, noise)
     if record.measured is not None and not record.measured.all():
         made = replace(
@@ -396,13 +413,31 @@ def _loudness(noise: ChannelNoise) -> float:
     return sum(part.size**2 for part in noise.parts)
 
 
+def _with_slow(
+    sources: Mapping[str, ChannelNoise], slow: Mapping[str, SlowNoise]
+) -> dict[str, ChannelNoise]:
+    """The noise of each signal with that which no difference of neighbours shows."""
+    return {
+        c: replace(own, parts=(*own.parts, *slow[c].parts), lines=(*own.lines, *slow[c].lines))
+        if c in slow
+        else own
+        for c, own in sources.items()
+    }
+
+
 def measured_sources(record: Record, joint: Joint, sensing: Sensing) -> dict[str, ChannelNoise]:
     """Noise of each measured signal, from samples that were measured: bridges are smoother than a
     reading.
     """
     signals = signals_of(record, joint, sensing)
     return {
-        c: noise_of(record, c, x, joint.gear_ratio)
+        c: noise_of(
+            record,
+            c,
+            x,
+            joint.gear_ratio,
+            None if c.endswith("position") else signals.get("motor_position"),
+        )
         for c, x in signals.items()
         if c in POSITION_CHAINS
     }

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from casadi_models import EFFECTS
+from identification.balance.colour import LOWEST_LINE
 from identification.balance.dataset import Dataset
 from identification.balance.weak import REST_SHARE, WeakRecord, differentiated_kernel
 
@@ -47,6 +48,11 @@ REST_WORTH: Final = 0.05
 """Share of rows at rest that is worth a word: joints that stick for a moment at each turn stay
 below.
 """
+
+
+SLOWEST_COLOUR: Final = 1.0
+"""Memory of a noise from which on it is a drift [s]: twenty times the longest that neighbouring
+samples show."""
 
 
 def rest_note(share: float) -> str:
@@ -125,7 +131,29 @@ def excitation_warnings(data: Dataset) -> tuple[str, ...]:
             f"noise of the positions would lower the {worst}: the fit takes that off as far as the "
             "noise is white, finer encoders avoid it"
         )
-    return tuple(out)
+    return (*out, *slow_noise_notes(data))
+
+
+def slow_noise_notes(data: Dataset) -> list[str]:
+    """What is said of a torque's reading that drifts or hums slowly."""
+    unit, out = "N" if data.joint.kind == "linear" else "N.m", []
+    for signal, what in (("drive", "the drive's torque"), ("torque", "the link's torque")):
+        noise = data.sources.get(signal)
+        if noise is None:
+            continue
+        drift = math.hypot(*(p.size for p in noise.parts if p.memory > SLOWEST_COLOUR))
+        said = [f"drifts by about {drift:.2g} {unit}"] if drift > 0 else []
+        said += [
+            f"hums with {size:.2g} {unit} at {frequency:.3g} Hz"
+            for size, frequency in noise.lines
+            if frequency < LOWEST_LINE
+        ]
+        if said:
+            out.append(
+                f"the reading of {what} {' and '.join(said)}: that counts as noise, and what is "
+                "as slow and no larger is not told from it; check the amplifier"
+            )
+    return out
 
 
 def unlike_units(data: Dataset) -> str:

@@ -9,7 +9,13 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import numpy.typing as npt
 
-from identification.balance.colour import ChannelNoise, coloured, spacings_of, white
+from identification.balance.colour import (
+    FEWEST_SPACINGS,
+    ChannelNoise,
+    coloured,
+    spacings_of,
+    white,
+)
 from identification.data.record import Record
 
 FloatArray = npt.NDArray[np.float64]
@@ -31,6 +37,17 @@ JUMP: Final = 5.0
 """Noise levels over which a fourth difference is a jump: one in two million by chance."""
 FEWEST_LEFT: Final = 0.2
 """Share of the samples around which no jump must be: from fewer their level is no level of all."""
+
+CALM: Final = 0.4
+"""Share of the samples at which a joint moves, those with the least acceleration, that are calm: of
+40 s at 100 Hz some 1000 are left around which nothing else is."""
+BEND: Final = 0.02
+"""Time on either side over which a position tells the acceleration [s]: an encoder's noise is
+smaller than that of most motions then."""
+AROUND: Final = 0.1
+"""Time over which it is averaged [s]: that of a fourth difference that reaches farthest."""
+MOVING: Final = 0.05
+"""Share of the usual speed from which a joint moves: at rest a reading may stand on one step."""
 
 LONGEST_LAG: Final = 60
 """Rows up to which correlation is followed: fifteen kernel lengths, longer than any block holds
@@ -84,6 +101,7 @@ def spaced_levels(
     level: float,
     spacings: Sequence[int],
     measured: npt.NDArray[np.bool_] | None = None,
+    calm: npt.NDArray[np.bool_] | None = None,
 ) -> list[float]:
     """`noise_level` of even samples from fourth differences over several spacings.
 
@@ -100,13 +118,16 @@ def spaced_levels(
         Increasing.
     measured : (n,) bool array, optional
         False where a lost sample is bridged: such a value is in no difference that counts.
+    calm : (n,) bool array, optional
+        Samples at which the joint is calm: a difference that counts reaches over no other.
 
     Returns
     -------
     list of float
         Zero from the spacing on over which too few are left.
     """
-    jumps = np.zeros(len(values))
+    jumps = np.zeros(len(values)) if calm is None else (~calm).astype(np.float64)
+    least = FEWEST_LEFT * (len(values) - float(jumps.sum()))
     _mark(jumps, values, segments, 1, JUMP * level)
     out = []
     for spacing in spacings:
@@ -119,7 +140,7 @@ def spaced_levels(
             if s.stop - s.start > 8 * spacing
         ]
         squares = np.concatenate([*left, np.empty(0)]) ** 2
-        if len(squares) < FEWEST_LEFT * len(values):
+        if not len(squares) or len(squares) < least:
             break
         count = int(KEPT * (len(squares) - 1)) + 1
         smallest = np.partition(squares, count - 1)[:count]
@@ -164,7 +185,13 @@ _LEVELS: Final[WeakKeyDictionary[Record, dict[tuple[str, float], ChannelNoise]]]
 )
 
 
-def noise_of(record: Record, signal: str, values: FloatArray, ratio: float) -> ChannelNoise:
+def noise_of(
+    record: Record,
+    signal: str,
+    values: FloatArray,
+    ratio: float,
+    position: FloatArray | None = None,
+) -> ChannelNoise:
     """Noise of a signal made from a record, estimated once per record, signal and gear ratio; its
     colour is read where the stamps are even.
 
@@ -177,6 +204,8 @@ def noise_of(record: Record, signal: str, values: FloatArray, ratio: float) -> C
         The signal, which must follow from record, name and gear ratio.
     ratio : float
         Gear ratio by which it is referred to the link.
+    position : (n,) array, optional
+        Of a torque: where the joint is. Its noise is read where the joint is calm, if it is.
     """
     known = _LEVELS.setdefault(record, {})
     if (signal, ratio) not in known:
@@ -194,7 +223,46 @@ def noise_of(record: Record, signal: str, values: FloatArray, ratio: float) -> C
             further = spaced_levels(values, stretches, level, spacings_of(dt)[1:], there)
             longest = max(stretches, key=lambda s: s.stop - s.start)
             known[signal, ratio] = coloured(values, longest, dt, [level, *further])
+        if even and position is not None and level > 0:
+            found = _where_calm(values, position, stretches, float(np.median(steps)), there)
+            known[signal, ratio] = found or known[signal, ratio]
     return known[signal, ratio]
+
+
+def _where_calm(
+    values: FloatArray,
+    position: FloatArray,
+    stretches: Sequence[slice],
+    dt: float,
+    there: npt.NDArray[np.bool_] | None,
+) -> ChannelNoise | None:
+    """Noise of a channel read where the joint moves evenly; None where that is too short."""
+    calm = calm_of(position, stretches, dt)
+    spacings = spacings_of(dt, calm=True)
+    levels = spaced_levels(values, stretches, np.inf, spacings, there, calm)
+    if sum(1 for x in levels if x > 0) < min(FEWEST_SPACINGS, len(spacings)):
+        return None
+    longest = max(stretches, key=lambda s: s.stop - s.start)
+    share = float(np.mean(calm if there is None else calm & there))
+    return coloured(values, longest, dt, levels, share, calm=True)
+
+
+def calm_of(position: FloatArray, stretches: Sequence[slice], dt: float) -> npt.NDArray[np.bool_]:
+    """Samples (n,) at which a joint moves with little acceleration."""
+    apart, width = max(1, round(BEND / dt)), max(1, round(AROUND / dt))
+    bend, speed = np.full(len(position), np.inf), np.zeros(len(position))
+    for s in stretches:
+        q = position[s]
+        if len(q) <= 2 * apart + width:
+            continue
+        inner = slice(s.start + apart, s.stop - apart)
+        bent = np.abs(q[2 * apart :] - 2 * q[apart:-apart] + q[: -2 * apart])
+        bend[inner] = np.convolve(bent, np.full(width, 1 / width), "same")
+        speed[inner] = np.abs(q[2 * apart :] - q[: -2 * apart])
+    moving = speed > MOVING * float(np.median(speed[speed > 0] if np.any(speed) else [0.0]))
+    if not moving.any():
+        return moving
+    return np.asarray(moving & (bend <= np.quantile(bend[moving], CALM)))
 
 
 def _fourth(x: FloatArray, time: FloatArray | None) -> FloatArray:

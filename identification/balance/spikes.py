@@ -24,6 +24,10 @@ or a peak of the motion they are as far apart themselves.
 """
 STEPS: Final = 4.0
 """Smallest steps of the channel that it must be off: a coarse converter toggles by one."""
+TIE: Final = 1 / 24
+"""Smallest steps of the channel by which it must be off farther: middles and slopes of values in
+whole steps are whole twelfths of one, and rounding would decide which of two equal ones is larger.
+"""
 MOST: Final = 0.02
 """Share of the samples above which they are no single faults; four times the worst of usual
 links."""
@@ -49,7 +53,7 @@ def without_spikes(values: FloatArray, segments: Sequence[slice], level: float) 
     if level <= 0:
         return values
     found = [np.empty(0, dtype=np.int64)]
-    limit: float | None = None
+    smallest: float | None = None
     for s in segments:
         x = values[s]
         if len(x) <= 2 * NEIGHBOURS:
@@ -59,10 +63,11 @@ def without_spikes(values: FloatArray, segments: Sequence[slice], level: float) 
         near = np.flatnonzero(np.abs(own - (x[2:-4] + x[4:-2]) / 2) > FAR / 2 * level)
         if not len(near):
             continue
-        if limit is None:
+        if smallest is None:
             changes = np.abs(np.diff(values))
-            limit = max(FAR * level, STEPS * float(np.min(changes[changes > 0], initial=np.inf)))
-        found.append(s.start + NEIGHBOURS + near[_alone(x, near + NEIGHBOURS, limit)])
+            smallest = float(np.min(changes[changes > 0], initial=np.inf))
+        alone = _alone(x, near + NEIGHBOURS, FAR * level, smallest)
+        found.append(s.start + NEIGHBOURS + near[alone])
     rows = np.concatenate(found)
     if not 0 < len(rows) <= MOST * len(values):
         return values
@@ -80,8 +85,11 @@ def without_spikes(values: FloatArray, segments: Sequence[slice], level: float) 
     return out
 
 
-def _alone(x: FloatArray, rows: npt.NDArray[np.int64], limit: float) -> npt.NDArray[np.bool_]:
-    """Which of these samples are off by more than a limit, and alone in that."""
+def _alone(
+    x: FloatArray, rows: npt.NDArray[np.int64], limit: float, smallest: float
+) -> npt.NDArray[np.bool_]:
+    """Which of these samples are off by more than a limit and some smallest steps, and alone in
+    that."""
     apart = np.arange(1, NEIGHBOURS + 1)
     after, before = x[rows[:, None] + apart], x[rows[:, None] - apart]
     off = np.abs(x[rows] - np.median((after + before) / 2, axis=1))
@@ -89,7 +97,8 @@ def _alone(x: FloatArray, rows: npt.NDArray[np.int64], limit: float) -> npt.NDAr
     level = np.sort(np.hstack([after - slope * apart, before + slope * apart]), axis=1)
     # another wild sample may be among the neighbours
     spread = np.minimum(level[:, -1] - level[:, 1], level[:, -2] - level[:, 0])
-    return np.asarray(off > np.maximum(limit, ALONE * spread))
+    least = np.maximum(max(limit, STEPS * smallest), ALONE * spread)
+    return np.asarray(off > least + TIE * smallest)
 
 
 __all__ = ["without_spikes"]

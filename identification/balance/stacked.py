@@ -426,7 +426,7 @@ def _either_direction(record: WeakRecord, place: str, noise: ChannelNoise) -> np
     grid, source = record.grid, f"{place}_position"
     velocity = record.points[f"{place}_velocity"]
     slow = np.abs(velocity) < 3 * grid.velocity_noise(source, noise)
-    turns = np.diff(np.sign(velocity), append=velocity[-1]) != 0
+    turns = np.diff(np.sign(velocity), append=np.sign(velocity[-1:])) != 0
     apart = grid.step * grid.dt
     reach = max(0, whole(TURN_SHARE * (grid.pointwise[source] - TURN_KERNEL) / apart))
     near = (

@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from identification.balance.noise import noise_level
 from identification.balance.weak import CLAIM_KERNEL, KERNEL_SAMPLES
+from identification.data.check.quanta import quantum
 
 if TYPE_CHECKING:
     from identification.data.record import Record
@@ -439,7 +440,8 @@ class _Kept:
                     self.slots.time[own],
                     table[own],
                     grid,
-                    there if self.slots.in_slots else np.full(len(grid), -1),
+                    there,
+                    moved=not self.slots.in_slots,
                 )
             )
             for c, parts in slow.items():
@@ -463,6 +465,11 @@ class _Kept:
             segment=np.concatenate(numbers),
             age=np.concatenate(ages) if ages else None,
             measured=np.concatenate(measured),
+            quanta={
+                c: step
+                for c in fast
+                if c.endswith("position") and (step := quantum(self.record[c])) is not None
+            },
             provenance=self.record.provenance.noted(*notes),
         )
 
@@ -495,9 +502,19 @@ class _Kept:
         ).astype(np.int64)
 
 
-def bridged(time: FloatArray, table: FloatArray, grid: FloatArray, there: IntArray) -> FloatArray:
+def bridged(
+    time: FloatArray,
+    table: FloatArray,
+    grid: FloatArray,
+    there: IntArray,
+    *,
+    moved: bool = False,
+) -> FloatArray:
     """Values on a grid: those of the samples that are there, cubics through their neighbours for
     the others.
+
+    A sample beside its grid point is taken along the cubic from where it is to that point: its
+    noise stays what it is, which the cubic itself would smooth.
 
     Parameters
     ----------
@@ -505,7 +522,9 @@ def bridged(time: FloatArray, table: FloatArray, grid: FloatArray, there: IntArr
     table : (n, channels) array
     grid : (m,) array
     there : (m,) int array
-        Row of the sample that stands for a grid point as it is; -1 for none.
+        Row of the sample that stands for a grid point; -1 for none.
+    moved
+        Whether such samples are beside their points, by less than a step.
 
     Returns
     -------
@@ -514,19 +533,34 @@ def bridged(time: FloatArray, table: FloatArray, grid: FloatArray, there: IntArr
     out = np.empty((len(grid), table.shape[1]))
     out[there >= 0] = table[there[there >= 0]]
     open_ = np.flatnonzero(there < 0)
-    if not open_.size:
-        return out
+    if moved:
+        beside = np.flatnonzero(there >= 0)
+        own = there[beside]
+        out[beside] += _cubic(time, table, grid[beside]) - _cubic(
+            time, table, time[own], grid[beside]
+        )
+    if open_.size:
+        out[open_] = _cubic(time, table, grid[open_])
+    return out
+
+
+def _cubic(
+    time: FloatArray, table: FloatArray, at: FloatArray, around: FloatArray | None = None
+) -> FloatArray:
+    """Values at times (m,) of the cubics through the samples around them (or `around` others),
+    (m, channels).
+    """
+    middle = at if around is None else around
     count = min(SAMPLES, len(time))
     degree = min(3, count - 1)
-    first = np.clip(np.searchsorted(time, grid[open_]) - count // 2, 0, len(time) - count)
+    first = np.clip(np.searchsorted(time, middle) - count // 2, 0, len(time) - count)
     near = first[:, None] + np.arange(count)
-    apart = time[near] - grid[open_][:, None]
+    apart = time[near] - at[:, None]
     basis = (apart / np.maximum(np.abs(apart).max(axis=1), 1e-300)[:, None])[
         :, :, None
     ] ** np.arange(degree + 1)
     gram = np.swapaxes(basis, 1, 2) @ basis
-    unit = np.zeros((len(open_), degree + 1, 1))
+    unit = np.zeros((len(at), degree + 1, 1))
     unit[:, 0] = 1.0
     weights = (basis @ np.linalg.solve(gram, unit))[:, :, 0]
-    out[open_] = np.einsum("gk,gkc->gc", weights, table[near])
-    return out
+    return np.asarray(np.einsum("gk,gkc->gc", weights, table[near]))

@@ -145,6 +145,8 @@ class Record:
         `run_age`).
     measured : (n,) ndarray of bool, optional
         False for a sample that was lost and bridged from its neighbours.
+    quanta : mapping of str to float
+        Step in which a channel was read whose values are no longer whole steps, in its unit.
 
     Raises
     ------
@@ -161,6 +163,7 @@ class Record:
     payload: str = ""
     age: FloatArray | None = None
     measured: npt.NDArray[np.bool_] | None = None
+    quanta: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         time = np.ascontiguousarray(self.time, dtype=np.float64)
@@ -205,6 +208,7 @@ class Record:
             self.payload,
             self.age,
             self.measured,
+            dict(self.quanta),
         )
 
     @classmethod

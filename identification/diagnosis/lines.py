@@ -29,6 +29,7 @@ from identification.balance.kinematic import residual_unit
 from identification.balance.sensing import Sensing, signals_of
 from identification.balance.stamps import EVEN
 from identification.balance.weak import POSITION_CHAINS, Grid, WeakRecord, kernel, whole
+from identification.data.check.quanta import quantum
 from identification.data.joint_file import Joint
 from identification.data.record import Record
 from identification.diagnosis.candidates import observable
@@ -51,7 +52,7 @@ from identification.diagnosis.order_tracking import (
 )
 from identification.fitting.engine import Solution
 
-__all__ = ["Line", "find_lines", "highest_order", "named_orders", "orders_of"]
+__all__ = ["Line", "find_lines", "held_out_drop", "highest_order", "named_orders", "orders_of"]
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -97,6 +98,13 @@ a second.
 """
 MOVING: Final = 0.05
 """Weight, as a share of the largest, above which a sample belongs to the motion."""
+
+
+STEP_ORDERS: Final = (1, 2, 3)
+"""Multiples of its steps at which an encoder is heard: those of a saw tooth fall with the
+multiple."""
+WINDING_PARTS: Final = 100
+"""Parts of a record, and of its stroke, over which the winding of the transmission is told."""
 
 
 @final
@@ -528,6 +536,9 @@ def find_lines(
         return []
     tracked, runs = _tracked(solution, data, train, held_out)
     named = named_orders(data.joint)
+    of_steps = [
+        band for r, w in zip(train, runs, strict=True) for band in _encoder_orders(r, w, data)
+    ]
     seen: list[tuple[_Tracked, Peak]] = []
     for one in tracked:
         lowest = LOWEST_ORDER * turns_per_unit(data.joint)
@@ -542,7 +553,8 @@ def find_lines(
         seen += [
             (one, p)
             for p in found
-            if (one.held is None or confirmed(p, one.held, len(found)))
+            if not _within(p.order, math.pi / one.train.stroke, of_steps)
+            and (one.held is None or confirmed(p, one.held, len(found)))
             and everywhere(p, [x for x in found if x is not p], one.train, named)
         ]
     # what a position reads wrong stands in every balance of its acceleration, larger: where a
@@ -563,6 +575,41 @@ def find_lines(
     return sorted(out, key=lambda line: -line.prominence)[:most]
 
 
+def _encoder_orders(record: Record, run: WeakRecord, data: Dataset) -> list[tuple[float, float]]:
+    """Orders at which the steps of an encoder stand in every balance of its position, lowest and
+    highest: they are those of its own angle, which is not the motor's where the transmission winds
+    up with the position, as under gravity.
+    """
+    ratio, factor = abs(data.joint.gear_ratio), _angle_factor(data.joint)
+    out = []
+    for channel, per_link in (("link_position", 1.0), ("motor_position", ratio)):
+        if not record.has(channel):
+            continue
+        step = record.quanta.get(channel) or quantum(np.asarray(record[channel]))
+        if step is None:
+            continue
+        order = 2 * math.pi * per_link / (step * factor)
+        winding = _winding(run) if channel == "link_position" else 0.0
+        out += [(k * order * (1 - winding), k * order * (1 + winding)) for k in STEP_ORDERS]
+    return out
+
+
+def _winding(run: WeakRecord) -> float:
+    """Largest share of a motion of the motor that winds the transmission up."""
+    if not {"motor_position", "link_position"} <= set(run.points):
+        return 0.0
+    motor, link = (run.smooth[f"{side}_position"] for side in ("motor", "link"))
+    part = max(1, len(motor) // WINDING_PARTS)
+    moved = motor[part:] - motor[:-part]
+    far = np.abs(moved) > np.ptp(motor) / WINDING_PARTS
+    twisted = moved - (link[part:] - link[:-part])
+    return float(np.quantile(np.abs(twisted[far] / moved[far]), 0.95)) if far.any() else 0.0
+
+
+def _within(order: float, near: float, bands: Sequence[tuple[float, float]]) -> bool:
+    return any(low - near <= order <= high + near for low, high in bands)
+
+
 def _line(peak: Peak, order: float, one: _Tracked, names: tuple[str, ...], joint: Joint) -> Line:
     linear = joint.kind == "linear"
     band = NORMAL_95 * peak.amplitude_error
@@ -573,7 +620,7 @@ def _line(peak: Peak, order: float, one: _Tracked, names: tuple[str, ...], joint
         balance=one.balance,
         prominence=peak.prominence,
         effects=names,
-        held_out_drop_percent=_held_out_drop(peak, one.held),
+        held_out_drop_percent=held_out_drop(peak, one.held),
         per="metre" if linear else "motor turn",
         unit=residual_unit(one.balance, "linear" if linear else "rotary"),
         order_error=peak.error,
@@ -582,7 +629,7 @@ def _line(peak: Peak, order: float, one: _Tracked, names: tuple[str, ...], joint
     )
 
 
-def _held_out_drop(peak: Peak, held: Samples | None) -> float:
+def held_out_drop(peak: Peak, held: Samples | None) -> float:
     """Fall of the RMS on held-out samples by the line with its phase from training, in percent."""
     if held is None:
         return 0.0

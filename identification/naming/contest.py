@@ -298,7 +298,7 @@ def turning(
             velocity = rows.points[f"{side}_velocity"]
             widths = [solution.values[n] for n in solution.model.named("smoothing", side)]
             slow = np.abs(velocity) < TURN_WIDTHS * max(widths, default=0.0)
-            turns = np.diff(np.sign(velocity), append=velocity[-1]) != 0
+            turns = np.diff(np.sign(velocity), append=np.sign(velocity[-1:])) != 0
             out |= rows.average((slow | turns).astype(np.float64)) > REST_SHARE
         parts.append(out)
     return np.concatenate(parts)

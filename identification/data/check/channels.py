@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from identification.data.check.finding import Finding, at
+from identification.data.check.quanta import quantum
 from identification.data.check.stamps import gap_limit
 
 if TYPE_CHECKING:
@@ -47,20 +48,6 @@ _LOCKED: Final = 5.0
 than one, and compliant transmissions are let pass.
 """
 # a channel's values count as multiples of one step ...
-_ROUNDING: Final = 1e-9
-"""Share of the largest step below which a step is rounding of the numbers and no quantum."""
-_NEAR_STEP: Final = 1.5
-"""Steps up to so many times the smallest one are one quantum (the next are two)."""
-_OFF_STEP: Final = (0.02, 1e-4)
-"""How far a step may be from a whole number of quanta: digits of the file, and the error of the
-quantum itself that grows with the number.
-"""
-_ALL_STEPS: Final = 0.99
-"""Share of the steps that must be whole: a glitch or a resampled row does not hide a quantum."""
-_FEW_SIZES: Final = 0.2
-"""Different step sizes as a share of the steps up to which numbers are levels of a quantiser, and
-not just printed with few digits.
-"""
 _MANY_LEVELS: Final = 1e6
 """Levels from which quantisation is not worth a word: twenty bits, below the noise of a drive."""
 
@@ -241,22 +228,6 @@ def check_saturation(record: Record) -> list[Finding]:
             )
             findings.append(Finding("warn", "saturation", message, channel, row))
     return findings
-
-
-def quantum(values: FloatArray) -> float | None:
-    """Quantisation step of a channel, or None where its values are not multiples of one step."""
-    steps = np.abs(np.diff(values[np.isfinite(values)][:200_000]))
-    steps = steps[steps > 0.0]
-    if steps.size < 3:
-        return None
-    scale = float(steps.max())
-    step = float(steps[steps > _ROUNDING * scale].min())
-    near = steps[steps < _NEAR_STEP * step]
-    step = float(near.mean())
-    ratio = steps / step
-    multiples = np.abs(ratio - np.rint(ratio)) < _OFF_STEP[0] + _OFF_STEP[1] * ratio
-    few = float(np.unique(np.rint(ratio)).size) < _FEW_SIZES * steps.size or steps.size < 100
-    return step if multiples.mean() > _ALL_STEPS and few else None
 
 
 def check_quantisation(record: Record) -> list[Finding]:

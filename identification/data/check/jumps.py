@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from identification.data.check.channels import quantum, span
+from identification.data.check.channels import span
 from identification.data.check.finding import Finding, at
+from identification.data.check.quanta import quantum
 
 if TYPE_CHECKING:
     from identification.data.record import FloatArray, Record

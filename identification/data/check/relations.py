@@ -9,8 +9,9 @@ import numpy as np
 
 from identification.balance.noise import noise_level
 from identification.balance.sensing import CLAMPED_TRAVEL
-from identification.data.check.channels import GUESSED_RATIO, quantum, span
+from identification.data.check.channels import GUESSED_RATIO, span
 from identification.data.check.finding import Finding, at
+from identification.data.check.quanta import quantum
 
 if TYPE_CHECKING:
     import numpy.typing as npt

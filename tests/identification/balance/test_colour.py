@@ -226,3 +226,14 @@ def test_two_shares_are_the_least_squares_that_are_not_negative() -> None:
         assert np.abs(shares - mine).max() < 1e-12
         borders += bool(mine.min() == 0.0)
     assert 10 < borders < 190, "both kinds were there"
+
+
+@pytest.mark.parametrize("unit", [5e-8, 1e-3, 0.1, np.pi / 180, 1 / 7, 3.0])
+def test_a_sample_exactly_at_the_limit_is_no_spike_in_any_unit(unit: float) -> None:
+    """Off by twice the range of its neighbours, in whole steps of a converter."""
+    counts = np.array([*range(20), *[0, 10] * 30], dtype=float)
+    for size, spikes in ((20.0, []), (20.5, [41])):
+        counts[41] = size
+        values = 0.1 + unit * counts
+        mended = without_spikes(values, (slice(0, len(values)),), 0.01 * unit)
+        assert np.flatnonzero(mended != values).tolist() == spikes

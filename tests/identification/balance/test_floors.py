@@ -4,15 +4,24 @@ noise takes off a parameter.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 import pytest
 
 from identification import Record, fit
+from identification.balance.balances import balances_of
 from identification.balance.colour import white
 from identification.balance.drawn_noise import LONGEST, draws_of, excerpt
 from identification.balance.excitation import attenuation, excitation_warnings
 from identification.balance.noise import noise_level
+from identification.balance.stacked import (
+    TURN_KERNEL,
+    TURN_SHARE,
+    _either_direction,
+    unsure,
+)
 from identification.balance.weak import prepare
 from identification.diagnosis.improvement import judged_drop, made_worse
 from identification.fitting.assess import BalanceError, Error, assess
@@ -185,3 +194,50 @@ def test_pieces_of_a_long_record_have_its_rows_and_its_floor() -> None:
     plain = prepare(time, {"torque": 0.01 * rng.standard_normal(count)}, segments, length=0.06)
     left = rms(drawn.noisy.averaged["torque"] - drawn.calm.averaged["torque"])
     assert left == pytest.approx(rms(plain.averaged["torque"]), rel=0.03)
+
+
+@pytest.mark.parametrize("dt", [1e-3, 4e-3])
+def test_the_direction_is_unknown_where_the_joint_is_slow_or_turns(dt: float) -> None:
+    time = np.arange(0.0, 8.0, dt)
+    position = np.where(time < 5.0, np.cos(np.pi * np.minimum(time, 5.0)), -1.0)
+    made = prepare(time, {"motor_position": position}, (slice(0, len(time)),))
+    points = time[:: made.grid.step]
+    unknown = _either_direction(made, "motor", white(1e-5))
+    slowest = 3 * made.grid.velocity_noise("motor_position", white(1e-5))
+    speed = np.where(points < 5.0, np.pi * np.abs(np.sin(np.pi * points)), 0.0)
+    assert np.all(unknown[points > 5.1]), "at rest"
+    turn = np.min(np.abs(points[:, None] - np.arange(1, 6)), axis=1)
+    assert np.all(unknown[(turn < dt / 2) & (points > 0.1) & (points < 4.9)]), "at a turn"
+    sure = (turn > 0.06) & (points > 0.06) & (points < 4.9) & (speed > 2 * slowest)
+    assert not unknown[sure].any()
+    assert np.mean(sure) > 0.4
+    # without noise only the turns are left, and only as far as a kernel blurs their instant
+    turning = _either_direction(made, "motor", white(1e-12))
+    reach = TURN_SHARE * max(made.grid.pointwise["motor_position"] - TURN_KERNEL, 0.0)
+    near = turning & (points > 0.1) & (points < 4.9)
+    assert set(np.round(points[near])) == {1.0, 2.0, 3.0, 4.0}
+    assert np.max(turn[near]) <= reach + 3 * made.grid.step * dt
+    # a motion that ends the other way round than it began does not turn at its end
+    time = np.arange(0.1, 1.6, dt)
+    away = prepare(time, {"motor_position": np.cos(np.pi * time)}, (slice(0, len(time)),))
+    assert not _either_direction(away, "motor", white(1e-12))[[0, 1, -2, -1]].any()
+
+
+def test_what_may_act_either_way_is_the_friction_of_the_motor() -> None:
+    """Beside it stands half of what a change twice as wide would move: squares add up."""
+    train = record("train", 3, False, *FAST)
+    joint = replace(JOINT, effects=(*JOINT.effects, "coulomb@motor"))
+    model = prepared_model(joint, train)
+    data = load_dataset([train], [], joint, model)
+    values = dict.fromkeys(model.parameter_names, 1.0)
+    values |= dict.fromkeys(model.named("smoothing"), 0.02) | {"motor_coulomb": 3.0}
+    balances = balances_of(model, data.sensing, wrt=())
+    wide = {**values, **dict.fromkeys(model.named("smoothing"), 0.04)}
+    (seen,) = data.train
+    here, there = (balances.evaluate(seen, v)["motor"][0] for v in (values, wide))
+    either = _either_direction(seen, "motor", data.sources["motor_position"])
+    acting = 3.0 * seen.average(either.astype(float))
+    assert 1.0 < np.max(acting) <= 3.0, "a turn is there"
+    rows = seen.taking("motor")
+    found = unsure(balances, data, values, [seen])["motor"]
+    assert found[rows] == pytest.approx(np.hypot((here - there) / 2, acting)[rows], rel=1e-9)

@@ -121,3 +121,88 @@ def test_the_last_digit_of_a_clock_makes_no_row_more_or_less(step: float) -> Non
         made = prepare(time, signals, (slice(0, count),), length=0.06)
         shapes.add((made.rows, made.grid.stride, made.grid.half))
     assert len(shapes) == 1
+
+
+@pytest.mark.parametrize("place", [0.1, 1.0, 1234.5678])
+def test_a_joint_at_rest_has_no_velocity_wherever_it_stands(place: float) -> None:
+    """Rounding of the position would turn it now one way and now the other."""
+    time = np.arange(4000) * 1e-3
+    position = place + 0.3 * np.maximum(time - 2.0, 0.0) ** 3
+    made = prepare(time, {"motor_position": position}, (slice(0, 4000),))
+    still = made.grid.dt * made.grid.step * np.arange(len(made.points["motor_velocity"])) < 1.9
+    assert np.all(made.points["motor_velocity"][still] == 0.0)
+    assert np.all(made.averaged["motor_acceleration"][made.time < 1.9] == 0.0)
+    assert made.points["motor_velocity"][~still].max() == pytest.approx(3.6, rel=0.03)
+
+
+def test_blocks_are_even_and_no_row_reaches_over_their_ends() -> None:
+    """Two stretches of 4 s and 2 s in blocks of about 1.5 s: three and one."""
+    time = np.concatenate([np.arange(2000) * 2e-3, 10 + np.arange(1000) * 2e-3])
+    parts = (slice(0, 2000), slice(2000, 3000))
+    made = prepare(time, {"motor_position": np.sin(time)}, parts, first_block=5)
+    first = made.time < 5
+    assert set(made.block[first]) == {-1, 5, 6, 7}
+    assert set(made.block[~first]) == {8}
+    begun, ended = made.time[first][0], made.time[first][-1]
+    width = (ended - begun) / 3
+    inside = made.block >= 0
+    reach = (made.grid.half - 1) * made.grid.dt
+    for k in range(3):
+        rows = made.time[first & (made.block == 5 + k)]
+        low, high = begun + k * width, begun + (k + 1) * width
+        # the ends of a stretch are ends of blocks already
+        assert rows.min() == pytest.approx(low + (reach if k else 0.0), abs=0.03)
+        assert rows.max() == pytest.approx(high - (reach if k < 2 else 0.0), abs=0.03)
+        assert k == 0 or rows.min() >= low + reach - 1e-9
+        assert k == 2 or rows.max() <= high - reach + 1e-9
+    lost = made.time[first & ~inside]
+    ends = begun + width * np.array([1.0, 2.0])
+    assert np.all(np.min(np.abs(lost[:, None] - ends), axis=1) < reach)
+
+
+def test_short_blocks_keep_three_quarters_of_their_rows() -> None:
+    time = np.arange(3000) * 1e-3
+    made = prepare(time, {"motor_position": np.sin(time)}, (slice(0, 3000),), block=0.2)
+    assert np.mean(made.block >= 0) == pytest.approx(0.75, abs=0.05)
+    assert made.block.max() + 1 == round((made.time[-1] - made.time[0]) / 0.2)
+
+
+@pytest.mark.parametrize("step", [1, 5, 7, 11])
+def test_an_average_of_every_so_many_samples_ends_where_that_of_all_does(step: int) -> None:
+    every, some = (differentiated_kernel(0.06, 1e-3, 0, step=k) for k in (1, step))
+    reach = len(every) // 2 + 1
+    outside = np.abs(np.arange(len(some)) - len(some) // 2) * step >= reach
+    assert some.sum() == pytest.approx(1.0)
+    assert np.all(np.abs(some[outside]) < 1e-12)
+    here = some[~outside]
+    there = every[np.abs(np.arange(len(every)) - len(every) // 2) % step == 0]
+    assert here / here.max() == pytest.approx((there / there.max())[: len(here)], abs=1e-12)
+
+
+def test_a_signal_that_is_given_no_kernel_has_that_of_thirty_milliseconds() -> None:
+    time = np.arange(2000) * 1e-3
+    signals = {"motor_position": np.sin(time), "link_position": np.sin(time)}
+    made = prepare(time, signals, (slice(0, 2000),), pointwise={"motor_position": 0.01})
+    assert made.grid.pointwise["motor_position"] == 0.01
+    assert made.grid.pointwise["link_position"] == 0.03
+
+
+def test_averages_and_curvatures_of_the_points_are_exact_for_polynomials() -> None:
+    time = np.arange(2000) * 1e-3
+    made = prepare(time, {"motor_position": np.sin(time)}, (slice(0, 2000),))
+    t = made.points["time"]
+    assert made.average(np.ones_like(t)) == pytest.approx(1.0)
+    assert made.average(t) == pytest.approx(made.time, abs=1e-9)
+    assert made.curve(3 * t**2 + t - 1) == pytest.approx(6.0, rel=1e-9)
+    both = made.curve(np.column_stack([t, t**2]))
+    assert both == pytest.approx(np.tile([0.0, 2.0], (made.rows, 1)), abs=1e-8)
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 4])
+def test_every_derivative_of_the_kernel_averages_that_of_a_fast_wave(order: int) -> None:
+    dt, omega = 1e-4, 2 * math.pi * 12
+    mean, found = (differentiated_kernel(0.06, dt, k) for k in (0, order))
+    t = dt * (np.arange(len(mean)) - len(mean) // 2)
+    truth = omega**order * np.sin(omega * t + 0.4 + order * math.pi / 2)
+    averaged = float(found @ np.sin(omega * t + 0.4))
+    assert averaged == pytest.approx(float(mean @ truth), rel=2e-3)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -13,7 +15,7 @@ from identification.diagnosis.claims import Ranking, rank
 from identification.diagnosis.trials import make_base
 from identification.fitting.engine import load_dataset, prepared_model, solve
 from identification.naming.contest import FEWEST, Contest, rivals_of
-from identification.naming.odds import contenders, contest_of, odds_of, unmodelled
+from identification.naming.odds import Odds, contenders, contest_of, odds_of, unmodelled
 from tests.smooth_laws import Law, record
 
 FloatArray = npt.NDArray[np.float64]
@@ -131,3 +133,14 @@ def test_improve_takes_the_name_that_fits_best_and_says_how_sure_it_is() -> None
 def test_chances_are_told_without_false_certainty() -> None:
     assert chances({"a": 0.9999, "b": 1e-5}) == "over 99 % a, under 1 % b"
     assert chances({"a": 0.967, "b": 0.033}) == "97 % a, 3 % b"
+
+
+def test_a_name_stands_for_its_set_unless_another_counts_as_better(drags: Contest) -> None:
+    first, second, nothing = drags.rivals
+    even = math.exp(-FEWEST)
+    for behind, holds in ((1.01 * even, True), (0.99 * even, False)):
+        odds = Odds((first, second), {first.name: 1.0, second.name: behind}, {})
+        assert odds.holds(first.name)
+        assert odds.holds(second.name) == holds
+        assert not odds.holds("gravity"), "no rival at all"
+    assert not Odds((), {}, {}).holds(first.name)

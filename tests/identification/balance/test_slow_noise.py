@@ -1,0 +1,144 @@
+"""Drift and hum of a torque's reading are noise, and what the joint does is none."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.signal import lfilter
+
+from identification import Record, fit
+from identification.balance.noise import calm_of, noise_of
+from identification.balance.stamps import evened
+from identification.fitting.fit import Fit
+from tests.identification.balance.test_clocks import motion
+from tests.identification.diagnosis.test_other_payload import DT, JOINT, PER_AMPERE, RATIO
+
+FloatArray = npt.NDArray[np.float64]
+
+LEVEL = {"drive": 0.035, "torque": 0.05}
+"""White noise of the readings [N.m]."""
+
+
+def walk(rng: np.random.Generator, count: int) -> FloatArray:
+    course = np.cumsum(rng.standard_normal(count))
+    return np.asarray((course - course.mean()) / course.std())
+
+
+@cache
+def seen(kind: str, seed: int = 3, missing: float = 0.0) -> Fit:
+    """The fit of a run read with drift, hum or neither; with a torque of the motor that the model
+    does not have, `missing` times the cube of its speed [N.m].
+    """
+    t, run = motion()
+    rng = np.random.default_rng(seed)
+    motor, link = 2 * np.pi / 9000, 2 * np.pi / 100_000
+    speed = run.states[:, 1] / np.std(run.states[:, 1])
+    slow = {"drive": np.zeros(len(t)), "torque": np.zeros(len(t))}
+    for signal, level in LEVEL.items():
+        if kind == "drift":
+            slow[signal] = level * walk(rng, len(t))
+        if kind == "hum" and signal == "drive":
+            slow[signal] = level * np.sin(2 * np.pi * 11.3 * t + 1.0)
+    drive = run.drive + missing * speed**3 + slow["drive"]
+    record = Record.from_channels(
+        t,
+        {
+            "motor_current": drive / PER_AMPERE
+            + LEVEL["drive"] / abs(PER_AMPERE) * rng.standard_normal(len(t)),
+            "motor_position": np.round(run.states[:, 0] * RATIO / motor) * motor,
+            "link_position": np.round(run.states[:, 2] / link) * link,
+            "link_torque": run.torque
+            + slow["torque"]
+            + LEVEL["torque"] * rng.standard_normal(len(t)),
+        },
+        name=f"{kind} {seed}",
+    )
+    return fit(JOINT, [record])
+
+
+def slow_part(found: Fit, signal: str) -> float:
+    """Deviation of the noise that forgets itself in more than a second, over the level."""
+    noise = found.data.sources[signal]
+    return float(np.sqrt(sum(p.size**2 for p in noise.parts if p.memory > 1.0))) / noise.level
+
+
+def test_a_drift_is_noise_of_its_size() -> None:
+    found = seen("drift")
+    for signal in LEVEL:
+        assert 0.4 < slow_part(found, signal) < 2.5, signal
+    for balance, error in found.train.balances.items():
+        assert 0.6 < error.ratio < 1.4, balance
+
+
+@pytest.mark.parametrize("missing", [0.0, 0.5])
+def test_nothing_drifts_where_nothing_does(missing: float) -> None:
+    """Neither noise nor a torque that the model lacks is taken for drift or hum."""
+    found = seen("none", missing=missing)
+    for signal in LEVEL:
+        assert slow_part(found, signal) == 0.0
+        assert not found.data.sources[signal].lines
+    assert (found.train.balances["motor"].ratio > 1.5) is (missing > 0)
+
+
+def test_a_slow_hum_is_a_line_of_the_reading_that_has_it() -> None:
+    noise = seen("hum").data.sources
+    assert not noise["torque"].lines
+    ((size, frequency),) = noise["drive"].lines
+    assert frequency == pytest.approx(11.3, abs=0.03)
+    assert size == pytest.approx(LEVEL["drive"], rel=0.2)
+
+
+@pytest.mark.parametrize("jitter", [0.02, 0.1, 0.3])
+def test_samples_beside_their_grid_keep_noise_and_motion(jitter: float) -> None:
+    """Samples at true, uneven stamps: the even record has the noise of the readings, not that of
+    a smoother, and the motion.
+    """
+    rng = np.random.default_rng(1)
+    t = DT * (np.arange(8000) + np.clip(jitter * rng.standard_normal(8000), -0.4, 0.4))
+    whole = evened(
+        Record.from_channels(
+            t,
+            {
+                "link_position": np.sin(2 * np.pi * 1.7 * t),
+                "link_torque": rng.standard_normal(8000),
+            },
+        )
+    )
+    inner = slice(10, -10)
+    np.testing.assert_allclose(
+        whole["link_position"][inner], np.sin(2 * np.pi * 1.7 * whole.time[inner]), atol=2e-6
+    )
+    noise = noise_of(whole, "torque", np.asarray(whole["link_torque"]), 1.0)
+    assert noise.level == pytest.approx(1.0, rel=0.1)
+    # what the rows of the balances see: an average over 60 ms
+    weights = np.full(30, 1 / 30)
+    assert noise.after(weights, whole.dt) == pytest.approx(30**-0.5, rel=0.15)
+
+
+@pytest.mark.parametrize("rate", [100.0, 250.0])
+def test_noise_is_read_where_a_joint_is_calm(rate: float) -> None:
+    """Steps of a torque ten thousand times its noise, between stretches of even motion."""
+    rng = np.random.default_rng(2)
+    t = np.arange(round(40 * rate)) / rate
+    pole = 0.9 ** (500 / rate)
+    noise = lfilter([np.sqrt(1 - pole**2)], [1, -pole], rng.standard_normal(len(t) + 1000))[1000:]
+    jumps = np.where((t % 2.0) < 1.0, 1.0, -1.0)
+    speed = lfilter([0.2], [1, -0.8], jumps)
+    position = np.cumsum(speed) / rate
+    shaken = np.gradient(speed) * rate
+    torque = 50.0 * shaken / np.abs(shaken).max() * (1 + np.sin(40 * t)) + 0.005 * noise
+    record = Record.from_channels(t, {"link_position": position, "link_torque": torque})
+    found = noise_of(record, "torque", torque, 1.0, position)
+    # of noise with this pole an average over 60 ms leaves
+    length = round(0.06 * rate)
+    kept = np.sqrt(
+        sum(pole ** abs(i - j) for i in range(length) for j in range(length)) / length**2
+    )
+    assert found.after(np.full(length, 1 / length), 1 / rate) == pytest.approx(
+        0.005 * kept, rel=0.35
+    )
+    calm = calm_of(position, (slice(0, len(t)),), 1 / rate)
+    assert np.abs(shaken[calm]).max() < 0.05 * np.abs(shaken).max()

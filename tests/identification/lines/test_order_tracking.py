@@ -1,0 +1,255 @@
+"""The parts of order tracking against numbers that are known without it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from identification.diagnosis.lines import _noise, _Tracked, held_out_drop
+from identification.diagnosis.order_tracking import (
+    FEWEST_CYCLES,
+    MEDIAN_EFFICIENCY,
+    NAMED_WITHIN,
+    NEAREST,
+    OUTLIER,
+    SURROUNDINGS,
+    Peak,
+    Samples,
+    background,
+    clipped,
+    detrended,
+    everywhere,
+    independent_orders,
+    peaks,
+    phase_fit,
+    refined,
+    spectrum,
+    threshold,
+    trend,
+    velocity_knots,
+)
+
+COUNT = 6000
+
+
+def along(angle: np.ndarray, residual: np.ndarray, weight: np.ndarray | None = None) -> Samples:
+    """Samples in blocks of a hundred."""
+    ones = np.ones(len(angle)) if weight is None else weight
+    return Samples(angle, residual, ones, np.arange(len(angle)) // 100)
+
+
+def line(order: float = 3.0, sine: float = 0.6, cosine: float = -0.8, **changed: float) -> Peak:
+    given = {"error": 0.01, "prominence": 400.0, "apart": 0.1, "amplitude_error": 0.05}
+    return Peak(order, sine=sine, cosine=cosine, **{**given, **changed})
+
+
+def test_a_line_is_its_sine_and_cosine_of_the_angle() -> None:
+    angle = np.linspace(-4.0, 7.0, 50)
+    assert line().amplitude == pytest.approx(1.0)
+    assert line().certainty == pytest.approx(0.5 * 20.0**2)
+    wave = line().wave(along(angle, 0 * angle))
+    assert wave == pytest.approx(0.6 * np.sin(3 * angle) - 0.8 * np.cos(3 * angle), abs=1e-12)
+
+
+def test_a_line_lies_at_an_order_within_its_error_and_nearer_than_the_next() -> None:
+    near = NAMED_WITHIN * 0.01
+    assert line().at(3.0 + 0.99 * near)
+    assert not line().at(3.0 + 1.01 * near)
+    assert not line().at(3.0 - 1.01 * near)
+    assert not line(error=1.0).at(3.06), "as near to the next one"
+    assert line(error=1.0).at(3.04)
+
+
+def test_stroke_of_an_even_spread_is_its_span_and_rest_has_no_weight_in_it() -> None:
+    angle = np.linspace(5.0, 25.0, COUNT)
+    assert along(angle, 0 * angle).stroke == pytest.approx(20.0, rel=1e-3)
+    rest = np.concatenate([angle, np.full(COUNT, 24.0)])
+    weight = np.concatenate([np.ones(COUNT), np.zeros(COUNT)])
+    assert along(rest, 0 * rest, weight).stroke == pytest.approx(20.0, rel=1e-3)
+    assert along(angle, 0 * angle, 0 * angle).stroke == 0.0
+    assert independent_orders(2.0, 7.0, 20.0) == pytest.approx(5.0 * 20.0 / (2 * math.pi))
+
+
+def test_trend_takes_out_what_it_is_made_of() -> None:
+    rng = np.random.default_rng(1)
+    time = np.linspace(0.0, 40.0, COUNT)
+    angle, velocity = 9 + 5 * np.sin(time), 5 * np.cos(time)
+    acceleration = -5 * np.sin(time) + rng.standard_normal(COUNT)
+    knots = velocity_knots(velocity)
+    small = 0.01 * np.abs(velocity).max()
+    assert np.sum(np.abs(knots) <= small * (1 + 1e-9)) == 2, "a step of its own at zero"
+    assert knots[0] == pytest.approx(velocity.min())
+    assert knots[-1] == pytest.approx(velocity.max())
+    columns = trend(angle, velocity, acceleration, knots, (4.0, 14.0))
+    assert columns.shape == (COUNT, len(knots) + 4)
+    assert np.sum(columns[:, : len(knots)], axis=1) == pytest.approx(1.0), "the hats share one"
+    x = (angle - 9.0) / 5.0
+    assert columns[:, -4:-1] == pytest.approx(np.column_stack([x, x**2, x**3]), abs=1e-12)
+    assert np.abs(columns[:, -1]).max() == pytest.approx(1.0)
+    slow = 3 * np.interp(velocity, knots, np.sin(knots)) + 2 * x - x**3 + 0.1 * acceleration
+    weight = np.where(rng.random(COUNT) < 0.3, 0.0, 1.0)
+    spoilt = np.where(weight > 0, slow, 1e3)
+    assert columns @ detrended(columns, along(angle, spoilt, weight)) == pytest.approx(slow)
+
+
+def test_outliers_are_cut_at_robust_deviations_of_what_counts() -> None:
+    rng = np.random.default_rng(2)
+    residual = 0.3 * rng.standard_normal(COUNT)
+    residual[::50] = 40.0
+    weight = np.ones(COUNT)
+    weight[1::2] = 0.0
+    residual[1::2] *= 100
+    cut = clipped(along(np.arange(COUNT) * 0.01, residual, weight))
+    assert np.abs(cut.residual).max() == pytest.approx(OUTLIER * 0.3, rel=0.1)
+    inside = np.abs(residual) < 1.0
+    assert np.array_equal(cut.residual[inside], residual[inside])
+    assert np.array_equal(clipped(along(residual, residual, 0 * weight)).residual, 0 * residual)
+
+
+def test_scan_is_the_power_of_the_samples_over_even_orders() -> None:
+    angle = np.linspace(-3.0, 37.0, COUNT)
+    samples = along(angle, 0.7 * np.sin(6.0 * angle + 0.4), np.full(COUNT, 0.5))
+    orders, power = spectrum(samples, 10.0)
+    assert orders[0] == 0.0
+    assert orders[-1] <= 10.0 < orders[-1] + 2 * orders[1]
+    assert np.diff(orders) == pytest.approx(orders[1])
+    k = int(np.argmax(power))
+    at = refined(orders, power, k)
+    assert at == pytest.approx(6.0, abs=0.02 * 2 * math.pi / 40.0)
+    assert power[k] == pytest.approx((0.5 * COUNT * 0.7 / 2) ** 2, rel=0.06)
+    # between the points it is what the sum of exp(i h angle) gives
+    base = samples.residual * samples.weight
+    direct = [abs(np.sum(base * np.exp(-1j * h * angle))) ** 2 for h in orders[k - 3 : k + 4]]
+    assert power[k - 3 : k + 4] == pytest.approx(direct, rel=0.05)
+
+
+def test_a_peak_between_points_is_that_of_their_parabola() -> None:
+    orders = np.arange(10) * 0.2
+    power = 10 - 3 * (orders - 0.87) ** 2
+    assert refined(orders, power, 4) == pytest.approx(0.87, abs=1e-12)
+    assert refined(orders, power, 0) == 0.0
+    assert refined(orders, power, 9) == pytest.approx(1.8)
+    assert refined(orders, np.ones(10), 4) == pytest.approx(0.8)
+
+
+def test_phase_is_that_of_the_samples_that_count_beside_any_level() -> None:
+    angle = np.linspace(0.0, 30.0, COUNT)
+    weight = np.where(np.arange(COUNT) % 3 == 0, 0.0, 1.0)
+    residual = 5.0 + 0.3 * np.sin(2.2 * angle) - 0.4 * np.cos(2.2 * angle) + 100 * (weight == 0)
+    assert phase_fit(2.2, along(angle, residual, weight)) == pytest.approx((0.3, -0.4), abs=1e-9)
+
+
+@pytest.mark.parametrize("fall", [0.0, 1.0])
+def test_background_is_the_mean_power_of_noise(fall: float) -> None:
+    """Of exponential powers whose mean falls with the order, peaks left out."""
+    rng = np.random.default_rng(5)
+    stroke = 2 * math.pi * 10
+    orders = np.arange(4000) * 0.1 / 4  # four points to an independent order
+    mean = 7.0 / (1 + orders) ** fall
+    power = np.repeat(rng.exponential(size=1000), 4) * mean
+    lowest = FEWEST_CYCLES * 0.1
+    level = background(orders, power, stroke, lowest)
+    first = int(np.searchsorted(orders, lowest))
+    assert np.all(level[:first] == level[first])
+    ratio = level[first + 20 :] / mean[first + 20 :]
+    assert np.median(ratio) == pytest.approx(1.1, rel=0.15), "the larger one of two sides"
+    assert ratio[200:].min() > 0.6
+    assert ratio[:-400].max() < 3.0
+    # one line changes nothing but the rank of a median
+    loud = power.copy()
+    loud[2000:2004] *= 1e6
+    assert background(orders, loud, stroke, lowest) == pytest.approx(level, rel=0.35)
+
+
+def test_background_of_few_orders_is_one_level() -> None:
+    orders = np.arange(100) * 0.025
+    power = np.random.default_rng(6).exponential(3.0, size=100)
+    level = background(orders, power, 2 * math.pi * 10, 0.2)
+    assert np.ptp(level) == 0.0
+    assert level[0] == pytest.approx(float(np.median(power[8:])) / math.log(2))
+
+
+def test_noise_passes_the_threshold_with_its_chance() -> None:
+    """An exponential power over the mean of so many others."""
+    rng = np.random.default_rng(7)
+    others = 2 * (SURROUNDINGS - NEAREST) * MEDIAN_EFFICIENCY
+    level = rng.gamma(others, 1 / others, size=400_000)
+    over = np.mean(rng.exponential(size=400_000) / level > threshold(0.01, 1.0))
+    assert over == pytest.approx(0.01, rel=0.1)
+    assert threshold(0.01, 10.0) == pytest.approx(threshold(0.001, 1.0))
+    assert threshold(0.01, 0.0) == threshold(0.01, 1.0)
+
+
+def test_where_nothing_moves_there_is_no_line() -> None:
+    still = np.full(COUNT, 3.0)
+    assert peaks(along(still, np.random.default_rng(0).standard_normal(COUNT)), 6.0) == []
+    short = np.linspace(0.0, 1.0, COUNT)
+    assert peaks(along(short, np.sin(4 * short)), 6.0) == [], "no order has its cycles"
+
+
+def test_two_lines_are_both_found_the_strongest_first() -> None:
+    rng = np.random.default_rng(8)
+    angle = 40 * np.sin(0.01 * np.arange(COUNT)) + 7 * np.sin(0.037 * np.arange(COUNT))
+    weight = np.abs(np.gradient(angle))
+    residual = 0.5 * np.sin(2.0 * angle) + 0.9 * np.cos(3.5 * angle) + rng.standard_normal(COUNT)
+    found = peaks(along(angle, residual, weight), 6.0)
+    assert [round(p.order, 2) for p in found[:2]] == [3.5, 2.0]
+    assert [round(p.amplitude, 1) for p in found[:2]] == [0.9, 0.5]
+    assert [p.prominence for p in found] == sorted((p.prominence for p in found), reverse=True)
+    assert len(peaks(along(angle, residual, weight), 6.0, most=1)) == 1
+    assert all(p.order > 2.5 for p in peaks(along(angle, residual, weight), 6.0, lowest=2.5))
+
+
+@pytest.mark.parametrize("where", ["everywhere", "one end", "one direction", "turned"])
+def test_a_line_is_everywhere_or_none(where: str) -> None:
+    rng = np.random.default_rng(9)
+    angle = 30 * np.sin(0.01 * np.arange(COUNT) + 0.2)
+    forward = np.gradient(angle) > 0
+    wave = np.sin(2.0 * angle)
+    shown = {
+        "everywhere": wave,
+        "one end": np.where(angle > 10, 3 * wave, 0.0),
+        "one direction": np.where(forward, 2 * wave, 0.0),
+        "turned": np.where(angle > 0, wave, -wave),
+    }[where]
+    samples = along(angle, shown + 0.2 * rng.standard_normal(COUNT), np.abs(np.gradient(angle)))
+    peak = line(2.0, 1.0, 0.0, prominence=2000.0, apart=2 * math.pi / samples.stroke)
+    assert everywhere(peak, [], samples) == (where == "everywhere")
+
+
+def test_what_a_line_takes_off_held_out_samples() -> None:
+    angle = np.linspace(0.0, 50.0, COUNT)
+    weight = np.where(np.arange(COUNT) % 2 == 0, 2.0, 1.0)
+    wave = line().wave(along(angle, 0 * angle))
+    assert held_out_drop(line(), along(angle, 2 * wave, weight)) == pytest.approx(50.0)
+    assert held_out_drop(line(), along(angle, wave, weight)) == pytest.approx(100.0)
+    assert held_out_drop(line(), along(angle, -wave, weight)) == pytest.approx(-100.0)
+    assert held_out_drop(line(), None) == 0.0
+
+
+def test_the_error_of_a_line_is_the_scatter_of_its_phase_in_noise() -> None:
+    angle = 40 * np.sin(0.01 * np.arange(COUNT)) + 7 * np.sin(0.037 * np.arange(COUNT))
+    weight = np.abs(np.gradient(angle))
+    sines, errors = [], []
+    for seed in range(150):
+        noise = np.random.default_rng(seed).standard_normal(COUNT)
+        samples = along(angle, noise, weight)
+        sines.append(phase_fit(2.3, samples)[0])
+        if seed < 6:
+            tracked = _Tracked("motor", 1, samples, None, 1e-2, direct=True)
+            errors.append(_noise(line(2.3), tracked))
+    assert np.mean(errors) == pytest.approx(np.sqrt(np.mean(np.square(sines))), rel=0.2)
+
+
+def test_the_error_of_an_order_is_the_scatter_of_the_orders() -> None:
+    angle = 40 * np.sin(0.01 * np.arange(COUNT)) + 7 * np.sin(0.037 * np.arange(COUNT))
+    weight = np.abs(np.gradient(angle))
+    off = []
+    for seed in range(30):
+        noise = np.random.default_rng(seed).standard_normal(COUNT)
+        found = peaks(along(angle, 0.4 * np.sin(2.3 * angle) + noise, weight), 6.0, most=1)[0]
+        off.append((found.order - 2.3) / found.error)
+    # the larger one of two estimates of the error, so rather too large
+    assert 0.5 < np.sqrt(np.mean(np.square(off))) < 1.4
