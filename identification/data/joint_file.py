@@ -390,9 +390,7 @@ def toml_text(
             values = {"value": known.value, "low": known.low, "high": known.high}
             lines.append(f"{name} = {KNOWN.inline(values)}")
     if joint.columns:
-        lines += ["", "[columns]"]
-        for channel, entry in joint.columns.items():
-            lines.append(f"{toml_key(channel)} = {toml_value(entry)}")
+        lines += ["", *column_lines(joint.columns)]
     if parameters:
         lines += ["", "[fitted]", *_entries(FITTED, parameters)]
     if calibration:
@@ -405,6 +403,11 @@ def toml_text(
         text, f"{joint.source or joint.name}, as it would be written"
     )  # it may replace the file it came from
     return text
+
+
+def column_lines(columns: Mapping[str, Any]) -> list[str]:
+    """A column map as the table [columns] of a joint file."""
+    return ["[columns]", *(f"{toml_key(c)} = {toml_value(e)}" for c, e in columns.items())]
 
 
 def _entries(schema: Schema, entries: Mapping[str, Mapping[str, Any]]) -> list[str]:

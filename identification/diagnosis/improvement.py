@@ -15,7 +15,7 @@ from identification.balance.dataset import HOLD_DELAY, Dataset, visible_labels
 from identification.data.joint_file import Joint
 from identification.diagnosis.candidates import NotTestable
 from identification.diagnosis.claims import Claim, Ranking
-from identification.diagnosis.learned import LearnedClaim, with_curves
+from identification.diagnosis.learned import LearnedClaim, carried, with_curves
 from identification.diagnosis.lines import Line
 from identification.diagnosis.locate import Unexplained
 from identification.diagnosis.outcome import Refusal, outcome_of, why_not
@@ -149,10 +149,15 @@ class Improvement:
         return self.steps[-1].solution.model
 
     def to_joint_file(self) -> str:
-        """The joint with all that was added, learned curves included, as the text of a joint
-        file.
+        """The joint with all that was added, learned curves that lower the error of held-out
+        records included, as the text of a joint file.
         """
-        return joint_text(self.joint, with_curves(self.steps[-1].solution, self.learned), self.data)
+        return joint_text(self.joint, with_curves(self.steps[-1].solution, self.carried), self.data)
+
+    @property
+    def carried(self) -> tuple[LearnedClaim, ...]:
+        """The learned curves that the joint file has."""
+        return carried(self.steps[-1].solution, self.learned, self.data)
 
     def __str__(self) -> str:
         lines = [self.reason]

@@ -29,7 +29,7 @@ from identification.diagnosis.curve import (
 )
 from identification.diagnosis.places import AXIS_TITLES, Branch, Place
 from identification.diagnosis.trials import Base, make_base
-from identification.fitting.assess import Error
+from identification.fitting.assess import Error, relative_error_percent
 from identification.fitting.covariance import window_errors, windows_over
 from identification.fitting.engine import Solution
 
@@ -51,8 +51,9 @@ FEWER: Final = 0.4
 more, a sum of laws imitates the curve."""
 HALF: Final = 0.5
 """Share missed from which a curve over any variable, and not the name, is what is missing."""
-OUTSIDE: Final = 2.0
-"""Standard errors by which a parameter must want to pass its bound."""
+OUTSIDE: Final = 3.0
+"""Standard errors by which a parameter must want to pass its bound: of ten that may stand at one,
+one in 75 joints would by chance."""
 
 
 # --- a curve as a claim ---------------------------------------------------------------------------
@@ -174,6 +175,26 @@ def with_curves(solution: Solution, learned: Sequence[LearnedClaim]) -> Solution
         correlation={},
         unidentified=(),
     )
+
+
+def carried(
+    solution: Solution, learned: Sequence[LearnedClaim], data: Dataset
+) -> tuple[LearnedClaim, ...]:
+    """The learned curves that a model takes along: the last ones stay out until the error of the
+    held-out records (of the training records where there are none) is no higher than without any.
+
+    Each curve is drawn on the steady rows of one variable; a few together may swing far between
+    the rows that they were drawn on, where only their sum is known.
+    """
+    records = data.held_out or data.train
+
+    def error(count: int) -> float:
+        found = with_curves(solution, learned[:count])
+        return relative_error_percent(found.model, data, records, found.values)
+
+    most = error(0) if learned else 0.0
+    count = next(n for n in range(len(learned), -1, -1) if n == 0 or error(n) <= most)
+    return tuple(learned[:count])
 
 
 def _inside(model: JointModel, values: Mapping[str, float]) -> dict[str, float]:

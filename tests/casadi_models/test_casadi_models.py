@@ -517,3 +517,32 @@ def test_time_derivative_follows_the_chain_rule() -> None:
     }
     expected = math.cos(0.3) * 2 * 5 + math.sin(0.3) * 7
     assert float(f(list(values.values()))) == pytest.approx(expected, rel=1e-14)
+
+
+def test_elements_of_a_hysteresis_fill_at_the_rate_of_the_torsion() -> None:
+    """Over one, three and nine widths, in rates, in a step and in the linear model."""
+    model = model_2b().add("hysteresis")
+    width = 0.01
+    model = model.with_values(
+        {**{f"hysteresis_torque_{k}": 2.0 for k in (1, 2, 3)}, "hysteresis_width": width}
+    )
+    f, p = model.functions, model.value_vector()
+    state, stops = np.array([2e-3, 0.5, 0.0, 0.2]), np.array([0.1, -0.2, 0.3])
+    at = np.concatenate([state, stops])
+    rates = np.array(f.dynamics(at, np.zeros(3), p)).ravel()
+    known = 0.3 / (width * np.array([1.0, 3.0, 9.0]))
+    assert rates[4:] == pytest.approx(known, rel=1e-6)
+    h = 1e-6
+    after = state + h * rates[:4]
+    moved = np.array(f.memory_step(after, state, stops, np.zeros(3), p, h)).ravel()
+    assert (moved - stops) / h == pytest.approx(known, rel=1e-4)
+    # a turn empties them from where they stand, and a full one stays full
+    back = np.array(f.memory_step(state, after, stops, np.zeros(3), p, h)).ravel()
+    assert (back - stops) / h == pytest.approx(-known, rel=1e-4)
+    full = np.array(f.memory_step(state + [0.5, 0, 0, 0], state, stops, np.zeros(3), p, h))
+    assert full.ravel() == pytest.approx(1.0, rel=1e-3)
+    system = f.linearize()
+    assert system.A.shape == (7, 7)
+    assert system.A[4, 1] == pytest.approx(1 / width, rel=1e-6)
+    assert system.A[4, 3] == pytest.approx(-1 / width, rel=1e-6)
+    assert np.array_equal(system.C, np.eye(4, 7))

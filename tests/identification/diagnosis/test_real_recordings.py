@@ -10,7 +10,11 @@ import numpy as np
 import pytest
 
 from identification import Improvement, Record, improve, read
+from identification.balance.dataset import visible_labels
 from identification.data.joint_file import Joint, parse_joint
+from identification.data.plain_text import from_toml
+from identification.diagnosis.learned import with_curves
+from identification.fitting.assess import relative_error_percent
 
 SHARED = Path(__file__).resolve().parents[3].parent / "shared" / "measurements"
 VELOCITY_LAWS = {
@@ -57,6 +61,18 @@ def test_emps_error_on_the_pulses_record_falls_under_six_percent() -> None:
     errors = [s.held_out.relative_error_percent for s in emps().steps]
     assert 17.0 < errors[0] < 19.5
     assert errors[-1] <= 6.0
+
+
+def test_the_joint_file_of_emps_is_no_worse_on_held_out_records_than_the_loop_says() -> None:
+    """What is written is what was judged: learned curves that only fit the training rows stay
+    out.
+    """
+    found = emps()
+    written = parse_joint(from_toml(found.to_joint_file(), "emps"), "emps")
+    solution = with_curves(found.steps[-1].solution, found.carried)
+    assert sorted(written.effects) == sorted(visible_labels(solution.model))
+    error = relative_error_percent(solution.model, found.data, found.data.held_out, solution.values)
+    assert error <= 1.001 * found.steps[-1].held_out.relative_error_percent
 
 
 def test_emps_parameters_agree_with_the_published_ones() -> None:

@@ -128,6 +128,7 @@ def test_progress_goes_from_its_start_to_its_end() -> None:
     train, held = runs(wave)
     improve(train, JOINT, [held], progress=lambda text, share: told.append((text, share)))
     shares = [share for _, share in told]
+    assert shares == sorted(shares), "it never goes back"
     assert min(shares) == shares[0] == 0.05
     assert max(shares) <= 1.0
     texts = [text for text, _ in told]
@@ -135,6 +136,8 @@ def test_progress_goes_from_its_start_to_its_end() -> None:
         assert word in texts
     assert texts[-1] == "looking at what is left"
     tries = [share for text, share in told if text.startswith("trying ")]
+    again = shares[texts.index("adding gravity") + 1 : -2]
+    assert again == pytest.approx([0.2 + 0.6 / MAX_ADDITIONS] * len(again)), "one addition of all"
     assert min(tries) == 0.15
     assert shares[-1] == 0.85
 

@@ -32,6 +32,8 @@ from identification.diagnosis.trials import (
     try_candidate,
 )
 from identification.fitting.engine import load_dataset, prepared_model, solve
+from identification.fitting.weak_form import WeakForm
+from identification.naming.contest import rivals_of
 from tests.recorded_world.world import TROUBLES, make_case, write_case
 from tests.smooth_laws import COULOMB, Law, record
 
@@ -418,3 +420,37 @@ def test_a_gain_that_only_takes_noise_away_is_none() -> None:
     assert abs(found.values["torque_sensor_gain"]) > 0.1  # a slope over a column of noise
     assert found.cv_drop_percent > 15  # as long as nobody asks what noise alone would leave
     assert found.beyond_noise(found.cv_drop_percent) < MAJOR_DROP / 2
+
+
+@pytest.mark.parametrize("balance", ["motor", "transmission"])
+def test_of_several_places_a_name_stands_for_the_best_where_it_is_claimed(
+    balance: str, elastic: Base
+) -> None:
+    key = "asymmetric_coulomb"
+    tries = [
+        t
+        for place in ("motor", "link")
+        if isinstance(t := try_candidate(candidate(elastic, key, place), elastic), Trial)
+    ]
+    there = [t for t in tries if t.balance == balance]
+    best = max(there, key=lambda t: t.score)
+    (rival,) = rivals_of([key], balance, elastic.solution, elastic.data)
+    assert (rival.name, rival.label) == (key, best.candidate.label)
+
+
+def test_a_shape_of_a_law_with_memory_has_the_slope_of_its_rows(elastic: Base) -> None:
+    """By a one-sided step of a hundredth: the law has kinks, which smaller ones would resolve."""
+    model = elastic.solution.model.add("hysteresis")
+    values = {**elastic.solution.values}
+    values |= {"hysteresis_width": 1e-4} | {f"hysteresis_torque_{k}": 2.0 for k in (1, 2, 3)}
+    free = ("hysteresis_width", "hysteresis_torque_1")
+    balances = balances_of(model, elastic.data.sensing, wrt=free)
+    ones = dict.fromkeys(balances.balances, 1.0)
+    problem = WeakForm(balances, elastic.data, values, free, ones)
+    x = np.array([values[n] for n in free])
+    slope = problem.jacobian(x)
+    for k, size in enumerate((0.01 * x[0], 1e-3)):
+        step = np.eye(2)[k] * size
+        numeric = (problem.residual(x + step) - problem.residual(x)) / size
+        assert np.linalg.norm(numeric) > 0
+        assert slope[:, k] == pytest.approx(numeric, rel=1e-6, abs=1e-6 * np.abs(numeric).max())
