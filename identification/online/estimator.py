@@ -442,6 +442,7 @@ class OnlineEstimator:
                 y,
                 h,
                 self.theta,
+                self.guard.before,
                 shares,
                 on,
                 self.floor,

@@ -1,10 +1,14 @@
 """Holds the estimate through sensor failures that nothing else has told: a recursion on probation.
 
-Where the residuals leave their level at once, the recursion goes on, but the estimate shown is the
-one from before. It is taken up again as it was when the residuals come back (the failure was
-temporary). The new one is accepted when it explains the readings, the change shows in one balance,
-and no failed sensor explains it as well: neither a gain and an offset of the torque of that balance
-nor those of its motion. These are fitted to the residuals since, beside the new parameters.
+Residuals are those of an estimate from a second before or more, which no failure since has moved. A
+newer one takes its place when it has explained the readings of a second as well: an estimate of a
+moment in which the recursion swings is none to go back to.
+Where they leave their level at once, the recursion goes on, but the estimate shown is that one; on
+the way there, for a second at most, it is the last one. It is taken up again as it was when the
+residuals come back (the failure was temporary). The new one is accepted when it explains the
+readings, the change shows in one balance, and no failed sensor explains it as well: neither a gain
+and an offset of the torque of that balance nor those of its motion. These are fitted to the
+residuals since, beside the new parameters.
 """
 
 from __future__ import annotations
@@ -33,7 +37,7 @@ back, or explained [s].
 _EXPLAINED: Final = 0.5
 """Share of the limit under which a new estimate explains the readings: a half, so that residuals
 that hover at the limit do not pass for explained. A failed sensor explains them by the same
-measure."""
+measure, and the estimate shown waits from there."""
 _SINGULAR: Final = 1e-9
 """Share of a signal's mean square that varies at least, for its gain to be told from its offset; a
 thousand times the rounding of the sums."""
@@ -43,8 +47,10 @@ _PLAIN: Final = (
     "_back",
     "_explained",
     "_next",
+    "_doubt",
     "held_for",
     "_fast",
+    "_trial",
     "_new",
     "_over",
     "_on",
@@ -97,6 +103,9 @@ class Guard:
     ----------
     theta : (parameters,) array
         The estimate to show.
+    before : (2, parameters) array
+        The estimate that residuals are judged with, a second old or more, so that a recursion that
+        follows a failed sensor within less does not hide it; and the one that is to follow it.
     on_probation : bool
     held_for : int
         Rows since the probation began.
@@ -114,18 +123,20 @@ class Guard:
     def reset(self) -> None:
         """Before the recursion starts."""
         self.on_probation = False
-        self._back = self._explained = self._next = self.held_for = 0
+        self._back = self._explained = self._next = self._doubt = self.held_for = 0
         self._fast, self._new = [0.0] * self._count, [0.0] * self._count
+        self._trial = [0.0] * self._count
         self._over, self._on = [_LONG_AGO] * self._count, [True] * self._count
         self._sums = [[0.0] * _SUMS for _ in range(self._count)]
         self._limits = [0.0] * self._count
-        self.theta = np.zeros(self._size)
+        self.theta, self.before = np.zeros(self._size), np.zeros((2, self._size))
         self._kept: list[bytes] = []
 
     def start(self, estimator: RecursiveLeastSquares) -> None:
         """A new recursion, trusted."""
         self.reset()
         self.theta = estimator.theta
+        self.before[:] = self.theta
         self._kept = [estimator.state()] * 2
 
     def step(
@@ -145,8 +156,8 @@ class Guard:
             After its update; it may be put back.
         theta : (parameters,) array
             Its estimate.
-        error : (balances,) array
-            Weighted residual of the row with the estimate shown.
+        error : (2, balances) array
+            Weighted residuals of the row with :attr:`before`.
         level : (balances,) array
             Size the residuals have when all is well.
         on : (balances,) bool array
@@ -163,15 +174,17 @@ class Guard:
         self._limits = limits
         lost = any(was and not now for was, now in zip(self._on, flags, strict=True))
         self._on = flags
-        over = self._follow(self._fast, error.tolist(), limits)
+        errors, newer = error.tolist()
+        over = self._follow(self._fast, errors, limits)
         if not self.on_probation:
-            return self._calm(estimator, theta, over, lost=lost)
+            self._follow(self._trial, newer, limits)
+            return self._calm(estimator, theta, over, limits, lost=lost)
         self.held_for += 1
         self._over = [
             self.held_for if now else then for now, then in zip(over, self._over, strict=True)
         ]
         self._back = 0 if True in over else self._back + 1
-        self._remember(error.tolist(), signals.tolist())
+        self._remember(errors, signals.tolist())
         unexplained = self._follow(self._new, estimator.error.tolist(), limits, share=_EXPLAINED)
         self._explained = 0 if True in unexplained else self._explained + 1
         if self._back >= self._wait_back:
@@ -204,8 +217,28 @@ class Guard:
         self._on = [False] * self._count
         return self.theta
 
+    def _doubtful(self, limits: list[float]) -> bool:
+        """True where the residuals are no longer those of an estimate that explains them."""
+        return any(
+            square > (_EXPLAINED * limit) ** 2
+            for square, limit in zip(self._fast, limits, strict=True)
+        )
+
+    def _proven(self, limits: list[float]) -> bool:
+        """True where the newer estimate explains the readings, or as well as the older one."""
+        return all(
+            new <= max(old, (_EXPLAINED * limit) ** 2)
+            for new, old, limit in zip(self._trial, self._fast, limits, strict=True)
+        )
+
     def _calm(
-        self, estimator: RecursiveLeastSquares, theta: FloatArray, over: list[bool], *, lost: bool
+        self,
+        estimator: RecursiveLeastSquares,
+        theta: FloatArray,
+        over: list[bool],
+        limits: list[float],
+        *,
+        lost: bool,
     ) -> str:
         if True in over:
             self.on_probation = True
@@ -213,29 +246,29 @@ class Guard:
             self._new = list(self._fast)
             self._back = self._explained = self.held_for = 0
             self._sums = [[0.0] * _SUMS for _ in range(self._count)]
-            self.theta = self._before(estimator)
+            self.theta = self.before[0].copy()
             return "held"
         if lost:  # rows before a failure was noticed may hold it
             self._restore(estimator)
+            return ""
+        self._doubt = self._doubt + 1 if self._doubtful(limits) else 0
+        if 0 < self._doubt <= self._age:  # what is no failure by then is told by no more rows
             return ""
         self.theta = theta
         self._next += 1
         if self._next >= self._age:
             self._next = 0
-            self._kept = [self._kept[-1], estimator.state()]
+            if self._proven(limits):
+                self._kept[0] = self._kept[1]
+                self.before[0] = self.before[1]
+            self._kept[1] = estimator.state()
+            self.before[1] = theta
         return ""
-
-    def _before(self, estimator: RecursiveLeastSquares) -> FloatArray:
-        """The estimate of the older state kept."""
-        now = estimator.state()
-        estimator.restore(self._kept[0])
-        found = estimator.theta
-        estimator.restore(now)
-        return found
 
     def _restore(self, estimator: RecursiveLeastSquares) -> None:
         estimator.restore(self._kept[0])
         self.theta = estimator.theta
+        self.before[:] = self.theta
         self._kept = [self._kept[0]] * 2
         self._next = 0
 
@@ -294,7 +327,10 @@ class Guard:
     def state(self) -> tuple[dict[str, Any], dict[str, FloatArray], dict[str, bytes]]:
         """Everything that changes."""
         parts = {f"guard{i}": kept for i, kept in enumerate(self._kept)}
-        return {n: getattr(self, n) for n in _PLAIN}, {"theta": self.theta}, parts
+        return {n: getattr(self, n) for n in _PLAIN}, self._arrays(), parts
+
+    def _arrays(self) -> dict[str, FloatArray]:
+        return {"theta": self.theta, "before": self.before.copy()}
 
     def restore(
         self, plain: Mapping[str, Any], arrays: Mapping[str, FloatArray], parts: Mapping[str, bytes]
@@ -302,5 +338,5 @@ class Guard:
         """Take up what :meth:`state` gave."""
         for name in _PLAIN:
             setattr(self, name, plain[name])
-        self.theta = arrays["theta"]
+        self.theta, self.before = arrays["theta"], arrays["before"].copy()
         self._kept = [parts[f"guard{i}"] for i in range(2) if f"guard{i}" in parts]

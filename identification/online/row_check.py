@@ -24,6 +24,7 @@ _INTO: Final = (
     "y",
     "h",
     "theta",
+    "before",
     "share",
     "on",
     "floor",
@@ -63,8 +64,10 @@ class RowCheck:
 
     Attributes
     ----------
-    error, weighted_error : (balances,) array
-        Residuals of the last row, and times their weights.
+    error : (balances,) array
+        Residuals of the last row with the estimate.
+    weighted_error : (2, balances) array
+        Residuals with two estimates from before, times their weights.
     square, torque, least, ratio, over : (balances,) array
         Mean squares of the weighted residuals and of the torques; what counts as noise at least
         [N.m]; residual over that; 1 where the residual is over its limit.
@@ -89,6 +92,7 @@ class RowCheck:
         sizes = {
             "h": (parameters, balances),
             "theta": (parameters, 1),
+            "before": (parameters, 2),
             "share": (2, 1),
             "floor_share": (1, 1),
         }
@@ -113,7 +117,7 @@ class RowCheck:
         over = ca.logic_and(use, root > limit * ca.fmax(least, v["level"]))
         out = (
             error,
-            left,
+            ca.repmat(weight, 1, 2) * (ca.repmat(v["y"], 1, 2) - v["h"].T @ v["before"]),
             square,
             torque,
             least,
@@ -125,9 +129,14 @@ class RowCheck:
         )
         self.function = ca.Function("row_check", list(v.values()), [ca.densify(e) for e in out])
         self._into = [
-            np.zeros((balances, parameters) if name == "h" else v[name].numel()) for name in _INTO
+            np.zeros(v[name].shape[::-1] if min(v[name].shape) > 1 else v[name].numel())
+            for name in _INTO
         ]
-        shapes = {"h": (balances, parameters), "signals": (3, balances)}
+        shapes = {
+            "h": (balances, parameters),
+            "signals": (3, balances),
+            "weighted_error": (2, balances),
+        }
         found = [np.zeros(shapes.get(name, (balances,))) for name in _OUT]
         self._buffer, self._trigger = self.function.buffer()
         for i, item in enumerate(self._into):
@@ -148,8 +157,8 @@ class RowCheck:
         ) = found
 
     def __call__(self, *given: Any) -> None:
-        """Take y, h, theta, the shares of standstill, flags, floor, level, torques, mean
-        squares and the floor's share of the torque.
+        """Take y, h, theta, the estimates from before, the shares of standstill, flags, floor,
+        level, torques, mean squares and the floor's share of the torque.
         """
         for target, value in zip(self._into, given, strict=True):
             target[:] = value

@@ -13,6 +13,7 @@ import importlib.util
 import os
 import platform
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -150,6 +151,35 @@ def _private_folder() -> Path:
     return Path(tempfile.mkdtemp(prefix="identification-"))
 
 
+def run_whole(command: list[str], seconds: float) -> subprocess.CompletedProcess[str]:
+    """Run a command; when its time is over, or this process is interrupted, what it has started
+    ends with it (a driver that is killed leaves its compiler running).
+
+    Raises
+    ------
+    OSError
+        It cannot be started.
+    subprocess.TimeoutExpired
+        It took longer than `seconds`.
+    """
+    with subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,  # a group of its own; Windows has none and ends the driver alone
+    ) as process:
+        try:
+            out, err = process.communicate(timeout=seconds)
+        except BaseException:
+            if sys.platform == "win32":
+                process.kill()
+            else:
+                os.killpg(process.pid, signal.SIGKILL)
+            raise
+    return subprocess.CompletedProcess(command, process.returncode, out, err)
+
+
 def _compile(source: str, compiler: tuple[str, ...], flags: list[str], target: Path) -> None:
     """Compile in a temporary folder beside the target, then rename."""
     with tempfile.TemporaryDirectory(prefix="build-", dir=target.parent) as temporary:
@@ -164,9 +194,7 @@ def _compile(source: str, compiler: tuple[str, ...], flags: list[str], target: P
             *([] if sys.platform == "win32" else ["-lm"]),
         ]
         try:
-            done = subprocess.run(
-                command, capture_output=True, text=True, check=False, timeout=_TIMEOUT_SECONDS
-            )
+            done = run_whole(command, _TIMEOUT_SECONDS)
         except (OSError, subprocess.TimeoutExpired) as error:
             raise NoCompilerError(f"the C compiler {compiler[0]} did not run: {error}") from error
         if done.returncode != 0 or not library.is_file():

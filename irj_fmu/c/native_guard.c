@@ -42,13 +42,33 @@ static void estimate_of(const State *s, const Recursion *r, double theta[N_THETA
 static void guard_start(State *s) { /* a new recursion, trusted */
     clear_guard(&s->guard);
     estimate_of(s, &s->rls, s->guard.theta);
+    estimate_of(s, &s->rls, s->guard.before);
+    estimate_of(s, &s->rls, s->guard.before + N_THETA);
     s->guard.kept[0] = s->guard.kept[1] = s->rls;
+}
+
+/* True where the residuals are no longer those of an estimate that explains them. */
+static int guard_doubtful(const Guard *g, const double limits[N_BALANCES]) {
+    int b;
+    for (b = 0; b < N_BALANCES; b++)
+        if (g->quick[b] > (GUARD_EXPLAINED * limits[b]) * (GUARD_EXPLAINED * limits[b])) return 1;
+    return 0;
+}
+
+/* True where the newer estimate explains the readings, or as well as the older one. */
+static int guard_proven(const Guard *g, const double limits[N_BALANCES]) {
+    int b;
+    for (b = 0; b < N_BALANCES; b++)
+        if (g->trial[b] > fmax(g->quick[b], (GUARD_EXPLAINED * limits[b]) * (GUARD_EXPLAINED * limits[b]))) return 0;
+    return 1;
 }
 
 static void guard_restore(State *s) {
     Guard *g = &s->guard;
     s->rls = g->kept[0];
     estimate_of(s, &s->rls, g->theta);
+    estimate_of(s, &s->rls, g->before);
+    estimate_of(s, &s->rls, g->before + N_THETA);
     g->kept[1] = g->kept[0];
     g->next = 0;
 }
@@ -115,24 +135,31 @@ static int guard_step(State *s, const double theta[N_THETA], const Checked *chec
     memcpy(g->on, on, sizeof g->on);
     any = guard_follow(g, g->quick, checked->weighted, limits, 1.0, over);
     if (!g->on_probation) {
+        guard_follow(g, g->trial, checked->weighted + N_BALANCES, limits, 1.0, unexplained);
         if (any) {
             g->on_probation = 1;
             for (b = 0; b < N_BALANCES; b++) g->over[b] = over[b] ? 0 : GUARD_LONG_AGO;
             memcpy(g->fresh, g->quick, sizeof g->fresh);
             g->back = g->explained = g->held_for = 0;
             memset(g->sums, 0, sizeof g->sums);
-            estimate_of(s, &g->kept[0], g->theta);
+            memcpy(g->theta, g->before, sizeof g->theta);
             return HELD_NOW;
         }
         if (lost) { /* rows before a failure was noticed may hold it */
             guard_restore(s);
             return NOTHING;
         }
+        g->doubt = guard_doubtful(g, limits) ? g->doubt + 1 : 0;
+        if (0 < g->doubt && g->doubt <= GUARD_AGE) return NOTHING;
         memcpy(g->theta, theta, sizeof g->theta);
         if (++g->next >= GUARD_AGE) {
             g->next = 0;
-            g->kept[0] = g->kept[1];
+            if (guard_proven(g, limits)) {
+                g->kept[0] = g->kept[1];
+                memcpy(g->before, g->before + N_THETA, sizeof g->theta);
+            }
             g->kept[1] = s->rls;
+            memcpy(g->before + N_THETA, theta, sizeof g->theta);
         }
         return NOTHING;
     }

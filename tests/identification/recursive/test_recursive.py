@@ -682,3 +682,24 @@ def test_integers_and_lists_are_accepted() -> None:
     for k in range(200):
         estimator.update(2 + 3 * (k % 5), [1, k % 5])
     np.testing.assert_allclose(estimator.theta, [2.0, 3.0], rtol=1e-3)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_excitation_is_counted_by_output_in_units_of_its_noise(known: bool) -> None:
+    """Sums of products of the scaled regressors, from which the check tells what is excited; as
+    they are where the noise is not known.
+    """
+    _, h, y = _data(5, n=3, m=2)
+    scale, noise = np.array([2.0, 3.0, 1.0]), np.array([0.01, 0.04])
+    given = noise if known else None
+    estimator = RecursiveLeastSquares(np.full(3, 0.3), scale, "constant", outputs=2, R2=given)
+    estimator.run(y, h)
+    engine = estimator.engine_for("excitation")
+    products = np.einsum("koi,koj->oij", h * scale, h * scale)
+    products = products / noise[:, None, None] if known else products
+    energy = engine.part("fast", "energy").reshape(2, 3)
+    np.testing.assert_allclose(energy, [np.diag(p) for p in products], rtol=1e-12)
+    mean = engine.part("fast", "mean").reshape(2, 3)
+    np.testing.assert_allclose(mean, (h * scale).sum(axis=0), rtol=1e-12)
+    pairs = [products.sum(axis=0)[i, j] for j in range(3) for i in range(j)]
+    np.testing.assert_allclose(engine.part("fast", "info"), pairs, rtol=1e-12)
