@@ -51,6 +51,8 @@ JOINT = files("workbench") / "demo" / "joint.toml"
 LIMITS = {
     "first plot [s]": 1.0,
     "click to new error [s]": 0.3,
+    "hover to law drawn [s]": 0.05,
+    "slider to new error [s]": 0.1,
     "page [kB]": 1000.0,
     "server [MB]": 500.0,
 }
@@ -220,9 +222,67 @@ def ours(data: Path) -> dict[str, Any]:
                     lambda v=view, f=begun: page.wait_for_function(f, arg=v, timeout=600_000),
                 )
             page.wait_for_timeout(float(os.environ.get("IRJ_LOOK_S", "4")) * 1000)
+            out.update(moves(page))
             out.update(clicks(page))
             out["server [MB]"] = memory(process)
     return out
+
+
+HOVERS, SLIDES = 9, 9
+"""Times of which the median is given: the hand moves often, the machine has other work, too."""
+HOVER = """async (labels) => {
+  const frame = () => new Promise((go) => requestAnimationFrame(go)), took = [];
+  for (const label of labels) {
+    const row = document.querySelector(`li.candidate[data-label="${label}"]`);
+    const began = performance.now();
+    row.dispatchEvent(new PointerEvent('pointerenter'));
+    while (document.querySelector('#law-panel').dataset.label !== label)
+      await new Promise((go) => setTimeout(go));
+    await frame();
+    took.push(performance.now() - began);
+  }
+  return took;
+}"""
+SLIDE = """async (times) => {
+  const figure = document.querySelector('#slider-error'), took = [];
+  const slider = document.querySelector('#sliders input[type=range]');
+  for (let k = 1; k <= times; k++) {
+    const span = Number(slider.max) - Number(slider.min);
+    delete figure.dataset.milliseconds;
+    const began = performance.now();
+    slider.value = String(Number(slider.min) + span * k / (times + 1));
+    slider.dispatchEvent(new Event('input', { bubbles: true }));
+    while (!figure.dataset.milliseconds) await new Promise((go) => setTimeout(go));
+    took.push(performance.now() - began);
+  }
+  return took;
+}"""
+
+
+def moves(page: Any) -> dict[str, Any]:
+    """Median time from pointing at a candidate to its law on the screen, and from a moved slider
+    to the new held-out error.
+    """
+    labels = page.evaluate(
+        "() => [...document.querySelectorAll('.ranking li.candidate')].map((c) => c.dataset.label)"
+    )
+    for label in labels:  # as the page itself does ahead of the hand
+        page.evaluate("l => get(`/view/law?label=${encodeURIComponent(l)}`)", label)
+    page.wait_for_function("() => document.querySelector('#law-panel').dataset.label")
+    row = [labels[k % len(labels)] for k in range(HOVERS + 1)]
+    page.evaluate(HOVER, row)  # each once: what is fetched is kept
+    hover = page.evaluate(HOVER, row)
+    page.click("#nav-parameters")
+    page.wait_for_selector("#sliders input[type=range]")
+    slide = page.evaluate(SLIDE, SLIDES)
+    page.click("#slider-reset")
+    page.click("#nav-diagnose")
+    page.wait_for_selector(".candidate button.primary")
+    return {
+        "hover to law drawn [s]": float(np.median(hover)) / 1e3,
+        "slider to new error [s]": float(np.median(slide)) / 1e3,
+        "slider, longest of nine [s]": float(max(slide)) / 1e3,
+    }
 
 
 CLICKS = (

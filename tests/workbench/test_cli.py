@@ -22,9 +22,10 @@ from identification import load_joint, read
 from identification.data.typical import true_values
 from workbench.cli import files as outputs
 from workbench.cli import loop
-from workbench.cli.first.help import EXAMPLES, print_untested
+from workbench.cli.first.help import EXAMPLES
 from workbench.cli.main import main, parser
 from workbench.cli.online import fault_text
+from workbench.show.words import untested_lines
 
 ROOT = Path(__file__).resolve().parents[2]
 DEMO = Path(str(files("workbench"))) / "demo"
@@ -264,8 +265,8 @@ def test_diagnose_ranks_and_says_what_cannot_be_tested(
     assert f"not testable ({len(found['not_testable'])}): -v lists them" in text
     assert "extra_inertia: " not in text
     assert "\x1b" not in text  # colours are for a terminal
-    print_untested([SimpleNamespace(**n) for n in found["not_testable"]], verbose=True)
-    assert "not testable: extra_inertia: " in capsys.readouterr().out
+    items = [SimpleNamespace(**n) for n in found["not_testable"]]
+    assert "not testable: extra_inertia: " in "\n".join(untested_lines(items, verbose=True))
     assert found["claims"][0]["effects"] == [HIDDEN]
     assert found["ranking"][0]["effect"] == HIDDEN
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import threading
 import time
 from collections.abc import Iterator
@@ -16,6 +17,7 @@ from identification.data.joint_file import Joint
 from identification.errors import InputError
 from identification.faults.types import FaultEvent, Verdict
 from workbench.cli.following import growing
+from workbench.cli.following.datagrams import Datagrams
 from workbench.cli.following.growing import LOOKS, Growing, follow
 from workbench.cli.main import main
 from workbench.cli.online import limits, replay
@@ -181,3 +183,66 @@ def test_what_stands_is_what_was_not_withdrawn() -> None:
         "Withdrawn: link position, said at 9 s, withdrawn at 11 s."
     )
     assert standing([both[0], both[2]]).startswith("No reading is doubted any more: link position")
+
+
+def test_a_stream_gives_what_the_file_gives(joint_file: Path, tmp_path: Path) -> None:
+    """Begun before a head, the head said again now and then, two datagrams the wrong way round, one
+    twice: what comes late is left out, its hole is bridged, and the rest says what the file says.
+    """
+    joint, text = load_joint(joint_file), lines(faulty=True)
+    head, rows = text[0], text[1:]
+    pieces = ["\n".join(rows[k : k + 10]) for k in range(0, len(rows), 10)]
+    late = 30
+    kept = [*pieces[:late], *pieces[late + 1 :]]
+    sent = [rows[0], *(f"{head}\n{p}" if k % 10 == 0 else p for k, p in enumerate(pieces))]
+    sent[late + 1 : late + 3] = [sent[late + 2], sent[late + 1], sent[late + 2]]
+    healthy = [read(DEMO / "train.npz", joint=joint)]
+    with (
+        Datagrams("udp://127.0.0.1:0", joint) as source,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
+    ):
+
+        def stop() -> bool:
+            now, sent[:] = sent[:80], sent[80:]
+            for piece in now:
+                sender.sendto(piece.encode(), ("127.0.0.1", source.port))
+            return not now
+
+        stop()
+        streamed = list(
+            follow(source, joint, lambda first: limits(joint, first, healthy), stop=stop)
+        )
+        assert source.late == 2 * 10, "those that were overtaken, and those that came twice"
+    (tmp_path / "whole.csv").write_text("\n".join([head, *kept, ""]))
+    record = read(tmp_path / "whole.csv")
+    whole = replay(record, joint, limits(joint, record, healthy))
+    assert len(streamed) > 5, "it was followed while it came"
+    said = [[(e["fault"], e["text"]) for e in r.events] for r in (streamed[-1], whole)]
+    assert said[0] == said[1]
+    assert [e.verdict for _, e in streamed[-1].verdicts] == [e.verdict for _, e in whole.verdicts]
+    last, sigma = streamed[-1].values[-1], streamed[-1].sigmas[-1]
+    assert (np.abs(last - whole.values[-1]) < 0.1 * sigma).all()
+
+
+def test_a_stream_that_cannot_be_is_said_in_one_line(
+    joint_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    joint = load_joint(joint_file)
+    with Datagrams("udp://127.0.0.1:0", joint) as source:
+        taken = f"udp://127.0.0.1:{source.port}"
+        for address, says in (
+            (taken, "cannot listen there (Address already in use)"),
+            ("udp://127.0.0.1", "give the address as udp://HOST:PORT"),
+            ("udp://127.0.0.1:99999", "give the address as udp://HOST:PORT"),
+            ("udp://192.0.2.1:9870", "cannot listen there"),
+        ):
+            assert main(["track", address, "--joint", str(joint_file), "--follow", "0.3"]) == 2
+            assert says in capsys.readouterr().err
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            junk = "time_s,motor_position_rad\n" + "\n".join(f"{k},x" for k in range(200))
+            for piece in (b"\xff\x00junk", b"", junk.encode()):
+                sender.sendto(piece, ("127.0.0.1", source.port))
+            with pytest.raises(InputError) as caught:
+                list(follow(source, joint, quiet=0.3))
+        assert "udp://127.0.0.1:0" in str(caught.value)
+        assert "\n" not in str(caught.value)

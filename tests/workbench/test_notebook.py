@@ -11,10 +11,15 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from identification import compare, diagnose, fit, load_joint, read
 from identification.diagnosis.improve import Improvement
+from identification.errors import InputError
+from identification.frames import frames
+from tests.workbench.chromium import context_of, launched, needs_chromium
+from workbench.show.notebook import interactive
 
 ROOT = Path(__file__).resolve().parents[2]
 DEMO = ROOT / "workbench" / "demo"
@@ -124,6 +129,51 @@ def test_tables_have_headers_and_pictures_have_names(results: dict[str, Any]) ->
 
 def test_the_whole_loop_has_a_picture_too() -> None:
     assert callable(Improvement._repr_html_)
+
+
+def test_frames_hold_what_the_results_say(results: dict[str, Any]) -> None:
+    """Each figure stands at its name, and the rows in their order; a result without a table and a
+    stranger are told apart.
+    """
+    pytest.importorskip("pandas")
+    train, first, found = (results[k] for k in ("record", "fit", "diagnosis"))
+    channels = frames(train)["channels"]
+    assert list(channels.columns) == list(train.channels)
+    np.testing.assert_array_equal(channels.index, train.time)
+    np.testing.assert_array_equal(channels["link_torque"], train["link_torque"])
+    parameters = frames(first)["parameters"]
+    assert {n: parameters.loc[n, "value"] for n in first.parameters} == {
+        n: p["value"] for n, p in first.parameters.items()
+    }
+    tables, data = frames(found), found.as_json()
+    assert list(tables["ranking"]["effect"]) == [r["effect"] for r in data["ranking"]]
+    for name, row in data["floor_ratio"].items():
+        assert tables["floor_ratio"].loc[name, "ratio"] == row["ratio"]
+    steps = frames(found.found)["steps"]
+    assert list(steps["held_out relative_error_percent"]) == [
+        s.held_out.relative_error_percent for s in found.found.steps
+    ]
+    with pytest.raises(InputError, match="int is no result"):
+        frames(3)
+
+
+@needs_chromium
+def test_the_report_works_inside_a_cell(results: dict[str, Any]) -> None:
+    """Its plots are drawn and zoom; names from files stay text; it cannot reach the notebook."""
+    cell = interactive(results["diagnosis"].found, [results["record"]])
+    with launched() as chromium:
+        page = context_of(chromium, viewport={"width": 1280, "height": 860}).new_page()
+        problems: list[str] = []
+        page.on("pageerror", lambda e: problems.append(str(e)))
+        page.on("dialog", lambda d: (problems.append("dialog"), d.dismiss()))
+        page.set_content(f"<p id=cell></p>{cell._repr_html_()}")
+        inside = page.frame_locator("iframe")
+        inside.locator(".uplot").first.wait_for(timeout=60_000)
+        assert "Stribeck" in inside.locator("body").inner_text()
+        frame = page.frames[1]
+        reach = "() => { try { return parent.document.title; } catch (e) { return e.name; } }"
+        assert frame.evaluate(reach) == "SecurityError"
+        assert problems == []
 
 
 def html_of(outputs: list[Any]) -> str:

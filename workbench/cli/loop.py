@@ -15,7 +15,6 @@ from identification.data.check.gate import gate_warnings
 from identification.data.joint_file import Joint
 from identification.data.record import Record
 from identification.diagnosis.improve import Improvement, improve
-from identification.diagnosis.locate import Unexplained
 from identification.fitting.fit import Fit, fit
 from identification.fitting.trust import Trust, trust
 from workbench.cli.files import (
@@ -28,7 +27,8 @@ from workbench.cli.files import (
     write_json,
     write_text,
 )
-from workbench.cli.first.help import bold, print_untested
+from workbench.cli.first.help import bold
+from workbench.show.words import finding_lines, place_lines, step_lines, untested_lines
 
 
 def improve_files(
@@ -103,7 +103,9 @@ def run_improve(arguments: Namespace) -> int:
     write_json(arguments.json, data)
     if arguments.output:
         write_text(arguments.output, found.to_joint_file())
-        print(f"joint file: {arguments.output}")
+        left = len(found.learned) - len(found.carried)
+        without = f", without {left} of the learned curves: they raise the held-out error"
+        print(f"joint file: {arguments.output}{without if left else ''}")
     write_picture(found, arguments.picture)
     _write_report(found, records, arguments.report, arguments.command)
     return 0
@@ -206,83 +208,9 @@ def print_improvement(found: Improvement, *, verbose: bool = False) -> None:
     not be tested.
     """
     print(bold(found.reason))
-    if found.data.note:
-        print(f"note: {found.data.note}")
-    print(f"{'step':<32} {'train %':>8} {'held-out %':>10}   residual over noise floor")
-    for step in found.steps:
-        ratios = "  ".join(f"{b} {e.ratio:.3g}" for b, e in step.held_out.balances.items())
-        name = f"+ {step.added}" if step.added else "start model"
-        print(
-            f"{name:<32} {step.train.relative_error_percent:8.3f} "
-            f"{step.held_out.relative_error_percent:10.3f}   {ratios}"
-        )
-    for claim in found.claims:
-        names = (
-            claim.effects[0] if len(claim.effects) == 1 else "{" + ", ".join(claim.effects) + "}"
-        )
-        if claim.like:
-            names = claim.like
-        said, rest = (
-            ("in part", "; structure is left that is not in the library")
-            if claim.partial
-            else ("missing", "")
-        )
-        print(
-            f"{said}: {names}, {claim.balance} balance, held-out RMS falls by "
-            f"{claim.held_out_drop_percent:.1f} %{rest}"
-        )
-        if claim.confidence:
-            print(f"  by the likelihoods of whole fits: {claim.surety}")
-        if claim.separate_by:
-            print(
-                f"  these cannot be told apart on these records; {claim.separate_by} would "
-                "separate them"
-            )
-    for claim in found.minor:
-        print(
-            f"minor, small but certain: {', '.join(claim.effects)} ({claim.balance} balance, "
-            f"{claim.held_out_drop_percent:.1f} %)"
-        )
-    for line in found.lines:
-        named = f", {' or '.join(line.effects)}" if line.effects else ", function of position"
-        print(
-            f"line: order {line.order:.3f} +- {line.tolerance:.3f} per {line.per}, "
-            f"{line.amplitude:.3g} {line.unit} ({line.balance}{named})"
-        )
-    print_places(found.unexplained)
-    for learned in found.learned:
-        print(f"learned: {learned.sentence}")
-    for c in found.calibration:
-        if c.bounded:
-            print(
-                f"calibration bounded: {c.what} of {c.sensor} in {found.data.train_names[c.run]} "
-                f"within {2 * (c.stderr or 0.0):.2g} {c.unit} of {c.value:.4g} {c.unit}; these "
-                "records cannot tell it from viscous friction, a torque sensor would"
-            )
-        elif c.stderr is not None and abs(c.value) > 2 * c.stderr:
-            name = found.data.train_names[c.run]
-            print(
-                f"calibration found: {c.what} of {c.sensor} in {name} {c.value:.4g} +- "
-                f"{2 * c.stderr:.2g} {c.unit} (taken off, no physics)"
-            )
-    print_untested(found.not_testable, verbose=verbose)
-
-
-def print_places(places: Sequence[Unexplained]) -> None:
-    """Where structure is left that no effect explains."""
-    for place in places:
-        where = "no measured variable"
-        if place.axis and place.low is not None and place.high is not None:
-            where = f"{place.axis} from {place.low:.3g} to {place.high:.3g} {place.unit}"
-        extra = (
-            f", order {place.order:.2f}"
-            if place.order
-            else (f", near {place.frequency_hz:.1f} Hz" if place.frequency_hz else "")
-        )
-        print(
-            f"unexplained: {place.balance} balance, depends on {where} "
-            f"({place.share_percent:.0f} % of it){extra}"
-        )
+    untested = untested_lines(found.not_testable, verbose=verbose)
+    for line in (*step_lines(found), *finding_lines(found), *untested):
+        print(line)
 
 
 def run_fit(arguments: Namespace) -> int:
@@ -426,8 +354,9 @@ def run_diagnose(arguments: Namespace) -> int:
     print(bold(answer))
     if ranked:
         print(ranked)
-    print_places(found.unexplained)
-    print_untested(found.ranking.not_testable, verbose=arguments.verbose)
+    untested = untested_lines(found.ranking.not_testable, verbose=arguments.verbose)
+    for line in (*place_lines(found.unexplained), *untested):
+        print(line)
     for key in arguments.why:
         print(found.why(key))
     if arguments.output and found.claims:

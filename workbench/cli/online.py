@@ -9,7 +9,6 @@ import sys
 from argparse import Namespace
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -28,7 +27,8 @@ from workbench.cli.files import (
     write_bytes,
     write_json,
 )
-from workbench.cli.following.growing import Growing, follow
+from workbench.cli.following.datagrams import source as followed_source
+from workbench.cli.following.growing import follow
 from workbench.cli.following.stepper import Stepper, arrays_of, fault_text
 from workbench.cli.renewed import renewed
 from workbench.show.replayed import READINGS, UNESTIMATED, Replay, standing
@@ -98,7 +98,7 @@ def _run_follow(arguments: Namespace, joint: Joint) -> int:
         raise InputError(f"--follow {arguments.follow:g}: give seconds above 0")
     healthy, warnings = open_records(arguments.healthy, joint)
     said, made = 0, None
-    with Growing(Path(arguments.records[0]), joint) as source:
+    with followed_source(arguments.records[0], joint) as source:
         try:
             for made in follow(
                 source, joint, lambda first: limits(joint, first, healthy), quiet=arguments.follow

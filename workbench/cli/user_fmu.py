@@ -18,9 +18,9 @@ from identification.data.record import Record
 from identification.errors import InputError
 from irj_fmu.command_line import OneLineParser, check_output, keep_inputs
 from workbench.cli.files import distinct, open_records, progress_bar, write_json, write_text
-from workbench.cli.first.help import print_untested
 from workbench.cli.library import with_law
 from workbench.cli.records import checked
+from workbench.show.words import untested_lines
 
 if TYPE_CHECKING:
     from irj_fmu.imported.diagnose import UserDiagnosis
@@ -214,7 +214,8 @@ def run_diagnose(arguments: Namespace) -> int:
             f"held-out data, noise {balance.floor:.3g} {balance.unit}"
         )
     print(found)
-    print_untested(found.ranking.not_testable, verbose=arguments.verbose)
+    for line in untested_lines(found.ranking.not_testable, verbose=arguments.verbose):
+        print(line)
     if found.claims:
         joint = found.diagnosis.found.steps[-1].solution.model
         label = found.claims[0].label

@@ -40,6 +40,7 @@ from identification.fitting.engine import (
 )
 from identification.fitting.joint_text import joint_text
 from identification.fitting.parameters import parameter_table
+from workbench.page.desk.curves import kept_curves
 from workbench.page.first import first_look
 from workbench.page.records import thinned
 from workbench.page.session import StepEntry
@@ -368,6 +369,8 @@ class Analysis:
                     )
                 },
                 "headline": headline(story),
+                # after an addition they belong to the model with it
+                **({} if found.claims else kept_curves(found.found)),
                 "ranking": rows,
                 "claim": claim,
                 "unit": unit,

@@ -12,10 +12,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from identification.data.joint_file import column_lines
+from identification.data.plain_text import from_toml
 from identification.diagnosis.improve import HOLD_DELAY
 from identification.errors import InputError
 from workbench.page.analysis import Progress
-from workbench.page.jobs.place import Place
+from workbench.page.jobs.place import Place, confirmed_map
 from workbench.page.report import improvement_of, records_of
 from workbench.page.session import FileEntry, State, StepEntry, write_atomic
 
@@ -109,8 +111,26 @@ def _plain(columns: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def joint_file(live: Place) -> str:
-    """The fitted joint, or the joint as it was given where nothing is fitted yet."""
-    return live.analysis().to_joint_file() if live.state.steps else live.state.joint_text
+    """The fitted joint, or the joint as it was given where nothing is fitted yet; with the column
+    map that was confirmed for its records, so that the command line reads them with it.
+    """
+    state = live.state
+    if not state.steps:
+        return _given(state)
+    story = state.improvement or {}
+    if story.get("joint_text") and story["exact"] == state.steps[-1].exact:
+        return str(story["joint_text"])  # with the curves that the loop has learned
+    return live.analysis().to_joint_file()
+
+
+def _given(state: State) -> str:
+    """The joint file as it was typed, and the map behind it where it has none."""
+    columns = confirmed_map(state)
+    if not columns or not state.joint_text:
+        return state.joint_text
+    if "columns" in from_toml(state.joint_text, state.joint_source or "joint"):
+        return state.joint_text
+    return "\n".join([state.joint_text.rstrip("\n"), "", *column_lines(columns), ""])
 
 
 def report_available() -> bool:

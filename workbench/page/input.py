@@ -256,12 +256,16 @@ def _from_form(body: Mapping[str, Any], previous: Mapping[str, Any]) -> dict[str
         raise InputError("effects must be a list of names")
     old = previous.get("joint")
     before: dict[str, Any] = dict(old) if isinstance(old, Mapping) else {}
+    asked = [str(e) for e in effects]
+    was = before.get("effects")
+    # as they stood: another order would be another input of the fits
+    stay = [e for e in was if e in asked] if isinstance(was, list) else []
     table: dict[str, Any] = {
         **before,
         "name": str(body.get("name") or "joint"),
         "kind": body.get("kind") or "rotary",
         "model": model,
-        "effects": [str(e) for e in effects],
+        "effects": [*stay, *(e for e in asked if e not in stay)],
     }
     for key in NUMBERS:
         if key in body:

@@ -16,7 +16,7 @@ from workbench.page.analysis import Progress
 from workbench.page.desk.tree import after_input, given
 from workbench.page.jobs.child import Ask, Done
 from workbench.page.jobs.doing import unchanged
-from workbench.page.jobs.place import Change, Place, joint_of
+from workbench.page.jobs.place import Change, Place, described
 from workbench.page.jobs.process import Halt, Helper, InternalError
 from workbench.page.records import checked
 from workbench.page.session import FileEntry, Session, State
@@ -140,7 +140,7 @@ class Live(Place):
             else:
                 self._analysis = None
         if before.joint_text != after.joint_text and self._analysis is not None:
-            self._analysis.joint = joint_of(after)
+            self._analysis.joint = described(after)
         return after
 
     def snapshot(self) -> dict[str, Any]:
@@ -369,7 +369,7 @@ class Live(Place):
                     if given(made) != given(self.state):
                         self._analysis = None
                     elif made.joint_text != self.state.joint_text and self._analysis is not None:
-                        self._analysis.joint = joint_of(made)
+                        self._analysis.joint = described(made)
                     self.state = self.session.save(made)
                     if done is not None:
                         self._adopt(done)

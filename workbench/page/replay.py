@@ -19,7 +19,7 @@ from identification.data.plain_text import from_toml
 from identification.data.record import Record
 from identification.errors import InputError
 from irj_fmu.estimator.healthy import detector_state, online_readings
-from workbench.cli.following.growing import Growing
+from workbench.cli.following.datagrams import source as followed_source
 from workbench.cli.following.growing import follow as growing
 from workbench.cli.online import replay as followed
 from workbench.page.analysis import Progress, clean
@@ -154,6 +154,7 @@ def follow(
     if not steps:
         raise InputError("follow: fit first, the estimator starts from the fitted joint")
     path = source_of(live.session.folder.parent, name)
+    short = Path(path).name
     joint = parse_joint(from_toml(live.analysis().to_joint_file(), "joint"), "joint")
     why, made, written, shown = "", None, 0.0, -math.inf
 
@@ -170,17 +171,17 @@ def follow(
 
     stopped(folder)  # what was asked of an earlier one
     (folder / FILE).unlink(missing_ok=True)
-    progress(f"waiting for {path.name}", 0.0)
-    with Growing(path, joint) as source:
+    with followed_source(path, joint) as source:
+        progress(f"waiting for {short}", 0.0)  # from here on nothing of a stream is lost
         for made in growing(source, joint, state_of, stop=lambda: stopped(folder)):
             now = float(made.record.time[-1])
-            progress(f"following {path.name}, {now:.0f} s", 0.0)
+            progress(f"following {short}, {now:.0f} s", 0.0)
             fresh = now > shown and time.monotonic() - written > REWRITTEN
             if len(made.time) and fresh:
                 written, shown = time.monotonic(), now
                 _kept(folder, made, steps, {"no_detector": why, "live": True})
     if made is None:
-        raise InputError(f"follow: nothing came into {path.name}; start the recording first")
+        raise InputError(f"follow: nothing came into {short}; start the recording first")
     return _kept(folder, made, steps, {"no_detector": why})
 
 

@@ -452,7 +452,7 @@ def serve(
     say : callable, optional
         Gets the line with the address in place of standard output.
     follow : sequence of path
-        Files that are being written, which the Replay page may follow.
+        Files that are being written, and addresses of streams, which the Replay page may follow.
 
     Raises
     ------

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import html
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import singledispatch
+from typing import final
 
 from identification.data.formats import pretty_unit, value_range
 from identification.data.record import Record
@@ -16,6 +19,7 @@ from identification.variants.exploration import Exploration
 from workbench.show.bode import bode_html
 from workbench.show.ceiling import ceiling_html
 from workbench.show.front import exploration_html
+from workbench.show.report import render_report
 from workbench.show.results import (
     comparison_html,
     diagnosis_html,
@@ -74,3 +78,46 @@ def _(result: Bode) -> str | None:
 @html_of.register
 def _(result: Exploration) -> str | None:
     return exploration_html(result)
+
+
+@final
+@dataclass(frozen=True)
+class Interactive:
+    """A document with its plots at work, as the output of a cell.
+
+    Attributes
+    ----------
+    document : str
+        HTML with its scripts and styles.
+    height : int
+        Of the frame that it is shown in [px].
+    """
+
+    document: str
+    height: int
+
+    def _repr_html_(self) -> str:
+        """A frame that runs the document's own scripts, and can reach nothing of the notebook."""
+        return (
+            f'<iframe srcdoc="{html.escape(self.document)}" sandbox="allow-scripts" '
+            f'title="Joint report" style="width:100%;height:{self.height}px;border:0"></iframe>'
+        )
+
+
+def interactive(
+    result: Improvement, records: Sequence[Record] = (), *, height: int = 720
+) -> Interactive:
+    """The report of a loop inside a notebook: plots in time that zoom, and all that the report has.
+
+    Parameters
+    ----------
+    result : Improvement
+    records : sequence of Record
+        For the plots over time.
+    height : int
+        [px].
+    """
+    return Interactive(render_report(result, records=records), height)
+
+
+__all__ = ["Interactive", "html_of", "interactive"]

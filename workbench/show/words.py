@@ -1,16 +1,19 @@
 """The words that results are told in: outcomes with their next step, and the glossary.
 
-The page, the report and the notebook take them from here, so that one word means one thing.
+The page, the report, the notebook and the command line take them from here, so that one word means
+one thing: what `irj improve` prints of a result stands on the page line by line.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, final
 
 from casadi_models import EFFECTS
 from identification.data.formats import words
+from identification.diagnosis.improve import Improvement
+from identification.diagnosis.locate import Unexplained
 
 
 @final
@@ -111,3 +114,108 @@ def title_of(label: str) -> str:
 def plain_name(name: str) -> str:
     """A parameter's name for a reader: underscores as spaces, no mark of an instance."""
     return words(name.partition("#")[0])
+
+
+# --- a result, line by line -----------------------------------------------------------------------
+
+
+def printed(found: Improvement) -> str:
+    """A result as `irj improve` prints it."""
+    lines = (found.reason, *step_lines(found), *finding_lines(found))
+    return "\n".join([*lines, *untested_lines(found.not_testable)])
+
+
+def step_lines(found: Improvement) -> list[str]:
+    """The note on the records, and the falling error as a table."""
+    lines = [f"note: {found.data.note}"] if found.data.note else []
+    lines.append(f"{'step':<32} {'train %':>8} {'held-out %':>10}   residual over noise floor")
+    for step in found.steps:
+        ratios = "  ".join(f"{b} {e.ratio:.3g}" for b, e in step.held_out.balances.items())
+        name = f"+ {step.added}" if step.added else "start model"
+        lines.append(
+            f"{name:<32} {step.train.relative_error_percent:8.3f} "
+            f"{step.held_out.relative_error_percent:10.3f}   {ratios}"
+        )
+    return lines
+
+
+def finding_lines(found: Improvement) -> list[str]:
+    """What was named, with its numbers; what repeats, what is left, what was learned, and what the
+    sensors are off by.
+    """
+    lines = []
+    for claim in found.claims:
+        names = (
+            claim.effects[0] if len(claim.effects) == 1 else "{" + ", ".join(claim.effects) + "}"
+        )
+        if claim.like:
+            names = claim.like
+        said, rest = (
+            ("in part", "; structure is left that is not in the library")
+            if claim.partial
+            else ("missing", "")
+        )
+        lines.append(
+            f"{said}: {names}, {claim.balance} balance, held-out RMS falls by "
+            f"{claim.held_out_drop_percent:.1f} %{rest}"
+        )
+        if claim.confidence:
+            lines.append(f"  by the likelihoods of whole fits: {claim.surety}")
+        if claim.separate_by:
+            lines.append(
+                f"  these cannot be told apart on these records; {claim.separate_by} would "
+                "separate them"
+            )
+    lines += [
+        f"minor, small but certain: {', '.join(claim.effects)} ({claim.balance} balance, "
+        f"{claim.held_out_drop_percent:.1f} %)"
+        for claim in found.minor
+    ]
+    for line in found.lines:
+        named = f", {' or '.join(line.effects)}" if line.effects else ", function of position"
+        lines.append(
+            f"line: order {line.order:.3f} +- {line.tolerance:.3f} per {line.per}, "
+            f"{line.amplitude:.3g} {line.unit} ({line.balance}{named})"
+        )
+    lines += place_lines(found.unexplained)
+    lines += [f"learned: {learned.sentence}" for learned in found.learned]
+    for c in found.calibration:
+        if c.bounded:
+            lines.append(
+                f"calibration bounded: {c.what} of {c.sensor} in {found.data.train_names[c.run]} "
+                f"within {2 * (c.stderr or 0.0):.2g} {c.unit} of {c.value:.4g} {c.unit}; these "
+                "records cannot tell it from viscous friction, a torque sensor would"
+            )
+        elif c.stderr is not None and abs(c.value) > 2 * c.stderr:
+            name = found.data.train_names[c.run]
+            lines.append(
+                f"calibration found: {c.what} of {c.sensor} in {name} {c.value:.4g} +- "
+                f"{2 * c.stderr:.2g} {c.unit} (taken off, no physics)"
+            )
+    return lines
+
+
+def place_lines(places: Sequence[Unexplained]) -> list[str]:
+    """Where structure is left that no effect explains."""
+    lines = []
+    for place in places:
+        where = "no measured variable"
+        if place.axis and place.low is not None and place.high is not None:
+            where = f"{place.axis} from {place.low:.3g} to {place.high:.3g} {place.unit}"
+        extra = (
+            f", order {place.order:.2f}"
+            if place.order
+            else (f", near {place.frequency_hz:.1f} Hz" if place.frequency_hz else "")
+        )
+        lines.append(
+            f"unexplained: {place.balance} balance, depends on {where} "
+            f"({place.share_percent:.0f} % of it){extra}"
+        )
+    return lines
+
+
+def untested_lines(items: Sequence[Any], *, verbose: bool = False) -> list[str]:
+    """What these records cannot show, in one line; `verbose`: each effect with the reason."""
+    if verbose:
+        return [f"not testable: {item.effect}: {item.why}" for item in items]
+    return [f"not testable ({len(items)}): -v lists them with the reason"] if items else []

@@ -163,26 +163,30 @@ function glossaryCard() {
 
 /* One picture beside the ranking: the law of the candidate that is pointed at. They are fetched ahead, so that pointing is at once. */
 class LawPanel {
-  constructor(labels) {
-    this.kept = new Map(); this.shown = null;
+  constructor(labels, note = "line: what the law would take off it. Point at a candidate to see its law.") {
+    this.kept = new Map(); this.shown = null; this.step = app.state.steps.at(-1).id;
     this.title = h("h2", {}, "The law through the residual");
     this.host = h("div", { "aria-live": "polite" }, h("p", { class: "soft small" }, "Drawing …"));
-    this.node = h("aside", { class: "card law-panel", id: "law-panel" }, this.title, h("p", { class: "soft small" }, "◆ residual of the model as it stands; line: what the law would take off it. Point at a candidate to see its law."), this.host);
+    this.node = h("aside", { class: "card law-panel", id: "law-panel" }, this.title, h("p", { class: "soft small" }, `◆ residual of the model as it stands; ${note}`), this.host);
     later(() => this.ahead(labels).catch(fail));
   }
   async ahead(labels) {
     for (const label of labels) { if (!this.node.isConnected) return; await this.fetch(label).catch(() => null); if (!this.shown) this.show(label); }
   }
   fetch(label) {
-    if (!this.kept.has(label)) this.kept.set(label, get(`/view/law?label=${encodeURIComponent(label)}`).then((made) => { this.kept.set(label, made); return made; }));
+    if (!this.kept.has(label)) this.kept.set(label, get(`/view/law?label=${encodeURIComponent(label)}&step=${this.step}`).then((made) => { if (!made.stale) this.kept.set(label, made); return made; }));
     return Promise.resolve(this.kept.get(label));
   }
   show(label) {
     this.shown = label;
-    const ready = this.kept.get(label), put = (made) => { if (this.shown === label) { this.host.replaceChildren(h("p", {}, h("strong", {}, made.title)), new ServedChart(made.chart, { name: `${made.title} through the residual` }).node); this.node.dataset.label = label; } };
+    const ready = this.kept.get(label), put = (made) => { if (this.shown === label && !made.stale) { this.host.replaceChildren(h("p", {}, h("strong", {}, made.title)), new ServedChart(made.chart, { name: `${made.title} through the residual` }).node); this.node.dataset.label = label; } };
     if (ready && !ready.then) put(ready); else this.fetch(label).then(put).catch((e) => { if (this.shown === label) this.host.replaceChildren(h("p", { class: "small bad" }, e.message)); });
   }
 }
+
+/* What a list needs so that pointing at an item, or the focus on it, draws its law. */
+const pointsAt = (panel, label) => ({ "data-label": label, onpointerenter: () => panel.show(label), onfocusin: () => panel.show(label) });
+const LEARNED_NOTE = "line: what the learned curves of this balance take off it together. Point at a curve to see it.";
 
 /* --- any signal against any ----------------------------------------------------------------------------------- */
 
@@ -228,15 +232,15 @@ function typedNumber(text, name, low, high) {
 
 /* Every parameter as a slider: the held-out error and the residual follow; nothing is changed until it is said. */
 function slidersCard(rows, error) {
-  const values = {}, figure = h("output", { class: "figure", id: "slider-error" }, `${digits(error)} %`), charts = h("div", { class: "grid" }), state = { turn: 0, busy: false, again: false };
+  const values = {}, figure = h("output", { class: "figure", id: "slider-error" }, `${digits(error)} %`), charts = h("div", { class: "grid" }), state = { turn: 0, busy: false, again: false }, step = app.state.steps.at(-1).id;
   const look = async () => {
     if (state.busy) { state.again = true; return; }
     state.busy = true;
     figure.setAttribute("aria-busy", "true");
     const began = performance.now(), turn = state.turn;
     try {
-      const made = await get(`/view/what-if?values=${encodeURIComponent(JSON.stringify(values))}`);
-      if (turn === state.turn) {
+      const made = await get(`/view/what-if?values=${encodeURIComponent(JSON.stringify(values))}&step=${step}`);
+      if (turn === state.turn && !made.stale) {
         figure.textContent = made.relative_error_percent == null ? "no number" : `${digits(made.relative_error_percent)} %`;
         charts.replaceChildren(...made.charts.map((c) => h("figure", { class: "place" }, h("figcaption", {}, `${c.balance} balance: with the sliders (◆), with the fit (■)`), new ServedChart(c.chart, { name: `${c.balance} residual with the sliders` }).node)));
         figure.dataset.milliseconds = String(Math.round(performance.now() - began));

@@ -111,12 +111,12 @@ const views = {
     const again = button(d ? "Diagnose again" : "Diagnose", () => run("diagnose", {}, "diagnose"), { kind: d ? "" : "primary", id: "diagnose" });
     if (!d) return [h("div", { class: "row between head" }, h("div", {}, heading("What is missing?", "Every effect of the library is tried in every place of the current model, and judged on blocks and records it was not fitted to.")), again)];
     const clear = d.ranking.filter((r) => r.significant), faint = d.ranking.filter((r) => !r.significant), said = d.claim, fallOf = (r) => (said && said.label === r.label ? said.held_out_drop_percent : r.held_out_drop_percent) || 0, most = Math.max(1, ...d.ranking.map(fallOf)); /* what is claimed was fitted wholly: its figure is the one in the sentence, too */
-    const panel = new LawPanel(clear.map((r) => r.label));
+    const curves = d.learned || [], panel = new LawPanel([...clear, ...curves].map((r) => r.label), clear.length ? undefined : LEARNED_NOTE);
     const row = (r, k) => {
       const bar = h("i"), drop = fallOf(r);
       later(() => { bar.style.width = `${Math.max(0, (100 * drop) / most)}%`; });
       const key = d.claim && d.claim.label === r.label;
-      return h("li", { class: `candidate${r.significant ? "" : " dim"}`, "data-label": r.label, onpointerenter: () => panel.show(r.label), onfocusin: () => panel.show(r.label) }, h("span", { class: "rank" }, String(k + 1)),
+      return h("li", { class: `candidate${r.significant ? "" : " dim"}`, ...pointsAt(panel, r.label) }, h("span", { class: "rank" }, String(k + 1)),
         h("div", {}, h("h3", {}, r.title, " ", h("span", { class: "place" }, `· ${r.place.replace(/_/g, " ")}`)), h("p", { class: "small" }, `Without it ${r.absence}.`),
           h("p", { class: "small soft" }, `${digits(r.contribution)} ${unit(d.unit)} rms in the ${r.balance} balance; p ${r.p_value < 1e-4 ? "< 0.0001" : "= " + digits(r.p_value, 2)}; evidence ${digits(r.gain_nats)} (gain in log-likelihood).${r.confusable_with.length ? ` Often confused with ${r.confusable_with.map(effectTitle).join(", ")}.` : ""}`)),
         h("div", { class: "effect-size" }, h("p", { class: "small" }, drop > 0 ? ["residual ", h("span", { class: "num" }, `−${digits(drop, 2)} %`)] : "no fall"), h("span", { class: "bar", "aria-hidden": "true" }, bar)),
@@ -131,6 +131,7 @@ const views = {
         h("p", { id: "reason" }, sentence(d.reason || ""))]),
       d.warnings.map((w) => h("p", { class: "note small" }, sentence(w))),
       clear.length ? h("div", { class: "two ranking" }, h("div", { class: "card" }, h("h2", {}, "Ranked effects"), h("p", { class: "soft small" }, "The bar is the fall of the residual on held-out records if the effect is added to the model as it stands. Falls do not add up: add one, then diagnose again."), h("ol", { class: "ranked" }, clear.map(row))), panel.node) : null,
+      curves.length ? h("div", { class: "two ranking" }, h("div", { class: "card", id: "learned" }, h("h2", {}, "Curves without a name"), curveList(curves, panel)), clear.length ? null : panel.node) : null,
       faint.length ? h("details", { class: "card" }, h("summary", {}, `Not to be told from chance, or too small (${faint.length})`), h("ol", { class: "ranked" }, faint.map((r, k) => row(r, k + clear.length)))) : null,
       d.refused && d.refused.length ? h("details", { class: "card", id: "refused" }, h("summary", {}, `Why not another? (${d.refused.length})`), h("ul", {}, d.refused.map((r) => h("li", {}, h("strong", {}, effectTitle(r.effect)), r.why.startsWith("with ") ? `: ${r.why}.` : `: it ${r.why}.`)))) : null,
       d.not_testable.length ? h("details", { class: "card" }, h("summary", {}, `Not testable with these records (${d.not_testable.length})`), h("ul", {}, d.not_testable.map((n) => h("li", {}, h("strong", {}, n.title), `: ${n.why}.`, n.asks && n.asks.length ? knownAsk(n, known) : null)))) : null,
@@ -150,6 +151,7 @@ const views = {
       !last.settled ? h("p", { class: "note", id: "first-look", role: "status" }, "First look: two steps from the diagnosis. The whole fit follows by itself …") : null,
       !last.exact ? h("p", { class: "note" }, `${sentence(state.note || "fitted and judged on a part of the samples")} `, button("Confirm on every sample", () => run("confirm"), { kind: "quiet", id: "confirm" })) : null,
       story ? h("p", { class: `note outcome ${outcomeOf(story)}`, id: "verdict" }, h("strong", {}, sentence(story.headline || story.verdict.replace(/_/g, " ")) + " "), sentence(story.reason)) : null,
+      story && story.printed ? foundCard(story) : null,
       h("div", { class: "two" }, h("figure", { class: "card", id: "staircase" }, h("figcaption", {}, "The falling staircase", h("span", {}, "dotted: ", term("noise floor"))), new ServedChart(stairs.stairs, { name: "The falling staircase" }).node),
         h("div", { class: "card" }, h("h2", {}, "In the model now"), h("ul", { class: "plain" }, inside.map((e) => h("li", {}, h("div", { class: "row between" }, effectTitle(e), button("Remove", () => run("remove", { label: e }), { kind: "quiet", label: `Remove ${effectTitle(e)}`, off: e === "transmission_compliance" && inside.includes("structural_damping") })))))),
       ),
@@ -186,6 +188,15 @@ const views = {
       h("section", { class: "card" }, h("h2", {}, "Copy as code"), h("p", { class: "soft" }, "Python that does this session again, with the same errors. Run it in the folder of the measurement files."), h("div", { class: "row" }, button("Copy", () => navigator.clipboard.writeText(code).then(() => { copied.textContent = "copied"; }, () => { copied.textContent = "not allowed; select the text instead"; }), { work: false, id: "copy" }), h("a", { class: "button", href: `${base()}/view/session.py`, download: "" }, "Download"), copied), h("pre", { tabindex: "0", "aria-label": "Python code" }, h("code", {}, code)))];
   },
 };
+
+/* The result of the whole loop: its learned curves, each drawn through the residual when it is pointed at, and every line as the terminal prints it. */
+function foundCard(story) {
+  const curves = story.learned || [], panel = curves.length ? new LawPanel(curves.map((c) => c.label), LEARNED_NOTE) : null;
+  const list = h("section", { class: "card", id: "found" }, panel ? [h("h2", {}, "Curves without a name"), curveList(curves, panel)] : h("h2", {}, "The whole loop"),
+    h("details", {}, h("summary", {}, "As irj improve prints it"), h("pre", { id: "printed", tabindex: "0", "aria-label": "As irj improve prints it" }, story.printed)));
+  return panel ? h("div", { class: "two ranking" }, list, panel.node) : list;
+}
+const curveList = (curves, panel) => h("ul", {}, curves.map((c) => h("li", { class: "points", tabindex: "0", ...pointsAt(panel, c.label) }, c.sentence.replace(` (${c.label})`, ""))));
 
 /* What no place shows: noise, or something that hangs on no measured signal. A balance over its noise is said. */
 function nowhere(found) {

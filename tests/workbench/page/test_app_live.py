@@ -1,8 +1,9 @@
-"""A file that is being written, followed on the Replay page, in Debian's Chromium."""
+"""A file that is being written and a stream, followed on the Replay page, in Debian's Chromium."""
 
 from __future__ import annotations
 
 import os
+import socket
 import threading
 import time
 from collections.abc import Iterator
@@ -47,7 +48,15 @@ def growing(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def page(root: Path, growing: Path) -> Iterator[Any]:
+def stream() -> str:
+    """An address that is free."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as found:
+        found.bind(("127.0.0.1", 0))
+        return f"udp://127.0.0.1:{found.getsockname()[1]}"
+
+
+@pytest.fixture(scope="module")
+def page(root: Path, growing: Path, stream: str) -> Iterator[Any]:
     """The demo with what it lacks, fitted."""
     import uvicorn
 
@@ -56,7 +65,7 @@ def page(root: Path, growing: Path) -> Iterator[Any]:
 
     listening = _listen(0)
     port = int(listening.getsockname()[1])
-    allow(root, [growing])
+    allow(root, [growing, stream])
     app = create_app(root, port=port)
     server = uvicorn.Server(
         uvicorn.Config(app, log_level="error", ws="none", timeout_graceful_shutdown=1)
@@ -147,6 +156,42 @@ def test_a_growing_file_is_followed_and_its_verdict_withdrawn_in_the_headline(
         page.evaluate(Path(AXE).read_text(encoding="utf-8"))
         found = page.evaluate("() => axe.run(document)")
         assert [(v["id"], n["html"][:160]) for v in found["violations"] for n in v["nodes"]] == []
+
+
+def test_a_stream_is_followed_as_a_file_is(page: Any, stream: str) -> None:
+    host, _, port = stream.removeprefix("udp://").rpartition(":")
+    head, *rows = lines()
+    page.click("#nav-replay")
+    idle(page, "replay")
+    page.select_option("#follow-file", stream)
+    page.click("#follow")
+    page.wait_for_function(
+        "() => app.state.job && app.state.job.text.startsWith('waiting for')", timeout=60_000
+    )
+    ended = threading.Event()
+
+    def send() -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            for k in range(0, len(rows), 40):
+                sender.sendto("\n".join([head, *rows[k : k + 40]]).encode(), (host, int(port)))
+                if ended.wait(0.02):
+                    return
+
+    sending = threading.Thread(target=send, daemon=True)
+    sending.start()
+    try:
+        page.wait_for_function(
+            "() => (document.querySelector('#standing') || {}).textContent"
+            "?.startsWith('No reading is doubted any more: link position, said at 9')",
+            timeout=60_000,
+        )
+    finally:
+        ended.set()
+        sending.join(10)
+    page.click("#follow-stop")
+    idle(page, "replay")
+    assert page.locator("#error").is_hidden()
+    assert "withdrawn at" in page.inner_text("#standing")
 
 
 def test_no_other_file_can_be_followed(page: Any, growing: Path) -> None:

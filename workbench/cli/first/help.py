@@ -6,8 +6,8 @@ import argparse
 import os
 import sys
 from argparse import Namespace
-from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from collections.abc import Mapping
+from typing import Final
 
 from irj_fmu.command_line import OneLineParser
 
@@ -136,20 +136,10 @@ def _coloured() -> bool:
     )
 
 
-def print_untested(items: Sequence[Any], *, verbose: bool) -> None:
-    """What these records cannot show, in one line; `verbose`: each effect with the reason."""
-    if verbose:
-        for item in items:
-            print(f"not testable: {item.effect}: {item.why}")
-    elif items:
-        print(f"not testable ({len(items)}): -v lists them with the reason")
-
-
 __all__ = [
     "EXAMPLES",
     "bash",
     "bold",
-    "print_untested",
     "run_completion",
     "welcome",
     "with_examples",

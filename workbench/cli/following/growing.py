@@ -8,10 +8,12 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Self, final
+from typing import TYPE_CHECKING, Any, Final, Protocol, Self, final
 
 import numpy as np
+import numpy.typing as npt
 
+from identification.balance.stamps import longest_hole
 from identification.data.read import read
 from identification.data.read.csv import head_of
 from identification.data.record import Record
@@ -23,6 +25,9 @@ from workbench.show.replayed import READINGS, Replay
 
 if TYPE_CHECKING:
     from identification.data.joint_file import Joint
+
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
 
 POLL: Final = 0.25
 """Time between two looks at the file [s]: a reader sees a fault no later than it can react."""
@@ -36,6 +41,15 @@ LOOKS: Final = 400
 """Looks at the course that are kept at least; twice as many are thinned to every other one."""
 LOOK: Final = 0.05
 """Time between two looks before any is thinned out [s]."""
+
+
+class Source(Protocol):
+    """What `follow` takes rows from; `path` is its name."""
+
+    path: Path
+
+    def new(self) -> Record | None:
+        """The rows that came since the last call; None where there are none."""
 
 
 @final
@@ -96,7 +110,7 @@ class Growing:
 
 
 def follow(
-    source: Growing,
+    source: Source,
     joint: Joint,
     detector_state: Callable[[Record], bytes | None] = lambda _first: None,
     *,
@@ -110,7 +124,8 @@ def follow(
 
     Parameters
     ----------
-    source : Growing
+    source : Source
+        A growing file, or a stream.
     joint : Joint
         With fitted values the sensor-fault detector runs too.
     detector_state : callable
@@ -166,31 +181,49 @@ class _Run:
         self.stepper = Stepper(estimator, max(1, round(LOOK / first.dt)))
         self.stepper.restart()
         self.rows: list[tuple[float, Any, Any, Any]] = []
-        self.last = -math.inf
+        self.step, self.last = first.dt, -math.inf
+        nothing = np.zeros(len(READINGS))
+        self.newest: tuple[FloatArray, BoolArray, float] = nothing, nothing > 0, self.last
 
     def take(self, record: Record) -> None:
         table, there = online_readings(record, self.joint)
         readings = np.array(table)
-        valid = (np.isfinite(readings) & np.array(there)).tolist()
-        rows, stepper = np.nan_to_num(readings).tolist(), self.stepper
-        detector = stepper.estimator.detector
+        valid = np.isfinite(readings) & np.array(there)
         for k, now in enumerate(record.time.tolist()):
             if not now > self.last:
                 raise InputError(
                     f"{self.name}: time goes from {self.last:.6g} to {now:.6g} s; a run that "
                     "begins anew needs a file of its own"
                 )
-            self.last = now
-            looked = stepper.feed(now, rows[k], valid[k])
-            if not self.rows and not looked:  # times count from the first sample
-                stepper.looks.append((0, [0.0] * len(READINGS)))
-            elif not looked:
-                continue
-            replaced = detector.replaced if detector is not None else (False,) * len(READINGS)
-            used = stepper.estimator.readings if detector is not None else rows[k]
-            self.rows.append((now, readings[k], np.array(used), np.array(replaced)))
+            self._bridge(now, readings[k], valid[k])
+            self._feed(now, readings[k], valid[k])
         while len(self.rows) > 2 * LOOKS and len(self.rows) % 2:
             self._thin()
+
+    def _bridge(self, now: float, row: FloatArray, there: BoolArray) -> None:
+        """What the check of a whole record does at lost samples: a short hole is bridged, behind a
+        long one the estimator starts anew.
+        """
+        lost = round((now - self.last) / self.step) - 1 if math.isfinite(self.last) else 0
+        if lost > longest_hole(self.step):
+            self.stepper.restart()
+            return
+        before, seen, since = self.newest
+        for k in range(1, lost + 1):
+            part = k / (lost + 1)
+            self._feed(since + part * (now - since), before + part * (row - before), seen & there)
+
+    def _feed(self, now: float, row: FloatArray, there: BoolArray) -> None:
+        stepper, detector = self.stepper, self.stepper.estimator.detector
+        self.last, self.newest = now, (row, there, now)
+        looked = stepper.feed(now, np.nan_to_num(row).tolist(), there.tolist())
+        if not self.rows and not looked:  # times count from the first sample
+            stepper.looks.append((0, [0.0] * len(READINGS)))
+        elif not looked:
+            return
+        replaced = detector.replaced if detector is not None else (False,) * len(READINGS)
+        used = stepper.estimator.readings if detector is not None else row
+        self.rows.append((now, row, np.array(used), np.array(replaced)))
 
     def _thin(self) -> None:
         """The first look and every other one after it, with the larger score of the two."""
@@ -235,4 +268,4 @@ class _Run:
         )
 
 
-__all__ = ["Growing", "follow"]
+__all__ = ["Growing", "Source", "follow"]

@@ -11,8 +11,6 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from casadi_models import JointModel
-from identification.balance.balances import balances_of
 from identification.balance.dataset import without
 from identification.data.channels import DECLARED
 from identification.data.plain_text import from_json
@@ -20,9 +18,11 @@ from identification.data.record import Record
 from identification.diagnosis.places import Place, place, places_of
 from identification.errors import InputError
 from identification.fitting.assess import relative_error_percent
-from identification.fitting.engine import references, stack
+from identification.fitting.engine import references
 from workbench.page.analysis import Analysis
 from workbench.page.charts.choices import limits_of, within
+from workbench.page.charts.learned import curve_chart, shown_residual
+from workbench.page.desk.curves import learned_of
 from workbench.page.jobs.place import hint_for
 from workbench.page.live import Live
 from workbench.page.records import plot_time
@@ -131,31 +131,43 @@ def _told(
 
 def _shown(analysis: Analysis, step: StepEntry) -> dict[str, FloatArray]:
     made = analysis.solution_of(step)
-    return _residual(analysis, made.model, made.values)
-
-
-def _residual(
-    analysis: Analysis, model: JointModel, values: Mapping[str, float]
-) -> dict[str, FloatArray]:
-    """Residual on the held-out rows; NaN where a record takes no part."""
-    balances = balances_of(model, analysis.data.sensing, wrt=())
-    return stack(balances, analysis.data.held_out, values).shown
+    return shown_residual(analysis, made.model, made.values)
 
 
 # --- laws through the residual --------------------------------------------------------------------
 
 
+def _is_stale(live: Live, query: Query) -> bool:
+    """Whether a page asks about a step that it has not heard the end of yet: no error, the answer
+    is not wanted any more.
+    """
+    asked = str(query.get("step", ""))
+    return bool(asked) and asked not in {s.id for s in live.state.steps[-1:]}
+
+
 def _law(live: Live, query: Query) -> dict[str, Any]:
-    """A candidate's law drawn through the residual of the model as it stands."""
+    """A candidate's law, or a learned curve, drawn through the residual of the model as it
+    stands.
+    """
+    if _is_stale(live, query):
+        return {"stale": True}
     label, analysis = str(query.get("label", "")), live.analysis()
     mark = (label, len(live.state.steps), live.state.steps[-1].label if live.state.steps else "")
     kept = live.kept.get(f"law {label}")
     if kept is not None and kept[0] == (mark, id(analysis.current)):
         found: dict[str, Any] = kept[1]
         return found
-    before = _residual(analysis, analysis.current.model, analysis.current.values)
+    for story in (live.state.improvement, live.state.diagnosis):
+        curve = learned_of(story, label)
+        if story is not None and curve is not None:
+            chart = curve_chart(analysis, story, curve)
+            found = {"label": label, "title": title_of(label), "balance": curve["balance"]}
+            found |= {"chart": chart}
+            live.kept[f"law {label}"] = ((mark, id(analysis.current)), found)
+            return found
+    before = shown_residual(analysis, analysis.current.model, analysis.current.values)
     made = analysis.with_candidate(label, hint_for(live.state, label))
-    after = _residual(analysis, made.model, made.values)
+    after = shown_residual(analysis, made.model, made.values)
     row = hint_for(live.state, label)
     balance = str(row["balance"]) if row else max(before, key=lambda b: float(np.nanstd(before[b])))
     step = step_place(analysis.rows, label, balance, before, after)
@@ -175,7 +187,7 @@ def _as_such(live: Live, query: Query) -> list[dict[str, Any]]:
     """
     analysis = live.analysis()
     now, rows = analysis.current, analysis.rows
-    residual = _residual(analysis, now.model, now.values)
+    residual = shown_residual(analysis, now.model, now.values)
     out: list[dict[str, Any]] = []
 
     def put(title: str, quantity: str, measured: Place, model: Place) -> None:
@@ -247,8 +259,8 @@ def _own(analysis: Analysis, belongs: Callable[[Any], bool], balance: str) -> Fl
             continue  # another law needs it
     if model is now.model or len(model.terms) == len(now.model.terms):
         return None
-    bare = _residual(analysis, model, now.values)[balance]
-    own: FloatArray = bare - _residual(analysis, now.model, now.values)[balance]
+    bare = shown_residual(analysis, model, now.values)[balance]
+    own: FloatArray = bare - shown_residual(analysis, now.model, now.values)[balance]
     return own if float(np.nanmax(np.abs(own), initial=0.0)) > 0 else None
 
 
@@ -363,6 +375,8 @@ def _runs(record: Record, channel: str, name: str, style: Style) -> list[Curve]:
 
 def _what_if(live: Live, query: Query) -> dict[str, Any]:
     """Held-out error and residual with other values of the parameters; nothing is changed."""
+    if _is_stale(live, query):
+        return {"stale": True}
     analysis = live.analysis()
     now = analysis.current
     given = from_json(str(query.get("values", "{}")).encode(), "the values")
@@ -382,7 +396,7 @@ def _what_if(live: Live, query: Query) -> dict[str, Any]:
     values = {**now.values, **moved}
     data = analysis.data
     error = relative_error_percent(now.model, data, data.held_out, values)
-    residual = _residual(analysis, now.model, values)
+    residual = shown_residual(analysis, now.model, values)
     charts = []
     for was, balance in _watched(live, analysis, residual, tuple(sorted(moved))):
         rows = analysis.rows
@@ -402,7 +416,7 @@ def _watched(
     if kept is not None and kept[0] == mark:
         found: list[tuple[Place, str]] = kept[1]
         return found
-    fitted = _residual(analysis, analysis.current.model, analysis.current.values)
+    fitted = shown_residual(analysis, analysis.current.model, analysis.current.values)
     found = []
     for balance in _moved(fitted, residual)[:MOVING_PLACES]:
         best = places_of({balance: residual[balance]}, analysis.rows)[0]

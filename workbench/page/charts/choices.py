@@ -47,7 +47,8 @@ def held_text(live: Live, held: Any) -> str:
         raise InputError("hold: say which parameter at which value")
     text = live.analysis().to_joint_file() if live.state.steps else live.state.joint_text
     data = from_toml(text, "joint")
-    as_typed = from_toml(live.state.joint_text, "joint").get("known", {})
+    typed = from_toml(live.state.joint_text, "joint")
+    as_typed = typed.get("known", {})
     known = {**data.get("known", {}), **as_typed}  # with the units and sources they were given in
     limits = limits_of(live)
     for name, value in held.items():
@@ -57,7 +58,8 @@ def held_text(live: Live, held: Any) -> str:
                 known[name] = entry
         elif value is not None:
             known[name] = within(name, _number(name, value), limits)
-    made = {k: v for k, v in data.items() if k in GIVEN and k != "known"}
+    confirmed = {"columns"} - set(typed)  # the map of the records stays with them
+    made = {k: v for k, v in data.items() if k in GIVEN and k not in {"known", *confirmed}}
     return tables_text(made | ({"known": known} if known else {}))
 
 

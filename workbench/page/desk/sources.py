@@ -1,5 +1,5 @@
-"""Files that are being written, which a page may follow: those that were named where the server was
-started, and no other, since whoever reaches the page could otherwise read any file.
+"""Files that are being written and streams, which a page may follow: those that were named where
+the server was started, and no other, since whoever reaches the page could otherwise read any file.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from identification.errors import InputError
+from workbench.cli.following.datagrams import SCHEME
 from workbench.page.session import write_atomic
 
 FILE: Final = "follow.json"
@@ -18,7 +19,7 @@ STOP: Final = "follow.stop"
 
 def allow(root: Path, paths: Sequence[str | Path]) -> None:
     """Let the sessions under a root follow these files, and no others any more."""
-    names = [str(Path(p).absolute()) for p in paths]
+    names = [str(p) if _is_stream(p) else str(Path(p).absolute()) for p in paths]
     write_atomic(root / FILE, json.dumps(names).encode())
 
 
@@ -31,7 +32,12 @@ def allowed(root: Path) -> list[str]:
     return [str(p) for p in found] if isinstance(found, list) else []
 
 
-def source_of(root: Path, name: str) -> Path:
+def _is_stream(path: str | Path) -> bool:
+    """Whether it is the address of a stream and no file."""
+    return isinstance(path, str) and path.startswith(SCHEME)
+
+
+def source_of(root: Path, name: str) -> str:
     """One of them by its name.
 
     Raises
@@ -45,7 +51,7 @@ def source_of(root: Path, name: str) -> Path:
             "follow: this file was not named when the page was started; start it with "
             "irj app --follow FILE"
         )
-    return Path(found)
+    return found
 
 
 def ask_stop(exports: Path) -> None:

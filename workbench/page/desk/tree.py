@@ -105,7 +105,8 @@ def put_away(before: State, after: State | None = None) -> State:
     path = (*before.steps, *before.undone)
     others = tuple(b for b in after.branches if b.id != before.branch)
     covered = any(
-        given(b) == given(before) and _begins(path, (*b.steps, *b.undone)) for b in others
+        given(b) == given(before) and _stands_in(before, path, (*b.steps, *b.undone))
+        for b in others
     )
     if not path or covered:
         return after
@@ -371,6 +372,15 @@ def _taken(state: State, branch: Branch) -> State:
     return replace(
         state, branches=others, branch=branch.id, parent=branch.parent, ahead="", **shared
     )
+
+
+def _stands_in(state: State, path: tuple[StepEntry, ...], longer: tuple[StepEntry, ...]) -> bool:
+    """Whether another path begins with all of this one: an equal fit that was made twice counts
+    once, but not where something was noted or found at the one that would go.
+    """
+    kept = {*state.remarks, *state.found}
+    same_id = {a.id for a, b in zip(path, longer, strict=False) if a.id == b.id}
+    return _begins(path, longer) and not any(a.id in kept - same_id for a in path)
 
 
 def _begins(path: tuple[StepEntry, ...], longer: tuple[StepEntry, ...]) -> bool:

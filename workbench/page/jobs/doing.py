@@ -18,9 +18,10 @@ from workbench.page import export as app_export
 from workbench.page.analysis import Progress, clean
 from workbench.page.desk import law as app_law
 from workbench.page.desk import tree
+from workbench.page.desk.curves import kept_curves
 from workbench.page.jobs.place import Change, Place, folder_of, hint_for
 from workbench.page.session import State, StepEntry
-from workbench.show.words import headline
+from workbench.show.words import headline, printed
 
 Body = Mapping[str, Any]
 
@@ -83,10 +84,19 @@ def improve(place: Place, body: Body, progress: Progress) -> Change:
     analysis = place.analysis()
     train, held = analysis.quick
     result = whole_loop(train, analysis.joint, held, progress=progress)
+    result = replace(
+        result, data=replace(result.data, note=analysis.note)
+    )  # the loop was given both
     steps = ledger(result, exact=analysis.whole)
     analysis.restore(steps[-1])
     story = clean(result.as_json())
-    story["headline"] = headline(story)
+    story |= {
+        "headline": headline(story),
+        "printed": printed(result),
+        "joint_text": result.to_joint_file(),
+        "exact": analysis.whole,
+        **clean(kept_curves(result)),
+    }
     return partial(_improved, steps, analysis.note, story)
 
 

@@ -6,6 +6,7 @@ import contextlib
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -68,7 +69,7 @@ class Place:
             self._records.clear()
         self.state = state
         if self._analysis is not None:
-            self._analysis.joint = joint_of(state)
+            self._analysis.joint = described(state)
         self.fitted_elsewhere(fitted)
 
     def fitted_elsewhere(self, fitted: Fitted | None) -> None:
@@ -193,7 +194,7 @@ class Place:
         used = [(f.role, without_windows(self.record(f.id), f.left_out)) for f in ready]
         train = [r for role, r in used if role == "train"]
         held = [r for role, r in used if role == "held_out"]
-        return Analysis(joint_of(state), train, held)
+        return Analysis(described(state), train, held)
 
 
 def joint_of(state: State) -> Joint:
@@ -212,6 +213,26 @@ def joint_of(state: State) -> Joint:
     return parse_joint(from_toml(state.joint_text, source), source)
 
 
+def confirmed_map(state: State) -> Mapping[str, Any] | None:
+    """The column map of the records, where one was confirmed for all of them."""
+    ready = [f for f in state.files if f.status == "ready"]
+    columns = ready[0].columns if ready else None
+    return columns if columns and all(f.columns == columns for f in ready) else None
+
+
+def described(state: State) -> Joint:
+    """The joint of a state as it is taken home: with the column map that was confirmed for its
+    records, so that the command line reads them with it.
+
+    Raises
+    ------
+    InputError
+        No joint yet, or not a valid one.
+    """
+    joint = joint_of(state)
+    return joint if joint.columns else replace(joint, columns=confirmed_map(state))
+
+
 def hint_for(state: State, label: str) -> Mapping[str, Any] | None:
     """Start values of a candidate from the diagnosis on disk."""
     rows = (state.diagnosis or {}).get("ranking", [])
@@ -226,4 +247,12 @@ def folder_of(place: Place) -> Path:
     return made
 
 
-__all__ = ["Change", "Place", "folder_of", "hint_for", "joint_of"]
+__all__ = [
+    "Change",
+    "Place",
+    "confirmed_map",
+    "described",
+    "folder_of",
+    "hint_for",
+    "joint_of",
+]

@@ -1,0 +1,161 @@
+"""A record that comes over the network, line by line in datagrams, for the online estimator."""
+
+from __future__ import annotations
+
+import shutil
+import socket
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Self, final
+from urllib.parse import urlsplit
+
+import numpy as np
+
+from identification.data.read import read
+from identification.data.record import Record
+from identification.errors import InputError
+from workbench.cli.following.growing import FIRST_ROWS, Growing
+
+if TYPE_CHECKING:
+    from identification.data.joint_file import Joint
+
+SCHEME: Final = "udp://"
+LARGEST: Final = 65_535
+"""Bytes of a datagram at most, as the protocol has it."""
+WAITING: Final = 1 << 22
+"""Bytes that may wait between two looks: 0.25 s of 10 kHz with 100 bytes a row are 250 kB, a decade
+is left."""
+HEAD: Final = 20
+"""Lines before the first row of numbers that are kept at most: names and units are two, loggers
+write some more."""
+
+
+@final
+class Datagrams:
+    """The rows of a table that another program sends by UDP, each once.
+
+    A datagram holds whole lines as a CSV file has them. A line without a number at its begin
+    belongs to the head: names of the columns, and units. The head may come again at any time, so
+    that a receiver can start late; rows before the first one are left out. Of datagrams that
+    overtake one another the late ones are left out, too.
+
+    Parameters
+    ----------
+    address : str
+        ``udp://HOST:PORT``, of this machine: what comes there is taken from any sender.
+    joint : Joint
+        Column map and kind of the axis.
+
+    Raises
+    ------
+    InputError
+        No such address, or it is in use.
+    """
+
+    def __init__(self, address: str, joint: Joint) -> None:
+        self.path, self.joint = Path(address.removeprefix(SCHEME)), joint
+        self.late = 0
+        self._head: list[bytes] = []
+        self._rows: list[bytes] = []
+        self._in_head, self._last = False, -np.inf
+        self._socket = _bound(address)
+        self._folder = Path(tempfile.mkdtemp(prefix="irj-"))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._socket.close()
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    @property
+    def port(self) -> int:
+        """Where it listens: the system's choice where 0 was asked for."""
+        return int(self._socket.getsockname()[1])
+
+    def new(self) -> Record | None:
+        """The rows that came since the last call; None where there are none, or too few to begin
+        with.
+
+        Raises
+        ------
+        InputError
+            Rows that cannot be used.
+        """
+        while True:
+            try:
+                came = self._socket.recv(LARGEST)
+            except BlockingIOError:
+                break
+            for line in came.splitlines():
+                self._take(line.strip())
+        first = not np.isfinite(self._last)
+        if not self._rows or (first and len(self._rows) < FIRST_ROWS):
+            return None
+        part = self._folder / "part.csv"
+        part.write_bytes(b"\n".join([*self._head, *self._rows, b""]))
+        self._rows = []
+        try:
+            made = read(part, columns=self.joint.columns, kind=self.joint.kind, name="stream")
+        except InputError as error:
+            raise InputError(str(error).replace(str(part), f"{SCHEME}{self.path}")) from None
+        newest = np.maximum.accumulate(np.concatenate([[self._last], made.time]))
+        in_order = made.time > newest[:-1]
+        self.late += int(np.count_nonzero(~in_order))
+        self._last = float(newest[-1])
+        return made.take(in_order) if in_order.any() else None
+
+    def _take(self, line: bytes) -> None:
+        if not line:
+            return
+        if not _is_row(line):
+            if not self._in_head:
+                self._head, self._in_head = [], True
+            if len(self._head) < HEAD:
+                self._head.append(line)
+        else:
+            self._in_head = False
+            if self._head:
+                self._rows.append(line)
+
+
+def _is_row(line: bytes) -> bool:
+    """Whether a line begins with a number, whatever stands between its cells."""
+    first = line.replace(b";", b"\t").replace(b",", b"\t").split(None, 1)[0]
+    try:
+        float(first)
+    except ValueError:
+        return False
+    return True
+
+
+def _bound(address: str) -> socket.socket:
+    asked = urlsplit(address)
+    try:
+        host, port = asked.hostname, asked.port
+    except ValueError:
+        host, port = None, None
+    if host is None or port is None or asked.path not in ("", "/"):
+        raise InputError(
+            f"{address}: give the address as {SCHEME}HOST:PORT, as {SCHEME}0.0.0.0:9870"
+        )
+    made = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, WAITING)
+        made.bind((host, port))
+    except OSError as error:
+        made.close()
+        raise InputError(
+            f"{address}: cannot listen there ({error.strerror}); take an address of this machine "
+            "and a port that is free"
+        ) from None
+    made.setblocking(False)
+    return made
+
+
+def source(name: str, joint: Joint) -> Growing | Datagrams:
+    """What is followed: a file that is being written, or a stream by its address."""
+    return Datagrams(name, joint) if name.startswith(SCHEME) else Growing(Path(name), joint)
+
+
+__all__ = ["SCHEME", "Datagrams", "source"]
