@@ -71,6 +71,10 @@ FAST: Final = 0.99
 """Quantile of the speeds that is the speed of a record."""
 FEW: Final = 0.1
 """Share of such rows below which a motion turns all the time: then its turns tell the clocks."""
+ANSWERS: Final = 0.5
+"""Share of a shift by which the lateness must be less after it. Where less is, more than half of
+what the rate of a reading moves is its noise, and what was read is none of a clock.
+"""
 STRETCHES: Final = 8
 """Stretches of a record whose slopes are compared."""
 
@@ -179,15 +183,17 @@ def in_time(
             break
         shifts = {p: k for p, k in moved.items() if k}
         made = make(shifts)
-    for place in LOW_PASSED & shifts.keys():
-        if abs(shifts[place]) > MOST_SKEW:
-            continue  # what is later is no filter of a drive
+    for place in sorted(shifts):
         # a shift of zero keeps the rows: what is compared are the same instants
         unshifted = {**shifts, place: 0.0}
-        other = make(unshifted)
-        late = shifts[place] * made.grid.dt
-        louder = noise(made, place, late) - noise(made, place, 0.0)
-        if _leaves_less(other, made, place, louder, torque=torque):
+        other, late = make(unshifted), shifts[place] * made.grid.dt
+        found = [lateness(x, place, torque=torque)[0] for x in (other, made)]
+        taken = (found[0] - found[1]) / late > ANSWERS
+        # what is later than that is no filter of a drive
+        if taken and place in LOW_PASSED and abs(shifts[place]) <= MOST_SKEW:
+            louder = noise(made, place, late) - noise(made, place, 0.0)
+            taken = not _leaves_less(other, made, place, louder, torque=torque)
+        if not taken:
             shifts, made = unshifted, other
     return made
 
@@ -203,7 +209,8 @@ def _leaves_less(
     order. A shift of the latter leaves half the square of the lateness times the second derivative.
 
     Rows that neither meets, as those of slow motion whose friction is not the law's, say nothing:
-    the sum of squares that is compared is Tukey's, bounded.
+    the sum of squares that is compared is Tukey's, bounded. So those in which the joint creeps may
+    stay: what changes fast there tells the two apart best.
     """
     kept = one_way(one)
     friction = any_curve(one, "motor_velocity", kept)
@@ -234,17 +241,28 @@ def _parts(
             through = scaled(np.column_stack([*motion_of(a, "motor"), column]))
             motion = [through @ np.linalg.lstsq(through, x, rcond=None)[0] for x in motion]
         return a["torque"], motion, column
-    load = [a["torque"]] if torque else []
+    # unlike the motor's by the wind-up of the transmission, whose rates look like a lateness
+    load = [a["torque"]] if torque else [x for n, x in a.items() if n == "link_acceleration"]
     return a["drive"], [*motion_of(a, "motor"), *load], -a["drive_rate"]
 
 
 def one_way(record: WeakRecord) -> npt.NDArray[np.bool_]:
-    """Rows within which the joint neither turns nor creeps, shape (rows,): where dry friction turns
-    it has a rate that no lateness explains. All rows where hardly any is such a row.
+    """Rows within which the joint does not turn, shape (rows,): where dry friction turns it has a
+    rate that no lateness explains. All rows where hardly any is such a row.
     """
-    speed = np.abs(record.points["motor_velocity"])
-    creeps = speed < CREEP * np.quantile(speed, FAST)
-    way = np.where(creeps, 0.0, np.sign(record.points["motor_velocity"]))
+    return _within(record, np.sign(record.points["motor_velocity"]))
+
+
+def steady(record: WeakRecord) -> npt.NDArray[np.bool_]:
+    """Rows within which the joint neither turns nor creeps, shape (rows,): what is no law of the
+    model yet has its rates in a Stribeck curve, too. All rows where hardly any is such a row.
+    """
+    v = record.points["motor_velocity"]
+    creeps = np.abs(v) < CREEP * np.quantile(np.abs(v), FAST)
+    return _within(record, np.where(creeps, 0.0, np.sign(v)))
+
+
+def _within(record: WeakRecord, way: FloatArray) -> npt.NDArray[np.bool_]:
     same = np.abs(record.average(way)) > 1 - ONE_WAY
     return np.asarray(same if np.mean(same) > FEW else np.ones(record.rows, dtype=np.bool_))
 
@@ -263,7 +281,7 @@ def lateness(made: WeakRecord, place: str, *, torque: bool) -> tuple[float, floa
     large for it. Read through the motion of the motor (two-stage least squares) it is not, but
     known less well; so that is taken where the two are certainly unlike (Hausman 1978).
     """
-    kept = one_way(made)
+    kept = steady(made)
     a = {n: x[kept] for n, x in made.averaged.items()}
     if place not in ENCODERS:
         late, error = _slope(*_parts(made, place, kept, torque=torque))
@@ -327,4 +345,5 @@ __all__ = [
     "one_way",
     "places_of",
     "shifted",
+    "steady",
 ]

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from casadi_models import EFFECTS
 from identification.balance.balances import balances_of
+from identification.balance.calibration import usual
 from identification.balance.dataset import Dataset
 from identification.balance.stacked import (
     INDEPENDENT_SHARE,
@@ -161,13 +162,16 @@ class Contest:
             for rival, weight in zip(self.rivals, entitled, strict=True)
         ]
         self._taking = {b: taking_part(b, data.train) for b in names}
-        costs = [_cost(r, self._taking) for r in left]
+        unlikely = [_unlikely(rival, data) for rival in self.rivals]
+        known = [x / INDEPENDENT_SHARE for x in unlikely]
+        costs = [_cost(r, self._taking) + x for r, x in zip(left, known, strict=True)]
         best = int(np.argmin(costs))
         for k, rival in enumerate(self.rivals):  # none may be ahead where the two are compared
             counted = dict(zip(names, self._calm(self.rivals[best], rival), strict=True))
-            if _cost(left[k], counted) < _cost(left[best], counted):
+            if _cost(left[k], counted) + known[k] < _cost(left[best], counted) + known[best]:
                 best = k
         self.leader = self.rivals[best]
+        self._unlikely = np.array(unlikely)
         own = entitled[best]
         self._old = [
             self._rows(
@@ -210,8 +214,10 @@ class Contest:
 
     @cached_property
     def likelihood(self) -> FloatArray:
-        """Log-likelihood of each rival on the old records, (rivals,) [nats]."""
-        return np.array([-0.5 * INDEPENDENT_SHARE * float(r @ r) for r, _, _ in self._old])
+        """Log-likelihood of each rival on the old records, beside what its clocks and zeros are
+        worth beforehand, (rivals,) [nats]."""
+        rows = np.array([-0.5 * INDEPENDENT_SHARE * float(r @ r) for r, _, _ in self._old])
+        return rows - self._unlikely
 
     @cached_property
     def ahead(self) -> FloatArray:
@@ -220,7 +226,8 @@ class Contest:
 
         Rows at a turn count only where one of the two laws says what happens there.
         """
-        best, _, block = self._old[self.rivals.index(self.leader)]
+        leader = self.rivals.index(self.leader)
+        best, _, block = self._old[leader]
         out = np.zeros((len(self.rivals), 2))
         for k, (rival, (own, _, _)) in enumerate(zip(self.rivals, self._old, strict=True)):
             counted = np.concatenate(self._calm(self.leader, rival))
@@ -231,7 +238,8 @@ class Contest:
             mean = float(difference.sum()) / spread if spread > 0 else 0.0
             # one block may hold most of a difference that all of them show
             signs = float(np.sign(difference).sum()) / math.sqrt(count)
-            out[k] = difference.sum(), max(mean, signs)
+            beforehand = float(self._unlikely[k] - self._unlikely[leader])
+            out[k] = difference.sum() + beforehand, max(mean, signs)
         return out
 
     def alive(self, unmodelled: float = 0.0) -> tuple[Rival, ...]:
@@ -256,13 +264,16 @@ class Contest:
 
         Odds of the likelihoods with the price of each free parameter as in Bayes' criterion; before
         the records all are equally likely. Likelihoods are tempered so that what is `unmodelled`
-        [nats] is no more than `FEWEST`.
+        [nats] is no more than `FEWEST`, and each by its own scatter over blocks: a normal value
+        that is z deviates from zero has a likelihood of 2 z^2 [nats] over the same with the other
+        sign, and one block of a record that no law meets is no certainty.
         """
         tempering = max(1.0, unmodelled / FEWEST)
         rows = np.count_nonzero(self._old[0][2] >= 0) / len(self.data.sensing.balances)
         price = 0.5 * math.log(max(INDEPENDENT_SHARE * rows / tempering, 1.0))
         count = np.array([len(r.solution.free) for r in self.rivals])
-        log = -self.ahead[:, 0] / tempering - price * count
+        nats, deviate = self.ahead.T
+        log = -np.minimum(nats / tempering, 2 * np.maximum(deviate, 0.0) ** 2) - price * count
         odds = np.exp(log - log.max())
         return np.asarray(odds / odds.sum())
 
@@ -344,6 +355,15 @@ def _left(rival: Rival, data: Dataset) -> Mapping[str, FloatArray]:
     """Residual of each balance on the old records."""
     balances = balances_of(rival.solution.model, data.sensing, wrt=())
     return stack(balances, data.train, rival.solution.values).residual
+
+
+def _unlikely(rival: Rival, data: Dataset) -> float:
+    """What the clocks and zeros of a rival cost by what is known of them before the rows are asked
+    [nats]: a name that needs a skew of three samples is not ahead by what the skew takes off.
+    """
+    values = rival.solution.values
+    known = usual(rival.solution.model, data.train, torque=data.sensing.has_torque)
+    return 0.5 * sum(((values[n] - m) / s) ** 2 for n, (m, s) in known.items() if n in values)
 
 
 def _cost(

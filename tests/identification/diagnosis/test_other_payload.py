@@ -101,19 +101,24 @@ tell the gain from a torque of the position.
 
 GAINS = {"motor_constant_error", "torque_sensor_gain"}
 """Either scales one torque against the other; friction and inertia alone tell which."""
+OF_POSITION = {"cyclic_torque"}
+"""What slow motions about one place hardly tell from a gain: one block in 27 does, the first."""
 FAST = ((0.11, 0.29, 0.63), (0.5, 0.22, 0.08), 0.0)
 
 
-def test_a_set_on_loaded_records_and_the_gain_after_an_unloaded_run() -> None:
+@pytest.mark.parametrize("seed", [1, 10, 13])
+def test_a_set_on_loaded_records_and_the_gain_after_an_unloaded_run(seed: int) -> None:
     slow = ((0.07, 0.11), (0.15, 0.10), 0.8)
     loaded, held = (
-        record("loaded", 1, True, *slow, NOISY),
-        record("held out", 2, True, *slow, NOISY),
+        record("loaded", seed, True, *slow, NOISY),
+        record("held out", seed + 1, True, *slow, NOISY),
     )
     alone = improve(loaded, JOINT, [held])
-    assert set(alone.claims[0].effects) == GAINS
+    assert set(alone.claims[0].effects) >= GAINS
+    assert set(alone.claims[0].effects) <= GAINS | OF_POSITION
+    assert alone.claims[0].confidence["motor_constant_error"] > 0.1
     assert "without payload" in (alone.claims[0].separate_by or "")
-    unloaded = replace(record("unloaded", 3, False, *FAST, NOISY), payload="none")
+    unloaded = replace(record("unloaded", seed + 2, False, *FAST, NOISY), payload="none")
     both = improve([loaded, unloaded], JOINT, [held])
     assert len(both.claims) == 1
     assert "motor_constant_error" in both.claims[0].effects
