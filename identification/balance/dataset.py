@@ -21,7 +21,7 @@ from identification.balance.noise import noise_of
 from identification.balance.sensing import Sensing, adapt, check_alike, sense, signals_of
 from identification.balance.slow_noise import SlowNoise, slow_noise_of
 from identification.balance.spikes import without_spikes
-from identification.balance.stamps import evened
+from identification.balance.stamps import bridge_errors, evened
 from identification.balance.weak import (
     CLAIM_KERNEL,
     KERNEL_SAMPLES,
@@ -365,6 +365,11 @@ def weak_record(
                 record.measured.astype(float),
                 differentiated_kernel(made.grid.length, made.grid.dt, 0),
             ),
+            bridging={
+                c: bridge_errors(signals[c], record.measured, segments, _loudness(own))
+                for c, own in noise.items()
+                if c in signals
+            },
         )
     if made.rows < 8:
         raise InputError(

@@ -105,6 +105,7 @@ def excerpt(record: WeakRecord) -> tuple[WeakRecord, IntArray]:
     found_rows: list[IntArray] = []
     points: list[IntArray] = []
     segments: list[slice] = []
+    samples_of: list[IntArray] = []
     first_row = first_point = 0
     for s in grid.segments:
         count = len(range(grid.half, s.stop - s.start - grid.half, grid.stride))
@@ -113,6 +114,7 @@ def excerpt(record: WeakRecord) -> tuple[WeakRecord, IntArray]:
             begin = segments[-1].stop if segments else 0
             samples = 2 * grid.half + (taken - 1) * grid.stride + 1
             segments.append(slice(begin, begin + samples))
+            samples_of.append(s.start + row * grid.stride + np.arange(samples))
             found_rows.append(first_row + row + np.arange(taken))
             at = first_point + row * grid.stride // grid.step
             points.append(at + np.arange(len(range(0, samples, grid.step))))
@@ -137,6 +139,7 @@ def excerpt(record: WeakRecord) -> tuple[WeakRecord, IntArray]:
         rest=of(record.rest, which),
         between=of(record.between, which),
         support=None if record.support is None else record.support[which],
+        bridging=of(record.bridging, np.concatenate(samples_of)),
     )
     return pieces, which
 
@@ -150,6 +153,9 @@ def _drawn(
         c for c in POSITION_CHAINS if c in noise and noise[c].level > 0 and c in record.points
     ]
     drawn = {c: noise[c].draw(rng, count, grid.dt) for c in present}
+    for c in present:
+        if c in record.bridging:  # what bridges are off by, after the noise: its draws stay
+            drawn[c] = drawn[c] + record.bridging[c][:count] * rng.standard_normal(count)
     averaged, points, smooth, curved = filtered(grid, drawn, curved=bool(record.curved))
     also = paired(grid, {c: drawn.get(c, np.zeros(count)) for c in record.paired})
     calm = replace(record, points={**record.points, **record.smooth})

@@ -69,6 +69,12 @@ SAMPLES: Final = 6
 """Samples, half on either side, whose cubic bridges a hole: two more than a cubic has unknowns,
 so that noise does not swing it.
 """
+BESIDE: Final = 3
+"""Samples on either side of a lost one that are bridged as it was, to see by how much that errs: as
+far as the samples of its own cubic reach."""
+TOLD: Final = 3.0
+"""Square of such errors over that of noise from which they are more than noise: the mean of five
+squares of normal values is so large one time in a hundred."""
 _LAGS: Final = (4, 16, 64, 256, 1024)
 _SLOW: Final = ("run", "temperature")
 
@@ -541,6 +547,52 @@ def bridged(
         )
     if open_.size:
         out[open_] = _cubic(time, table, grid[open_])
+    return out
+
+
+def bridge_errors(
+    values: FloatArray, measured: BoolArray, segments: tuple[slice, ...], level: float
+) -> FloatArray:
+    """Standard deviation by which bridged samples may be off beside the noise of a reading, (n,);
+    0 for measured ones.
+
+    A cubic rounds a corner off. Samples beside a lost one that are there are bridged as it was,
+    from samples as far away, and what that is off by is held against their noise.
+
+    Parameters
+    ----------
+    values : (n,) array
+        A signal on an even grid, lost samples bridged.
+    measured : (n,) bool array
+        False for those.
+    segments : tuple of slice
+        Contiguous stretches.
+    level : float
+        Noise of a reading.
+    """
+    out = np.zeros(len(values))
+    for part in segments:
+        x, there = values[part], np.flatnonzero(measured[part])
+        lost = np.flatnonzero(~measured[part])
+        if not lost.size or len(there) < SAMPLES:
+            continue
+        first = np.clip(np.searchsorted(there, lost) - SAMPLES // 2, 0, len(there) - SAMPLES)
+        apart = there[first[:, None] + np.arange(SAMPLES)] - lost[:, None]
+        width = np.abs(apart).max(axis=1, keepdims=True)
+        basis = (apart / width)[:, :, None] ** np.arange(4)
+        weights = np.linalg.pinv(basis)[:, 0]  # of the samples in the cubic at the lost one
+        power, count = np.zeros(len(lost)), np.zeros(len(lost))
+        for step in (k for k in range(-BESIDE, BESIDE + 1) if k):
+            at = lost + step
+            far = at[:, None] + apart
+            good = (far.min(axis=1) >= 0) & (far.max(axis=1) < len(x)) & (at >= 0) & (at < len(x))
+            good[good] &= measured[part][at[good]]
+            error = x[at[good]] - np.sum(weights[good] * x[far[good]], axis=1)
+            power[good] += error**2
+            count[good] += 1
+        noise = level**2 * (1 + np.sum(weights**2, axis=1))
+        mean = power / np.maximum(count, 1)
+        out[part][lost] = np.sqrt(np.where(mean > TOLD * noise, mean - noise, 0.0))
     return out
 
 

@@ -267,6 +267,9 @@ class WeakRecord:
         samples between them, halved.
     support : (rows,) array, optional
         Share of each row's kernel that was measured and not bridged; 1 everywhere where it is None.
+    bridging : mapping of str to (samples,) array
+        Standard deviation by which bridged samples of a signal may be off beside its noise, where
+        some are.
     name : str
         Tells the record from all others: its calibration unknowns go by it.
     shifts : mapping of str to float
@@ -289,6 +292,7 @@ class WeakRecord:
     name: str = ""
     shifts: Mapping[str, float] = field(default_factory=dict)
     paired: Mapping[str, FloatArray] = field(default_factory=dict)
+    bridging: Mapping[str, FloatArray] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return one_line(self)

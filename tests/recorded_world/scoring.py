@@ -163,7 +163,9 @@ def score(truth: Mapping[str, Any], result: Json) -> Answer:
     elif outside:
         good = verdict == "unexplained" or learned or bool(found)
     else:
-        good = verdict in {"complete"} | left and set(hidden) <= found
+        # a delay that was taken off as a clock's leaves nothing to be claimed
+        claimed = set(hidden) - _calibrated(truth, result)
+        good = verdict in ({"complete"} if claimed else CLEAN) | left and set(hidden) <= found
     last = result["steps"][-1]["held_out"]
     sensors = truth["sensors"]
     return Answer(

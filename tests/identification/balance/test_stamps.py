@@ -13,7 +13,7 @@ import pytest
 
 from identification import Joint, Record, fit, load_joint, read
 from identification.balance.calibration import is_of_run
-from identification.balance.stamps import evened, longest_hole, slots_of
+from identification.balance.stamps import bridge_errors, bridged, evened, longest_hole, slots_of
 from identification.data.check.checks import check, gate, repair
 from identification.diagnosis.places import running_time
 from tests.hidden_effect.generator import generate_case
@@ -217,3 +217,31 @@ def test_runs_are_laid_end_to_end_and_no_curve_joins_them(
     time = running_time([w])
     assert (np.diff(time) > 0).all()
     assert np.flatnonzero(w.begins).tolist() == [int(np.argmax(w.stretch == 1))]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_a_bridge_is_off_by_is_known_where_it_is_more_than_noise(seed: int) -> None:
+    """A motion with corners, a fifth of its samples lost: the stated deviation is the size of the
+    error; of a smooth motion hardly any bridge is off.
+    """
+    rng = np.random.default_rng(seed)
+    n, dt, level = 6000, 5e-3, 2e-5
+    t = np.arange(n) * dt
+    corners = np.abs((t / 0.31) % 2 - 1)
+    corners = np.convolve(corners, np.hanning(9) / np.hanning(9).sum(), "same")
+    there = rng.random(n) > 0.2
+    there[[0, -1]] = True
+    for motion, sharp in ((corners, True), (np.sin(2 * np.pi * 0.4 * t), False)):
+        noise = level * rng.standard_normal(n)
+        own = np.flatnonzero(there)
+        where = np.where(there, np.cumsum(there) - 1, -1)
+        filled = bridged(t[own], (motion + noise)[own, None], t, where)[:, 0]
+        off = np.where(there, 0.0, filled - motion)
+        told = bridge_errors(filled, there, (slice(20, n - 20),), level)
+        inside = slice(20, n - 20)
+        assert np.all(told[there] == 0)
+        if sharp:
+            size = np.sqrt(np.mean(off[inside] ** 2) / np.mean(told[inside] ** 2))
+            assert 0.6 < size < 1.5
+        else:
+            assert np.mean(told[~there] > 0) < 0.03
