@@ -58,8 +58,8 @@ ENCODERS: Final = frozenset({"link_position_sensor"})
 LOW_PASSED: Final = frozenset({"drive"})
 """Places whose readings may come through a low-pass and not late: drives filter their current."""
 SURE: Final = 4.53
-"""Standard errors by which a channel must be late: of an error from eight stretches (Student's t, seven
-degrees of freedom) as rare as three of a known one."""
+"""Standard errors by which a channel must be late: of an error from eight stretches (Student's t,
+seven degrees of freedom) as rare as three of a known one."""
 UNLIKE: Final = 2.0
 """Standard errors from which a lateness read through the motor is certainly another: 5 %."""
 ONE_WAY: Final = 1e-3

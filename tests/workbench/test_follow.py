@@ -16,7 +16,7 @@ from identification import load_joint, read
 from identification.data.joint_file import Joint
 from identification.errors import InputError
 from identification.faults.types import FaultEvent, Verdict
-from workbench.cli.following import growing
+from workbench.cli.following import datagrams, growing
 from workbench.cli.following.datagrams import Datagrams
 from workbench.cli.following.growing import LOOKS, Growing, follow
 from workbench.cli.main import main
@@ -246,3 +246,26 @@ def test_a_stream_that_cannot_be_is_said_in_one_line(
                 list(follow(source, joint, quiet=0.3))
         assert "udp://127.0.0.1:0" in str(caught.value)
         assert "\n" not in str(caught.value)
+
+
+def test_nothing_of_a_stream_is_lost_while_nobody_looks(
+    joint_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A detector learns for a second and more before the first look: ten times what the system
+    keeps is sent meanwhile.
+    """
+    monkeypatch.setattr(datagrams, "AT_ONCE", 1 << 15)
+    text = lines(faulty=False)
+    head, rows = text[0], text[1:]
+    with (
+        Datagrams("udp://127.0.0.1:0", load_joint(joint_file)) as source,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
+    ):
+        for k in range(0, len(rows), 40):
+            piece = "\n".join([head, *rows[k : k + 40]])
+            sender.sendto(piece.encode(), ("127.0.0.1", source.port))
+            time.sleep(0.001)
+        found = source.new()
+    assert found is not None
+    assert len(found) == len(rows)
+    assert sum(map(len, rows)) > 400_000

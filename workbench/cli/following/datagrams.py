@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import select
 import shutil
 import socket
 import tempfile
+import threading
+from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Self, final
 from urllib.parse import urlsplit
@@ -22,9 +25,14 @@ if TYPE_CHECKING:
 SCHEME: Final = "udp://"
 LARGEST: Final = 65_535
 """Bytes of a datagram at most, as the protocol has it."""
-WAITING: Final = 1 << 22
-"""Bytes that may wait between two looks: 0.25 s of 10 kHz with 100 bytes a row are 250 kB, a decade
-is left."""
+WAITING: Final = 1 << 27
+"""Bytes that may wait between two looks: a minute of 10 kHz with 200 bytes a row, as long as a
+detector takes to learn from long records."""
+AT_ONCE: Final = 1 << 22
+"""Bytes that the system is asked to keep; without leave it keeps some 200 kB, which a second of a
+fast stream fills, so they are fetched as they come."""
+WAKE: Final = 0.2
+"""Longest time until the fetching sees that it is over [s]."""
 HEAD: Final = 20
 """Lines before the first row of numbers that are kept at most: names and units are two, loggers
 write some more."""
@@ -60,13 +68,37 @@ class Datagrams:
         self._in_head, self._last = False, -np.inf
         self._socket = _bound(address)
         self._folder = Path(tempfile.mkdtemp(prefix="irj-"))
+        self._came: deque[bytes] = deque()
+        self._waiting = 0
+        self._reading, self._over = threading.Lock(), threading.Event()
+        self._thread = threading.Thread(target=self._fetch, daemon=True)
 
     def __enter__(self) -> Self:
+        self._thread.start()
         return self
 
     def __exit__(self, *error: object) -> None:
+        self._over.set()
+        self._thread.join()
         self._socket.close()
         shutil.rmtree(self._folder, ignore_errors=True)
+
+    def _fetch(self) -> None:
+        """Take what comes out of the system's buffer while the estimator is at work."""
+        while not self._over.is_set():
+            if select.select([self._socket], [], [], WAKE)[0]:
+                self._drain()
+
+    def _drain(self) -> None:
+        with self._reading:
+            while self._waiting < WAITING:
+                try:
+                    came = self._socket.recv(LARGEST)
+                except BlockingIOError:
+                    return
+                self._came.append(came)
+                self._waiting += len(came)
+        self._over.wait(WAKE)  # full: let the others go
 
     @property
     def port(self) -> int:
@@ -82,13 +114,12 @@ class Datagrams:
         InputError
             Rows that cannot be used.
         """
-        while True:
-            try:
-                came = self._socket.recv(LARGEST)
-            except BlockingIOError:
-                break
-            for line in came.splitlines():
-                self._take(line.strip())
+        self._drain()
+        with self._reading:
+            came, self._waiting = list(self._came), 0
+            self._came.clear()
+        for line in b"\n".join(came).splitlines():
+            self._take(line.strip())
         first = not np.isfinite(self._last)
         if not self._rows or (first and len(self._rows) < FIRST_ROWS):
             return None
@@ -141,7 +172,7 @@ def _bound(address: str) -> socket.socket:
         )
     made = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_DGRAM)
     try:
-        made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, WAITING)
+        made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, AT_ONCE)
         made.bind((host, port))
     except OSError as error:
         made.close()

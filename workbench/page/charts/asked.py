@@ -138,11 +138,13 @@ def _shown(analysis: Analysis, step: StepEntry) -> dict[str, FloatArray]:
 
 
 def _is_stale(live: Live, query: Query) -> bool:
-    """Whether a page asks about a step that it has not heard the end of yet: no error, the answer
-    is not wanted any more.
+    """Whether a page asks about a step that it has not heard the end of yet, or that is being
+    fitted again: no error, the answer is not wanted any more.
     """
     asked = str(query.get("step", ""))
-    return bool(asked) and asked not in {s.id for s in live.state.steps[-1:]}
+    if not asked:
+        return False
+    return asked not in {s.id for s in live.state.steps[-1:]} or live.analysis().solution is None
 
 
 def _law(live: Live, query: Query) -> dict[str, Any]:
