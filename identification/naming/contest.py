@@ -217,7 +217,7 @@ class Contest:
         """Log-likelihood of each rival on the old records, beside what its clocks and zeros are
         worth beforehand, (rivals,) [nats]."""
         rows = np.array([-0.5 * INDEPENDENT_SHARE * float(r @ r) for r, _, _ in self._old])
-        return rows - self._unlikely
+        return np.asarray(rows - self._unlikely)
 
     @cached_property
     def ahead(self) -> FloatArray:

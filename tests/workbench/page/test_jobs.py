@@ -14,15 +14,19 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 pytest.importorskip("starlette")
 
 from casadi_models import EFFECTS
+from identification import Joint, improve
+from tests.smooth_laws import record
 from workbench.page import verbs
 from workbench.page import views as app_views
 from workbench.page.demo import demo_files
 from workbench.page.input import set_joint, start_demo
+from workbench.page.jobs.doing import ledger
 from workbench.page.live import Live
 from workbench.page.session import Session, Store
 
@@ -302,3 +306,17 @@ def test_one_key_is_another_law_in_another_session(tmp_path: Path) -> None:
             titles.append(EFFECTS["seal"].title)
     assert titles == ["typed law a*tanh(v/b)", "typed law a*sin(v/b)"]
     assert "seal" not in EFFECTS
+
+
+def test_a_set_stays_a_set_on_the_ledger_of_the_whole_loop() -> None:
+    """An offset and a friction that differs by direction: the step holds one of the two, and says
+    both, with the run that tells them apart.
+    """
+    runs = [record(np.random.default_rng([3, k]), 20.0, lambda q, v: 4 + 0 * q) for k in (0, 1)]
+    axis = Joint("axis", model_name="hd1", effects=("viscous", "coulomb"))
+    found = improve(runs[0], axis, [runs[1]])
+    start, added = ledger(found)
+    assert set(added.names) == set(found.claims[0].effects)
+    assert {"current_offset", "asymmetric_coulomb"} <= set(added.names)
+    assert added.separate_by == found.claims[0].separate_by
+    assert start.names == () and start.separate_by is None

@@ -178,8 +178,9 @@ ACTIONS: Final[Mapping[str, Callable[[Place, Body, Progress], Change]]] = {
 
 def ledger(result: Improvement, *, exact: bool = True) -> tuple[StepEntry, ...]:
     """The steps of the whole loop as entries of the ledger; not `exact` where it took windows
-    of the records.
+    of the records. A set stays a set.
     """
+    claims = {c.label: c for c in result.claims}
     return tuple(
         StepEntry(
             "add" if s.added else "start",
@@ -190,6 +191,8 @@ def ledger(result: Improvement, *, exact: bool = True) -> tuple[StepEntry, ...]:
             key=s.added,
             label=s.label,
             title=EFFECTS[s.added].title if s.added else None,
+            names=tuple(claims[s.label].effects) if s.label in claims else (),
+            separate_by=claims[s.label].separate_by if s.label in claims else None,
             virtual_work=s.solution.model.virtual_work,
             exact=exact,
             id=secrets.token_hex(4),
