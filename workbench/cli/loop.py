@@ -28,7 +28,13 @@ from workbench.cli.files import (
     write_text,
 )
 from workbench.cli.first.help import bold
-from workbench.show.words import finding_lines, place_lines, step_lines, untested_lines
+from workbench.show.words import (
+    finding_lines,
+    left_behind,
+    place_lines,
+    step_lines,
+    untested_lines,
+)
 
 
 def improve_files(
@@ -103,9 +109,7 @@ def run_improve(arguments: Namespace) -> int:
     write_json(arguments.json, data)
     if arguments.output:
         write_text(arguments.output, found.to_joint_file())
-        left = len(found.learned) - len(found.carried)
-        without = f", without {left} of the learned curves: they raise the held-out error"
-        print(f"joint file: {arguments.output}{without if left else ''}")
+        print(", ".join(filter(None, (f"joint file: {arguments.output}", left_behind(found)))))
     write_picture(found, arguments.picture)
     _write_report(found, records, arguments.report, arguments.command)
     return 0

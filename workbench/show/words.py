@@ -219,3 +219,9 @@ def untested_lines(items: Sequence[Any], *, verbose: bool = False) -> list[str]:
     if verbose:
         return [f"not testable: {item.effect}: {item.why}" for item in items]
     return [f"not testable ({len(items)}): -v lists them with the reason"] if items else []
+
+
+def left_behind(found: Improvement) -> str:
+    """What the joint file of a loop is without, behind its name; empty where it has all."""
+    left = len(found.learned) - len(found.carried)
+    return f"without {left} of the learned curves: they raise the held-out error" if left else ""

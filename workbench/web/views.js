@@ -176,12 +176,13 @@ const views = {
   },
 
   async export(state) {
-    const { code } = await get("/view/code"), fitted = state.steps.length > 0;
+    const { code } = await get("/view/code"), fitted = state.steps.length > 0, story = state.improvement;
+    const without = story && story.without && story.exact === state.steps.at(-1)?.exact ? ` It is ${story.without}.` : "";
     const link = (name, text, note) => h("div", { class: "card" }, h("h2", {}, text), h("p", { class: "soft" }, note), h("a", { class: "button primary", href: `${base()}/view/${name}`, download: "", id: `get-${name.replace(".", "-")}` }, "Download"));
     const made = (action, name, text, note, on) => h("div", { class: "card" }, h("h2", {}, sentence(text, "")), h("p", { class: "soft" }, note), on ? button(`Make the ${text}`, () => run(action, {}, () => { const a = h("a", { href: `${base()}/view/${name}`, download: "" }); document.body.append(a); a.click(); a.remove(); }), { kind: "primary", id: `make-${action}`, off: !fitted }) : h("p", { class: "small" }, "Not available in this installation."));
     const copied = h("span", { class: "small good", role: "status" });
     return [heading("Take it home"), h("div", { class: "grid" },
-      link("joint.toml", "Joint file", fitted ? "The joint with its fitted values, standard errors and provenance. It is a joint file again." : "The joint as it was described; nothing is fitted yet."),
+      link("joint.toml", "Joint file", fitted ? "The joint with its fitted values, standard errors and provenance. It is a joint file again." + without : "The joint as it was described; nothing is fitted yet."),
       made("report", "report.html", "report", "One HTML file that opens offline: verdict, staircase, places before and after, parameters.", app.config.report),
       made("plant", "plant.fmu", "FMU of the joint", "The fitted joint as a simulation unit (FMI 2.0) for other tools; needs a C compiler on this machine.", app.config.fmu),
       made("estimator", "estimator.fmu", "FMU of the estimator", "The online estimator with this joint's values; it carries its Python along.", app.config.fmu)),

@@ -15,6 +15,7 @@ from identification.data.joint_file import Joint, parse_joint
 from identification.data.plain_text import from_toml
 from identification.diagnosis.learned import with_curves
 from identification.fitting.assess import relative_error_percent
+from workbench.show.words import left_behind
 
 SHARED = Path(__file__).resolve().parents[3].parent / "shared" / "measurements"
 VELOCITY_LAWS = {
@@ -73,6 +74,9 @@ def test_the_joint_file_of_emps_is_no_worse_on_held_out_records_than_the_loop_sa
     assert sorted(written.effects) == sorted(visible_labels(solution.model))
     error = relative_error_percent(solution.model, found.data, found.data.held_out, solution.values)
     assert error <= 1.001 * found.steps[-1].held_out.relative_error_percent
+    left = len(found.learned) - len(found.carried)
+    assert left_behind(found).startswith(f"without {left} " if left else "")
+    assert bool(left_behind(found)) == bool(left)
 
 
 def test_emps_parameters_agree_with_the_published_ones() -> None:

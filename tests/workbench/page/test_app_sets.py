@@ -70,6 +70,12 @@ def test_the_page_says_what_the_terminal_says(tmp_path: Path, name: str, most: i
                     page.screenshot(path=f"{shots}/{name}-{colours}-{width}.png", full_page=True)
                     assert page.evaluate("document.documentElement.scrollWidth") <= width
                     page.click("#nav-export")
+        story = state_of(page, "improvement")
+        left = sum(c["label"] not in story["joint_text"] for c in story["learned"])
+        page.click("#nav-export")
+        page.wait_for_selector("#get-joint-toml")
+        said = f"It is without {left} of the learned curves"
+        assert (said in page.inner_text("main")) == (left > 0)
         if any("curve" in c for c in made.improved["claims"]):
             a_learned_curve_is_drawn_where_it_is_pointed_at(page)
     assert made.differences() == []

@@ -21,7 +21,7 @@ from workbench.page.desk import tree
 from workbench.page.desk.curves import kept_curves
 from workbench.page.jobs.place import Change, Place, folder_of, hint_for
 from workbench.page.session import State, StepEntry
-from workbench.show.words import headline, printed
+from workbench.show.words import headline, left_behind, printed
 
 Body = Mapping[str, Any]
 
@@ -94,6 +94,7 @@ def improve(place: Place, body: Body, progress: Progress) -> Change:
         "headline": headline(story),
         "printed": printed(result),
         "joint_text": result.to_joint_file(),
+        "without": left_behind(result),
         "exact": analysis.whole,
         **clean(kept_curves(result)),
     }
