@@ -137,8 +137,11 @@ function adopt(state) {
   goOn();
 }
 
+/* A tab that nobody looks at holds no connection: browsers give a host six, and the seventh tab would hang. */
 function listen() {
   if (app.source) app.source.close();
+  app.source = null;
+  if (document.hidden) return;
   app.source = new EventSource(base() + "/events");
   app.source.onmessage = (event) => {
     const news = JSON.parse(event.data);
@@ -300,6 +303,7 @@ async function boot() {
   $("fresh").addEventListener("click", () => act(fresh));
   $("home").addEventListener("click", () => open("home"));
   $("error-close").addEventListener("click", clearError);
+  document.addEventListener("visibilitychange", () => { if (app.id) { listen(); if (!document.hidden && app.state) refresh().catch(fail); } });
   addEventListener("dragover", (e) => { e.preventDefault(); document.querySelectorAll(".drop").forEach((d) => d.classList.add("over")); });
   addEventListener("dragleave", () => document.querySelectorAll(".drop").forEach((d) => d.classList.remove("over")));
   addEventListener("drop", (e) => { e.preventDefault(); if (e.dataTransfer && e.dataTransfer.files.length) { if (app.view !== "load") open("load"); upload(e.dataTransfer.files); } });

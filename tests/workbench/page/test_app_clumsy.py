@@ -160,6 +160,40 @@ def test_a_joint_that_cannot_be_is_refused_at_its_form(opened: Opened) -> None:
     opened.problems.clear()  # the browser logs an answer of 422
 
 
+def looked_at(page: Any, *, yes: bool) -> None:
+    page.evaluate(
+        "h => { Object.defineProperty(document, 'hidden', { value: h, configurable: true });"
+        "document.dispatchEvent(new Event('visibilitychange')); }",
+        not yes,
+    )
+
+
+def test_tabs_that_nobody_looks_at_hold_no_connection_and_miss_nothing(opened: Opened) -> None:
+    """Browsers give a host six connections: with seven tabs open the page hung."""
+    page = opened.page
+    session = page.evaluate("() => app.id")
+    others = []
+    for _ in range(7):
+        tab = opened.context.new_page()
+        tab.goto(f"{opened.address}#session={session}&view=compare", timeout=20_000)
+        drawn(tab, "compare")
+        looked_at(tab, yes=False)
+        others.append(tab)
+    page.evaluate("() => run('add', { label: 'cubic_viscous@motor' }, 'ledger')")
+    page.wait_for_function("() => !busy() && app.state.steps.length === 2", timeout=120_000)
+    drawn(page, "ledger")
+    assert others[0].evaluate("() => app.state.steps.length") == 1
+    looked_at(others[0], yes=True)
+    others[0].wait_for_function("() => app.state.steps.length === 2")
+    page.click("#undo")
+    page.wait_for_function("() => !busy() && app.state.steps.length === 1")
+    others[0].wait_for_function("() => app.state.steps.length === 1")
+    for tab in others:
+        tab.close()
+    page.click("#nav-compare")
+    drawn(page, "compare")
+
+
 def test_a_second_click_on_a_step_keeps_what_was_opened_in_it(opened: Opened) -> None:
     page = opened.page
     page.click("#nav-compare")
