@@ -48,7 +48,7 @@ function treeCard(state) {
 function besideCard(state) {
   if (state.steps.length < 2) return null;
   const held = h("div", { id: "beside" }), last = state.steps.length - 1;
-  const choice = (id, name, chosen) => h("label", { for: id }, name, h("select", { id, onchange: show }, state.steps.map((s, k) => h("option", { value: s.id, selected: k === chosen }, `${k + 1}: ${stepTitle({ ...s, remark: (state.remarks || {})[s.id] || {} })}`))));
+  const choice = (id, name, chosen) => h("label", { for: id }, `${name} `, h("select", { id, onchange: show }, state.steps.map((s, k) => h("option", { value: s.id, selected: k === chosen }, `${k + 1}: ${stepTitle({ ...s, remark: (state.remarks || {})[s.id] || {} })}`))));
   const first = choice("beside-first", "Step", last - 1), second = choice("beside-second", "beside", last), value = (label) => label.querySelector("select").value;
   function show() {
     const asked = [value(first), value(second)];
