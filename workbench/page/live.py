@@ -14,7 +14,7 @@ from identification.crash import internal_error
 from identification.errors import InputError
 from workbench.page.analysis import Progress
 from workbench.page.desk.tree import after_input, given
-from workbench.page.jobs.child import Ask, Done
+from workbench.page.jobs.child import Ask, Done, Refused, refused
 from workbench.page.jobs.doing import unchanged
 from workbench.page.jobs.place import Change, Place, described
 from workbench.page.jobs.process import Halt, Helper, InternalError
@@ -267,7 +267,15 @@ class Live(Place):
                 self.session.begin({**body, "action": action})
         self.seen.set()
         self.tell()
-        self.worker.submit(Task(lambda: self._guarded(job, body, here, after)))
+        try:
+            self.worker.submit(Task(lambda: self._guarded(job, body, here, after)))
+        except RuntimeError as problem:  # no thread can be started
+            with self.lock:
+                self._end(
+                    f"{action}: a thread for the work cannot be started ({problem}); close other "
+                    "programs and start it again"
+                )
+            self.tell()
 
     def ahead(self, action: str, body: Mapping[str, Any]) -> None:
         """Queue spare work of the session's process: given up when a job comes."""
@@ -320,6 +328,22 @@ class Live(Place):
         here: Here | None,
         after: Callable[[], None] | None,
     ) -> None:
+        """Do a job, which ends whatever dies in it: nothing above this thread could say so."""
+        try:
+            self._work(job, body, here, after)
+        except BaseException as problem:  # also what ends a thread, such as SystemExit
+            with self.lock:
+                if self.job is job:
+                    self._end(_sentence(problem, job.action))
+            self.tell()
+
+    def _work(
+        self,
+        job: Job,
+        body: Mapping[str, Any],
+        here: Here | None,
+        after: Callable[[], None] | None,
+    ) -> None:
         change: Change | None = None
         done: Done | None = None
         error: str | None = None
@@ -348,13 +372,7 @@ class Live(Place):
             except (
                 Exception
             ) as problem:  # the page must get a sentence for whatever goes wrong in a fit
-                said = (
-                    str(problem)
-                    if isinstance(problem, InternalError)
-                    else internal_error(problem, f"page: {job.action}")
-                )
-                error = f"{job.action}: {said}; the state before it is kept"
-                _LOG.error(error)
+                error = _sentence(problem, job.action)
             if job.cancelled:
                 change, error = None, f"{job.action}: cancelled; nothing was changed"
             self._finish(change, done, error)
@@ -378,10 +396,14 @@ class Live(Place):
                         f"the session folder cannot be written ({problem.strerror}); free "
                         "some space"
                     )
-            self.job, self.error = None, error
-            with contextlib.suppress(OSError):
-                self.session.end()
+            self._end(error)
         self.tell()
+
+    def _end(self, error: str | None) -> None:
+        """No job any more; the caller has the lock."""
+        self.job, self.error = None, error
+        with contextlib.suppress(OSError):
+            self.session.end()
 
     def can(self, change: Change) -> bool:
         """Whether a change has something to do."""
@@ -407,6 +429,17 @@ class Live(Place):
         self.tell()
         job.halt.at_once()
         return True
+
+
+def _sentence(problem: BaseException, action: str) -> str:
+    """What the page says of a job that ended in an error of no user; an internal one is logged."""
+    made = Refused(str(problem), True) if isinstance(problem, InternalError) else None
+    made = made or refused(problem, action)
+    if not made.internal:
+        return made.sentence
+    said = f"{action}: {made.sentence}; the state before it is kept"
+    _LOG.error(said)
+    return said
 
 
 __all__ = ["SOON", "BusyError", "Job", "Live"]

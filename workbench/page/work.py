@@ -93,8 +93,12 @@ class Worker:
             self._tasks.append(task)
             self._ready.notify()
             if not self._alive:
+                try:
+                    threading.Thread(target=self._loop, daemon=True, name=self.name).start()
+                except RuntimeError:  # the system has none left: nobody would do the task
+                    self._tasks.remove(task)
+                    raise
                 self._alive = True
-                threading.Thread(target=self._loop, daemon=True, name=self.name).start()
 
     def give_up(self) -> None:
         """Stop the spare work, and what of it waits."""

@@ -44,9 +44,23 @@ function treeCard(state) {
   return card;
 }
 
+/* The parameters of two steps of the ledger beside one another: what the last one changed, until others are chosen. */
+function besideCard(state) {
+  if (state.steps.length < 2) return null;
+  const held = h("div", { id: "beside" }), last = state.steps.length - 1;
+  const choice = (id, name, chosen) => h("label", { for: id }, `${name} `, h("select", { id, onchange: show }, state.steps.map((s, k) => h("option", { value: s.id, selected: k === chosen }, `${k + 1}: ${stepTitle({ ...s, remark: (state.remarks || {})[s.id] || {} })}`))));
+  const first = choice("beside-first", "Step", last - 1), second = choice("beside-second", "beside", last), value = (label) => label.querySelector("select").value;
+  function show() {
+    const asked = [value(first), value(second)];
+    get(`/view/fits?a=${asked[0]}&b=${asked[1]}`).then((found) => { if (asked[0] === value(first) && asked[1] === value(second)) held.replaceChildren(fitsTable(found)); }).catch(fail);
+  }
+  show();
+  return h("section", { class: "card" }, h("h2", {}, "Two steps beside one another"), h("p", { class: "soft small" }, "The values that differ; – where a step has no such parameter."), h("div", { class: "row" }, first, second), held);
+}
+
 function fitsTable(found) {
   const [a, b] = found.steps, changed = found.values.filter((v) => v.first !== v.second), cell = (v) => h("td", { class: "num" }, v == null ? "–" : digits(v, 4));
-  return h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Two fits compared" }, h("table", {}, h("caption", {}, "Two fits side by side"), h("thead", {}, h("tr", {}, h("th", { scope: "col" }, ""), h("th", { scope: "col", class: "num" }, stepTitle(a)), h("th", { scope: "col", class: "num" }, stepTitle(b)))),
+  return h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Two fits compared" }, h("table", {}, h("caption", {}, "Two fits side by side"), h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Parameter"), h("th", { scope: "col", class: "num" }, stepTitle(a)), h("th", { scope: "col", class: "num" }, stepTitle(b)))),
     h("tbody", {}, h("tr", { class: "now" }, h("th", { scope: "row" }, "Held-out error [%]"), cell(a.error), cell(b.error)), h("tr", {}, h("th", { scope: "row" }, "Only in it"), found.only.map((o) => h("td", {}, o.length ? o.map(effectTitle).join(", ") : "–"))),
       changed.map((v) => h("tr", {}, h("th", { scope: "row" }, words(v.name)), cell(v.first), cell(v.second))))));
 }

@@ -172,6 +172,7 @@ const views = {
     return [heading("Parameters", "Standard errors come from the scatter between blocks of the records. All values are referred to the link."),
       h("div", { class: "card scroll", tabindex: "0", role: "region", "aria-label": "Table of parameters" }, h("table", { class: "stack" }, h("thead", {}, h("tr", {}, ["Parameter", "Value", "± std. error", "95 % band", "Unit", "Side", "Flags"].map((t, k) => h("th", { scope: "col", class: k > 0 && k < 4 ? "num" : null }, t)))),
         h("tbody", {}, rows.map(([name, p]) => h("tr", {}, h("td", {}, words(name), h("div", { class: "small soft" }, p.meaning)), h("td", { class: "num", "data-label": "Value" }, digits(p.value, 5)), h("td", { class: "num", "data-label": "± std. error" }, digits(p.stderr, 2)), h("td", { class: "num", "data-label": "95 % band" }, band(p)), h("td", { "data-label": "Unit" }, unit(p.unit) || "–"), h("td", { "data-label": "Side" }, p.side), h("td", { "data-label": "Flags" }, h("div", { class: "row" }, flags(p).length ? flags(p) : h("span", { class: "soft" }, "–")))))))),
+      besideCard(state),
       slidersCard(table, error)];
   },
 

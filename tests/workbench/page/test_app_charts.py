@@ -244,6 +244,31 @@ def test_the_falling_staircase_has_its_floor_and_the_place_that_told(page: Any) 
             assert bad == [], view
 
 
+def test_two_steps_show_their_parameters_beside_one_another(page: Any) -> None:
+    """The last two steps until others are chosen; the same step twice differs in nothing."""
+    go(page, "parameters")
+    page.wait_for_selector("#beside table")
+    ids = page.evaluate("() => app.state.steps.map((s) => s.id)")
+    assert [page.input_value(f"#beside-{k}") for k in ("first", "second")] == ids[-2:]
+    shown = page.evaluate(
+        "() => Object.fromEntries([...document.querySelectorAll('#beside tbody tr')].map((r) =>"
+        " [r.cells[0].innerText, [r.cells[1].innerText, r.cells[2].innerText]]))"
+    )
+    error = page.inner_text("#headline strong").split()[0]
+    assert float(shown["Held-out error [%]"][1]) == pytest.approx(float(error), rel=2e-3)
+    made = page.evaluate(
+        "([a, b]) => get(`/view/fits?a=${a}&b=${b}`).then((f) => Object.fromEntries("
+        "f.values.filter((v) => v.first !== v.second).map((v) => [words(v.name),"
+        " [v.first, v.second].map((x) => x == null ? '–' : digits(x, 4))])))",
+        ids[-2:],
+    )
+    assert made
+    assert {k: v for k, v in shown.items() if k in made} == made
+    assert any(before == "–" for before, _ in made.values()), "the new effect's parameters"
+    page.select_option("#beside-first", ids[-1])
+    page.wait_for_function("() => document.querySelectorAll('#beside tbody tr').length === 2")
+
+
 def test_a_parameter_is_held_at_a_typed_value_and_let_free_again(page: Any) -> None:
     go(page, "parameters")
     free = float(page.inner_text("#headline strong").split()[0])

@@ -4,13 +4,17 @@ with nothing but its own session's laws.
 
 from __future__ import annotations
 
+import errno
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +30,12 @@ from workbench.page import verbs
 from workbench.page import views as app_views
 from workbench.page.demo import demo_files
 from workbench.page.input import set_joint, start_demo
+from workbench.page.jobs import child
+from workbench.page.jobs.child import Done
 from workbench.page.jobs.doing import ledger
 from workbench.page.live import Live
-from workbench.page.session import Session, Store
+from workbench.page.session import Session, State, Store
+from workbench.page.work import Worker
 
 ROOT = Path(__file__).parents[3]
 LAW = {
@@ -104,6 +111,119 @@ def test_a_killed_process_is_one_sentence_and_every_fit_is_kept(live: Live) -> N
     run(live, "diagnose")
     assert live.helper.pid != pid
     assert live.state.steps == before.steps
+
+
+def _ended_in_one_line(live: Live, before: Any) -> str:
+    wait_for_end = time.monotonic() + 20
+    while live.job is not None:
+        assert time.monotonic() < wait_for_end, "the job never ended"
+        time.sleep(0.005)
+    assert live.error is not None
+    assert "\n" not in live.error
+    assert live.state == before
+    assert live.session.running() is None
+    return live.error
+
+
+class _Exit:
+    """Something that ends a thread where it is called."""
+
+    def __call__(self, _: Any) -> Any:
+        raise SystemExit(3)
+
+
+def _no_number(state: Any) -> Any:
+    return replace(state, left_open={"x": float("nan")})
+
+
+def _broken(_: Any) -> Any:
+    raise KeyError("lost")
+
+
+def _memory(_: Any) -> Any:
+    raise MemoryError
+
+
+def _full(_: Any) -> Any:
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (_no_number, "internal error (ValueError"),
+        (_broken, "internal error (KeyError"),
+        (_memory, "the memory ran out"),
+        (_full, "free some space"),
+        (_Exit(), "internal error (SystemExit: 3)"),
+    ],
+)
+@pytest.mark.parametrize("when", ["in the work", "at its end"])
+def test_whatever_dies_in_a_job_it_ends_in_one_line(
+    live: Live, change: Any, says: str, when: str
+) -> None:
+    """In the thread of the session, while the change is made and while it is kept; a job that did
+    not end would keep the page busy for ever.
+    """
+    before = live.state
+    at_once = when == "in the work" and change is not _no_number
+    live.start("own", "own", {}, here=(lambda p: change(None)) if at_once else (lambda p: change))
+    assert says in _ended_in_one_line(live, before)
+    live.start("own", "own", {}, here=lambda p: lambda s: s)
+    wait(live)
+    assert live.error is None, "the thread takes the next job"
+
+
+def test_where_no_thread_can_be_started_the_job_ends(
+    live: Live, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = live.state
+
+    def none_left(self: Any) -> None:
+        raise RuntimeError("can't start new thread")
+
+    live.worker = Worker("own")
+    with monkeypatch.context() as patched:
+        patched.setattr(threading.Thread, "start", none_left)
+        live.start("own", "own", {}, here=lambda p: lambda s: s)
+    assert "cannot be started (can't start new thread)" in _ended_in_one_line(live, before)
+    live.start("own", "own", {}, here=lambda p: lambda s: s)
+    wait(live)
+    assert live.error is None
+
+
+@pytest.mark.parametrize(
+    ("answer", "says"),
+    [
+        (lambda: Done(lambda s: s, None, (), 0.0), "internal error ("),
+        (lambda: _full(None), "own: the disk is full (No space left on device)"),
+        (lambda: _memory(None), "own: the memory ran out"),
+    ],
+)
+def test_an_answer_that_cannot_be_sent_or_made_is_a_refusal(
+    answer: Callable[[], Done], says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The process of a session goes on: its prepared records are not lost with one answer."""
+    here, there = multiprocessing.Pipe()
+    monkeypatch.setattr(child, "_done", lambda *a: answer())
+    serving = threading.Thread(target=_served, args=(there, tmp_path), daemon=True)
+    monkeypatch.setattr(child.signal, "signal", lambda *a: None)
+    monkeypatch.setattr(child.os, "setsid", lambda: None)
+    monkeypatch.setattr(child, "FIRST_TO_GO", "x")  # refused: this process is the test's own
+    serving.start()
+    for _ in range(2):
+        here.send(child.Ask("own", {}, State()))
+        assert here.poll(20), "no answer"
+        said = here.recv()
+        assert isinstance(said, child.Refused)
+        assert says in said.sentence
+    here.close()
+    serving.join(10)
+    assert not serving.is_alive()
+
+
+def _served(pipe: Any, folder: Path) -> None:
+    child.main(pipe, folder, [])
 
 
 @posix

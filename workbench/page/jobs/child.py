@@ -5,6 +5,7 @@ pipe, and sends back how far it is and what it found.
 from __future__ import annotations
 
 import contextlib
+import errno
 import multiprocessing
 import os
 import signal
@@ -30,6 +31,9 @@ FIRST_TO_GO: Final = "500"
 """Linux's `oom_score_adj` of the process, half of its range: where the memory runs out it is ended
 before the server, which has the sessions.
 """
+
+FULL: Final = (errno.ENOSPC, errno.EDQUOT)
+"""Errors of a disk, or of a user's share of it, that takes no more."""
 
 
 @final
@@ -130,9 +134,21 @@ def main(pipe: Connection, folder: Path, files: Sequence[EffectFile]) -> None:
         try:
             asked = pipe.recv()
             if isinstance(asked, Ask):
-                pipe.send(_answer(pipe, place, asked))
+                _send(pipe, asked.action, _answer(pipe, place, asked))
         except (EOFError, OSError):  # the server closed the pipe, or has ended
             return
+
+
+def _send(pipe: Connection, action: str, answer: Done | Refused) -> None:
+    """Send an answer; one that cannot be packed is refused, so that the work does not end in the
+    end of its process.
+    """
+    try:
+        pipe.send(answer)
+    except (EOFError, OSError):
+        raise
+    except Exception as error:  # nothing of it was sent: it is packed first
+        pipe.send(refused(error, action))
 
 
 def _end_with_the_server() -> None:
@@ -158,13 +174,25 @@ def _answer(pipe: Connection, place: Place, asked: Ask) -> Done | Refused:
         return Refused("")
     except InputError as error:
         return Refused(str(error))
-    except MemoryError:
+    except Exception as error:  # the page must get a sentence for whatever goes wrong in a fit
+        return refused(error, asked.action)
+
+
+def refused(error: BaseException, action: str) -> Refused:
+    """The sentence for work that ended in an error which is no refusal of its own: what the machine
+    lacks is said as such; all else is an internal error.
+    """
+    if isinstance(error, MemoryError):
         return Refused(
-            f"{asked.action}: the memory ran out; fits before it are kept; leave out records or "
+            f"{action}: the memory ran out; fits before it are kept; leave out records or "
             "windows of them"
         )
-    except Exception as error:  # the page must get a sentence for whatever goes wrong in a fit
-        return Refused(internal_error(error, f"page: {asked.action}"), internal=True)
+    if isinstance(error, OSError) and error.errno in FULL:
+        return Refused(
+            f"{action}: the disk is full ({error.strerror}); fits before it are kept; free some "
+            "space and start it again"
+        )
+    return Refused(internal_error(error, f"page: {action}"), internal=True)
 
 
 def _done(place: Place, asked: Ask, progress: Progress) -> Done:
@@ -188,4 +216,4 @@ def _done(place: Place, asked: Ask, progress: Progress) -> Done:
     )
 
 
-__all__ = ["STOP", "Ask", "Done", "Refused", "Said", "main"]
+__all__ = ["STOP", "Ask", "Done", "Refused", "Said", "main", "refused"]
