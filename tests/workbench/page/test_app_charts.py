@@ -265,6 +265,13 @@ def test_two_steps_show_their_parameters_beside_one_another(page: Any) -> None:
     assert made
     assert {k: v for k, v in shown.items() if k in made} == made
     assert any(before == "–" for before, _ in made.values()), "the new effect's parameters"
+    assert not any("delay" in name or "skew" in name for name in made), "clocks are no parameters"
+    page.set_viewport_size({"width": 375, "height": 860})
+    card = page.locator("#beside .scroll")
+    assert card.evaluate("e => e.scrollWidth <= e.clientWidth"), "no column is cut on a phone"
+    if os.environ.get("IRJ_SCREENSHOTS"):
+        card.screenshot(path=f"{os.environ['IRJ_SCREENSHOTS']}/beside-375.png")
+    page.set_viewport_size({"width": 1280, "height": 860})
     page.select_option("#beside-first", ids[-1])
     page.wait_for_function("() => document.querySelectorAll('#beside tbody tr').length === 2")
 

@@ -14,6 +14,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, Final
 
+from casadi_models.hold import UNKNOWNS
 from identification.balance.calibration import is_of_run
 from identification.data.joint_schema import JOINT
 from identification.data.plain_text import from_toml
@@ -293,7 +294,8 @@ def compared(state: State, first: str, second: str) -> dict[str, Any]:
     if first not in every or second not in every:
         raise InputError("no such step in this session")
     a, b = every[first], every[second]
-    names = [n for n in dict.fromkeys([*a.values, *b.values]) if not is_of_run(n)]
+    every_name = dict.fromkeys([*a.values, *b.values])
+    names = [n for n in every_name if n not in UNKNOWNS and not is_of_run(n)]
     return {
         "steps": [_step(s, state, undone=False) for s in (a, b)],
         "only": [
