@@ -506,10 +506,12 @@ class OnlineEstimator:
         y, h, shares = (np.array([row[i] for row in self._collected]) for i in range(3))
         self._set(torque=self._now.torque / len(y))
         least = np.maximum(self.options.floor_share * np.sqrt(self._now.torque), LEAST)
-        first, weight = first_estimate(y, h, least, partial(self._weight_of, shares))
+        first, weight = first_estimate(
+            y, h, least, self.rows.like, partial(self._weight_of, shares)
+        )
         least = np.maximum(least, self.rows.floor(first.tolist(), self.watch.noise[list(SAMPLED)]))
         y, h = y * weight, h * weight[:, :, None]
-        self._set(scale=prior_range(first, self.theta, h, y, self.rows.usual))
+        self._set(scale=prior_range(first, self.theta, h, y, self.rows.usual, self.rows.like))
         self.estimator = self.recursion(self.theta)
         started = self.estimator.begin(y, h, least, overlap=self.rows.timing.overlap)
         if started.undetermined:

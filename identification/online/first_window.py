@@ -11,6 +11,7 @@ import numpy.typing as npt
 from identification.recursive.estimator import RecursiveLeastSquares, Settings
 
 FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
 
 
 ABSENT: Final = 1e-30
@@ -32,7 +33,22 @@ RIDGE: Final = 1e-5
 than its columns loses one part in ten thousand, one that rounding alone shows stays at zero."""
 
 
-def least_range(h: FloatArray, y: FloatArray) -> FloatArray:
+def shared(size: FloatArray, like: IntArray) -> FloatArray:
+    """The largest of the sizes (parameters,) of those that are of one size: the control value of a
+    curve that no row has reached yet is as large as the others.
+
+    Parameters
+    ----------
+    size : (parameters,) array
+    like : (parameters,) int array
+        :attr:`identification.online.rows.RowMaker.like`.
+    """
+    most = np.zeros_like(size)
+    np.maximum.at(most, like, size)
+    return np.asarray(most[like])
+
+
+def least_range(h: FloatArray, y: FloatArray, like: IntArray) -> FloatArray:
     """Smallest prior range of each parameter: what moves the balances by a hundredth of their
     torque.
 
@@ -40,15 +56,22 @@ def least_range(h: FloatArray, y: FloatArray) -> FloatArray:
     ----------
     h : (rows, balances, parameters) array
     y : (rows, balances) array
+    like
+        As in :func:`shared`.
     """
-    size = np.sqrt(np.mean(h**2, axis=(0, 1)))
+    size = shared(np.sqrt(np.mean(h**2, axis=(0, 1))), like)
     level = float(np.sqrt(np.mean(y**2))) or 1.0
     found: FloatArray = np.where(size > ABSENT, RANGE * level / np.maximum(size, ABSENT), 1.0)
     return found
 
 
 def prior_range(
-    first: FloatArray, before: FloatArray, h: FloatArray, y: FloatArray, usual: FloatArray
+    first: FloatArray,
+    before: FloatArray,
+    h: FloatArray,
+    y: FloatArray,
+    usual: FloatArray,
+    like: IntArray,
 ) -> FloatArray:
     """Prior range of each parameter, (parameters,): the usual one where there is one, else its size
     in the first estimate or before, and never under :func:`least_range`.
@@ -61,15 +84,18 @@ def prior_range(
         As in :func:`least_range`.
     usual : (parameters,) array
         :attr:`identification.online.rows.RowMaker.usual`.
+    like
+        As in :func:`shared`.
     """
-    size = np.maximum(np.abs(first), np.abs(before))
-    found: FloatArray = np.where(usual > 0, usual, np.maximum(size, least_range(h, y)))
+    size = shared(np.maximum(np.abs(first), np.abs(before)), like)
+    found: FloatArray = np.where(usual > 0, usual, np.maximum(size, least_range(h, y, like)))
     return found
 
 
-def least_squares(y: FloatArray, h: FloatArray, least: FloatArray) -> FloatArray:
+def least_squares(y: FloatArray, h: FloatArray, least: FloatArray, like: IntArray) -> FloatArray:
     """Least squares with columns of equal size and balances of equal residual; what no row shows
-    stays at zero.
+    stays at zero. Control values of one curve keep their sizes beside each other: one that a row
+    touches by a millionth is none to be told.
 
     Parameters
     ----------
@@ -77,13 +103,15 @@ def least_squares(y: FloatArray, h: FloatArray, least: FloatArray) -> FloatArray
         As in :func:`least_range`.
     least : (balances,) array
         Residual of each balance at least [N.m].
+    like
+        As in :func:`shared`.
     """
     count = h.shape[2]
     weight = 1.0 / np.maximum(np.sqrt(np.mean(y**2, axis=0)), least)
     theta = np.zeros(count)
     for _ in range(2):
         rows = (h * weight[:, None]).reshape(-1, count)
-        size = np.linalg.norm(rows, axis=0)
+        size = shared(np.linalg.norm(rows, axis=0), like)
         shrink = np.where(size > ABSENT, 1 / np.maximum(size, ABSENT), 0.0)
         target = (y * weight).ravel()
         ridge = np.vstack([rows * shrink, RIDGE * np.eye(count)])
@@ -101,13 +129,14 @@ def first_estimate(
     y: FloatArray,
     h: FloatArray,
     least: FloatArray,
+    like: IntArray,
     weight_of: Callable[[FloatArray, FloatArray], FloatArray],
 ) -> tuple[FloatArray, FloatArray]:
     """Least squares of the first window with weights that follow from it.
 
     Parameters
     ----------
-    y, h, least
+    y, h, least, like
         As in :func:`least_squares`.
     weight_of : callable
         (parameters, size of the residuals (balances,)) -> weights (rows, balances).
@@ -118,7 +147,7 @@ def first_estimate(
     """
     weight = np.ones_like(y)
     for _ in range(PASSES):
-        first = least_squares(y * weight, h * weight[:, :, None], least)
+        first = least_squares(y * weight, h * weight[:, :, None], least, like)
         size = DEVIATION * np.median(np.abs(y - h @ first), axis=0)
         weight = weight_of(first, np.maximum(size, least))
     return first, weight

@@ -90,7 +90,7 @@ def identifiable(
                 kept_y.append(found[0])
                 kept_h.append(found[1])
     y, h = np.array(kept_y), np.array(kept_h)
-    scale = prior_range(theta, theta, h, y, rows.usual)
+    scale = prior_range(theta, theta, h, y, rows.usual, rows.like)
     least = np.maximum(
         options.floor_share * np.sqrt(np.mean(y**2, axis=0)),
         rows.floor(theta.tolist(), noise[list(SAMPLED)]),

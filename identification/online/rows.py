@@ -26,6 +26,7 @@ from identification.balance.weak import POSITION_CHAINS, differentiated_kernel, 
 from identification.online.timing import Alignment, Timing
 
 FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 
 SOURCES: Final = ("motor_position", "link_position", "torque", "drive")
@@ -86,6 +87,9 @@ class RowMaker:
     balances, shapes : tuple of str
     usual : (parameters,) array
         Prior range of parameters that have one whatever the joint: skews of clocks; 0 for others.
+    like : (parameters,) int array
+        Number of the first parameter that is of the same size: control values of one curve; its own
+        for others.
     alignment : Alignment
         What :class:`identification.online.samples.Samples` does to late channels; :attr:`model` has
         only what it leaves of their delays.
@@ -114,6 +118,7 @@ class RowMaker:
         self.shape_values = np.array([self._value(n) for n in self.shapes])
         self.names = linear_parameters(model, sensing, held)
         self.usual = np.array([USUAL_SKEW * dt if n in CLOCKS else 0.0 for n in self.names])
+        self.like = _alike(model, self.names)
         expressions = residual_expressions(model, sensing)
         self.balances = tuple(expressions)
         e = model.equations
@@ -518,3 +523,12 @@ def _standstill(weights: FloatArray, gain: float) -> Any:
             share += weight * (ca.logic_or(still, now * speed[side, k - 1] < 0) if k else still)
         shares.append(share)
     return ca.Function("still", [speed, noise, sharp], [ca.vertcat(*shares)])
+
+
+def _alike(model: JointModel, names: Sequence[str]) -> IntArray:
+    curves = [set(t.names) for t in model.terms if t.effect.table is not None]
+    first = {
+        n: next(i for i, m in enumerate(names) if n == m or any({n, m} <= c for c in curves))
+        for n in names
+    }
+    return np.array([first[n] for n in names], dtype=np.int64)

@@ -101,8 +101,8 @@ class ShapedBalances:
     balances, coefficients : tuple of int
         The balances that the shapes enter, with those that share a parameter with them, and their
         parameters.
-    usual : (parameters,) array
-        See :attr:`identification.online.rows.RowMaker.usual`.
+    usual, like : (parameters,) array
+        See :class:`identification.online.rows.RowMaker`.
     lead : int
         Rows at the beginning of a window that only fill the kernel.
     overlap : float
@@ -111,7 +111,7 @@ class ShapedBalances:
 
     def __init__(self, rows: RowMaker) -> None:
         self._model, self.shapes, self.names = rows.model, rows.shapes, rows.names
-        self.usual = rows.usual
+        self.usual, self.like = rows.usual, rows.like
         self._linear_of, self._linear = rows.linear_of, rows.linear.copy()
         self._linear_moves = bool(rows.linear_of.jac_sparsity(0, 0).nnz())
         self._width, self._count = rows.width, len(rows.balances)

@@ -258,9 +258,9 @@ def _restarted(
         return np.zeros(y.shape[1]), None, np.ones(len(task.theta))
     weight = task.weight[whole]
     y, h = y[whole] * weight, h[whole] * weight[:, :, None]
-    first = least_squares(y, h, task.least)
+    first = least_squares(y, h, task.least, balances.like)
     tick()
-    scale = prior_range(first, task.theta, h, y, balances.usual)
+    scale = prior_range(first, task.theta, h, y, balances.usual, balances.like)
     made = recursion(task.theta, scale)
     made.begin(y, h, task.least, overlap=balances.overlap)
     return np.sqrt(np.mean((y - h @ made.theta) ** 2, axis=0)), made, scale

@@ -69,6 +69,14 @@ static void stack_balances(Twin *m, const double scale[N_THETA], const double we
     triangularise(m->matrix, N_BALANCES * COLUMNS + N_THETA);
 }
 
+/* Each size the largest of those that are of one size: control values of one curve. */
+static void share(double size[N_THETA]) {
+    double most[N_THETA] = {0};
+    int i;
+    for (i = 0; i < N_THETA; i++) most[like[i]] = fmax(most[like[i]], size[i]);
+    for (i = 0; i < N_THETA; i++) size[i] = most[like[i]];
+}
+
 /* Least squares of the weighted window with columns of equal size and balances of equal residual. */
 static void least_squares(Twin *m, const double least[N_BALANCES], double theta[N_THETA]) {
     const double none[N_THETA] = {0};
@@ -81,8 +89,10 @@ static void least_squares(Twin *m, const double least[N_BALANCES], double theta[
         for (i = 0; i < N_THETA; i++) {
             size[i] = 0;
             for (b = 0; b < N_BALANCES; b++) size[i] += weight[b] * weight[b] * column_square(m, b, i);
-            size[i] = sqrt(size[i]) > ABSENT ? 1 / sqrt(size[i]) : 0;
+            size[i] = sqrt(size[i]);
         }
+        share(size);
+        for (i = 0; i < N_THETA; i++) size[i] = size[i] > ABSENT ? 1 / size[i] : 0;
         stack_balances(m, size, weight, none, RIDGE);
         back_substitute(m->matrix, theta);
         for (i = 0; i < N_THETA; i++) theta[i] *= size[i];
@@ -128,9 +138,10 @@ static void least_range(const Twin *m, double out[N_THETA]) {
     for (i = 0; i < N_THETA; i++) {
         double size = 0;
         for (b = 0; b < N_BALANCES; b++) size += column_square(m, b, i);
-        size = sqrt(size / rows);
-        out[i] = size > ABSENT ? FIRST_RANGE * level / size : 1;
+        out[i] = sqrt(size / rows);
     }
+    share(out);
+    for (i = 0; i < N_THETA; i++) out[i] = out[i] > ABSENT ? FIRST_RANGE * level / out[i] : 1;
 }
 
 /* P in scaled parameters as U diag(d) U'. */
@@ -221,7 +232,7 @@ static void deviations(State *s) {
 /* Start the recursion from the collected rows; gives the number of parameters that they do not determine. */
 static int begin_recursion(Twin *m) {
     State *s = &m->s;
-    double first[N_THETA], range[N_THETA], least[N_BALANCES], floor[N_BALANCES];
+    double first[N_THETA], range[N_THETA], known[N_THETA], least[N_BALANCES], floor[N_BALANCES];
     int i, b, undetermined;
     for (b = 0; b < N_BALANCES; b++) {
         s->torque[b] /= s->window.count;
@@ -231,8 +242,9 @@ static int begin_recursion(Twin *m) {
     noise_floor(m, first, floor);
     for (b = 0; b < N_BALANCES; b++) least[b] = fmax(least[b], floor[b]);
     least_range(m, range);
-    for (i = 0; i < N_THETA; i++)
-        s->scale[i] = usual_range[i] > 0 ? usual_range[i] : fmax(fmax(fabs(first[i]), fabs(s->theta[i])), range[i]);
+    for (i = 0; i < N_THETA; i++) known[i] = fmax(fabs(first[i]), fabs(s->theta[i]));
+    share(known);
+    for (i = 0; i < N_THETA; i++) s->scale[i] = usual_range[i] > 0 ? usual_range[i] : fmax(known[i], range[i]);
     clear_recursion(s);
     undetermined = start_values(m, s->rls.config + CONFIG_THETA0, s->scale, least, s->theta);
     estimate_of(s, &s->rls, first);

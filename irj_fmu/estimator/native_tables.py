@@ -376,6 +376,7 @@ def _recursion_tables(header: _Header, made: OnlineEstimator) -> None:
     for key, value in made.guard.figures().items():
         header.define(f"GUARD_{key}", value)
     header.doubles("usual_range", made.rows.usual)
+    header.whole("like", made.rows.like)
     header.doubles("lowest", made.low)
     header.doubles("highest", made.high)
     for key, number in made.pulse.figures().items():
