@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from identification.errors import InputError
+from identification.online.first_window import least_squares, prior_range
 from identification.online.identifiable import Identifiable
 from identification.recursive.estimator import RecursiveLeastSquares, Settings
 from identification.recursive.prior_start import UNDETERMINED, solve_with_prior
@@ -131,6 +132,30 @@ def test_stribeck_is_found_without_noise() -> None:
     level = {r.name: r for r in rows}
     assert level["gravity_cosine"].plant == 0.0
     assert abs(level["gravity_cosine"].estimate) < 0.005 * level["gravity_torque"].plant
+
+
+def test_a_control_value_that_rows_hardly_touch_is_not_told() -> None:
+    """A curve of three control values of 4 N.m: one well seen, one touched by a ten-millionth of
+    that, one not reached. Alone the second would be what rounding and noise make of it.
+    """
+    rng = np.random.default_rng(7)
+    h = np.zeros((300, 1, 4))
+    h[:, 0, 0], h[:, 0, 1], h[:, 0, 3] = rng.normal(size=(3, 300)) * [[1.0], [1e-7], [1e-3]]
+    y = h @ np.array([4.0, 4.0, 4.0, 900.0]) + 1e-3 * rng.normal(size=(300, 1))
+    like, apart = np.array([0, 0, 0, 3]), np.arange(4)
+    least, usual = np.array([1e-3]), np.zeros(4)
+    found = least_squares(y, h, least, like)
+    assert found[[0, 3]] == pytest.approx([4.0, 900.0], rel=1e-2)
+    assert np.all(np.abs(found[1:3]) < 4.0)
+    assert abs(least_squares(y, h, least, apart)[1]) > 40.0
+    ranges = prior_range(found, np.zeros(4), h, y, usual, like)
+    assert ranges[:3] == pytest.approx([4.0] * 3, rel=1e-2)
+
+
+def test_a_learned_curve_is_found() -> None:
+    """What the motion does not reach is said to be unsure."""
+    rows: list[EffectRow] = list(run("learned_position_friction@link", (None,), ("python",)))
+    assert all(r.passed for r in rows)
 
 
 def test_plant_reads_its_drive_late_where_the_model_says_so() -> None:
