@@ -4,9 +4,10 @@ from.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, final
+from typing import Any, Final, final
 
 import numpy as np
 import numpy.typing as npt
@@ -15,10 +16,16 @@ from identification.data.channels import CHANNELS, KINDS, channel_unit
 from identification.errors import InputError
 from identification.representation import html_of
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-__all__ = ["CHANNELS", "KINDS", "Checked", "Provenance", "Record", "channel_unit", "concat"]
+__all__ = [
+    "CHANNELS",
+    "KINDS",
+    "Checked",
+    "Provenance",
+    "Record",
+    "channel_unit",
+    "concat",
+    "listed",
+]
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -549,3 +556,23 @@ def concat(records: Sequence[Record], name: str | None = None) -> Record:
             ]
         ),
     )
+
+
+def listed(records: Record | Sequence[Record]) -> list[Record]:
+    """One record, or several, as a list.
+
+    Raises
+    ------
+    InputError
+        Something else.
+    """
+    found = [records] if isinstance(records, Record) else records
+    kinds = (str, bytes, Mapping)
+    several = isinstance(found, Iterable) and not isinstance(found, kinds)
+    strange = [x for x in (found if several else [found]) if not isinstance(x, Record)]
+    if strange:
+        raise InputError(
+            f"a record, or a list of them, is needed, and not {type(strange[0]).__name__}: "
+            "read(FILE) gives one"
+        )
+    return list(found)

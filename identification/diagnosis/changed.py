@@ -28,7 +28,7 @@ from identification.balance.noise import effective_share
 from identification.balance.stacked import taking_part
 from identification.data.joint_file import Joint
 from identification.data.prepare import STANDARD_GRAVITY
-from identification.data.record import Record
+from identification.data.record import Record, listed
 from identification.diagnosis.candidates import observable
 from identification.diagnosis.claims import FALSE_DISCOVERY, GAIN, LARGEST_SET
 from identification.errors import InputError
@@ -305,7 +305,7 @@ def changed(
     --------
     >>> print(changed(load_joint("healthy.toml"), read("today.csv")))   # doctest: +SKIP
     """
-    given = [records] if isinstance(records, Record) else list(records)
+    given = listed(records)
     tell = progress or (lambda text, share: None)
     search = _prepared(reference, given, tell)
     moved = search.chosen(tell)

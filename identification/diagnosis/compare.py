@@ -14,7 +14,7 @@ from identification.balance.calibration import settled
 from identification.balance.excitation import rest_note
 from identification.balance.rest import rest_check, rest_warnings
 from identification.data.check.gate import gate_warnings, gated
-from identification.data.record import Record
+from identification.data.record import Record, listed
 from identification.diagnosis.bench import JointBench
 from identification.diagnosis.places import Place, gather, places_of
 from identification.diagnosis.session import refuse_unlike
@@ -126,7 +126,7 @@ def compare(fitted: Fit, records: Record | Sequence[Record], *, linear: bool = T
         Records that the gate refuses, with other channels than those of the fit, or in unlike
         units.
     """
-    given = gated([records] if isinstance(records, Record) else list(records), fitted.joint)
+    given = gated(listed(records), fitted.joint)
     unseen = not any(_same(r, seen) for r in given for seen in fitted.records)
     # records of its own are judged as the loop judges the training records, others as it judges
     # held-out ones: one figure for one state

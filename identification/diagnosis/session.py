@@ -25,7 +25,7 @@ from identification.balance.excitation import (
 from identification.balance.kinematic import without_scale
 from identification.data.check.gate import gate_warnings, gated
 from identification.data.joint_file import Joint
-from identification.data.record import Record
+from identification.data.record import Record, listed
 from identification.diagnosis.bench import Bench, JointBench, Progress
 from identification.diagnosis.claims import (
     HELD_OUT_DROP,
@@ -192,8 +192,8 @@ class Session:
         InputError
             Unusable records or joint, in one line.
         """
-        given = [records] if isinstance(records, Record) else list(records)
-        apart = [held_out] if isinstance(held_out, Record) else list(held_out)
+        given = listed(records)
+        apart = listed(held_out)
         if not given:
             raise InputError("no training record; give at least one")
         given, apart = gated(given, joint), gated(apart, joint)

@@ -11,7 +11,7 @@ from identification.balance.dataset import visible_labels
 from identification.balance.kinematic import without_scale
 from identification.data.check.gate import gated
 from identification.data.joint_file import Joint
-from identification.data.record import Record
+from identification.data.record import Record, listed
 from identification.errors import InputError
 from identification.fitting.assess import Error, assess
 from identification.fitting.engine import Dataset, Solution, load_dataset, prepared_model
@@ -111,9 +111,20 @@ class Fit:
 
 
 def as_joint(model: JointModel | Joint, joint: Joint | None = None) -> Joint:
-    """The joint behind a model: the joint given, with the model's effects."""
+    """The joint behind a model: the joint given, with the model's effects.
+
+    Raises
+    ------
+    InputError
+        Neither a joint nor a model.
+    """
     if isinstance(model, Joint):
         return model
+    if not isinstance(model, JointModel):
+        raise InputError(
+            f"a joint or a model is needed, and not {type(model).__name__}: load_joint(FILE) gives "
+            "one"
+        )
     base = joint or Joint(name=model.name, kind=model.kind, gear_ratio=model.gear_ratio)
     return replace(
         base,
@@ -131,7 +142,7 @@ def fit(
     records: Record | Sequence[Record],
     *,
     joint: Joint | None = None,
-    held_out: Sequence[Record] = (),
+    held_out: Record | Sequence[Record] = (),
 ) -> Fit:
     """Fit a joint model to records by weighted least squares on the weak form of its balances.
 
@@ -142,7 +153,7 @@ def fit(
     records : Record or sequence of Record
     joint : Joint, optional
         Motor constant and known values where `model` is a JointModel.
-    held_out : sequence of Record
+    held_out : Record or sequence of Record
         Records the fit does not see; their error is given too.
 
     Raises
@@ -155,17 +166,17 @@ def fit(
     >>> first = fit(load_joint("joint.toml"), read("joint3.csv"))   # doctest: +SKIP
     """
     whole = as_joint(model, joint)
-    train = gated([records] if isinstance(records, Record) else list(records), whole)
+    train = gated(listed(records), whole)
     if not train:
         raise InputError("no record to fit; give at least one")
     prepared = prepared_model(whole, train[0])
-    data = load_dataset(train, gated(list(held_out), whole), whole, prepared)
+    data = load_dataset(train, gated(listed(held_out), whole), whole, prepared)
     solution = first_fit(prepared, data)
     return Fit(
         whole,
         solution,
         data,
         assess(solution.model, data, data.train, solution.values),
-        assess(solution.model, data, data.held_out, solution.values) if held_out else None,
+        assess(solution.model, data, data.held_out, solution.values) if data.held_out else None,
         tuple(train),
     )

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from identification.balance.calibration import is_of_run, without_calibration
 from identification.balance.dataset import HOLD_NAME, run_name
-from identification.data.record import Record
+from identification.data.record import Record, listed
 from identification.errors import InputError
 from identification.fitting.assess import assess
 from identification.fitting.covariance import (
@@ -201,11 +201,7 @@ def refine(
         A model with internal states; records without a drive channel; records shorter than a
         window; a simulation that diverges.
     """
-    given = (
-        [records]
-        if isinstance(records, Record)
-        else list(fit.records if records is None else records)
-    )
+    given = listed(fit.records if records is None else records)
     _refuse(fit, given)
     model, limits = fit.model, bounds_of(fit.model, fit.joint.known, fit.data)
     free = tuple(n for n in fit.solution.free if n not in fit.solution.unidentified)

@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from casadi_models import JointModel
-from identification.data.record import Record
+from identification.data.record import Record, listed
 from identification.errors import InputError
 from identification.fitting.engine import Dataset
 from identification.linear.spectra import (
@@ -95,13 +95,7 @@ def bode(fitted: Fit, records: Record | Sequence[Record] | None = None) -> Bode 
     Bode or None
         None where the records excite too narrow a band, lack the channels, or are too short.
     """
-    given = (
-        fitted.records
-        if records is None
-        else (records,)
-        if isinstance(records, Record)
-        else tuple(records)
-    )
+    given = fitted.records if records is None else tuple(listed(records))
     return bode_of(fitted.model, fitted.data, given)
 
 

@@ -19,7 +19,7 @@ from identification.balance.calibration import unknowns_of
 from identification.balance.dataset import visible_labels, without
 from identification.balance.sensing import adapt, sense
 from identification.data.joint_file import Joint
-from identification.data.record import Record
+from identification.data.record import Record, listed
 from identification.diagnosis.bench import Progress
 from identification.diagnosis.candidates import NotTestable
 from identification.diagnosis.improvement import Improvement
@@ -94,8 +94,9 @@ def explore(
     improvement = session.run(start)
     if improvement.ranking is None:
         raise InputError(improvement.reason)
-    given = [records] if isinstance(records, Record) else list(records)
-    return _Search(session, start, given[0], _part(progress, 0.3, 0.7)).result(improvement)
+    return _Search(session, start, listed(records)[0], _part(progress, 0.3, 0.7)).result(
+        improvement
+    )
 
 
 def _part(progress: Progress | None, low: float, span: float) -> Progress:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from identification.data.record import Record
 from irj_fmu.imported.fit import Solver, UserFit, simulator_of
-from irj_fmu.imported.model import UserModel, listed
+from irj_fmu.imported.model import UserModel, at_least_one
 from irj_fmu.imported.outputs import UserComparison, comparison_of, noise_of
 from irj_fmu.imported.port import coupled
 
@@ -29,7 +29,7 @@ def compare(model: UserModel | UserFit, records: Record | Sequence[Record]) -> U
         Where the FMU refuses a call.
     """
     model = model.model if isinstance(model, UserFit) else model
-    given = listed(records)
+    given = at_least_one(records)
     windows = model.windows(given)
     model = model if model.coupling is not None else coupled(model, windows)
     simulator, _ = simulator_of(model, windows)

@@ -29,7 +29,7 @@ from irj_fmu.imported.bench import OUTSIDE, FmuBench, Freedom, freedom, without_
 from irj_fmu.imported.compare import compare
 from irj_fmu.imported.correction import Correction, correction_of
 from irj_fmu.imported.fit import UserFit, fit
-from irj_fmu.imported.model import UserModel, listed
+from irj_fmu.imported.model import UserModel, at_least_one
 from irj_fmu.imported.outputs import UserComparison
 from irj_fmu.imported.port import port_of
 from irj_fmu.imported.restart import Restart
@@ -208,8 +208,8 @@ def diagnose(
     """
     say = progress or (lambda _text, _share: None)
     model = model.model if isinstance(model, UserFit) else model
-    given = gated(listed(records), model.joint)
-    apart = gated(listed(held_out), model.joint) if held_out else []
+    given = gated(at_least_one(records), model.joint)
+    apart = gated(at_least_one(held_out), model.joint) if held_out else []
     train, held, note = with_held_out(given, apart)
     every = [*train, *held]
     count = len(train)
@@ -268,7 +268,9 @@ def diagnose(
     found = Diagnosis(decided if seen else held_to_outputs(decided, compare(model, held)))
     say("done", 1.0)
     start = found.found.steps[0]
-    return UserDiagnosis(model, found, start.held_out, start.solution, tuple(listed(records)), why)
+    return UserDiagnosis(
+        model, found, start.held_out, start.solution, tuple(at_least_one(records)), why
+    )
 
 
 def held_to_outputs(found: Improvement, outputs: UserComparison) -> Improvement:

@@ -25,7 +25,7 @@ from identification.fitting.least_squares import least_squares, triangle_of
 from irj_fmu.host.run import FmuError
 from irj_fmu.host.signals import FloatArray
 from irj_fmu.imported.exact import Exact, NotExact
-from irj_fmu.imported.model import UserModel, listed, start_values
+from irj_fmu.imported.model import UserModel, at_least_one, start_values
 from irj_fmu.imported.outputs import UserComparison, comparison_of, noise_of
 from irj_fmu.imported.port import coupled, hold_of
 from irj_fmu.imported.run import Window
@@ -156,7 +156,7 @@ def fit(
     FmuError
         Where the FMU fails at the start values.
     """
-    given = listed(records)
+    given = at_least_one(records)
     if not model.values:
         raise InputError(f"{model.fmu.path.name}: no parameter to fit; name those that may move")
     say = progress or (lambda _text, _share: None)

@@ -18,7 +18,7 @@ from identification.diagnosis.verdict import verdict_of
 from irj_fmu.imported.compare import compare
 from irj_fmu.imported.diagnose import UserDiagnosis, diagnose, held_to_outputs, with_outside
 from irj_fmu.imported.fit import fit
-from irj_fmu.imported.model import UserModel, listed
+from irj_fmu.imported.model import UserModel, at_least_one
 from irj_fmu.imported.outputs import UserComparison
 
 
@@ -101,8 +101,8 @@ def improve(
         Where the FMU refuses a call.
     """
     say = progress or (lambda _text, _share: None)
-    given = gated(listed(records), model.joint)
-    apart = gated(listed(held_out), model.joint) if held_out else []
+    given = gated(at_least_one(records), model.joint)
+    apart = gated(at_least_one(held_out), model.joint) if held_out else []
     train, held, note = with_held_out(given, apart)
 
     def looked_at(now: UserModel, number: int) -> tuple[UserModel, UserComparison]:

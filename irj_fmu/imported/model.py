@@ -14,7 +14,7 @@ import numpy as np
 
 from identification.data.channels import channel_unit
 from identification.data.joint_file import Joint
-from identification.data.record import Record
+from identification.data.record import Record, listed
 from identification.data.units import base_unit, same_dimension
 from identification.errors import InputError
 from irj_fmu.host.run import Number
@@ -180,9 +180,9 @@ class UserModel:
         )
 
 
-def listed(records: Record | Sequence[Record]) -> list[Record]:
+def at_least_one(records: Record | Sequence[Record]) -> list[Record]:
     """One record or several as a list."""
-    found = [records] if isinstance(records, Record) else list(records)
+    found = listed(records)
     if not found:
         raise InputError("no record; give at least one")
     return found
@@ -375,4 +375,11 @@ def start_values(windows: Sequence[Window]) -> FloatArray:
     return np.array([w.start for w in windows])
 
 
-__all__ = ["Mapped", "UserModel", "UserParameter", "listed", "load_user_model", "start_values"]
+__all__ = [
+    "Mapped",
+    "UserModel",
+    "UserParameter",
+    "at_least_one",
+    "load_user_model",
+    "start_values",
+]
