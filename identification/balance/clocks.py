@@ -55,6 +55,19 @@ that of an acceleration in the model lack, is under a hundredth.
 """
 ENCODERS: Final = frozenset({"link_position_sensor"})
 """Places whose readings are positions."""
+HALF_A_CYCLE: Final = 0.5
+"""Half the cycle of a drive's filter [samples]: it is read by a logger that is no faster."""
+PRICE: Final = 2.5
+"""Squares, in units of the variance, that rows must lose for each that independent ones would: they
+are four to a kernel length, and 0.4 of them count.
+"""
+HALF_WAY: Final = 0.625
+"""Part of a minimum's depth that half the way to it must have: a parabola has three quarters, a
+straight slope half."""
+SHARE_ERROR: Final = 0.01
+"""Error of a share of a lateness [samples]: a hundredth of a usual lateness squared, which is what
+second order is then off by, is what :data:`NEAR` leaves.
+"""
 LOW_PASSED: Final = frozenset({"drive"})
 """Places whose readings may come through a low-pass and not late: drives filter their current."""
 SURE: Final = 4.53
@@ -192,36 +205,75 @@ def in_time(
         taken = (found[0] - found[1]) / late > ANSWERS
         # what is later than that is no filter of a drive
         if taken and place in LOW_PASSED and abs(shifts[place]) <= MOST_SKEW:
-            louder = noise(made, place, late) - noise(made, place, 0.0)
-            taken = not _leaves_less(other, made, place, louder, torque=torque)
-        if not taken:
+            shifts, made = _shared(make, shifts, place, noise, torque=torque)
+        elif not taken:
             shifts, made = unshifted, other
     return made
 
 
-def _leaves_less(
-    one: WeakRecord, other: WeakRecord, place: str, louder: float, *, torque: bool
-) -> bool:
-    """True where the balance of a sensor is better met with `one` than with `other`, beside the
-    variance by which noise is louder in `one`. Neither is the rule: the likelier is taken.
+def _shared(
+    make: Callable[[Mapping[str, float]], WeakRecord],
+    shifts: Mapping[str, float],
+    place: str,
+    noise: Callable[[WeakRecord, str, float], float],
+    *,
+    torque: bool,
+) -> tuple[dict[str, float], WeakRecord]:
+    """The shifts, and the rows, with that part of the lateness of a place shifted that the rows
+    are best met with; the rest is its rate's.
 
-    Both are late by the same time in first order. A reading that waits is the true value of an
-    earlier instant; one through a low-pass is made good by its rate, and nothing is left of higher
-    order. A shift of the latter leaves half the square of the lateness times the second derivative.
+    All parts are late by the same time in first order. A reading that waits is the true value of
+    an earlier instant: all of it is to be shifted. One through a low-pass is made good by its rate,
+    and nothing is left of higher order. A low-pass of a computer weighs its last reading and the
+    one before: its rate is that of half its cycle ago, and so much is to be shifted the other way.
 
     Rows that neither meets, as those of slow motion whose friction is not the law's, say nothing:
     the sum of squares that is compared is Tukey's, bounded. So those in which the joint creeps may
-    stay: what changes fast there tells the two apart best.
+    stay: what changes fast there tells best. Of the first two neither is the rule: the likelier is
+    taken. The third has a number more, and its price: it takes more off than that, whether the
+    noise that a rate makes louder is taken off too, which is not known so well, or not. And it does
+    so by a parabola: where rows fall in and out of what is bounded there are other minima.
     """
-    kept = one_way(one)
-    friction = any_curve(one, "motor_velocity", kept)
-    parts = [_parts(made, place, kept, torque=torque) for made in (one, other)]
-    rest = [rest_beside(values, [*others, friction, column]) for values, others, column in parts]
-    scale = min(DEVIATION * float(np.median(np.abs(x))) for x in rest)
+    from scipy.optimize import minimize_scalar
+
+    whole, alone, waiting = shifts[place], make({**shifts, place: 0.0}), make(shifts)
+    dt, kept = alone.grid.dt, one_way(alone)
+    friction = any_curve(alone, "motor_velocity", kept)
+
+    def rest(made: WeakRecord) -> FloatArray:
+        values, others, column = _parts(made, place, kept, torque=torque)
+        return rest_beside(values, [*others, friction, column])
+
+    left = {0.0: rest(alone), whole: rest(waiting)}
+    scale = min(DEVIATION * float(np.median(np.abs(x))) for x in left.values())
     if not scale:
-        return False
-    met, unmet = (float(np.sum(bounded(x / scale))) for x in rest)
-    return unmet - met + louder / scale**2 * len(rest[0]) > 0.0
+        return dict(shifts), waiting
+
+    def unmet(shift: float) -> float:
+        """Squares in units of the variance."""
+        if shift not in left:
+            left[shift] = rest(make({**shifts, place: shift}))
+        return float(np.sum(bounded(left[shift] / scale)))
+
+    def louder(shift: float) -> float:
+        """Those of them by which noise is louder."""
+        return len(friction) * noise(waiting, place, (whole - shift) * dt) / scale**2
+
+    if unmet(0.0) - louder(0.0) > unmet(whole) - louder(whole):
+        return dict(shifts), waiting
+    shift = 0.0
+    if whole > NEAR:
+        found = minimize_scalar(
+            unmet,
+            bounds=(-HALF_A_CYCLE, 0.0),
+            method="bounded",
+            options={"xatol": SHARE_ERROR},
+        )
+        at, gain = float(found.x), unmet(0.0) - float(found.fun)
+        sure = min(gain, gain + louder(at) - louder(0.0)) > PRICE * math.log(len(friction))
+        if sure and unmet(0.0) - unmet(at / 2) > HALF_WAY * gain:
+            shift = at
+    return {**shifts, place: shift}, make({**shifts, place: shift})
 
 
 def _parts(

@@ -82,6 +82,8 @@ class Dataset:
     orders : mapping of str to tuple of float
         By effect, orders per motor turn at which a line carries its name: start values of its
         shape.
+    other_orders : tuple of float
+        Orders per motor turn of lines without a name: what stands there is no named effect.
     colours : mapping of str to ChannelNoise
         Noise of each measured signal that is not white, in the proportions of its parts.
     """
@@ -96,6 +98,7 @@ class Dataset:
     held_out_names: tuple[str, ...] = ()
     note: str = ""
     orders: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    other_orders: tuple[float, ...] = ()
     colours: Mapping[str, ChannelNoise] = field(default_factory=dict)
 
     def __repr__(self) -> str:

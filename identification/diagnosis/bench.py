@@ -26,7 +26,7 @@ from identification.diagnosis.learned import (
     equivalences,
     learned_claims,
 )
-from identification.diagnosis.lines import Line, find_lines, orders_of
+from identification.diagnosis.lines import Line, find_lines, orders_of, other_orders
 from identification.diagnosis.locate import Unexplained, locate
 from identification.diagnosis.trials import Base, Trial, make_base, try_candidate
 from identification.fitting.assess import RATIO_LIMIT, VERDICT_KERNELS, BalanceError, Error, assess
@@ -174,7 +174,12 @@ class JointBench:
         """Take down the orders of the lines in what a step leaves: trials of periodic effects
         start there.
         """
-        self.data = replace(self.data, orders=orders_of(self.lines(step), self.joint))
+        lines = self.lines(step)
+        self.data = replace(
+            self.data,
+            orders=orders_of(lines, self.joint),
+            other_orders=other_orders(lines, self.joint),
+        )
 
     def base(self, solution: Solution) -> Base:
         """See :func:`identification.diagnosis.trials.make_base`."""

@@ -129,7 +129,8 @@ class LearnedClaim:
 def learned_claims(
     solution: Solution, data: Dataset, error: Error, threshold: float
 ) -> tuple[LearnedClaim, ...]:
-    """The curves of every balance that stays over its floor.
+    """The curves of every balance that stays over its floor, where they lower its error on held-out
+    rows: what does not hold on data that the fit never saw is not what is missing.
 
     Parameters
     ----------
@@ -149,6 +150,8 @@ def learned_claims(
     for balance in failing:
         found = find_curves(base, balance)
         drop = found.held_out_drop_percent
+        if drop <= 0:  # none is told where no held-out row moves steadily
+            continue
         seen = {c.curve.label for c in out}  # a side that two balances show is told once
         out += [LearnedClaim(c, drop) for c in found.curves if c.label not in seen]
     return tuple(out)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, final
 
@@ -39,9 +39,9 @@ from identification.diagnosis.order_tracking import (
     Peak,
     Samples,
     background,
+    beside,
     clipped,
     confirmed,
-    detrended,
     everywhere,
     peaks,
     phase_fit,
@@ -52,7 +52,15 @@ from identification.diagnosis.order_tracking import (
 )
 from identification.fitting.engine import Solution
 
-__all__ = ["Line", "find_lines", "held_out_drop", "highest_order", "named_orders", "orders_of"]
+__all__ = [
+    "Line",
+    "find_lines",
+    "held_out_drop",
+    "highest_order",
+    "named_orders",
+    "orders_of",
+    "other_orders",
+]
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -189,13 +197,27 @@ def _angle_factor(joint: Joint) -> float:
     return 2 * math.pi if joint.kind == "linear" else abs(joint.gear_ratio)
 
 
+def _per_motor_angle(joint: Joint) -> float:
+    """Order of a line to the order of a law: periods per radian of the motor."""
+    return _angle_factor(joint) / abs(joint.gear_ratio)
+
+
 def orders_of(lines: Sequence[Line], joint: Joint) -> dict[str, tuple[float, ...]]:
     """By effect, the orders of the lines that carry its name, as the shape of its law counts
     them (periods per radian of the motor).
     """
-    turn = _angle_factor(joint) / abs(joint.gear_ratio)
+    turn = _per_motor_angle(joint)
     keys = dict.fromkeys(k for line in lines for k in line.effects)
     return {k: tuple(line.order * turn for line in lines if k in line.effects) for k in keys}
+
+
+def other_orders(lines: Sequence[Line], joint: Joint) -> tuple[float, ...]:
+    """The orders of the lines that carry no name, counted in the same way.
+
+    A periodic effect that is tried at the named orders alone takes a part of such a line with it
+    and ends in the valley next to one of them.
+    """
+    return tuple(line.order * _per_motor_angle(joint) for line in lines if not line.effects)
 
 
 def at_every_sample(
@@ -390,6 +412,11 @@ class _Joined:
     factor: float
 
     @property
+    def weight(self) -> FloatArray:
+        """Angle that each sample covers, per second."""
+        return self.factor * np.abs(self.signal("motor_velocity", smooth=True))
+
+    @property
     def starts(self) -> IntArray:
         """First sample of each stretch."""
         parts, first = [np.zeros(1, dtype=np.int64)], 0
@@ -421,7 +448,7 @@ class _Joined:
         return Samples(
             self.factor * self.signal("motor_position"),
             seen(self.residual),
-            self.factor * np.abs(self.signal("motor_velocity", smooth=True)),
+            self.weight,
             np.concatenate(block),
             seen,
         )
@@ -494,18 +521,22 @@ def _without_trend(
         slow = [of.signal(n, smooth=True) for n in ("motor_velocity", "motor_acceleration")]
         return trend(of.factor * of.signal("motor_position"), slow[0], slow[1], knots, ends)
 
-    own, beyond = columns(train), None if held is None else columns(held)
+    parts = [(of, beside(columns(of), of.weight)) for of in (train, held) if of is not None]
     out = []
     for smoothed in SMOOTHED:
-        samples = train.samples(smoothed)
-        coefficients = detrended(own, samples)
-        left = clipped(replace(samples, residual=samples.residual - own @ coefficients))
-        apart = None
-        if held is not None and beyond is not None:
-            apart = held.samples(smoothed)
-            apart = clipped(replace(apart, residual=apart.residual - beyond @ coefficients))
-        out.append(_Tracked(balance, smoothed, left, apart, train.runs[0].grid.dt, direct))
+        left = [_beside(of.samples(smoothed), taken) for of, taken in parts]
+        apart = left[1] if held is not None else None
+        out.append(_Tracked(balance, smoothed, left[0], apart, train.runs[0].grid.dt, direct))
     return out
+
+
+def _beside(samples: Samples, taken: Callable[[FloatArray], FloatArray]) -> Samples:
+    """The samples without a trend, their outliers cut."""
+
+    def seen(values: FloatArray) -> FloatArray:
+        return taken(samples.seen(values))
+
+    return clipped(replace(samples, residual=taken(samples.residual), seen=seen))
 
 
 def find_lines(
@@ -752,7 +783,7 @@ def _gains(
         | dict.fromkeys(amplitudes, 0.0)
     )
     law = _Pointwise(model, data.sensing, amplitudes)
-    turn = _angle_factor(data.joint) / abs(data.joint.gear_ratio)
+    turn = _per_motor_angle(data.joint)
     out = []
     for order in orders:
         normal, right = np.zeros((len(amplitudes), len(amplitudes))), np.zeros(len(amplitudes))

@@ -88,7 +88,8 @@ class Samples:
     block : (n,) int array
         Number of the second that the sample belongs to.
     seen : callable
-        What the smoothing of the residual leaves of a signal at the samples.
+        What the smoothing of the residual, and the trend taken out of it, leave of a signal at the
+        samples.
     """
 
     angle: FloatArray
@@ -200,13 +201,26 @@ def velocity_knots(velocity: FloatArray) -> FloatArray:
     return np.unique(np.concatenate([inner[np.abs(inner) > small], [-small, small]]))
 
 
-def detrended(columns: FloatArray, samples: Samples) -> FloatArray:
-    """Coefficients of the trend by weighted least squares."""
-    root = np.sqrt(samples.weight)
-    return np.asarray(
-        np.linalg.lstsq(columns * root[:, None], samples.residual * root, rcond=None)[0],
-        dtype=np.float64,
-    )
+def beside(columns: FloatArray, weight: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    """What weighted least squares on the columns of a trend leave of a signal.
+
+    The residual and the line that is looked for in it are both taken without the trend (R. Frisch,
+    F. Waugh 1933): where the velocity goes with the position, as on moves between the same places,
+    the trend takes a part of a line too, and a whole sine taken off what is left would write that
+    part into it as a line of its own.
+
+    Parameters
+    ----------
+    columns : (n, k) array
+    weight : (n,) array
+    """
+    root = np.sqrt(weight)
+    solving = np.linalg.pinv(columns * root[:, None], rcond=1e-10) * root
+
+    def left(values: FloatArray) -> FloatArray:
+        return np.asarray(values - columns @ (solving @ values), dtype=np.float64)
+
+    return left
 
 
 def clipped(samples: Samples) -> Samples:

@@ -559,11 +559,14 @@ class Session:
         the model that this ends with.
 
         A name of the model that falls out, or is much less probable than another one, gives its
-        place to the one that fits best. `stale`: the ranking is that of an earlier model.
+        place to the one that fits best; one that is less probable than nothing at all goes.
+        `stale`: the ranking is that of an earlier model.
         """
         self.progress("fitting the names of each claim", 0.8)
         swapped: set[str] = set()
-        for position in range(len(standing.claims)):
+        position = -1
+        while position + 1 < len(standing.claims):
+            position += 1
             claim = standing.claims[position]
             if stale:
                 base = self.bench.base(standing.now.solution)
@@ -572,6 +575,15 @@ class Session:
             if odds is None or not odds.rivals:
                 continue
             self._doubted.update(odds.behind)
+            others = tuple(c for c in standing.claims if c is not claim)
+            if odds.empty and not any(claim.effects[0] in c.effect.needs for c in others):
+                self._refused[claim.label] = (
+                    f"gains no more than laws that are not missing: nothing is {odds.nothing:.0%} "
+                    "probable"
+                )
+                standing, stale = self._replay(others, standing), True
+                position -= 1
+                continue
             best = odds.rivals[0]
             told = replace(claim, confidence=odds.probability)
             taken = best.label in swapped or any(c.label == best.label for c in standing.claims)

@@ -39,6 +39,8 @@ away.
 COLLINEAR: Final = 2e-3
 """Share of a candidate's columns outside the base below which it is not testable."""
 
+UNNAMED_LINE: Final = "explains most of a line whose order has no name"
+"""Why a periodic effect is no candidate whose own order is none that it may have."""
 REFINE_SHARE: Final = 0.1
 """Share of the residual that a candidate must explain on its grid before its shape is refined."""
 
@@ -467,11 +469,16 @@ def try_candidate(candidate: Candidate, base: Base) -> Trial | NotTestable | Non
             best = (found[0], shapes, found[1])
     if best is None:
         return None
+    parameters = {p.name: p for p in candidate.model.parameters}
+    periods = [n for n in candidate.shapes if parameters[n].role == "order"]
+    for order in data.other_orders if periods else ():
+        found = projected({**best[1], **dict.fromkeys(periods, order)})
+        if found is not None and found[0] > best[0]:
+            return NotTestable(candidate.effect.key, UNNAMED_LINE)
     if inside < COLLINEAR:
         return NotTestable(candidate.effect.key, _collinear_reason(candidate))
     if best[0] <= 0:
         return None
-    parameters = {p.name: p for p in candidate.model.parameters}
     limits = {
         n: (
             parameters[n].grid[0] * data.ranges[parameters[n].scale] / 2,

@@ -38,11 +38,21 @@ class Odds:
         names that fell out and with nothing of the library at all.
     behind : mapping of str to str
         Why a name fell out.
+    nothing : float
+        Chance that no name of the library is missing.
     """
 
     rivals: tuple[Rival, ...]
     probability: Mapping[str, float]
     behind: Mapping[str, str]
+    nothing: float = 0.0
+
+    @property
+    def empty(self) -> bool:
+        """Whether nothing at all is more probable than all names together: what the first one
+        gains is no more than laws that are not missing gain on the same records.
+        """
+        return self.nothing > sum(self.probability.values())
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -151,4 +161,5 @@ def odds_of(contest: Contest, allowance: float) -> Odds:
         tuple(sorted(left, key=lambda r: -chance[r.name])),
         MappingProxyType({r.name: chance[r.name] for r in left}),
         MappingProxyType(behind),
+        chance.get(NOTHING, 0.0),
     )

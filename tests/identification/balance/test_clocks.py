@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from identification import Improvement, Record, fit, improve, load_joint, read
 from identification.balance.calibration import values_on
 from identification.balance.clocks import MOST_SKEW, NEAR, lateness
 from identification.balance.dataset import run_name
+from identification.data.joint_file import Joint
 from identification.fitting.engine import floors, load_dataset, prepared_model, solve
 from identification.fitting.fit import Fit
 from identification.planning.follow import Controller, Follower
@@ -26,6 +28,8 @@ from tests.identification.diagnosis.test_other_payload import (
     TRUE,
     follower,
 )
+from tests.recorded_world._engine import ROWS_PER_SECOND
+from tests.recorded_world.world import make_case, write_case
 
 DEMO = Path(__file__).resolve().parents[3] / "workbench" / "demo"
 CHANNELS = ("link_position", "link_torque", "motor_current")
@@ -204,3 +208,22 @@ def test_what_is_taken_off_the_rows_is_not_taken_off_the_value() -> None:
     values = dict.fromkeys(model.parameter_names, 0.0) | {f"link_encoder_skew[{rows.name}]": 0.008}
     left = values_on(model, rows, values)["link_encoder_skew"]
     assert left == pytest.approx(0.008 - shift)
+
+
+@cache
+def through_a_filter(seed: int) -> tuple[float, tuple[Record, ...], Joint]:
+    """Cycle of the drive's filter as a part of a sample, the records of a joint, and its file."""
+    case = make_case(seed)
+    with TemporaryDirectory() as folder:
+        where = write_case(case, Path(folder), "all")
+        joint = load_joint(where / "joint.toml")
+        runs = tuple(read(where / f"{n}.csv", joint=joint) for n in ("train", "test"))
+        return case.sensors.rate / ROWS_PER_SECOND, runs, joint
+
+
+@pytest.mark.parametrize("seed", [8916, 8925])
+def test_a_filter_that_is_computed_in_cycles_is_half_a_cycle_behind_its_rate(seed: int) -> None:
+    cycle, runs, joint = through_a_filter(seed)
+    data = load_dataset([runs[0]], [runs[1]], joint, prepared_model(joint, runs[0]))
+    for rows, run in zip((*data.train, *data.held_out), runs, strict=True):
+        assert rows.shifts["drive"] / run.dt == pytest.approx(-cycle / 2, abs=0.01)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from benchmarks.lines import Case, Result, results
-from identification import Record, load_joint, read
+from identification import Record, improve, load_joint, read
 from identification.balance.sensing import sense
 from identification.data.joint_file import Joint, parse_joint, toml_text
 from identification.diagnosis.lines import (
@@ -71,6 +71,24 @@ def test_line_of_a_few_percent_is_found_at_its_order(order: float | None, twist:
     else:
         assert lines[0].balance == "transmission"
         assert lines[0].order == pytest.approx(order, abs=lines[0].tolerance)
+
+
+def test_a_line_at_an_order_without_a_name_is_no_effect_at_a_named_one_beside_it() -> None:
+    if not SHARED.exists() and not os.environ.get("CI"):
+        pytest.skip("../shared/hidden_effect is not there")
+
+    def with_error(record: Record) -> Record:
+        angle = record["link_position"] + 1e-5 * np.sin(2.5 * record["motor_position"] + 1)
+        return record.with_channel("link_position", angle)
+
+    train, held = (
+        [with_error(read(SHARED / f"{n}{i}.csv")) for i in ("", "2")] for n in ("train", "test")
+    )
+    result = improve(train, load_joint(SHARED / "joint.toml"), held)
+    assert result.claims == ()
+    assert [line.order for line in result.lines] == [pytest.approx(2.5, abs=0.005)]
+    why = {x.effect: x.why for x in result.not_testable}
+    assert "line" in why["kinematic_error"]
 
 
 def swinging(seed: int, order: float = 0.0, amplitude: float = 0.0, count: int = 6000) -> Samples:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,8 +19,8 @@ from identification.diagnosis.order_tracking import (
     Peak,
     Samples,
     background,
+    beside,
     clipped,
-    detrended,
     everywhere,
     independent_orders,
     peaks,
@@ -91,7 +92,32 @@ def test_trend_takes_out_what_it_is_made_of() -> None:
     slow = 3 * np.interp(velocity, knots, np.sin(knots)) + 2 * x - x**3 + 0.1 * acceleration
     weight = np.where(rng.random(COUNT) < 0.3, 0.0, 1.0)
     spoilt = np.where(weight > 0, slow, 1e3)
-    assert columns @ detrended(columns, along(angle, spoilt, weight)) == pytest.approx(slow)
+    left = beside(columns, weight)(spoilt)
+    assert left[weight > 0] == pytest.approx(0.0, abs=1e-9)
+
+
+def between_two_places(rate: float = 0.3) -> tuple[np.ndarray, np.ndarray]:
+    """Moves to and fro: the velocity is a function of the position."""
+    time = np.linspace(0.0, 40.0, COUNT)
+    return 14 * np.sin(rate * time), 14 * rate * np.cos(rate * time)
+
+
+def test_what_the_trend_takes_of_a_line_is_no_line_of_its_own() -> None:
+    angle, velocity = between_two_places()
+    knots = velocity_knots(velocity)
+    columns = trend(angle, velocity, -angle, knots, (-14.0, 14.0))
+    weight = np.abs(velocity)
+    taken = beside(columns, weight)
+    wave = np.sin(0.75 * angle + 1.0)
+    samples = replace(along(angle, taken(wave), weight), seen=taken)
+    lost = float(np.sum(weight * (wave - samples.residual) ** 2) / np.sum(weight * wave**2))
+    assert lost > 0.01, "a motion whose trend holds something of the line"
+    sine, cosine = phase_fit(0.75, samples)
+    assert (sine, cosine) == pytest.approx((math.cos(1.0), math.sin(1.0)), rel=1e-6)
+    found = replace(line(0.75), sine=sine, cosine=cosine)
+    assert samples.residual - found.wave(samples) == pytest.approx(0.0, abs=1e-6)
+    whole = found.wave(along(angle, wave, weight))
+    assert np.abs(samples.residual - whole).max() > 0.1
 
 
 def test_outliers_are_cut_at_robust_deviations_of_what_counts() -> None:

@@ -146,3 +146,17 @@ def test_a_name_stands_for_its_set_unless_another_counts_as_better(drags: Contes
         assert odds.holds(second.name) == holds
         assert not odds.holds("gravity"), "no rival at all"
     assert not Odds((), {}, {}).holds(first.name)
+
+
+def test_names_that_are_less_probable_than_nothing_are_no_claim(drags: Contest) -> None:
+    first, second, _ = drags.rivals
+    for nothing, empty in ((0.49, False), (0.51, True)):
+        share = {first.name: 0.6 * (1 - nothing), second.name: 0.4 * (1 - nothing)}
+        assert Odds((first, second), share, {}, nothing).empty == empty
+    sure = odds_of(drags, 0.0)
+    assert not sure.empty
+    assert sum(sure.probability.values()) + sure.nothing <= 1 + 1e-12
+    # so much is gained by laws that are not missing that the names' own gain says nothing
+    doubted = odds_of(drags, 1e9)
+    assert doubted.nothing == pytest.approx(1 / 3, abs=0.01)
+    assert doubted.nothing > sure.nothing
