@@ -12,7 +12,8 @@ makes it good, and no shift.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -28,7 +29,7 @@ from identification.balance.beside import (
     rest_beside,
     scaled,
 )
-from identification.balance.weak import WeakRecord
+from identification.balance.weak import Filter, WeakRecord
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -186,6 +187,7 @@ def in_time(
         Whether the torque of the link is measured.
     """
     shifts: dict[str, float] = {}
+    filters: dict[str, Filter] = {}
     made, wanted = make(shifts), tuple(places)
     for _ in range(SHIFTS):
         moved = dict(shifts)
@@ -205,24 +207,35 @@ def in_time(
         taken = (found[0] - found[1]) / late > ANSWERS
         # what is later than that is no filter of a drive
         if taken and place in LOW_PASSED and abs(shifts[place]) <= MOST_SKEW:
-            shifts, made = _shared(make, shifts, place, noise, torque=torque)
+            filters[place] = told = _filter(make, shifts, place, noise, torque=torque)
+            shifts = {**shifts, place: as_told([told], told) / made.grid.dt}
+            made = make(shifts)
         elif not taken:
             shifts, made = unshifted, other
-    return made
+    return replace(made, filters=filters) if filters else made
 
 
-def _shared(
+def as_told(filters: Sequence[Filter], of: Filter) -> float:
+    """Shift of a reading [s] by what several records say: its filter is that of the drive, and the
+    records that tell more decide for those that tell less.
+    """
+    if sum(f.better for f in filters) < 0.0:
+        return of.late
+    return float(max(filters, key=lambda f: f.gain).behind)
+
+
+def _filter(
     make: Callable[[Mapping[str, float]], WeakRecord],
     shifts: Mapping[str, float],
     place: str,
     noise: Callable[[WeakRecord, str, float], float],
     *,
     torque: bool,
-) -> tuple[dict[str, float], WeakRecord]:
-    """The shifts, and the rows, with that part of the lateness of a place shifted that the rows
-    are best met with; the rest is its rate's.
+) -> Filter:
+    """What rows say of a late reading, by how well they are met with all of its lateness shifted,
+    with its rate in the place of that, or with a part shifted the other way and its rate.
 
-    All parts are late by the same time in first order. A reading that waits is the true value of
+    All are late by the same time in first order. A reading that waits is the true value of
     an earlier instant: all of it is to be shifted. One through a low-pass is made good by its rate,
     and nothing is left of higher order. A low-pass of a computer weighs its last reading and the
     one before: its rate is that of half its cycle ago, and so much is to be shifted the other way.
@@ -247,7 +260,7 @@ def _shared(
     left = {0.0: rest(alone), whole: rest(waiting)}
     scale = min(DEVIATION * float(np.median(np.abs(x))) for x in left.values())
     if not scale:
-        return dict(shifts), waiting
+        return Filter(whole * dt, -1.0)
 
     def unmet(shift: float) -> float:
         """Squares in units of the variance."""
@@ -259,9 +272,7 @@ def _shared(
         """Those of them by which noise is louder."""
         return len(friction) * noise(waiting, place, (whole - shift) * dt) / scale**2
 
-    if unmet(0.0) - louder(0.0) > unmet(whole) - louder(whole):
-        return dict(shifts), waiting
-    shift = 0.0
+    better = unmet(whole) - louder(whole) - unmet(0.0) + louder(0.0)
     if whole > NEAR:
         found = minimize_scalar(
             unmet,
@@ -272,8 +283,8 @@ def _shared(
         at, gain = float(found.x), unmet(0.0) - float(found.fun)
         sure = min(gain, gain + louder(at) - louder(0.0)) > PRICE * math.log(len(friction))
         if sure and unmet(0.0) - unmet(at / 2) > HALF_WAY * gain:
-            shift = at
-    return {**shifts, place: shift}, make({**shifts, place: shift})
+            return Filter(whole * dt, better, at * dt, gain)
+    return Filter(whole * dt, better)
 
 
 def _parts(

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Final, final
 
 import numpy as np
@@ -13,7 +14,7 @@ import numpy.typing as npt
 
 from casadi_models import JointModel, hold
 from identification.balance.calibration import named_late, unknowns_of
-from identification.balance.clocks import SIGNAL, in_time, places_of, shifted
+from identification.balance.clocks import SIGNAL, as_told, in_time, places_of, shifted
 from identification.balance.colour import ChannelNoise, white
 from identification.balance.contacts import TOLD_BY, restored
 from identification.balance.memory import cache_of
@@ -54,6 +55,8 @@ STILL: Final = 3.0
 """Pointwise speed of a side at rest, in standard deviations of its noise: 0.3 % of samples at
 rest lie above.
 """
+NANOSECOND: Final = 1e-9
+"""What two shifts may differ by and be the same [s]: no stamp is finer."""
 PREPARED: Final = 16_000_000
 """Values of prepared records that a thread keeps (128 MB): two records of 40 s at 1 kHz at every
 kernel of the verdict.
@@ -169,25 +172,21 @@ def load_dataset(
     alone = seen_from_the_motor(sensing, joint)
     length = kernel or (ONE_SIDED_KERNEL if alone else CLAIM_KERNEL)
     prepared: list[WeakRecord] = []
-    first = 0
+    first, count = 0, len(train)
+    again: list[Callable[..., WeakRecord]] = []
     for number, record in enumerate((*train, *held_out)):
-        other = record.payload != train[0].payload
-        masked = _of_the_link(record, sensing) if other else frozenset[str]()
-        made = _once(
-            record,
-            joint,
-            sensing,
-            length,
-            first,
-            curved=model.lagging_load,
-            late=places_of(model),
-            known=None if shifts is None else shifts[number],
-        )
-        if masked:
-            made = replace(made, masked=masked)
-        first = max(first, 1 + int(made.block.max(initial=first - 1)))
-        prepared.append(made)
-    count = len(train)
+        way = partial(_once, curved=model.lagging_load, late=places_of(model))
+        again.append(partial(way, record, joint, sensing, length, first))
+        prepared.append(again[-1](known=None if shifts is None else shifts[number]))
+        first = max(first, 1 + int(prepared[-1].block.max(initial=first - 1)))
+    for number, (record, made) in enumerate(zip((*train, *held_out), prepared, strict=True)):
+        told = {p: [w.filters[p] for w in prepared[:count] if p in w.filters] for p in made.filters}
+        agreed = {p: as_told(told[p], f) for p, f in made.filters.items() if told[p]}
+        if any(abs(made.shifts[p] - late) > NANOSECOND for p, late in agreed.items()):
+            made = replace(again[number](known={**made.shifts, **agreed}), filters=made.filters)
+        if record.payload != train[0].payload:
+            made = replace(made, masked=_of_the_link(record, sensing))
+        prepared[number] = made
     for balance in sensing.balances:
         if held_out and all(balance in made.masked for made in prepared[count:]):
             raise InputError(
@@ -359,7 +358,7 @@ def weak_record(
             return made_with(shifts)
 
         late_by = {SIGNAL[p]: k for p, k in shifts.items()}
-        made = restored(made, mended, read, late_by, remade)
+        made = replace(restored(made, mended, read, late_by, remade), filters=made.filters)
     made = _with_rests(made, noise)
     if record.measured is not None and not record.measured.all():
         made = replace(

@@ -236,6 +236,29 @@ def _strided(
 
 @final
 @dataclass(frozen=True)
+class Filter:
+    """What the rows of a record say of a late reading: whether it waits or is low-passed.
+
+    Attributes
+    ----------
+    late : float
+        Time by which it is late [s].
+    better : float
+        Squares, in units of the variance, by which a low-pass meets the rows better than a delay.
+    behind : float
+        What is to be shifted beside the rate of a low-pass, zero or less [s].
+    gain : float
+        Squares by which that is better than no shift.
+    """
+
+    late: float
+    better: float
+    behind: float = 0.0
+    gain: float = 0.0
+
+
+@final
+@dataclass(frozen=True)
 class WeakRecord:
     """One record prepared for weak-form regression.
 
@@ -273,8 +296,9 @@ class WeakRecord:
     name : str
         Tells the record from all others: its calibration unknowns go by it.
     shifts : mapping of str to float
-        By the place of a late sensor, the whole samples that are taken off its readings already
-        [s].
+        By the place of a late sensor, the samples that are taken off its readings already [s].
+    filters : mapping of str to Filter
+        By the place of a sensor that may be read through a low-pass, what the record says of it.
     """
 
     grid: Grid
@@ -293,6 +317,7 @@ class WeakRecord:
     shifts: Mapping[str, float] = field(default_factory=dict)
     paired: Mapping[str, FloatArray] = field(default_factory=dict)
     bridging: Mapping[str, FloatArray] = field(default_factory=dict)
+    filters: Mapping[str, Filter] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return one_line(self)

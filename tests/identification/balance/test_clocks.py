@@ -14,8 +14,9 @@ from scipy.interpolate import CubicSpline
 from casadi_models import JointModel
 from identification import Improvement, Record, fit, improve, load_joint, read
 from identification.balance.calibration import values_on
-from identification.balance.clocks import MOST_SKEW, NEAR, lateness
+from identification.balance.clocks import MOST_SKEW, NEAR, as_told, lateness
 from identification.balance.dataset import run_name
+from identification.balance.weak import Filter
 from identification.data.joint_file import Joint
 from identification.fitting.engine import floors, load_dataset, prepared_model, solve
 from identification.fitting.fit import Fit
@@ -213,7 +214,7 @@ def test_what_is_taken_off_the_rows_is_not_taken_off_the_value() -> None:
 @cache
 def through_a_filter(seed: int) -> tuple[float, tuple[Record, ...], Joint]:
     """Cycle of the drive's filter as a part of a sample, the records of a joint, and its file."""
-    case = make_case(seed)
+    case = make_case(seed, kind="none")
     with TemporaryDirectory() as folder:
         where = write_case(case, Path(folder), "all")
         joint = load_joint(where / "joint.toml")
@@ -227,3 +228,27 @@ def test_a_filter_that_is_computed_in_cycles_is_half_a_cycle_behind_its_rate(see
     data = load_dataset([runs[0]], [runs[1]], joint, prepared_model(joint, runs[0]))
     for rows, run in zip((*data.train, *data.held_out), runs, strict=True):
         assert rows.shifts["drive"] / run.dt == pytest.approx(-cycle / 2, abs=0.01)
+
+
+def test_records_of_one_drive_share_its_filter() -> None:
+    """What one record says surely of the drive counts for one that says little."""
+    sure, vague, waits = (
+        Filter(0.01, 900.0, -1e-4, 40.0),
+        Filter(0.012, -2.0),
+        Filter(0.012, -950.0),
+    )
+    assert as_told([sure, vague], vague) == as_told([sure, vague], sure) == -1e-4
+    assert as_told([vague], vague) == 0.012, "alone it is a delay"
+    assert as_told([sure, waits], sure) == 0.01, "each is late by its own"
+    assert as_told([sure, waits], waits) == 0.012
+
+
+def test_a_held_out_record_is_read_through_the_filter_of_the_training_records() -> None:
+    _, runs, joint = through_a_filter(9106)
+    data = load_dataset([runs[0]], [runs[1]], joint, prepared_model(joint, runs[0]))
+    train, held_out = data.train[0], data.held_out[0]
+    assert train.filters["drive"].behind < 0.0
+    assert held_out.filters["drive"].behind == 0.0, "of itself it tells none"
+    assert held_out.shifts["drive"] == pytest.approx(train.shifts["drive"], abs=1e-9)
+    swapped = load_dataset([runs[1]], [runs[0]], joint, prepared_model(joint, runs[1]))
+    assert swapped.train[0].shifts["drive"] == swapped.held_out[0].shifts["drive"] == 0.0
