@@ -63,6 +63,8 @@ VERBS: Final[Mapping[str, tuple[str, ...]]] = {
 }
 LEFT: Final = re.compile(r"\.part$|^\.build-|^\.write-|^\.fmu-|^irj-(?!locks-)")
 """Names that must not be there once a run has ended."""
+PATIENCE: Final = 60.0
+"""What a run may take to end when it is asked to [s]."""
 NOTES: Final = (".lock", "batch.sha256")
 
 
@@ -98,11 +100,18 @@ def started(verb: str, folder: Path) -> subprocess.Popen[str]:
     )
 
 
-def killed(process: subprocess.Popen[str], number: int = signal.SIGKILL) -> None:
-    """End a run that this campaign started, with its children."""
+def killed(process: subprocess.Popen[str], number: int = signal.SIGKILL) -> bool:
+    """End a run that this campaign started, with its children; False where only SIGKILL ends it."""
     with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, number)
-    process.communicate()
+    try:
+        process.communicate(timeout=PATIENCE)
+    except subprocess.TimeoutExpired:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+        return False
+    return True
 
 
 def finished(verb: str, folder: Path) -> str:
@@ -111,8 +120,10 @@ def finished(verb: str, folder: Path) -> str:
     if verb == "app":
         assert process.stdout is not None
         line = process.stdout.readline()
-        killed(process, signal.SIGINT)
-        return "" if "http://" in line else f"no address: {line!r}"
+        ended = killed(process, signal.SIGINT)
+        if "http://" not in line:
+            return f"no address: {line!r}"
+        return "" if ended else "does not end on SIGINT"
     _, err = process.communicate(timeout=300)
     return "" if process.returncode == 0 else f"exit {process.returncode}: {err.strip()[-300:]}"
 
@@ -219,6 +230,8 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--verbs", nargs="+", choices=tuple(VERBS), default=list(VERBS))
     arguments = parser.parse_args()
+    # a shell starts what runs in its background with SIGINT ignored, and runs would inherit that
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     with tempfile.TemporaryDirectory(prefix="irj-kills-") as place:
         bad = campaign(arguments.count, arguments.seed, Path(place), tuple(arguments.verbs))
     print(f"{arguments.count} kills: {bad} wrong")
