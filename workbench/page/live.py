@@ -6,6 +6,7 @@ import contextlib
 import logging
 import secrets
 import threading
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, final
@@ -84,6 +85,7 @@ class Live(Place):
         self.job: Job | None = None
         self.error: str | None = None
         self.begun = ""
+        self._said = time.time_ns() // 1_000_000  # goes on after a restart of the server
         self.listeners: set[Listener] = set()
         self.helper = Helper(session.folder)
         self.worker = Worker(f"session {session.id[:6]}", self.helper.close)
@@ -144,9 +146,12 @@ class Live(Place):
         return after
 
     def snapshot(self) -> dict[str, Any]:
-        """What the page needs to know at once when something changed."""
+        """What the page needs to know at once when something changed. ``said`` grows with every
+        change that is told: of two that overtook one another the page knows the newer one.
+        """
         with self.lock:
             return {
+                "said": self._said,
                 "revision": self.state.revision,
                 "job": self.job.as_json() if self.job else None,
                 "error": self.error,
@@ -160,7 +165,9 @@ class Live(Place):
 
     def tell(self) -> None:
         """Send the snapshot to every open page."""
-        snapshot = self.snapshot()
+        with self.lock:
+            self._said += 1
+            snapshot = self.snapshot()
         for listener in tuple(self.listeners):
             listener(snapshot)
 

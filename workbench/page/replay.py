@@ -346,13 +346,17 @@ def _result(made: Replay) -> dict[str, Any]:
     }
 
 
-def stored(folder: Path) -> dict[str, Any]:
-    """The last replay, or ``{}``."""
+def shown(folder: Path, *, following: bool) -> dict[str, Any]:
+    """The last replay, or ``{}``. While a file or a stream is followed, only what came of it: the
+    verdict on an earlier record would stand there as one on this. What was cancelled is no longer
+    live.
+    """
     try:
         found: dict[str, Any] = json.loads((folder / FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
-    return found
+    of_it = bool(found.get("live", False))
+    return {} if following and not of_it else {**found, "live": following}
 
 
-__all__ = ["READINGS", "TRIED", "Request", "follow", "replay", "request_of", "stored"]
+__all__ = ["READINGS", "TRIED", "Request", "follow", "replay", "request_of", "shown"]

@@ -149,9 +149,14 @@ def _compare(live: Live, query: Query) -> dict[str, Any]:
     return {**found, "pattern": pattern(analysis, live.state.steps)}
 
 
+def _runs(live: Live, action: str) -> bool:
+    job = live.job
+    return job is not None and job.action == action
+
+
 def _replay(live: Live, query: Query) -> dict[str, Any]:
     return {
-        "last": app_replay.stored(folder_of(live)),
+        "last": app_replay.shown(folder_of(live), following=_runs(live, "follow")),
         "sensors": app_replay.READINGS,
         "faults": app_replay.TRIED,
         "seconds": app_replay.MOST_SECONDS,

@@ -30,21 +30,35 @@ function knownTyped(node) {
 }
 const knownAll = (root) => Object.fromEntries([...root.querySelectorAll("fieldset.known")].map((n) => [n.dataset.name, knownTyped(n)]));
 
-/* The card of the Model page: what is given stands there, a parameter is added by its name. */
-function knownCard(rows) {
+/* The card of the Model page: what is given stands there, a parameter is added by its name. `added` keeps the names for when the page is drawn anew. */
+function knownCard(rows, added) {
   if (!rows.length) return null;
-  const given = rows.filter((r) => Object.keys(r.given).length), others = rows.filter((r) => !given.includes(r));
+  const given = rows.filter((r) => Object.keys(r.given).length || added.includes(r.name)), others = rows.filter((r) => !given.includes(r));
   const list = h("div", {}, given.map((r) => knownRow(r, "known")));
   const pick = h("select", { id: "known-pick", "aria-label": "Parameter that is known" }, others.map((r) => h("option", { value: r.name }, words(r.name))));
   const add = button("Give it", () => {
     const row = others.find((r) => r.name === pick.value);
     if (!row) return;
+    added.push(row.name);
     list.append(knownRow(row, "known"));
     pick.querySelector(`option[value="${row.name}"]`).remove();
     $(`known-${row.name}-value`).focus();
   }, { work: false, id: "known-add" });
   return h("section", { class: "card", id: "known" }, h("h2", {}, "What is known"), h("p", { class: "soft small" }, "From a catalogue, CAD or a scale. A value is kept as it stands; bounds let the fit move between them. Empty fields take it back."), list,
     others.length ? h("div", { class: "row" }, pick, add) : null);
+}
+
+/* What was typed and chosen in a form and is not sent yet: it stands there again when the view is drawn anew, as long as what the form is about is the same. */
+function keepTyped(form, typed) {
+  const keyOf = (c) => (c.type === "radio" ? c.name : c.id || `${c.name}=${c.value}`);
+  form.addEventListener("input", (e) => { typed[keyOf(e.target)] = e.target.type === "checkbox" ? e.target.checked : e.target.value; });
+  for (const c of form.querySelectorAll("input, select, textarea")) {
+    const value = typed[keyOf(c)];
+    if (value === undefined) continue;
+    if (c.type === "checkbox") c.checked = value;
+    else if (c.type === "radio") c.checked = c.value === value;
+    else if (c.tagName !== "SELECT" || [...c.options].some((o) => o.value === value)) c.value = value;
+  }
 }
 
 /* Under an effect that needs a known parameter: its fields, and the fit with it. The model as it stands is fitted again on a branch of its own. */

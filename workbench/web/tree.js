@@ -47,11 +47,13 @@ function treeCard(state) {
 /* The parameters of two steps of the ledger beside one another: what the last one changed, until others are chosen. */
 function besideCard(state) {
   if (state.steps.length < 2) return null;
-  const held = h("div", { id: "beside" }), last = state.steps.length - 1;
+  const held = h("div", { id: "beside" }), last = state.steps.length - 1, of = state.steps.map((s) => s.id).join(), kept = app.drafts.beside && app.drafts.beside.of === of ? app.drafts.beside.chosen : []; /* another step asks for the newest pair again */
   const choice = (id, name, chosen) => h("label", { for: id }, `${name} `, h("select", { id, onchange: show }, state.steps.map((s, k) => h("option", { value: s.id, selected: k === chosen }, `${k + 1}: ${stepTitle({ ...s, remark: (state.remarks || {})[s.id] || {} })}`))));
-  const first = choice("beside-first", "Step", last - 1), second = choice("beside-second", "beside", last), value = (label) => label.querySelector("select").value;
+  const at = (k, usual) => { const place = state.steps.findIndex((s) => s.id === kept[k]); return place < 0 ? usual : place; };
+  const first = choice("beside-first", "Step", at(0, last - 1)), second = choice("beside-second", "beside", at(1, last)), value = (label) => label.querySelector("select").value;
   function show() {
     const asked = [value(first), value(second)];
+    app.drafts.beside = { of, chosen: asked };
     get(`/view/fits?a=${asked[0]}&b=${asked[1]}`).then((found) => { if (asked[0] === value(first) && asked[1] === value(second)) held.replaceChildren(fitsTable(found)); }).catch(fail);
   }
   show();

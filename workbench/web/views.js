@@ -55,7 +55,8 @@ const views = {
       torque_per_current: $("torque_per_current").value, torque_per_voltage: $("torque_per_voltage").value, model: $("model").value,
       effects: [...document.querySelectorAll("[name=effect]:checked")].map((c) => c.value), known: knownAll(node),
     });
-    let edited = !text;
+    const draft = app.drafts.joint && app.drafts.joint.text === text ? app.drafts.joint : (app.drafts.joint = { text, typed: {}, added: [] });
+    let edited = !text || Object.keys(draft.typed).some((key) => key !== "joint-text");
     const save = async () => { if ($("joint-text").value !== text) await post("/joint", { text: $("joint-text").value, source: state.joint_source || "joint" }); else if (edited) await post("/joint", read()); };
     const node = h("form", { oninput: (e) => { if (e.target.id !== "joint-text") edited = true; }, onsubmit: (e) => e.preventDefault() },
       h("div", { class: "two" }, h("div", { class: "card" }, h("h2", {}, "The joint"),
@@ -70,23 +71,27 @@ const views = {
         h("fieldset", {}, h("legend", {}, "Effects in it from the start"), h("div", { class: "checks" }, common.map((k) => box(k, effectTitle(k))), exact.map((k) => box(k, effectTitle(k)))),
           h("details", { open: others.some((e) => chosen.has(e.key)) }, h("summary", {}, `All others (${others.length})`), h("div", { class: "checks" }, others.map((e) => box(e.key, e.title))))),
         h("details", {}, h("summary", {}, "As joint file (TOML), with known values and column map"), h("label", { for: "joint-text" }, "Joint file"), h("textarea", { id: "joint-text", spellcheck: "false", value: text })))),
-      knownCard(known),
+      knownCard(known, draft.added),
       h("div", { class: "row" }, button("Save and fit", () => act(async () => { await save(); await refresh(); }).then((done) => { if (done) run("fit", {}, "compare"); }), { kind: "primary", id: "save-fit", off: !state.files.some((f) => ["ready", "checking", "columns"].includes(f.status)) }),
         button("Save", () => act(async () => { await save(); await refresh(); }), { id: "save" })));
+    keepTyped(node, draft.typed);
+    const kind = node.querySelector("[name=kind]:checked").value;
+    later(() => relabel(kind));
     return [heading("Model", "What is known about the joint, and the model to start from. Everything else has a start value and bounds derived from the records."), node];
   },
 
   async compare(state) {
     const found = await get("/view/compare"), last = state.steps[state.steps.length - 1];
     const balances = Object.keys(found.error.balances), first = found.places[0], host = h("div", { class: "plot" });
-    let balance = found.worst.balance;
+    const draft = app.drafts.compare || (app.drafts.compare = {});
+    let balance = balances.includes(draft.balance) ? draft.balance : found.worst.balance;
     forgetCharts();
     const plot = new SeriesPlot(host, (range, points) => get(`/view/balance?balance=${balance}&points=${points}${range ? `&from=${range[0]}&to=${range[1]}` : ""}`), { title: "Measured torque, model and residual", panels: [["measured", "model"], ["residual"]], side: "at the link" });
     plot.marks = () => linked.marks; linked.plot = plot;
     plot.onCursor = (index) => plot.data && cursorInCharts(plot.data)(index);
     app.plots.push(plot);
     later(() => plot.show([found.worst.low, found.worst.high]).catch(fail));
-    const pick = h("select", { id: "balance", "aria-label": "Balance in the time plot", onchange: (e) => { balance = e.target.value; plot.forget(); plot.show(plot.range).catch(fail); } }, balances.map((b) => h("option", { value: b, selected: b === balance }, `${b} balance`)));
+    const pick = h("select", { id: "balance", "aria-label": "Balance in the time plot", onchange: (e) => { balance = draft.balance = e.target.value; plot.forget(); plot.show(plot.range).catch(fail); } }, balances.map((b) => h("option", { value: b, selected: b === balance }, `${b} balance`)));
     const strong = found.places.filter((p) => p.share_percent > 5 && (found.error.balances[p.balance].ratio ?? 9) > 1.2), rest = found.places.filter((p) => !strong.includes(p));
     const figure = (p) => chartFigure([`${p.balance} balance against ${p.title}`, h("span", {}, p.share_percent > 1 ? `explains ${digits(p.share_percent, 2)} % of the residual's variance on blocks it was not drawn from` : "explains next to nothing")], p.chart, { name: `${p.balance} residual against ${p.title}`, axis: p.axis, brush: markInTime(p.axis) });
     const curves = await get("/view/as-such");
@@ -143,7 +148,7 @@ const views = {
     const [library, stairs] = await Promise.all([get("/view/library"), get(`/view/staircase?width=${Math.round(pictureWidth(560))}`)]), steps = state.steps, last = steps[steps.length - 1], before = steps[steps.length - 2];
     const now = last.held_out.relative_error_percent, was = before && before.held_out.relative_error_percent;
     const story = state.improvement, inside = last.effects.filter((e) => e !== "channel_delay@drive");
-    const add = h("select", { id: "add-label", "aria-label": "Effect to add" }, library.filter((e) => !e.inside).map((e) => h("option", { value: e.label }, `${e.title} (${e.place.replace(/_/g, " ")})`)));
+    const add = h("select", { id: "add-label", "aria-label": "Effect to add", onchange: (e) => { app.drafts.add = e.target.value; } }, library.filter((e) => !e.inside).map((e) => h("option", { value: e.label, selected: e.label === app.drafts.add }, `${e.title} (${e.place.replace(/_/g, " ")})`)));
     return [
       h("div", { class: "row between head" }, h("div", {}, heading(before ? (now < was ? `The error falls from ${digits(was)} to ${digits(now)} %` : `The error is ${digits(now)} %, from ${digits(was)} %`) : `The error is ${digits(now)} %`, "Each step is fitted to the training records and judged on records the fit did not see.")),
         h("div", { class: "row" }, button(steps.length > 1 ? "What else is missing?" : "What is missing? Diagnose", () => run("diagnose", {}, "diagnose"), { kind: "primary", id: "diagnose" }), button("Take it home", () => open("export"), { work: false, id: "to-export" }))),

@@ -168,6 +168,7 @@ def test_a_stream_is_followed_as_a_file_is(page: Any, stream: str) -> None:
     page.wait_for_function(
         "() => app.state.job && app.state.job.text.startsWith('waiting for')", timeout=60_000
     )
+    page.wait_for_function("() => !document.querySelector('#standing')", timeout=60_000)
     ended = threading.Event()
 
     def send() -> None:
@@ -202,3 +203,23 @@ def test_no_other_file_can_be_followed(page: Any, growing: Path) -> None:
     page.wait_for_selector("#error:not([hidden])", timeout=60_000)
     idle(page)
     assert "was not named when the page was started" in page.inner_text("#error-text")
+
+
+@pytest.mark.parametrize("view", ["model", "compare", "ledger", "replay", "plan"])
+def test_what_is_chosen_stands_when_the_view_is_drawn_anew(page: Any, view: str) -> None:
+    """A view is drawn anew whenever work ends; who then clicks means what was chosen before."""
+    page.click(f"#nav-{view}")
+    idle(page, view)
+    ids = page.evaluate(
+        "() => [...document.querySelectorAll('#main select')]"
+        ".filter((s) => s.options.length > 1 && s.offsetParent && !s.id.startsWith('role-'))"
+        ".map((s) => s.id)"
+    )
+    assert ids
+    for name in ids:
+        last = page.evaluate("id => [...document.getElementById(id).options].pop().value", name)
+        page.select_option(f"#{name}", last)
+        idle(page, view)
+        page.evaluate("() => { document.querySelector('#main').dataset.view = ''; render(false); }")
+        idle(page, view)
+        assert page.input_value(f"#{name}") == last, name

@@ -403,7 +403,7 @@ def test_replay_names_the_sensor_that_was_made_to_fail(
     complete: Live, sensor: str, kind: str, about: str
 ) -> None:
     run(complete, "replay", file=held_out_file(complete), sensor=sensor, kind=kind, at=8)
-    found = app_replay.stored(folder_of(complete))
+    found = app_replay.shown(folder_of(complete), following=False)
     told = [v for v in found["verdicts"] if v["about"]]
     assert told[0]["about"] == [about]
     assert 7.999 <= told[0]["time"] < 8.5
@@ -411,6 +411,7 @@ def test_replay_names_the_sensor_that_was_made_to_fail(
         sensor in failed for t, failed in zip(found["time"], found["failed"], strict=True) if t > 9
     )
     assert f"{sensor}, {kind}" in found["note"]
+    assert app_replay.shown(folder_of(complete), following=True) == {}, "of another record"
 
 
 @pytest.mark.parametrize(

@@ -141,7 +141,7 @@ def follow(
         The file cannot be used, or held too few rows when it came to rest.
     """
     run: _Run | None = None
-    last = time.monotonic()
+    last, halted = time.monotonic(), False
     while True:
         record = source.new()
         if record is not None:
@@ -153,14 +153,16 @@ def follow(
             break
         if run is not None:
             yield run.replay()
-        if stop():
+        halted = stop()
+        if halted:
             break
         if record is None:
             time.sleep(POLL)
     if run is None:
+        when = "before it was stopped" if halted else f"within {quiet:g} s"
         raise InputError(
-            f"{source.path}: fewer than {FIRST_ROWS} lines came within {quiet:g} s; start the "
-            "recording first, or follow it for longer"
+            f"{source.path}: fewer than {FIRST_ROWS} lines came {when}; start the recording "
+            "first, or follow it for longer"
         )
 
 
