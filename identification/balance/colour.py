@@ -68,6 +68,9 @@ MOST_LINES: Final = 4
 """Lines of one channel: mains and three harmonics."""
 FEWEST_SPACINGS: Final = 4
 """Spacings from which on: one more than white noise beside one with a memory needs."""
+SLOWEST_COLOUR: Final = 1.0
+"""Memory of a noise from which on it is a drift [s]: twenty times the longest that neighbouring
+samples show."""
 FEWEST: Final = 1000
 """Samples from which a colour is read."""
 
@@ -140,6 +143,21 @@ class ChannelNoise:
     level: float
     parts: tuple[Part, ...]
     lines: tuple[tuple[float, float], ...] = ()
+
+    @property
+    def drift(self) -> Part | None:
+        """The parts that no row averages away, as one; None where there are none."""
+        slow = [part for part in self.parts if part.memory > SLOWEST_COLOUR]
+        if not slow:
+            return None
+        return Part(math.hypot(*(p.size for p in slow)), max(p.memory for p in slow))
+
+    @property
+    def without_drift(self) -> ChannelNoise:
+        """The same noise less its drift."""
+        if self.drift is None:
+            return self
+        return replace(self, parts=tuple(p for p in self.parts if p.memory <= SLOWEST_COLOUR))
 
     def scaled(self, level: float) -> ChannelNoise:
         """The same colour at another level."""

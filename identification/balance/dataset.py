@@ -15,7 +15,7 @@ import numpy.typing as npt
 from casadi_models import JointModel, hold
 from identification.balance.calibration import named_late, unknowns_of
 from identification.balance.clocks import SIGNAL, as_told, in_time, places_of, shifted
-from identification.balance.colour import ChannelNoise, white
+from identification.balance.colour import ChannelNoise, Part, white
 from identification.balance.contacts import TOLD_BY, restored
 from identification.balance.memory import cache_of
 from identification.balance.noise import noise_of
@@ -204,9 +204,10 @@ def load_dataset(
                 f"{held_out[0].name}: the joint stands still in every held-out record; give one "
                 "in which it moves"
             )
+    slow = _of_one_make([slow_noise_of(made) for made in prepared])
     found = [
-        _with_slow(measured_sources(r, joint, sensing), slow_noise_of(made))
-        for r, made in zip(train, prepared, strict=False)
+        _with_slow(measured_sources(r, joint, sensing), own)
+        for r, own in zip(train, slow, strict=False)
     ]
     noise = {c: float(np.median([one[c].level for one in found])) for c in found[0]}
     # colours are those of the record in the middle
@@ -430,6 +431,25 @@ def _with_slow(
         else own
         for c, own in sources.items()
     }
+
+
+def _of_one_make(found: Sequence[Mapping[str, SlowNoise]]) -> list[dict[str, SlowNoise]]:
+    """The same sensors walked in all records: each has the mean of their walks. One course of a
+    walk tells its rate by half only, and one of four does not tell it at all.
+    """
+    out = [dict(slow) for slow in found]
+    for c in {c for slow in found for c in slow}:
+        parts = [slow[c].parts for slow in found if c in slow]
+        walking = [part for own in parts for part in own]
+        if not walking:
+            continue
+        rate = sum(part.size**2 / part.memory for part in walking) / len(parts)
+        memory = max(part.memory for part in walking)
+        mean = (Part(math.sqrt(rate * memory), memory),)
+        for slow in out:
+            if c in slow:
+                slow[c] = replace(slow[c], parts=mean)
+    return out
 
 
 def measured_sources(record: Record, joint: Joint, sensing: Sensing) -> dict[str, ChannelNoise]:

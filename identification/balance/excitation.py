@@ -50,11 +50,6 @@ below.
 """
 
 
-SLOWEST_COLOUR: Final = 1.0
-"""Memory of a noise from which on it is a drift [s]: twenty times the longest that neighbouring
-samples show."""
-
-
 def rest_note(share: float) -> str:
     """What is said about rows at rest; empty where they are too few."""
     return (
@@ -141,7 +136,7 @@ def slow_noise_notes(data: Dataset) -> list[str]:
         noise = data.sources.get(signal)
         if noise is None:
             continue
-        drift = math.hypot(*(p.size for p in noise.parts if p.memory > SLOWEST_COLOUR))
+        drift = noise.drift.size if noise.drift is not None else 0.0
         said = [f"drifts by about {drift:.2g} {unit}"] if drift > 0 else []
         said += [
             f"hums with {size:.2g} {unit} at {frequency:.3g} Hz"

@@ -107,10 +107,11 @@ def rests_of(record: WeakRecord) -> dict[str, FloatArray]:
         state = [column for side in sides for column in motion_of(a, side)]
         state += _curves(record, sides[0], every)
         columns["drive"] = "drive", state
+        state.append(a["drive_rate"])
         if "torque" in a:
             columns["both"] = "drive", [*state, a["torque"], a["torque_rate"]]
     if "torque" in a:
-        state = [*motion_of(a, sides[-1]), *_curves(record, sides[-1], every)]
+        state = [*motion_of(a, sides[-1]), *_curves(record, sides[-1], every), a["torque_rate"]]
         columns["torque"] = "torque", state
     return {key: rest_beside(a[signal], state, ROUNDS) for key, (signal, state) in columns.items()}
 

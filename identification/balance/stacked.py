@@ -146,23 +146,49 @@ def floor_rows(
     count less: their scatter has a weight of its own. A level above what the training records leave
     is a contradiction (the noise of a channel reads too much): it is lowered to that.
     """
+    quick, drift = noise_rows(model, data, values, records)
+    return {b: np.hypot(level, _even(drift[b], b, records)) for b, level in quick.items()}
+
+
+def noise_rows(
+    model: JointModel, data: Dataset, values: Mapping[str, float], records: Sequence[WeakRecord]
+) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
+    """As :func:`floor_rows`, in two parts: what noise gives each row but for the drift of the
+    measured torques, and what that gives it.
+    """
     values = settled(model, data.sensing, [*data.train, *records], values)
     every = {id(w): w for w in (*data.train, *records)}
     known = {mark: drawn_floors(model, data, values, w) for mark, w in every.items()}
     kept = noise_believed(model, data, values, [known[id(w)] for w in data.train])
-    return {
+    drift = {b: kept[b] * x for b, x in drift_rows(model, data, values, records).items()}
+    quick = {
         b: np.concatenate([np.full(w.rows, kept[b] * known[id(w)][b]) for w in records])
         if records
         else np.empty(0)
         for b in data.sensing.balances
     }
+    return {b: _less(x, _even(drift[b], b, records)) for b, x in quick.items()}, drift
+
+
+def _even(drift: FloatArray, balance: str, records: Sequence[WeakRecord]) -> FloatArray:
+    """RMS of a drift in the rows of each record that take part, (rows,)."""
+    out, first = np.zeros(len(drift)), 0
+    for w in records:
+        out[first : first + w.rows] = rms(drift[first : first + w.rows][w.taking(balance)])
+        first += w.rows
+    return out
+
+
+def _less(whole: FloatArray, part: FloatArray) -> FloatArray:
+    return np.sqrt(np.maximum(whole**2 - part**2, 0.0))
 
 
 def drawn_floors(
     model: JointModel, data: Dataset, values: Mapping[str, float], record: WeakRecord
 ) -> Mapping[str, float]:
-    """RMS of what drawn noise changes in each balance of one record, whatever is left of it [N.m];
-    with the same draws for every model.
+    """RMS of what noise changes in each balance of one record, whatever is left of it [N.m]: drawn,
+    with the same draws for every model, and a drift of the torques beside them. A record holds one
+    course of a drift, and the RMS of one is anything from a third to twice that of all.
     """
     balances = balances_of(model, data.sensing, wrt=())
     given = (tuple(sorted(values.items())), tuple(sorted(data.sources.items(), key=_first)))
@@ -179,7 +205,7 @@ def _drawn_floors(
     balances: Balances, data: Dataset, values: Mapping[str, float], record: WeakRecord
 ) -> dict[str, float]:
     power = dict.fromkeys(balances.balances, 0.0)
-    drawn = draws_of(record, data.sources)
+    drawn = draws_of(record, {c: noise.without_drift for c, noise in data.sources.items()})
     seen = drawn[0].record
     either = unsure(balances, data, values, [seen])
     values = values_on(balances.model, record, values)
@@ -189,7 +215,118 @@ def _drawn_floors(
         for b in power:
             rows = seen.taking(b)
             power[b] += _sure_rms((noisy[b][0] - calm[b][0])[rows], either[b][rows]) ** 2
-    return {b: math.sqrt(p / len(drawn)) for b, p in power.items()}
+    slow = _drifts(balances, data, values, record)
+    return {
+        b: math.hypot(
+            math.sqrt(p / len(drawn)), rms(slow[b][record.taking(b)]) if b in slow else 0.0
+        )
+        for b, p in power.items()
+    }
+
+
+def drift_rows(
+    model: JointModel, data: Dataset, values: Mapping[str, float], records: Sequence[WeakRecord]
+) -> dict[str, FloatArray]:
+    """Standard deviation that a drift of the measured torques gives each row of the balances,
+    (rows,) each.
+    """
+    balances = balances_of(model, data.sensing, wrt=())
+    found = [_drifts(balances, data, values_on(model, w, values), w) for w in records]
+    return {
+        b: np.concatenate([f.get(b, np.zeros(w.rows)) for f, w in zip(found, records, strict=True)])
+        if records
+        else np.empty(0)
+        for b in balances.balances
+    }
+
+
+def _drifts(
+    balances: Balances, data: Dataset, values: Mapping[str, float], record: WeakRecord
+) -> dict[str, FloatArray]:
+    sizes = {
+        c: noise.drift.size
+        for c, noise in data.sources.items()
+        if noise.drift is not None and c in SCALED
+    }
+    return _moved_by(balances, values, record, sizes) if sizes else {}
+
+
+def _moved_by(
+    balances: Balances,
+    values: Mapping[str, float],
+    record: WeakRecord,
+    sizes: Mapping[str, float],
+) -> dict[str, FloatArray]:
+    """What offsets of measured torques make of each row of the balances, root of the sum of the
+    squares, (rows,) each.
+    """
+    before = balances.evaluate(record, values)
+    power = {b: np.zeros(record.rows) for b in before}
+    for channel, size in sizes.items():
+        if channel not in record.points:
+            continue
+        moved = replace(
+            record,
+            points=_higher(record.points, channel, size),
+            smooth=_higher(record.smooth, channel, size),
+            averaged=_higher(record.averaged, channel, size),
+        )
+        after = balances.evaluate(moved, values, remembered=record)
+        for b in power:
+            power[b] += (after[b][0] - before[b][0]) ** 2
+    return {b: np.sqrt(squares) for b, squares in power.items()}
+
+
+def innovations(
+    residual: FloatArray,
+    scatter: FloatArray,
+    drift: FloatArray,
+    *,
+    memory: float,
+    records: Sequence[WeakRecord],
+) -> FloatArray:
+    """Residuals (rows,) of a balance over their deviation, each beside what the rows before it say
+    of the drift: of unit RMS where drift and scatter are all that is left.
+
+    Parameters
+    ----------
+    residual : (rows,) array
+    scatter, drift : (rows,) array
+        Deviation of each row but for the drift (infinite: the row says nothing), and by it.
+    memory : float
+        Of the drift [s].
+    records : sequence of WeakRecord
+        Whose rows these are; each has a course of its own.
+    """
+    out = np.empty(len(residual))
+    first = 0
+    for w in records:
+        rows = slice(first, first + w.rows)
+        first += w.rows
+        kept = np.exp(-np.diff(w.time, prepend=w.time[:1]) / memory)
+        state, power, course = 0.0, 1.0, []
+        for r, f, g, k in zip(
+            residual[rows].tolist(),
+            (scatter[rows] ** 2).tolist(),
+            drift[rows].tolist(),
+            np.abs(kept).tolist(),
+            strict=True,
+        ):
+            state, power = k * state, 1.0 - k * k * (1.0 - power)
+            spread = g * g * power + f
+            error = r - g * state
+            sure = 0.0 < spread < math.inf
+            course.append(error / math.sqrt(spread) if sure else 0.0)
+            gain = power * g / spread if sure else 0.0
+            state, power = state + gain * error, power * (1.0 - gain * g)
+        out[rows] = course
+    return out
+
+
+def drift_memory(data: Dataset) -> float:
+    """The longest memory of a drift of the measured torques [s]; zero where none drifts."""
+    found = [n.drift.memory for c, n in data.sources.items() if n.drift is not None and c in SCALED]
+    return max(found, default=0.0)
 
 
 def _sure_rms(change: FloatArray, either: FloatArray) -> float:
@@ -231,6 +368,7 @@ def noise_believed(
         levels = [drawn_floors(model, data, values, w) for w in data.train]
     residual = stack(balances_of(model, data.sensing, wrt=()), data.train, values).residual
     either = unsure(balances_of(model, data.sensing, wrt=()), data, values, data.train)
+    drifts, memory = drift_rows(model, data, values, data.train), drift_memory(data)
     out = dict.fromkeys(residual, 1.0)
     for b, r in residual.items():
         rows = taking_part(b, data.train)
@@ -239,7 +377,18 @@ def noise_believed(
         )
         if rows.any() and level[rows].min() > 0:
             spread = SURE_ERRORS / math.sqrt(2 * INDEPENDENT_SHARE * float(rows.sum()))
-            left = _sure_rms(r[rows] / level[rows], either[b][rows] / level[rows])
+            if memory:
+                quick = _less(level, _even(drifts[b], b, data.train))
+                course = innovations(
+                    np.where(rows, r, 0.0),
+                    np.where(rows, np.hypot(quick, either[b]), math.inf),
+                    drifts[b],
+                    memory=memory,
+                    records=data.train,
+                )
+                left = rms(course[rows])
+            else:
+                left = _sure_rms(r[rows] / level[rows], either[b][rows] / level[rows])
             out[b] = min(1.0, left / max(1 - spread, LEAST_MARGIN))
     return out
 
@@ -263,27 +412,9 @@ def passed_on(
     records = [*data.train, *data.held_out]
     balances = balances_of(model, data.sensing, wrt=())
     values = settled(model, data.sensing, records, values)
-    found: dict[str, list[FloatArray]] = {b: [] for b in balances.balances}
-    for record in records:
-        own = values_on(model, record, values)
-        before = balances.evaluate(record, own)
-        power = {b: np.zeros(record.rows) for b in found}
-        for channel in SCALED:
-            if channel not in data.sources or channel not in record.points:
-                continue
-            size = data.sources[channel].level
-            moved = replace(
-                record,
-                points=_higher(record.points, channel, size),
-                smooth=_higher(record.smooth, channel, size),
-                averaged=_higher(record.averaged, channel, size),
-            )
-            after = balances.evaluate(moved, own, remembered=record)
-            for b in power:
-                power[b] += (after[b][0] - before[b][0]) ** 2
-        for b, squares in power.items():
-            found[b].append(np.sqrt(squares))
-    return {b: np.concatenate(parts) for b, parts in found.items()}
+    sizes: dict[str, float] = {c: data.sources[c].level for c in SCALED if c in data.sources}
+    found = [_moved_by(balances, values_on(model, w, values), w, sizes) for w in records]
+    return {b: np.concatenate([f[b] for f in found]) for b in balances.balances}
 
 
 def _higher(signals: Mapping[str, FloatArray], channel: str, size: float) -> dict[str, FloatArray]:

@@ -14,6 +14,7 @@ from casadi_models import JointModel
 from identification.balance.balances import balances_of
 from identification.balance.calibration import settled
 from identification.balance.kinematic import residual_unit
+from identification.balance.stacked import drift_memory, innovations, noise_rows
 from identification.balance.weak import WeakRecord
 from identification.fitting.engine import (
     Dataset,
@@ -45,6 +46,10 @@ RATIO_LIMIT: Final = 1.5
 0.9 to 1.4, dirty sensors included.
 """
 
+WALK: Final = 2.77
+"""What the mean square of a random walk about its mean exceeds its expectation by in one course of
+twenty: the law of Cramer and von Mises."""
+
 
 @final
 @dataclass(frozen=True)
@@ -58,7 +63,9 @@ class BalanceError:
     floor : float
         What measurement noise alone would leave.
     ratio : float
-        RMS of residual over noise, row by row: 1 where only noise is left.
+        RMS of residual over noise, row by row: 1 where only noise is left. Where a measured torque
+        drifts, of what the drift does not foretell; and no less than what is left over the most
+        that one course of it may do.
     unit : str
     residual, weight : (rows,) array
         Residual of each row [unit] and 1 over the scatter that noise allows it: two models are
@@ -132,16 +139,32 @@ def assess(
     residual = {b: whole[b][rows[b]] for b in whole}
     measured = {b: y[rows[b]] for b, y in references(data, records).items()}
     floor = floor_rows(model, data, values, records)
-    weights = row_weights(
+    wide = row_weights(
         balances, data, values, {b: np.maximum(floor[b], 1e-12) for b in floor}, records
     )
-    weights = {b: w[rows[b]] for b, w in weights.items()}
+    weights = {b: w[rows[b]] for b, w in wide.items()}
+    ratios = {b: rms(residual[b] * weights[b]) for b in weights}
+    if memory := drift_memory(data):
+        quick, drift = noise_rows(model, data, values, records)
+        for b, ratio in ratios.items():
+            share = rms(drift[b][rows[b]] * weights[b]) ** 2
+            scatter = np.sqrt(np.maximum(wide[b] ** -2.0 - drift[b] ** 2, quick[b] ** 2))
+            course = innovations(
+                np.where(rows[b], whole[b], 0.0),
+                np.where(rows[b], scatter, math.inf),
+                drift[b],
+                memory=memory,
+                records=records,
+            )
+            ratios[b] = max(
+                rms(course[rows[b]]), ratio / math.sqrt(1 + min(share, 1.0) * (WALK - 1))
+            )
     floor = {b: f[rows[b]] for b, f in floor.items()}
     errors = {
         b: BalanceError(
             rms(residual[b] * weights[b]) / max(rms(weights[b]), 1e-300),
             rms(floor[b] * weights[b]) / max(rms(weights[b]), 1e-300),
-            rms(residual[b] * weights[b]) if np.any(floor[b] > 0) else math.inf,
+            ratios[b] if np.any(floor[b] > 0) else math.inf,
             residual_unit(b, model.kind),
             residual[b],
             weights[b],

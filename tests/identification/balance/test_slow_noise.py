@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -10,8 +11,12 @@ import pytest
 from scipy.signal import lfilter
 
 from identification import Record, fit
+from identification.balance.balances import balances_of
+from identification.balance.calibration import settled, values_on
 from identification.balance.noise import calm_of, noise_of
+from identification.balance.stacked import drawn_floors
 from identification.balance.stamps import evened
+from identification.balance.weak import filtered
 from identification.fitting.fit import Fit
 from tests.identification.balance.test_clocks import motion
 from tests.identification.diagnosis.test_other_payload import DT, JOINT, PER_AMPERE, RATIO
@@ -20,6 +25,8 @@ FloatArray = npt.NDArray[np.float64]
 
 LEVEL = {"drive": 0.035, "torque": 0.05}
 """White noise of the readings [N.m]."""
+COURSES = 200
+"""The mean square of a walk scatters by nine tenths of itself: over so many by a sixteenth."""
 
 
 def walk(rng: np.random.Generator, count: int) -> FloatArray:
@@ -142,3 +149,46 @@ def test_noise_is_read_where_a_joint_is_calm(rate: float) -> None:
     )
     calm = calm_of(position, (slice(0, len(t)),), 1 / rate)
     assert np.abs(shaken[calm]).max() < 0.05 * np.abs(shaken).max()
+
+
+@pytest.mark.parametrize("seed", [4, 7, 10])
+def test_what_a_drift_foretells_is_told_from_what_the_model_lacks(seed: int) -> None:
+    """Of one course of a drift nobody knows its size beforehand: a ratio to that says little."""
+    for error in seen("drift", seed).train.balances.values():
+        assert 0.85 < error.ratio < 1.15
+    lacking = seen("drift", seed, missing=0.15).train.balances
+    assert lacking["motor"].ratio > 3.0, "a tenth of what the drift may be"
+    assert 0.85 < lacking["transmission"].ratio < 1.15
+
+
+def test_a_floor_is_that_of_all_courses_of_a_drift() -> None:
+    """And not that of the one which is drawn."""
+    found = seen("drift")
+    data, values, model = found.data, found.solution.values, found.solution.model
+    (record,) = data.train
+    record = replace(record, points={**record.points, **record.smooth})
+    rng = np.random.default_rng(5)
+    count = max(s.stop for s in record.grid.segments)
+    power = dict.fromkeys(data.sensing.balances, 0.0)
+    balances = balances_of(model, data.sensing, wrt=())
+    own = values_on(model, record, values)
+    before = balances.evaluate(record, own)
+    for _ in range(COURSES):
+        drawn = {c: noise.draw(rng, count, record.grid.dt) for c, noise in data.sources.items()}
+        made = filtered(record.grid, drawn, curved=False)[:3]
+        averaged, points, smooth = (
+            {n: x + noise.get(n, 0.0) for n, x in signals.items()}
+            for signals, noise in zip(
+                (record.averaged, record.points, record.smooth),
+                made,
+                strict=True,
+            )
+        )
+        moved = replace(record, averaged=averaged, points=points, smooth=smooth)
+        after = balances.evaluate(moved, own, remembered=record)
+        for b in power:
+            change = (after[b][0] - before[b][0])[record.taking(b)]
+            power[b] += float(np.mean(change**2)) / COURSES
+    floors = drawn_floors(model, data, settled(model, data.sensing, [record], values), record)
+    for b, total in power.items():
+        assert floors[b] == pytest.approx(np.sqrt(total), rel=0.15), b
