@@ -434,8 +434,8 @@ def _with_slow(
 
 
 def _of_one_make(found: Sequence[Mapping[str, SlowNoise]]) -> list[dict[str, SlowNoise]]:
-    """The same sensors walked in all records: each has the mean of their walks. One course of a
-    walk tells its rate by half only, and one of four does not tell it at all.
+    """The same sensors walked in all records: each has the mean of their walks, as one course of a
+    walk tells its rate badly.
     """
     out = [dict(slow) for slow in found]
     for c in {c for slow in found for c in slow}:

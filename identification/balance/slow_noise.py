@@ -97,7 +97,7 @@ def slow_noise_of(record: WeakRecord) -> dict[str, SlowNoise]:
 def rests_of(record: WeakRecord) -> dict[str, FloatArray]:
     """What is left, (rows,), of the drive's torque beside all motion (`drive`), of the same beside
     the transmitted torque, too (`both`), and of that beside its side's motion (`torque`); where
-    they are measured.
+    they are measured. Each beside its own rate as well: clocks and low-passes are no noise.
     """
     a = record.averaged
     every = np.ones(record.rows, dtype=np.bool_)
@@ -106,8 +106,8 @@ def rests_of(record: WeakRecord) -> dict[str, FloatArray]:
     if "drive" in a:
         state = [column for side in sides for column in motion_of(a, side)]
         state += _curves(record, sides[0], every)
-        columns["drive"] = "drive", state
         state.append(a["drive_rate"])
+        columns["drive"] = "drive", state
         if "torque" in a:
             columns["both"] = "drive", [*state, a["torque"], a["torque_rate"]]
     if "torque" in a:

@@ -146,7 +146,13 @@ def floor_rows(
     count less: their scatter has a weight of its own. A level above what the training records leave
     is a contradiction (the noise of a channel reads too much): it is lowered to that.
     """
-    quick, drift = noise_rows(model, data, values, records)
+    return together(*noise_rows(model, data, values, records), records)
+
+
+def together(
+    quick: Mapping[str, FloatArray], drift: Mapping[str, FloatArray], records: Sequence[WeakRecord]
+) -> dict[str, FloatArray]:
+    """The floors of both parts of :func:`noise_rows`."""
     return {b: np.hypot(level, _even(drift[b], b, records)) for b, level in quick.items()}
 
 
@@ -309,7 +315,7 @@ def innovations(
             residual[rows].tolist(),
             (scatter[rows] ** 2).tolist(),
             drift[rows].tolist(),
-            np.abs(kept).tolist(),
+            kept.tolist(),
             strict=True,
         ):
             state, power = k * state, 1.0 - k * k * (1.0 - power)

@@ -32,7 +32,7 @@ from identification.data.record import Record, listed
 from identification.diagnosis.candidates import observable
 from identification.diagnosis.claims import FALSE_DISCOVERY, GAIN, LARGEST_SET
 from identification.errors import InputError
-from identification.fitting.assess import Error, assess
+from identification.fitting.assess import RATIO_LIMIT, Error, assess
 from identification.fitting.covariance import (
     FEWEST_BLOCKS,
     cores,
@@ -200,7 +200,7 @@ class Changes:
         """Balances in which more than noise is left with every parameter fitted anew: something
         that is no parameter.
         """
-        return tuple(b for b, e in self.refitted.balances.items() if e.ratio > NOISE_RATIO)
+        return tuple(b for b, e in self.refitted.balances.items() if e.ratio > RATIO_LIMIT)
 
     def as_json(self) -> dict[str, Any]:
         """The shape of `changed --json`."""
@@ -271,10 +271,6 @@ class Changes:
                 told.append(f"{p.name} by less than {size}{share}")
         if told:
             yield f"too small to be seen on these records: {', '.join(told)}"
-
-
-NOISE_RATIO: Final = 1.5
-"""Residual over noise from which more than noise is left: the limit of `improve`."""
 
 
 def changed(

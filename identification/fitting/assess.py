@@ -14,11 +14,10 @@ from casadi_models import JointModel
 from identification.balance.balances import balances_of
 from identification.balance.calibration import settled
 from identification.balance.kinematic import residual_unit
-from identification.balance.stacked import drift_memory, innovations, noise_rows
+from identification.balance.stacked import drift_memory, innovations, noise_rows, together
 from identification.balance.weak import WeakRecord
 from identification.fitting.engine import (
     Dataset,
-    floor_rows,
     references,
     rms,
     row_weights,
@@ -138,14 +137,14 @@ def assess(
     rows = {b: taking_part(b, records) for b in balances.balances}
     residual = {b: whole[b][rows[b]] for b in whole}
     measured = {b: y[rows[b]] for b, y in references(data, records).items()}
-    floor = floor_rows(model, data, values, records)
+    quick, drift = noise_rows(model, data, values, records)
+    floor = together(quick, drift, records)
     wide = row_weights(
         balances, data, values, {b: np.maximum(floor[b], 1e-12) for b in floor}, records
     )
     weights = {b: w[rows[b]] for b, w in wide.items()}
     ratios = {b: rms(residual[b] * weights[b]) for b in weights}
     if memory := drift_memory(data):
-        quick, drift = noise_rows(model, data, values, records)
         for b, ratio in ratios.items():
             share = rms(drift[b][rows[b]] * weights[b]) ** 2
             scatter = np.sqrt(np.maximum(wide[b] ** -2.0 - drift[b] ** 2, quick[b] ** 2))
