@@ -407,10 +407,12 @@ class Live(Place):
         self.tell()
 
     def _end(self, error: str | None) -> None:
-        """No job any more; the caller has the lock."""
-        self.job, self.error = None, error
+        """No job any more; the caller has the lock. Its note in the folder goes first: whoever
+        sees that the job has ended, without the lock too, finds nothing left of it.
+        """
         with contextlib.suppress(OSError):
             self.session.end()
+        self.error, self.job = error, None
 
     def can(self, change: Change) -> bool:
         """Whether a change has something to do."""

@@ -113,6 +113,20 @@ def test_a_killed_process_is_one_sentence_and_every_fit_is_kept(live: Live) -> N
     assert live.state.steps == before.steps
 
 
+def test_the_note_of_a_job_goes_before_the_job(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever sees that no job is left, finds no note of one in the folder."""
+    left: list[bool] = []
+    end = Session.end
+
+    def watched(session: Session) -> None:
+        left.append(live.job is None)
+        end(session)
+
+    monkeypatch.setattr(Session, "end", watched)
+    run(live, "diagnose")
+    assert left == [False]
+
+
 def _ended_in_one_line(live: Live, before: Any) -> str:
     wait_for_end = time.monotonic() + 20
     while live.job is not None:
