@@ -83,10 +83,10 @@ class Comparison:
         ratios = ", ".join(
             f"{b} {e.ratio:.3g} times its floor" for b, e in self.error.balances.items()
         )
+        first = next((p for p in self.places if p.tells), None)
         top = (
-            f"; fails most against {self.places[0].axis.replace('_', ' ')} "
-            f"({self.places[0].balance} balance)"
-            if self.places
+            f"; fails most against {first.axis.replace('_', ' ')} ({first.balance} balance)"
+            if first
             else ""
         )
         linear = f"\n{self.linear}" if self.linear else ""

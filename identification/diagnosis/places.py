@@ -19,8 +19,8 @@ from casadi_models.signals import one_line
 from identification.balance.balances import balances_of
 from identification.balance.kinematic import residual_unit
 from identification.balance.weak import WeakRecord
+from identification.diagnosis.locate import AXIS_R2, table_r2
 from identification.diagnosis.locate import axes as signals_of_rows
-from identification.diagnosis.locate import table_r2
 from identification.fitting.engine import Dataset, Solution, stack
 
 FloatArray = npt.NDArray[np.float64]
@@ -28,6 +28,8 @@ IntArray = npt.NDArray[np.int64]
 
 BINS: Final = 28
 FEWEST_ROWS: Final = 10
+TELLING_STRENGTH: Final = 2.5
+"""Least strength of a place that tells something: the largest of all bins reaches 2 by chance."""
 DIRECTION_SHARE: Final = 0.02
 """Share of variance by which a table per direction must beat a plain one to be shown as two
 branches.
@@ -125,6 +127,13 @@ class Place:
 
     def __repr__(self) -> str:
         return one_line(self)
+
+    @property
+    def tells(self) -> bool:
+        """True where the curve says something: it explains variance of blocks it was not drawn
+        from.
+        """
+        return self.share_percent >= 100 * AXIS_R2 and self.strength >= TELLING_STRENGTH
 
     def as_json(self) -> dict[str, Any]:
         """The place as data; NaN becomes None."""

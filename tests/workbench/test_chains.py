@@ -139,6 +139,9 @@ def test_the_improved_joint_reaches_the_floor_when_it_is_compared(demo: Folder) 
     motor = [float(re.findall(r"motor (\S+) times its floor", t)[0]) for t in (before, after)]
     assert motor[0] > 10
     assert motor[1] < 1.5
+    assert "fails most against motor velocity" in before
+    assert "fails most" not in after  # what is left depends on nothing
+    assert "explains 0 %" not in before + after
 
 
 def test_the_improved_joint_is_tracked_without_a_fault(demo: Folder) -> None:

@@ -751,6 +751,9 @@ def test_a_slip_gets_the_word_that_was_meant(capsys: pytest.CaptureFixture[str])
         with pytest.raises(SystemExit):
             main(words)
         assert meant in capsys.readouterr().err
+    with pytest.raises(SystemExit):  # an option of another command, and none here is like it
+        main(["compare", "x.csv", "--joint", "j.toml", "--held-out", "y.csv"])
+    assert "did you mean" not in capsys.readouterr().err
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="no bash")

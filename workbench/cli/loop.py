@@ -322,10 +322,10 @@ def run_compare(arguments: Namespace) -> int:
     fitted = fit(joint, basis)
     comparison = compare(fitted, records, linear=not arguments.no_linear)
     print(comparison)
-    for place in comparison.places[:5]:
+    for place in [p for p in comparison.places if p.tells][:5]:
         print(
             f"  {place.balance} balance against {place.title}: explains "
-            f"{max(place.share_percent, 0):.0f} % of what is left there"
+            f"{place.share_percent:.0f} % of what is left there"
         )
     judged = trust(fitted.solution, fitted.data, profiles=False)
     write_json(arguments.json, {**comparison.as_json(), "trust": judged.as_json()})

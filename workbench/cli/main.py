@@ -659,7 +659,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         arguments.rest, arguments.own_effects = _taken(rest)
     if rest and arguments.module != "fmi":
         own = parser().verbs[arguments.verb]
-        options = [o for a in own.arguments for o in a.option_strings]
+        options = [o for a in own.arguments for o in a.option_strings if a.dest != "help"]
         close = meant(next((r for r in rest if r.startswith("-")), ""), options)
         own.error(f"unrecognized arguments: {' '.join(rest)}{close}")
     arguments.command = shlex.join(["irj", *given])

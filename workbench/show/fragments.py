@@ -16,7 +16,7 @@ from identification.data.record import Record
 from identification.diagnosis.improve import RATIO_LIMIT, Improvement
 from identification.diagnosis.learned import LearnedClaim
 from identification.diagnosis.lines import Line
-from identification.diagnosis.locate import AXIS_R2, Unexplained
+from identification.diagnosis.locate import Unexplained
 from identification.diagnosis.places import AXIS_TITLES, Place
 from identification.fitting.assess import VERDICT_KERNELS
 from workbench.show.bode import bode_html
@@ -28,7 +28,6 @@ from workbench.show.results import BALANCES, table, text, title_of
 from workbench.show.words import GLOSSARY
 
 SHOWN_PER_BALANCE: Final = 3
-TELLING_STRENGTH: Final = 2.5
 STILL_POINTS: Final = 700
 """Points of a curve of a still picture."""
 
@@ -145,18 +144,13 @@ def _state(start: float, end: float) -> str:
     return "was over the noise, now at it" if start > RATIO_LIMIT else "at the noise"
 
 
-def telling(p: Place) -> bool:
-    """True where a curve says something: it explains variance of blocks it was not drawn from."""
-    return p.share_percent >= 100 * AXIS_R2 and p.strength >= TELLING_STRENGTH
-
-
 def place_figure(before: Place, after: Place | None, law: Place | None = None) -> str:
     """A figure of one place with its caption; `law`: what an addition explains of it."""
     unit = pretty_unit(before.residual_unit)
     share = max(before.share_percent, 0.0)
     said = (
         f"explains {share:.0f} % of this residual"
-        if telling(before)
+        if before.tells
         else "no dependence beyond chance"
     )
     fall = f"{number(_largest(before), 2)} {unit} at most"
@@ -196,7 +190,7 @@ def places_html(improvement: Improvement, plots: ReportPlots) -> str:
     for before, after in plots.places:
         if before.balance in count and count[before.balance] < SHOWN_PER_BALANCE:
             count[before.balance] += 1
-            first = first or (before if telling(before) else None)
+            first = first or (before if before.tells else None)
             shown.append(place_figure(before, after))
         else:
             rest.append(place_figure(before, after))

@@ -207,3 +207,12 @@ def test_a_band_is_not_drawn_across_a_bin_without_one() -> None:
     )
     assert place_picture(place).count('class="s-before band"') == 2
     assert place_picture(replace(place, branches=(whole,))).count('class="s-before band"') == 1
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_noise_tells_nothing_and_a_dependence_tells(seed: int) -> None:
+    rows = made_rows(seed)
+    noise = np.random.default_rng(100 + seed).standard_normal(len(rows.block))
+    velocity = rows.axes["motor_velocity"].values
+    assert not any(place(rows, noise, "motor", axis).tells for axis in rows.axes)
+    assert place(rows, noise + 2 * velocity, "motor", "motor_velocity").tells
