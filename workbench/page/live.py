@@ -6,7 +6,6 @@ import contextlib
 import logging
 import secrets
 import threading
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, final
@@ -85,7 +84,7 @@ class Live(Place):
         self.job: Job | None = None
         self.error: str | None = None
         self.begun = ""
-        self._said = time.time_ns() // 1_000_000  # goes on after a restart of the server
+        self._said, self._teller = 0, secrets.token_hex(4)
         self.listeners: set[Listener] = set()
         self.helper = Helper(session.folder)
         self.worker = Worker(f"session {session.id[:6]}", self.helper.close)
@@ -147,11 +146,13 @@ class Live(Place):
 
     def snapshot(self) -> dict[str, Any]:
         """What the page needs to know at once when something changed. ``said`` grows with every
-        change that is told: of two that overtook one another the page knows the newer one.
+        change that is told, by one ``teller``: of two that overtook one another the page knows
+        the newer one. After a restart another one tells, whose numbers begin anew.
         """
         with self.lock:
             return {
                 "said": self._said,
+                "teller": self._teller,
                 "revision": self.state.revision,
                 "job": self.job.as_json() if self.job else None,
                 "error": self.error,

@@ -125,9 +125,12 @@ function arrive(state) {
   return false;
 }
 
+/* Told before what is known: numbers of one teller only can be compared, a restarted server counts anew. */
+function older(news) { return Boolean(app.state) && news.teller === app.state.teller && news.said < app.state.said; }
+
 function adopt(state) {
   if (state.id !== app.id || (app.state && state.id === app.state.id && state.revision < app.state.revision)) return;
-  if (app.state && state.id === app.state.id && state.said < app.state.said) Object.assign(state, { said: app.state.said, job: app.state.job }); /* what was told while the answer was under way is newer */
+  if (app.state && state.id === app.state.id && older(state)) Object.assign(state, { said: app.state.said, job: app.state.job }); /* what was told while the answer was under way is newer */
   const changed = !app.state || state.revision !== app.state.revision || state.id !== app.state.id;
   app.state = state;
   if (arrive(state)) { goOn(); return; }
@@ -147,9 +150,9 @@ function listen() {
   app.source.onmessage = (event) => {
     const news = JSON.parse(event.data);
     if (news.gone) { gone(); return; }
-    if (!app.state || news.said < app.state.said) return;
+    if (!app.state || older(news)) return;
     const ended = app.state.job && !news.job;
-    app.state.job = news.job; app.state.said = news.said;
+    app.state.job = news.job; app.state.said = news.said; app.state.teller = news.teller;
     surround();
     if (app.upload && !ended && !news.error) return; /* the answer to the upload brings the state */
     if (news.revision !== app.state.revision || ended || news.error) refresh().catch(fail);

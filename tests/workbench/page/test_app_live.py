@@ -223,3 +223,13 @@ def test_what_is_chosen_stands_when_the_view_is_drawn_anew(page: Any, view: str)
         page.evaluate("() => { document.querySelector('#main').dataset.view = ''; render(false); }")
         idle(page, view)
         assert page.input_value(f"#{name}") == last, name
+
+
+def test_a_server_that_was_started_anew_is_heard(page: Any) -> None:
+    """Its numbers begin anew, and are not taken for older news."""
+    idle(page)
+    page.evaluate("() => { app.state.said = 1e15; app.state.teller = 'before the restart'; }")
+    page.evaluate("run('diagnose', {}, 'diagnose')")
+    page.wait_for_function("() => app.state.teller !== 'before the restart'", timeout=20_000)
+    idle(page, "diagnose")
+    assert page.evaluate("() => app.state.diagnosis !== null && app.state.said < 1e15")
