@@ -52,7 +52,7 @@ from workbench.show.results import floor_percent
 from workbench.show.words import OUTCOME_WORDS, kind_of, title_of
 
 EVIL = "<script>alert('x')</script>&\"</title>"
-VOID = {"meta", "br", "img", "input", "hr", "link"}
+VOID = {"meta", "br", "wbr", "img", "input", "hr", "link"}
 
 
 def swing(seed: int, name: str, *, coulomb: float = 1.0) -> Record:

@@ -13,6 +13,8 @@
   var range = entry.window.slice();
   var quiet = false;
 
+  var side = ", referred to the link [";
+
   function colour(name) { return getComputedStyle(document.documentElement).getPropertyValue(name).trim(); }
   function short(v) { return v === null || v === undefined || isNaN(v) ? "–" : Number(v.toPrecision(4)).toString().replace("-", "\u2212"); }
   function unit() { return entry.unit.replace(".", "\u00b7"); }
@@ -52,9 +54,9 @@
     var last = report.added ? "with the additions" : "model";
     var drag = { hooks: { setSelect: [zoomed] }, cursor: { sync: { key: "overlay" }, drag: { x: true, y: false, setScale: false } } };
     charts = [
-      new uPlot(options(boxes[0], 260, [time(), curve("measured", "--ink", null, 2.2)].concat(start, [curve(last, "--after")]), "torque [" + unit() + "]", drag),
+      new uPlot(options(boxes[0], 260, [time(), curve("measured", "--ink", null, 2.2)].concat(start, [curve(last, "--after")]), entry.quantity + side + unit() + "]", drag),
         pick(torqueRows()), boxes[0]),
-      new uPlot(options(boxes[1], 220, [time()].concat(left, [curve("residual, " + last, "--after")]), "residual [" + unit() + "]", drag),
+      new uPlot(options(boxes[1], 220, [time()].concat(left, [curve("residual, " + last, "--after")]), "residual" + side + unit() + "]", drag),
         pick(residualRows()), boxes[1]),
       new uPlot(options(boxes[2], 110, [time(), curve(report.added ? "residual, start model" : "residual", report.added ? "--before" : "--after", null, 1)],
         "", { legend: { show: false }, cursor: { drag: { x: true, y: false, setScale: false } },

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
@@ -79,12 +80,13 @@ def law_html(improvement: Improvement, result: Mapping[str, Any]) -> str:
         term = next((t for t in model.terms if t.label == label), None)
         names = [n for n in (term.names if term else ()) if n in values]
         numbers = "<br>".join(
-            f"{text(plain_name(n))} = {with_error(values[n]['value'], values[n]['stderr'])} "
+            f"<span class='nowrap'>{text(plain_name(n))} = "
+            f"{with_error(values[n]['value'], values[n]['stderr'])} "
             f"{pretty_unit(values[n]['unit'])} <span class='side'>({text(values[n]['side'])})"
-            "</span>"
+            "</span></span>"
             for n in names
         )
-        shown = f"<code>{text(formula)}</code>" if formula else "–"
+        shown = formula or "–"
         side = f" <span class='side'>in the {text(where)} balance</span>" if where else ""
         rows.append([f"+ {text(name)}{side}", shown, numbers or "–"])
     curves = _curves_left(result)
@@ -120,9 +122,13 @@ def _parts(model: Any) -> dict[str, str]:
     return {source: _formula(part) for e in shown_equations(model) for source, part in e.parts}
 
 
-def _formula(part: Expression) -> str:
-    """A formula for the eye: powers as ^, products as a raised dot."""
-    return written(part).replace("**", "^").replace("*", "\u00b7")
+def _formula(part: Expression, sign: str = "") -> str:
+    """A formula for the eye, as HTML: powers as ^, products as a raised dot; lines end before a
+    product or a quotient, never inside a name or a number.
+    """
+    plain = written(part).replace("**", "^").replace("*", "\u00b7").replace("-", "\u2212")
+    said = re.sub("[\u00b7/]", r"<wbr>\g<0>", text(plain))
+    return f"<code class='formula'>{sign}{said}</code>"
 
 
 def equations_html(improvement: Improvement) -> str:
@@ -132,12 +138,10 @@ def equations_html(improvement: Improvement) -> str:
     out = []
     for e in shown_equations(improvement.steps[-1].solution.model):
         rows = [
-            [f"<code>{'+ ' if k else ''}{text(_formula(part))}</code>", text(_source(source))]
+            [_formula(part, "+ " if k else ""), text(_source(source))]
             for k, (source, part) in enumerate(e.parts)
         ]
-        caption = (
-            f"{text(e.title)} [{pretty_unit(e.unit)}]: <code>{text(_formula(e.left))}</code> ="
-        )
+        caption = f"{text(e.title)} [{pretty_unit(e.unit)}]: {_formula(e.left)} ="
         out.append(table(["part", "what it is"], rows, caption))
     return (
         "".join(out) + "<p class='note'>All quantities are referred to the link, in SI units.</p>"

@@ -7,8 +7,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-
 from casadi_models import EFFECTS
 from casadi_models.quantities import linear_unit
 from identification.data.formats import interval, number, percent, pretty_unit, ratio, words
@@ -309,16 +307,15 @@ def unexplained_html(improvement: Improvement) -> str:
     linear = improvement.joint.kind == "linear"
     items = "".join(f"<li>{unexplained_sentence(u, linear)}</li>" for u in improvement.unexplained)
     curves = "".join(
-        f"<article><p>{text(_plain(c))}</p>{place_picture(c.place, None, 'torque')}</article>"
+        f"<figure>{place_picture(c.place, None, 'torque')}"
+        f"<figcaption>{text(_plain(c))}</figcaption></figure>"
         for c in improvement.learned
     )
     if curves:
-        items += (
-            f"</ul><h3>The curve in the place of a name</h3><div class='grid'>{curves}</div><ul>"
-        )
+        curves = f"<h3>The curve in the place of a name</h3><div class='grid'>{curves}</div>"
     return (
-        f"<ul>{items}</ul><p class='note'>This is not in the library. Look at the place named "
-        "above; an effect of your own takes about ten lines of Python.</p>"
+        f"<ul>{items}</ul>{curves}<p class='note'>This is not in the library. Look at the place "
+        "named above; an effect of your own takes about ten lines of Python.</p>"
     )
 
 
@@ -359,9 +356,22 @@ def overlay_html(shown: Sequence[Overlay]) -> str:
             ("out", "−", "Zoom out"),
         )
     )
-    still = "".join(f"<figure>{c.svg()}</figure>" for c in window_charts(shown[0])) if shown else ""
+    still = ""
+    if shown:
+        figures = "".join(f"<figure>{c.svg()}</figure>" for c in window_charts(shown[0]))
+        models = (
+            '<span class="key before">╌ start model</span> '
+            '<span class="key after">─ with the additions</span>'
+            if shown[0].added
+            else '<span class="key after">─ model</span>'
+        )
+        still = (
+            f"<p class='legend print-only'>{text(shown[0].balance)} balance, "
+            f"{text(shown[0].record)}: <span class='key'>━ measured</span> {models}</p>"
+            f'<div class="print-only grid">{figures}</div>'
+        )
     return (
-        f'<div class="print-only grid">{still}</div>'
+        f"{still}"
         f'<div class="controls"><label>Show <select id="overlay-choice">{options}</select></label> '
         f'<span role="group" aria-label="Time window">{buttons}</span></div>'
         '<p id="overlay-status" class="note" aria-live="polite"></p>'
@@ -383,17 +393,15 @@ def window_charts(o: Overlay) -> tuple[Chart, Chart]:
     inside = (o.time >= o.window[0]) & (o.time <= o.window[1])
     whole = [o.measured[inside], o.start[inside], o.final[inside]]
     time, (measured, start, final) = decimated(o.time[inside], whole, STILL_POINTS)
-    added = not np.array_equal(o.start, o.final, equal_nan=True)
     x = Label("time, records end to end", "s")
-    what = "force" if o.unit == "N" else "torque"
     kinds: list[tuple[str, FloatArray, Style]] = [("with the additions", final, "after")]
-    kinds = [("start model", start, "before"), *kinds] if added else [("model", final, "after")]
+    kinds = [("start model", start, "before"), *kinds] if o.added else [("model", final, "after")]
     said = f"{o.balance} balance on {o.record}, {number(o.window[0])} to {number(o.window[1])} s"
     return (
         Chart(
-            f"Measured and modelled {what}, {said}",
+            f"Measured and modelled {o.quantity}, {said}",
             x,
-            torque_label(f"{what}, {o.balance} balance", o.unit),
+            torque_label(f"{o.quantity}, {o.balance} balance", o.unit),
             (
                 Curve("measured", time, measured, "ink"),
                 *(Curve(n, time, v, s, dashed=s == "before") for n, v, s in kinds),

@@ -123,6 +123,16 @@ class Overlay:
     final: FloatArray
     window: tuple[float, float]
 
+    @property
+    def added(self) -> bool:
+        """Whether start and final model differ."""
+        return not np.array_equal(self.start, self.final, equal_nan=True)
+
+    @property
+    def quantity(self) -> str:
+        """What is measured: a force of a linear axis, else a torque."""
+        return "force" if self.unit == "N" else "torque"
+
     def as_json(self, points: int = POINTS) -> dict[str, Any]:
         """For the plotting script: an overview with kept extremes, and the worst window in full."""
         whole = [
@@ -136,6 +146,7 @@ class Overlay:
         out: dict[str, Any] = {
             "balance": self.balance,
             "record": self.record,
+            "quantity": self.quantity,
             "unit": self.unit,
             "rows": len(self.time),
             "shown": len(time),

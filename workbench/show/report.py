@@ -312,9 +312,10 @@ def _parameter_note(effort: str) -> str:
 def _overlay(plots: ReportPlots, where: str, effort: str) -> str:
     return (
         f"<p>{effort.capitalize()} of a balance on {where}, as measured and as the models give "
-        "it. It opens on the window in which the start model is worst; "
-        "the lowest plot shows the whole record: drag across it to choose another "
-        f"window.</p>{fragments.overlay_html(plots.overlays)}"
+        "it<span class='screen-only'>. It opens on the window in which the start model is worst; "
+        "the lowest plot shows the whole record: drag across it to choose another window</span>"
+        "<span class='print-only'>, in the window in which the start model is worst</span>."
+        f"</p>{fragments.overlay_html(plots.overlays)}"
     )
 
 

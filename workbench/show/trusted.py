@@ -11,7 +11,8 @@ from workbench.show.results import table, text
 NOTE: Final = (
     "<p class='note'>95 % intervals; the standard errors behind them do not know of a wrong model. "
     "“By record”: the value that each training record alone gives. “Moves the prediction”: by how "
-    "much over half the interval, all others adapted. `irj trust` refits shapes on either side.</p>"
+    "much over half the interval, all others adapted. <code>irj trust</code> refits "
+    "shapes on either side.</p>"
 )
 
 
