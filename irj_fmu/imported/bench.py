@@ -19,6 +19,7 @@ from identification.balance.calibration import settled
 from identification.balance.sensing import signals_of
 from identification.balance.stamps import evened
 from identification.balance.weak import WeakRecord, differentiated_kernel, filtered
+from identification.data.joint_file import Known
 from identification.data.record import Record
 from identification.diagnosis.bench import Progress
 from identification.diagnosis.candidates import Candidate, NotTestable, offered
@@ -74,7 +75,10 @@ class Freedom:
     step : float
         Step with which the changes were taken: a scale of the parameter.
     changes : tuple of mapping of str to (n,) array
-        By record, training ones first: signals at full rate, link-referred.
+        By record, training ones first: signals at full rate, link-referred, of the joint whose
+        constants follow the parameter.
+    constants : mapping of str to float
+        What it changes in these constants.
     """
 
     name: str
@@ -82,6 +86,7 @@ class Freedom:
     high: float
     step: float
     changes: tuple[Mapping[str, FloatArray], ...]
+    constants: Mapping[str, float]
 
 
 def freedom(
@@ -90,8 +95,11 @@ def freedom(
     step: float,
     pairs: Sequence[tuple[Record, Record]],
     data: Dataset,
+    constants: Mapping[str, float],
 ) -> Freedom:
-    """A parameter's changes, from records (before, after) a step of it; training ones first."""
+    """A parameter's changes, from records (before, after) a step of it, training ones first, and
+    from what the step changes in the constants of the joint.
+    """
     out = []
     for before, after in pairs:
         changed = before
@@ -100,7 +108,7 @@ def freedom(
                 changed = changed.with_channel(channel, (after[channel] - before[channel]) / step)
         signals = signals_of(evened(changed), data.joint, data.sensing)
         out.append({n: x for n, x in signals.items() if n in TORQUES.values()})
-    return Freedom(name, *limits, step, tuple(out))
+    return Freedom(name, *limits, step, tuple(out), {n: x / step for n, x in constants.items()})
 
 
 def _sum(table: Mapping[str, FloatArray], more: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
@@ -308,7 +316,12 @@ class FmuBench:
 
     def _at(self, sizes: FloatArray) -> Dataset:
         """The records with the FMU's parameters moved, as far as that is linear."""
-        return self._with(self.data, sizes)
+        moved = self._with(self.data, sizes)
+        known = dict(moved.joint.known)
+        for f, size in zip(self._free, sizes.tolist(), strict=True):
+            for n, x in f.constants.items():
+                known[n] = Known(value=(known[n].value or 0.0) + size * x)
+        return replace(moved, joint=replace(moved.joint, known=known))
 
     def _with(self, data: Dataset, sizes: FloatArray) -> Dataset:
         changes = [
@@ -327,22 +340,30 @@ class FmuBench:
 
     def _columns(self, solution: Solution, data: Dataset) -> list[FloatArray]:
         """Change of every row with each of the FMU's parameters, training rows first [N.m per
-        unit]."""
+        unit].
+
+        The constants of the joint follow the parameter, and the laws of the model turn them into
+        torques where these stand now: a spring and a damper of the gear pull at what an error of
+        its angle leaves of the torsion, and an inertia takes the acceleration that was measured,
+        not the one that the FMU had without the missing effect.
+        """
         balances = balances_of(solution.model, data.sensing, wrt=())
 
-        def rows(given: Dataset) -> FloatArray:
+        def rows(given: Dataset, values: Mapping[str, float]) -> FloatArray:
             both = [
-                flatten(stack(balances, records, solution.values), balances.balances)[0]
+                flatten(stack(balances, records, values), balances.balances)[0]
                 for records in (given.train, given.held_out)
                 if records
             ]
             return np.concatenate(both)
 
-        before, out = rows(data), []
+        at = solution.values
+        before, out = rows(data, at), []
         for i, f in enumerate(self._free):
             sizes = np.zeros(len(self._free))
             sizes[i] = f.step
-            out.append((rows(self._with(data, sizes)) - before) / f.step)
+            moved = {**at, **{n: at[n] + x * f.step for n, x in f.constants.items()}}
+            out.append((rows(self._with(data, sizes), moved) - before) / f.step)
         return out
 
     def _moved(

@@ -233,12 +233,16 @@ def diagnose(
         low, high = bounds[name]
         step = _STEP * scale_of(value, (low, high))
         step = -step if value + step > high else step
-        pairs = [
-            (b, left.record(r, {name: value + step})) for b, r in zip(before, every, strict=True)
-        ]
+        constants: dict[str, float] = {}
         if isinstance(left, Restart):
+            follow = left.inertias_at({name: value + step})
             own |= left.moved_inertias(name, step)
-        free.append(freedom(name, (low - value, high - value), step, pairs, data))
+            constants = {n: x - left.sizes[n] for n, x in left.sizes_of(follow).items()}
+            after = [left.record(r, {name: value + step}, follow) for r in every]
+        else:
+            after = [left.record(r, {name: value + step}) for r in every]
+        pairs = list(zip(before, after, strict=True))
+        free.append(freedom(name, (low - value, high - value), step, pairs, data, constants))
     say("ranking the library", 0.75)
     inside = model.joint.model().terms
     if model.correction is not None:
