@@ -20,6 +20,7 @@ from identification.errors import InputError
 from identification.scratch import folder_beside, hold
 from irj_fmu.command_line import (
     OneLineParser,
+    check_folder,
     check_output,
     checkpoint,
     fail,
@@ -217,6 +218,7 @@ def _names(kind: str, base: str) -> list[str]:
 
 def _prepare(out: Path) -> list[Path]:
     """Make the folder where it is missing; the folders that were made, the innermost first."""
+    check_folder(out)
     missing = [folder for folder in (out, *out.parents) if not folder.exists()]
     try:
         out.mkdir(parents=True, exist_ok=True)

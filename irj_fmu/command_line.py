@@ -117,8 +117,14 @@ def fail(text: str) -> int:
     end_bar()
     if STOPPED:
         return stopped()
-    sys.stderr.write(one_line(text) + "\n")
+    _say(one_line(text))
     return 2
+
+
+def _say(line: str) -> None:
+    """A line on standard error; the exit code tells it where nobody can read that."""
+    with contextlib.suppress(OSError):
+        sys.stderr.write(line + "\n")
 
 
 def crashed(error: BaseException, doing: str) -> int:
@@ -134,7 +140,7 @@ def crashed(error: BaseException, doing: str) -> int:
     end_bar()
     if STOPPED:  # compiled code may turn an interrupt into an error of its own
         return stopped()
-    sys.stderr.write(one_line(internal_error(error, doing)) + "\n")
+    _say(one_line(internal_error(error, doing)))
     return CRASHED
 
 
@@ -142,7 +148,7 @@ def stopped() -> int:
     """Say that the user interrupted; the exit code of a shell for the signal."""
     end_bar()
     if signal.SIGINT in STOPPED:
-        sys.stderr.write("irj: interrupted\n")
+        _say("irj: interrupted")
         return INTERRUPTED
     return 128 + STOPPED[0]
 

@@ -334,6 +334,13 @@ def weak_record(
             before=before,
             same=set(signals) - changed,
         )
+        if made.rows < 8:
+            parted = f" in {len(segments)} stretches" if len(segments) > 1 else ""
+            raise InputError(
+                f"{record.name}: {len(record)} samples in {record.duration:.3g} s{parted} are too "
+                f"few for a kernel of {length:.3g} s; give a longer record"
+                f"{' with fewer gaps' if parted else ''}"
+            )
         made = replace(made, shifts={p: k * record.dt for p, k in shifts.items()})
         last.append((dict(shifts), made))
         return made
@@ -373,11 +380,6 @@ def weak_record(
                 for c, own in noise.items()
                 if c in signals
             },
-        )
-    if made.rows < 8:
-        raise InputError(
-            f"{record.name}: {len(record)} samples in {record.duration:.3g} s are too few for a "
-            f"kernel of {length:.3g} s; give a longer record"
         )
     return made
 

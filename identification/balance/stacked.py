@@ -98,11 +98,15 @@ def stack(
     share = [{b: w.taking(b) for b in balances.balances} for w in records]
     return Stacked(
         {
-            b: np.concatenate([p[b][0] * s[b] for p, s in zip(parts, share, strict=True)])
+            b: np.concatenate(
+                [np.where(s[b], p[b][0], 0.0) for p, s in zip(parts, share, strict=True)]
+            )
             for b in balances.balances
         },
         {
-            b: np.concatenate([p[b][1] * s[b][:, None] for p, s in zip(parts, share, strict=True)])
+            b: np.concatenate(
+                [np.where(s[b][:, None], p[b][1], 0.0) for p, s in zip(parts, share, strict=True)]
+            )
             for b in balances.balances
         },
         np.concatenate([w.block for w in records]),

@@ -29,6 +29,8 @@ from identification.errors import InputError
 
 LARGEST_RATIO: Final = 1e75
 """Its fourth power, that of cubic friction between motor side and link, is still a number."""
+LARGEST_VALUE: Final = 1e75
+"""Of a parameter: times a signal that is as large, and squared, it is still a number."""
 _TABLES: Final = ("joint", "known", "columns", "fitted", "calibration", "provenance", TABLE, LAWS)
 
 
@@ -311,6 +313,7 @@ def _known(name: str, entry: Any, model: JointModel, source: str) -> Known:
             f"{source}: [known] {name} is no finite number once it is in {unit} on the link "
             "side; correct value, unit or side"
         )
+    _check_size(max(map(abs, values.values())), f"{source}: [known] {name}")
     if scale < 0:  # the link is counted against the motor shaft
         values = {{"low": "high", "high": "low"}.get(k, k): v for k, v in values.items()}
     if values.get("low", -math.inf) > values.get("high", math.inf):
@@ -354,7 +357,15 @@ def _fitted(name: str, entry: Any, source: str) -> dict[str, Any]:
             f"{source}: [fitted] {name}: stderr = {given['stderr']:g} is below zero; correct it or "
             "leave it out"
         )
+    _check_size(abs(given["value"]), f"{source}: [fitted] {name}")
     return given
+
+
+def _check_size(value: float, where: str) -> None:
+    if value > LARGEST_VALUE:
+        raise InputError(
+            f"{where}: {value:g} is out of what can be computed with; correct it or fit again"
+        )
 
 
 def toml_text(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,7 +12,7 @@ from typing import Any, Final, final
 
 from casadi_models.term import MOTOR_INERTIA
 from identification.data.joint_file import Joint, load_joint, parse_joint
-from identification.data.plain_text import from_toml
+from identification.data.plain_text import from_json, from_toml
 from identification.errors import InputError
 
 PUBLISHED: Final = (
@@ -183,7 +182,7 @@ def published(path: Path) -> list[Entry]:
         No such table, in one line.
     """
     try:
-        table = json.loads(path.read_text(encoding="utf-8"))
+        table = from_json(path.read_text(encoding="utf-8"), str(path))
         rows = {str(n): dict(row) for n, row in table.items()}
     except OSError as error:
         raise InputError(

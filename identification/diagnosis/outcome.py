@@ -104,6 +104,20 @@ def refusals(
     return tuple(Refusal(key, why) for key, why in out.items() if key not in named)
 
 
+def known_key(key: str) -> str:
+    """The key of an effect of the library.
+
+    Raises
+    ------
+    InputError
+        No effect of that key.
+    """
+    wanted = key_of(key)
+    if wanted not in EFFECTS:
+        raise InputError(f"unknown effect {key!r}; `irj effects` lists the library")
+    return wanted
+
+
 def why_not(
     key: str,
     claims: Sequence[Claim],
@@ -127,9 +141,7 @@ def why_not(
     InputError
         No effect of that key.
     """
-    wanted = key_of(key)
-    if wanted not in EFFECTS:
-        raise InputError(f"unknown effect {key!r}; `irj effects` lists the library")
+    wanted = known_key(key)
     title = EFFECTS[wanted].title
     for claim in claims:
         if wanted == claim.effects[0]:

@@ -5,6 +5,7 @@ and a rendezvous start.
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,8 @@ from typing import Final, final
 import numpy as np
 import numpy.typing as npt
 
+from identification.data.check.channels import LARGEST
+from identification.data.check.stamps import MINIMUM_SAMPLES
 from identification.errors import InputError
 
 FloatArray = npt.NDArray[np.float64]
@@ -26,6 +29,10 @@ COLUMNS: Final = (
     "reference_velocity_rad/s",
     "reference_acceleration_rad/s2",
 )
+UNEVEN: Final = 0.01
+"""Share of a step that a time may be off: the nine digits of a file that was written here, and the
+fewer ones of others. A motion at 100 rad/s followed in steps of 1 ms is then off by 1e-3 rad.
+"""
 _RENDEZVOUS_CONSTANTS: Final = 5.0
 
 
@@ -73,15 +80,64 @@ class Motion:
 
     @staticmethod
     def load(path: str | Path) -> Motion:
-        """Read a file that :meth:`save` wrote."""
-        with Path(path).open(encoding="utf-8") as file:
-            header = tuple(file.readline().strip().split(","))
+        """Read a file that :meth:`save` wrote.
+
+        Raises
+        ------
+        InputError
+            No such file, or no such table; fewer rows than a record must have; a cell that holds no
+            number, or one that no joint follows; time that does not run on in even steps.
+        """
+        try:
+            with Path(path).open(encoding="utf-8") as file:
+                header = tuple(file.readline().strip().split(","))
+            if header == COLUMNS:
+                with warnings.catch_warnings(action="ignore"):  # no rows: refused below
+                    rows = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)
+        except OSError as error:
+            raise InputError(
+                f"{path}: cannot be read ({error.strerror}); give a trajectory file, as `irj plan` "
+                "writes it"
+            ) from None
+        except UnicodeDecodeError:
+            raise InputError(
+                f"{path}: is not a text file; give a trajectory file, as `irj plan` writes it"
+            ) from None
+        except ValueError as error:
+            raise InputError(
+                f"{path}: {str(error).rstrip('.')}; give a number in each of the "
+                f"{len(COLUMNS)} columns"
+            ) from None
         if header != COLUMNS:
             raise InputError(
                 f"{path}: the header is {','.join(header)}; a trajectory file has "
                 f"{','.join(COLUMNS)}"
             )
-        rows = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)
+        if len(rows) < MINIMUM_SAMPLES:
+            raise InputError(
+                f"{path}: has {len(rows)} rows, at least {MINIMUM_SAMPLES} are needed; plan a "
+                "longer motion"
+            )
+        if rows.shape[1] != len(COLUMNS):
+            raise InputError(
+                f"{path}: {rows.shape[1]} columns below a header of {len(COLUMNS)}; give a number "
+                "in each"
+            )
+        wrong = ~np.isfinite(rows) | (np.abs(rows) > LARGEST)
+        if wrong.any():
+            row, column = (int(k) for k in np.argwhere(wrong)[0])
+            raise InputError(
+                f"{path}: {COLUMNS[column]} is {rows[row, column]:g} in row {row + 1}; no joint "
+                "follows that, plan the motion again"
+            )
+        steps = np.diff(rows[:, 0])
+        off = np.flatnonzero(np.abs(steps - steps[0]) > UNEVEN * abs(steps[0]))
+        if steps[0] <= 0 or len(off):
+            row = int(off[0]) + 2 if len(off) else 2
+            raise InputError(
+                f"{path}: time does not run on in even steps, first at row {row}; give it in "
+                "steps of one length"
+            )
         return Motion(rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3], "file", MappingProxyType({}))
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
-import json
 import re
+import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, final
 
+from identification.data.plain_text import from_json
 from identification.errors import InputError
 from irj_fmu.batch.fits import PARAMETERS, is_fit_study, load_fit_study, run_fits
 from irj_fmu.batch.fits import SUMMARY as FIT_SUMMARY
@@ -25,6 +26,7 @@ from irj_fmu.batch.store import lock
 from irj_fmu.batch.study import Study, load_study
 from irj_fmu.command_line import (
     OneLineParser,
+    check_folder,
     check_output,
     counted,
     fail,
@@ -152,7 +154,9 @@ def default_folder(study: Path) -> Path:
 
 @contextlib.contextmanager
 def _held(folder: Path) -> Iterator[None]:
-    """Hold the folder against another study."""
+    """Hold the folder against another study; one that was made for nothing is taken away."""
+    check_folder(folder)
+    made = [place for place in (folder, *folder.parents) if not place.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
         held: Any = lock(folder)
@@ -163,9 +167,24 @@ def _held(folder: Path) -> Iterator[None]:
         ) from None
     try:
         yield
+    except InputError:
+        if not (folder / "chunks").exists():  # nothing was run
+            _unmake(folder, made)
+        raise
     finally:
         if held is not None:
             held.close()
+
+
+def _unmake(folder: Path, made: Sequence[Path]) -> None:
+    """Take away folders that were made here, with what a study that is refused leaves in them."""
+    if folder not in made:
+        return
+    (folder / ".lock").unlink(missing_ok=True)
+    shutil.rmtree(folder / "models", ignore_errors=True)
+    for place in made:
+        with contextlib.suppress(OSError):  # something else lies in it by now
+            place.rmdir()
 
 
 def _clear(chunks: Path) -> None:
@@ -419,7 +438,7 @@ def _address(given: str) -> str:
     is_file, found = Path(given).is_file(), given
     if is_file:
         try:
-            found = str(json.loads(Path(given).read_text(encoding="utf-8"))["address"])
+            found = str(from_json(Path(given).read_text(encoding="utf-8"), given)["address"])
         except (OSError, ValueError, KeyError, TypeError):
             raise InputError(
                 f"--dask {given}: is not a scheduler file; give what `dask scheduler "

@@ -210,7 +210,11 @@ def compile_library(
                 (line for line in done.stderr.splitlines() if "error" in line),
                 done.stderr.strip()[:200],
             )
-            raise InputError(f"compiler {command[0]!r} failed for {target}: {first}")
+            said = first or f"it said nothing and ended with {done.returncode}"
+            raise InputError(
+                f"compiler {command[0]!r} failed for {target} ({said}); try it by itself, or give "
+                "another one with --cc"
+            )
         return (Path(folder) / library).read_bytes()
 
 

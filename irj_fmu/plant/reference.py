@@ -4,7 +4,6 @@ shows all of them.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -13,6 +12,7 @@ from typing import Any, Final, final
 
 from casadi_models import JointModel, thesis
 from identification.data.joint_file import Joint
+from identification.data.plain_text import from_json
 from identification.errors import InputError
 
 _HD: Final[Mapping[str, float]] = {
@@ -137,7 +137,7 @@ def published_joint(
         Where the file or the key is missing, or the module has no gear ratio in its name.
     """
     try:
-        table: dict[str, Any] = json.loads(Path(path).read_text(encoding="utf-8"))
+        table: dict[str, Any] = from_json(Path(path).read_text(encoding="utf-8"), str(path))
         row = table[name]
         needed = {n: float(row[n]) for n in ("armature", "friction_viscous", "friction_base", "kt")}
         needed |= {
@@ -153,7 +153,8 @@ def published_joint(
     except KeyError as error:
         if name not in table:
             raise InputError(
-                f"{path}: no parameters {name!r}; there are {', '.join(sorted(table))}"
+                f"{path}: no parameters {name!r}; "
+                f"{'there are ' + ', '.join(sorted(table)) if table else 'it holds none at all'}"
             ) from None
         raise InputError(
             f"{path}: {name} has no {error.args[0]}; give a table with a row of numbers for each "

@@ -499,8 +499,11 @@ def test_bad_arguments_are_one_line(folder: Path, capsys: pytest.CaptureFixture[
         ([str(folder)], "directory"),
         ([str(folder / "plant.fmu")], "text file"),
         ([str(path), "--jobs", "0"], "at least 1"),
-        ([str(path), "-o", str(folder / "taken")], "writable folder"),
-        ([str(path), "-o", str(folder / "taken" / "deeper")], "writable folder"),
+        ([str(path), "-o", str(folder / "taken")], "taken: is a file; give the name of a folder"),
+        (
+            [str(path), "-o", str(folder / "taken" / "deeper")],
+            "taken: is a file; give the name of a folder",
+        ),
         ([str(path), "--json", str(folder / "no" / "a.json")], "no such folder"),
     ):
         assert main(argv) == 2

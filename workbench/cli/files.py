@@ -98,6 +98,7 @@ READ: Final = [
     "record",
     "like",
     "fmu",
+    "planned",
 ]
 """Options whose files are read, whatever the verb."""
 

@@ -15,6 +15,7 @@ from identification.data.check.gate import gate_warnings
 from identification.data.joint_file import Joint
 from identification.data.record import Record
 from identification.diagnosis.improve import Improvement, improve
+from identification.diagnosis.outcome import known_key
 from identification.fitting.fit import Fit, fit
 from identification.fitting.trust import Trust, trust
 from workbench.cli.files import (
@@ -342,6 +343,8 @@ def run_diagnose(arguments: Namespace) -> int:
         held_out=arguments.held_out,
     )
     joint = open_joint(arguments.joint)
+    for key in arguments.why:
+        known_key(key)
     records, _ = training(arguments.records, arguments.other_payload, joint)
     held, _ = open_records(arguments.held_out, joint)
     alike(

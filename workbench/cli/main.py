@@ -511,7 +511,10 @@ def parser() -> OneLineParser:
         "-o", "--output", metavar="FILE", help="the proposed motion as CSV, as `irj plan` writes it"
     )
     following.add_argument(
-        "--motion", metavar="FILE", help="without records: the motion that is planned (CSV)"
+        "--motion",
+        dest="planned",
+        metavar="FILE",
+        help="without records: the motion that is planned (CSV)",
     )
     for option, unit, text in (
         ("position", "DEG", "half of the link's workspace [deg; m on a linear axis]"),

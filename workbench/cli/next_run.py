@@ -55,8 +55,8 @@ def _limit(arguments: Namespace, option: str, degrees: bool) -> float:
 def _before(arguments: Namespace, limits: Limits) -> dict[str, Any]:
     """What a planned run cannot show."""
     joint = open_joint(arguments.joint)
-    if arguments.motion:
-        motion = Motion.load(arguments.motion)
+    if arguments.planned:
+        motion = Motion.load(arguments.planned)
     else:
         half = min(UNPLANNED.half, limits.position)
         speed = min(UNPLANNED.speed, limits.speed)
@@ -77,7 +77,7 @@ def _before(arguments: Namespace, limits: Limits) -> dict[str, Any]:
 
 def _after(arguments: Namespace, limits: Limits) -> dict[str, Any]:
     """The run that separates what ties on the records."""
-    if arguments.motion:
+    if arguments.planned:
         raise InputError("--motion goes without records: it says what a planned run cannot show")
     distinct(
         training=arguments.records,

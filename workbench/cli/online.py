@@ -27,6 +27,7 @@ from workbench.cli.files import (
     write_bytes,
     write_json,
 )
+from workbench.cli.following.datagrams import SCHEME
 from workbench.cli.following.datagrams import source as followed_source
 from workbench.cli.following.growing import follow
 from workbench.cli.following.stepper import Stepper, arrays_of, fault_text
@@ -51,6 +52,9 @@ def run_track(arguments: Namespace) -> int:
     joint = open_joint(arguments.joint)
     if getattr(arguments, "follow", None) is not None:
         return _run_follow(arguments, joint)
+    stream = next((r for r in arguments.records if r.startswith(SCHEME)), None)
+    if stream is not None:
+        raise InputError(f"{stream}: a stream has no end; add --follow to track it as it comes")
     tried = [parse_fault(text) for text in getattr(arguments, "inject", None) or []]
     records, raw, warnings = _open_doubtful(arguments.records, joint)
     healthy, more = open_records(arguments.healthy, joint)

@@ -31,6 +31,7 @@ from identification.data.record import Record
 from identification.errors import InputError
 from workbench.cli.files import (
     distinct,
+    named,
     open_joint,
     open_records,
     progress_bar,
@@ -85,10 +86,10 @@ def run_resample(arguments: Namespace) -> int:
     refused = next((f for f in stamps if f.severity == "refuse"), None)
     if refused is not None:
         raise InputError(refused.message)
-    for finding in stamps:
-        print(f"{finding.severity}: {finding.message}")
     even = repair(record)
     _write_record(Path(arguments.output), even)
+    for finding in stamps:
+        print(f"{finding.severity}: {finding.message}")
     lost = 0 if even.measured is None else int(np.sum(~even.measured))
     print(
         f"{arguments.output}: {len(even)} samples in {len(even.segments())} run(s), step "
@@ -110,7 +111,10 @@ def run_prefilter(arguments: Namespace) -> int:
     joint = open_joint(arguments.joint) if arguments.joint else None
     _table_name(arguments.output)
     (record,), _ = open_records(arguments.records, joint)
-    smooth = filtered(record.resampled(), arguments.cutoff, arguments.order)
+    try:
+        smooth = filtered(record.resampled(), arguments.cutoff, arguments.order)
+    except InputError as error:
+        raise named(error, arguments.records[0], record) from None
     if arguments.derivatives:
         smooth = with_derivatives(smooth)
     if arguments.trim:
@@ -220,6 +224,8 @@ def checked(
             f"{path}: {len(record)} samples, {record.duration:.3g} s, channels "
             f"{', '.join(record.channels)}"
         )
+        for note in record.provenance.notes:
+            print(f"  note: {note}")
         for finding in findings:
             print(f"  {finding.severity}: {finding.message}")
         refused |= any(f.severity == "refuse" for f in findings)

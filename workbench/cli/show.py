@@ -64,14 +64,17 @@ def _compensation(model: JointModel, arguments: Namespace) -> int:
     """
     if arguments.format != "text":
         raise InputError("show: --compensation is a table; leave --format out")
-    if not 0.0 < arguments.max_speed < np.inf:
-        raise InputError(f"show: --max-speed {arguments.max_speed:g} must be positive")
+    rotary = model.kind == "rotary"
+    fastest = np.radians(arguments.max_speed) if rotary else arguments.max_speed
+    if not 0.0 < SLOWEST * fastest < np.inf:
+        raise InputError(
+            f"show: --max-speed {arguments.max_speed:g} must be positive, and a number that can be "
+            "computed with"
+        )
     try:
         function = friction_compensation(model)
     except ValueError as error:
         raise InputError(f"{arguments.joint}: {error}; there is nothing to compensate") from None
-    rotary = model.kind == "rotary"
-    fastest = np.radians(arguments.max_speed) if rotary else arguments.max_speed
     speeds = np.geomspace(SLOWEST * fastest, fastest, SPEEDS)
     speeds = np.concatenate((-speeds[::-1], [0.0], speeds))
     given = function.sx_in()

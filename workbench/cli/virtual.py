@@ -7,19 +7,22 @@ from __future__ import annotations
 from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
 from casadi_models import EFFECTS, JointModel
 from casadi_models.simulate import sampled_step
+from identification.data.check.stamps import MINIMUM_SAMPLES
 from identification.data.joint_file import Joint
 from identification.data.typical import true_values
 from identification.errors import InputError
 from irj_fmu.command_line import is_special
 from workbench.cli.files import open_joint, progress_bar, write_bytes, write_json, write_text
 
+MOST_SAMPLES: Final = 10_000_000
+"""Of a simulated record: as CSV it takes about 1 GB."""
 FloatArray = npt.NDArray[np.float64]
 
 
@@ -28,6 +31,11 @@ def run_simulate(arguments: Namespace) -> int:
     joint = open_joint(arguments.joint)
     if not 1 <= arguments.rate <= 1e5 or not 0.5 <= arguments.seconds <= 1e4:
         raise InputError("--rate takes 1 to 100000 samples per second and --seconds 0.5 to 10000")
+    count = round(arguments.seconds * arguments.rate)
+    if not MINIMUM_SAMPLES <= count <= MOST_SAMPLES:
+        raise InputError(
+            f"--rate and --seconds make {count} samples; give {MINIMUM_SAMPLES} to {MOST_SAMPLES}"
+        )
     if arguments.seed < 0:
         raise InputError(f"--seed {arguments.seed}: give a whole number from 0 up")
     if Path(arguments.output).suffix not in (".csv", ".npz") and not is_special(
@@ -50,6 +58,8 @@ def run_simulate(arguments: Namespace) -> int:
             raise InputError(f"--hide {key}: {error.args[0]}") from None
     try:
         model = model.with_values({**true_values(model, joint), **_given(arguments.set, model)})
+    except InputError:
+        raise
     except ValueError as error:
         raise InputError(f"--set: {error.args[0]}") from None
     _check_hidden(model, arguments.hide)

@@ -417,7 +417,11 @@ def with_files(root: Path, files: Sequence[str | Path]) -> str:
     store = Store(root)
     for file in files:
         if not Path(file).is_file():
-            raise InputError(f"{file}: there is no such file; check the path")
+            raise InputError(
+                f"{file}: is a folder; name the files in it"
+                if Path(file).is_dir()
+                else f"{file}: there is no such file; check the path"
+            )
     session = store.create()
     live = Live(session)
     for file in sorted(map(Path, files), key=lambda f: f.suffix != ".toml"):
@@ -465,29 +469,29 @@ def serve(
     import uvicorn
 
     folder = root or default_root()
-    listening = _listen(port)
-    port = int(listening.getsockname()[1])
-    key = home.key_of(Store(folder))
-    sources.allow(folder, follow)
-    tail = f"#home={key}" + (f"&session={with_files(folder, files)}" if files else "")
-    address = f"http://127.0.0.1:{port}/{tail}"
-    if say is not None:
-        say(address)
-    else:
-        sys.stdout.write(address + "\n")
-        sys.stdout.flush()
-    config = uvicorn.Config(
-        create_app(folder, port=port),
-        log_level="warning",
-        access_log=False,
-        server_header=False,
-        timeout_graceful_shutdown=1,
-        ws="none",
-    )
-    threading.Thread(target=_warm_up, daemon=True, name="warm up").start()
-    if open_browser:
-        threading.Timer(0.5, webbrowser.open, (address,)).start()
-    uvicorn.Server(config).run(sockets=[listening])
+    with _listen(port) as listening:
+        port = int(listening.getsockname()[1])
+        key = home.key_of(Store(folder))
+        sources.allow(folder, follow)
+        tail = f"#home={key}" + (f"&session={with_files(folder, files)}" if files else "")
+        address = f"http://127.0.0.1:{port}/{tail}"
+        if say is not None:
+            say(address)
+        else:
+            sys.stdout.write(address + "\n")
+            sys.stdout.flush()
+        config = uvicorn.Config(
+            create_app(folder, port=port),
+            log_level="warning",
+            access_log=False,
+            server_header=False,
+            timeout_graceful_shutdown=1,
+            ws="none",
+        )
+        threading.Thread(target=_warm_up, daemon=True, name="warm up").start()
+        if open_browser:
+            threading.Timer(0.5, webbrowser.open, (address,)).start()
+        uvicorn.Server(config).run(sockets=[listening])
 
 
 def _warm_up() -> None:

@@ -208,7 +208,9 @@ def _drop(record: Record, keep: np.typing.NDArray[np.bool_], rule: str, also: st
     if count == 0:
         return record
     if count == keep.size:
-        raise InputError(f"{record.name}: no row is left after {rule}: export the channels again")
+        raise InputError(
+            f"{record.name}: no row is left ({rule.replace('_', ' ')}): export the channels again"
+        )
     first = int(np.argmin(keep)) + 1
     return record.take(
         keep, f"{rule}: {count} row(s), first row {first}" + (f"; {also}" if also else "")

@@ -210,7 +210,8 @@ def _slope(record: Record, drive: FloatArray, position: FloatArray) -> float | N
     rows = np.concatenate([p for p in parts if p is not None] or [np.empty((0, 9))])
     if len(rows) < 30:
         return None
-    both = rows[:, :2]
+    sizes = np.maximum(np.linalg.norm(rows[:, :2], axis=0), 1e-300)
+    both = rows[:, :2] / sizes
     others = rows[:, 2:] / np.maximum(np.linalg.norm(rows[:, 2:], axis=0), 1e-300)
     for spring in (True, False):
         used = others if spring else others[:, :-1]
@@ -221,7 +222,7 @@ def _slope(record: Record, drive: FloatArray, position: FloatArray) -> float | N
         partial = td / math.sqrt(tt * dd)
         if abs(partial) >= _PARTIAL:
             # geometric mean of both regressions: noise in either channel does not pull it to zero
-            return math.copysign(math.sqrt(dd / tt), partial)
+            return math.copysign(math.sqrt(dd / tt) * sizes[0] / sizes[1], partial)
     return None
 
 

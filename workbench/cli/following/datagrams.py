@@ -160,7 +160,14 @@ def _is_row(line: bytes) -> bool:
     return True
 
 
-def _bound(address: str) -> socket.socket:
+def place_of(address: str) -> tuple[str, int]:
+    """Host and port of a stream.
+
+    Raises
+    ------
+    InputError
+        It is no address.
+    """
     asked = urlsplit(address)
     try:
         host, port = asked.hostname, asked.port
@@ -170,6 +177,11 @@ def _bound(address: str) -> socket.socket:
         raise InputError(
             f"{address}: give the address as {SCHEME}HOST:PORT, as {SCHEME}0.0.0.0:9870"
         )
+    return host, port
+
+
+def _bound(address: str) -> socket.socket:
+    host, port = place_of(address)
     made = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_DGRAM)
     try:
         made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, AT_ONCE)

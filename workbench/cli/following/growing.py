@@ -93,7 +93,10 @@ class Growing:
                 stream.seek(self._at)
                 came = stream.read()
         except OSError as error:
-            raise InputError(f"{self.path}: cannot be read ({error.strerror})") from None
+            raise InputError(
+                f"{self.path}: cannot be read ({error.strerror}); give a CSV file that is being "
+                "written"
+            ) from None
         whole = came[: came.rfind(b"\n") + 1]
         if not whole or (not self._at and whole.count(b"\n") < FIRST_ROWS):
             return None

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from identification.errors import InputError
-from workbench.cli.following.datagrams import SCHEME
+from workbench.cli.following.datagrams import SCHEME, place_of
 from workbench.page.session import write_atomic
 
 FILE: Final = "follow.json"
@@ -18,7 +18,18 @@ STOP: Final = "follow.stop"
 
 
 def allow(root: Path, paths: Sequence[str | Path]) -> None:
-    """Let the sessions under a root follow these files, and no others any more."""
+    """Let the sessions under a root follow these files, and no others any more.
+
+    Raises
+    ------
+    InputError
+        A folder, or a stream whose address is none.
+    """
+    for path in paths:
+        if _is_stream(path):
+            place_of(str(path))
+        elif Path(path).is_dir():
+            raise InputError(f"{path}: is a folder; give the CSV file that is being written")
     names = [str(p) if _is_stream(p) else str(Path(p).absolute()) for p in paths]
     write_atomic(root / FILE, json.dumps(names).encode())
 
