@@ -2,7 +2,10 @@
 
 Residuals are those of an estimate from a second before or more, which no failure since has moved. A
 newer one takes its place when it has explained the readings of a second as well: an estimate of a
-moment in which the recursion swings is none to go back to.
+moment in which the recursion swings is none to go back to. A residual is judged by what was to be
+expected of it: the noise, and how unsure that estimate was of the row. Where it was unsure the
+innovations of the recursion are judged in its place, and what is gone back to is a quarter of a
+second old: what an old estimate did not know the rows since may have told.
 Where they leave their level at once, the recursion goes on, but the estimate shown is that one; on
 the way there, for a second at most, it is the last one. It is taken up again as it was when the
 residuals come back (the failure was temporary). The new one is accepted when it explains the
@@ -14,7 +17,7 @@ residuals since, beside the new parameters.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Final, final
+from typing import Any, Final, NamedTuple, final
 
 import numpy as np
 import numpy.typing as npt
@@ -51,6 +54,8 @@ _PLAIN: Final = (
     "held_for",
     "_fast",
     "_trial",
+    "_own",
+    "_until",
     "_new",
     "_over",
     "_on",
@@ -62,6 +67,17 @@ _PLAIN: Final = (
 _SUMS: Final = 10
 """Sums of each balance: rows, squares of residual and weight, and of torque and motion their
 squares and their products with weight and residual."""
+
+
+class _Kept(NamedTuple):
+    """A recursion to go back to, and its memory to judge residuals with."""
+
+    state: bytes
+    fast: FloatArray
+
+    @classmethod
+    def of(cls, estimator: RecursiveLeastSquares) -> _Kept:
+        return cls(estimator.state(), estimator.engine_for("guard").fast.copy())
 
 
 def sensor_explains(sums: Sequence[float], limit: float) -> bool:
@@ -103,9 +119,8 @@ class Guard:
     ----------
     theta : (parameters,) array
         The estimate to show.
-    before : (2, parameters) array
-        The estimate that residuals are judged with, a second old or more, so that a recursion that
-        follows a failed sensor within less does not hide it; and the one that is to follow it.
+    scale : (parameters,) array
+        That of the recursion.
     on_probation : bool
     held_for : int
         Rows since the probation began.
@@ -114,8 +129,8 @@ class Guard:
     def __init__(self, names: Sequence[str], balances: Sequence[str], period: float) -> None:
         self._count, self._size = len(balances), len(names)
         self._rate = min(1.0, period / _MEMORY)
-        self._age, self._wait_back, self._wait_accept = (
-            max(1, round(t / period)) for t in (_AGE, _BACK, _ACCEPT)
+        self._age, self._wait_back, self._wait_accept, self._often = (
+            max(1, round(t / period)) for t in (_AGE, _BACK, _ACCEPT, _MEMORY)
         )
         self._forget = 1.0 - 1.0 / self._wait_accept
         self.reset()
@@ -123,21 +138,34 @@ class Guard:
     def reset(self) -> None:
         """Before the recursion starts."""
         self.on_probation = False
-        self._back = self._explained = self._next = self._doubt = self.held_for = 0
+        self._back = self._explained = self._next = self._doubt = self._until = self.held_for = 0
         self._fast, self._new = [0.0] * self._count, [0.0] * self._count
-        self._trial = [0.0] * self._count
+        self._trial, self._own = [0.0] * self._count, [0.0] * self._count
         self._over, self._on = [_LONG_AGO] * self._count, [True] * self._count
         self._sums = [[0.0] * _SUMS for _ in range(self._count)]
         self._limits = [0.0] * self._count
-        self.theta, self.before = np.zeros(self._size), np.zeros((2, self._size))
-        self._kept: list[bytes] = []
+        self.theta, self.scale = np.zeros(self._size), np.ones(self._size)
+        self._kept: list[_Kept] = []
 
     def start(self, estimator: RecursiveLeastSquares) -> None:
         """A new recursion, trusted."""
         self.reset()
         self.theta = estimator.theta
-        self.before[:] = self.theta
-        self._kept = [estimator.state()] * 2
+        self.scale = estimator.engine_for("guard").part("config", "scale").copy()
+        self._kept = [_Kept.of(estimator)] * 3
+
+    @property
+    def fast(self) -> list[FloatArray]:
+        """Memory of the recursion whose estimate residuals are judged with, a second old or more,
+        so that a recursion that follows a failed sensor within less does not hide it; and of the
+        one that is to follow it (:class:`identification.recursive.settings.Layout`).
+        """
+        return [kept.fast for kept in self._kept[:2]]
+
+    @property
+    def before(self) -> FloatArray:
+        """The estimates of :attr:`fast`, (2, parameters)."""
+        return np.array([fast[: self._size] * self.scale for fast in self.fast])
 
     def step(
         self,
@@ -156,8 +184,9 @@ class Guard:
             After its update; it may be put back.
         theta : (parameters,) array
             Its estimate.
-        error : (2, balances) array
-            Weighted residuals of the row with :attr:`before`.
+        error : (3, balances) array
+            Residuals of the row with :attr:`before`, in the weights of
+            :attr:`identification.online.row_check.RowCheck.weighted_error`.
         level : (balances,) array
             Size the residuals have when all is well.
         on : (balances,) bool array
@@ -174,10 +203,13 @@ class Guard:
         self._limits = limits
         lost = any(was and not now for was, now in zip(self._on, flags, strict=True))
         self._on = flags
-        errors, newer = error.tolist()
+        errors, newer, own = error.tolist()
         over = self._follow(self._fast, errors, limits)
         if not self.on_probation:
             self._follow(self._trial, newer, limits)
+            follows = self._follow(self._own, own, limits)
+            if True in follows and True not in over:
+                over, self._fast, self._kept = follows, list(self._own), [self._kept[2]] * 3
             return self._calm(estimator, theta, over, limits, lost=lost)
         self.held_for += 1
         self._over = [
@@ -220,8 +252,8 @@ class Guard:
     def _doubtful(self, limits: list[float]) -> bool:
         """True where the residuals are no longer those of an estimate that explains them."""
         return any(
-            square > (_EXPLAINED * limit) ** 2
-            for square, limit in zip(self._fast, limits, strict=True)
+            max(square, own) > (_EXPLAINED * limit) ** 2
+            for square, own, limit in zip(self._fast, self._own, limits, strict=True)
         )
 
     def _proven(self, limits: list[float]) -> bool:
@@ -246,7 +278,7 @@ class Guard:
             self._new = list(self._fast)
             self._back = self._explained = self.held_for = 0
             self._sums = [[0.0] * _SUMS for _ in range(self._count)]
-            self.theta = self.before[0].copy()
+            self.theta = self.before[0]
             return "held"
         if lost:  # rows before a failure was noticed may hold it
             self._restore(estimator)
@@ -255,22 +287,24 @@ class Guard:
         if 0 < self._doubt <= self._age:  # what is no failure by then is told by no more rows
             return ""
         self.theta = theta
+        self._until += 1
+        if self._until >= self._often:
+            self._until = 0
+            self._kept[2] = _Kept.of(estimator)
         self._next += 1
         if self._next >= self._age:
             self._next = 0
             if self._proven(limits):
                 self._kept[0] = self._kept[1]
-                self.before[0] = self.before[1]
-            self._kept[1] = estimator.state()
-            self.before[1] = theta
+            self._kept[1] = _Kept.of(estimator)
         return ""
 
     def _restore(self, estimator: RecursiveLeastSquares) -> None:
-        estimator.restore(self._kept[0])
+        estimator.restore(self._kept[0].state)
         self.theta = estimator.theta
-        self.before[:] = self.theta
-        self._kept = [self._kept[0]] * 2
-        self._next = 0
+        self._kept = [self._kept[0]] * 3
+        self._own = [0.0] * self._count
+        self._next = self._until = 0
 
     @property
     def several(self) -> bool:
@@ -315,6 +349,7 @@ class Guard:
             "AGE": self._age,
             "BACK": self._wait_back,
             "ACCEPT": self._wait_accept,
+            "OFTEN": self._often,
             "FORGET": self._forget,
             "SINGULAR": _SINGULAR,
             "SUMS": _SUMS,
@@ -326,11 +361,15 @@ class Guard:
 
     def state(self) -> tuple[dict[str, Any], dict[str, FloatArray], dict[str, bytes]]:
         """Everything that changes."""
-        parts = {f"guard{i}": kept for i, kept in enumerate(self._kept)}
+        parts = {f"guard{i}": kept.state for i, kept in enumerate(self._kept)}
         return {n: getattr(self, n) for n in _PLAIN}, self._arrays(), parts
 
     def _arrays(self) -> dict[str, FloatArray]:
-        return {"theta": self.theta, "before": self.before.copy()}
+        return {
+            "theta": self.theta,
+            "scale": self.scale,
+            "fast": np.array([k.fast for k in self._kept]),
+        }
 
     def restore(
         self, plain: Mapping[str, Any], arrays: Mapping[str, FloatArray], parts: Mapping[str, bytes]
@@ -338,5 +377,5 @@ class Guard:
         """Take up what :meth:`state` gave."""
         for name in _PLAIN:
             setattr(self, name, plain[name])
-        self.theta, self.before = arrays["theta"], arrays["before"].copy()
-        self._kept = [parts[f"guard{i}"] for i in range(2) if f"guard{i}" in parts]
+        self.theta, self.scale = arrays["theta"], arrays["scale"]
+        self._kept = [_Kept(parts[f"guard{i}"], fast) for i, fast in enumerate(arrays["fast"])]

@@ -13,6 +13,9 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
+from identification.recursive.settings import Layout
+from identification.recursive.ud_factor import Factor, Parts, total
+
 FloatArray = npt.NDArray[np.float64]
 
 LEAST: Final = 1e-12
@@ -24,7 +27,10 @@ _INTO: Final = (
     "y",
     "h",
     "theta",
-    "before",
+    "older",
+    "newer",
+    "running",
+    "scale",
     "share",
     "on",
     "floor",
@@ -66,16 +72,18 @@ class RowCheck:
     ----------
     error : (balances,) array
         Residuals of the last row with the estimate.
-    weighted_error : (2, balances) array
-        Residuals with two estimates from before, times their weights.
+    weighted_error : (3, balances) array
+        Residuals with two estimates from before, and of the recursion itself, times their weights
+        and what noise alone is of what is expected of them (noise and :func:`_unsure`). That of
+        the recursion counts as far as the older estimate was unsure of the row.
     square, torque, least, ratio, over : (balances,) array
         Mean squares of the weighted residuals and of the torques; what counts as noise at least
         [N.m]; residual over that; 1 where the residual is over its limit.
     y, h : (balances,) and (balances, parameters) array
         The row times its weights.
     signals : (3, balances) array
-        Torque, what the motion makes of it (all but friction torques), and one, times the weights:
-        what a gain or an offset of a reading adds to the residual.
+        Torque, what the motion makes of it (all but friction torques), and one, times the weights
+        and that of the older estimate: what a gain or an offset of a reading adds to its residual.
     function, weight : casadi.Function
         The whole check, and (shares, parameters, size of the residuals) -> weights.
     """
@@ -89,10 +97,14 @@ class RowCheck:
         rate: float,
         limit: float,
     ) -> None:
+        layout = Layout(parameters, balances).fast
         sizes = {
             "h": (parameters, balances),
             "theta": (parameters, 1),
-            "before": (parameters, 2),
+            "older": (layout.size, 1),
+            "newer": (layout.size, 1),
+            "running": (layout.size, 1),
+            "scale": (parameters, 1),
             "share": (2, 1),
             "floor_share": (1, 1),
         }
@@ -114,10 +126,20 @@ class RowCheck:
         )
         least = ca.fmax(ca.fmax(v["floor"], v["floor_share"] * ca.sqrt(torque)), LEAST)
         root = ca.sqrt(square)
-        over = ca.logic_and(use, root > limit * ca.fmax(least, v["level"]))
+        level = ca.fmax(least, v["level"])
+        over = ca.logic_and(use, root > limit * level)
+        kept = [Parts(v[name], layout) for name in ("older", "newer", "running")]
+        unsure = [_unsure(part, v["scale"], v["h"], weight / level) for part in kept]
+        trusted = [weight / ca.sqrt(1 + share) for share in unsure]
+        before = [v["scale"] * ca.vertcat(*part["theta"]) for part in kept]
+        judged = [
+            share * (v["y"] - v["h"].T @ values)
+            for share, values in zip(trusted, before, strict=True)
+        ]
+        judged[2] *= ca.sqrt(unsure[0] / (1 + unsure[0]))
         out = (
             error,
-            ca.repmat(weight, 1, 2) * (ca.repmat(v["y"], 1, 2) - v["h"].T @ v["before"]),
+            ca.horzcat(*judged),
             square,
             torque,
             least,
@@ -125,7 +147,7 @@ class RowCheck:
             over,
             weight * v["y"],
             v["h"] * ca.repmat(weight.T, parameters, 1),
-            ca.horzcat(weight * v["reference"], weight * motion, weight),
+            ca.horzcat(trusted[0] * v["reference"], trusted[0] * motion, trusted[0]),
         )
         self.function = ca.Function("row_check", list(v.values()), [ca.densify(e) for e in out])
         self._into = [
@@ -135,7 +157,7 @@ class RowCheck:
         shapes = {
             "h": (balances, parameters),
             "signals": (3, balances),
-            "weighted_error": (2, balances),
+            "weighted_error": (3, balances),
         }
         found = [np.zeros(shapes.get(name, (balances,))) for name in _OUT]
         self._buffer, self._trigger = self.function.buffer()
@@ -157,8 +179,8 @@ class RowCheck:
         ) = found
 
     def __call__(self, *given: Any) -> None:
-        """Take y, h, theta, the estimates from before, the shares of standstill, flags, floor,
-        level, torques, mean squares and the floor's share of the torque.
+        """Take y, h, theta, the recursions from before and now, their scale, the shares of
+        standstill, flags, floor, level, torques, mean squares and the floor's share of the torque.
         """
         for target, value in zip(self._into, given, strict=True):
             target[:] = value
@@ -169,6 +191,28 @@ class RowCheck:
         size (balances,).
         """
         return np.array(self.weight(shares.T, theta, size)).T
+
+
+def _unsure(kept: Parts, scale: Any, h: Any, weight: Any) -> Any:
+    """Variance that the covariance P of an estimate adds to a residual, over that of the noise:
+    w^2 h P h', (balances,).
+
+    Parameters
+    ----------
+    kept : Parts
+        Of the recursion whose estimate the residuals are of.
+    scale : (parameters,)
+    h : (parameters, balances)
+    weight : (balances,)
+        Weights of the rows over the standard deviations of their noise.
+    """
+    factor = Factor(kept["d"], kept["u"])
+    found = []
+    for b in range(h.size2()):
+        row = factor.transposed_times(ca.vertsplit(scale * h[:, b]))
+        own = total([d * item * item for d, item in zip(factor.d, row, strict=True)])
+        found.append(weight[b] * weight[b] * own)
+    return ca.vertcat(*found)
 
 
 def _weight_function(

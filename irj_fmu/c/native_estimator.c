@@ -150,7 +150,7 @@ static int check_row(Twin *m, const int on[N_BALANCES]) {
     State *s = &m->s;
     Checked *c = &m->checked;
     double share[2], use[N_BALANCES], reference[N_BALANCES], over[N_BALANCES];
-    const double *const into[] = {m->y, m->h, s->theta, s->guard.before, share, use, s->floor, s->first_level, reference, s->square, s->torque, &s->floor_share};
+    const double *const into[] = {m->y, m->h, s->theta, s->guard.kept[0].fast, s->guard.kept[1].fast, s->rls.fast, s->scale, share, use, s->floor, s->first_level, reference, s->square, s->torque, &s->floor_share};
     double *const out[] = {c->error, c->weighted, c->square, c->torque, c->least, s->ratio, over, c->y, c->h, c->signals};
     int b, any = 0;
     standstill(m, share);

@@ -42,16 +42,14 @@ static void estimate_of(const State *s, const Recursion *r, double theta[N_THETA
 static void guard_start(State *s) { /* a new recursion, trusted */
     clear_guard(&s->guard);
     estimate_of(s, &s->rls, s->guard.theta);
-    estimate_of(s, &s->rls, s->guard.before);
-    estimate_of(s, &s->rls, s->guard.before + N_THETA);
-    s->guard.kept[0] = s->guard.kept[1] = s->rls;
+    s->guard.kept[0] = s->guard.kept[1] = s->guard.kept[2] = s->rls;
 }
 
 /* True where the residuals are no longer those of an estimate that explains them. */
 static int guard_doubtful(const Guard *g, const double limits[N_BALANCES]) {
     int b;
     for (b = 0; b < N_BALANCES; b++)
-        if (g->quick[b] > (GUARD_EXPLAINED * limits[b]) * (GUARD_EXPLAINED * limits[b])) return 1;
+        if (fmax(g->quick[b], g->own[b]) > (GUARD_EXPLAINED * limits[b]) * (GUARD_EXPLAINED * limits[b])) return 1;
     return 0;
 }
 
@@ -67,10 +65,9 @@ static void guard_restore(State *s) {
     Guard *g = &s->guard;
     s->rls = g->kept[0];
     estimate_of(s, &s->rls, g->theta);
-    estimate_of(s, &s->rls, g->before);
-    estimate_of(s, &s->rls, g->before + N_THETA);
-    g->kept[1] = g->kept[0];
-    g->next = 0;
+    g->kept[1] = g->kept[2] = g->kept[0];
+    memset(g->own, 0, sizeof g->own);
+    g->next = g->until = 0;
 }
 
 /* Mean squares of errors, in place; what is far over the limit is cut, not to be remembered for long. Tells where they are over. */
@@ -136,13 +133,19 @@ static int guard_step(State *s, const double theta[N_THETA], const Checked *chec
     any = guard_follow(g, g->quick, checked->weighted, limits, 1.0, over);
     if (!g->on_probation) {
         guard_follow(g, g->trial, checked->weighted + N_BALANCES, limits, 1.0, unexplained);
+        if (guard_follow(g, g->own, checked->weighted + 2 * N_BALANCES, limits, 1.0, unexplained) && !any) {
+            any = 1; /* the older estimate was unsure of the row, the rows since were not */
+            memcpy(over, unexplained, sizeof over);
+            memcpy(g->quick, g->own, sizeof g->quick);
+            g->kept[0] = g->kept[1] = g->kept[2];
+        }
         if (any) {
             g->on_probation = 1;
             for (b = 0; b < N_BALANCES; b++) g->over[b] = over[b] ? 0 : GUARD_LONG_AGO;
             memcpy(g->fresh, g->quick, sizeof g->fresh);
             g->back = g->explained = g->held_for = 0;
             memset(g->sums, 0, sizeof g->sums);
-            memcpy(g->theta, g->before, sizeof g->theta);
+            estimate_of(s, &g->kept[0], g->theta);
             return HELD_NOW;
         }
         if (lost) { /* rows before a failure was noticed may hold it */
@@ -152,14 +155,14 @@ static int guard_step(State *s, const double theta[N_THETA], const Checked *chec
         g->doubt = guard_doubtful(g, limits) ? g->doubt + 1 : 0;
         if (0 < g->doubt && g->doubt <= GUARD_AGE) return NOTHING;
         memcpy(g->theta, theta, sizeof g->theta);
+        if (++g->until >= GUARD_OFTEN) {
+            g->until = 0;
+            g->kept[2] = s->rls;
+        }
         if (++g->next >= GUARD_AGE) {
             g->next = 0;
-            if (guard_proven(g, limits)) {
-                g->kept[0] = g->kept[1];
-                memcpy(g->before, g->before + N_THETA, sizeof g->theta);
-            }
+            if (guard_proven(g, limits)) g->kept[0] = g->kept[1];
             g->kept[1] = s->rls;
-            memcpy(g->before + N_THETA, theta, sizeof g->theta);
         }
         return NOTHING;
     }

@@ -53,10 +53,10 @@ typedef struct { /* Pulse */
 
 typedef struct { /* Guard */
     int on_probation, on[N_BALANCES];
-    Count back, explained, next, doubt, held_for, over[N_BALANCES];
-    double quick[N_BALANCES], fresh[N_BALANCES], trial[N_BALANCES], theta[N_THETA], before[2 * N_THETA];
+    Count back, explained, next, doubt, until, held_for, over[N_BALANCES];
+    double quick[N_BALANCES], fresh[N_BALANCES], trial[N_BALANCES], own[N_BALANCES], theta[N_THETA];
     double sums[N_BALANCES][GUARD_SUMS];
-    Recursion kept[2];
+    Recursion kept[3];
 } Guard;
 
 typedef struct { /* StructuredRule and Residuals */
@@ -99,7 +99,7 @@ typedef struct {
 } State;
 
 typedef struct { /* RowCheck: what a row says before the recursion takes it */
-    double error[N_BALANCES], weighted[2 * N_BALANCES], square[N_BALANCES], torque[N_BALANCES], least[N_BALANCES];
+    double error[N_BALANCES], weighted[3 * N_BALANCES], square[N_BALANCES], torque[N_BALANCES], least[N_BALANCES];
     double y[N_BALANCES], h[N_BALANCES * N_THETA], signals[3 * N_BALANCES];
 } Checked;
 

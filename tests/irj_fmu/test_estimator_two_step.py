@@ -315,7 +315,7 @@ def guard_run(
         h = np.zeros((2, 4))
         h[0, :2], h[1, 2:] = rng.normal(size=2), rng.normal(size=2)
         y = h @ theta + offset + 0.05 * rng.normal(size=2)
-        error = y - guard.before @ h.T
+        error = np.vstack([y - guard.before @ h.T, np.zeros(2)])
         est.update(y, h)
         signals = np.array([y, h @ guard.theta, np.ones(2)])
         told.append(guard.step(est, est.theta, error, level, np.ones(2, dtype=bool), signals))
