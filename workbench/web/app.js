@@ -220,6 +220,7 @@ function render(moved) {
   app.plots = [];
   const main = $("main");
   const token = (app.token = (app.token || 0) + 1);
+  app.drawn = pictureWidth(WIDEST);
   delete main.dataset.view; /* what is on the screen is the old one until the new one is drawn */
   Promise.resolve(views[app.view](app.state)).then((nodes) => {
     if (token !== app.token) return;
@@ -299,7 +300,11 @@ async function fresh() {
 }
 
 async function boot() {
-  theme(remembered("irj-theme") || (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light"));
+  const dark = matchMedia("(prefers-color-scheme: dark)"), wished = () => remembered("irj-theme") || (dark.matches ? "dark" : "light");
+  theme(wished());
+  dark.addEventListener("change", () => { theme(wished()); render(false); });
+  let turned = null;
+  addEventListener("resize", () => { clearTimeout(turned); turned = setTimeout(() => { if (app.drawn && Math.abs(pictureWidth(WIDEST) / app.drawn - 1) > 0.1) render(false); }, 200); }); /* of a phone that was turned, pictures are drawn anew: their letters would shrink or be cut */
   $("theme").addEventListener("click", () => { const next = document.documentElement.dataset.theme === "dark" ? "light" : "dark"; remembered("irj-theme", next); theme(next); render(false); });
   $("undo").addEventListener("click", () => run("undo"));
   $("redo").addEventListener("click", () => run("redo"));

@@ -42,7 +42,7 @@ function patternCard(p) {
 
 /* One lane per reading: how close its residuals are to their limits, and when it was declared failed. */
 function timeline(r) {
-  const lanes = r.readings, W = pictureWidth(1120), L = W < 500 ? 106 : 118, R = 14, T = 26, row = 34, B = 38, H = T + row * lanes.length + B;
+  const lanes = r.readings, W = pictureWidth(WIDEST), L = W < 500 ? 106 : 118, R = 14, T = 26, row = 34, B = 38, H = T + row * lanes.length + B;
   const X = (t) => L + (t / r.end) * (W - L - R), marks = r.verdicts.filter((v) => v.about.length);
   const label = r.detector ? (marks.length ? `Fault timeline: ${marks.map((m) => `${words(m.about.join(", "))} at ${seconds(m.time)}`).join("; ")}` : "Fault timeline: no reading was doubted") : "Fault timeline: the detector did not run";
   const out = svg("svg", { viewBox: `0 0 ${W} ${H}`, role: "img", "aria-label": label });
@@ -79,7 +79,8 @@ function timeline(r) {
 
 /* A parameter as it was followed, beside the value of the fit. */
 function followed(name, p, time, end) {
-  const W = 250, H = 92, L = 6, R = 6, T = 8, B = 20, known = p.history.filter((v) => v != null);
+  /* on a phone two stand beside one another */
+  const W = pictureWidth(WIDEST) < 700 ? 150 : 250, H = 92, L = 6, R = 6, T = 8, B = 20, known = p.history.filter((v) => v != null);
   const reach = [...known, p.fitted].filter((v) => v != null);
   let [y0, y1] = [Math.min(...reach), Math.max(...reach)];
   const least = 0.05 * Math.max(Math.abs(p.fitted ?? y1), 1e-12);

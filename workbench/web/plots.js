@@ -30,6 +30,7 @@ function ticks(low, high, most = 5) {
   return out;
 }
 
+const WIDEST = 1120; /* of all pictures */
 /* Width of a picture in its own units: as wide as it will be drawn on a phone, so that its text stays readable. */
 function pictureWidth(most) {
   return Math.max(280, Math.min(most, document.documentElement.clientWidth - 70));
@@ -59,13 +60,13 @@ class SeriesPlot {
     this.save = h("div", { class: "row under end", hidden: true }, saver(this.title || "series", () => this.svg(), () => this.csv())); /* there is nothing to save before the data came */
     host.replaceChildren(this.main, this.strip, this.save);
     this.observer = new ResizeObserver(() => {
-      if (host.clientWidth) this.plots.forEach((p, k) => p.setSize({ width: host.clientWidth, height: this.height(k) }));
+      if (host.clientWidth) this.plots.forEach((p) => p.setSize({ width: host.clientWidth, height: this.height() }));
       if (this.small && host.clientWidth) { this.small.setSize({ width: host.clientWidth, height: 74 }); this.mark(); }
     });
     this.observer.observe(host);
   }
   get plot() { return this.plots[0] || null; }
-  height(k = 0) { const most = this.host.clientWidth < 600 ? 220 : 300; return this.panels ? Math.round(most * 0.75) : most; }
+  height() { return this.panels ? 225 : this.host.clientWidth < 600 ? 220 : 300; } /* a panel is as high as the label of its axis is long, also on a phone */
   forget() { this.whole = null; if (this.small) { this.small.destroy(); this.small = null; } }
   async show(range) {
     this.range = range || null;
@@ -106,7 +107,7 @@ class SeriesPlot {
       const units = [...new Set(group.map((s) => s.unit))], last = panel === groups.length - 1;
       const label = (u) => { const first = group.find((s) => s.unit === u), side = this.side || first.side, what = this.panels ? (group.length > 1 ? effort() : first.name) : ""; return [[what, side].filter(Boolean).join(" "), unit(u) && `[${unit(u)}]`].filter(Boolean).join(" "); };
       const made = new uPlot({
-        width: this.host.clientWidth || 800, height: this.height(panel), legend: { live: true }, cursor: { drag: { x: true, y: false, setScale: false }, sync: this.panels ? { key: "series", setSeries: false } : undefined },
+        width: this.host.clientWidth || 800, height: this.height(), legend: { live: true }, cursor: { drag: { x: true, y: false, setScale: false }, sync: this.panels ? { key: "series", setSeries: false } : undefined },
         scales: { x: { time: false, range: this.range ? () => this.range : undefined } },
         series: [{ label: "time [s]", value: (u, v) => digits(v, 6) }, ...group.map((s) => { const k = data.series.indexOf(s); return {
           label: s.name.replace(/_/g, " ") + (unit(s.unit) ? ` [${unit(s.unit)}]` : ""), stroke: of(s, k), width: data.time.length < 600 ? 1.5 : 1, scale: s.unit,

@@ -305,14 +305,60 @@ def test_every_view_fits_a_phone_and_passes_axe(
             assert page.evaluate("document.documentElement.scrollWidth") <= width, (
                 f"{view} is wider than {width} pixels"
             )
+            assert cut_or_tiny(page) == [], f"{view} at {width} pixels"
             serious += axe(page, f"{view} {width}")
     page.click("#nav-ledger")
+    browser.idle("ledger")
+    page.set_viewport_size({"width": 812, "height": 375})
+    page.wait_for_function("() => Math.abs(app.drawn - 742) < 20")
+    page.set_viewport_size({"width": 375, "height": 812})
+    page.wait_for_function("() => app.drawn < 320")
+    browser.idle("ledger")
+    assert cut_or_tiny(page) == [], "a phone that was turned has pictures of its own width"
+    other = "dark" if colours == "light" else "light"
+    for system in (other, colours):
+        page.emulate_media(color_scheme=system)
+        page.wait_for_function("s => document.documentElement.dataset.theme === s", arg=system)
     browser.idle("ledger")
     page.click("#diagnose")
     browser.idle("diagnose")
     browser.shot(f"{colours}-375-diagnose")
     serious += axe(page, "diagnose")
     assert serious == []
+
+
+LOWEST = 9
+"""Height of a letter's line under which a label is not read on a phone [px]."""
+
+
+def cut_or_tiny(page: Any) -> list[str]:
+    """Labels of pictures and plots that are cut or too small, and fields too narrow for theirs."""
+    found = page.evaluate(
+        """(lowest) => {
+          const out = [], seen = (e) => e.getClientRects().length;
+          for (const t of document.querySelectorAll('#main svg text')) {
+            if (!seen(t) || !t.textContent) continue;
+            const a = t.getBoundingClientRect(), b = t.ownerSVGElement.getBoundingClientRect();
+            if (a.height < lowest) out.push(`tiny: ${t.textContent}`);
+            if (a.left < b.left - 1 || a.right > b.right + 1 || a.top < b.top - 1
+              || a.bottom > b.bottom + 1) out.push(`cut: ${t.textContent}`);
+          }
+          const drawn = app.plots.flatMap((p) => p.plots || []);
+          const axes = drawn.flatMap((p) => p.axes.map((a) => [p, a]));
+          for (const [plot, axis] of axes) {
+            if (!axis.label) continue;
+            plot.ctx.font = axis.labelFont[0];
+            const room = axis.side % 2 ? plot.ctx.canvas.height : plot.ctx.canvas.width;
+            if (plot.ctx.measureText(axis.label).width > room) out.push(`cut: ${axis.label}`);
+          }
+          for (const f of document.querySelectorAll('#main input:not([type])'))
+            if (seen(f) && f.scrollWidth > f.clientWidth + 1) out.push(`narrow: ${f.value}`);
+          return out;
+        }""",
+        LOWEST,
+    )
+    assert isinstance(found, list)
+    return found
 
 
 def axe(page: Any, where: str) -> list[str]:

@@ -30,7 +30,7 @@ from workbench.page import verbs
 from workbench.page import views as app_views
 from workbench.page.demo import demo_files
 from workbench.page.input import set_joint, start_demo
-from workbench.page.jobs import child
+from workbench.page.jobs import child, process
 from workbench.page.jobs.child import Done
 from workbench.page.jobs.doing import ledger
 from workbench.page.live import Live
@@ -186,6 +186,33 @@ def test_whatever_dies_in_a_job_it_ends_in_one_line(
     live.start("own", "own", {}, here=lambda p: lambda s: s)
     wait(live)
     assert live.error is None, "the thread takes the next job"
+
+
+@pytest.mark.parametrize(
+    ("fails", "says"),
+    [
+        (OSError(errno.EAGAIN, os.strerror(errno.EAGAIN)), os.strerror(errno.EAGAIN)),
+        (EOFError(), "the system ended what starts it"),
+    ],
+    ids=["no process left", "the server of processes was killed"],
+)
+def test_where_no_process_can_be_started_the_job_says_so_and_the_next_one_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fails: Exception, says: str
+) -> None:
+    live = opened(tmp_path)
+    before = live.state
+
+    def refused(self: Any) -> None:
+        raise fails
+
+    with monkeypatch.context() as patched:
+        patched.setattr(type(process._context().Process()), "start", refused)
+        verbs.run(live, "fit", {})
+        said = _ended_in_one_line(live, before)
+    assert f"a process for the work cannot be started ({says})" in said
+    assert "internal" not in said
+    run(live, "fit")
+    assert live.state.steps
 
 
 def test_where_no_thread_can_be_started_the_job_ends(

@@ -173,25 +173,21 @@ class Helper:
             self._end()
             here, there = multiprocessing.Pipe()
             context = _context()
+            process = context.Process(
+                target=main, args=(there, self.folder, EFFECTS.files), daemon=True, name="session"
+            )
             try:
-                self._process = context.Process(
-                    target=main,
-                    args=(there, self.folder, EFFECTS.files),
-                    daemon=True,
-                    name="session",
-                )
-                self._process.start()
-            except OSError as error:
-                here.close()
-                self._process = None
+                process.start()
+            except (OSError, EOFError) as error:  # EOFError: what starts processes has ended
+                why = getattr(error, "strerror", None) or "the system ended what starts it"
                 raise InputError(
-                    f"a process for the work cannot be started ({error.strerror}); close other "
-                    "programs and start it again"
+                    f"a process for the work cannot be started ({why}); close other programs and "
+                    "start it again"
                 ) from None
             finally:
                 there.close()
-            self._pipe = here
-            self._at_exit = weakref.finalize(self, _kill, self._process)
+            self._process, self._pipe = process, here
+            self._at_exit = weakref.finalize(self, _kill, process)
         return self._pipe
 
     def _end(self) -> None:
