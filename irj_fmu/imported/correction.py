@@ -76,17 +76,19 @@ class Correction:
 
     def bounds(self) -> dict[str, tuple[float, float]]:
         """Bounds of the free parameters under their outside names; a shape stays near the value
-        of its trial.
+        of its trial; a smoothing velocity, which no trial has looked for, as far from its first
+        value as its grid reaches from its start.
         """
         found = {}
         for p in self.model.parameters:
             if p.name in self.free:
+                low, high = p.low, p.high
                 near = self.shapes.get(p.name)
-                low, high = (
-                    (p.low, p.high)
-                    if near is None
-                    else (max(p.low, near / SHAPE_RANGE), min(p.high, near * SHAPE_RANGE))
-                )
+                if near is not None:
+                    reach = (1 / SHAPE_RANGE, SHAPE_RANGE)
+                    if p.role == "smoothing":
+                        reach = min(p.grid) / p.start, max(p.grid) / p.start
+                    low, high = max(low, near * reach[0]), min(high, near * reach[1])
                 found[PREFIX + p.name] = (low, high)
         return found
 
@@ -101,10 +103,13 @@ class Correction:
 
 
 def correction_of(
-    model: JointModel, labels: tuple[str, ...], values: Mapping[str, float], free: tuple[str, ...]
+    model: JointModel, labels: tuple[str, ...], values: Mapping[str, float]
 ) -> Correction:
     """A correction from a rigid joint model: the named effects alone, the joint's own inertia
     and laws left to the FMU.
+
+    Free are the parameters of the effects, and the smoothing velocity of a side where one of them
+    changes its sign there: every other parameter would make up for a wrong one.
     """
     terms = tuple(t for t in model.terms if t.label in labels)
     bare = JointModel(
@@ -117,6 +122,9 @@ def correction_of(
         name="correction",
     )
     known = set(bare.parameter_names)
+    turning = {t.place for t in terms if "direction" in t.effect.reads}
+    smooth = [n for place in sorted(turning) for n in bare.named("smoothing", place)]
+    free = (*(n for t in terms for n in t.names), *smooth)
     made = bare.with_values(
         {
             **{k: float(v) for k, v in values.items() if k in known},

@@ -159,14 +159,13 @@ def with_outside(
     term = next(t for t in joint.terms if t.label == label)
     before = model.correction
     labels: tuple[str, ...] = (label,)
-    free: tuple[str, ...] = tuple(term.names)
     known = {**_starts(joint), **values}
     if before is not None:
         joint = replace(joint, terms=(*before.model.terms, term))
         theirs = dict(zip(before.model.parameter_names, before.model.value_vector(), strict=True))
         known |= {**theirs, **{n: known[n] for n in term.names}}
-        labels, free = (*before.labels, *labels), (*before.free, *free)
-    return replace(model, correction=correction_of(joint, labels, known, free))
+        labels = (*before.labels, *labels)
+    return replace(model, correction=correction_of(joint, labels, known))
 
 
 def _starts(model: JointModel) -> dict[str, float]:

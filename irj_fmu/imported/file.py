@@ -234,8 +234,11 @@ def outside_correction(
         for k, v in values.items()
         if k.startswith(PREFIX) and k.removeprefix(PREFIX) in own
     }
-    free = tuple(n for t in model.terms for n in t.names)
-    return replace(correction_of(model, tuple(t.label for t in model.terms), own, free), shapes={})
+    made = correction_of(model, tuple(t.label for t in model.terms), own)
+    # the shapes of a file are no trial's; a smoothing velocity stays bounded, as with a step for a
+    # slope the torque would have to be read at ever shorter times
+    smooth = made.model.named("smoothing")
+    return replace(made, shapes={n: x for n, x in made.shapes.items() if n in smooth})
 
 
 def user_joint_text(

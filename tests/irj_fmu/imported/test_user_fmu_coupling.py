@@ -11,6 +11,7 @@ import pytest
 
 from irj_fmu.imported.correction import PREFIX
 from irj_fmu.imported.file import outside_correction
+from irj_fmu.imported.fit import fit
 from irj_fmu.imported.model import Mapped, UserModel
 from irj_fmu.imported.port import coupled, feedback_of, hold_of, noted
 from irj_fmu.imported.run import HOLD, Window, parts_of
@@ -59,6 +60,25 @@ def stiff(path: Path, width: float, h: float = 1e-3) -> tuple[UserModel, Window]
 def path_of(model: UserModel, window: Window, coupling: float) -> npt.NDArray[np.float64]:
     law = feedback_of(replace(model, coupling=coupling), model.values)
     return model.runner().run(window, BARE, feedback=law)[:, 0]
+
+
+def test_the_width_of_a_turn_is_fitted_with_the_friction_outside(tmp_path: Path) -> None:
+    """It is ten times the library's start; held there, every other value would make up for it."""
+    model = axis_model(build("Axis", tmp_path, Make(2, ("CoSimulation",))))
+    own = tuple(p for p in model.parameters if p.name != "coulomb")
+    model = replace(model, parameters=own, constants={**model.constants, "coulomb": 0.0})
+    begun = {f"{PREFIX}motor_coulomb": 0.8 * COULOMB}
+    law = outside_correction(["coulomb@motor"], model.joint, begun, "here")
+    record = axis(seconds=2.0, h=4e-3, motion=lambda t: 0.03 * np.sin(3.0 * t))
+    found = fit(replace(model, correction=law), record)
+    width = f"{PREFIX}motor_smoothing_velocity"
+    wanted = {**TRUTH, f"{PREFIX}motor_coulomb": COULOMB, width: 0.01}
+    del wanted["coulomb"]
+    for name, value in wanted.items():
+        error = found.stderr[name]
+        assert error is not None
+        assert found.values[name] == pytest.approx(value, abs=4 * error + 1e-3 * value), name
+        assert error < 0.05 * value, name
 
 
 @pytest.mark.parametrize("kind", ["CoSimulation", "ModelExchange"])
