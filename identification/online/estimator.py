@@ -540,7 +540,7 @@ class OnlineEstimator:
             rank_seconds=8.0,
             inflation=self.rows.timing.overlap,
         )
-        return partial(fast_recursion, len(self.balances), self.names, settings)
+        return partial(fast_recursion, len(self.balances), self.names, self.rows.like, settings)
 
     def recursion(self, values: FloatArray) -> RecursiveLeastSquares:
         """A fresh recursion that begins at the given values, shape (parameters,)."""

@@ -154,11 +154,18 @@ def first_estimate(
 
 
 def fast_recursion(
-    outputs: int, names: tuple[str, ...], settings: Settings, values: FloatArray, scale: FloatArray
+    outputs: int,
+    names: tuple[str, ...],
+    like: IntArray,
+    settings: Settings,
+    values: FloatArray,
+    scale: FloatArray,
 ) -> RecursiveLeastSquares:
     """Recursive least squares, its step compiled where there is a compiler; the numbers are the
     same without.
     """
-    made = RecursiveLeastSquares(values, scale, outputs=outputs, names=names, settings=settings)
+    made = RecursiveLeastSquares(
+        values, scale, outputs=outputs, names=names, settings=settings, alike=like.tolist()
+    )
     made.compile()
     return made

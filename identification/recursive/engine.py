@@ -104,10 +104,11 @@ class Engine:
         settings: Settings,
         walk: FloatArray | None,
         noise: FloatArray | None,
+        alike: tuple[int, ...] | None = None,
     ) -> None:
         n = theta0.size
         self.freeze, self.walking = settings.freeze, walk is not None or method == "random_walk"
-        self.formulas = formulas(n, outputs, method, self.freeze, self.walking)
+        self.formulas = formulas(n, outputs, method, self.freeze, self.walking, alike)
         layout = self.layout = self.formulas.layout
         self.config = fill_config(
             layout, method, theta0=theta0, scale=scale, settings=settings, walk=walk, noise=noise

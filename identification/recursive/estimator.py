@@ -75,6 +75,9 @@ class RecursiveLeastSquares:
         diagonal matrix. None: estimated from the innovations.
     settings
         A `Settings`.
+    alike
+        A number for each parameter; those of one number are control values of one curve, of which
+        a motion shows a few at a time. None: each stands for itself.
 
     Raises
     ------
@@ -109,6 +112,7 @@ class RecursiveLeastSquares:
         R1: npt.ArrayLike | None = None,
         R2: npt.ArrayLike | None = None,
         settings: Settings | None = None,
+        alike: Sequence[int] | None = None,
     ) -> None:
         self._theta0 = vector(theta0, "theta0")
         n = self._theta0.size
@@ -133,6 +137,7 @@ class RecursiveLeastSquares:
             )
         self._method = method
         self._settings = settings or Settings()
+        self._alike = None if alike is None else tuple(int(group) for group in alike)
         self._walk = None if R1 is None else variances(R1, n, "R1", "parameters", zero=True)
         self._noise = None if R2 is None else variances(R2, None, "R2", "outputs", zero=False)
         self._engine: Engine | None = None
@@ -491,6 +496,7 @@ class RecursiveLeastSquares:
             settings=self._settings,
             walk=self._walk,
             noise=noise,
+            alike=self._alike,
         )
         return self._engine
 

@@ -4,6 +4,7 @@ CasADi.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import casadi as ca
@@ -15,9 +16,9 @@ _SHARE_LOW = 1e-10  # regularisation of the information matrix scaled to unit di
 _RETURN = 4.0  # times the share at which it was held that lets a parameter move: no flicker
 
 
-def check_function(layout: Layout, freeze: bool, walking: bool) -> Any:
+def check_function(layout: Layout, freeze: bool, walking: bool, alike: Sequence[int]) -> Any:
     """Every few samples: process noise R1, and what the sliding information matrix still
-    carries.
+    carries. Parameters of one number in `alike` are control values of one curve.
     """
     symbols = [
         ca.SX.sym("fast", layout.fast.size),
@@ -29,7 +30,7 @@ def check_function(layout: Layout, freeze: bool, walking: bool) -> Any:
     new_fast, new_slow = Parts(symbols[0], layout.fast), Parts(symbols[1], layout.slow)
     _inflation(layout, fast, slow, config, new_fast, new_slow)
     if freeze:
-        _excitation(layout, fast, slow, config, new_fast, new_slow)
+        _excitation(layout, fast, slow, config, new_fast, new_slow, alike)
     if walking:
         _walk(layout, fast, config, new_slow["excited"], new_fast)
     new_fast.values.update(since_check=[ca.SX(0)], due=[ca.SX(0)])
@@ -85,7 +86,13 @@ def _inflation(
 
 
 def _excitation(
-    layout: Layout, fast: Parts, slow: Parts, config: Parts, new_fast: Parts, new_slow: Parts
+    layout: Layout,
+    fast: Parts,
+    slow: Parts,
+    config: Parts,
+    new_fast: Parts,
+    new_slow: Parts,
+    alike: Sequence[int],
 ) -> None:
     """Which parameters and outputs are excited; moves the sums since the last check into the
     windows.
@@ -133,7 +140,13 @@ def _excitation(
             * ca.logic_or(energy[k] >= length * share * energy_best[k], energy[k] >= clear)
             for k in places
         ]
-        live.append(ca.logic_or(2.0 * total(swings) > total(known), total(known) <= 0))
+        # a curve swings where any of its control values does
+        curves = [[i for i in range(n) if alike[i] == group] for group in dict.fromkeys(alike)]
+        swinging, there = (
+            total([ca.fmin(1, total([flags[i] for i in curve])) for curve in curves])
+            for flags in (swings, known)
+        )
+        live.append(ca.logic_or(2.0 * swinging > there, there <= 0))
     diagonal = [total([fast["energy"][o * n + i] for o in range(m)]) for i in range(n)]
     # Standstill tells nothing of the rank: then the matrix waits.
     weight = total(live) > 0

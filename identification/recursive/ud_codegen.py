@@ -25,16 +25,33 @@ class Formulas:
     `check(fast, slow, config) -> fast, slow` whenever the step left `due` at 1.
     """
 
-    def __init__(self, n: int, m: int, method: str, freeze: bool, walking: bool) -> None:
+    def __init__(
+        self,
+        n: int,
+        m: int,
+        method: str,
+        freeze: bool,
+        walking: bool,
+        alike: tuple[int, ...] | None = None,
+    ) -> None:
         self.layout = Layout(n, m)
         self.step = step_function(self.layout, method, freeze)
-        self.check = check_function(self.layout, freeze, walking)
+        self.check = check_function(self.layout, freeze, walking, alike or range(n))
 
 
 @lru_cache(maxsize=32)
-def formulas(n: int, m: int, method: str, freeze: bool, walking: bool) -> Formulas:
-    """The functions for n parameters and m outputs; built once per process."""
-    return Formulas(n, m, method, freeze, walking)
+def formulas(
+    n: int,
+    m: int,
+    method: str,
+    freeze: bool,
+    walking: bool,
+    alike: tuple[int, ...] | None = None,
+) -> Formulas:
+    """The functions for n parameters and m outputs; built once per process. `alike` as in
+    :class:`identification.recursive.estimator.RecursiveLeastSquares`.
+    """
+    return Formulas(n, m, method, freeze, walking, alike)
 
 
 _REPLAY = """

@@ -65,7 +65,8 @@ class _Sample:
         # 0 or 1 from here on: products are cheaper than branches.
         self.seen = [self.valid * enabled[o] for o in range(m)]
         self.used = [self.seen[o] * flags[n + o] for o in range(m)]
-        self.moving = [config["free"][i] * flags[i] for i in range(n)]
+        self.free = config["free"]
+        self.moving = [self.free[i] * flags[i] for i in range(n)]
         self.inflation = flags[n + m :]
         self.acts = total(self.used) > 0
 
@@ -134,7 +135,9 @@ def _correct(
     noises, innovations, powers, sums, squares, over = [], [], [], [], [], []
     for o in range(layout.m):
         used = sample.used[o]
-        h = [used * sample.moving[i] * sample.h[o][i] for i in range(layout.n)]
+        # What a row says of a parameter is taken whether or not the rows before have shown it: left
+        # out, it would be an error of the row that no covariance knows of.
+        h = [used * sample.free[i] * sample.h[o][i] for i in range(layout.n)]
         # The scalars see the estimate that the outputs before them have corrected.
         error = used * (sample.y[o] - dot(sample.h[o], theta)) if o else used * sample.error[o]
         square = sample.y[o] ** 2
@@ -157,7 +160,7 @@ def _correct(
         bound = config["huber"][0] * ca.sqrt(ca.fmax(expected - used_noise, 0.0) + noise)
         cut = select(fast["innovation"][o] <= limit, ca.fmax(-bound, ca.fmin(error, bound)), error)
         step = cut / expected
-        theta = [theta[i] + sample.moving[i] * (gain[i] * step) for i in range(layout.n)]
+        theta = [theta[i] + sample.free[i] * (gain[i] * step) for i in range(layout.n)]
         expected = ca.fmax(expected - used_noise, 0.0) + noise
         normalised = error * error / expected
         power = fast["power"][o] + used * ca.fmax(config["noise_rate"][0], 1.0 / (1.0 + count)) * (

@@ -703,3 +703,30 @@ def test_excitation_is_counted_by_output_in_units_of_its_noise(known: bool) -> N
     np.testing.assert_allclose(mean, (h * scale).sum(axis=0), rtol=1e-12)
     pairs = [products.sum(axis=0)[i, j] for j in range(3) for i in range(j)]
     np.testing.assert_allclose(engine.part("fast", "info"), pairs, rtol=1e-12)
+
+
+def test_a_curve_of_which_a_motion_shows_a_few_values_at_a_time() -> None:
+    """Twenty control values, two in each row, beside two lines; each swing goes a little further
+    than the one before, so that it meets values that a row has touched once, long ago. No error is
+    over four of its standard deviations at any time, and all are found.
+    """
+    n, rows = 20, 4000
+    time = 0.016 * np.arange(rows)
+    at = 9.5 + (2.0 + time / 9.0) * np.sin(2 * np.pi * time / 6.0)
+    near = np.maximum(0.0, 1.0 - np.abs(at[:, None] - np.arange(n)))
+    h = np.column_stack([near, np.sin(7 * time), np.cos(7 * time)])[:, None, :]
+    truth = np.append(3.0 * np.sin(np.arange(n)), [4.0, 2.0])
+    y = h @ truth + 0.05 * np.random.default_rng(5).standard_normal((rows, 1))
+    estimator = RecursiveLeastSquares(
+        np.zeros(n + 2),
+        np.full(n + 2, 4.0),
+        R2=0.05**2,
+        settings=Settings(sample_time=0.016, window_seconds=2.0, rank_seconds=8.0),
+        alike=[0] * n + [1, 2],
+    )
+    for k in range(rows):
+        estimator.update(y[k], h[k])
+        if k % 4 == 0 and k > 200:
+            assert estimator.live.all(), k
+            assert np.all(np.abs(estimator.theta - truth) < 4 * estimator.deviation), k
+    np.testing.assert_allclose(estimator.theta, truth, atol=0.1)
