@@ -2,8 +2,7 @@
 
 from types import SimpleNamespace
 
-import casadi as ca
-
+from .. import bristle
 from ..effect import effect
 from ..parameter import amplitude, shape
 from ..signals import Expression, LocalSignals
@@ -12,12 +11,11 @@ from ..signals import Expression, LocalSignals
 def _bristle(
     z: tuple[Expression, ...], step: Expression, s: LocalSignals, p: SimpleNamespace
 ) -> tuple[Expression, ...]:
-    moved = step / p.presliding_distance
-    return ((z[0] + moved) / (1 + ca.fabs(moved)),)
+    return (bristle.after(z[0], step / p.presliding_distance),)
 
 
 def _rate(z: tuple[Expression, ...], s: LocalSignals, p: SimpleNamespace) -> tuple[Expression, ...]:
-    return ((s.velocity - ca.fabs(s.velocity) * z[0]) / p.presliding_distance,)
+    return (bristle.rate(z[0], s.velocity / p.presliding_distance),)
 
 
 @effect(

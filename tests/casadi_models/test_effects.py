@@ -478,7 +478,7 @@ def test_step_form_and_rate_agree(key: str) -> None:
         assert errors[1] == pytest.approx(errors[0] / 2, rel=0.05, abs=1e-7)
 
 
-@pytest.mark.parametrize("key", ["flexible_mode", "hysteresis"])
+@pytest.mark.parametrize("key", WITH_MEMORY)
 def test_one_long_step_is_many_short_ones(key: str) -> None:
     """The step form is exact while the coordinate moves evenly, however long the step."""
     after, _, _ = memory_function(EFFECTS[key])
