@@ -220,7 +220,7 @@ function render(moved) {
   app.plots = [];
   const main = $("main");
   const token = (app.token = (app.token || 0) + 1);
-  app.drawn = pictureWidth(WIDEST);
+  app.drawn = null; /* until a picture is drawn for the width there is */
   delete main.dataset.view; /* what is on the screen is the old one until the new one is drawn */
   Promise.resolve(views[app.view](app.state)).then((nodes) => {
     if (token !== app.token) return;
@@ -304,7 +304,7 @@ async function boot() {
   theme(wished());
   dark.addEventListener("change", () => { theme(wished()); render(false); });
   let turned = null;
-  addEventListener("resize", () => { clearTimeout(turned); turned = setTimeout(() => { if (app.drawn && Math.abs(pictureWidth(WIDEST) / app.drawn - 1) > 0.1) render(false); }, 200); }); /* of a phone that was turned, pictures are drawn anew: their letters would shrink or be cut */
+  addEventListener("resize", () => { clearTimeout(turned); turned = setTimeout(() => { if (app.drawn && Math.abs(pictureRoom() / app.drawn - 1) > 0.1) render(false); }, 200); }); /* of a phone that was turned, pictures are drawn anew: their letters would shrink or be cut */
   $("theme").addEventListener("click", () => { const next = document.documentElement.dataset.theme === "dark" ? "light" : "dark"; remembered("irj-theme", next); theme(next); render(false); });
   $("undo").addEventListener("click", () => run("undo"));
   $("redo").addEventListener("click", () => run("redo"));

@@ -232,7 +232,7 @@ function typedNumber(text, name, low, high) {
 
 /* Every parameter as a slider: the held-out error and the residual follow; nothing is changed until it is said. */
 function slidersCard(rows, error) {
-  const values = {}, figure = h("output", { class: "figure", id: "slider-error" }, `${digits(error)} %`), charts = h("div", { class: "grid" }), state = { turn: 0, busy: false, again: false }, step = app.state.steps.at(-1).id;
+  const values = {}, figure = h("output", { class: "figure", id: "slider-error" }, `${digits(error)} %`), charts = h("div", { class: "grid" }), state = { turn: 0, loads: 0, busy: false, again: false }, step = app.state.steps.at(-1).id;
   const look = async () => {
     if (state.busy) { state.again = true; return; }
     state.busy = true;
@@ -251,7 +251,7 @@ function slidersCard(rows, error) {
   };
   const inputs = [], set = {};
   /* A mass on the link moves its inertia and its weight together. */
-  const load = async () => { const turn = state.turn; try { clearError(); const made = await get(`/view/payload?mass=${encodeURIComponent($("payload-mass").value)}&distance=${encodeURIComponent($("payload-distance").value)}`); if (turn !== state.turn) return; for (const [k, v] of Object.entries(made.values)) if (set[k]) set[k](v); look(); } catch (e) { fail(e); } };
+  const load = async () => { const turn = state.turn, asked = (state.loads += 1); try { clearError(); const made = await get(`/view/payload?mass=${encodeURIComponent($("payload-mass").value)}&distance=${encodeURIComponent($("payload-distance").value)}`); if (turn !== state.turn || asked !== state.loads) return; /* what was asked later counts, in whichever order answers come */ for (const [k, v] of Object.entries(made.values)) if (set[k]) set[k](v); look(); } catch (e) { fail(e); } };
   const turning = !Object.values(rows).some((p) => p.unit === "kg");
   const payload = h("fieldset", { class: "known", id: "payload" }, h("legend", {}, "Another payload", h("span", { class: "small soft plain" }, " on the link; negative: taken off")), [["mass", "Mass [kg]"], ["distance", "From the joint's axis [m]"]].filter(([k]) => turning || k === "mass").map(([k, t]) => h("label", { class: "small pick", for: `payload-${k}` }, t, h("input", { id: `payload-${k}`, value: "0", inputmode: "decimal", autocomplete: "off", onchange: load }))), turning ? null : h("input", { type: "hidden", id: "payload-distance", value: "0" }));
   const row = ([name, p]) => {

@@ -33,8 +33,10 @@ function ticks(low, high, most = 5) {
 const WIDEST = 1120; /* of all pictures */
 /* Width of a picture in its own units: as wide as it will be drawn on a phone, so that its text stays readable. */
 function pictureWidth(most) {
-  return Math.max(280, Math.min(most, document.documentElement.clientWidth - 70));
+  app.drawn = pictureRoom();
+  return Math.min(most, app.drawn);
 }
+function pictureRoom() { return Math.max(280, Math.min(WIDEST, document.documentElement.clientWidth - 70)); }
 
 /* What a step did; a set of names stays a set. */
 function stepName(step) {
