@@ -30,7 +30,7 @@ def check_function(layout: Layout, freeze: bool, walking: bool, alike: Sequence[
     new_fast, new_slow = Parts(symbols[0], layout.fast), Parts(symbols[1], layout.slow)
     _inflation(layout, fast, slow, config, new_fast, new_slow)
     if freeze:
-        _excitation(layout, fast, slow, config, new_fast, new_slow, alike)
+        _excitation(layout, fast, slow, config, new_fast, new_slow=new_slow, alike=alike)
     if walking:
         _walk(layout, fast, config, new_slow["excited"], new_fast)
     new_fast.values.update(since_check=[ca.SX(0)], due=[ca.SX(0)])
