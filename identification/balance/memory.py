@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import threading
 import weakref
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import Callable, Hashable, Mapping
 from typing import Any, Final, Generic, TypeVar, final
 
@@ -122,14 +122,22 @@ class Law:
 
 @final
 class Cache(Generic[T]):
-    """Values by record and law, the oldest dropped first where they take too much room."""
+    """Values by record and law, those of records that are gone dropped, and the oldest where they
+    take too much room.
+    """
 
     def __init__(self) -> None:
         self.kept: OrderedDict[Hashable, tuple[weakref.ref[Any], T, int]] = OrderedDict()
         self.size = 0
+        self._gone: deque[Hashable] = deque()
+        """Keys of records that are gone; noted by whichever thread let go of them."""
 
     def get(self, record: Any, law: Hashable, make: Callable[[], tuple[T, int]], most: int) -> T:
         """The value kept for this very record, or a new one; `make` gives it and its size."""
+        while self._gone:
+            old = self.kept.get(key := self._gone.popleft())
+            if old is not None and old[0]() is None:  # else another record has its place by now
+                self.size -= self.kept.pop(key)[2]
         key = (id(record), law)
         found = self.kept.get(key)
         if found is not None and found[0]() is record:
@@ -138,7 +146,8 @@ class Cache(Generic[T]):
         made, size = make()
         old = self.kept.pop(key, None)
         self.size += size - (old[2] if old is not None else 0)
-        self.kept[key] = (weakref.ref(record), made, size)
+        gone = self._gone
+        self.kept[key] = (weakref.ref(record, lambda _: gone.append(key)), made, size)
         while self.size > most and self.kept:
             self.size -= self.kept.popitem(last=False)[1][2]
         return made

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import logging
 import secrets
 import threading
@@ -229,9 +230,11 @@ class Live(Place):
                 self._records.clear()
 
     def close(self) -> None:
-        """End the process of the session; the folder has everything."""
-        self.worker.give_up()
+        """End thread and process of the session and free its memory; the folder has everything."""
+        self.worker.close()
         self.helper.close()
+        self.forget()
+        gc.collect()  # its fits refer to one another and would wait long for the collector
 
     # --- jobs -------------------------------------------------------------------------------------
 

@@ -83,13 +83,14 @@ class Worker:
         self._tasks: deque[Task] = deque()
         self._now: Task | None = None
         self._ready = threading.Condition()
-        self._alive = False
+        self._alive = self._closed = False
 
     def submit(self, task: Task) -> None:
         """Queue a task; spare work is given up for one that is not spare."""
         with self._ready:
             if not task.spare:
                 self.give_up()
+            self._closed = False
             self._tasks.append(task)
             self._ready.notify()
             if not self._alive:
@@ -107,6 +108,15 @@ class Worker:
             if self._now is not None and self._now.spare:
                 self._now.stop()
 
+    def close(self) -> None:
+        """Give up the spare work, and let the thread end once the rest is done: what it keeps for
+        the next task goes with it.
+        """
+        with self._ready:
+            self.give_up()
+            self._closed = True
+            self._ready.notify()
+
     @property
     def idle(self) -> bool:
         """Whether nothing runs or waits."""
@@ -117,9 +127,8 @@ class Worker:
         while True:
             with self._ready:
                 self._now = None
-                if not self._tasks and not self._ready.wait_for(
-                    lambda: bool(self._tasks), IDLE_SECONDS
-                ):
+                self._ready.wait_for(lambda: self._closed or bool(self._tasks), IDLE_SECONDS)
+                if not self._tasks:
                     self._alive = False
                     break
                 self._now = task = self._tasks.popleft()

@@ -10,6 +10,7 @@ import pytest
 
 from casadi_models import EFFECTS, JointModel
 from casadi_models.vectorised import Vectorised
+from identification.balance.memory import Cache
 from identification.balance.noise import noise_level
 from identification.balance.weak import differentiated_kernel, kernel, prepare, whole
 
@@ -206,3 +207,20 @@ def test_every_derivative_of_the_kernel_averages_that_of_a_fast_wave(order: int)
     truth = omega**order * np.sin(omega * t + 0.4 + order * math.pi / 2)
     averaged = float(found @ np.sin(omega * t + 0.4))
     assert averaged == pytest.approx(float(mean @ truth), rel=2e-3)
+
+
+def test_what_was_made_of_a_record_goes_with_the_record() -> None:
+    class Thing:
+        pass
+
+    cache: Cache[str] = Cache()
+    first, second = Thing(), Thing()
+    for thing in (first, second):
+        assert cache.get(thing, "law", lambda: ("made", 3), 100) == "made"
+    assert (len(cache.kept), cache.size) == (2, 6)
+    del first, thing
+    assert cache.get(second, "law", lambda: ("new", 3), 100) == "made"
+    assert (len(cache.kept), cache.size) == (1, 3)
+    third = Thing()  # it may have the place in memory that the first one had
+    assert cache.get(third, "law", lambda: ("other", 5), 100) == "other"
+    assert (len(cache.kept), cache.size) == (2, 8)

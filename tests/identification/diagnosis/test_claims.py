@@ -371,3 +371,18 @@ def test_the_ranking_of_a_bump_over_the_position(base: Base) -> None:
     assert np.allclose(np.diff(shares), 1 / len(shares))
     assert told[-1][0].endswith(f"({len(told)} of {len(told)})")
     assert found.trials[0].effect.family == "torque", "a law of the position comes first"
+
+
+def test_a_name_that_is_not_significant_stands_behind_those_that_are(
+    base: Base, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However much it gains: here all pass the tests, and the fall of the best is not believed."""
+    best = rank(base).everything[0].candidate.label
+    place = "identification.diagnosis.claims"
+    monkeypatch.setattr(f"{place}._discoveries", lambda ts: {t.candidate.label for t in ts})
+    monkeypatch.setattr(f"{place}._major", lambda t, _base: t.candidate.label != best)
+    found = rank(base)
+    assert found.everything[0].candidate.label == best, "what was tried goes by its score alone"
+    sure = [t.candidate.label in found.significant for t in found.trials]
+    assert sure == [True] * (len(sure) - 1) + [False]
+    assert found.trials[-1].candidate.label == best

@@ -35,7 +35,7 @@ from workbench.page.jobs.child import Done
 from workbench.page.jobs.doing import ledger
 from workbench.page.live import Live
 from workbench.page.session import Session, State, Store
-from workbench.page.work import Worker
+from workbench.page.work import Task, Worker
 
 ROOT = Path(__file__).parents[3]
 LAW = {
@@ -481,3 +481,32 @@ def test_a_set_stays_a_set_on_the_ledger_of_the_whole_loop() -> None:
     assert {"current_offset", "asymmetric_coulomb"} <= set(added.names)
     assert added.separate_by == found.claims[0].separate_by
     assert start.names == () and start.separate_by is None
+
+
+def test_the_thread_of_a_session_that_is_closed_ends_with_its_last_task() -> None:
+    """It waited ten minutes for a next one, and what it had in memory with it."""
+    worker, began, go = Worker("closed"), threading.Event(), threading.Event()
+    done: list[str] = []
+
+    def thread() -> threading.Thread | None:
+        return next((t for t in threading.enumerate() if t.name == "closed"), None)
+
+    def work() -> None:
+        began.set()
+        go.wait(30)
+        done.append("first")
+
+    worker.submit(Task(work))
+    assert began.wait(30)
+    first = thread()
+    assert first is not None
+    worker.close()
+    go.set()
+    first.join(30)
+    assert not first.is_alive()
+    assert done == ["first"]
+    worker.submit(Task(lambda: done.append("again")))
+    worker.close()
+    while (again := thread()) is not None:
+        again.join(30)
+    assert done == ["first", "again"], "what comes afterwards is done all the same"
