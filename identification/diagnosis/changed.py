@@ -551,7 +551,7 @@ class _Search:
             form = replace(self.form, values=self.form.at(x), free=names)
             values, _ = form.fitted(self._limits, STEPS)
             # the reference was fitted so too: noise left in on one side only would be a change
-            values, _ = unbiased(replace(form, values=values), self._limits)
+            values = dict(unbiased(replace(form, values=values), self._limits).values)
             x = np.array([values[n] for n in self.names])
         return _Point.at(self, x, tuple(moved))
 

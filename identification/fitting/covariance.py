@@ -151,6 +151,7 @@ def window_errors(
     windows: Any,
     noise: tuple[FloatArray, FloatArray] | None = None,
     whole: FloatArray | None = None,
+    met_by: FloatArray | None = None,
 ) -> FloatArray | None:
     """Standard error of each parameter of a least-squares fit whose rows depend on each other
     within windows of time.
@@ -168,18 +169,23 @@ def window_errors(
         and to those with the residual over the window; taken off.
     whole : (p, p) array, optional
         Normal matrix of all rows, that of the noise taken off.
+    met_by : (n, p) array, optional
+        Columns of the equations where these are not those of the rows themselves: what instruments
+        say of them, so that their squares are their products with the rows' own
+        (:func:`identification.fitting.instruments.mixed`).
 
     Returns
     -------
     (p,) array, or None with fewer than `FEWEST_BLOCKS` independent windows.
     """
-    scores = windows @ (jacobian * residual[:, None])
+    by = jacobian if met_by is None else met_by
+    scores = windows @ (by * residual[:, None])
     core = cores(windows)
     parts = np.split(core.indices, core.indptr[1:-1])
-    grams = np.array([jacobian[rows].T @ jacobian[rows] for rows in parts])
+    grams = np.array([by[rows].T @ by[rows] for rows in parts])
     if noise is not None:
         grams, scores = grams - noise[0], scores - noise[1]
-    total = jacobian.T @ jacobian if whole is None else whole
+    total = by.T @ by if whole is None else whole
     return errors_of_windows(grams, scores, total, independent(windows))
 
 

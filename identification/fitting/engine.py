@@ -32,17 +32,9 @@ from identification.balance.stacked import (
     taking_part,
 )
 from identification.errors import InputError
-from identification.fitting.covariance import (
-    correlations,
-    known_errors,
-    window_errors,
-    windows_over,
-)
-from identification.fitting.errors_in_variables import (
-    NoiseProducts,
-    unbiased,
-    whole_without,
-)
+from identification.fitting.bands import Bands
+from identification.fitting.covariance import correlations
+from identification.fitting.errors_in_variables import Unbiased, unbiased
 from identification.fitting.start_values import bounds_of, starts
 from identification.fitting.turns import turns_of
 from identification.fitting.weak_form import WeakForm
@@ -232,9 +224,9 @@ def _fitted(
     share = _independent(balances, data, values)
     before = _beside(known_before, share)
     problem = WeakForm(balances, data, values, tuple(free), weights, before)
-    values, noise = unbiased(problem, limits)
-    problem = replace(problem, values=values)
-    found = _with_errors(problem, limits, sigma, used, noise=noise, share=share)
+    without = unbiased(problem, limits)
+    problem = replace(problem, values=without.values)
+    found = _with_errors(problem, limits, sigma, used, without=without, share=share)
     return replace(found, unidentified=(*found.unidentified, *unseen))
 
 
@@ -486,31 +478,16 @@ def _with_errors(
     sigma: Mapping[str, float],
     used: int,
     *,
-    noise: NoiseProducts,
+    without: Unbiased,
     share: float,
 ) -> Solution:
     """Standard errors from windows of time, without what noise adds to the columns; what cannot be
     identified is said.
     """
-    from scipy.sparse import csr_array, hstack
-
     balances, values, free = problem.balances, problem.values, problem.free
     weights = {b: np.asarray(w, dtype=np.float64) for b, w in problem.weights.items()}
-    stacked = problem.stacked(np.array([values[n] for n in free]))
-    prior = problem.prior
-    x = np.array([values[n] for n in free])
-    turns = turns_of(problem)
-    j = turns.without(problem.jacobian(x)) * ~np.outer(~problem.one_way, problem.clocks)
-    r = turns.without(
-        np.concatenate(
-            [*(stacked.residual[b] * weights[b] for b in balances.balances), problem.surprise(x)]
-        )
-    )
-    windows = windows_over([w.time for w in problem.data.train])
-    # what is known beforehand belongs to no window of time: it scatters by itself
-    empty = csr_array((windows.shape[0], len(prior)))
-    tiled = csr_array(hstack([*[windows] * len(balances.balances), empty]))
-    norms = np.linalg.norm(j, axis=0)
+    bands = Bands(problem, without, turns_of(problem), share)
+    norms = bands.norms
     smoothing = balances.model.named("smoothing")
     at_bound = _at_bound(balances.model, values, free, limits)
     usable = np.array([norm > 0 and n not in at_bound for n, norm in zip(free, norms, strict=True)])
@@ -523,20 +500,21 @@ def _with_errors(
     unidentified += [n for n in balances.model.named("stiffness") if n in at_bound]
     index = np.flatnonzero(usable)
     if len(index):
-        scaled = j[:, index] / norms[index]
-        unit = np.outer(norms[index], norms[index])
-        within = np.ix_(index, index)
-        whole = whole_without(scaled.T @ scaled, noise.whole[0][within] / unit)
-        grams, scores = noise.by_window(weights, windows, stacked.taking)
-        apart = (grams[:, index][:, :, index] / unit, scores[:, index] / norms[index])
-        errors = window_errors(scaled, r, tiled, apart, whole)
-        # rows of the prior were made heavier by the share; they scatter as the prior itself does
-        unsure = known_errors(whole, prior[:, index] / norms[index]) / math.sqrt(share)
-        size = None if errors is None else np.hypot(errors, unsure) / norms[index]
-        spread, corr = correlations(scaled.T @ scaled)
+        part = bands.of(index)
+        size = None if part.errors is None else part.errors / norms[index]
+        held = [
+            k
+            for k, n in enumerate(free)
+            if n in at_bound and norms[k] > 0 and not problem.bent[k] and not problem.clocks[k]
+        ]
+        high = [values[free[k]] >= limits[free[k]][1] for k in held]
+        wider = np.zeros(len(index)) if size is None else bands.beside(index, held, high)
+        spread, corr = correlations(part.gram)
         corr[:, [is_of_run(free[i]) for i in index.tolist()]] = 0.0
         for k, i in enumerate(index.tolist()):
-            stderr[free[i]] = None if size is None else float(size[k])
+            stderr[free[i]] = (
+                None if size is None else math.hypot(float(size[k]), float(wider[k] / norms[i]))
+            )
             other = int(np.argmax(np.abs(corr[k])))
             correlation[free[i]] = (free[int(index[other])], float(corr[k, other]))
             weak = size is not None and values[free[i]] != 0 and size[k] > abs(values[free[i]])

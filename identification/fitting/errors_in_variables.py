@@ -10,29 +10,44 @@ Measurement Error Models, section 2.2).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Final, final
 
 import numpy as np
 import numpy.typing as npt
 
 from identification.balance.drawn_noise import draws_of
-from identification.balance.stacked import noise_believed, stack
+from identification.balance.stacked import INDEPENDENT_SHARE, noise_believed, stack
 from identification.fitting.covariance import cores
+from identification.fitting.instruments import (
+    Instruments,
+    can_be_met,
+    from_others,
+    instruments_of,
+    mixed,
+)
 from identification.fitting.turns import Turns, turns_of
 from identification.fitting.weak_form import WeakForm
 
 FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
 
 MOST_NOISE: Final = 0.9
 """Largest share of the information on a direction that may be noise: the draws know it within 3 %,
 and what is left must stand clear of that.
 """
+MOST_MET: Final = 0.999
+"""The same where the columns of other sensors tell what is left: that is known as well as the sums
+over some thousand rows."""
 SURE_STEP: Final = 0.01
 """Least share that counts: a fit has not ended to better than that of its squares."""
 MOST_HIDDEN: Final = 2.0
 """Times what noise hides in the direction that holds most of it: other directions hide some, too,
 and a correction that diverges leaves powers of ten more."""
+LEVEL_ERROR: Final = 0.3
+"""Share by which the squares of a noise level may be off: heavy tails, steps of an encoder and a
+colour that is not white make it."""
 STEPS: Final = 3
 """Newton steps from the least squares: the products change little with the parameters."""
 
@@ -45,7 +60,7 @@ class NoiseProducts:
     Attributes
     ----------
     gram : mapping of str to (p, p) array
-        To the products of the weighted columns.
+        To the products of the weighted columns with those that meet them.
     score : mapping of str to (p,) array
         To their products with the weighted residual.
     """
@@ -58,6 +73,14 @@ class NoiseProducts:
         """Both over all balances."""
         grams, scores = np.array(list(self.gram.values())), np.array(list(self.score.values()))
         return np.asarray(grams.sum(axis=0)), np.asarray(scores.sum(axis=0))
+
+    def of(self, index: IntArray, mix: FloatArray) -> NoiseProducts:
+        """Those of some of the columns, met by combinations of theirs (columns, columns)."""
+        grams = {b: mix.T @ g[np.ix_(index, index)] for b, g in self.gram.items()}
+        return NoiseProducts(
+            {b: (g + g.T) / 2 for b, g in grams.items()},
+            {b: mix.T @ x[index] for b, x in self.score.items()},
+        )
 
     def by_window(
         self,
@@ -84,11 +107,19 @@ class NoiseProducts:
         )
 
 
-def noise_products(problem: WeakForm) -> NoiseProducts:
+def noise_products(problem: WeakForm, met: frozenset[str] = frozenset()) -> NoiseProducts:
     """What noise adds to the normal equations at the values of a problem.
 
     Shapes and smoothing velocities bend the columns, where first order does not hold: they are left
     as they are.
+
+    Parameters
+    ----------
+    problem : WeakForm
+    met : frozenset of str
+        Balances whose columns are met by those of the other sensors
+        (:mod:`identification.fitting.instruments`): what noise makes of one, times what it makes of
+        the other.
     """
     balances, data, free = problem.balances, problem.data, problem.free
     model, count = balances.model, len(free)
@@ -102,8 +133,15 @@ def noise_products(problem: WeakForm) -> NoiseProducts:
         first = rows.stop
         drawn = draws_of(record, data.sources)
         for draw in drawn:
-            calm, noisy = (
-                stack(balances, [w], problem.values, free) for w in (draw.calm, draw.noisy)
+            pair = (draw.calm, draw.noisy)
+            calm, noisy = (stack(balances, [w], problem.values, free) for w in pair)
+            theirs = (
+                [
+                    stack(balances, [from_others(problem, w, record)], problem.values, free)
+                    for w in pair
+                ]
+                if met
+                else [calm, noisy]
             )
             for b in balances.balances:
                 weight = np.broadcast_to(problem.weights[b], (problem.rows,))[rows]
@@ -112,8 +150,12 @@ def noise_products(problem: WeakForm) -> NoiseProducts:
                 whole = np.sum(squares) / max(float(np.sum(squares[draw.rows])), 1e-300)
                 weight = weight[draw.rows] * (believed[b] * np.sqrt(whole / len(drawn)))
                 moved = (noisy.jacobian[b] - calm.jacobian[b]) * weight[:, None] * straight
-                gram[b] += moved.T @ moved
-                score[b] += moved.T @ ((noisy.residual[b] - calm.residual[b]) * weight)
+                by = moved
+                if b in met:
+                    by = (theirs[1].jacobian[b] - theirs[0].jacobian[b]) * weight[:, None]
+                    by = by * straight
+                gram[b] += by.T @ moved
+                score[b] += by.T @ ((noisy.residual[b] - calm.residual[b]) * weight)
     return NoiseProducts(gram, score)
 
 
@@ -148,9 +190,26 @@ def _shares(whole: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArra
     return share, np.asarray(root @ direction, dtype=np.float64)
 
 
-def unbiased(
-    problem: WeakForm, limits: Mapping[str, tuple[float, float]]
-) -> tuple[dict[str, float], NoiseProducts]:
+@final
+@dataclass(frozen=True)
+class Unbiased:
+    """A fit without what noise of the signals does to it.
+
+    Attributes
+    ----------
+    values : mapping of str to float
+    noise : NoiseProducts
+        What noise adds to the normal equations there.
+    instruments : Instruments or None
+        The columns that meet those of some balances; None where each meets itself.
+    """
+
+    values: Mapping[str, float]
+    noise: NoiseProducts
+    instruments: Instruments | None = None
+
+
+def unbiased(problem: WeakForm, limits: Mapping[str, tuple[float, float]]) -> Unbiased:
     """Values at which the normal equations hold without the noise, inside the limits, and what
     noise adds there.
 
@@ -165,80 +224,180 @@ def unbiased(
     problem : WeakForm
         At the least-squares fit.
     limits : mapping of str to (low, high)
-        Parameters that stand at one stay there.
+        Shapes that stand at one stay there; what noise alone pushed to one leaves it.
     """
-    low, high = (np.array([limits[n][k] for n in problem.free]) for k in (0, 1))
+    bounds = (
+        np.array([limits[n][0] for n in problem.free]),
+        np.array([limits[n][1] for n in problem.free]),
+    )
     x = np.array([problem.values[n] for n in problem.free])
-    moves = (x > low) & (x < high)
+    moves = ((x > bounds[0]) & (x < bounds[1])) | ~problem.bent
     if problem.balances.has_gap:
         # noise about where a load turns makes the twist jump by the whole gap: no small error, and
         # what it adds to products is none of a straight line. Such rows count less already
-        return dict(problem.values), no_noise(problem)
-    turns = turns_of(problem)
-    began = turns.without(problem.residual(x))
-    for moving in (moves, moves & ~problem.bent):
-        found, noise = _corrected(problem, x, turns, (low, high), moving)
-        left = turns.without(found.residual(np.array([found.values[n] for n in found.free])))
-        share = _largest_share(found, noise, moving)
-        if left @ left <= began @ began * (1 + MOST_HIDDEN * share / (1 - share)):
-            return dict(found.values), noise
-    return dict(problem.values), no_noise(problem)
+        return Unbiased(dict(problem.values), no_noise(problem))
+    start = _Equations.at(problem, turns_of(problem))
+    began = start.rows @ start.rows
+    better = start.met(_worth_it(start, moves))
+    for equations in dict.fromkeys((better, start)):
+        for moving in (moves, moves & ~problem.bent):
+            found = equations.solved(bounds, moving)
+            share = found.largest_share(moving)
+            if found.rows @ found.rows <= began * (1 + MOST_HIDDEN * share / (1 - share)):
+                return Unbiased(dict(found.problem.values), found.noise, found.instruments)
+    return Unbiased(dict(problem.values), no_noise(problem))
 
 
-def _corrected(
-    problem: WeakForm,
-    x: FloatArray,
-    turns: Turns,
-    limits: tuple[FloatArray, FloatArray],
-    moves: npt.NDArray[np.bool_],
-) -> tuple[WeakForm, NoiseProducts]:
-    """The problem at the solution of its equations without noise, and what noise adds there."""
-    clocks, noise, x = problem.clocks, noise_products(problem), x.copy()
-    for _ in range(STEPS):
-        rows, jacobian = turns.without(problem.residual(x)), turns.without(problem.jacobian(x))
-        step = np.zeros(len(x))
-        if clocks.any():
-            told = problem.one_way
-            step[clocks] = _newton(
-                jacobian[told], rows[told], noise, moves & ~problem.bent, float(np.mean(told))
-            )[clocks]
-        step += _newton(jacobian, rows + jacobian @ step, noise, moves & ~clocks)
-        x[moves] = np.clip(x + step, *limits)[moves]
-        problem = problem.moved(x)
-        noise = noise_products(problem)
-    return problem, noise
-
-
-def _largest_share(problem: WeakForm, noise: NoiseProducts, moves: npt.NDArray[np.bool_]) -> float:
-    """Largest share of the information on a direction that is noise: of the squares at the true
-    parameters the least squares take at most that away, whatever else they fit.
+def _worth_it(start: _Equations, moves: npt.NDArray[np.bool_]) -> frozenset[str]:
+    """Balances in which a noise level that is off moves a parameter by more than its error, and by
+    more than where the columns of the other sensors meet them.
     """
-    jacobian = problem.jacobian(np.array([problem.values[n] for n in problem.free]))
-    size = np.linalg.norm(jacobian, axis=0)
-    moved = moves & (size > 0)
-    if not moved.any():
-        return 0.0
-    scaled, unit = jacobian[:, moved] / size[moved], np.outer(size[moved], size[moved])
-    share = _shares(scaled.T @ scaled, noise.whole[0][np.ix_(moved, moved)] / unit)[0]
-    return float(min(max(share.max(), SURE_STEP), MOST_NOISE))
+    able = can_be_met(start.problem)
+    own = {b: start.unsure(b, moves) for b in able}
+    if all(size <= 1 for size in own.values()):
+        return frozenset()
+    theirs = start.met(able)
+    return frozenset(b for b, size in own.items() if size > 1 and theirs.unsure(b, moves) < size)
 
 
-def _newton(
-    jacobian: FloatArray,
-    rows: FloatArray,
-    noise: NoiseProducts,
-    moves: npt.NDArray[np.bool_],
-    share: float = 1.0,
-) -> FloatArray:
-    """Step of the parameters that move to where these rows, less a share of the noise, hold."""
-    out = np.zeros(len(moves))
-    size = np.linalg.norm(jacobian, axis=0)
-    moved = moves & (size > 0)
-    if not moved.any():  # everything is known
+@final
+@dataclass(frozen=True, eq=False)
+class _Equations:
+    """The normal equations of a problem at its values, and what noise adds to them."""
+
+    problem: WeakForm
+    turns: Turns
+    noise: NoiseProducts
+    instruments: Instruments | None = None
+
+    @classmethod
+    def at(cls, problem: WeakForm, turns: Turns) -> _Equations:
+        return cls(problem, turns, noise_products(problem))
+
+    def met(self, balances: frozenset[str]) -> _Equations:
+        """With columns of the other sensors in these balances."""
+        if not balances:
+            return self
+        return replace(
+            self,
+            noise=noise_products(self.problem, balances),
+            instruments=instruments_of(self.problem, balances),
+        )
+
+    @cached_property
+    def x(self) -> FloatArray:
+        return np.array([self.problem.values[n] for n in self.problem.free])
+
+    @cached_property
+    def rows(self) -> FloatArray:
+        return self.turns.without(self.problem.residual(self.x))
+
+    @cached_property
+    def columns(self) -> tuple[FloatArray, FloatArray | None]:
+        """The columns, and those that meet them where these are others."""
+        plain = self.problem.jacobian(self.x)
+        own = self.turns.without(plain)
+        if self.instruments is None:
+            return own, None
+        return own, self.turns.without(self.instruments.beside(plain, self.problem))
+
+    def solved(
+        self, limits: tuple[FloatArray, FloatArray], moves: npt.NDArray[np.bool_]
+    ) -> _Equations:
+        """The same at their solution inside the limits; only `moves` move."""
+        here = self
+        met = here.instruments.met if here.instruments else frozenset[str]()
+        for _ in range(STEPS):
+            problem, step = here.problem, np.zeros(len(here.x))
+            room = (limits[0] - here.x, limits[1] - here.x)
+            if problem.clocks.any():
+                told, free = problem.one_way, moves & ~problem.bent
+                found = here.step(here.rows, room, free, told, float(np.mean(told)))
+                step[problem.clocks] = found[problem.clocks]
+            own, _ = here.columns
+            step += here.step(here.rows + own @ step, room, moves & ~problem.clocks)
+            problem = problem.moved(here.x + np.where(moves, step, 0.0))
+            here = replace(here, problem=problem, noise=noise_products(problem, met))
+        return here
+
+    def step(
+        self,
+        rows: FloatArray,
+        room: tuple[FloatArray, FloatArray],
+        moves: npt.NDArray[np.bool_],
+        told: npt.NDArray[np.bool_] | slice = slice(None),
+        share: float = 1.0,
+    ) -> FloatArray:
+        """Step of the parameters that move to where the rows that are told, less a share of the
+        noise, hold. What would leave its room stops there, and the others find their place beside
+        it.
+        """
+        (own, by), out = self.columns, np.zeros(len(moves))
+        seen = (own[told], None if by is None else by[told])
+        moved = np.flatnonzero(moves & (np.linalg.norm(seen[0], axis=0) > 0))
+        while len(moved):
+            size, whole, score = self._system(seen, rows[told] + seen[0] @ out, moved, share)
+            found = -np.linalg.pinv(whole, rcond=1e-12, hermitian=True) @ score / size
+            beyond = (found < room[0][moved]) | (found > room[1][moved])
+            out[moved] = np.where(beyond, np.clip(found, room[0][moved], room[1][moved]), 0.0)
+            if not beyond.any():
+                out[moved] = found
+                break
+            moved = moved[~beyond]
         return out
-    scaled, unit = jacobian[:, moved] / size[moved], np.outer(size[moved], size[moved])
-    added, pulled = noise.whole
-    score = scaled.T @ rows - share * pulled[moved] / size[moved]
-    whole = whole_without(scaled.T @ scaled, share * added[np.ix_(moved, moved)] / unit)
-    out[moved] = -np.linalg.pinv(whole, rcond=1e-12, hermitian=True) @ score / size[moved]
-    return out
+
+    def _system(
+        self,
+        columns: tuple[FloatArray, FloatArray | None],
+        rows: FloatArray,
+        moved: IntArray,
+        share: float = 1.0,
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Sizes of the columns that move, their normal matrix without noise and what pushes them,
+        in these sizes.
+        """
+        own, mix = columns[0][:, moved], self._mix(columns, moved)
+        by = own if columns[1] is None else columns[1][:, moved]
+        meeting, noise = by @ mix, self.noise.of(moved, mix)
+        gram = meeting.T @ own
+        size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+        added, pulled = (share * x for x in noise.whole)
+        unit = np.outer(size, size)
+        whole = whole_without((gram + gram.T) / 2 / unit, added / unit)
+        return size, whole, (meeting.T @ rows - pulled) / size
+
+    @staticmethod
+    def _mix(columns: tuple[FloatArray, FloatArray | None], moved: IntArray) -> FloatArray:
+        own, by = columns
+        return mixed(own[:, moved], None if by is None else by[:, moved])
+
+    def unsure(self, balance: str, moves: npt.NDArray[np.bool_]) -> float:
+        """Most that a parameter would move, in its errors, were the noise of one balance off by
+        :data:`LEVEL_ERROR`.
+        """
+        seen = self.columns
+        moved = np.flatnonzero(moves & (np.linalg.norm(seen[0], axis=0) > 0))
+        if not len(moved):
+            return 0.0
+        size, whole, _ = self._system(seen, self.rows, moved)
+        pulled = self.noise.of(moved, self._mix(seen, moved)).score[balance]
+        inverse = np.linalg.pinv(whole, rcond=1e-12, hermitian=True)
+        error = np.sqrt(np.maximum(np.diag(inverse), 1e-300) / INDEPENDENT_SHARE)
+        return float(np.max(np.abs(inverse @ (LEVEL_ERROR * pulled / size)) / error))
+
+    def largest_share(self, moves: npt.NDArray[np.bool_]) -> float:
+        """Largest share of the information on a direction that is noise: of the squares at the true
+        parameters the least squares take at most that away, whatever else they fit.
+        """
+        seen = self.columns
+        moved = np.flatnonzero(moves & (np.linalg.norm(seen[0], axis=0) > 0))
+        if not len(moved):
+            return 0.0
+        size, left, _ = self._system(seen, self.rows, moved)
+        whole = seen[0][:, moved].T @ seen[0][:, moved] / np.outer(size, size)
+        share = _shares(whole, whole - left)[0]
+        most = MOST_NOISE if self.instruments is None else MOST_MET
+        return float(min(max(share.max(), SURE_STEP), most))
+
+
+__all__ = ["NoiseProducts", "Unbiased", "no_noise", "noise_products", "unbiased", "whole_without"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -10,9 +11,12 @@ import pytest
 from scipy.sparse import csr_array
 
 from identification import Joint, Record, fit, load_joint, read
+from identification.balance.balances import balances_of
+from identification.balance.calibration import of_run
 from identification.balance.dataset import load_dataset, prepared_model
 from identification.balance.drawn_noise import LONGEST
 from identification.balance.excitation import attenuation
+from identification.fitting.bands import cut_square
 from identification.fitting.covariance import (
     BLOCK,
     OVERLAP,
@@ -24,6 +28,8 @@ from identification.fitting.errors_in_variables import (
     NoiseProducts,
     whole_without,
 )
+from identification.fitting.instruments import can_be_met, instruments_of, mixed
+from identification.fitting.weak_form import WeakForm
 from tests.recorded_world._engine import library
 from tests.recorded_world.world import make_case, write_case
 
@@ -139,3 +145,114 @@ def test_a_gap_as_small_as_the_encoders_tell_stays_where_the_fit_put_it(tmp_path
     found = fit(joint, read(folder / "train.csv", joint=joint))
     assert found.train.relative_error_percent < 1.0
     assert 0 < found.solution.values["backlash_stiffness_loss"] < 300.0
+
+
+def slow(
+    seed: int,
+    *,
+    heavy: bool = False,
+    level: float = 1e-3,
+    loud: float = 0.05,
+    viscous: float = 1.5,
+    coulomb: float = 0.0,
+) -> tuple[Record, dict[str, float]]:
+    """A slow arm on a transmission whose link encoder has that much noise, beside a motor encoder
+    and a torque sensor that are good: most of the link's acceleration is noise."""
+    rng = np.random.default_rng(990_000 + seed)
+    true = {
+        "link_inertia": 0.9,
+        "stiffness": 1.5e4,
+        "gravity_torque": 20.0,
+        "link_viscous": viscous,
+    }
+    t = np.arange(round(40.0 / DT)) * DT
+    w = 2 * np.pi * np.array([0.1, 0.23, 0.6]) * np.exp(rng.uniform(-0.1, 0.1, 3))
+    a, phase = np.array([0.5, 0.2, 0.05]), rng.uniform(0, 2 * np.pi, (3, 1))
+    angle = w[:, None] * t + phase
+    q, v, bend = a @ np.sin(angle), (a * w) @ np.cos(angle), -(a * w**2) @ np.sin(angle)
+    torque = true["link_inertia"] * bend + true["link_viscous"] * v
+    torque = torque - true["gravity_torque"] * np.sin(q) + coulomb * np.tanh(v / 0.01)
+    noise = rng.standard_t(2.2, len(t)) if heavy else rng.standard_normal(len(t))
+    channels = {
+        "motor_position": 100.0 * (q + torque / true["stiffness"])
+        + 100 * 2e-5 * rng.standard_normal(len(t)),
+        "link_position": q + level * noise,
+        "link_torque": torque + loud * rng.standard_normal(len(t)),
+    }
+    true["link_coulomb"] = coulomb
+    true = {n: x for n, x in true.items() if x}
+    return Record.from_channels(t, channels, name=f"slow {seed}"), true
+
+
+ARM = Joint(name="arm", gear_ratio=100.0, model_name="hd3", effects=("viscous@link", "gravity"))
+
+
+@pytest.mark.parametrize("heavy", [False, True])
+@pytest.mark.parametrize("seed", range(3))
+def test_motor_and_torque_sensor_tell_of_a_link_whose_encoder_is_noise(
+    seed: int, *, heavy: bool
+) -> None:
+    """Drawn from its level and taken off, the noise had left a twentieth to three quarters of the
+    inertia."""
+    record, true = slow(seed, heavy=heavy)
+    found = fit(ARM, [record])
+    assert max(e.ratio for e in found.train.balances.values()) < 1.2
+    for n, x in true.items():
+        error = found.solution.stderr[n]
+        assert error is not None
+        assert abs(found.solution.values[n] - x) < 3.5 * error, n
+    error = found.solution.stderr["link_inertia"]
+    assert error is not None
+    assert error < 0.1 * true["link_inertia"]
+
+
+def test_columns_of_others_hold_the_motion_of_the_link_and_not_its_noise() -> None:
+    """Without noise both are one; noise of the link's encoder does not move them."""
+    quiet, _ = slow(0, level=0.0)
+    noisy, _ = slow(0)
+    columns = []
+    for record in (quiet, noisy):
+        model = prepared_model(ARM, record)
+        data = load_dataset([record], [], ARM, model)
+        values = {**fit(ARM, [quiet]).solution.values}
+        balances = balances_of(model, data.sensing)
+        run = {of_run(n, data.train[0]): values[n] for n in model.calibration}
+        free = ("link_inertia", "stiffness", "link_viscous", "gravity_torque")
+        problem = WeakForm(
+            balances, data, {**values, **run}, free, dict.fromkeys(balances.balances, 1.0)
+        )
+        own = problem.jacobian(np.array([values[n] for n in free]))
+        met = can_be_met(problem)
+        assert met == {"link", "transmission"}
+        columns.append((own, instruments_of(problem, met).beside(own, problem)))
+    (own, by), (own_noisy, by_noisy) = columns
+    size = np.linalg.norm(own, axis=0)
+    assert np.all(np.linalg.norm(by - own, axis=0) < 0.1 * size)
+    # rows at rest are others under noise: acceleration beside gravity
+    share = [c[0] / c[3] for c in (np.linalg.norm(x, axis=0) for x in (own, by_noisy, own_noisy))]
+    assert share[1] == pytest.approx(share[0], rel=0.05)
+    assert share[2] > 2 * share[0]
+    mix = mixed(own, by)
+    np.testing.assert_allclose((by @ mix).T @ own, (by @ mix).T @ (by @ mix), rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("middle", [1.3, 0.0, -0.7, -4.0, -60.0])
+def test_the_mean_square_of_a_cut_normal_variable(middle: float) -> None:
+    """Against the integral."""
+    x = np.linspace(0.0, 12.0, 400_001)
+    law = np.exp(-0.5 * (x - middle) ** 2 + 0.5 * min(middle, 0.0) ** 2)
+    assert cut_square(middle, 1.0) == pytest.approx(np.sum(x**2 * law) / np.sum(law), rel=1e-2)
+
+
+def test_a_neighbour_of_a_parameter_at_its_bound_is_less_sure_than_without_that_one() -> None:
+    """A viscous friction that noise makes zero may be there: what it would take of the dry one
+    belongs to the band of the dry one."""
+    effects = ("viscous@link", "coulomb@link", "gravity")
+    record, true = slow(3, level=2e-4, loud=1.0, viscous=0.05, coulomb=0.5)
+    found, alone = (fit(replace(ARM, effects=e), [record]).solution for e in (effects, effects[1:]))
+    assert "link_viscous" in found.at_bound
+    error, least = found.stderr["link_coulomb"], alone.stderr["link_coulomb"]
+    assert error is not None
+    assert least is not None
+    assert error > 1.2 * least
+    assert abs(found.values["link_coulomb"] - true["link_coulomb"]) < 2 * error
