@@ -17,8 +17,15 @@ from typing import Any, Final, final
 import numpy as np
 import numpy.typing as npt
 
+from identification.balance.balances import balances_of
 from identification.balance.drawn_noise import draws_of
-from identification.balance.stacked import INDEPENDENT_SHARE, noise_believed, stack
+from identification.balance.stacked import (
+    INDEPENDENT_SHARE,
+    SURE_ERRORS,
+    drawn_floors,
+    noise_believed,
+    stack,
+)
 from identification.fitting.covariance import cores
 from identification.fitting.instruments import (
     Instruments,
@@ -214,7 +221,9 @@ def unbiased(problem: WeakForm, limits: Mapping[str, tuple[float, float]]) -> Un
     noise adds there.
 
     The correction is one of first order. Where it leaves more than noise can have hidden, a law
-    bent under it: then shapes stay, or all of it is left out.
+    bent under it: then shapes stay, or all of it is left out. Where other sensors meet the columns
+    of a balance, its residual must stay as near to its floor as it was: a motion that tells a value
+    neither way sends it anywhere.
 
     The clocks follow from rows within which the joint does not turn: where dry friction turns, the
     torque hangs on the very instant of the turn.  For the others these instants are unknown.
@@ -243,7 +252,8 @@ def unbiased(problem: WeakForm, limits: Mapping[str, tuple[float, float]]) -> Un
         for moving in (moves, moves & ~problem.bent):
             found = equations.solved(bounds, moving)
             share = found.largest_share(moving)
-            if found.rows @ found.rows <= began * (1 + MOST_HIDDEN * share / (1 - share)):
+            hidden = found.rows @ found.rows <= began * (1 + MOST_HIDDEN * share / (1 - share))
+            if hidden and found.as_near_as(start):
                 return Unbiased(dict(found.problem.values), found.noise, found.instruments)
     return Unbiased(dict(problem.values), no_noise(problem))
 
@@ -300,6 +310,29 @@ class _Equations:
         if self.instruments is None:
             return own, None
         return own, self.turns.without(self.instruments.beside(plain, self.problem))
+
+    def as_near_as(self, start: _Equations) -> bool:
+        """Whether the balances that other sensors meet are left no farther above their floors than
+        before, but for the scatter of a mean square.
+        """
+        before, after = start.over_floor, self.over_floor
+        met = self.instruments.met if self.instruments else frozenset[str]()
+        return all(after[b][0] <= before[b][0] * (1 + SURE_ERRORS * after[b][1]) for b in met)
+
+    @cached_property
+    def over_floor(self) -> dict[str, tuple[float, float]]:
+        """Mean square of each balance over that of its noise, and the relative error of that."""
+        problem, train = self.problem, self.problem.data.train
+        model, sensing = problem.balances.model, problem.data.sensing
+        residual = stack(balances_of(model, sensing, wrt=()), train, problem.values).residual
+        levels = [drawn_floors(model, problem.data, problem.values, w) for w in train]
+        out = {}
+        for b, r in residual.items():
+            counts = [int(w.taking(b).sum()) for w in train]
+            noise = sum(n * x[b] ** 2 for n, x in zip(counts, levels, strict=True))
+            rows = max(INDEPENDENT_SHARE * sum(counts), 1.0)
+            out[b] = (float(r @ r) / max(noise, 1e-300), float(np.sqrt(2 / rows)))
+        return out
 
     def solved(
         self, limits: tuple[FloatArray, FloatArray], moves: npt.NDArray[np.bool_]
