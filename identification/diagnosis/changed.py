@@ -42,7 +42,11 @@ from identification.fitting.covariance import (
     windows_over,
 )
 from identification.fitting.engine import Solution, solve, stack
-from identification.fitting.errors_in_variables import noise_products, unbiased, whole_without
+from identification.fitting.errors_in_variables.equations import (
+    noise_products,
+    unbiased,
+    whole_without,
+)
 from identification.fitting.start_values import bounds_of
 from identification.fitting.weak_form import WeakForm
 

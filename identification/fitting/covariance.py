@@ -172,7 +172,7 @@ def window_errors(
     met_by : (n, p) array, optional
         Columns of the equations where these are not those of the rows themselves: what instruments
         say of them, so that their squares are their products with the rows' own
-        (:func:`identification.fitting.instruments.mixed`).
+        (:func:`identification.fitting.errors_in_variables.instruments.mixed`).
 
     Returns
     -------

@@ -32,9 +32,9 @@ from identification.balance.stacked import (
     taking_part,
 )
 from identification.errors import InputError
-from identification.fitting.bands import Bands
 from identification.fitting.covariance import correlations
-from identification.fitting.errors_in_variables import Unbiased, unbiased
+from identification.fitting.errors_in_variables.bands import Bands
+from identification.fitting.errors_in_variables.equations import Unbiased, unbiased
 from identification.fitting.start_values import bounds_of, starts
 from identification.fitting.turns import turns_of
 from identification.fitting.weak_form import WeakForm

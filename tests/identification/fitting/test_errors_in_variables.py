@@ -16,19 +16,19 @@ from identification.balance.calibration import of_run
 from identification.balance.dataset import load_dataset, prepared_model
 from identification.balance.drawn_noise import LONGEST
 from identification.balance.excitation import attenuation
-from identification.fitting.bands import cut_square
 from identification.fitting.covariance import (
     BLOCK,
     OVERLAP,
     window_errors,
     windows_over,
 )
-from identification.fitting.errors_in_variables import (
+from identification.fitting.errors_in_variables.bands import cut_square
+from identification.fitting.errors_in_variables.equations import (
     MOST_NOISE,
     NoiseProducts,
     whole_without,
 )
-from identification.fitting.instruments import can_be_met, instruments_of, mixed
+from identification.fitting.errors_in_variables.instruments import can_be_met, instruments_of, mixed
 from identification.fitting.weak_form import WeakForm
 from tests.recorded_world._engine import library
 from tests.recorded_world.world import make_case, write_case

@@ -27,7 +27,7 @@ from identification.balance.stacked import (
     stack,
 )
 from identification.fitting.covariance import cores
-from identification.fitting.instruments import (
+from identification.fitting.errors_in_variables.instruments import (
     Instruments,
     can_be_met,
     from_others,
@@ -125,8 +125,8 @@ def noise_products(problem: WeakForm, met: frozenset[str] = frozenset()) -> Nois
     problem : WeakForm
     met : frozenset of str
         Balances whose columns are met by those of the other sensors
-        (:mod:`identification.fitting.instruments`): what noise makes of one, times what it makes of
-        the other.
+        (:mod:`identification.fitting.errors_in_variables.instruments`): what noise makes of one,
+        times what it makes of the other.
     """
     balances, data, free = problem.balances, problem.data, problem.free
     model, count = balances.model, len(free)
