@@ -261,7 +261,7 @@ def check_folder(path: str | Path) -> None:
     folder = Path(path)
     there = next((p for p in (folder, *folder.absolute().parents) if p.exists()), folder)
     if not there.is_dir():
-        raise InputError(f"{there}: is a file; give the name of a folder for --out")
+        raise InputError(f"{there}: is a file; give the name of a writable folder for --out")
     try:
         _try_to_write(there)
     except OSError as error:

@@ -46,6 +46,7 @@ __all__ = [
     "floor_rows",
     "floors",
     "load_dataset",
+    "posed",
     "prepared_model",
     "references",
     "reweighed",
@@ -185,7 +186,7 @@ def _fitted(
     held: frozenset[str] = frozenset(),
 ) -> Solution:
     """The fit itself; the parameters `held` keep their start values."""
-    values, free, limits, unseen = _posed(model, data, start, held)
+    values, free, limits, unseen = posed(model, data, start, held)
     shapes = {p.name for p in model.parameters if p.is_shape}
     softening = model.named("softening")
     known_before = usual(model, data.train, torque=data.sensing.has_torque)
@@ -246,7 +247,7 @@ def unseen_by(model: JointModel, data: Dataset) -> tuple[str, ...]:
     )
 
 
-def _posed(
+def posed(
     model: JointModel, data: Dataset, start: Mapping[str, float], held: frozenset[str]
 ) -> tuple[dict[str, float], list[str], dict[str, tuple[float, float]], list[str]]:
     """Start values inside their bounds, the parameters that are free, the bounds, and those that
@@ -298,7 +299,7 @@ def stepped(
         Without standard errors; and the weighted sum of squares.
     """
     held = frozenset(n for n in HANGING if n in like.values and n not in like.free)
-    values, free, limits, _ = _posed(model, data, start, held)
+    values, free, limits, _ = posed(model, data, start, held)
     balances = balances_of(model, data.sensing, wrt=bare(free))
     known_before = usual(model, data.train, torque=data.sensing.has_torque)
     theirs = balances_of(like.model, data.sensing, wrt=())

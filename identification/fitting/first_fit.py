@@ -17,8 +17,7 @@ from identification.balance.memory import Law
 from identification.balance.stacked import stack
 from identification.balance.weak import WeakRecord
 from identification.errors import InputError
-from identification.fitting.engine import Solution, solve
-from identification.fitting.start_values import starts
+from identification.fitting.engine import Solution, posed, solve
 
 KEPT: Final = 8
 """Fits that a thread keeps."""
@@ -52,7 +51,7 @@ def first_fit(model: JointModel, data: Dataset) -> Solution:
         )
         if same and made == law:
             return solution
-    _check_numbers(model, data, starts(model, data))
+    _check_numbers(model, data, posed(model, data, {}, frozenset())[0])
     found = solve(model, data)
     _check_numbers(found.model, data, found.values)
     fits.append((law, tuple(weakref.ref(w) for w in data.train), found))

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from functools import lru_cache, partial
-from typing import Any, final
+from typing import Any, Final, final
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,9 @@ from identification.recursive.settings import FloatArray, Settings, fill_config,
 from identification.recursive.ud_codegen import Formulas, formulas, replay_source
 
 _LONG_RECORD = 100_000  # samples; under this the interpreter is done before a compiler would be
+LONGEST_SOURCE: Final = 4_000_000
+"""Characters of C up to which a step is compiled: 0.3 million take seconds, the 9.7 million of a
+joint with a learned curve took five minutes, in which the interpreted step has done a record."""
 _CHUNK = 5_000_000  # samples per call of the compiled replay, so that an interrupt is seen
 
 
@@ -63,8 +66,12 @@ class Trajectory:
 @lru_cache(maxsize=32)
 def _library(formula: Formulas) -> tuple[Any, str]:
     """The compiled replay, or None and the reason; one attempt per process."""
+    source = replay_source(formula)
+    if len(source) > LONGEST_SOURCE:
+        n = formula.layout.n
+        return None, f"{n} parameters make a step that takes minutes to compile"
     try:
-        replay = build(replay_source(formula), "rls").rls_replay
+        replay = build(source, "rls").rls_replay
     except NoCompilerError as error:
         return None, str(error)
     pointer = ctypes.c_void_p

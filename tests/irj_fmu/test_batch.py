@@ -499,10 +499,13 @@ def test_bad_arguments_are_one_line(folder: Path, capsys: pytest.CaptureFixture[
         ([str(folder)], "directory"),
         ([str(folder / "plant.fmu")], "text file"),
         ([str(path), "--jobs", "0"], "at least 1"),
-        ([str(path), "-o", str(folder / "taken")], "taken: is a file; give the name of a folder"),
+        (
+            [str(path), "-o", str(folder / "taken")],
+            "taken: is a file; give the name of a writable folder",
+        ),
         (
             [str(path), "-o", str(folder / "taken" / "deeper")],
-            "taken: is a file; give the name of a folder",
+            "taken: is a file; give the name of a writable folder",
         ),
         ([str(path), "--json", str(folder / "no" / "a.json")], "no such folder"),
     ):

@@ -226,7 +226,7 @@ def test_export_with_records_that_cannot_serve(
         ),
         (
             ("export", "plant", "--joint", "joint.toml", "--out", "train.npz"),
-            "train.npz: is a file; give the name of a folder for --out",
+            "train.npz: is a file; give the name of a writable folder for --out",
         ),
         (
             ("export", "casadi", "--joint", "joint.toml", "--out", "joint.toml/a/b"),

@@ -12,6 +12,7 @@ from typing import Any, Final, final
 import numpy as np
 import numpy.typing as npt
 
+from identification.balance.stacked import taking_part
 from identification.fitting.covariance import (
     RANK,
     known_errors,
@@ -122,7 +123,7 @@ class Bands:
         grams, scores = noise.by_window(
             {b: np.asarray(w, dtype=np.float64) for b, w in problem.weights.items()},
             windows,
-            problem.stacked(self._x).taking,
+            {b: taking_part(b, problem.data.train) for b in problem.balances.balances},
         )
         apart = (grams / unit, scores / norms)
         errors = window_errors(scaled, self._rows, tiled, apart, whole, meeting)
