@@ -53,8 +53,8 @@ MOST_HIDDEN: Final = 2.0
 """Times what noise hides in the direction that holds most of it: other directions hide some, too,
 and a correction that diverges leaves powers of ten more."""
 LEVEL_ERROR: Final = 0.3
-"""Share by which the squares of a noise level may be off: heavy tails, steps of an encoder and a
-colour that is not white make it."""
+"""Share by which the squares of a noise level may be off, a choice: heavy tails, steps of an
+encoder and a colour that is not white make it."""
 STEPS: Final = 3
 """Newton steps from the least squares: the products change little with the parameters."""
 
