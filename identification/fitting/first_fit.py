@@ -62,11 +62,12 @@ def _check_numbers(model: JointModel, data: Dataset, values: Mapping[str, float]
     """Refuse a model that has no error on the records: a law takes the root, logarithm or power of
     what it is not defined for, or runs out of what can be computed.
     """
-    balances = balances_of(model, data.sensing, wrt=model.parameter_names)
+    residuals = balances_of(model, data.sensing, wrt=())
     for record in (*data.train, *data.held_out):
-        rows = stack(balances, [record], values)
-        if all(np.isfinite(r).all() for r in rows.residual.values()):
+        if all(np.isfinite(r).all() for r in stack(residuals, [record], values).residual.values()):
             continue
+        balances = balances_of(model, data.sensing, wrt=model.parameter_names)
+        rows = stack(balances, [record], values)
         endless = np.any([~np.isfinite(j).all(axis=0) for j in rows.jacobian.values()], axis=0)
         names = {n for n, bad in zip(balances.wrt, endless, strict=True) if bad}
         laws = sorted({t.effect.key for t in model.terms if names & set(t.names)})

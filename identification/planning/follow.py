@@ -6,17 +6,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import final
+from functools import cached_property
+from typing import Final, final
 
 import numpy as np
 import numpy.typing as npt
 
 from casadi_models import JointModel
 from identification.errors import InputError
+from identification.fitting.window_run import LONG, WindowRun
 
 FloatArray = npt.NDArray[np.float64]
 
-_BLOCK = 500
+_BLOCK: Final = 500
+_MANY: Final = 5 * LONG
+"""Samples after which the joint runs as C: the virtual machine has then taken as long as a compiler
+would (about 10 us a sample with five steps of Runge-Kutta, .5 to 1 s)."""
 
 
 @final
@@ -96,13 +101,15 @@ class Follower:
             + gains[1] * (reference[1] - x[1])
         )
         drive = drive - gains[3] * ca.sin(reference[0])
-        after = step(x, ca.vertcat(drive, 0, 0), p)
-        one = ca.Function("one", [x, reference, p, gains], [after, ca.vertcat(x, drive)])
-        s, u, q = ca.SX.sym("s", size), ca.SX.sym("u", 3), ca.SX.sym("q", count)
-        seen = ca.Function(
-            "seen", [s, u, q], [model.dynamics(s, u, q), model.functions.outputs(s, u, q)]
+        applied = ca.vertcat(drive, 0, 0)
+        outputs = [x, drive, model.dynamics(x, applied, p), model.functions.outputs(x, applied, p)]
+        self._sample = ca.Function(
+            "sample",
+            [x, ca.vertcat(reference, p), gains],
+            [step(x, applied, p), ca.vertcat(*outputs)],
         )
-        self._loop, self._seen, self._size = one.mapaccum("loop", _BLOCK), seen.map(_BLOCK), size
+        self._size, self._samples = size, 0
+        self._ends = np.cumsum([size, 1, model.dynamics.size1_out(0)])
         start = dict(zip(model.parameter_names, model.value_vector(), strict=True))
         inertia = sum(start[n] for n in model.inertias)
         tuned = controller or Controller()
@@ -111,6 +118,14 @@ class Follower:
             inertia,
             sum(start[n] for n in model.named("weight")),
         ]
+
+    @cached_property
+    def _interpreted(self) -> WindowRun:
+        return WindowRun(self._sample, _BLOCK, 0)
+
+    @cached_property
+    def _compiled(self) -> WindowRun:
+        return WindowRun(self._sample, _BLOCK, LONG)
 
     def run(
         self, reference: FloatArray, changes: Mapping[str, FloatArray] | None = None
@@ -134,24 +149,20 @@ class Follower:
         p = np.concatenate([values, np.repeat(values[:, -1:], pad, axis=1)], axis=1)
         x = np.zeros(self._size)
         x[[0, 2]], x[[1, 3]] = reference[0, 0], reference[0, 1]
-        rows, rates, readings = [], [], []
+        self._samples += samples
+        run = self._compiled if self._samples > _MANY else self._interpreted
+        rows = []
         for b in range(blocks):
             part = slice(b * _BLOCK, (b + 1) * _BLOCK)
-            after, out = (np.asarray(v) for v in self._loop(x, r[:, part], p[:, part], self._gains))
-            x = after[:, -1]
-            inputs = np.zeros((3, _BLOCK))
-            inputs[0] = out[-1]
-            rate, reading = (np.asarray(v) for v in self._seen(out[:-1], inputs, p[:, part]))
-            rows.append(out)
-            rates.append(rate)
-            readings.append(reading)
-        out, rate, reading = (
-            np.concatenate(v, axis=1)[:, :samples] for v in (rows, rates, readings)
-        )
+            given = np.concatenate([r[:, part], p[:, part]]).T
+            out, after = run.run(x[None], given, np.array(self._gains))
+            x = after[0]
+            rows.append(out[0])
+        states, drive, rate, reading = np.split(np.concatenate(rows)[:samples], self._ends, axis=1)
         return Followed(
             time=np.arange(samples, dtype=np.float64) * self.dt,
-            drive=out[-1],
-            states=out[:4].T.copy(),
-            accelerations=rate[[1, 3]].T.copy(),
-            torque=reading[4],
+            drive=drive[:, 0].copy(),
+            states=states[:, :4].copy(),
+            accelerations=rate[:, [1, 3]].copy(),
+            torque=reading[:, 4].copy(),
         )

@@ -14,6 +14,7 @@ import sys
 import tempfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import final
 from xml.etree import ElementTree
@@ -205,6 +206,18 @@ def _bundle(spec: SlaveSpec) -> dict[str, bytes]:
     return bundle
 
 
+@cache  # the packages of one process are bundled for many FMUs
+def _imported(text: bytes) -> frozenset[str]:
+    """Return the top names that a module imports when it starts."""
+    names: set[str] = set()
+    for node in ast.parse(text).body:
+        if isinstance(node, ast.Import):
+            names |= {item.name.partition(".")[0] for item in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+            names.add(node.module.partition(".")[0])
+    return frozenset(names)
+
+
 def _third_party(bundle: Mapping[str, bytes]) -> list[str]:
     """Return the modules that the bundle imports when it starts and neither holds nor finds in the
     standard library.
@@ -216,11 +229,7 @@ def _third_party(bundle: Mapping[str, bytes]) -> list[str]:
     for name, text in bundle.items():
         if not name.endswith(".py") or name.startswith("pythonfmu/"):
             continue
-        for node in ast.parse(text).body:
-            if isinstance(node, ast.Import):
-                names |= {item.name.partition(".")[0] for item in node.names}
-            elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
-                names.add(node.module.partition(".")[0])
+        names |= _imported(text)
     own = {name.partition("/")[0].removesuffix(".py") for name in bundle}
     return sorted(names - own - set(sys.stdlib_module_names))
 

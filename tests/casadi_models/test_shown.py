@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import re
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from workbench.cli.main import main
 DEMO = Path(__file__).resolve().parents[2] / "workbench" / "demo"
 PLACES = [(k, p) for k in sorted(EFFECTS) for p in EFFECTS[k].acts_on]
 sympy = pytest.importorskip("sympy")
+mpmath = pytest.importorskip("mpmath")
 
 
 def model_with(key: str, place: str) -> JointModel:
@@ -46,11 +48,16 @@ def by_casadi(expression: Any, symbols: list[Any], at: dict[str, float]) -> floa
 
 
 def by_sympy(text: str, at: dict[str, float]) -> float:
-    names = {identifier(n): sympy.Symbol(identifier(n), real=True) for n in at}
-    found = sympy.sympify(text, locals=names)
-    return float(
-        found.evalf(30, subs={names[identifier(n)]: sympy.Rational(v) for n, v in at.items()})
-    )
+    with mpmath.workdps(30):
+        return float(parsed(text, tuple(identifier(n) for n in at))(*map(mpmath.mpf, at.values())))
+
+
+@cache  # a learned curve is a long text, and its values are asked for more than once
+def parsed(text: str, names: tuple[str, ...]) -> Any:
+    """A text as sympy reads it, as a function of its symbols that mpmath evaluates."""
+    symbols = {n: sympy.Symbol(n, real=True) for n in names}
+    found = sympy.sympify(text, locals=symbols)
+    return sympy.lambdify(list(symbols.values()), found, "mpmath", cse=True)
 
 
 @pytest.mark.parametrize(("key", "place"), PLACES)

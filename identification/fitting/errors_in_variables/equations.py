@@ -247,7 +247,7 @@ def unbiased(problem: WeakForm, limits: Mapping[str, tuple[float, float]]) -> Un
         return Unbiased(dict(problem.values), no_noise(problem))
     start = _Equations.at(problem, turns_of(problem))
     began = start.rows @ start.rows
-    better = start.met(_worth_it(start, moves))
+    better = _worth_it(start, moves)
     for equations in dict.fromkeys((better, start)):
         for moving in (moves, moves & ~problem.bent):
             found = equations.solved(bounds, moving)
@@ -258,16 +258,17 @@ def unbiased(problem: WeakForm, limits: Mapping[str, tuple[float, float]]) -> Un
     return Unbiased(dict(problem.values), no_noise(problem))
 
 
-def _worth_it(start: _Equations, moves: npt.NDArray[np.bool_]) -> frozenset[str]:
-    """Balances in which a noise level that is off moves a parameter by more than its error, and by
-    more than where the columns of the other sensors meet them.
+def _worth_it(start: _Equations, moves: npt.NDArray[np.bool_]) -> _Equations:
+    """The same with the columns of the other sensors in the balances in which a noise level that is
+    off moves a parameter by more than its error, and by more than where these meet them.
     """
     able = can_be_met(start.problem)
     own = {b: start.unsure(b, moves) for b in able}
     if all(size <= 1 for size in own.values()):
-        return frozenset()
+        return start
     theirs = start.met(able)
-    return frozenset(b for b, size in own.items() if size > 1 and theirs.unsure(b, moves) < size)
+    worth = frozenset(b for b, size in own.items() if size > 1 and theirs.unsure(b, moves) < size)
+    return theirs if worth == able else start.met(worth)
 
 
 @final

@@ -265,15 +265,23 @@ def test_the_loop_on_emps(served: Served, browser: Browser, tmp_path: Path) -> N
     take_home(browser, tmp_path)
 
 
-@pytest.mark.parametrize("colours", ["light", "dark"])
-def test_every_view_fits_a_phone_and_passes_axe(
-    served: Served, browser: Browser, colours: str
-) -> None:
-    page = browser.page
-    page.emulate_media(color_scheme=colours)
+def test_every_view_fits_a_phone_and_passes_axe(served: Served, browser: Browser) -> None:
+    """In light and in dark: the page follows the system while it is open."""
+    page, serious = browser.page, []
+
+    def in_both(name: str, *, shot: bool = True) -> None:
+        for colours in ("light", "dark"):
+            page.emulate_media(color_scheme=colours)
+            page.wait_for_function(
+                "s => document.documentElement.dataset.theme === s", arg=colours
+            )
+            if shot:
+                browser.shot(f"{colours}-{name}")
+            serious.extend(axe(page, f"{name}, {colours}"))
+
     page.goto(served.address)
     page.wait_for_selector("#demo")
-    serious = axe(page, "empty")
+    in_both("empty", shot=False)
     demo_with_the_effect(served, browser)
     beside = (
         ("replay", ("#replay-kind", "bias"), "#replay", "#timeline"),
@@ -282,7 +290,7 @@ def test_every_view_fits_a_phone_and_passes_axe(
     for view, select, button, made in beside:
         page.click(f"#nav-{view}")
         browser.idle(view)
-        serious += axe(page, f"{view}, empty")
+        in_both(f"{view}, empty", shot=False)
         page.select_option(*select)
         page.click(button)
         page.wait_for_selector(made, timeout=120_000)
@@ -301,12 +309,11 @@ def test_every_view_fits_a_phone_and_passes_axe(
         ):
             page.click(f"#nav-{view}")
             browser.idle(view)
-            browser.shot(f"{colours}-{width}-{view}")
+            in_both(f"{width}-{view}")
             assert page.evaluate("document.documentElement.scrollWidth") <= width, (
                 f"{view} is wider than {width} pixels"
             )
             assert cut_or_tiny(page) == [], f"{view} at {width} pixels"
-            serious += axe(page, f"{view} {width}")
     page.click("#nav-ledger")
     browser.idle("ledger")
     page.set_viewport_size({"width": 812, "height": 375})
@@ -315,15 +322,9 @@ def test_every_view_fits_a_phone_and_passes_axe(
     page.wait_for_function("() => app.drawn < 320")
     browser.idle("ledger")
     assert cut_or_tiny(page) == [], "a phone that was turned has pictures of its own width"
-    other = "dark" if colours == "light" else "light"
-    for system in (other, colours):
-        page.emulate_media(color_scheme=system)
-        page.wait_for_function("s => document.documentElement.dataset.theme === s", arg=system)
-    browser.idle("ledger")
     page.click("#diagnose")
     browser.idle("diagnose")
-    browser.shot(f"{colours}-375-diagnose")
-    serious += axe(page, "diagnose")
+    in_both("375-diagnose")
     assert serious == []
 
 
