@@ -7,8 +7,10 @@ Each equation is a sum of parts, one per effect, taken from the model's own CasA
 from __future__ import annotations
 
 import re
+import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import count
 from types import MappingProxyType
 from typing import Any, Final, final
 
@@ -17,6 +19,7 @@ import casadi as ca
 from ..equations import PlacedLaw, Solvable, bare_twist, placed_laws, time_derivative
 from ..quantities import linear_unit
 from ..signals import SIGNAL_UNITS, Expression, Signals
+from .abbreviated import READABLE, Abbreviation, abbreviated
 from .written import Language, identifier, latex_name, written
 
 LATEX_SIGNALS: Final[Mapping[str, str]] = {
@@ -51,6 +54,8 @@ _SENSED: Final[Mapping[str, str]] = {
 }
 _WIDTH: Final = 60
 """Column at which the text says which effect a part is."""
+_LINE: Final = 96
+"""Letters of a line into which a long part is broken."""
 
 
 @final
@@ -98,6 +103,36 @@ def shown_equations(model: Solvable) -> tuple[ShownEquation, ...]:
     found += _sensors(laws, symbols.signals)
     found += _memories(laws)
     return tuple(_converted(e, model.kind) for e in found)
+
+
+@final
+@dataclass(frozen=True)
+class ReadableEquation:
+    """An equation whose long parts are written with abbreviations.
+
+    Attributes
+    ----------
+    equation : ShownEquation
+    where : tuple of (symbol, definition)
+        Each uses only those before it.
+    """
+
+    equation: ShownEquation
+    where: tuple[Abbreviation, ...]
+
+
+def readable(equations: Sequence[ShownEquation]) -> tuple[ReadableEquation, ...]:
+    """Equations for the eye; no two abbreviations have one name."""
+    numbers, out = count(1), []
+    for e in equations:
+        parts: list[tuple[str, Expression]] = []
+        where: list[Abbreviation] = []
+        for source, part in e.parts:
+            short, names = abbreviated(part, numbers)
+            parts.append((source, short))
+            where += names
+        out.append(ReadableEquation(replace(e, parts=tuple(parts)), tuple(where)))
+    return tuple(out)
 
 
 def _of(
@@ -248,7 +283,7 @@ def shown(
     errors : mapping
         Standard errors of the values, by parameter name.
     """
-    equations = shown_equations(model)
+    equations = readable(shown_equations(model))
     if language == "latex":
         return _latex(equations, values_of(model, errors))
     return (
@@ -273,19 +308,23 @@ def values_of(model: Solvable, errors: Mapping[str, float]) -> list[dict[str, An
     ]
 
 
-def _text(equations: Sequence[ShownEquation], model: Solvable, errors: Mapping[str, float]) -> str:
+def _text(
+    equations: Sequence[ReadableEquation], model: Solvable, errors: Mapping[str, float]
+) -> str:
     lines = [
         f"{model.name}: gear ratio {model.gear_ratio:g}; all quantities are referred to the "
         "link, in SI units"
     ]
-    for e in equations:
+    for e, where in ((r.equation, r.where) for r in equations):
         lines += ["", f"{e.title} [{e.unit}]", f"  {written(e.left)} ="]
         for i, (source, part) in enumerate(e.parts):
             body = written(part)
             minus = i > 0 and body.startswith("-") and " + " not in body and " - " not in body
             head = "-" if minus else "+" if i else " "
             body = body[1:] if minus else body
-            lines.append(f"    {head} {body}".ljust(_WIDTH) + f"  # {source}")
+            lines += _broken(f"    {head} {body}", source)
+        for symbol, definition in where:
+            lines += _broken(f"    with {written(symbol)} = {written(definition)}", "")
     lines += ["", "values +- standard error"]
     for v in values_of(model, errors):
         error = f" +- {v['stderr']:.2g}" if v["stderr"] is not None else ""
@@ -296,14 +335,48 @@ def _text(equations: Sequence[ShownEquation], model: Solvable, errors: Mapping[s
     return "\n".join(lines) + "\n"
 
 
-def _latex(equations: Sequence[ShownEquation], values: Sequence[Mapping[str, Any]]) -> str:
+def _broken(line: str, source: str) -> list[str]:
+    """A line of an equation; a long one is broken before its operators."""
+    said = f"  # {source}" if source else ""
+    if len(line) <= READABLE:
+        return [line.ljust(_WIDTH) + said if said else line]
+    head, _, body = line.strip().partition(" ")
+    lines = [f"    {head}".ljust(_WIDTH) + said if said else f"    {head}"]
+    for summand in _summands(body):
+        lines += textwrap.wrap(
+            summand,
+            _LINE,
+            initial_indent="        ",
+            subsequent_indent="            ",
+            break_long_words=False,
+            break_on_hyphens=False,
+        )
+    return lines
+
+
+def _summands(text: str) -> list[str]:
+    """A written sum, cut before the signs of its outermost level that has any."""
+    depth, signs = 0, []
+    for i, letter in enumerate(text):
+        depth += (letter == "(") - (letter == ")")
+        if text[i : i + 3] in (" + ", " - "):
+            signs.append((depth, i))
+    least = min((d for d, _ in signs), default=0)
+    cuts = [0, *(i + 1 for d, i in signs if d == least), len(text)]
+    return [text[i:j].rstrip() for i, j in zip(cuts, cuts[1:], strict=False)]
+
+
+def _latex(equations: Sequence[ReadableEquation], values: Sequence[Mapping[str, Any]]) -> str:
     rows = []
-    for e in equations:
+    for e, where in ((r.equation, r.where) for r in equations):
         left = written(e.left, "latex", LATEX_SIGNALS)
         for i, (_, part) in enumerate(e.parts):
             body = written(part, "latex", LATEX_SIGNALS)
             join = f"{left} &= " if i == 0 else "&\\quad " if body.startswith("-") else "&\\quad + "
             rows.append(f"  {join}{body}")
+        for symbol, definition in where:
+            name, body = (written(x, "latex", LATEX_SIGNALS) for x in (symbol, definition))
+            rows.append(f"  {name} &= {body}")
     table = [
         rf"  {latex_name(v['name'])} &= {_latex_number(v['value'])}"
         + (rf" \pm {_latex_number(v['stderr'], 2)}" if v["stderr"] is not None else "")
@@ -326,14 +399,19 @@ def _latex_unit(unit: str) -> str:
     return r"\mathrm{" + re.sub(r"(\d+)", r"^{\1}", unit).replace(".", r"\,") + "}"
 
 
-def _sympy(equations: Sequence[ShownEquation], model: Solvable, errors: Mapping[str, float]) -> str:
+def _sympy(
+    equations: Sequence[ReadableEquation], model: Solvable, errors: Mapping[str, float]
+) -> str:
     """Python code that defines the symbols, one ``Eq`` for each equation, ``values`` and
     ``errors``.
     """
     names: dict[str, None] = {}
-    for e in equations:
-        for x in ca.symvar(ca.vertcat(e.left, *(part for _, part in e.parts))):
-            names[identifier(x.name())] = None
+    short = {identifier(symbol.name()) for r in equations for symbol, _ in r.where}
+    for r in equations:
+        all_parts = (*(x for _, x in r.where), *(part for _, part in r.equation.parts))
+        for x in ca.symvar(ca.vertcat(r.equation.left, *all_parts)):
+            if identifier(x.name()) not in short:
+                names[identifier(x.name())] = None
     names.update(dict.fromkeys(model.parameter_names))
     lines = [
         f"# {model.name!r}: gear ratio {model.gear_ratio!r}; link-referred, SI units",
@@ -342,7 +420,8 @@ def _sympy(equations: Sequence[ShownEquation], model: Solvable, errors: Mapping[
     ]
     lines += [f'{n} = Symbol("{n}", real=True)' for n in names]
     lines.append("equations = {}")
-    for e in equations:
+    for e, where in ((r.equation, r.where) for r in equations):
+        lines += [f"{written(symbol, 'sympy')} = {written(x, 'sympy')}" for symbol, x in where]
         right = " + ".join(f"({written(part, 'sympy')})" for _, part in e.parts)
         lines += [
             f"# {e.title} [{e.unit}]",

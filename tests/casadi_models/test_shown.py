@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 from casadi_models import EFFECTS, JointModel
-from casadi_models.text.shown import shown, shown_equations
+from casadi_models.text.abbreviated import READABLE
+from casadi_models.text.shown import readable, shown, shown_equations
 from casadi_models.text.written import LANGUAGES, identifier, written
 from workbench.cli.main import main
 
@@ -103,6 +104,39 @@ def test_the_equations_shown_are_those_of_the_model(key: str, place: str) -> Non
             at = points(symbols, rng)
             scale = abs(by_casadi(other, symbols, at))
             assert abs(by_casadi(difference, symbols, at)) <= 1e-11 * (1 + scale)
+
+
+@pytest.mark.parametrize(("key", "place"), PLACES)
+def test_a_long_law_is_read_by_abbreviations_that_give_it_back(key: str, place: str) -> None:
+    model, rng = model_with(key, place), np.random.default_rng(7)
+    equations, seen = shown_equations(model), set()
+    for exact, e in zip(equations, readable(equations), strict=True):
+        names = [symbol.name() for symbol, _ in e.where]
+        assert not seen & set(names), "one name stands for one thing"
+        seen |= set(names)
+        for (_, whole), (_, short) in zip(exact.parts, e.equation.parts, strict=True):
+            assert len(written(short)) <= max(READABLE, 0.6 * len(written(whole)))
+            back = ca.SX(short)
+            for symbol, definition in reversed(e.where):
+                (back,) = ca.substitute([back], [symbol], [definition])
+            symbols = ca.symvar(ca.SX(whole))
+            assert {x.name() for x in ca.symvar(back)} == {x.name() for x in symbols}
+            at = points(symbols, rng)
+            assert by_casadi(back, ca.symvar(back), at) == by_casadi(whole, symbols, at)
+
+
+def test_a_learned_curve_is_shown_in_lines_and_its_code_runs() -> None:
+    model = model_with("learned_velocity", "motor")
+    text, space = shown(model), {}
+    assert max(map(len, text.splitlines())) < 250
+    assert len(text) < 12_000
+    exec(compile(shown(model, "sympy"), "code.py", "exec"), space)
+    at = {x: sympy.Rational(3, 10) for x in space["equations"]["motor"].free_symbols}
+    (exact,) = (e.right for e in shown_equations(model) if e.key == "motor")
+    names = {x.name(): 0.3 for x in ca.symvar(exact)}
+    assert float(space["equations"]["motor"].rhs.evalf(20, subs=at)) == pytest.approx(
+        by_casadi(exact, ca.symvar(exact), names), rel=1e-12
+    )
 
 
 @pytest.mark.parametrize(("key", "place"), PLACES)

@@ -6,11 +6,12 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
+import casadi as ca
 import numpy as np
 
 from casadi_models import EFFECTS, JointModel
 from casadi_models.signals import Expression
-from casadi_models.text.shown import shown_equations
+from casadi_models.text.shown import readable, shown_equations
 from casadi_models.text.written import written
 from identification.data.channels import channel_unit
 from identification.data.formats import number, pretty_unit, with_error
@@ -119,7 +120,17 @@ def _parts(model: Any) -> dict[str, str]:
     """Of each effect its law; empty for a model whose equations are not known."""
     if not isinstance(model, JointModel):
         return {}
-    return {source: _formula(part) for e in shown_equations(model) for source, part in e.parts}
+    found = {}
+    for r in readable(shown_equations(model)):
+        with_these = "".join(f"<br>{_with(*pair)}" for pair in r.where)
+        for source, part in r.equation.parts:
+            used = {x.name() for x in ca.symvar(ca.SX(part))} & {x.name() for x, _ in r.where}
+            found[source] = _formula(part) + (with_these if used else "")
+    return found
+
+
+def _with(symbol: Expression, definition: Expression) -> str:
+    return f"with {_formula(symbol)} = {_formula(definition)}"
 
 
 def _formula(part: Expression, sign: str = "") -> str:
@@ -136,11 +147,13 @@ def equations_html(improvement: Improvement) -> str:
     if not improvement.steps or not isinstance(improvement.steps[-1].solution.model, JointModel):
         return ""
     out = []
-    for e in shown_equations(improvement.steps[-1].solution.model):
+    for r in readable(shown_equations(improvement.steps[-1].solution.model)):
+        e = r.equation
         rows = [
             [_formula(part, "+ " if k else ""), text(_source(source))]
             for k, (source, part) in enumerate(e.parts)
         ]
+        rows += [[_with(*pair), "short for what stands more than once"] for pair in r.where]
         caption = f"{text(e.title)} [{pretty_unit(e.unit)}]: {_formula(e.left)} ="
         out.append(table(["part", "what it is"], rows, caption))
     return (

@@ -22,10 +22,12 @@ from identification.balance.drawn_noise import draws_of
 from identification.balance.stacked import (
     INDEPENDENT_SHARE,
     SURE_ERRORS,
+    Stacked,
     drawn_floors,
     noise_believed,
     stack,
 )
+from identification.balance.weak import WeakRecord
 from identification.fitting.covariance import cores
 from identification.fitting.errors_in_variables.instruments import (
     Instruments,
@@ -114,7 +116,26 @@ class NoiseProducts:
         )
 
 
-def noise_products(problem: WeakForm, met: frozenset[str] = frozenset()) -> NoiseProducts:
+DrawnRows = list[list[tuple[Stacked, Stacked]]]
+"""For each training record and draw: rows without and with the drawn noise."""
+
+
+def drawn_rows(problem: WeakForm) -> DrawnRows:
+    """Rows and columns of a problem as noise is drawn, at its values."""
+    balances, data = problem.balances, problem.data
+
+    def rows(record: WeakRecord) -> Stacked:
+        return stack(balances, [record], problem.values, problem.free)
+
+    return [
+        [(rows(draw.calm), rows(draw.noisy)) for draw in draws_of(record, data.sources)]
+        for record in data.train
+    ]
+
+
+def noise_products(
+    problem: WeakForm, met: frozenset[str] = frozenset(), own: DrawnRows | None = None
+) -> NoiseProducts:
     """What noise adds to the normal equations at the values of a problem.
 
     Shapes and smoothing velocities bend the columns, where first order does not hold: they are left
@@ -127,6 +148,8 @@ def noise_products(problem: WeakForm, met: frozenset[str] = frozenset()) -> Nois
         Balances whose columns are met by those of the other sensors
         (:mod:`identification.fitting.errors_in_variables.instruments`): what noise makes of one,
         times what it makes of the other.
+    own : list, optional
+        Of :func:`drawn_rows`, where they are known.
     """
     balances, data, free = problem.balances, problem.data, problem.free
     model, count = balances.model, len(free)
@@ -134,18 +157,16 @@ def noise_products(problem: WeakForm, met: frozenset[str] = frozenset()) -> Nois
     gram = {b: np.zeros((count, count)) for b in balances.balances}
     score = {b: np.zeros(count) for b in balances.balances}
     believed = noise_believed(model, data, problem.values)
-    first = 0
-    for record in data.train:
+    first, own = 0, own or drawn_rows(problem)
+    for record, pairs in zip(data.train, own, strict=True):
         rows = slice(first, first + record.rows)
         first = rows.stop
         drawn = draws_of(record, data.sources)
-        for draw in drawn:
-            pair = (draw.calm, draw.noisy)
-            calm, noisy = (stack(balances, [w], problem.values, free) for w in pair)
+        for draw, (calm, noisy) in zip(drawn, pairs, strict=True):
             theirs = (
                 [
                     stack(balances, [from_others(problem, w, record)], problem.values, free)
-                    for w in pair
+                    for w in (draw.calm, draw.noisy)
                 ]
                 if met
                 else [calm, noisy]
@@ -280,10 +301,12 @@ class _Equations:
     turns: Turns
     noise: NoiseProducts
     instruments: Instruments | None = None
+    drawn: DrawnRows | None = None
 
     @classmethod
     def at(cls, problem: WeakForm, turns: Turns) -> _Equations:
-        return cls(problem, turns, noise_products(problem))
+        drawn = drawn_rows(problem)
+        return cls(problem, turns, noise_products(problem, own=drawn), drawn=drawn)
 
     def met(self, balances: frozenset[str]) -> _Equations:
         """With columns of the other sensors in these balances."""
@@ -291,7 +314,7 @@ class _Equations:
             return self
         return replace(
             self,
-            noise=noise_products(self.problem, balances),
+            noise=noise_products(self.problem, balances, self.drawn),
             instruments=instruments_of(self.problem, balances),
         )
 
@@ -351,7 +374,8 @@ class _Equations:
             own, _ = here.columns
             step += here.step(here.rows + own @ step, room, moves & ~problem.clocks)
             problem = problem.moved(here.x + np.where(moves, step, 0.0))
-            here = replace(here, problem=problem, noise=noise_products(problem, met))
+            noise = noise_products(problem, met)
+            here = replace(here, problem=problem, noise=noise, drawn=None)
         return here
 
     def step(
