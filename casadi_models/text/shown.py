@@ -113,25 +113,26 @@ class ReadableEquation:
     Attributes
     ----------
     equation : ShownEquation
-    where : tuple of (symbol, definition)
-        Each uses only those before it.
+    of_part : tuple of tuples of (symbol, definition)
+        The abbreviations of each part; each uses only those before it.
     """
 
     equation: ShownEquation
-    where: tuple[Abbreviation, ...]
+    of_part: tuple[tuple[Abbreviation, ...], ...]
+
+    @property
+    def where(self) -> tuple[Abbreviation, ...]:
+        """Those of all parts."""
+        return tuple(pair for pairs in self.of_part for pair in pairs)
 
 
 def readable(equations: Sequence[ShownEquation]) -> tuple[ReadableEquation, ...]:
     """Equations for the eye; no two abbreviations have one name."""
     numbers, out = count(1), []
     for e in equations:
-        parts: list[tuple[str, Expression]] = []
-        where: list[Abbreviation] = []
-        for source, part in e.parts:
-            short, names = abbreviated(part, numbers)
-            parts.append((source, short))
-            where += names
-        out.append(ReadableEquation(replace(e, parts=tuple(parts)), tuple(where)))
+        found = [(source, *abbreviated(part, numbers)) for source, part in e.parts]
+        parts = tuple((source, short) for source, short, _ in found)
+        out.append(ReadableEquation(replace(e, parts=parts), tuple(x for *_, x in found)))
     return tuple(out)
 
 

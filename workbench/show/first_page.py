@@ -6,7 +6,6 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
-import casadi as ca
 import numpy as np
 
 from casadi_models import EFFECTS, JointModel
@@ -120,13 +119,11 @@ def _parts(model: Any) -> dict[str, str]:
     """Of each effect its law; empty for a model whose equations are not known."""
     if not isinstance(model, JointModel):
         return {}
-    found = {}
-    for r in readable(shown_equations(model)):
-        with_these = "".join(f"<br>{_with(*pair)}" for pair in r.where)
-        for source, part in r.equation.parts:
-            used = {x.name() for x in ca.symvar(ca.SX(part))} & {x.name() for x, _ in r.where}
-            found[source] = _formula(part) + (with_these if used else "")
-    return found
+    return {
+        source: "<br>".join([_formula(part), *(_with(*pair) for pair in where)])
+        for r in readable(shown_equations(model))
+        for (source, part), where in zip(r.equation.parts, r.of_part, strict=True)
+    }
 
 
 def _with(symbol: Expression, definition: Expression) -> str:

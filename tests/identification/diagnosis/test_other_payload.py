@@ -106,14 +106,7 @@ OF_POSITION = {"cyclic_torque"}
 FAST = ((0.11, 0.29, 0.63), (0.5, 0.22, 0.08), 0.0)
 
 
-@pytest.mark.parametrize(
-    "seed",
-    [
-        pytest.param(1, marks=pytest.mark.slow),
-        pytest.param(10, marks=pytest.mark.slow),
-        13,
-    ],
-)
+@pytest.mark.parametrize("seed", [1, 10, 13])
 def test_a_set_on_loaded_records_and_the_gain_after_an_unloaded_run(seed: int) -> None:
     slow = ((0.07, 0.11), (0.15, 0.10), 0.8)
     loaded, held = (
