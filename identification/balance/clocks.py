@@ -171,6 +171,7 @@ def in_time(
     noise: Callable[[WeakRecord, str, float], float],
     *,
     torque: bool,
+    fast: Callable[[Mapping[str, float]], WeakRecord],
 ) -> WeakRecord:
     """A record whose late channels are shifted.
 
@@ -182,9 +183,11 @@ def in_time(
         Whose channels may be shifted.
     noise : callable
         Variance that the noise of a place's channel gives the rows of a record, its rate times a
-        lateness [s] added.
+        lateness [s] added; as `fast` makes them.
     torque : bool
         Whether the torque of the link is measured.
+    fast : callable
+        As `make`, with the shortest kernel: a filter and a wait are alike in all that is slow.
     """
     shifts: dict[str, float] = {}
     filters: dict[str, Filter] = {}
@@ -207,7 +210,7 @@ def in_time(
         taken = (found[0] - found[1]) / late > ANSWERS
         # what is later than that is no filter of a drive
         if taken and place in LOW_PASSED and abs(shifts[place]) <= MOST_SKEW:
-            filters[place] = told = _filter(make, shifts, place, noise, torque=torque)
+            filters[place] = told = _filter(fast, shifts, place, noise, torque=torque)
             shifts = {**shifts, place: as_told([told], told) / made.grid.dt}
             made = make(shifts)
         elif not taken:

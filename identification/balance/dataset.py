@@ -28,6 +28,7 @@ from identification.balance.weak import (
     KERNEL_SAMPLES,
     PAIR,
     POSITION_CHAINS,
+    TELLING_KERNEL,
     WeakRecord,
     differentiated_kernel,
     kernel,
@@ -118,6 +119,16 @@ class Dataset:
             for c, level in self.noise.items()
         }
 
+    def with_drift(self, drifts: Mapping[str, Part]) -> Dataset:
+        """The same records, the readings of some signals drifting by as much at least."""
+        colours, sources = dict(self.colours), self.sources
+        for signal, part in drifts.items():
+            before = sources[signal]
+            if before.drift is None or before.drift.size < part.size:
+                calm = before.without_drift
+                colours[signal] = replace(calm, parts=(*calm.parts, part))
+        return replace(self, colours=colours)
+
     @property
     def kernel(self) -> float:
         """Kernel length of the balances [s]."""
@@ -152,11 +163,11 @@ def load_dataset(
     *,
     kernel: float | None = None,
     like: Sensing | None = None,
-    shifts: Sequence[Mapping[str, float]] | None = None,
+    told: Dataset | None = None,
 ) -> Dataset:
     """Prepare records for the balances that their common channels allow (`like`: temperature counts
-    as in the records of a fit; `shifts`: by which the channels of each record are late [s], by
-    place, where another kernel has told it).
+    as in the records of a fit; `told`: the same records at the kernel that has told how late their
+    channels are and what their sensors' noise is, neither of which hangs on a kernel).
 
     Raises
     ------
@@ -174,14 +185,15 @@ def load_dataset(
     prepared: list[WeakRecord] = []
     first, count = 0, len(train)
     again: list[Callable[..., WeakRecord]] = []
+    shifts = None if told is None else [w.shifts for w in (*told.train, *told.held_out)]
     for number, record in enumerate((*train, *held_out)):
         way = partial(_once, curved=model.lagging_load, late=places_of(model))
         again.append(partial(way, record, joint, sensing, length, first))
         prepared.append(again[-1](known=None if shifts is None else shifts[number]))
         first = max(first, 1 + int(prepared[-1].block.max(initial=first - 1)))
     for number, (record, made) in enumerate(zip((*train, *held_out), prepared, strict=True)):
-        told = {p: [w.filters[p] for w in prepared[:count] if p in w.filters] for p in made.filters}
-        agreed = {p: as_told(told[p], f) for p, f in made.filters.items() if told[p]}
+        seen = {p: [w.filters[p] for w in prepared[:count] if p in w.filters] for p in made.filters}
+        agreed = {p: as_told(seen[p], f) for p, f in made.filters.items() if seen[p]}
         if any(abs(made.shifts[p] - late) > NANOSECOND for p, late in agreed.items()):
             made = replace(again[number](known={**made.shifts, **agreed}), filters=made.filters)
         if record.payload != train[0].payload:
@@ -204,14 +216,11 @@ def load_dataset(
                 f"{held_out[0].name}: the joint stands still in every held-out record; give one "
                 "in which it moves"
             )
-    slow = _of_one_make([slow_noise_of(made) for made in prepared])
-    found = [
-        _with_slow(measured_sources(r, joint, sensing), own)
-        for r, own in zip(train, slow, strict=False)
-    ]
-    noise = {c: float(np.median([one[c].level for one in found])) for c in found[0]}
-    # colours are those of the record in the middle
-    colours = {c: sorted((one[c] for one in found), key=_loudness)[len(found) // 2] for c in noise}
+    noise, colours = (
+        _noise_of_all(train, prepared, joint, sensing)
+        if told is None
+        else (told.noise, told.colours)
+    )
     return Dataset(
         joint,
         sensing,
@@ -221,8 +230,25 @@ def load_dataset(
         noise=noise,
         train_names=tuple(r.name for r in train),
         held_out_names=tuple(r.name for r in held_out),
-        colours={c: x for c, x in colours.items() if x != white(x.level)},
+        colours=colours,
     )
+
+
+def _noise_of_all(
+    train: Sequence[Record], prepared: Sequence[WeakRecord], joint: Joint, sensing: Sensing
+) -> tuple[Mapping[str, float], Mapping[str, ChannelNoise]]:
+    """Level and colour of the noise of each measured signal; `prepared` are the training records
+    and then the held-out ones, whose sensors are the same.
+    """
+    slow = _of_one_make([slow_noise_of(made) for made in prepared])
+    found = [
+        _with_slow(measured_sources(r, joint, sensing), own)
+        for r, own in zip(train, slow, strict=False)
+    ]
+    noise = {c: float(np.median([one[c].level for one in found])) for c in found[0]}
+    # colours are those of the record in the middle
+    colours = {c: sorted((one[c] for one in found), key=_loudness)[len(found) // 2] for c in noise}
+    return noise, {c: x for c, x in colours.items() if x != white(x.level)}
 
 
 def _once(
@@ -308,7 +334,8 @@ def weak_record(
     signals = {
         c: without_spikes(x, segments, noise[c].level) if c in noise else x for c, x in read.items()
     }
-    length = max(length, KERNEL_SAMPLES * record.dt)
+    shortest = KERNEL_SAMPLES * record.dt
+    length, telling = max(length, shortest), max(min(length, TELLING_KERNEL), shortest)
     longest = length / 2 if length <= CLAIM_KERNEL else 0.06
     pointwise = {
         c: pointwise_kernel(signals[c], segments, record.dt, longest, own)
@@ -316,11 +343,11 @@ def weak_record(
     }
     torsion = torsion_kernel(signals, segments, record.dt, pointwise, noise)
 
-    last: list[tuple[Mapping[str, float], WeakRecord]] = []
+    last: dict[float, tuple[Mapping[str, float], WeakRecord]] = {}
 
-    def made_with(shifts: Mapping[str, float]) -> WeakRecord:
+    def made_with(shifts: Mapping[str, float], length: float = length) -> WeakRecord:
         moved, parts = shifted(signals, segments, shifts)
-        known, before = last.pop() if last else ({}, None)
+        known, before = last.pop(length, ({}, None))
         changed = {SIGNAL[p] for p in {*shifts, *known} if shifts.get(p, 0.0) != known.get(p, 0.0)}
         made = prepare(
             record.time,
@@ -342,11 +369,11 @@ def weak_record(
                 f"{' with fewer gaps' if parted else ''}"
             )
         made = replace(made, shifts={p: k * record.dt for p, k in shifts.items()})
-        last.append((dict(shifts), made))
+        last[length] = dict(shifts), made
         return made
 
     def spread(made: WeakRecord, place: str, lateness: float) -> float:
-        plain, rate = (differentiated_kernel(length, record.dt, order) for order in (0, 1))
+        plain, rate = (differentiated_kernel(telling, record.dt, order) for order in (0, 1))
         own = _with_slow(noise, slow_noise_of(made))[SIGNAL[place]]
         return own.after(plain + lateness * rate, record.dt) ** 2
 
@@ -354,7 +381,15 @@ def weak_record(
         made = made_with({p: round(k / record.dt, 9) for p, k in known.items()})
     else:
         made = (
-            in_time(made_with, late, spread, torque=sensing.has_torque) if late else made_with({})
+            in_time(
+                made_with,
+                late,
+                spread,
+                torque=sensing.has_torque,
+                fast=partial(made_with, length=telling),
+            )
+            if late
+            else made_with({})
         )
     mended = {c: signals[c] for c in TOLD_BY if c in signals and signals[c] is not read[c]}
     if mended:

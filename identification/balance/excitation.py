@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from casadi_models import EFFECTS
-from identification.balance.colour import LOWEST_LINE
+from identification.balance.colour import LOWEST_LINE, Part
 from identification.balance.dataset import Dataset
 from identification.balance.weak import REST_SHARE, WeakRecord, differentiated_kernel
 
@@ -43,6 +43,9 @@ DEGREES_LIKE: Final = 2.0
 radians.
 """
 
+
+READ: Final[Mapping[str, str]] = {"drive": "the drive's torque", "torque": "the link's torque"}
+"""Readings that drift and hum."""
 
 REST_WORTH: Final = 0.05
 """Share of rows at rest that is worth a word: joints that stick for a moment at each turn stay
@@ -131,24 +134,37 @@ def excitation_warnings(data: Dataset) -> tuple[str, ...]:
 
 def slow_noise_notes(data: Dataset) -> list[str]:
     """What is said of a torque's reading that drifts or hums slowly."""
-    unit, out = "N" if data.joint.kind == "linear" else "N.m", []
-    for signal, what in (("drive", "the drive's torque"), ("torque", "the link's torque")):
+    out = []
+    for signal in READ:
         noise = data.sources.get(signal)
         if noise is None:
             continue
         drift = noise.drift.size if noise.drift is not None else 0.0
-        said = [f"drifts by about {drift:.2g} {unit}"] if drift > 0 else []
-        said += [
-            f"hums with {size:.2g} {unit} at {frequency:.3g} Hz"
-            for size, frequency in noise.lines
-            if frequency < LOWEST_LINE
-        ]
-        if said:
-            out.append(
-                f"the reading of {what} {' and '.join(said)}: that counts as noise, and what is "
-                "as slow and no larger is not told from it; check the amplifier"
-            )
+        out += _slow_noise_note(data, signal, drift, noise.lines)
     return out
+
+
+def drift_notes(data: Dataset, drifts: Mapping[str, Part]) -> list[str]:
+    """The same of what a fitted model leaves of the readings."""
+    return [note for c, part in drifts.items() for note in _slow_noise_note(data, c, part.size)]
+
+
+def _slow_noise_note(
+    data: Dataset, signal: str, drift: float, lines: Sequence[tuple[float, float]] = ()
+) -> list[str]:
+    unit = "N" if data.joint.kind == "linear" else "N.m"
+    said = [f"drifts by about {drift:.2g} {unit}"] if drift > 0 else []
+    said += [
+        f"hums with {size:.2g} {unit} at {frequency:.3g} Hz"
+        for size, frequency in lines
+        if frequency < LOWEST_LINE
+    ]
+    if not said:
+        return []
+    return [
+        f"the reading of {READ[signal]} {' and '.join(said)}: that counts as noise, and what is "
+        "as slow and no larger is not told from it; check the amplifier"
+    ]
 
 
 def unlike_units(data: Dataset) -> str:

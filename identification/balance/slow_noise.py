@@ -16,7 +16,7 @@ have.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, final
 
@@ -51,6 +51,10 @@ ALONE: Final = 13.7
 """The same at 1 %, where the balance of the motor tells alone: it has the fewest unknowns."""
 BEYOND_DOUBT: Final = 35.5
 """The same at 0.1 %, where no other balance could have told."""
+SHARE_AGREED: Final = 0.05
+SHARE_ALONE: Final = 0.01
+SHARE_DOUBT: Final = 0.001
+"""The chances of these three, where records are taken together and have more degrees."""
 LOWEST_HUM: Final = 5.0
 """Frequency from which a line may be a hum [Hz]: what a joint is moved with is slower."""
 SAME: Final = 3.0
@@ -190,14 +194,52 @@ def _longest(record: WeakRecord) -> tuple[npt.NDArray[np.bool_], float]:
     return rows, float(number.max()) * record.grid.stride * record.grid.dt
 
 
+@final
+@dataclass(frozen=True)
+class _Walk:
+    """How well a walk beside white noise meets the spectrum of a course.
+
+    Attributes
+    ----------
+    rate : float
+        Variance by which it walks in a second.
+    fall : float
+        Of chi-square, against white noise alone.
+    left : float
+        What is left of it.
+    degrees : int
+        Octaves beyond the two unknowns.
+    """
+
+    rate: float
+    fall: float
+    left: float
+    degrees: int
+
+    @property
+    def better(self) -> float:
+        """The fall over what is left per degree."""
+        return self.fall / (self.left / self.degrees) if self.left > 0 else math.inf
+
+
 def _walk(course: FloatArray, length: float) -> tuple[float, float]:
     """Variance by which a course (n,) of that length [s] walks in a second, and the fall of
     chi-square over what is left per octave; zeros where the power does not certainly fall so.
     """
+    found = _spectrum_of(course, length)
+    if found is None or found.fall < CERTAIN:
+        return 0.0, 0.0
+    return found.rate, found.better
+
+
+def _spectrum_of(course: FloatArray, length: float) -> _Walk | None:
+    """The walk that meets the spectrum of a course (n,) of that length [s] best; None where there
+    are too few octaves.
+    """
     frequency = np.arange(1, math.ceil(min(HIGHEST * length, len(course) / 2)))
     octave = np.floor(np.log2(frequency)).astype(np.int64)
     if not np.any(course) or not len(octave) or octave[-1] + 1 < OCTAVES:
-        return 0.0, 0.0
+        return None
     power = np.abs(np.fft.rfft(course)[frequency]) ** 2 * length / len(course) ** 2
     number = np.bincount(octave)
     level = np.bincount(octave, np.log(np.maximum(power, 1e-300))) / number + LOG_BIAS
@@ -210,11 +252,62 @@ def _walk(course: FloatArray, length: float) -> tuple[float, float]:
     flat, _, _ = left(0.0)
     tried = np.geomspace(1.0, float(frequency[-1]), CROSSINGS)
     walking, base, crossing = min(left(float(x)) for x in tried)
-    fall = flat - walking
-    if fall < CERTAIN:
-        return 0.0, 0.0
-    better = fall / (walking / (len(number) - 2)) if walking > 0 else math.inf
-    return math.exp(base) * (2 * math.pi * crossing / length) ** 2, better
+    rate = math.exp(base) * (2 * math.pi * crossing / length) ** 2
+    return _Walk(rate, flat - walking, walking, len(number) - 2)
 
 
-__all__ = ["SlowNoise", "slow_noise_of"]
+def drift_of_rest(
+    records: Sequence[WeakRecord], rests: Mapping[str, Sequence[FloatArray]]
+) -> dict[str, Part]:
+    """Drift of the readings of torques in what a fitted model leaves, by signal.
+
+    Beside a model a drift is seen far better than beside free curves; but what the model lacks is
+    there, too. That has the frequencies of the motion, not power that falls from octave to octave:
+    all records together must say so, and the balances agree as in :func:`slow_noise_of`.
+
+    Parameters
+    ----------
+    records : sequence of WeakRecord
+    rests : mapping of str to sequence of (rows,) array
+        For each record, what is left of the transmitted torque (`torque`), of the drive's beside it
+        (`both`) and of the drive's beside all motion (`drive`); those that the balances give.
+    """
+    found = {}
+    for key, courses in rests.items():
+        walks = []
+        for w, course in zip(records, courses, strict=True):
+            rows, length = _longest(w)
+            walks.append(_spectrum_of(_calm(course)[rows], length))
+        told = [x for x in walks if x is not None]
+        if not told or len(told) < len(walks):
+            return {}
+        found[key] = _Walk(
+            float(np.mean([x.rate for x in told])),
+            sum(x.fall for x in told),
+            sum(x.left for x in told),
+            sum(x.degrees for x in told),
+        )
+    witness = found.pop("both", None)
+    memory = max(_longest(w)[1] for w in records) / 3.0
+    out = {}
+    for signal, own in found.items():
+        agreed = signal == "drive" and witness is not None
+        asked = SHARE_AGREED if agreed else SHARE_ALONE if witness is not None else SHARE_DOUBT
+        each = [own, witness] if agreed and witness is not None else [own]
+        sure = [x for x in each if _surely(x, asked)]
+        if len(sure) < len(each):
+            sure = [x for x in [witness] if agreed and x is not None and _surely(x, SHARE_ALONE)]
+        if sure:
+            rate = min(x.rate for x in sure)
+            out[signal] = Part(math.sqrt(rate * memory / 2.0), memory)
+    return out
+
+
+def _surely(walk: _Walk, share: float) -> bool:
+    """Whether chance would make a spectrum fall so in less than that share."""
+    from scipy.special import fdtri
+
+    return walk.fall >= CERTAIN and walk.better >= float(fdtri(1, walk.degrees, 1.0 - share))
+
+
+__all__ = ["SlowNoise", "drift_of_rest", "slow_noise_of"]

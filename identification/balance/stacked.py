@@ -15,10 +15,11 @@ import numpy.typing as npt
 from casadi_models import JointModel
 from identification.balance.balances import Balances, balances_of
 from identification.balance.calibration import bare, of_run, settled, values_on
-from identification.balance.colour import ChannelNoise
+from identification.balance.colour import ChannelNoise, Part
 from identification.balance.dataset import Dataset
 from identification.balance.drawn_noise import draws_of
 from identification.balance.memory import numbers_of
+from identification.balance.slow_noise import drift_of_rest
 from identification.balance.weak import WeakRecord, whole
 
 FloatArray = npt.NDArray[np.float64]
@@ -331,6 +332,31 @@ def innovations(
             state, power = state + gain * error, power * (1.0 - gain * g)
         out[rows] = course
     return out
+
+
+def drifts_beside(model: JointModel, data: Dataset, values: Mapping[str, float]) -> dict[str, Part]:
+    """See :func:`identification.balance.slow_noise.drift_of_rest`; of all records of the data."""
+    balances = balances_of(model, data.sensing, wrt=())
+    records = [*data.train, *data.held_out]
+    values = settled(model, data.sensing, records, values)
+    left = [
+        {
+            b: np.where(w.taking(b), r, 0.0)
+            for b, (r, _) in balances.evaluate(w, values_on(model, w, values)).items()
+        }
+        for w in records
+    ]
+    whole = next((b for b in ("sum", "axis") if b in balances.balances), None)
+    rests: dict[str, list[FloatArray]] = {}
+    if {"motor", "link"} <= set(balances.balances):
+        rests = {
+            "torque": [r["link"] for r in left],
+            "both": [r["motor"] for r in left],
+            "drive": [r["motor"] + r["link"] for r in left],
+        }
+    elif whole is not None:
+        rests = {"drive": [r[whole] for r in left]}
+    return {c: p for c, p in drift_of_rest(records, rests).items() if c in data.noise}
 
 
 def drift_memory(data: Dataset) -> float:

@@ -6,12 +6,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Protocol, final
 
 from casadi_models import JointModel
 from identification.balance.calibration import settled
+from identification.balance.colour import Part
 from identification.balance.dataset import without
 from identification.balance.sensing import Sensing
+from identification.balance.stacked import drifts_beside
 from identification.data.joint_file import Joint
 from identification.data.record import Record
 from identification.diagnosis.candidates import offered
@@ -77,6 +80,11 @@ class Bench(Protocol):
     def ratios(self, step: Step) -> dict[str, BalanceError]:
         """Residual over floor of every balance on held-out records, as the verdict counts it."""
 
+    def drifts(self, step: Step) -> Mapping[str, Part]:
+        """Drift of the torques' readings that the verdict counts in what a step leaves, by
+        signal.
+        """
+
     def shown(self, step: Step) -> Step:
         """The step with ratios that agree with the verdict, as every door shows them."""
 
@@ -140,6 +148,7 @@ class JointBench:
         self._stepped: dict[tuple[object, ...], Solution] = {}
         self._ratios: dict[tuple[int, bool], tuple[Solution, dict[str, BalanceError]]] = {}
         self._equal: dict[tuple[object, ...], tuple[Solution, dict[str, Equivalence]]] = {}
+        self._drifts: dict[tuple[int, bool], Mapping[str, Part]] = {}
         self._kernels: dict[float, Dataset] = {round(data.kernel, 9): data}
 
     def start(self) -> Solution:
@@ -217,6 +226,20 @@ class JointBench:
         One with structure left reads at the kernel that shows it best.
         """
         ratios = {b: e.ratio for b, e in self._judged(solution, held_out=held_out).items()}
+        drifts = self._drifts[id(solution), held_out]
+        if drifts:
+            data = self.data.with_drift(drifts)
+            records = data.held_out if held_out else data.train
+            louder = assess(solution.model, data, records, self._settled(solution)).balances
+            error = replace(
+                error,
+                balances={
+                    b: replace(e, rms=louder[b].rms, floor=louder[b].floor)
+                    if ratios[b] <= RATIO_LIMIT < e.ratio
+                    else e
+                    for b, e in error.balances.items()
+                },
+            )
         shown = {
             b: r if r <= RATIO_LIMIT else max(r, error.balances[b].ratio) for b, r in ratios.items()
         }
@@ -228,25 +251,51 @@ class JointBench:
         mark = (id(solution), held_out)
         if mark not in self._ratios:
             out: dict[str, BalanceError] = {}
-            # zero and clocks of a record, too, are its own and found at the kernel of the claims
-            values = settled(
-                solution.model,
-                self.data.sensing,
-                [*self.data.train, *self.data.held_out],
-                solution.values,
-            )
+            values = self._settled(solution)
             for length in sorted({VERDICT_KERNELS[b] for b in self.data.sensing.balances}):
-                data = self._at_kernel(length)
-                error = assess(
-                    solution.model, data, data.held_out if held_out else data.train, values
+                out |= self._errors_at(length, solution.model, values, held_out=held_out)
+            drifts, believed = {}, frozenset[str]()
+            if any(e.ratio > RATIO_LIMIT for e in out.values()):
+                drifts = drifts_beside(solution.model, self.data, values)
+            for length in sorted({VERDICT_KERNELS[b] for b in out}) if drifts else ():
+                told = self._errors_at(
+                    length, solution.model, values, held_out=held_out, drifts=drifts
                 )
-                out.update(
-                    {b: e for b, e in error.balances.items() if VERDICT_KERNELS[b] == length}
-                )
+                # what a drift does not explain whole is left as it is
+                whole = {b: e for b, e in told.items() if e.ratio <= RATIO_LIMIT < out[b].ratio}
+                out |= whole
+                believed |= frozenset(whole)
+            self._drifts[mark] = drifts if believed else {}
             # the solution is kept with its ratios: an identity is not given to another while it
             # lives
             self._ratios[mark] = solution, {b: out[b] for b in self.data.sensing.balances}
         return dict(self._ratios[mark][1])
+
+    def _settled(self, solution: Solution) -> Mapping[str, float]:
+        """Values of a solution; zero and clocks of a record, too, are its own and found at the
+        kernel of the claims.
+        """
+        records = [*self.data.train, *self.data.held_out]
+        return settled(solution.model, self.data.sensing, records, solution.values)
+
+    def _errors_at(
+        self,
+        length: float,
+        model: JointModel,
+        values: Mapping[str, float],
+        *,
+        held_out: bool,
+        drifts: Mapping[str, Part] = MappingProxyType({}),
+    ) -> dict[str, BalanceError]:
+        """Errors of the balances whose verdict falls at this kernel."""
+        data = self._at_kernel(length).with_drift(drifts)
+        error = assess(model, data, data.held_out if held_out else data.train, values)
+        return {b: e for b, e in error.balances.items() if VERDICT_KERNELS[b] == length}
+
+    def drifts(self, step: Step) -> Mapping[str, Part]:
+        """Drift that a fitted model shows and that explains a ratio, by signal."""
+        self._judged(step.solution, held_out=True)
+        return self._drifts[id(step.solution), True]
 
     def lines(self, step: Step) -> list[Line]:
         """See :func:`identification.diagnosis.lines.find_lines`."""
@@ -309,7 +358,7 @@ class JointBench:
         mark = round(length, 9)
         if mark not in self._kernels:
             model = prepared_model(self.joint, self._train[0])
-            # clocks are the records' own: how late a channel is does not hang on the kernel
+            # clocks and noise are the records' own: neither hangs on the kernel
             self._kernels[mark] = load_dataset(
                 self._train,
                 self._held,
@@ -317,6 +366,6 @@ class JointBench:
                 model,
                 kernel=length,
                 like=self._like,
-                shifts=[w.shifts for w in (*self.data.train, *self.data.held_out)],
+                told=self.data,
             )
         return self._kernels[mark]

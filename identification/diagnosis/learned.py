@@ -484,6 +484,10 @@ def _place(solution: Solution, name: str) -> str:
 
 
 def _no_dry_friction(solution: Solution, curves: Sequence[Curve]) -> list[Doubt]:
+    """Where dry friction lies outside the band of a curve over velocity, carried back to zero
+    speed: as friction that changes its sign at once, and as one that does so as smoothly as the
+    model has it, since the first knots may lie where it still does.
+    """
     out = {}
     for c in curves:
         table = EFFECTS[c.label.partition("@")[0]].table
@@ -491,15 +495,27 @@ def _no_dry_friction(solution: Solution, curves: Sequence[Curve]) -> list[Doubt]
         if table is None or not (table.of_speed and table.odd):
             continue
         torque = sticking_torque(solution.model, solution.values, place)
-        slope = (c.y[1] - c.y[0]) / (c.x[1] - c.x[0])
-        low, high = c.low[0] - slope * c.x[0], c.high[0] - slope * c.x[0]
-        if torque and not low <= torque <= high:
+        smooth = [solution.values[n] for n in solution.model.named("smoothing", place)]
+        starts = [_start(c, torque, width) for width in (0.0, *smooth)]
+        if torque and not any(low <= torque <= high for low, high in starts):
+            low, high = starts[0]
             out[place] = Doubt(
                 place,
                 f"the dry friction of the {place} side, {torque:.3g} {c.y_unit}, is an artefact: "
                 f"the curve over velocity starts between {low:.3g} and {high:.3g} {c.y_unit}",
             )
     return list(out.values())
+
+
+def _start(curve: Curve, torque: float, width: float) -> tuple[float, float]:
+    """Band of a curve over velocity at zero speed, carried on from its first two knots beside dry
+    friction that changes its sign over a speed `width`.
+    """
+    x = curve.x[:2]
+    dry = torque * np.tanh(x / width) if width > 0 else np.full(2, torque)
+    rest = curve.y[:2] - dry
+    moved = dry[0] - torque + (rest[1] - rest[0]) / (x[1] - x[0]) * x[0]
+    return float(curve.low[0] - moved), float(curve.high[0] - moved)
 
 
 def marked(

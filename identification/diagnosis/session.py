@@ -17,6 +17,7 @@ from casadi_models import EFFECTS
 from identification.balance.dataset import Dataset, with_effect, without
 from identification.balance.excitation import (
     claim_limit,
+    drift_notes,
     excitation_warnings,
     few_reversals,
     not_identifiable,
@@ -410,6 +411,7 @@ class Session:
             warnings=(
                 *hardly_a_model(steps[0]),
                 *excitation_warnings(self.data),
+                *drift_notes(self.data, self.bench.drifts(end)),
                 *self._about_temperature(judged),
                 *([scale] if (scale := self._scale(solution)) else []),
                 *unseen(solution),
@@ -524,7 +526,6 @@ class Session:
             for t in ranking.trials
             if t.key != best.key
             and t.balance == best.balance
-            and (t.key in best.effect.confused_with or best.key in t.effect.confused_with)
             and t.candidate.label in ranking.significant
             and t.candidate.label not in refused
             # a trial's columns say little of a law that is read backwards

@@ -16,6 +16,7 @@ from casadi_models import EFFECTS, Effect, JointModel
 from casadi_models.term import SIDE_INERTIAS
 from identification.balance.balances import balances_of
 from identification.balance.calibration import settled
+from identification.balance.colour import Part
 from identification.balance.sensing import signals_of
 from identification.balance.stamps import evened
 from identification.balance.weak import WeakRecord, differentiated_kernel, filtered
@@ -275,6 +276,10 @@ class FmuBench:
     def ratios(self, step: Step) -> dict[str, BalanceError]:
         """Of every balance, at the kernel of the claims."""
         return dict(step.held_out.balances)
+
+    def drifts(self, step: Step) -> Mapping[str, Part]:
+        """None: what an FMU leaves holds the errors of its solver."""
+        return {}
 
     def shown(self, step: Step) -> Step:
         """The step: its one kernel is that of the verdict."""

@@ -154,7 +154,8 @@ int simulate(const double *p, const double *state, const double *ref, const long
         }
         u_before = u;
         torque_before = torque;
-        sum += h * (r - qm);
+        /* no drive goes on integrating at its limit: the joint would swing ever farther */
+        if (fabs(u) < p[P_LIMIT]) sum += h * (r - qm);
         v = vn; w = wn; zm = znm; zl = znl;
         q = qm + 0.5 * h * v;
         th = tm + 0.5 * h * w;

@@ -123,7 +123,10 @@ def thermal_friction(s: Setting) -> Law:
 
 
 def cyclic_friction(s: Setting) -> Law:
-    return s.on_side(CYC=s.some(0.12, 0.25, s.joint.friction), CYC_P=s.shape(0.0, 2.0 * np.pi))
+    """At most the side's own Coulomb friction: a band that closes is another law."""
+    most = s.joint.values[f"{s.side}_TC"]
+    amplitude = min(s.some(0.12, 0.25, s.joint.friction), most)
+    return s.on_side(CYC=amplitude, CYC_P=s.shape(0.0, 2.0 * np.pi))
 
 
 def cyclic_torque(s: Setting) -> Law:

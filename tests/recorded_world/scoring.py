@@ -104,15 +104,21 @@ def _is_order(line: Json, order: float, truth: Mapping[str, Any]) -> bool:
     return any(abs(told - o) <= slack * o for o in known.get(per, []))
 
 
-def _calibrated(truth: Mapping[str, Any], result: Json) -> set[str]:
-    """Hidden delays that the answer reports as a skew of the same channel."""
+def _taken_up(truth: Mapping[str, Any], result: Json) -> set[str]:
+    """Hidden laws that the model has under another name: a delay that the answer reports as a skew
+    of the same channel, and once per turn of a link that hangs in gravity, whose zero is free.
+    """
+    found = set()
     law = truth["laws"].get("channel_delay")
-    if law is None:
-        return set()
-    delay = float(law["current_delay_s"])
-    skews = (c for c in result.get("calibration", []) if c["what"] == "skew")
-    near = any(abs(abs(float(c["value"])) - delay) < 0.5 * delay for c in skews)
-    return {"channel_delay"} if near else set()
+    if law is not None:
+        delay = float(law["current_delay_s"])
+        skews = (c for c in result.get("calibration", []) if c["what"] == "skew")
+        if any(abs(abs(float(c["value"])) - delay) < 0.5 * delay for c in skews):
+            found.add("channel_delay")
+    hangs = float(truth["values"]["TG"]) > 0.0 and "gravity" not in truth["laws"]
+    if hangs and truth["places"].get("cyclic_torque") == "link":
+        found.add("cyclic_torque")
+    return found
 
 
 def score(truth: Mapping[str, Any], result: Json) -> Answer:
@@ -133,7 +139,8 @@ def score(truth: Mapping[str, Any], result: Json) -> Answer:
         and not any(_is_order(x, orders[n], truth) for x in lines)
     }
     claims = [(_names(c) - missed, c) for c in result["claims"]]
-    found = _calibrated(truth, result)
+    taken_up = _taken_up(truth, result)
+    found = set(taken_up)
     found |= {n for n, order in orders.items() if any(_is_order(x, order, truth) for x in lines)}
     found |= {n for n in hidden if any(names & accepted[n] for names, _ in claims)}
     outside = truth["kind"] == "outside"
@@ -163,8 +170,8 @@ def score(truth: Mapping[str, Any], result: Json) -> Answer:
     elif outside:
         good = verdict == "unexplained" or learned or bool(found)
     else:
-        # a delay that was taken off as a clock's leaves nothing to be claimed
-        claimed = set(hidden) - _calibrated(truth, result)
+        # what the model took up leaves nothing to be claimed
+        claimed = set(hidden) - taken_up
         good = verdict in ({"complete"} if claimed else CLEAN) | left and set(hidden) <= found
     last = result["steps"][-1]["held_out"]
     sensors = truth["sensors"]

@@ -13,8 +13,9 @@ from scipy.signal import lfilter
 from identification import Record, fit
 from identification.balance.balances import balances_of
 from identification.balance.calibration import settled, values_on
+from identification.balance.dataset import load_dataset
 from identification.balance.noise import calm_of, noise_of
-from identification.balance.stacked import drawn_floors
+from identification.balance.stacked import drawn_floors, drifts_beside
 from identification.balance.stamps import evened
 from identification.balance.weak import filtered
 from identification.fitting.fit import Fit
@@ -96,6 +97,36 @@ def test_a_slow_hum_is_a_line_of_the_reading_that_has_it() -> None:
     ((size, frequency),) = noise["drive"].lines
     assert frequency == pytest.approx(11.3, abs=0.03)
     assert size == pytest.approx(LEVEL["drive"], rel=0.2)
+
+
+@pytest.mark.parametrize("seed", [3, 8])
+def test_a_model_shows_the_drift_of_its_readings(seed: int) -> None:
+    found = seen("drift", seed)
+    told = drifts_beside(found.model, found.data, found.solution.values)
+    assert set(told) == set(LEVEL)
+    for signal, part in told.items():
+        assert 0.4 < part.size / LEVEL[signal] < 2.5, signal
+
+
+@pytest.mark.parametrize("missing", [0.0, 0.02, 0.1, 0.5])
+def test_what_a_model_lacks_is_no_drift(missing: float) -> None:
+    found = seen("", 3, missing)
+    assert drifts_beside(found.model, found.data, found.solution.values) == {}
+
+
+@pytest.mark.parametrize("length", [0.03, 0.12])
+def test_the_noise_of_a_reading_does_not_hang_on_the_kernel(length: float) -> None:
+    found = seen("drift")
+    told = load_dataset(
+        list(found.records),
+        [],
+        JOINT,
+        found.model,
+        kernel=length,
+        told=found.data,
+    )
+    assert told.sources == found.data.sources
+    assert told.kernel == pytest.approx(length)
 
 
 @pytest.mark.parametrize("jitter", [0.02, 0.1, 0.3])

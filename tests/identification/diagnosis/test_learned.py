@@ -9,10 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from smooth_laws import LAWS, Law, Run, nothing, record, run
+from smooth_laws import LAWS, FloatArray, Law, Run, nothing, record, run
 
 from identification.data.joint_file import Joint, load_joint
+from identification.diagnosis.candidates import Candidate
 from identification.diagnosis.claims import Claim
+from identification.diagnosis.curve import curves_on, steadily_moving
 from identification.diagnosis.improve import RATIO_LIMIT, Improvement, improve
 from identification.diagnosis.learned import (
     Equivalence,
@@ -21,6 +23,7 @@ from identification.diagnosis.learned import (
     learned_claims,
     with_curves,
 )
+from identification.diagnosis.trials import make_base
 from identification.fitting.assess import assess
 from workbench.cli.main import main
 
@@ -82,6 +85,24 @@ def test_an_amplitude_held_at_its_bound_is_told() -> None:
 def test_nothing_forbids_complete_where_the_model_is_right(seed: int) -> None:
     found = run(seed, nothing)
     assert artefacts(found.solution, found.data, found.found.curves) == ()
+
+
+@pytest.mark.parametrize("width", [0.02, 0.04])
+def test_dry_friction_that_changes_its_sign_over_a_few_knots_is_none(width: float) -> None:
+    """Its curve has not reached the Coulomb torque at the first knots, and starts from zero."""
+
+    def law(q: FloatArray, v: FloatArray) -> FloatArray:
+        return 20 * (np.tanh(v / width) - np.tanh(v / 2e-3)) + 8 * v * np.abs(v)
+
+    found = run(38, law, ("viscous", "coulomb", "quadratic_drag@motor"))
+
+    def own(candidate: Candidate) -> bool:
+        return candidate.effect.key == "learned_velocity"
+
+    moving = steadily_moving(make_base(found.solution, found.data))
+    (curve,) = curves_on(moving, "axis", own, most=1, certain=False).curves
+    assert curve.x[0] < 3 * width
+    assert artefacts(found.solution, found.data, [curve]) == ()
 
 
 def asked(seed: int, law: Law) -> Improvement:

@@ -272,9 +272,7 @@ def test_every_view_fits_a_phone_and_passes_axe(served: Served, browser: Browser
     def in_both(name: str, *, shot: bool = True) -> None:
         for colours in ("light", "dark"):
             page.emulate_media(color_scheme=colours)
-            page.wait_for_function(
-                "s => document.documentElement.dataset.theme === s", arg=colours
-            )
+            page.wait_for_function("s => document.documentElement.dataset.theme === s", arg=colours)
             if shot:
                 browser.shot(f"{colours}-{name}")
             serious.extend(axe(page, f"{name}, {colours}"))
