@@ -183,11 +183,11 @@ def in_time(
         Whose channels may be shifted.
     noise : callable
         Variance that the noise of a place's channel gives the rows of a record, its rate times a
-        lateness [s] added; as `fast` makes them.
+        lateness [s] added.
     torque : bool
         Whether the torque of the link is measured.
     fast : callable
-        As `make`, with the shortest kernel: a filter and a wait are alike in all that is slow.
+        As `make`, with a short kernel: a filter and a wait are alike in all that is slow.
     """
     shifts: dict[str, float] = {}
     filters: dict[str, Filter] = {}
@@ -210,7 +210,10 @@ def in_time(
         taken = (found[0] - found[1]) / late > ANSWERS
         # what is later than that is no filter of a drive
         if taken and place in LOW_PASSED and abs(shifts[place]) <= MOST_SKEW:
-            filters[place] = told = _filter(fast, shifts, place, noise, torque=torque)
+            told = _filter(make, shifts, place, noise, torque=torque)
+            # slow rows are calm, fast ones show most of what neither makes good: both are asked
+            quick = _filter(fast, shifts, place, noise, torque=torque, share=False)
+            filters[place] = told = replace(told, better=told.better + quick.better)
             shifts = {**shifts, place: as_told([told], told) / made.grid.dt}
             made = make(shifts)
         elif not taken:
@@ -234,6 +237,7 @@ def _filter(
     noise: Callable[[WeakRecord, str, float], float],
     *,
     torque: bool,
+    share: bool = True,
 ) -> Filter:
     """What rows say of a late reading, by how well they are met with all of its lateness shifted,
     with its rate in the place of that, or with a part shifted the other way and its rate.
@@ -276,7 +280,7 @@ def _filter(
         return len(friction) * noise(waiting, place, (whole - shift) * dt) / scale**2
 
     better = unmet(whole) - louder(whole) - unmet(0.0) + louder(0.0)
-    if whole > NEAR:
+    if share and whole > NEAR:
         found = minimize_scalar(
             unmet,
             bounds=(-HALF_A_CYCLE, 0.0),

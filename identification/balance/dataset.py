@@ -373,7 +373,8 @@ def weak_record(
         return made
 
     def spread(made: WeakRecord, place: str, lateness: float) -> float:
-        plain, rate = (differentiated_kernel(telling, record.dt, order) for order in (0, 1))
+        length = made.grid.length
+        plain, rate = (differentiated_kernel(length, record.dt, order) for order in (0, 1))
         own = _with_slow(noise, slow_noise_of(made))[SIGNAL[place]]
         return own.after(plain + lateness * rate, record.dt) ** 2
 

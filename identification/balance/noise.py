@@ -46,6 +46,10 @@ BEND: Final = 0.02
 smaller than that of most motions then."""
 AROUND: Final = 0.1
 """Time over which it is averaged [s]: that of a fourth difference that reaches farthest."""
+NOISE_BEND: Final = 3.0
+"""Such a bend over the noise of the position up to which noise alone makes it: the mean size of the
+second difference of white noise, root of 12 over pi, and half of it for what a tenth of a second
+leaves of its scatter."""
 MOVING: Final = 0.05
 """Share of the usual speed from which a joint moves: at rest a reading may stand on one step."""
 
@@ -262,7 +266,9 @@ def calm_of(position: FloatArray, stretches: Sequence[slice], dt: float) -> npt.
     moving = speed > MOVING * float(np.median(speed[speed > 0] if np.any(speed) else [0.0]))
     if not moving.any():
         return moving
-    return np.asarray(moving & (bend <= np.quantile(bend[moving], CALM)))
+    # a bend that the encoder's own noise makes is none, and would cut an even motion to pieces
+    even = NOISE_BEND * noise_level(position, tuple(stretches))
+    return np.asarray(moving & (bend <= max(float(np.quantile(bend[moving], CALM)), even)))
 
 
 def _fourth(x: FloatArray, time: FloatArray | None) -> FloatArray:

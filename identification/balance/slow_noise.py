@@ -122,7 +122,7 @@ def rests_of(record: WeakRecord) -> dict[str, FloatArray]:
 
 def _calm(rest: FloatArray) -> FloatArray:
     """The rest without rows that agree with nothing."""
-    limit = BIWEIGHT * DEVIATION * float(np.median(np.abs(rest)))
+    limit = BIWEIGHT * DEVIATION * float(np.median(np.abs(rest))) if len(rest) else 0.0
     return np.where(np.abs(rest) < limit, rest, 0.0)
 
 
@@ -261,23 +261,31 @@ def drift_of_rest(
 ) -> dict[str, Part]:
     """Drift of the readings of torques in what a fitted model leaves, by signal.
 
-    Beside a model a drift is seen far better than beside free curves; but what the model lacks is
-    there, too. That has the frequencies of the motion, not power that falls from octave to octave:
-    all records together must say so, and the balances agree as in :func:`slow_noise_of`.
+    Beside a model a drift is seen far better than beside all motion; but what the model lacks is
+    there, too. A law of the place or the speed is taken off as free curves of these; others have
+    the frequencies of the motion, not power that falls from octave to octave: all records together
+    must say so, and the balances agree as in :func:`slow_noise_of`.
 
     Parameters
     ----------
     records : sequence of WeakRecord
     rests : mapping of str to sequence of (rows,) array
         For each record, what is left of the transmitted torque (`torque`), of the drive's beside it
-        (`both`) and of the drive's beside all motion (`drive`); those that the balances give.
+        (`both`) and of the drive's beside all motion (`drive`); those that the balances give. No
+        number where a row takes no part: a walk goes on over what is left out, and what is left
+        over is a walk.
     """
     found = {}
     for key, courses in rests.items():
         walks = []
         for w, course in zip(records, courses, strict=True):
             rows, length = _longest(w)
-            walks.append(_spectrum_of(_calm(course)[rows], length))
+            kept = rows & np.isfinite(course)
+            sides = [x for x in ("motor", "link") if f"{x}_position" in w.points]
+            side = sides[-1] if key == "torque" else sides[0]
+            beside = [np.ones(int(kept.sum())), *_curves(w, side, kept)]
+            rest = rest_beside(course[kept], beside, ROUNDS) if kept.any() else course[kept]
+            walks.append(_spectrum_of(_calm(rest), length))
         told = [x for x in walks if x is not None]
         if not told or len(told) < len(walks):
             return {}

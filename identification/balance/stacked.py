@@ -341,7 +341,7 @@ def drifts_beside(model: JointModel, data: Dataset, values: Mapping[str, float])
     values = settled(model, data.sensing, records, values)
     left = [
         {
-            b: np.where(w.taking(b), r, 0.0)
+            b: np.where(w.taking(b), r, np.nan)
             for b, (r, _) in balances.evaluate(w, values_on(model, w, values)).items()
         }
         for w in records

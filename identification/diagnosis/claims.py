@@ -241,6 +241,33 @@ def nearly(ranking: Ranking, base: Base, refused: frozenset[str]) -> Trial | Non
     return None
 
 
+def unproved(ranking: Ranking, base: Base, refused: frozenset[str]) -> list[Trial]:
+    """The best trials that are certain on the training blocks and lower what they leave by too
+    little for a claim: a motion at one speed hardly shows a law of the speed, and yet another
+    motion falls by most of it.
+    """
+    sure = FALSE_DISCOVERY / max(len(ranking.everything), 1)
+    return [
+        t
+        for t in ranking.everything
+        if t.candidate.label not in refused
+        and t.p_value <= sure
+        and t.gain > GAIN
+        and t.effect.stage != "late"
+        and not t.effect.is_delay
+        and not math.isnan(t.held_out_drop_percent)
+        and t.beyond_noise(t.cv_drop_percent) < least_drop(t, base)
+    ][:LARGEST_SET]
+
+
+def least_drop(trial: Trial, base: Base) -> float:
+    """Fall of the RMS that a claim of this name must bring [%]."""
+    if trial.effect.common:
+        return COMMON_DROP
+    unseen = base.solution.model.load_compliance(base.solution.values) > 0
+    return UNSEEN_DROP if unseen else MAJOR_DROP
+
+
 def _discoveries(trials: Sequence[Trial]) -> set[str]:
     """Benjamini-Hochberg at 5 %."""
     ordered = sorted(trials, key=lambda t: t.p_value)
@@ -253,15 +280,8 @@ def _discoveries(trials: Sequence[Trial]) -> set[str]:
 
 def _major(trial: Trial, base: Base) -> bool:
     common = trial.effect.common
-    least = (
-        COMMON_DROP
-        if common
-        else UNSEEN_DROP
-        if base.solution.model.load_compliance(base.solution.values) > 0
-        else MAJOR_DROP
-    )
     drop = trial.beyond_noise(trial.cv_drop_percent)
-    if trial.gain <= GAIN or drop < least:
+    if trial.gain <= GAIN or drop < least_drop(trial, base):
         return False
     held = trial.beyond_noise(trial.held_out_drop_percent)
     if not math.isnan(held) and held < (COMMON_DROP / 2 if common else HELD_OUT_DROP):

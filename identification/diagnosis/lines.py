@@ -38,6 +38,7 @@ from identification.diagnosis.order_tracking import (
     BLOCK,
     Peak,
     Samples,
+    apart_from_slow,
     background,
     beside,
     clipped,
@@ -587,6 +588,7 @@ def find_lines(
             if not _within(p.order, math.pi / one.train.stroke, of_steps)
             and (one.held is None or confirmed(p, one.held, len(found)))
             and everywhere(p, [x for x in found if x is not p], one.train, named)
+            and apart_from_slow(p, one.train, one.dt, named=any(p.at(h) for h in named))
         ]
     # what a position reads wrong stands in every balance of its acceleration, larger: where a
     # balance without shows it, it is there

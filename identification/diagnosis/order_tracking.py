@@ -66,6 +66,11 @@ lies at one end of the stroke are in one of them."""
 ALIKE: Final = 2.0
 """Times that a line may be larger or smaller in a part than on the whole: half way, on a scale of
 sizes, between a line that is everywhere and one that is in a quarter of the motion."""
+SLOW: Final = 10.0
+"""Frequency up to which what is left of a model may be slow [Hz]: noise with a memory and friction
+about a turn lie under it."""
+FEWEST_APART: Final = 0.1
+"""Share of the weight of a line beside such samples from which on they tell of it."""
 BLOCK: Final = 1.0
 """Length of the blocks of held-out rows that count as independent [s]."""
 KNOTS: Final = 12
@@ -480,6 +485,40 @@ def confirmed(peak: Peak, samples: Samples, candidates: int) -> bool:
     error = SURE * spread / float(sizes.sum())
     # with less than half of the size they are worse off with the line than without
     return size >= 1 / ALIKE and size - error <= ALIKE
+
+
+def apart_from_slow(peak: Peak, samples: Samples, dt: float, *, named: bool) -> bool:
+    """True where a line is there beside the samples between which it makes whole periods.
+
+    At such a speed an order above the sampling rate stands still in the samples: a drift, or what
+    is left of friction, looks like it there, and a motion that keeps the speed makes it the
+    largest.
+
+    Parameters
+    ----------
+    peak : Peak
+    samples : Samples
+        Trend taken out.
+    dt : float
+        Between two samples [s].
+    named : bool
+        Whether its order is known beforehand: then it must only not be contradicted.
+    """
+    periods = peak.order * np.abs(np.gradient(samples.angle)) / (2 * math.pi)
+    whole = np.rint(periods)
+    still = (whole >= 1) & (np.abs(periods - whole) < SLOW * dt)
+    wave = peak.wave(samples)
+    _, inverse = np.unique(samples.block, return_inverse=True)
+    weight = np.where(still, 0.0, samples.weight)
+    scores, sizes = (
+        np.bincount(inverse, weights=weight * wave * x) for x in (samples.residual, wave)
+    )
+    every = float(np.sum(samples.weight * wave**2))
+    if not float(sizes.sum()) > FEWEST_APART * every:
+        return named
+    size = float(scores.sum() / sizes.sum())
+    error = SURE * float(np.linalg.norm(scores - size * sizes) / sizes.sum())
+    return size + error >= 1 / ALIKE and (named or size > error)
 
 
 def everywhere(

@@ -35,11 +35,13 @@ from identification.diagnosis.claims import (
     Claim,
     Ranking,
     confusion_set,
+    least_drop,
     make_claim,
     minor_claims,
     nearly,
     shortened,
     simplest,
+    unproved,
 )
 from identification.diagnosis.improvement import (
     Improvement,
@@ -479,7 +481,7 @@ class Session:
         """
         trial = nearly(ranking, base, frozenset(self._refused))
         if trial is None:
-            return ranking
+            return ranking if ranking.significant else self._shown_elsewhere(ranking, base, now)
         label = trial.candidate.label
         drop = held_drop(now.held_out, self.bench.added(trial, now).held_out, trial.balance)
         if drop < HELD_OUT_DROP:
@@ -506,6 +508,29 @@ class Session:
             for t in ranking.everything
         )
         return replace(ranking, everything=renewed, significant=ranking.significant | {label})
+
+    def _shown_elsewhere(self, ranking: Ranking, base: Base, now: Step) -> Ranking:
+        """The ranking with the names that the training records hardly need and that held-out ones
+        fall by, once they are fitted whole. Asked only where nothing else is left to claim and the
+        model stands over its floor.
+        """
+        if not self._over(now):
+            return ranking
+        proved: dict[str, float] = {}
+        for t in unproved(ranking, base, frozenset(self._refused)):
+            drop = held_drop(now.held_out, self.bench.added(t, now).held_out, t.balance)
+            if drop >= least_drop(t, base):
+                proved[t.candidate.label] = drop
+        return replace(
+            ranking,
+            everything=tuple(
+                replace(t, held_out_drop_percent=proved[t.candidate.label])
+                if t.candidate.label in proved
+                else t
+                for t in ranking.everything
+            ),
+            significant=ranking.significant | frozenset(proved),
+        )
 
     def _by_whole_fit(
         self,

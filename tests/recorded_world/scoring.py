@@ -115,7 +115,7 @@ def _taken_up(truth: Mapping[str, Any], result: Json) -> set[str]:
         skews = (c for c in result.get("calibration", []) if c["what"] == "skew")
         if any(abs(abs(float(c["value"])) - delay) < 0.5 * delay for c in skews):
             found.add("channel_delay")
-    hangs = float(truth["values"]["TG"]) > 0.0 and "gravity" not in truth["laws"]
+    hangs = float(truth["values"].get("TG", 0.0)) > 0.0 and "gravity" not in truth["laws"]
     if hangs and truth["places"].get("cyclic_torque") == "link":
         found.add("cyclic_torque")
     return found
