@@ -254,6 +254,7 @@ def _main(arguments: argparse.Namespace) -> int:
     study = load_study(arguments.study)
     _check_results(arguments, study)
     if arguments.dry_run:
+        _must_be_there(study.source, _inputs(study))
         sizes = [
             counted(len(study.models), "model"),
             counted(len(study.files), "record"),
@@ -305,6 +306,7 @@ def _fits(arguments: argparse.Namespace) -> int:
     study = load_fit_study(arguments.study)
     folder = arguments.out or default_folder(study.source)
     if arguments.dry_run:
+        _must_be_there(study.source, study.inputs)
         sys.stdout.write(f"study {study.name}: {study.task}, {counted(len(study.jobs), 'job')}\n")
         return 0
     keep_inputs([folder / n for n in (FIT_SUMMARY, PARAMETERS)], study.inputs)
@@ -338,14 +340,28 @@ def _fits(arguments: argparse.Namespace) -> int:
     return 1 if arguments.fail_on_error and found.failed else 0
 
 
-def _check_results(arguments: argparse.Namespace, study: Study) -> None:
-    """Refuse results that cannot be written or would replace a file that the study reads."""
-    inputs = [
+def _inputs(study: Study) -> list[Path]:
+    """Files that a study reads."""
+    return [
         study.source,
         *study.files,
         *(model.path for model in study.models),
         *([study.columns] if study.columns is not None else []),
     ]
+
+
+def _must_be_there(study: Path, inputs: Sequence[Path]) -> None:
+    """Refuse a study whose files are not where it says."""
+    missing = next((path for path in inputs if not path.is_file()), None)
+    if missing is not None:
+        raise InputError(
+            f"{study}: there is no file {missing}; paths are relative to the study file"
+        )
+
+
+def _check_results(arguments: argparse.Namespace, study: Study) -> None:
+    """Refuse results that cannot be written or would replace a file that the study reads."""
+    inputs = _inputs(study)
     folder = arguments.out or default_folder(study.source)
     results = [
         folder / name

@@ -8,6 +8,7 @@ import csv
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -521,6 +522,12 @@ def test_the_study_in_the_docs_is_one(tmp_path: Path, capsys: pytest.CaptureFixt
     found = re.findall(r"^```toml\n(.*?)^```", text, flags=re.MULTILINE | re.DOTALL)
     example = next(block for block in found if block.startswith("[study]"))
     (tmp_path / "study.toml").write_text(example)
+    assert main([str(tmp_path / "study.toml"), "--dry-run"]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "there is no file" in said
+    assert "axis3.toml" in said
+    shutil.copy(ROOT / "workbench" / "demo" / "joint.toml", tmp_path / "axis3.toml")
     assert main([str(tmp_path / "study.toml"), "--dry-run"]) == 0
     said = capsys.readouterr().out
     count = int(said.rsplit(",", 1)[1].split()[0])
