@@ -25,7 +25,7 @@ from ..signals import Expression, LocalSignals
             "smooth_stribeck_velocity",
             "rad/s",
             "velocity near which the extra friction peaks",
-            (0.01, 0.02, 0.04, 0.08, 0.15, 0.3, 0.6),
+            (0.01, 0.02, 0.04, 0.08, 0.15, 0.3),
             "velocity",
             start=0.02,
             low=1e-6,

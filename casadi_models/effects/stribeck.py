@@ -26,7 +26,7 @@ from ..signals import Expression, LocalSignals
             "stribeck_velocity",
             "rad/s",
             "velocity at which the extra friction has fallen to 1/e",
-            (0.01, 0.02, 0.04, 0.08, 0.15, 0.3, 0.6),
+            (0.01, 0.02, 0.04, 0.08, 0.15, 0.3),
             "velocity",
             start=0.02,
             low=1e-6,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Final
 from weakref import WeakKeyDictionary
@@ -46,10 +47,9 @@ BEND: Final = 0.02
 smaller than that of most motions then."""
 AROUND: Final = 0.1
 """Time over which it is averaged [s]: that of a fourth difference that reaches farthest."""
-NOISE_BEND: Final = 3.0
-"""Such a bend over the noise of the position up to which noise alone makes it: the mean size of the
-second difference of white noise, root of 12 over pi, and half of it for what a tenth of a second
-leaves of its scatter."""
+NOISE_BEND: Final = (1.95, 1.5)
+"""Mean size of the second difference of white noise, root of 12 over pi, in units of the noise; and
+two standard errors of a mean of such sizes, as a share of it, times the root of their number."""
 MOVING: Final = 0.05
 """Share of the usual speed from which a joint moves: at rest a reading may stand on one step."""
 
@@ -267,7 +267,8 @@ def calm_of(position: FloatArray, stretches: Sequence[slice], dt: float) -> npt.
     if not moving.any():
         return moving
     # a bend that the encoder's own noise makes is none, and would cut an even motion to pieces
-    even = NOISE_BEND * noise_level(position, tuple(stretches))
+    mean, spread = NOISE_BEND
+    even = mean * (1 + spread / math.sqrt(width)) * noise_level(position, tuple(stretches))
     return np.asarray(moving & (bend <= max(float(np.quantile(bend[moving], CALM)), even)))
 
 

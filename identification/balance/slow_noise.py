@@ -51,10 +51,11 @@ ALONE: Final = 13.7
 """The same at 1 %, where the balance of the motor tells alone: it has the fewest unknowns."""
 BEYOND_DOUBT: Final = 35.5
 """The same at 0.1 %, where no other balance could have told."""
-SHARE_AGREED: Final = 0.05
-SHARE_ALONE: Final = 0.01
-SHARE_DOUBT: Final = 0.001
-"""The chances of these three, where records are taken together and have more degrees."""
+DEVIATIONS_AGREED: Final = 1.960
+DEVIATIONS_ALONE: Final = 2.576
+DEVIATIONS_DOUBT: Final = 3.291
+"""The same chances as two-sided deviations of a normal variable, where records are taken together
+and have more degrees."""
 LOWEST_HUM: Final = 5.0
 """Frequency from which a line may be a hum [Hz]: what a joint is moved with is slower."""
 SAME: Final = 3.0
@@ -300,22 +301,32 @@ def drift_of_rest(
     out = {}
     for signal, own in found.items():
         agreed = signal == "drive" and witness is not None
-        asked = SHARE_AGREED if agreed else SHARE_ALONE if witness is not None else SHARE_DOUBT
+        asked = (
+            DEVIATIONS_AGREED
+            if agreed
+            else DEVIATIONS_ALONE
+            if witness is not None
+            else DEVIATIONS_DOUBT
+        )
         each = [own, witness] if agreed and witness is not None else [own]
         sure = [x for x in each if _surely(x, asked)]
         if len(sure) < len(each):
-            sure = [x for x in [witness] if agreed and x is not None and _surely(x, SHARE_ALONE)]
+            sure = [
+                x for x in [witness] if agreed and x is not None and _surely(x, DEVIATIONS_ALONE)
+            ]
         if sure:
             rate = min(x.rate for x in sure)
             out[signal] = Part(math.sqrt(rate * memory / 2.0), memory)
     return out
 
 
-def _surely(walk: _Walk, share: float) -> bool:
-    """Whether chance would make a spectrum fall so in less than that share."""
-    from scipy.special import fdtri
-
-    return walk.fall >= CERTAIN and walk.better >= float(fdtri(1, walk.degrees, 1.0 - share))
+def _surely(walk: _Walk, deviations: float) -> bool:
+    """Whether a spectrum falls so by less than that chance: the quantile of Student's t by the
+    first terms of its series in one over the degrees (Cornish, Fisher 1938).
+    """
+    z, n = deviations, walk.degrees
+    t = z + (z**3 + z) / (4 * n) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * n**2)
+    return walk.fall >= CERTAIN and walk.better >= t**2
 
 
 __all__ = ["SlowNoise", "drift_of_rest", "slow_noise_of"]
