@@ -13,6 +13,24 @@ if (
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+LONGEST = (
+    "test_docs.py",
+    "test_hidden_effect_campaign.py",
+    "test_chains.py",
+    "test_other_payload.py",
+    "test_native_twin.py",
+    "test_estimator_fmu.py",
+    "test_doors.py",
+)
+"""Files of over a minute and a half each: a worker that begins one when the others have done all
+the rest keeps the suite waiting."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest files first, all others as they were collected."""
+    items.sort(key=lambda item: item.path.name not in LONGEST)
+
+
 @pytest.fixture(autouse=True, scope="session")
 def _allowed_effects(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """What tests allow to run, and the traces of what fails, are kept in a folder of their own."""
