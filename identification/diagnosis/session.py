@@ -66,6 +66,7 @@ from identification.diagnosis.verdict import (
 from identification.errors import InputError
 from identification.fitting.assess import RATIO_LIMIT
 from identification.fitting.engine import Solution, load_dataset, prepared_model
+from identification.naming.odds import SCREEN
 
 MAX_ADDITIONS: Final = 6
 ATTEMPTS: Final = 2 * MAX_ADDITIONS
@@ -128,6 +129,8 @@ def with_held_out(
 
 RELATIVE_SHARE: Final = 0.3
 """Share of the best trial's log-likelihood from which a relative of its name is fitted too."""
+OTHER_SHARE: Final = 1 / SCREEN
+"""The same for a name that is not declared as confused with it."""
 MOST_RELATIVES: Final = 3
 """Relatives that are fitted at most: each costs a whole fit."""
 
@@ -555,7 +558,13 @@ class Session:
             and t.candidate.label not in refused
             # a trial's columns say little of a law that is read backwards
             and (t.key not in names or self.data.sensing.kinematic)
-            and t.score >= RELATIVE_SHARE * best.score
+            and t.score
+            >= best.score
+            * (
+                RELATIVE_SHARE
+                if t.key in best.effect.confused_with or best.key in t.effect.confused_with
+                else OTHER_SHARE
+            )
         ][:MOST_RELATIVES]
         if not relatives:
             return best, names
