@@ -44,18 +44,13 @@ LOG_BIAS: Final = 0.5772156649
 of logarithms hardly sees the lines that a periodic motion puts into few ordinates."""
 CERTAIN: Final = 16.0
 """Fall of chi-square from which power that falls with frequency is no chance: four deviations."""
-BETTER: Final = 6.0
-"""That fall over what is left per octave: 5 % of the F distribution of 1 and 6 degrees, so that a
-spectrum of any other shape is none of a walk."""
-ALONE: Final = 13.7
+AGREED: Final = 1.960
+"""Deviations that a fall must have over what is left per octave, so that a spectrum of any other
+shape is none of a walk, where two balances say so: 5 %, two-sided."""
+ALONE: Final = 2.576
 """The same at 1 %, where the balance of the motor tells alone: it has the fewest unknowns."""
-BEYOND_DOUBT: Final = 35.5
+BEYOND_DOUBT: Final = 3.291
 """The same at 0.1 %, where no other balance could have told."""
-DEVIATIONS_AGREED: Final = 1.960
-DEVIATIONS_ALONE: Final = 2.576
-DEVIATIONS_DOUBT: Final = 3.291
-"""The same chances as two-sided deviations of a normal variable, where records are taken together
-and have more degrees."""
 LOWEST_HUM: Final = 5.0
 """Frequency from which a line may be a hum [Hz]: what a joint is moved with is slower."""
 SAME: Final = 3.0
@@ -87,12 +82,14 @@ def slow_noise_of(record: WeakRecord) -> dict[str, SlowNoise]:
         rests = {key: _calm(rest) for key, rest in rests_of(record).items()}
         length = _longest(record)[1]
         lines = _lines(record, rests)
+        walks = _walks(record, rests)
         return {
             signal: SlowNoise(
-                (Part(math.sqrt(rate * length / 6.0), length / 3.0),) if rate > 0 else (),
+                (_drift(walks[signal], length / 3.0),) if signal in walks else (),
                 lines.get(signal, ()),
             )
-            for signal, rate in _walks(record, rests).items()
+            for signal in rests
+            if signal != "both"
         }, len(rests)
 
     found: dict[str, SlowNoise] = cache_of("slow noise").get(record, None, make, RECORDS)
@@ -128,14 +125,10 @@ def _calm(rest: FloatArray) -> FloatArray:
 
 
 def _walks(record: WeakRecord, rests: Mapping[str, FloatArray]) -> dict[str, float]:
-    """Variance by which each torque's reading walks in a second, zero where none is certain."""
+    """Variance by which each torque's reading certainly walks in a second, by signal."""
     rows, length = _longest(record)
     found = {key: _walk(rest[rows], length) for key, rest in rests.items()}
-    witness = found.pop("both", None)
-    walks = {signal: _agreed(own, witness) for signal, own in found.items()}
-    if witness is not None and not walks["drive"] and witness[1] >= ALONE:
-        walks["drive"] = witness[0]
-    return walks
+    return _agreed({key: walk for key, walk in found.items() if walk is not None})
 
 
 def _lines(
@@ -178,13 +171,25 @@ def _curves(record: WeakRecord, side: str, every: npt.NDArray[np.bool_]) -> list
     return [any_curve(record, f"{side}_{what}", every) for what in ("velocity", "position")]
 
 
-def _agreed(own: tuple[float, float], witness: tuple[float, float] | None) -> float:
-    """The lesser of two walks (variance in a second, fall of chi-square over what is left) of which
-    both are sure enough; zero where they are not.
+def _agreed(walks: Mapping[str, _Walk]) -> dict[str, float]:
+    """Variance by which each torque's reading walks in a second, by signal, where it is certain:
+    the lesser of its own and that of the drive beside the transmitted torque (`both`), where these
+    agree; what the latter alone is surer of is a walk of the drive.
     """
-    if witness is None:
-        return own[0] if own[1] >= BEYOND_DOUBT else 0.0
-    return min(own[0], witness[0]) if min(own[1], witness[1]) >= BETTER else 0.0
+    found: dict[str, float] = {}
+    witness = walks.get("both")
+    for signal, own in walks.items():
+        if signal == "both":
+            continue
+        if witness is None:
+            sure = own.is_sure(BEYOND_DOUBT)
+        else:
+            sure = own.is_sure(AGREED) and witness.is_sure(AGREED)
+        if sure:
+            found[signal] = min(own.rate, witness.rate) if witness is not None else own.rate
+        elif signal == "drive" and witness is not None and witness.is_sure(ALONE):
+            found[signal] = witness.rate
+    return found
 
 
 def _longest(record: WeakRecord) -> tuple[npt.NDArray[np.bool_], float]:
@@ -217,23 +222,17 @@ class _Walk:
     left: float
     degrees: int
 
-    @property
-    def better(self) -> float:
-        """The fall over what is left per degree."""
-        return self.fall / (self.left / self.degrees) if self.left > 0 else math.inf
+    def is_sure(self, deviations: float) -> bool:
+        """Whether chance makes a spectrum fall so less often than it brings a normal value so many
+        deviations off: Student's t by its series in one over the degrees (Cornish, Fisher 1938).
+        """
+        z, n = deviations, self.degrees
+        t = z + (z**3 + z) / (4 * n) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * n**2)
+        t += (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / (384 * n**3)
+        return self.fall >= CERTAIN and self.fall * n >= t**2 * self.left
 
 
-def _walk(course: FloatArray, length: float) -> tuple[float, float]:
-    """Variance by which a course (n,) of that length [s] walks in a second, and the fall of
-    chi-square over what is left per octave; zeros where the power does not certainly fall so.
-    """
-    found = _spectrum_of(course, length)
-    if found is None or found.fall < CERTAIN:
-        return 0.0, 0.0
-    return found.rate, found.better
-
-
-def _spectrum_of(course: FloatArray, length: float) -> _Walk | None:
+def _walk(course: FloatArray, length: float) -> _Walk | None:
     """The walk that meets the spectrum of a course (n,) of that length [s] best; None where there
     are too few octaves.
     """
@@ -286,9 +285,9 @@ def drift_of_rest(
             side = sides[-1] if key == "torque" else sides[0]
             beside = [np.ones(int(kept.sum())), *_curves(w, side, kept)]
             rest = rest_beside(course[kept], beside, ROUNDS) if kept.any() else course[kept]
-            walks.append(_spectrum_of(_calm(rest), length))
+            walks.append(_walk(_calm(rest), length))
         told = [x for x in walks if x is not None]
-        if not told or len(told) < len(walks):
+        if len(told) < len(walks):
             return {}
         found[key] = _Walk(
             float(np.mean([x.rate for x in told])),
@@ -296,37 +295,13 @@ def drift_of_rest(
             sum(x.left for x in told),
             sum(x.degrees for x in told),
         )
-    witness = found.pop("both", None)
     memory = max(_longest(w)[1] for w in records) / 3.0
-    out = {}
-    for signal, own in found.items():
-        agreed = signal == "drive" and witness is not None
-        asked = (
-            DEVIATIONS_AGREED
-            if agreed
-            else DEVIATIONS_ALONE
-            if witness is not None
-            else DEVIATIONS_DOUBT
-        )
-        each = [own, witness] if agreed and witness is not None else [own]
-        sure = [x for x in each if _surely(x, asked)]
-        if len(sure) < len(each):
-            sure = [
-                x for x in [witness] if agreed and x is not None and _surely(x, DEVIATIONS_ALONE)
-            ]
-        if sure:
-            rate = min(x.rate for x in sure)
-            out[signal] = Part(math.sqrt(rate * memory / 2.0), memory)
-    return out
+    return {c: _drift(rate, memory) for c, rate in _agreed(found).items()}
 
 
-def _surely(walk: _Walk, deviations: float) -> bool:
-    """Whether a spectrum falls so by less than that chance: the quantile of Student's t by the
-    first terms of its series in one over the degrees (Cornish, Fisher 1938).
-    """
-    z, n = deviations, walk.degrees
-    t = z + (z**3 + z) / (4 * n) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * n**2)
-    return walk.fall >= CERTAIN and walk.better >= t**2
+def _drift(rate: float, memory: float) -> Part:
+    """A walk that forgets itself, of that variance in a second."""
+    return Part(math.sqrt(rate * memory / 2.0), memory)
 
 
 __all__ = ["SlowNoise", "drift_of_rest", "slow_noise_of"]

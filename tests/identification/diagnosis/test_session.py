@@ -7,9 +7,11 @@ from functools import cache
 import numpy as np
 import numpy.typing as npt
 import pytest
+from scipy.integrate import cumulative_trapezoid
 
 from identification import Improvement, Record, improve
 from identification.data.joint_file import Joint
+from identification.diagnosis.claims import MAJOR_DROP
 from identification.diagnosis.improvement import held_drop
 from identification.diagnosis.session import (
     LEAST_ADDED_DROP,
@@ -49,6 +51,43 @@ def runs(law: Law) -> tuple[Record, Record]:
 def improved(law: Law, most: int = MAX_ADDITIONS) -> Improvement:
     train, held = runs(law)
     return improve(train, JOINT, [held], max_additions=most)
+
+
+def at_one_speed(rng: np.random.Generator, law: Law) -> Record:
+    """Back and forth at 0.8 rad/s for 20 s, torque by inverse dynamics, 1 N.m of noise."""
+    t = np.arange(20_000) * 1e-3
+    beat = 2 * np.pi * 0.25
+    v = 0.8 * np.tanh(8 * np.sin(beat * t))
+    a = np.gradient(v, t)
+    q = cumulative_trapezoid(v, t, initial=0.0)
+    torque = INERTIA * a + VISCOUS * v + COULOMB * np.tanh(v / 2e-3) + law(q, v)
+    return Record.from_channels(
+        t, {"motor_position": q, "motor_torque": torque + rng.standard_normal(len(t))}
+    ).renamed("one speed")
+
+
+def little_drag(q: FloatArray, v: FloatArray) -> FloatArray:
+    return 5 * v * np.abs(v)
+
+
+@pytest.mark.parametrize("law", [little_drag, nothing])
+def test_what_other_motion_falls_by_is_claimed_where_the_training_motion_hardly_shows_it(
+    law: Law,
+) -> None:
+    """Drag at one speed is nearly Coulomb friction: little of what is left, however certain; of the
+    held-out record it is most.
+    """
+    found = improve(at_one_speed(np.random.default_rng(3), law), JOINT, [runs(law)[1]])
+    first = found.ranking.everything[0]
+    assert first.cv_drop_percent < MAJOR_DROP, "the training blocks alone do not carry a claim"
+    if law is nothing:
+        assert found.claims == ()
+        assert found.verdict == "nothing_missing"
+        return
+    (claim,) = found.claims
+    assert "quadratic_drag" in claim.effects
+    errors = [s.held_out.relative_error_percent for s in found.steps]
+    assert errors[-1] < 0.5 * errors[0]
 
 
 def test_two_hidden_laws_are_both_named_and_the_error_falls_with_each() -> None:
