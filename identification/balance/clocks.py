@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -168,7 +169,7 @@ def cubic(f: float) -> tuple[float, float, float, float]:
 def in_time(
     make: Callable[[Mapping[str, float]], WeakRecord],
     places: Iterable[str],
-    noise: Callable[[WeakRecord, str, float], float],
+    noise: Callable[[WeakRecord, float, str, float], float],
     *,
     torque: bool,
     fast: Callable[[Mapping[str, float]], WeakRecord],
@@ -182,8 +183,8 @@ def in_time(
     places : iterable of str
         Whose channels may be shifted.
     noise : callable
-        Variance that the noise of a place's channel gives the rows of a record, its rate times a
-        lateness [s] added.
+        Variance that the noise of a place's channel, as a record tells it, gives the rows of a
+        kernel of some length [s], its rate times a lateness [s] added.
     torque : bool
         Whether the torque of the link is measured.
     fast : callable
@@ -210,9 +211,11 @@ def in_time(
         taken = (found[0] - found[1]) / late > ANSWERS
         # what is later than that is no filter of a drive
         if taken and place in LOW_PASSED and abs(shifts[place]) <= MOST_SKEW:
-            told = _filter(make, shifts, place, noise, torque=torque)
+            # noise is one whatever the kernel
+            louder = partial(noise, make(shifts))
+            told = _filter(make, shifts, place, louder, torque=torque)
             # slow rows are calm, fast ones show most of what neither makes good: both are asked
-            quick = _filter(fast, shifts, place, noise, torque=torque, share=False)
+            quick = _filter(fast, shifts, place, louder, torque=torque, share=False)
             filters[place] = told = replace(told, better=told.better + quick.better)
             shifts = {**shifts, place: as_told([told], told) / made.grid.dt}
             made = make(shifts)
@@ -234,7 +237,7 @@ def _filter(
     make: Callable[[Mapping[str, float]], WeakRecord],
     shifts: Mapping[str, float],
     place: str,
-    noise: Callable[[WeakRecord, str, float], float],
+    noise: Callable[[float, str, float], float],
     *,
     torque: bool,
     share: bool = True,
@@ -277,7 +280,7 @@ def _filter(
 
     def louder(shift: float) -> float:
         """Those of them by which noise is louder."""
-        return len(friction) * noise(waiting, place, (whole - shift) * dt) / scale**2
+        return len(friction) * noise(waiting.grid.length, place, (whole - shift) * dt) / scale**2
 
     better = unmet(whole) - louder(whole) - unmet(0.0) + louder(0.0)
     if share and whole > NEAR:

@@ -372,10 +372,9 @@ def weak_record(
         last[length] = dict(shifts), made
         return made
 
-    def spread(made: WeakRecord, place: str, lateness: float) -> float:
-        length = made.grid.length
+    def spread(heard: WeakRecord, length: float, place: str, lateness: float) -> float:
         plain, rate = (differentiated_kernel(length, record.dt, order) for order in (0, 1))
-        own = _with_slow(noise, slow_noise_of(made))[SIGNAL[place]]
+        own = _with_slow(noise, slow_noise_of(heard))[SIGNAL[place]]
         return own.after(plain + lateness * rate, record.dt) ** 2
 
     if known is not None:

@@ -134,7 +134,10 @@ def drawn_rows(problem: WeakForm) -> DrawnRows:
 
 
 def noise_products(
-    problem: WeakForm, met: frozenset[str] = frozenset(), own: DrawnRows | None = None
+    problem: WeakForm,
+    met: frozenset[str] = frozenset(),
+    own: DrawnRows | None = None,
+    believed: Mapping[str, float] | None = None,
 ) -> NoiseProducts:
     """What noise adds to the normal equations at the values of a problem.
 
@@ -150,13 +153,15 @@ def noise_products(
         times what it makes of the other.
     own : list, optional
         Of :func:`drawn_rows`, where they are known.
+    believed : mapping of str to float, optional
+        Of :func:`identification.balance.stacked.noise_believed`, where it is known.
     """
     balances, data, free = problem.balances, problem.data, problem.free
     model, count = balances.model, len(free)
     straight = ~problem.bent
     gram = {b: np.zeros((count, count)) for b in balances.balances}
     score = {b: np.zeros(count) for b in balances.balances}
-    believed = noise_believed(model, data, problem.values)
+    believed = believed or noise_believed(model, data, problem.values)
     first, own = 0, own or drawn_rows(problem)
     for record, pairs in zip(data.train, own, strict=True):
         rows = slice(first, first + record.rows)
@@ -300,13 +305,17 @@ class _Equations:
     problem: WeakForm
     turns: Turns
     noise: NoiseProducts
+    believed: Mapping[str, float]
+    """Share of the noise that is taken off: what the least squares leave tells it for every step."""
     instruments: Instruments | None = None
     drawn: DrawnRows | None = None
 
     @classmethod
     def at(cls, problem: WeakForm, turns: Turns) -> _Equations:
         drawn = drawn_rows(problem)
-        return cls(problem, turns, noise_products(problem, own=drawn), drawn=drawn)
+        believed = noise_believed(problem.balances.model, problem.data, problem.values)
+        noise = noise_products(problem, own=drawn, believed=believed)
+        return cls(problem, turns, noise, believed, drawn=drawn)
 
     def met(self, balances: frozenset[str]) -> _Equations:
         """With columns of the other sensors in these balances."""
@@ -314,7 +323,7 @@ class _Equations:
             return self
         return replace(
             self,
-            noise=noise_products(self.problem, balances, self.drawn),
+            noise=noise_products(self.problem, balances, self.drawn, self.believed),
             instruments=instruments_of(self.problem, balances),
         )
 
@@ -374,7 +383,7 @@ class _Equations:
             own, _ = here.columns
             step += here.step(here.rows + own @ step, room, moves & ~problem.clocks)
             problem = problem.moved(here.x + np.where(moves, step, 0.0))
-            noise = noise_products(problem, met)
+            noise = noise_products(problem, met, believed=here.believed)
             here = replace(here, problem=problem, noise=noise, drawn=None)
         return here
 
