@@ -104,7 +104,14 @@ def library() -> Iterator[None]:
         getattr(EFFECTS, name).update(entries)
 
 
-@pytest.mark.parametrize("page", PAGES)
+def shown(page: str) -> bool:
+    """Whether a page shows what is printed."""
+    return any(b.language == "text" and "not run" not in b.notes for b in blocks(ROOT / page))
+
+
+@pytest.mark.parametrize(
+    "page", [pytest.param(p, marks=[] if shown(p) else [pytest.mark.no_figures]) for p in PAGES]
+)
 def test_a_page_runs_as_it_stands(
     page: str,
     readers: dict[Callable[[Path], None], Path],

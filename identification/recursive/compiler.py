@@ -6,6 +6,7 @@ temporary file and renames it, so that processes that build the same source at o
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import functools
 import hashlib
@@ -17,6 +18,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import final
 
@@ -37,6 +39,8 @@ _FLAGS = (
     "-shared",
 )
 _TIMEOUT_SECONDS = 300.0
+MOST_KEPT = 64
+"""Files of :func:`kept`: some 20 MB where each is a library of an FMU."""
 
 
 @final
@@ -101,7 +105,7 @@ def build(source: str, name: str) -> ctypes.CDLL:
         raise NoCompilerError("no C compiler found (gcc, clang, cc or the Python package ziglang)")
     flags = [*_FLAGS, *(["-fPIC"] if sys.platform != "win32" else [])]
     identity = "\0".join(
-        [source, *_compiler_identity(compiler), *flags, sys.platform, platform.machine(), "1"]
+        [source, *compiler_identity(compiler), *flags, sys.platform, platform.machine(), "1"]
     )
     digest = hashlib.sha256(identity.encode()).hexdigest()[:32]
     file_name = f"{name}-{digest}{_suffix()}"
@@ -118,14 +122,48 @@ def build(source: str, name: str) -> ctypes.CDLL:
         raise NoCompilerError(f"the compiled library cannot be loaded: {error}") from error
 
 
+def kept(name: str, identity: Sequence[str | bytes], make: Callable[[], bytes]) -> bytes:
+    """What `make` returns, from the cache where it was made before of the same things.
+
+    A file that is damaged is made anew; where the cache cannot be written, nothing is kept. The
+    newest :data:`MOST_KEPT` of a name stay.
+
+    Parameters
+    ----------
+    name
+        Start of the file's name in the cache.
+    identity
+        Everything that the result follows from.
+    make
+        Makes it; what it raises is raised.
+    """
+    parts = [x if isinstance(x, bytes) else x.encode() for x in identity]
+    digest = hashlib.sha256(b"".join(len(x).to_bytes(8, "big") + x for x in parts)).hexdigest()
+    place = _usable_folder() / f"{name}-{digest[:32]}"
+    with contextlib.suppress(OSError):
+        found = place.read_bytes()
+        if hashlib.sha256(found[32:]).digest() == found[:32]:
+            return found[32:]
+    made = make()
+    with contextlib.suppress(OSError):
+        with tempfile.TemporaryDirectory(prefix="build-", dir=place.parent) as temporary:
+            written = Path(temporary) / place.name
+            written.write_bytes(hashlib.sha256(made).digest() + made)
+            os.replace(written, place)
+        old = sorted(place.parent.glob(f"{name}-*"), key=lambda x: x.stat().st_mtime)
+        for one in old[:-MOST_KEPT]:
+            one.unlink(missing_ok=True)
+    return made
+
+
 def _suffix() -> str:
     return {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
 
 
-def _compiler_identity(compiler: tuple[str, ...]) -> list[str]:
+def compiler_identity(compiler: tuple[str, ...]) -> list[str]:
     """Path, size and time of the compiler's file: another compiler builds anew."""
     try:
-        about = Path(compiler[0]).resolve().stat()
+        about = Path(shutil.which(compiler[0]) or compiler[0]).resolve().stat()
     except OSError:
         return list(compiler)
     return [*compiler, str(about.st_size), str(about.st_mtime_ns)]

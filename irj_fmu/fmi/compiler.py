@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import final
 
 from identification.errors import InputError
+from identification.recursive.compiler import compiler_identity, kept
 from irj_fmu.command_line import checkpoint
 
 
@@ -159,6 +160,8 @@ def compile_library(
 ) -> bytes:
     """Compile one C file (others included from it) to a shared library and return its bytes.
 
+    The same sources, compiler and flags are compiled once for each user.
+
     Parameters
     ----------
     sources : mapping
@@ -188,13 +191,31 @@ def compile_library(
     if place.suffix == ".dylib":
         flags += ["-s", "-g0", f"-Wl,-install_name,@rpath/model{place.suffix}"]
     links = [f"-l{name}" for name in libraries] if place.suffix == ".so" else []
+    headers = header_folder()
+    library = f"model{place.suffix}"
+    words = [*command, *flags, f"-I{headers}", "-I.", main, "-o", library, *links]
+
+    def made() -> bytes:
+        return _compiled(sources, words, library, target)
+
+    if "ziglang" in command:  # several programs, which no one file stands for
+        return made()
+    told = [part for name in sorted(sources) for part in (name, sources[name])]
+    read = [part for h in sorted(headers.glob("fmi*.h")) for part in (h.name, h.read_bytes())]
+    identity = [*compiler_identity(tuple(command)), *words[len(command) :], *read, *told]
+    return kept("fmu", identity, made)
+
+
+def _compiled(
+    sources: Mapping[str, bytes], words: Sequence[str], library: str, target: str
+) -> bytes:
+    """What the command makes of the sources, in a folder of its own."""
     with tempfile.TemporaryDirectory(prefix="irj-build-") as folder:
         for name, content in sources.items():
             (Path(folder) / name).write_bytes(content)
-        library = f"model{place.suffix}"
         try:
             done = subprocess.run(
-                [*command, *flags, f"-I{header_folder()}", "-I.", main, "-o", library, *links],
+                words,
                 cwd=folder,
                 capture_output=True,
                 text=True,
@@ -203,7 +224,7 @@ def compile_library(
             )
         except OSError as error:
             raise InputError(
-                f"compiler {command[0]!r} cannot be started ({error.strerror}); check `cc`"
+                f"compiler {words[0]!r} cannot be started ({error.strerror}); check `cc`"
             ) from error
         if done.returncode != 0:
             first = next(
@@ -212,7 +233,7 @@ def compile_library(
             )
             said = first or f"it said nothing and ended with {done.returncode}"
             raise InputError(
-                f"compiler {command[0]!r} failed for {target} ({said}); try it by itself, or give "
+                f"compiler {words[0]!r} failed for {target} ({said}); try it by itself, or give "
                 "another one with --cc"
             )
         return (Path(folder) / library).read_bytes()

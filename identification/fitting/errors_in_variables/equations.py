@@ -306,7 +306,7 @@ class _Equations:
     turns: Turns
     noise: NoiseProducts
     believed: Mapping[str, float]
-    """Share of the noise that is taken off: what the least squares leave tells it for every step."""
+    """Share of the noise that is taken off: what the least squares leave tells it for all steps."""
     instruments: Instruments | None = None
     drawn: DrawnRows | None = None
 

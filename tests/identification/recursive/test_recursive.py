@@ -16,7 +16,13 @@ import pytest
 
 from benchmarks import joint_regressor as joint
 from identification.errors import InputError
-from identification.recursive.compiler import CACHE_VARIABLE, COMPILER_VARIABLE, find_compiler
+from identification.recursive.compiler import (
+    CACHE_VARIABLE,
+    COMPILER_VARIABLE,
+    MOST_KEPT,
+    find_compiler,
+    kept,
+)
 from identification.recursive.engine import _library
 from identification.recursive.estimator import (
     METHODS,
@@ -730,3 +736,31 @@ def test_a_curve_of_which_a_motion_shows_a_few_values_at_a_time() -> None:
             assert estimator.live.all(), k
             assert np.all(np.abs(estimator.theta - truth) < 4 * estimator.deviation), k
     np.testing.assert_allclose(estimator.theta, truth, atol=0.1)
+
+
+def test_what_is_kept_is_made_once_and_what_is_damaged_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+    made: list[bytes] = []
+
+    def make() -> bytes:
+        made.append(b"library")
+        return made[-1]
+
+    assert [kept("a", ["x", "yz"], make) for _ in range(2)] == [b"library"] * 2
+    assert len(made) == 1
+    assert kept("a", ["xy", "z"], make) and len(made) == 2, "the same letters, other parts"
+    for damaged in (b"", b"\0" * 40, next((tmp_path / "cache").glob("a-*")).read_bytes()[:-1]):
+        for file in (tmp_path / "cache").glob("a-*"):
+            file.write_bytes(damaged)
+        before = len(made)
+        assert kept("a", ["x", "yz"], make) == b"library"
+        assert len(made) == before + 1
+    for k in range(MOST_KEPT + 5):
+        kept("b", [str(k)], make)
+    assert len(list((tmp_path / "cache").glob("b-*"))) == MOST_KEPT
+    assert len(list((tmp_path / "cache").glob("a-*"))) == 2
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "file"))
+    assert kept("a", ["x", "yz"], make) == b"library", "a cache that is no folder keeps nothing"

@@ -41,7 +41,9 @@ def a_learned_curve_is_drawn_where_it_is_pointed_at(page: Any) -> None:
     assert left < 0.5 * np.sum(size["before"] ** 2), "the curve runs through the residual"
 
 
-@pytest.mark.parametrize(("name", "most"), [("kuka_axis1", 12), ("hebi", 12)])
+@pytest.mark.parametrize(
+    ("name", "most"), [("kuka_axis1", 12), pytest.param("hebi", 12, marks=pytest.mark.slow)]
+)
 def test_the_page_says_what_the_terminal_says(tmp_path: Path, name: str, most: int) -> None:
     """Files whose guess of the columns must be corrected: the same verdict, set, numbers, sentences
     and joint file; the falling error stands there within the clicks of a new user.
