@@ -35,6 +35,7 @@ from identification.diagnosis.trials import Base, Trial, make_base, try_candidat
 from identification.fitting.assess import RATIO_LIMIT, VERDICT_KERNELS, BalanceError, Error, assess
 from identification.fitting.engine import Dataset, Solution, load_dataset, prepared_model, solve
 from identification.fitting.first_fit import first_fit
+from identification.fitting.left_open import LeftOpen
 from identification.naming.contest import FEWEST, Rival
 from identification.naming.odds import Odds, contenders, contest_of, odds_of, unmodelled
 
@@ -83,6 +84,11 @@ class Bench(Protocol):
     def drifts(self, step: Step) -> Mapping[str, Part]:
         """Drift of the torques' readings that the verdict counts in what a step leaves, by
         signal.
+        """
+
+    def left_open(self, step: Step) -> Mapping[str, tuple[str, ...]]:
+        """Parameters whose errors explain what a balance leaves on held-out records over the
+        noise, by balance.
         """
 
     def shown(self, step: Step) -> Step:
@@ -225,7 +231,8 @@ class JointBench:
         sensors that only a slow kernel sees must not stand in a table beside "nothing is missing".
         One with structure left reads at the kernel that shows it best.
         """
-        ratios = {b: e.ratio for b, e in self._judged(solution, held_out=held_out).items()}
+        verdict = self._judged(solution, held_out=held_out)
+        ratios = {b: e.ratio for b, e in verdict.items()}
         drifts = self._drifts[id(solution), held_out]
         if drifts:
             data = self.data.with_drift(drifts)
@@ -243,8 +250,16 @@ class JointBench:
         shown = {
             b: r if r <= RATIO_LIMIT else max(r, error.balances[b].ratio) for b, r in ratios.items()
         }
+        # the floor beside a ratio that counts what the fit leaves open counts it, too
+        floor = {
+            b: e.rms / max(shown[b], 1e-300) if verdict[b].left_open else e.floor
+            for b, e in error.balances.items()
+        }
         return replace(
-            error, balances={b: replace(e, ratio=shown[b]) for b, e in error.balances.items()}
+            error,
+            balances={
+                b: replace(e, ratio=shown[b], floor=floor[b]) for b, e in error.balances.items()
+            },
         )
 
     def _judged(self, solution: Solution, *, held_out: bool) -> dict[str, BalanceError]:
@@ -266,6 +281,15 @@ class JointBench:
                 out |= whole
                 believed |= frozenset(whole)
             self._drifts[mark] = drifts if believed else {}
+            over = {b for b, e in out.items() if e.ratio > RATIO_LIMIT}
+            if over and held_out:
+                left_open = LeftOpen.of(solution, self.data, values)
+                for length in sorted({VERDICT_KERNELS[b] for b in over}):
+                    told = self._errors_at(
+                        length, solution.model, values, held_out=True, left_open=left_open
+                    )
+                    # as a drift: what is not explained whole is left as it is
+                    out |= {b: e for b, e in told.items() if b in over and e.ratio <= RATIO_LIMIT}
             # the solution is kept with its ratios: an identity is not given to another while it
             # lives
             self._ratios[mark] = solution, {b: out[b] for b in self.data.sensing.balances}
@@ -286,16 +310,23 @@ class JointBench:
         *,
         held_out: bool,
         drifts: Mapping[str, Part] = MappingProxyType({}),
+        left_open: LeftOpen | None = None,
     ) -> dict[str, BalanceError]:
         """Errors of the balances whose verdict falls at this kernel."""
         data = self._at_kernel(length).with_drift(drifts)
-        error = assess(model, data, data.held_out if held_out else data.train, values)
+        records = data.held_out if held_out else data.train
+        error = assess(model, data, records, values, left_open)
         return {b: e for b, e in error.balances.items() if VERDICT_KERNELS[b] == length}
 
     def drifts(self, step: Step) -> Mapping[str, Part]:
         """Drift that a fitted model shows and that explains a ratio, by signal."""
         self._judged(step.solution, held_out=True)
         return self._drifts[id(step.solution), True]
+
+    def left_open(self, step: Step) -> Mapping[str, tuple[str, ...]]:
+        """Parameters whose errors explain what a balance leaves on held-out records."""
+        judged = self._judged(step.solution, held_out=True)
+        return {b: e.left_open for b, e in judged.items() if e.left_open}
 
     def lines(self, step: Step) -> list[Line]:
         """See :func:`identification.diagnosis.lines.find_lines`."""

@@ -58,6 +58,7 @@ from identification.diagnosis.rival_table import is_absorbed
 from identification.diagnosis.trials import Base, Trial
 from identification.diagnosis.verdict import (
     hardly_a_model,
+    open_notes,
     unseen,
     verdict_of,
     without_link,
@@ -417,6 +418,7 @@ class Session:
                 *hardly_a_model(steps[0]),
                 *excitation_warnings(self.data),
                 *drift_notes(self.data, self.bench.drifts(end)),
+                *open_notes(self.bench.left_open(end)),
                 *self._about_temperature(judged),
                 *([scale] if (scale := self._scale(solution)) else []),
                 *unseen(solution),

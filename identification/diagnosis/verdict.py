@@ -132,6 +132,15 @@ def hardly_a_model(start: Step) -> tuple[str, ...]:
     return tuple(out)
 
 
+def open_notes(left_open: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
+    """What held-out records leave over the noise because the fit leaves parameters open."""
+    return tuple(
+        f"in the {balance} balance the held-out records stand over the noise by no more than "
+        f"the training records leave open of {', '.join(names)}: train on motion like theirs, too"
+        for balance, names in left_open.items()
+    )
+
+
 def unseen(solution: Solution) -> tuple[str, ...]:
     """Parameters of the model that no channel of the records shows."""
     kept = [n for n in solution.unidentified if n not in solution.free]

@@ -24,6 +24,7 @@ from identification.fitting.engine import (
     stack,
     taking_part,
 )
+from identification.fitting.left_open import LeftOpen
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -69,6 +70,8 @@ class BalanceError:
     residual, weight : (rows,) array
         Residual of each row [unit] and 1 over the scatter that noise allows it: two models are
         compared on one common weighting.
+    left_open : tuple of str
+        Parameters whose errors the ratio stands beside: what they may be is counted as noise.
     """
 
     rms: float
@@ -77,6 +80,7 @@ class BalanceError:
     unit: str
     residual: FloatArray = field(default_factory=lambda: np.empty(0), repr=False, compare=False)
     weight: FloatArray = field(default_factory=lambda: np.empty(0), repr=False, compare=False)
+    left_open: tuple[str, ...] = field(default=(), repr=False, compare=False)
 
     def as_json(self) -> dict[str, Any]:
         """The shape of `improve --json`."""
@@ -128,9 +132,15 @@ def relative_error_percent(
 
 
 def assess(
-    model: JointModel, data: Dataset, records: Sequence[WeakRecord], values: Mapping[str, float]
+    model: JointModel,
+    data: Dataset,
+    records: Sequence[WeakRecord],
+    values: Mapping[str, float],
+    left_open: LeftOpen | None = None,
 ) -> Error:
-    """Error of a model with the given values on prepared records."""
+    """Error of a model with the given values on prepared records; the ratios beside what the fit
+    leaves open, where that is given.
+    """
     balances = balances_of(model, data.sensing, wrt=())
     values = settled(model, data.sensing, [*data.train, *records], values)
     whole = stack(balances, records, values).residual
@@ -143,20 +153,24 @@ def assess(
         balances, data, values, {b: np.maximum(floor[b], 1e-12) for b in floor}, records
     )
     weights = {b: w[rows[b]] for b, w in wide.items()}
-    ratios = {b: rms(residual[b] * weights[b]) for b in weights}
+    steps = left_open.steps(data, records, values, wide) if left_open is not None else {}
+    beside = {b: whole[b] + steps[b].moved if b in steps else whole[b] for b in whole}
+    prices = {b: steps[b].price / max(int(rows[b].sum()), 1) if b in steps else 0.0 for b in whole}
+    ratios = {b: math.hypot(rms(beside[b][rows[b]] * weights[b]), prices[b] ** 0.5) for b in whole}
     if memory := drift_memory(data):
         for b, ratio in ratios.items():
             share = rms(drift[b][rows[b]] * weights[b]) ** 2
             scatter = np.sqrt(np.maximum(wide[b] ** -2.0 - drift[b] ** 2, quick[b] ** 2))
             course = innovations(
-                np.where(rows[b], whole[b], 0.0),
+                np.where(rows[b], beside[b], 0.0),
                 np.where(rows[b], scatter, math.inf),
                 drift[b],
                 memory=memory,
                 records=records,
             )
             ratios[b] = max(
-                rms(course[rows[b]]), ratio / math.sqrt(1 + min(share, 1.0) * (WALK - 1))
+                math.hypot(rms(course[rows[b]]), prices[b] ** 0.5),
+                ratio / math.sqrt(1 + min(share, 1.0) * (WALK - 1)),
             )
     floor = {b: f[rows[b]] for b, f in floor.items()}
     errors = {
@@ -165,8 +179,9 @@ def assess(
             rms(floor[b] * weights[b]) / max(rms(weights[b]), 1e-300),
             ratios[b] if np.any(floor[b] > 0) else math.inf,
             residual_unit(b, model.kind),
-            residual[b],
-            weights[b],
+            residual=residual[b],
+            weight=weights[b],
+            left_open=steps[b].names if b in steps else (),
         )
         for b in balances.balances
     }

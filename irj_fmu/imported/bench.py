@@ -281,6 +281,10 @@ class FmuBench:
         """None: what an FMU leaves holds the errors of its solver."""
         return {}
 
+    def left_open(self, step: Step) -> Mapping[str, tuple[str, ...]]:
+        """None: what is left is judged on the outputs."""
+        return {}
+
     def shown(self, step: Step) -> Step:
         """The step: its one kernel is that of the verdict."""
         return step

@@ -88,6 +88,17 @@ def test_what_other_motion_falls_by_is_claimed_where_the_training_motion_hardly_
     assert "quadratic_drag" in claim.effects
     errors = [s.held_out.relative_error_percent for s in found.steps]
     assert errors[-1] < 0.5 * errors[0]
+    assert found.verdict == "complete", "one speed leaves open what drag there is and what friction"
+    (noted,) = [w for w in found.warnings if "leave open" in w]
+    assert "motor_quadratic_drag" in noted
+
+
+def test_what_a_fit_leaves_open_excuses_no_law_that_is_missing() -> None:
+    """A fit to one speed leaves viscous and Coulomb friction open, and nothing over the place."""
+    found = improve(at_one_speed(np.random.default_rng(3), nothing), JOINT, [runs(wave)[1]])
+    assert found.verdict == "unexplained"
+    assert found.final_ratios["axis"].ratio > 2
+    assert not [w for w in found.warnings if "leave open" in w]
 
 
 def test_two_hidden_laws_are_both_named_and_the_error_falls_with_each() -> None:

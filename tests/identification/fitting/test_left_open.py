@@ -1,0 +1,68 @@
+"""What a fit leaves open counts as noise on other records, by no more than that."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from identification import Joint
+from identification.balance.calibration import settled
+from identification.balance.dataset import load_dataset, prepared_model
+from identification.fitting.assess import assess
+from identification.fitting.engine import solve
+from identification.fitting.left_open import LeftOpen
+from tests.identification.diagnosis.test_session import at_one_speed
+from tests.smooth_laws import nothing, record
+
+JOINT = Joint(model_name="hd1", effects=("viscous", "coulomb", "quadratic_drag"))
+SEEDS = range(12)
+
+
+def ratios(seed: int) -> tuple[float, float]:
+    """Of the right model on a record of many speeds, fitted to one speed: without and with what
+    the fit leaves open.
+    """
+    rng = np.random.default_rng([11, seed])
+    train = at_one_speed(rng, nothing)
+    held = record(np.random.default_rng([12, seed]), 10.0, nothing).renamed("held")
+    model = prepared_model(JOINT, train)
+    data = load_dataset([train], [held], JOINT, model, kernel=0.2)
+    found = solve(model, data)
+    values = settled(model, data.sensing, [*data.train, *data.held_out], found.values)
+    left_open = LeftOpen.of(found, data, values)
+    plain, beside = (
+        assess(model, data, data.held_out, found.values, given).balances["axis"].ratio
+        for given in (None, left_open)
+    )
+    return plain, beside
+
+
+@pytest.fixture(scope="module")
+def drawn() -> np.ndarray:
+    return np.array([ratios(seed) for seed in SEEDS])
+
+
+def test_the_right_model_stands_at_its_noise(drawn: np.ndarray) -> None:
+    plain, beside = drawn.T
+    assert plain.max() > 3, "by what is left open it stands far over it"
+    assert np.all(np.abs(np.log(beside)) < np.log(1.5))
+    assert np.sqrt(np.mean(beside**2)) == pytest.approx(1.0, abs=0.15)
+
+
+def test_a_step_costs_what_the_training_rows_lose_by_it() -> None:
+    """The triangle is that of the training rows: a step of one parameter by its standard error
+    beside all others costs one variance.
+    """
+    rng = np.random.default_rng(5)
+    train = record(rng, 10.0, nothing).renamed("train")
+    model = prepared_model(JOINT, train)
+    data = load_dataset([train], [], JOINT, model, kernel=0.2)
+    found = solve(model, data)
+    values = settled(model, data.sensing, data.train, found.values)
+    left_open = LeftOpen.of(found, data, values)
+    inverse = np.linalg.inv(left_open.triangle)
+    errors = np.linalg.norm(inverse, axis=1)
+    stated = np.array([found.stderr[n] or np.nan for n in left_open.names])
+    # rows overlap: windows of time tell the errors, and rows that are taken as independent less
+    assert np.all((stated / errors)[np.isfinite(stated)] > 0.7)
+    assert np.all((stated / errors)[np.isfinite(stated)] < 5)
