@@ -109,9 +109,14 @@ def shown(page: str) -> bool:
     return any(b.language == "text" and "not run" not in b.notes for b in blocks(ROOT / page))
 
 
-@pytest.mark.parametrize(
-    "page", [pytest.param(p, marks=[] if shown(p) else [pytest.mark.no_figures]) for p in PAGES]
-)
+def marks_of(page: str) -> list[pytest.MarkDecorator]:
+    """What is left out where; the commands of docs/user-fmu.md stand in test_user_fmu.py, too."""
+    if shown(page):
+        return []
+    return [pytest.mark.no_figures, *([pytest.mark.slow] if page == "docs/user-fmu.md" else [])]
+
+
+@pytest.mark.parametrize("page", [pytest.param(p, marks=marks_of(p)) for p in PAGES])
 def test_a_page_runs_as_it_stands(
     page: str,
     readers: dict[Callable[[Path], None], Path],

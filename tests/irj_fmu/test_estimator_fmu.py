@@ -144,7 +144,7 @@ def twin(
     return made
 
 
-@pytest.mark.parametrize("name", ["elastic", "rigid"])
+@pytest.mark.parametrize("name", [pytest.param("elastic", marks=pytest.mark.slow), "rigid"])
 def test_equals_the_python_estimator(
     name: str, files: dict[str, Path], readings: dict[str, FloatArray]
 ) -> None:

@@ -446,6 +446,7 @@ def as_in_c(path: Path, steps: int) -> FloatArray:
     return np.array(out)
 
 
+@pytest.mark.slow
 def test_fifty_cycles_in_c(c_host: Path, rigid: Path, tmp_path: Path) -> None:
     """Instantiate, run, free, 50 times, exit 0; the last run as under fmpy. The host has no
     locale and no LD_PRELOAD.

@@ -523,7 +523,7 @@ def test_equals_python_through_common_failures(
         (STEP, (2e-3,)),
         (STEP, (4e-3,)),
         (STEP, (8e-3,)),
-        (16e-3, (16e-3,)),
+        pytest.param(16e-3, (16e-3,), marks=pytest.mark.slow),
         (STEP, (3e-4, 1.7e-3, 1.1e-3, 6e-4)),
         (4e-3, (3e-3, 5e-3, 4.4e-3)),
     ],

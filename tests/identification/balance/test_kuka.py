@@ -48,7 +48,7 @@ def improved(axis: int) -> Improvement:
     return improve([run("A", axis), run("B", axis)], joint, [run("C", axis)])
 
 
-@pytest.mark.parametrize("axis", [1, 2, 3])
+@pytest.mark.parametrize("axis", [1, pytest.param(2, marks=pytest.mark.slow), 3])
 def test_zeros_and_skews_are_those_of_the_owners(axis: int) -> None:
     found = improved(axis).calibration
     for skew in (c for c in found if c.what == "skew"):

@@ -97,7 +97,12 @@ def test_refinement_says_that_it_cannot_simulate_an_unseen_link() -> None:
 
 
 @pytest.mark.parametrize(
-    ("effect", "seed"), [("stribeck", 1000), (None, 1003), ("quadratic_drag", 1000)]
+    ("effect", "seed"),
+    [
+        ("stribeck", 1000),
+        (None, 1003),
+        pytest.param("quadratic_drag", 1000, marks=pytest.mark.slow),
+    ],
 )
 def test_friction_is_named_from_the_motor_side_alone(
     effect: str | None, seed: int, tmp_path: Path

@@ -35,10 +35,10 @@ def judged(
         ("cubic_stiffness", {"dirt": True}),
         ("load_dependent_friction", {}),
         ("hysteresis", {}),
-        ("torque_sensor_offset", {}),
-        ("added_spring", {"size": 0.2}),
-        ("torque_ripple", {}),
-        ("asymmetric_viscous", {"dirt": True}),
+        pytest.param("torque_sensor_offset", {}, marks=pytest.mark.slow),
+        pytest.param("added_spring", {"size": 0.2}, marks=pytest.mark.slow),
+        pytest.param("torque_ripple", {}, marks=pytest.mark.slow),
+        pytest.param("asymmetric_viscous", {"dirt": True}, marks=pytest.mark.slow),
     ],
 )
 def test_hidden_effect_is_in_the_set_and_nothing_else_is_claimed(
@@ -56,8 +56,8 @@ def test_hidden_effect_is_in_the_set_and_nothing_else_is_claimed(
         ("cyclic_torque", 7001),
         ("stribeck", 7000),
         ("kinematic_error", 7001),
-        ("asymmetric_coulomb", 7000),
-        ("current_offset", 7003),
+        pytest.param("asymmetric_coulomb", 7000, marks=pytest.mark.slow),
+        pytest.param("current_offset", 7003, marks=pytest.mark.slow),
     ],
 )
 def test_one_record_with_few_reversals_names_the_effect(

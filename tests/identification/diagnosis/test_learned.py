@@ -123,7 +123,10 @@ def test_the_loop_leaves_a_true_name_plain(key: str) -> None:
     "law",
     [
         lambda q, v: 8 * v / (np.abs(v) + 0.15),  # quadratic and Stribeck together imitate it
-        lambda q, v: 25 * np.logaddexp(0.0, (np.abs(v) - 1.2) / 0.1) * 0.1 * np.sign(v),
+        pytest.param(
+            lambda q, v: 25 * np.logaddexp(0.0, (np.abs(v) - 1.2) / 0.1) * 0.1 * np.sign(v),
+            marks=pytest.mark.slow,
+        ),
     ],
     ids=["rational", "knee"],
 )

@@ -96,6 +96,7 @@ def test_the_proposed_run_tells_the_names_apart_as_expected() -> None:
     assert 0.5 < proposed[1].found / proposed[1].expected < 2.0
 
 
+@pytest.mark.slow
 def test_no_motion_tells_an_offset_from_direction_dependent_friction(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

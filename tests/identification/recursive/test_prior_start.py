@@ -152,6 +152,7 @@ def test_a_control_value_that_rows_hardly_touch_is_not_told() -> None:
     assert ranges[:3] == pytest.approx([4.0] * 3, rel=1e-2)
 
 
+@pytest.mark.slow
 def test_a_learned_curve_is_found() -> None:
     """What the motion does not reach is said to be unsure."""
     rows: list[EffectRow] = list(run("learned_position_friction@link", (None,), ("python",)))

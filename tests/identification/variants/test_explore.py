@@ -91,6 +91,7 @@ def test_every_model_by_name_is_a_variant_or_said_to_be_none(demo: Path) -> None
     assert rigid["held_out"]["of_start_percent"] > 300  # the demo's gear twists
 
 
+@pytest.mark.slow
 def test_both_of_two_hidden_effects_are_recommended(tmp_path: Path) -> None:
     found = explored(("cubic_stiffness", "cyclic_friction"), 8101, tmp_path / "pair")
     assert {"cubic_stiffness", "cyclic_friction"} <= set(found.recommended.effects)

@@ -94,6 +94,7 @@ def test_a_loop_of_the_gear_is_told_where_a_fit_without_it_left_the_fmu(path: Pa
     assert max(ratios[b].ratio for b in ("motor", "link")) < 1.2
 
 
+@pytest.mark.slow
 def test_a_kinematic_error_is_told_where_a_fit_without_it_left_the_fmu(path: Path) -> None:
     """Spring and damper of the FMU pull at the torsion that the error leaves, not at the measured
     one: with the damping of the latter the steps ended at twice the true one, and the link stood

@@ -227,6 +227,7 @@ def test_the_loop_on_stribeck(served: Served, browser: Browser, tmp_path: Path) 
     assert browser.error() == pytest.approx(after, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_the_loop_on_emps(served: Served, browser: Browser, tmp_path: Path) -> None:
     """A file without recognised headers: the guess is shown, corrected and confirmed, and the
     loop follows.
@@ -451,6 +452,7 @@ def demo_with_the_effect(served: Served, browser: Browser) -> None:
     browser.idle("ledger")
 
 
+@pytest.mark.slow
 def test_pattern_replay_and_plan_by_clicks(
     served: Served, browser: Browser, tmp_path: Path
 ) -> None:

@@ -37,5 +37,6 @@ WORST = (
 )
 
 
+@pytest.mark.slow
 def test_no_move_loses_a_fit(tmp_path: Path) -> None:
     assert moves.made(tmp_path, list(WORST), print) >= 5
