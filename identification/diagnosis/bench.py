@@ -281,9 +281,9 @@ class JointBench:
                 out |= whole
                 believed |= frozenset(whole)
             self._drifts[mark] = drifts if believed else {}
-            over = {b for b, e in out.items() if e.ratio > RATIO_LIMIT}
+            over = frozenset(b for b, e in out.items() if e.ratio > RATIO_LIMIT)
             if over and held_out:
-                left_open = LeftOpen.of(solution, self.data, values)
+                left_open = LeftOpen.of(solution, self.data, values, over)
                 for length in sorted({VERDICT_KERNELS[b] for b in over}):
                     told = self._errors_at(
                         length, solution.model, values, held_out=True, left_open=left_open

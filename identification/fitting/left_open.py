@@ -21,7 +21,7 @@ import numpy.typing as npt
 from identification.balance.balances import Balances, balances_of
 from identification.balance.calibration import bare, names_of_runs
 from identification.balance.dataset import Dataset
-from identification.balance.stacked import Stacked, floor_rows, row_weights, stack
+from identification.balance.stacked import floor_rows, row_weights, stack
 from identification.balance.weak import WeakRecord
 from identification.fitting.engine import Solution
 from identification.fitting.least_squares import least_squares, triangle_of
@@ -64,6 +64,8 @@ class LeftOpen:
     Attributes
     ----------
     solution : Solution
+    asked : frozenset of str
+        Balances that are asked for a step.
     names : tuple of str
         Its free parameters that other records share.
     triangle : (p, p) array
@@ -74,13 +76,20 @@ class LeftOpen:
     """
 
     solution: Solution
+    asked: frozenset[str]
     names: tuple[str, ...]
     triangle: FloatArray
     limits: tuple[FloatArray, FloatArray]
     logarithmic: npt.NDArray[np.bool_]
 
     @classmethod
-    def of(cls, solution: Solution, data: Dataset, values: Mapping[str, float]) -> LeftOpen:
+    def of(
+        cls,
+        solution: Solution,
+        data: Dataset,
+        values: Mapping[str, float],
+        asked: frozenset[str],
+    ) -> LeftOpen:
         """Of a fit, `values` those of it and of the runs."""
         model, sensing = solution.model, data.sensing
         runs = names_of_runs(model, data.train)
@@ -102,7 +111,8 @@ class LeftOpen:
         triangle = triangle_of(rows)[len(runs) :, len(runs) :]
         limits = bounds_of(model, data.joint.known, data)
         low, high = (np.array([limits[n][i] for n in names]) for i in (0, 1))
-        return cls(solution, names, triangle, (low, high), problem.logarithmic[len(runs) :])
+        logarithmic = problem.logarithmic[len(runs) :]
+        return cls(solution, asked, names, triangle, (low, high), logarithmic)
 
     def steps(
         self,
@@ -111,7 +121,7 @@ class LeftOpen:
         values: Mapping[str, float],
         weights: Mapping[str, FloatArray],
     ) -> dict[str, Step]:
-        """What each balance of other records asks for.
+        """What each balance that is asked wants on other records.
 
         Parameters
         ----------
@@ -123,7 +133,7 @@ class LeftOpen:
         """
         balances = balances_of(self.solution.model, data.sensing, wrt=self.names)
         out = {}
-        for b, weight in weights.items():
+        for b, weight in ((b, w) for b, w in weights.items() if b in self.asked):
             problem = _Beside(self, balances, records, values, b, weight)
             found = least_squares(
                 problem,
@@ -163,13 +173,16 @@ class _Beside:
         """Values of the fit, (p,)."""
         return np.array([self.values[n] for n in self.known.names])
 
-    def _at(self, x: FloatArray) -> Stacked:
-        moved = dict(zip(self.known.names, x.tolist(), strict=True))
-        return stack(self.balances, self.records, {**self.values, **moved}, self.known.names)
+    def _at(self, x: FloatArray) -> Mapping[str, float]:
+        return {**self.values, **dict(zip(self.known.names, x.tolist(), strict=True))}
+
+    @cached_property
+    def _bare(self) -> Balances:
+        return balances_of(self.balances.model, self.balances.sensing, wrt=())
 
     def left(self, x: FloatArray) -> FloatArray:
         """Residual of the balance, (rows,)."""
-        return np.asarray(self._at(x).residual[self.balance])
+        return np.asarray(stack(self._bare, self.records, self._at(x)).residual[self.balance])
 
     def residual(self, x: FloatArray) -> FloatArray:
         """Weighted rows, and those of the training records, (rows + p,)."""
@@ -178,7 +191,8 @@ class _Beside:
 
     def jacobian(self, x: FloatArray) -> FloatArray:
         """Their derivative, (rows + p, p)."""
-        columns = self._at(x).jacobian[self.balance] * self.weight[:, None]
+        found = stack(self.balances, self.records, self._at(x), self.known.names)
+        columns = found.jacobian[self.balance] * self.weight[:, None]
         return np.concatenate([columns, self.known.triangle])
 
 

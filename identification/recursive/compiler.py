@@ -139,7 +139,10 @@ def kept(name: str, identity: Sequence[str | bytes], make: Callable[[], bytes]) 
     """
     parts = [x if isinstance(x, bytes) else x.encode() for x in identity]
     digest = hashlib.sha256(b"".join(len(x).to_bytes(8, "big") + x for x in parts)).hexdigest()
-    place = _usable_folder() / f"{name}-{digest[:32]}"
+    folder = _shared_folder()
+    if folder is None:
+        return make()
+    place = folder / f"{name}-{digest[:32]}"
     with contextlib.suppress(OSError):
         found = place.read_bytes()
         if hashlib.sha256(found[32:]).digest() == found[:32]:
@@ -170,18 +173,21 @@ def compiler_identity(compiler: tuple[str, ...]) -> list[str]:
 
 
 def _usable_folder() -> Path:
-    """The cache folder, or a private one of this process where the cache cannot be trusted or
-    written.
-    """
+    """The cache folder, or a private one of this process where that is none to use."""
+    return _shared_folder() or _private_folder()
+
+
+def _shared_folder() -> Path | None:
+    """The cache folder; None where it cannot be trusted or written."""
     folder = cache_folder()
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         about = folder.stat()
     except OSError:
-        return _private_folder()
+        return None
     if hasattr(os, "getuid") and (about.st_uid != os.getuid() or about.st_mode & 0o022):
-        return _private_folder()  # another user could plant a library there
-    return folder if os.access(folder, os.W_OK | os.X_OK) else _private_folder()
+        return None  # another user could plant a library there
+    return folder if os.access(folder, os.W_OK | os.X_OK) else None
 
 
 @functools.lru_cache(maxsize=1)

@@ -29,7 +29,7 @@ def ratios(seed: int) -> tuple[float, float]:
     data = load_dataset([train], [held], JOINT, model, kernel=0.2)
     found = solve(model, data)
     values = settled(model, data.sensing, [*data.train, *data.held_out], found.values)
-    left_open = LeftOpen.of(found, data, values)
+    left_open = LeftOpen.of(found, data, values, frozenset({"axis"}))
     plain, beside = (
         assess(model, data, data.held_out, found.values, given).balances["axis"].ratio
         for given in (None, left_open)
@@ -59,7 +59,7 @@ def test_a_step_costs_what_the_training_rows_lose_by_it() -> None:
     data = load_dataset([train], [], JOINT, model, kernel=0.2)
     found = solve(model, data)
     values = settled(model, data.sensing, data.train, found.values)
-    left_open = LeftOpen.of(found, data, values)
+    left_open = LeftOpen.of(found, data, values, frozenset({"axis"}))
     inverse = np.linalg.inv(left_open.triangle)
     errors = np.linalg.norm(inverse, axis=1)
     stated = np.array([found.stderr[n] or np.nan for n in left_open.names])
