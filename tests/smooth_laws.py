@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.integrate import cumulative_trapezoid
 
 from identification.balance.dataset import Dataset
 from identification.data.joint_file import Joint
@@ -63,6 +64,19 @@ def record(rng: np.random.Generator, seconds: float, law: Law) -> Record:
     return Record.from_channels(
         t, {"motor_position": np.round(q / 5e-6) * 5e-6, "motor_torque": torque}
     )
+
+
+def at_one_speed(rng: np.random.Generator, law: Law) -> Record:
+    """Back and forth at 0.8 rad/s for 20 s, torque by inverse dynamics, 1 N.m of noise."""
+    t = np.arange(20_000) * 1e-3
+    beat = 2 * np.pi * 0.25
+    v = 0.8 * np.tanh(8 * np.sin(beat * t))
+    a = np.gradient(v, t)
+    q = cumulative_trapezoid(v, t, initial=0.0)
+    torque = INERTIA * a + VISCOUS * v + COULOMB * np.tanh(v / 2e-3) + law(q, v)
+    return Record.from_channels(
+        t, {"motor_position": q, "motor_torque": torque + rng.standard_normal(len(t))}
+    ).renamed("one speed")
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from casadi_models import EFFECTS, Effect, JointModel
 from casadi_models.table import Table
 from identification.balance.dataset import Dataset
-from identification.balance.stacked import sticking_torque
+from identification.balance.stacked import references, sticking_torque
 from identification.diagnosis.candidates import Candidate
 from identification.diagnosis.claims import Claim
 from identification.diagnosis.curve import (
@@ -54,6 +54,10 @@ HALF: Final = 0.5
 OUTSIDE: Final = 3.0
 """Standard errors by which a parameter must want to pass its bound: of ten that may stand at one,
 one in 75 joints would by chance."""
+BY_CHANCE: Final = 0.05
+"""Share of joints on which an amplitude that was there before the additions may come to its bound
+by noise alone: with an error e and a true value anywhere from 0 to a, e / (a sqrt(2 pi)) of them.
+"""
 
 
 # --- a curve as a claim ---------------------------------------------------------------------------
@@ -421,23 +425,88 @@ def artefacts(
     -------
     tuple of Doubt
         An amplitude that its bound holds back by more than `OUTSIDE` errors, or that was there by
-        as much before the additions and has gone to its bound with them; dry friction that lies
+        as much before the additions and has gone to its bound with them, which chance does to
+        `BY_CHANCE` of those so large; dry friction that lies
         outside the band of a curve over velocity at zero speed. A bare sign does not tell: the fit
         without the true law gives a positive Coulomb torque where there is none.
     """
-    gone = _gone(solution, start)
+    stands = at_bounds(solution, data)
+    gone = _gone(solution, stands, start)
     named = {d.sentence.partition(" ")[0] for d in gone}
-    held = [d for d in _held_back(solution, data) if d.sentence.partition(" ")[0] not in named]
+    held = [d for d in _held_back(solution, stands) if d.sentence.partition(" ")[0] not in named]
     return (*gone, *held, *_no_dry_friction(solution, curves))
 
 
-def _gone(solution: Solution, start: Solution | None) -> list[Doubt]:
+@final
+@dataclass(frozen=True)
+class AtBound:
+    """What the training rows say of an amplitude that stands at its bound.
+
+    Attributes
+    ----------
+    wanted : float
+        By how much it would move into its range if it had no bound; negative: out of it.
+    error : float
+    room : float
+        Amplitude at which its law has all the torque that was measured: farther out a step means
+        nothing, and a linear model of the rows holds nothing.
+    """
+
+    wanted: float
+    error: float
+    room: float
+
+    @property
+    def beyond(self) -> float:
+        """Standard errors by which the rows would gain outside the bound, no farther than
+        `room`.
+        """
+        out = min(max(-self.wanted, 0.0), self.room)
+        return float(np.sqrt(max(out * (-2.0 * self.wanted - out), 0.0)) / self.error)
+
+    def suspicious(self, before: float) -> bool:
+        """Whether an amplitude that lies anywhere up to `before` inside its range would hardly
+        come to stand at its bound by chance.
+        """
+        lost = before * (before - 2.0 * max(self.wanted, -self.room))
+        return lost > (self.error / (np.sqrt(2.0 * np.pi) * BY_CHANCE)) ** 2
+
+
+def at_bounds(solution: Solution, data: Dataset) -> dict[str, AtBound]:
+    from scipy.sparse import hstack
+
+    base = make_base(solution, data)
+    count = base.inward.shape[1]
+    if not count:
+        return {}
+    both = np.column_stack([base.jacobian, base.inward])
+    windows = windows_over([w.time for w in data.train])
+    errors = window_errors(both, base.residual, hstack([windows] * len(base.balances), "csr"))
+    if errors is None:
+        return {}
+    step = np.linalg.lstsq(both, -base.residual, rcond=None)[0]
+    loads = references(data, data.train)
+    load = np.concatenate([loads[b] for b in base.balances]) * base.weight
+    rooms = [float(np.linalg.norm(load[column != 0.0])) for column in base.inward.T]
+    return {
+        n: AtBound(float(d) / size, float(e) / size, room / size)
+        for n, d, e, room, size in zip(
+            base.inward_names, step[-count:], errors[-count:], rooms, base.inward_norms, strict=True
+        )
+    }
+
+
+def _gone(solution: Solution, stands: Mapping[str, AtBound], start: Solution | None) -> list[Doubt]:
     out = []
     for name in solution.at_bound if start is not None else ():
         if start is None or _is_shape(solution, name) or name not in solution.free:
             continue
         before, error = start.values.get(name), start.stderr.get(name)
         if before is None or error is None or abs(before) <= OUTSIDE * error:
+            continue
+        # the value before held a part of what was missing: the true one may be any smaller one
+        here = stands.get(name)
+        if here is not None and not here.suspicious(abs(before - solution.values[name])):
             continue
         out.append(
             Doubt(
@@ -449,30 +518,16 @@ def _gone(solution: Solution, start: Solution | None) -> list[Doubt]:
     return out
 
 
-def _held_back(solution: Solution, data: Dataset) -> list[Doubt]:
-    from scipy.sparse import hstack
-
-    base = make_base(solution, data)
-    count = base.inward.shape[1]
-    if not count:
-        return []
-    both = np.column_stack([base.jacobian, base.inward])
-    windows = windows_over([w.time for w in data.train])
-    errors = window_errors(both, base.residual, hstack([windows] * len(base.balances), "csr"))
-    if errors is None:
-        return []
-    step = np.linalg.lstsq(both, -base.residual, rcond=None)[0]
-    out = []
-    for name, d, e in zip(base.inward_names, step[-count:], errors[-count:], strict=True):
-        if d < -OUTSIDE * e:
-            out.append(
-                Doubt(
-                    _place(solution, name),
-                    f"{name} stands at its bound ({solution.values[name]:.3g}) and would pass it "
-                    f"by {-d / e:.2g} standard errors: another law does its work",
-                )
-            )
-    return out
+def _held_back(solution: Solution, stands: Mapping[str, AtBound]) -> list[Doubt]:
+    return [
+        Doubt(
+            _place(solution, name),
+            f"{name} stands at its bound ({solution.values[name]:.3g}) and would pass it "
+            f"by {here.beyond:.2g} standard errors: another law does its work",
+        )
+        for name, here in stands.items()
+        if here.beyond > OUTSIDE
+    ]
 
 
 def _is_shape(solution: Solution, name: str) -> bool:

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Final, final
 
@@ -87,6 +87,8 @@ class Base:
         What these columns were divided by.
     inward_names : tuple of str
         Parameters of the columns of `inward`.
+    inward_norms : (m,) array
+        What these columns were divided by.
     """
 
     solution: Solution
@@ -108,6 +110,7 @@ class Base:
     names: tuple[str, ...]
     norms: FloatArray
     inward_names: tuple[str, ...] = ()
+    inward_norms: FloatArray = field(default_factory=lambda: np.empty(0))
 
     @property
     def parts(self) -> tuple[int, int]:
@@ -284,6 +287,7 @@ def make_base(solution: Solution, data: Dataset) -> Base:
         names=tuple(n for n, a in zip(free, alive, strict=False) if a),
         norms=norms[alive],
         inward_names=tuple(n for n, b in zip(names, back, strict=True) if b),
+        inward_norms=norms[back],
     )
 
 

@@ -9,7 +9,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from smooth_laws import LAWS, FloatArray, Law, Run, nothing, record, run
+from smooth_laws import (
+    COULOMB,
+    LAWS,
+    FloatArray,
+    Law,
+    Run,
+    at_one_speed,
+    nothing,
+    record,
+    run,
+)
 
 from identification.data.joint_file import Joint, load_joint
 from identification.diagnosis.candidates import Candidate
@@ -17,6 +27,8 @@ from identification.diagnosis.claims import Claim
 from identification.diagnosis.curve import curves_on, steadily_moving
 from identification.diagnosis.improve import RATIO_LIMIT, Improvement, improve
 from identification.diagnosis.learned import (
+    BY_CHANCE,
+    AtBound,
     Equivalence,
     artefacts,
     equivalence,
@@ -25,6 +37,7 @@ from identification.diagnosis.learned import (
 )
 from identification.diagnosis.trials import make_base
 from identification.fitting.assess import assess
+from identification.fitting.engine import load_dataset, prepared_model, solve
 from workbench.cli.main import main
 
 NAMES: dict[str, Law] = {
@@ -79,6 +92,50 @@ def test_an_amplitude_held_at_its_bound_is_told() -> None:
     found = run(35, LAWS["tanh"][1], ("viscous", "coulomb", "stribeck@motor"))
     reasons = artefacts(found.solution, found.data)
     assert any("stands at its bound" in r.sentence for r in reasons)
+
+
+def test_a_bound_that_is_hardly_come_to_by_chance_is_suspicious() -> None:
+    """True values anywhere from 0 to 1, told with an error of .1 and of .2: how many of them come
+    to their bound at 0 is what the rule is about.
+    """
+    rng = np.random.default_rng(8)
+    told = rng.uniform(0, 1, 100_000) + np.array([[0.1], [0.2]]) * rng.standard_normal(100_000)
+    few, many = np.mean(told < 0, axis=1)
+    assert few < BY_CHANCE < many
+    assert AtBound(wanted=0.0, error=0.1, room=5.0).suspicious(1.0)
+    assert not AtBound(wanted=0.0, error=0.2, room=5.0).suspicious(1.0)
+
+
+def test_a_step_past_a_bound_counts_as_far_as_there_is_torque() -> None:
+    assert AtBound(wanted=-4.0, error=1.0, room=5.0).beyond == pytest.approx(4.0)
+    assert AtBound(wanted=0.5, error=1.0, room=5.0).beyond == 0.0
+    # 12 of 16 squares are gained up to half the way
+    assert AtBound(wanted=-4.0, error=1.0, room=2.0).beyond ** 2 == pytest.approx(12.0)
+    assert AtBound(wanted=-400.0, error=100.0, room=2.0).beyond < 1.0
+
+
+def without_coulomb(q: FloatArray, v: FloatArray) -> FloatArray:
+    """Stribeck friction that ends in nothing: viscous friction is all there is at speed."""
+    return 15 * np.exp(-((v / 0.5) ** 2)) * np.sign(v) - COULOMB * np.tanh(v / 2e-3)
+
+
+def test_at_one_speed_an_addition_may_send_dry_friction_to_its_bound() -> None:
+    """Before it, Coulomb friction does its work; after it, nothing tells how much there is."""
+    ended = []
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        train, held = (at_one_speed(rng, without_coulomb) for _ in range(2))
+        fits = []
+        for effects in (("viscous", "coulomb"), ("viscous", "coulomb", "stribeck@motor")):
+            joint = Joint("axis", gear_ratio=1.0, model_name="hd1", effects=effects)
+            model = prepared_model(joint, train)
+            data = load_dataset([train], [held], joint, model)
+            fits.append((solve(model, data), data))
+        (before, _), (after, data) = fits
+        assert before.values["motor_coulomb"] > 10
+        ended.append("motor_coulomb" in after.at_bound)
+        assert artefacts(after, data, start=before) == ()
+    assert any(ended)
 
 
 @pytest.mark.parametrize("seed", [36, 37])

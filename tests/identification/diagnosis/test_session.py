@@ -7,7 +7,6 @@ from functools import cache
 import numpy as np
 import numpy.typing as npt
 import pytest
-from scipy.integrate import cumulative_trapezoid
 
 from identification import Improvement, Record, improve
 from identification.data.joint_file import Joint
@@ -21,7 +20,16 @@ from identification.diagnosis.session import (
     with_held_out,
 )
 from identification.errors import InputError
-from tests.smooth_laws import COULOMB, INERTIA, LAWS, VISCOUS, Law, nothing, record
+from tests.smooth_laws import (
+    COULOMB,
+    INERTIA,
+    LAWS,
+    VISCOUS,
+    Law,
+    at_one_speed,
+    nothing,
+    record,
+)
 
 FloatArray = npt.NDArray[np.float64]
 JOINT = Joint(model_name="hd1", effects=("viscous", "coulomb"))
@@ -51,19 +59,6 @@ def runs(law: Law) -> tuple[Record, Record]:
 def improved(law: Law, most: int = MAX_ADDITIONS) -> Improvement:
     train, held = runs(law)
     return improve(train, JOINT, [held], max_additions=most)
-
-
-def at_one_speed(rng: np.random.Generator, law: Law) -> Record:
-    """Back and forth at 0.8 rad/s for 20 s, torque by inverse dynamics, 1 N.m of noise."""
-    t = np.arange(20_000) * 1e-3
-    beat = 2 * np.pi * 0.25
-    v = 0.8 * np.tanh(8 * np.sin(beat * t))
-    a = np.gradient(v, t)
-    q = cumulative_trapezoid(v, t, initial=0.0)
-    torque = INERTIA * a + VISCOUS * v + COULOMB * np.tanh(v / 2e-3) + law(q, v)
-    return Record.from_channels(
-        t, {"motor_position": q, "motor_torque": torque + rng.standard_normal(len(t))}
-    ).renamed("one speed")
 
 
 def little_drag(q: FloatArray, v: FloatArray) -> FloatArray:
