@@ -469,7 +469,7 @@ class AtBound:
         come to stand at its bound by chance.
         """
         lost = before * (before - 2.0 * max(self.wanted, -self.room))
-        return lost > (self.error / (np.sqrt(2.0 * np.pi) * BY_CHANCE)) ** 2
+        return bool(lost > (self.error / (np.sqrt(2.0 * np.pi) * BY_CHANCE)) ** 2)
 
 
 def at_bounds(solution: Solution, data: Dataset) -> dict[str, AtBound]:
