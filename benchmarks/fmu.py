@@ -153,7 +153,7 @@ def readings(count: int) -> np.ndarray[Any, Any]:
     joint = reference_joint("irj_ts")
     t = STEP * np.arange(count)
     drive = 250 * np.sin(2 * np.pi * 0.4 * t) + 60 * np.sin(2 * np.pi * 1.7 * t)
-    found = simulate(joint.model().with_values({"gravity_torque": -105.0}), drive, STEP).readings
+    found = simulate(joint.model(), drive, STEP).readings
     table = np.column_stack([drive / (joint.torque_per_current or 1.0), found])
     table[:, 1:3] *= joint.gear_ratio
     noise: np.ndarray[Any, Any] = np.random.default_rng(1).normal(size=table.shape) * [

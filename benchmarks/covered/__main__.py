@@ -1,6 +1,7 @@
 """Lines of the workbench that its tests run: ``python -m benchmarks.covered [TEST ...]``.
 
-Runs the tests (by default all of tests/workbench) and counts lines in every process that they
+Runs the tests (by default all of tests/workbench, and the pages of docs, which run every command as
+a user would) and counts lines in every process that they
 start: the server, the processes in which sessions work, the command line, and copies of them that a
 test kills (see sitecustomize.py beside this file). Printed is a line per module under the limit and
 the total; the exit code is 1 below the limit. Needs coverage, which is in the extra ``test``.
@@ -36,7 +37,7 @@ def main() -> int:
     import coverage
 
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("tests", nargs="*", default=["tests/workbench"])
+    parser.add_argument("tests", nargs="*", default=["tests/workbench", "tests/test_docs.py"])
     parser.add_argument("--over", default="workbench", help="folder whose lines are counted")
     parser.add_argument("--least", type=float, default=90.0, help="limit of the total [%%]")
     parser.add_argument("--missing", action="store_true", help="name the lines that were not run")

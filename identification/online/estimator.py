@@ -422,12 +422,13 @@ class OnlineEstimator:
         if found is None:
             return False
         y, h = found
-        self._set(rows=self._now.rows + 1)
+        rows = self._now.rows + 1
         on: BoolArray = ~np.any(self.rows.uses & self.samples.lost, axis=1)
         shares = self._shares()
         if self.two_step is not None:
             self.two_step.keep(self.rows.new_points, self.rows.signals, shares, on)
         if self.estimator is None:
+            self._set(rows=rows)
             if enable and on.all():
                 self._collected.append((y, h, shares))
                 power = self.rows.signals[self.reference] ** 2
@@ -455,15 +456,19 @@ class OnlineEstimator:
                 self.options.floor_share,
             ),
         )
+        believed = enable and bool(on.any())
+        strained = self._now.strained + 1 if check.over.any() else 0
         self._set(
+            rows=rows,
             residual=check.error.copy(),
             ratio=check.ratio.copy(),
             square=check.square.copy(),
             torque=check.torque.copy(),
+            strained=strained if believed else self._now.strained,
         )
         if not enable:
             return True
-        if not on.any():
+        if not believed:
             self._set(theta=self._within(self.guard.blind(self.estimator)))
             return True
         for b, use in enumerate(on.tolist()):
@@ -471,7 +476,6 @@ class OnlineEstimator:
         theta = self.estimator.update(check.y, check.h)
         noise = self.estimator.engine_for("noise").part("fast", "noise")
         np.maximum(noise, check.least**2, out=noise)
-        self._set(strained=self._now.strained + 1 if check.over.any() else 0)
         shown = self._guarded(self.guard, theta, check, on)
         self._set(theta=self._within(shown))
         if (

@@ -485,10 +485,8 @@ class Estimator(TableSlave):
                 self._report("reoptimise_request: there are no nonlinear parameters to search")
         if estimator.update(time, readings, flags, enable=bool(values[self._enable])):
             self._publish()
-        values[self._q_at], values[self._q_at + 1] = (
-            estimator.readings[Q_L],
-            estimator.readings[W_L],
-        )
+        shown = estimator.readings
+        values[self._q_at], values[self._q_at + 1] = shown[Q_L], shown[W_L]
         fault = estimator.fault
         if fault != values[self._fault_at]:
             values[self._fault_at] = fault

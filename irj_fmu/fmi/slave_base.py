@@ -123,6 +123,7 @@ class TableSlave(Fmi2Slave):  # type: ignore[misc, unused-ignore]
             kind: frozenset(i for _, i in self._inputs if self._kinds[i] == kind) for kind in kinds
         }
         self._known: dict[tuple[Kind, tuple[int, ...]], Any] = {}
+        self._plain: set[tuple[Kind, tuple[int, ...]]] = set()  # references of inputs alone
         self._phase = 0
         self._changed = False
         self._configured: dict[str, Value] = {}
@@ -307,7 +308,13 @@ class TableSlave(Fmi2Slave):  # type: ignore[misc, unused-ignore]
         return found
 
     def _set(self, references: list[int], new: list[Any], kind: Kind) -> None:
-        if all(map(self._inputs_of[kind].__contains__, references)) and len(new) == len(references):
+        key = (kind, tuple(references))
+        plain = key in self._plain
+        if not plain and all(map(self._inputs_of[kind].__contains__, references)):
+            plain = True
+            if len(self._plain) < _KNOWN:
+                self._plain.add(key)
+        if plain and len(new) == len(references):
             values = self._values
             for reference, value in zip(references, new, strict=True):
                 values[reference] = value
