@@ -473,6 +473,9 @@ class AtBound:
 
 
 def at_bounds(solution: Solution, data: Dataset) -> dict[str, AtBound]:
+    """What the training rows say of each amplitude that stands at its bound, by name; nothing where
+    there are too few of them for an error.
+    """
     from scipy.sparse import hstack
 
     base = make_base(solution, data)

@@ -453,9 +453,9 @@ def parser() -> OneLineParser:
         nargs="?",
         const=10.0,
         metavar="SECONDS",
-        help="the record is a CSV file that is still being written, or udp://HOST:PORT where its "
-        "lines come: follow it, and print what is found at once, until nothing came for SECONDS "
-        "(10)",
+        help="the record is a CSV file that is still being written, udp://HOST:PORT where its "
+        "lines come, or ros2://TOPIC of joint states: follow it, and print what is found at once, "
+        "until nothing came for SECONDS (10)",
     )
     tracked.add_argument(
         "--inject",
@@ -627,8 +627,8 @@ def parser() -> OneLineParser:
         metavar="FILE",
         action="append",
         default=[],
-        help="a CSV file that is being written, or udp://HOST:PORT where its lines come: the "
-        "Replay page can follow it",
+        help="a CSV file that is being written, udp://HOST:PORT where its lines come, or "
+        "ros2://TOPIC of joint states: the Replay page can follow it",
     )
     app.add_argument("--no-browser", action="store_true", help="print the address, open nothing")
     text = "completion of verbs and options for your shell"

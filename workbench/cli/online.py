@@ -27,9 +27,9 @@ from workbench.cli.files import (
     write_bytes,
     write_json,
 )
-from workbench.cli.following.datagrams import SCHEME
-from workbench.cli.following.datagrams import source as followed_source
 from workbench.cli.following.growing import follow
+from workbench.cli.following.source import is_stream
+from workbench.cli.following.source import source as followed_source
 from workbench.cli.following.stepper import Stepper, arrays_of, fault_text
 from workbench.cli.renewed import renewed
 from workbench.show.replayed import READINGS, UNESTIMATED, Replay, standing
@@ -52,7 +52,7 @@ def run_track(arguments: Namespace) -> int:
     joint = open_joint(arguments.joint)
     if getattr(arguments, "follow", None) is not None:
         return _run_follow(arguments, joint)
-    stream = next((r for r in arguments.records if r.startswith(SCHEME)), None)
+    stream = next((r for r in arguments.records if is_stream(r)), None)
     if stream is not None:
         raise InputError(f"{stream}: a stream has no end; add --follow to track it as it comes")
     tried = [parse_fault(text) for text in getattr(arguments, "inject", None) or []]

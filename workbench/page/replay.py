@@ -19,8 +19,8 @@ from identification.data.plain_text import from_toml
 from identification.data.record import Record
 from identification.errors import InputError
 from irj_fmu.estimator.healthy import detector_state, online_readings
-from workbench.cli.following.datagrams import source as followed_source
 from workbench.cli.following.growing import follow as growing
+from workbench.cli.following.source import source as followed_source
 from workbench.cli.online import replay as followed
 from workbench.page.analysis import Progress, clean
 from workbench.page.desk.sources import source_of, stopped

@@ -1,23 +1,17 @@
-"""A record that comes over the network, line by line in datagrams, for the online estimator."""
+"""A record that comes over the network, line by line in datagrams."""
 
 from __future__ import annotations
 
 import select
-import shutil
 import socket
-import tempfile
 import threading
 from collections import deque
-from pathlib import Path
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Final, Self, final
 from urllib.parse import urlsplit
 
-import numpy as np
-
-from identification.data.read import read
-from identification.data.record import Record
 from identification.errors import InputError
-from workbench.cli.following.growing import FIRST_ROWS, Growing
+from workbench.cli.following.lines import Lines
 
 if TYPE_CHECKING:
     from identification.data.joint_file import Joint
@@ -33,19 +27,14 @@ AT_ONCE: Final = 1 << 22
 fast stream fills, so they are fetched as they come."""
 WAKE: Final = 0.2
 """Longest time until the fetching sees that it is over [s]."""
-HEAD: Final = 20
-"""Lines before the first row of numbers that are kept at most: names and units are two, loggers
-write some more."""
 
 
 @final
-class Datagrams:
-    """The rows of a table that another program sends by UDP, each once.
+class Datagrams(Lines):
+    """The rows of a table that another program sends by UDP.
 
-    A datagram holds whole lines as a CSV file has them. A line without a number at its begin
-    belongs to the head: names of the columns, and units. The head may come again at any time, so
-    that a receiver can start late; rows before the first one are left out. Of datagrams that
-    overtake one another the late ones are left out, too.
+    A datagram holds whole lines; of datagrams that overtake one another the late ones are left
+    out.
 
     Parameters
     ----------
@@ -61,13 +50,8 @@ class Datagrams:
     """
 
     def __init__(self, address: str, joint: Joint) -> None:
-        self.path, self.joint = Path(address.removeprefix(SCHEME)), joint
-        self.late = 0
-        self._head: list[bytes] = []
-        self._rows: list[bytes] = []
-        self._in_head, self._last = False, -np.inf
         self._socket = _bound(address)
-        self._folder = Path(tempfile.mkdtemp(prefix="irj-"))
+        super().__init__(address, joint)
         self._came: deque[bytes] = deque()
         self._waiting = 0
         self._reading, self._over = threading.Lock(), threading.Event()
@@ -81,7 +65,7 @@ class Datagrams:
         self._over.set()
         self._thread.join()
         self._socket.close()
-        shutil.rmtree(self._folder, ignore_errors=True)
+        super().__exit__(*error)
 
     def _fetch(self) -> None:
         """Take what comes out of the system's buffer while the estimator is at work."""
@@ -105,59 +89,13 @@ class Datagrams:
         """Where it listens: the system's choice where 0 was asked for."""
         return int(self._socket.getsockname()[1])
 
-    def new(self) -> Record | None:
-        """The rows that came since the last call; None where there are none, or too few to begin
-        with.
-
-        Raises
-        ------
-        InputError
-            Rows that cannot be used.
-        """
+    def arrived(self) -> Iterable[bytes]:
+        """Lines of the datagrams that came since the last call."""
         self._drain()
         with self._reading:
             came, self._waiting = list(self._came), 0
             self._came.clear()
-        for line in b"\n".join(came).splitlines():
-            self._take(line.strip())
-        first = not np.isfinite(self._last)
-        if not self._rows or (first and len(self._rows) < FIRST_ROWS):
-            return None
-        part = self._folder / "part.csv"
-        part.write_bytes(b"\n".join([*self._head, *self._rows, b""]))
-        self._rows = []
-        try:
-            made = read(part, columns=self.joint.columns, kind=self.joint.kind, name="stream")
-        except InputError as error:
-            raise InputError(str(error).replace(str(part), f"{SCHEME}{self.path}")) from None
-        newest = np.maximum.accumulate(np.concatenate([[self._last], made.time]))
-        in_order = made.time > newest[:-1]
-        self.late += int(np.count_nonzero(~in_order))
-        self._last = float(newest[-1])
-        return made.take(in_order) if in_order.any() else None
-
-    def _take(self, line: bytes) -> None:
-        if not line:
-            return
-        if not _is_row(line):
-            if not self._in_head:
-                self._head, self._in_head = [], True
-            if len(self._head) < HEAD:
-                self._head.append(line)
-        else:
-            self._in_head = False
-            if self._head:
-                self._rows.append(line)
-
-
-def _is_row(line: bytes) -> bool:
-    """Whether a line begins with a number, whatever stands between its cells."""
-    first = line.replace(b";", b"\t").replace(b",", b"\t").split(None, 1)[0]
-    try:
-        float(first)
-    except ValueError:
-        return False
-    return True
+        return b"\n".join(came).splitlines()
 
 
 def place_of(address: str) -> tuple[str, int]:
@@ -196,9 +134,4 @@ def _bound(address: str) -> socket.socket:
     return made
 
 
-def source(name: str, joint: Joint) -> Growing | Datagrams:
-    """What is followed: a file that is being written, or a stream by its address."""
-    return Datagrams(name, joint) if name.startswith(SCHEME) else Growing(Path(name), joint)
-
-
-__all__ = ["SCHEME", "Datagrams", "source"]
+__all__ = ["SCHEME", "Datagrams", "place_of"]

@@ -44,9 +44,10 @@ LOOK: Final = 0.05
 
 
 class Source(Protocol):
-    """What `follow` takes rows from; `path` is its name."""
+    """What `follow` takes rows from."""
 
-    path: Path
+    name: str
+    """As the user gave it."""
 
     def new(self) -> Record | None:
         """The rows that came since the last call; None where there are none."""
@@ -65,7 +66,7 @@ class Growing:
     """
 
     def __init__(self, path: Path, joint: Joint) -> None:
-        self.path, self.joint = path, joint
+        self.path, self.joint, self.name = path, joint, str(path)
         self._folder = Path(tempfile.mkdtemp(prefix="irj-"))
         self._head, self._at = b"", 0
 
@@ -164,7 +165,7 @@ def follow(
     if run is None:
         when = "before it was stopped" if halted else f"within {quiet:g} s"
         raise InputError(
-            f"{source.path}: fewer than {FIRST_ROWS} lines came {when}; start the recording "
+            f"{source.name}: fewer than {FIRST_ROWS} lines came {when}; start the recording "
             "first, or follow it for longer"
         )
 

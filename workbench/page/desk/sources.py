@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from identification.errors import InputError
-from workbench.cli.following.datagrams import SCHEME, place_of
+from workbench.cli.following.source import check_address, is_stream
 from workbench.page.session import write_atomic
 
 FILE: Final = "follow.json"
@@ -26,11 +26,11 @@ def allow(root: Path, paths: Sequence[str | Path]) -> None:
         A folder, or a stream whose address is none.
     """
     for path in paths:
-        if _is_stream(path):
-            place_of(str(path))
+        if is_stream(path):
+            check_address(str(path))
         elif Path(path).is_dir():
             raise InputError(f"{path}: is a folder; give the CSV file that is being written")
-    names = [str(p) if _is_stream(p) else str(Path(p).absolute()) for p in paths]
+    names = [str(p) if is_stream(p) else str(Path(p).absolute()) for p in paths]
     write_atomic(root / FILE, json.dumps(names).encode())
 
 
@@ -41,11 +41,6 @@ def allowed(root: Path) -> list[str]:
     except (OSError, ValueError):
         return []
     return [str(p) for p in found] if isinstance(found, list) else []
-
-
-def _is_stream(path: str | Path) -> bool:
-    """Whether it is the address of a stream and no file."""
-    return isinstance(path, str) and path.startswith(SCHEME)
 
 
 def source_of(root: Path, name: str) -> str:
