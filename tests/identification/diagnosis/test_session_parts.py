@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -22,7 +23,7 @@ from identification.diagnosis.candidates import NotTestable, offered
 from identification.diagnosis.claims import LARGEST_SET, Claim, Ranking
 from identification.diagnosis.curve import Curve
 from identification.diagnosis.improvement import Improvement, Step
-from identification.diagnosis.learned import Equivalence
+from identification.diagnosis.learned import Doubt, Equivalence
 from identification.diagnosis.locate import Unexplained
 from identification.diagnosis.outcome import key_of
 from identification.diagnosis.session import Session, _behind
@@ -67,6 +68,10 @@ class World:
         Independent ones.
     late : set of str
         Names that cannot be tested on the start model.
+    curves, doubts : tuple
+        What is learned of what is left; why parameters cannot be those of their laws.
+    steady : bool
+        Whether small effects have one sign at every kernel.
     turned : set of str
         Names whose candidates come with the law of the motion turned round.
     without : str
@@ -87,6 +92,9 @@ class World:
     unit: float = 1.0
     rows: float = 100.0
     late: frozenset[str] = frozenset()
+    curves: tuple[Any, ...] = ()
+    doubts: tuple[Doubt, ...] = ()
+    steady: bool = True
     turned: frozenset[str] = frozenset()
     without: str = ""
     located: float = 0.0
@@ -94,6 +102,7 @@ class World:
     chances: Callable[[Claim, Step], Odds | None] = lambda claim, now: None
     asked: list[tuple[frozenset[str], bool]] = field(default_factory=list)
     fitted_whole: list[str] = field(default_factory=list)
+    doubted: list[tuple[int, tuple[Curve, ...], int]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         data = self.based.data
@@ -213,16 +222,17 @@ class World:
     def listen(self, step: Step) -> None: ...
 
     def lines(self, step: Step) -> list[Any]:
-        return []
+        return [f"line beside {len(step.effects)}"]
 
-    def learned(self, step: Step, error: Error) -> tuple[()]:
-        return ()
+    def learned(self, step: Step, error: Error) -> tuple[Any, ...]:
+        return self.curves
 
-    def artefacts(self, *_: object) -> tuple[()]:
-        return ()
+    def artefacts(self, step: Step, curves: Sequence[Curve], start: Step) -> tuple[Doubt, ...]:
+        self.doubted.append((len(step.effects), tuple(curves), len(start.effects)))
+        return self.doubts
 
     def same_sign(self, trial: Trial, solution: Solution) -> bool:
-        return True
+        return self.steady
 
     def drifts(self, step: Step) -> dict[str, Any]:
         return {}
@@ -277,10 +287,10 @@ def test_a_set_of_too_many_is_forgotten_where_a_later_law_takes_its_work_along(b
         {**alike, "quadratic_drag": {"p": 1.0, "q@link": 1.0}},
         first={"quadratic_drag": {"q@link": 1.0}},
     )
-    found = ended(world)
-    assert named(found) == ["quadratic_drag"]
-    assert found.verdict == "complete"
-    assert "cannot be named" not in found.reason
+    for found in (ended(world), Session(world).diagnose(world.start())):
+        assert named(found) == ["quadratic_drag"]
+        assert found.verdict == "complete"
+        assert "cannot be named" not in found.reason
 
 
 # --- the number of additions and what is looked for -----------------------------------------------
@@ -365,6 +375,22 @@ def test_a_law_that_training_hardly_shows_is_fitted_whole_only_over_the_floor(ba
         assert bool(world.fitted_whole) == bool(names)
         if names:
             assert {*world.fitted_whole} == {"quadratic_drag", "cyclic_torque"}
+
+
+def test_an_addition_that_brings_little_or_spoils_another_balance_is_refused(base: Base) -> None:
+    """Whatever its trial says; the next name is taken."""
+    spoils = {"p": 0.9, "q@link": -1.0}
+    for whole, why in (({"p": 0.01}, "2 % asked"), (spoils, "the link balance rises by")):
+        world = World(
+            base,
+            {"p": 24.0, "q@link": 8.0},
+            {"cyclic_torque": whole, "quadratic_drag": {"p": 0.9}},
+            first={"cyclic_torque": {"p": 0.95}, "quadratic_drag": {"p": 0.3}},
+            chances=lambda claim, now: told(now, {claim.effects[0]: 1.0}, {}),
+        )
+        found = ended(world)
+        assert named(found) == ["quadratic_drag"]
+        assert why in found.why("cyclic_torque")
 
 
 # --- a name and its relatives ---------------------------------------------------------------------
@@ -750,6 +776,82 @@ def test_what_is_left_around_a_mode_has_the_frequency_from_before_it(
     assert asked == [({"cyclic_torque"}, "link")]
     for claims in ([law], [law, replace(mode, partial=False)], [replace(law, partial=True)]):
         assert Session(world)._with_frequency([nowhere], claims, found.steps) == [nowhere]
+
+
+# --- what is told beside the claims ---------------------------------------------------------------
+
+
+def test_a_doubt_about_a_parameter_forbids_that_all_is_well(base: Base) -> None:
+    laws, doubts = {"cyclic_torque": {"p": 1.0}}, (Doubt("motor", "a mass is below nothing"),)
+    sure = ended(World(base, {"p": 24.0}, laws))
+    assert sure.verdict == "complete"
+    found = ended(World(base, {"p": 24.0}, laws, doubts=doubts))
+    assert found.verdict == "unexplained"
+    assert found.reason == f"{sure.reason} But a mass is below nothing."
+    quiet = ended(World(base, {}, laws, doubts=doubts))
+    assert quiet.verdict == "unexplained"
+    assert "But a mass" in quiet.reason
+    left = ended(World(base, {"p": 24.0, "q": 8.0}, laws, doubts=doubts))
+    assert left.verdict == "unexplained"
+    assert "But" not in left.reason, "it is told what is left"
+
+
+def test_a_curve_is_the_answer_where_something_is_left_and_no_name_is_next(base: Base) -> None:
+    laws = {"cyclic_torque": {"p": 1.0}, "quadratic_drag": {"q": 1.0}}
+    own, other = cast(Curve, object()), cast(Curve, object())
+    curves = (SimpleNamespace(curve=own),)
+    beside = {
+        "cyclic_torque@motor": Equivalence(0.03, 0.01, "like it", other),
+        "quadratic_drag@motor": Equivalence(0.0, 0.001, "it", None),
+    }
+    for hidden, most, learned in (
+        ({"p": 24.0, "q": 8.0}, 6, False),
+        ({"p": 24.0, "q": 8.0}, 1, False),
+        ({"p": 24.0, "q": 8.0, "r": 5.0}, 6, True),
+        ({"p": 24.0, "q": 8.0, "r": 5.0}, 1, False),
+    ):
+        world = World(base, hidden, laws, curves=curves, wrong=beside)
+        found = ended(world, most)
+        assert len(found.claims) == min(most, 2)
+        assert bool(found.learned) == learned
+        # the parameters are looked at with every curve beside them, and as the start model has them
+        assert world.doubted == [(min(most, 2), (other, own) if learned else (other,), 0)]
+
+
+def test_lines_are_looked_for_where_something_is_left_or_minor_effects_are(base: Base) -> None:
+    laws = {"cyclic_torque": {"p": 1.0}}
+    for hidden, lean, lines in (
+        ({"p": 24.0}, True, ()),
+        ({"p": 24.0}, False, ("line beside 1",)),
+        ({"p": 24.0, "q": 8.0}, True, ("line beside 1",)),
+    ):
+        world = World(base, hidden, laws)
+        session = Session(world)
+        found = (session.diagnose if lean else session.run)(world.start())
+        assert found.lines == lines
+
+
+def test_a_small_effect_is_told_where_its_sign_is_sure_and_not_by_a_diagnosis(base: Base) -> None:
+    laws = {"cyclic_torque": {"p": 1.0}, "quadratic_drag": {"q": 0.8}}
+    for steady, lean in ((True, False), (False, False), (True, True)):
+        world = World(base, {"p": 24.0, "q": 0.1}, laws, rows=1e4, steady=steady)
+        session = Session(world)
+        found = (session.diagnose if lean else session.run)(world.start())
+        assert named(found) == ["cyclic_torque"]
+        assert [c.effects for c in found.minor] == [("quadratic_drag",)] * (steady and not lean)
+
+
+def test_records_that_cannot_carry_the_question_get_their_reason_and_no_claim(
+    base: Base, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    why = "the motor never turns"
+    monkeypatch.setattr("identification.diagnosis.session.not_identifiable", lambda data: why)
+    world = World(base, {"p": 24.0}, {"cyclic_torque": {"p": 1.0}})
+    found = ended(world)
+    assert (found.verdict, found.reason, found.claims) == ("not_identifiable", why, ())
+    assert [s.added for s in found.steps] == [None]
+    assert found.final_ratios["axis"].ratio == 5.0
+    assert world.asked == []
 
 
 # --- what comes near a name -----------------------------------------------------------------------
