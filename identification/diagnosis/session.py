@@ -275,7 +275,7 @@ class Session:
                         size = f"is one of {len(claim.effects)} names that explain the same"
                         self._doubted[t.candidate.label] = f"{size}: too many to be an answer"
                 continue
-            share = len(standing.claims) / max(most, 1)
+            share = len(standing.claims) / most
             self.progress(f"adding {best.key}", 0.2 + 0.6 * share if not lean else 0.65)
             told = self._told_apart(claim, standing)
             if told is not None:
@@ -307,7 +307,7 @@ class Session:
             stale = lean and unnamed is None and not self._over(standing.now)
             if not stale:
                 base = self.bench.base(standing.now.solution)
-                share = len(standing.claims) / max(most, 1)
+                share = len(standing.claims) / most
                 ranking = self.bench.ranking(base, progress=self._within(0.2 + 0.6 * share, 0.0))
         if len(standing.claims) >= most:
             standing = self._without_wrong(standing, decided=lean) or standing
@@ -799,9 +799,7 @@ class Session:
                 self._near[claim.label] = _behind(same, ranking)
                 names = confusion_set(same, ranking.everything, base)
                 names = (claim.effects[0], *(n for n in names if n != claim.effects[0]))
-                current[position] = replace(
-                    claim, effects=names, separate_by=claim.separate_by if len(names) > 1 else None
-                )
+                current[position] = replace(claim, effects=names)
         return _Standing(standing.steps, tuple(current))
 
     def _replay(

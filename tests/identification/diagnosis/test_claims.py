@@ -262,6 +262,18 @@ def test_a_set_holds_what_explains_as_much(base: Base) -> None:
         assert (len(confusion_set(held, [held, other], base)) == 2) == inside
 
 
+@pytest.mark.parametrize(("count", "apart"), [(1, False), (2, True), (3, True)])
+def test_blocks_that_agree_tell_names_apart_from_two_on(
+    count: int, apart: bool, base: Base
+) -> None:
+    """One block says nothing of how much they scatter."""
+    few = replace(base, block=np.where(base.block >= 0, base.block % count, -1))
+    agree = np.linspace(10.0, 10.1, count)
+    best = trial(few, "stribeck", 100.0, blocks=agree)
+    other = trial(few, "cyclic_torque", 50.0, blocks=agree / 2)
+    assert (len(confusion_set(best, [best, other], few)) == 1) == apart
+
+
 def test_who_never_stands_in_a_set(base: Base) -> None:
     best = trial(base, "viscous", 100.0, blocks=scores(base, 10.0))
     richer = trial(base, "cubic_viscous", 100.0, blocks=scores(base, 10.0))

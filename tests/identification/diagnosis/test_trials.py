@@ -25,6 +25,7 @@ from identification.diagnosis.trials import (
     Base,
     Trial,
     _refined,
+    _unit,
     columns,
     effective_share,
     make_base,
@@ -157,7 +158,46 @@ def test_the_best_shape_lies_between_the_points_of_the_grid() -> None:
     assert bound[1] == {"a": 0.3, "b": 7.0}
 
 
+@pytest.mark.parametrize(("away", "left"), [(2.4, 0.2), (0.1, 0.05), (-2.4, 0.2), (-0.1, 0.05)])
+def test_the_best_shape_is_found_far_away_and_near(away: float, left: float) -> None:
+    """Steps stay long while they help and become short where they do not."""
+
+    def projected(shapes: dict[str, float]) -> tuple[float, FloatArray, float]:
+        return -abs(math.log(shapes["a"]) - away), np.zeros((1, 1)), 1.0
+
+    start = {"a": 1.0}
+    best = _refined(projected, (projected(start)[0], start, np.zeros((1, 1))), {"a": (0.01, 100)})
+    assert abs(math.log(best[1]["a"]) - away) < left
+    assert best[0] == projected(best[1])[0]
+
+
 # --- the base -------------------------------------------------------------------------------------
+
+
+def test_held_out_rows_that_are_the_training_rows_have_their_columns() -> None:
+    """Those of an amplitude at its bound, too."""
+    driven = made(lambda q, v: -2 * COULOMB * np.sign(v), held=False)
+    assert driven.inward.shape[1] == 1
+    alike = make_base(driven.solution, replace(driven.data, held_out=driven.data.train))
+    for own, held in (
+        (alike.jacobian, alike.held_jacobian),
+        (alike.inward, alike.held_inward),
+        (alike.balance, alike.held_balance),
+    ):
+        assert held.shape == own.shape
+        assert held == pytest.approx(own, abs=1e-9)
+    whole = alike.held_residual - alike.orthonormal @ (alike.orthonormal.T @ alike.held_residual)
+    assert whole == pytest.approx(alike.residual, abs=1e-6)
+    # without held-out records there are the same columns and no rows
+    for one, other in (
+        (driven.held_jacobian, alike.held_jacobian),
+        (driven.held_inward, alike.held_inward),
+        (driven.held_own, alike.held_own),
+        (driven.held_residual, alike.held_residual),
+        (driven.held_balance, alike.held_balance),
+        (driven.held_weight, alike.held_weight),
+    ):
+        assert one.shape == (0, *other.shape[1:])
 
 
 def test_the_base_leaves_nothing_that_its_own_columns_explain(base: Base) -> None:
@@ -305,6 +345,58 @@ def test_what_the_model_has_already_is_not_testable(base: Base) -> None:
     alike = ", ".join(EFFECTS[k].title for k in EFFECTS["cyclic_torque"].confused_with)
     assert said.why.startswith(f"on these records it cannot be told from {alike}; ")
     assert said.why.endswith(f"{EFFECTS['cyclic_torque'].separate_by} would separate them")
+
+
+@pytest.mark.parametrize(("share", "testable"), [(0.003, True), (0.0015, False)])
+def test_what_is_testable_has_two_parts_in_a_thousand_of_its_own(
+    share: float, testable: bool, base: Base
+) -> None:
+    """A column that the base holds but for a share of it."""
+    one = candidate(base, "quadratic_drag")
+    balances = balances_of(one.model, base.data.sensing, wrt=one.amplitudes, columns_only=True)
+    (c,) = (columns(one, base, {}, base.data.train, balances) * base.weight[:, None]).T
+    c = c / np.linalg.norm(c)
+    noise = np.random.default_rng(0).standard_normal(len(c))
+    noise -= c * (c @ noise)
+    noise /= np.linalg.norm(noise)
+    inside = math.sqrt(1 - share**2) * c + share * noise
+    holding = replace(base, jacobian=inside[:, None], orthonormal=inside[:, None], names=("c",))
+    outside = c - inside * (inside @ c)
+    assert np.linalg.norm(outside) == pytest.approx(share)
+    # something is left that the column explains
+    left = base.residual - 1e5 * outside
+    found = try_candidate(
+        one, replace(holding, residual=left, norms=np.ones(1), held_residual=np.empty(0))
+    )
+    assert isinstance(found, Trial if testable else NotTestable)
+
+
+@pytest.mark.parametrize(("count", "says"), [(2, False), (3, False), (4, True), (5, True)])
+def test_a_chance_takes_two_blocks_more_than_amplitudes(count: int, says: bool, base: Base) -> None:
+    """Two amplitudes: three blocks leave one degree of freedom, which is not asked."""
+    few = replace(base, block=np.where(base.block >= 0, base.block % count, -1))
+    found = tried(few, "cyclic_torque")
+    assert len(found.candidate.amplitudes) == 2
+    assert (found.p_value < 0.05) == says
+    assert says or found.p_value == 1.0
+
+
+@pytest.mark.parametrize("share", [-0.5, -0.1, 0.3])
+def test_noise_alone_counts_at_the_parameters_that_a_candidate_leaves(
+    share: float, base: Base
+) -> None:
+    """Noise of the acceleration goes with the inertia; where it would grow it is not paid for."""
+    one = candidate(base, "quadratic_drag")
+    number = base.names.index("inertia")
+    value = base.solution.values["inertia"]
+    delta = np.zeros(len(base.names) + 1)
+    delta[number] = share * value * base.norms[number]
+    values = {**base.solution.values, "inertia": (1 + share) * value}
+    moved = replace(base, solution=replace(base.solution, values=values))
+    expected = moved.noise_alone["axis"] / base.noise_alone["axis"]
+    assert (expected < 0.999) == (share < 0), "the inertia carries a part of the noise"
+    (unit,) = _unit(one, base, {"motor_quadratic_drag": 0.0}, delta)
+    assert unit == pytest.approx(min(expected, 1.0))
 
 
 def test_nothing_is_found_where_nothing_is_hidden() -> None:

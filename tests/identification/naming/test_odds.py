@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +15,7 @@ from identification.data.joint_file import Joint
 from identification.diagnosis.claims import Ranking, rank
 from identification.diagnosis.trials import make_base
 from identification.fitting.engine import load_dataset, prepared_model, solve
-from identification.naming.contest import FEWEST, Contest, rivals_of
+from identification.naming.contest import FEWEST, Contest, _by_block, rivals_of
 from identification.naming.odds import Odds, contenders, contest_of, odds_of, unmodelled
 from tests.smooth_laws import Law, record
 
@@ -76,6 +77,61 @@ def test_a_name_falls_out_by_more_than_what_is_unmodelled(drags: Contest) -> Non
     assert names[1.01 * nats] == set(NAMES) | ({""} if drags.ahead[2, 0] <= 1.01 * nats else set())
     unsure = drags.probability(2 * nats)[1]
     assert 0.5 < unsure < 0.9, "what is unmodelled makes a name less sure"
+
+
+def test_a_parameter_costs_half_the_logarithm_of_the_rows_that_count(drags: Contest) -> None:
+    """Four of ten of those that stand in a block and do not rest."""
+    (w,) = drags.data.train
+    still = w.time < 8.0
+    resting = replace(w, rest={"motor": still.astype(float)})
+    found = Contest(drags.rivals, replace(drags.data, train=[resting]))
+    rows = int(np.sum(~still & (w.block >= 0)))
+    assert 100 < rows < 0.7 * np.sum(w.block >= 0)
+    sizes = [len(r.solution.free) for r in found.rivals]
+    assert sizes == [5, 5, 4], "nothing has no amplitude"
+    for allowance, tempering in ((0.0, 1.0), (2 * FEWEST, 2.0)):
+        share = np.log(found.probability(allowance))
+        lost = [min(nats / tempering, 2 * max(z, 0.0) ** 2) for nats, z in found.ahead]
+        price = 0.5 * math.log(0.4 * rows / tempering)
+        assert share[2] - share[1] == pytest.approx(lost[1] - lost[2] + price)
+        assert share[0] - share[1] == pytest.approx(lost[1] - lost[0])
+
+
+def test_the_lead_by_plain_sums_over_blocks(drags: Contest) -> None:
+    """Student's t of the blocks' differences, or that of their signs; rows of a block count each
+    four tenths, those at a turn by none of two laws that say nothing of it.
+    """
+    leader = drags.rivals.index(drags.leader)
+    assert drags.ahead[leader].tolist() == [0.0, 0.0], "nobody is ahead of itself"
+    (w,) = drags.data.train
+    (counted,) = drags._calm(drags.leader, drags.rivals[1 - leader])
+    assert 0 < np.sum(~counted) < 0.1 * len(counted)
+    best = drags._old[leader][0]
+    for k, (left, _, _) in enumerate(drags._old[:2]):
+        if k == leader:
+            continue
+        rows = np.where(counted, 0.2 * (left**2 - best**2), 0.0)
+        by = np.array([rows[w.block == b].sum() for b in range(w.block.max() + 1)])
+        t = by.mean() / (by.std(ddof=1) / math.sqrt(len(by)))
+        signs = (np.sum(by > 0) - np.sum(by < 0)) / math.sqrt(len(by))
+        # neither has a clock or a zero that would cost anything beforehand
+        assert drags.ahead[k] == pytest.approx([by.sum(), max(t, signs)])
+
+
+def test_squares_are_summed_over_the_rows_of_each_block_and_no_others() -> None:
+    left, block = np.array([1.0, 2.0, 3.0, 4.0, 5.0]), np.array([0, 0, 2, -1, 2])
+    assert _by_block(left, block).tolist() == [5.0, 0.0, 34.0]
+
+
+def test_rows_at_a_turn_count_where_either_law_says_what_happens_there(drags: Contest) -> None:
+    first, second, _ = drags.rivals
+    turns = replace(first, name="lugre")
+    (whole,) = drags._calm(turns, replace(second, name="hysteresis"))
+    (fewer,) = drags._calm(first, second)
+    assert whole.all()
+    assert not fewer.all()
+    for pair in ((turns, second), (second, turns)):
+        assert np.array_equal(drags._calm(*pair)[0], whole)
 
 
 def test_what_the_true_law_leaves_holds_no_other(drags: Contest) -> None:
