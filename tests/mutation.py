@@ -91,6 +91,7 @@ _UPDATES: Final = Judges(
 _ROWS: Final = Judges(
     (
         f"{_BALANCE}/test_weak.py",
+        f"{_BALANCE}/test_innovations.py",
         "tests/identification/fitting/test_signed_fit.py",
         f"{_BALANCE}/test_floors.py",
         *_LOOP[:1],
