@@ -224,6 +224,23 @@ def test_the_direction_is_unknown_where_the_joint_is_slow_or_turns(dt: float) ->
     assert not _either_direction(away, "motor", white(1e-12))[[0, 1, -2, -1]].any()
 
 
+def test_noise_alone_tells_no_direction_and_hides_none_that_is_well_above_it() -> None:
+    """One in 370 normal numbers is beyond three deviations; one in 40 above three of a mean of five
+    is not.
+    """
+    rng, dt, noise = np.random.default_rng(6), 1e-3, 1e-5
+    time = dt * np.arange(20_000)
+    known = []
+    for deviations in (0.0, 5.0):
+        level = prepare(time, {"motor_position": time}, (slice(0, len(time)),)).grid
+        speed = deviations * level.velocity_noise("motor_position", white(noise))
+        position = speed * time + noise * rng.standard_normal(len(time))
+        made = prepare(time, {"motor_position": position}, (slice(0, len(time)),))
+        known.append(float(np.mean(~_either_direction(made, "motor", white(noise)))))
+    assert known[0] < 0.01
+    assert known[1] > 0.95
+
+
 def test_what_may_act_either_way_is_the_friction_of_the_motor() -> None:
     """Beside it stands half of what a change twice as wide would move: squares add up."""
     train = record("train", 3, False, *FAST)

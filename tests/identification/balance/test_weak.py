@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import casadi as ca
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from casadi_models import EFFECTS, JointModel
@@ -13,6 +15,8 @@ from casadi_models.vectorised import Vectorised
 from identification.balance.memory import Cache
 from identification.balance.noise import noise_level
 from identification.balance.weak import differentiated_kernel, kernel, prepare, whole
+
+FloatArray = npt.NDArray[np.float64]
 
 
 @pytest.mark.parametrize("order", [0, 1, 2, 3])
@@ -197,6 +201,21 @@ def test_averages_and_curvatures_of_the_points_are_exact_for_polynomials() -> No
     assert made.curve(3 * t**2 + t - 1) == pytest.approx(6.0, rel=1e-9)
     both = made.curve(np.column_stack([t, t**2]))
     assert both == pytest.approx(np.tile([0.0, 2.0], (made.rows, 1)), abs=1e-8)
+
+
+@pytest.mark.parametrize(("length", "dt"), [(0.06, 1e-3), (0.06, 4e-3), (0.03, 2e-3)])
+@pytest.mark.parametrize("make", [kernel, differentiated_kernel])
+def test_the_kernel_wipes_out_three_and_more_whole_waves(
+    make: Callable[[float, float, int], FloatArray], length: float, dt: float
+) -> None:
+    """Of c cos^4 over its width, the one that ends where the next samples would be, two thirds of
+    one wave are left and a sixth of two.
+    """
+    weights = make(length, dt, 0)
+    count = len(weights) + 1
+    assert abs(count * dt - length) < 3.5 * dt
+    phase = 2 * math.pi * np.outer(np.arange(6), np.arange(1, count) - count / 2) / count
+    assert np.cos(phase) @ weights == pytest.approx([1, 2 / 3, 1 / 6, 0, 0, 0], abs=1e-12)
 
 
 @pytest.mark.parametrize("order", [1, 2, 3, 4])
