@@ -456,7 +456,7 @@ def _averages(
             ]
         )
         columns = (centres[:, None] + np.arange(-own, own + 1)).ravel()
-        pointers = np.arange(0, len(columns) + 1, len(weights))
+        pointers = len(weights) * np.arange(len(centres) + 1)
         found = _matrices[key] = csr_array(
             (np.tile(weights, len(centres)), columns, pointers),
             shape=(len(centres), starts[-1]),

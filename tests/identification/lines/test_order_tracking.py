@@ -267,6 +267,23 @@ def test_a_part_contradicts_a_line_from_two_errors_of_white_noise_under_half_of_
     assert everywhere(peak, [], along(angle, shown)) == stands
 
 
+def test_a_larger_line_beside_another_is_no_contradiction_in_a_part_of_the_stroke() -> None:
+    """Over a third of the stroke lines five independent orders apart are not independent."""
+    angle = 30 * (1 - np.abs(np.arange(COUNT) / (COUNT / 2) - 1))
+    apart = 2 * math.pi / 30
+    small = line(2 * math.pi, 1.0, 0.0, prominence=1e4, apart=apart)
+    large = replace(small, order=small.order + 5 * apart, sine=3.0, cosine=4.0)
+    shown = sum(p.wave(along(angle, angle)) for p in (small, large))
+    samples = along(angle, shown)
+    assert not everywhere(small, [], samples)
+    assert everywhere(small, [large], samples)
+    # what cannot be told apart there counts beside it only where it is known beforehand
+    near = replace(large, order=small.order + 2 * apart)
+    samples = along(angle, small.wave(samples) + near.wave(samples))
+    assert not everywhere(small, [near], samples)
+    assert everywhere(small, [near], samples, (near.order,))
+
+
 def at_whole_periods(share: float, beside: float, size: float) -> tuple[Peak, Samples, float]:
     """A line of which whole periods lie between two samples in all but a share of the blocks, and
     of which those beside have a part.
