@@ -21,9 +21,11 @@ from identification.balance.stacked import (
     TURN_SHARE,
     _between_samples,
     _either_direction,
+    _either_way,
     unsure,
 )
 from identification.balance.weak import prepare
+from identification.data.joint_file import Joint
 from identification.diagnosis.improvement import judged_drop, made_worse
 from identification.fitting.assess import BalanceError, Error, assess
 from identification.fitting.covariance import BLOCK, window_errors, windows_over
@@ -259,6 +261,46 @@ def test_the_direction_is_unknown_wherever_a_kernel_takes_a_turn_for_another_ins
     unknown = _either_direction(made, "motor", white(1e-12))
     assert unknown[wrong].all()
     assert not unknown[np.abs(points - turn) > 0.05].any(), "no further than half of the kernel"
+
+
+def test_friction_before_a_link_that_nobody_sees_acts_by_its_curvature_too() -> None:
+    """The link hangs on a spring: what friction of unknown signs makes of a row is no more than is
+    allowed for, and with the worst signs as much.
+    """
+    time = 1e-3 * np.arange(6000)
+    seen = Record.from_channels(
+        time,
+        {
+            "motor_torque": 0.4 * np.sign(np.cos(3 * time)) - 0.5 * np.sin(3 * time),
+            "motor_position": np.round(16e4 * np.sin(3 * time)) / 1e3,
+        },
+        name="seen",
+    )
+    joint = Joint(name="bare", gear_ratio=160.0, model_name="hd1", effects=("coulomb@motor",))
+    model = prepared_model(joint, seen)
+    assert model.lagging_load
+    data = load_dataset([seen], [], joint, model)
+    values = dict.fromkeys(model.parameter_names, 0.0) | {
+        "motor_coulomb": 3.0,
+        "inertia": 15.0,
+        "swinging_share": 0.6,
+        "load_compliance": 1 / 2e4,
+    }
+    lag = 15.0 * 0.6 / 2e4
+    (rows,) = data.train
+    allowed = _either_way(model, data, values, data.train)["axis"]
+    either = _either_direction(rows, "motor", data.sources["motor_position"]).astype(float)
+    rng, most = np.random.default_rng(0), np.zeros(rows.rows)
+    for _ in range(300):
+        torque = 3.0 * either * rng.choice([-1.0, 1.0], len(either))
+        most = np.maximum(most, np.abs(rows.average(torque) + lag * rows.curve(torque)))
+    assert np.all(most <= allowed * (1 + 1e-9))
+    weights = rows.averaging + lag * rows.curving
+    worst = 3.0 * np.abs(weights) @ either
+    assert np.all(worst <= allowed * (1 + 1e-9))
+    some = allowed > 0
+    assert np.max(worst[some] / allowed[some]) == pytest.approx(1.0), "it is as bad as that"
+    assert np.max(worst[some] / (3.0 * rows.average(either))[some]) > 1.2, "the curvature counts"
 
 
 def test_what_may_act_either_way_is_the_friction_of_the_motor() -> None:

@@ -21,11 +21,14 @@ from identification.balance.sensing import Sensing, sense
 from identification.data.joint_file import Joint, parse_joint, toml_text
 from identification.diagnosis.lines import (
     Line,
+    _Joined,
     _names,
     _Scan,
     _Tracked,
+    _without_trend,
     at_every_sample,
     find_lines,
+    line_models,
     named_orders,
     orders_of,
 )
@@ -289,6 +292,46 @@ def test_the_law_of_an_effect_is_tried_where_its_order_is_not_another(
     assert order == pytest.approx(4.017, abs=1e-9)
     assert np.max(np.abs(np.array(tried) - 4.0)) < peak.apart / 2
     assert np.min(tried) < 4.0 < np.max(tried)
+
+
+def test_an_effect_that_is_a_line_is_tried_as_what_is_not_there_yet() -> None:
+    """The first kinematic error with its virtual work and without; a further one as that one is."""
+    every = Sensing(
+        ("motor", "link", "transmission"),
+        both_positions=True,
+        has_torque=True,
+        has_drive=True,
+        has_temperature=False,
+    )
+    plain, ripple = JointModel.harmonic_drive(3), JointModel.harmonic_drive(3).add("torque_ripple")
+    four = replace(JointModel.harmonic_drive(4), virtual_work=False)
+
+    def errors(model: JointModel) -> list[tuple[str, bool]]:
+        made = line_models(model, every)
+        assert all(m.effects == (*model.effects, label) for _, label, m in made)
+        return [(label, m.virtual_work) for key, label, m in made if key == "kinematic_error"]
+
+    assert errors(plain) == [("kinematic_error", True), ("kinematic_error", False)]
+    assert errors(ripple) == errors(plain)
+    assert "torque_ripple#2" in [label for _, label, _ in line_models(ripple, every)]
+    assert errors(four) == [("kinematic_error#4", False)]
+
+
+def test_two_records_at_rest_in_two_places_have_no_line() -> None:
+    joint = Joint(name="arm", gear_ratio=1.0, model_name="hd1", effects=("viscous@link",))
+    time = 2e-3 * np.arange(1000)
+    runs = []
+    for place in (0.0, 0.7):
+        record = Record.from_channels(
+            time, {"link_position": np.full(1000, place), "link_torque": np.cos(time)}
+        )
+        made = at_every_sample(record, joint, sense(record, prepared_model(joint, record)))
+        still = {n: 0 * x for n, x in made.smooth.items() if n.endswith(("velocity", "jerk"))}
+        runs.append(replace(made, smooth={**made.smooth, **still}))
+    residual = np.concatenate([np.cos(w.time) for w in runs])
+    for some in (runs, runs[1:]):
+        joined = _Joined(tuple(some), residual[: 1000 * len(some)], 1.0)
+        assert _without_trend("link", joined, None, direct=True) == []
 
 
 CASES = (

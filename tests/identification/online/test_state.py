@@ -71,6 +71,23 @@ def test_an_estimator_without_detection_takes_up_the_state_of_one_with_it() -> N
     assert np.array_equal(feed(back, "hd3", 3500, 3600).theta, feed(plain, "hd3", 3500, 3600).theta)
 
 
+def test_a_margin_of_the_detection_divides_its_scores_and_means_nothing_without_it() -> None:
+    joint, options = reference_joint("hd3"), OnlineOptions(optimise=False, warm_up=2.0)
+    scores = {}
+    for margins in ((1.0,), (2.0,), (2.0, 2.0), (4.0, 1.0)):
+        one = OnlineEstimator(joint, STEP, options)
+        for margin in margins:
+            one.set_fault_margin(margin)
+        scores[margins] = np.array(feed(one, "hd3", 0, 1500).score)
+    assert np.max(scores[1.0,]) > 0.1
+    assert scores[2.0,] == pytest.approx(scores[1.0,] / 2, rel=1e-9)
+    assert np.array_equal(scores[2.0, 2.0], scores[2.0,])
+    assert scores[4.0, 1.0] == pytest.approx(scores[1.0,], rel=1e-9)
+    plain = OnlineEstimator(joint, STEP, QUICK)
+    plain.set_fault_margin(2.0)
+    assert plain.score == OnlineEstimator(joint, STEP, QUICK).score
+
+
 def test_a_share_of_the_torque_is_noise_at_least() -> None:
     """Of the motor's drive and of the torque into the link, root mean square so far."""
     shares = (1e-3, 0.2)
