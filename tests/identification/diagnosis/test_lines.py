@@ -190,6 +190,7 @@ def test_samples_are_taken_as_they_are_unless_their_stamps_are_uneven(jitter: fl
     joint = Joint(name="arm", gear_ratio=1.0, model_name="hd1", effects=("viscous@link",))
     made = at_every_sample(record, joint, sense(record, prepared_model(joint, record)))
     assert len(made.starts) == 3
+    assert np.array_equal(made.stretch, np.repeat([0, 1], np.diff(made.starts))), "a row a sample"
     assert np.median(np.diff(made.time)) == pytest.approx(dt, rel=1e-3)
     inside = np.delete(np.diff(made.time), made.starts[1:-1] - 1)
     assert inside == pytest.approx(np.median(inside), rel=1e-6)
