@@ -85,12 +85,14 @@ _UPDATES: Final = Judges(
         f"{_ONLINE}/test_common_mode.py",
         f"{_ONLINE}/test_exact_rows.py",
         f"{_ONLINE}/test_filter.py",
+        f"{_ONLINE}/test_state.py",
     ),
     (f"{_ONLINE}/test_faulty_files.py", "tests/irj_fmu/test_estimator_rows.py"),
 )
 _ROWS: Final = Judges(
     (
         f"{_BALANCE}/test_weak.py",
+        f"{_BALANCE}/test_innovations.py",
         "tests/identification/fitting/test_signed_fit.py",
         f"{_BALANCE}/test_floors.py",
         *_LOOP[:1],

@@ -416,7 +416,7 @@ def noise_believed(
             if memory:
                 quick = _less(level, _even(drifts[b], b, data.train))
                 course = innovations(
-                    np.where(rows, r, 0.0),
+                    r,
                     np.where(rows, np.hypot(quick, either[b]), math.inf),
                     drifts[b],
                     memory=memory,

@@ -130,13 +130,14 @@ def differentiated_kernel(length: float, dt: float, order: int, step: int = 1) -
     half = max(order + 2, whole(length / (dt * step) / 2))
     t = np.arange(-half, half + 1) * (dt * step)
     phase = np.clip(np.pi * t / width, -np.pi / 2, np.pi / 2)
-    c, s, a = np.cos(phase), np.sin(phase), np.pi / width
+    c, s = np.cos(phase), np.sin(phase)
+    # but for their sizes, which the moment of the order sets
     shapes = (
         c**4,
-        4 * a * c**3 * s,
-        a**2 * (12 * c**2 * s**2 - 4 * c**4),
-        a**3 * (24 * c * s**3 - 40 * c**3 * s),
-        a**4 * (24 * s**4 - 192 * c**2 * s**2 + 40 * c**4),
+        c**3 * s,
+        c**2 * (3 * s**2 - c**2),
+        c * s * (3 * s**2 - 5 * c**2),
+        3 * s**4 - 24 * c**2 * s**2 + 5 * c**4,
     )
     weights = np.asarray(shapes[order], dtype=float)
     unit = c**4 / np.sum(c**4)
@@ -456,7 +457,7 @@ def _averages(
             ]
         )
         columns = (centres[:, None] + np.arange(-own, own + 1)).ravel()
-        pointers = np.arange(0, len(columns) + 1, len(weights))
+        pointers = len(weights) * np.arange(len(centres) + 1)
         found = _matrices[key] = csr_array(
             (np.tile(weights, len(centres)), columns, pointers),
             shape=(len(centres), starts[-1]),

@@ -121,7 +121,7 @@ class OnlineEstimator:
         self.present = (True, True, True, has_link, has_link, self.options.has_torque)
         self._all, self._whole = list(self.present), all(self.present)
         used: list[bool] = np.any(self.rows.uses, axis=0).tolist()
-        self.needs = [False] * 6
+        self.needs = [False] * len(self.present)
         for k, reading in enumerate(SAMPLED):
             self.needs[reading] = used[k] and self.present[reading]
         self.samples = Samples(self.rows.timing, self.needs, self.rows.alignment)

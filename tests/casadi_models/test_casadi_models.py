@@ -343,6 +343,59 @@ def test_sensor_compliance_is_a_spring_in_series(cubic: float) -> None:
             assert torque == pytest.approx(twist / (1 / 2.1513e4 + 1 / 4e4), rel=1e-12)
 
 
+INVERTED: dict[str, JointModel] = {
+    "elastic, load on both sides": JointModel.harmonic_drive(3)
+    .add("gravity")
+    .add("load_dependent_friction@motor")
+    .add("load_dependent_friction@link")
+    .with_values(
+        {
+            **TABLE_4_3,
+            "gravity_torque": -105.18,
+            "motor_load_friction": 0.1,
+            "link_load_friction": 0.07,
+        }
+    ),
+    "rigid, load at the motor": JointModel(gear_ratio=-160.0)
+    .add("gravity")
+    .add("load_dependent_friction@motor")
+    .with_values({"motor_inertia": 4.447, "link_inertia": 10.277, "gravity_torque": -105.18})
+    .with_values({"motor_load_friction": 0.1, "motor_smoothing_velocity": 0.02}),
+    "rigid, what the teeth carry is lost in them": JointModel(gear_ratio=-160.0)
+    .add("gravity")
+    .add("viscous@link")
+    .add("load_dependent_friction@link")
+    .with_values({"motor_inertia": 4.447, "link_inertia": 10.277, "gravity_torque": -105.18})
+    .with_values({"link_load_friction": 0.08, "link_smoothing_velocity": 0.02, "link_viscous": 9}),
+    "one inertia": JointModel(inertias=("inertia",))
+    .add("gravity")
+    .add("load_dependent_friction@motor")
+    .with_values({"inertia": 12.0, "gravity_torque": -105.18, "motor_load_friction": 0.1}),
+    "internal states": model_2b().add("hysteresis"),
+}
+
+
+@pytest.mark.parametrize("which", sorted(INVERTED))
+def test_the_regressor_at_the_motion_of_the_dynamics_gives_the_drive_back(which: str) -> None:
+    """Y theta + rest of the accelerations that a drive makes is that drive, and nothing is left of
+    the link's equation.
+    """
+    model = INVERTED[which]
+    p, names = model.value_vector(), model.parameter_names
+    theta = np.array([p[names.index(n)] for n in model.linear_parameters])
+    mechanical, memory = len(model.functions.state_names), len(model.functions.memory_names)
+    assert model.regressor.size1_in(1) == mechanical // 2, "an acceleration per degree of freedom"
+    rng = np.random.default_rng(4)
+    for drive in (-120.0, 0.0, 35.0):
+        x = np.array([0.4 + 2e-3, 0.5, 0.4, -0.3] if mechanical == 4 else [0.7, -0.4])
+        x = np.concatenate([x, rng.uniform(-0.5, 0.5, memory)])
+        u = [drive, 0.0, 0.0]
+        rates = np.array(model.dynamics(x, u, p)).ravel()
+        matrix, rest = (np.array(m) for m in model.regressor(x, rates[1:mechanical:2], u, p))
+        given = np.array([drive, 0.0])[: len(rest)]
+        assert (matrix @ theta + rest.ravel()) == pytest.approx(given, rel=1e-8, abs=1e-8)
+
+
 # --- linearisation --------------------------------------------------------------------------------
 
 

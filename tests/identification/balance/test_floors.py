@@ -21,9 +21,11 @@ from identification.balance.stacked import (
     TURN_SHARE,
     _between_samples,
     _either_direction,
+    _either_way,
     unsure,
 )
 from identification.balance.weak import prepare
+from identification.data.joint_file import Joint
 from identification.diagnosis.improvement import judged_drop, made_worse
 from identification.fitting.assess import BalanceError, Error, assess
 from identification.fitting.covariance import BLOCK, window_errors, windows_over
@@ -222,6 +224,83 @@ def test_the_direction_is_unknown_where_the_joint_is_slow_or_turns(dt: float) ->
     time = np.arange(0.1, 1.6, dt)
     away = prepare(time, {"motor_position": np.cos(np.pi * time)}, (slice(0, len(time)),))
     assert not _either_direction(away, "motor", white(1e-12))[[0, 1, -2, -1]].any()
+
+
+def test_noise_alone_tells_no_direction_and_hides_none_that_is_well_above_it() -> None:
+    """One in 370 normal numbers is beyond three deviations; one in 40 above three of a mean of five
+    is not.
+    """
+    rng, dt, noise = np.random.default_rng(6), 1e-3, 1e-5
+    time = dt * np.arange(20_000)
+    known = []
+    for deviations in (0.0, 5.0):
+        level = prepare(time, {"motor_position": time}, (slice(0, len(time)),)).grid
+        speed = deviations * level.velocity_noise("motor_position", white(noise))
+        position = speed * time + noise * rng.standard_normal(len(time))
+        made = prepare(time, {"motor_position": position}, (slice(0, len(time)),))
+        known.append(float(np.mean(~_either_direction(made, "motor", white(noise)))))
+    assert known[0] < 0.01
+    assert known[1] > 0.95
+
+
+@pytest.mark.parametrize(("before", "after"), [(1.0, -0.2), (-0.2, 1.0), (-1.0, 0.2)])
+def test_the_direction_is_unknown_wherever_a_kernel_takes_a_turn_for_another_instant(
+    before: float, after: float
+) -> None:
+    """A joint that bounces back is slower after the turn: smoothed, it turns elsewhere."""
+    dt = 1e-3
+    time = dt * np.arange(4000)
+    turn = 2.0
+    position = np.where(time < turn, before, after) * (time - turn)
+    made = prepare(time, {"motor_position": position}, (slice(0, len(time)),), pointwise=0.1)
+    points = time[:: made.grid.step]
+    wrong = np.sign(made.points["motor_velocity"]) != np.sign(
+        np.where(points < turn, before, after)
+    )
+    assert np.sum(wrong) > 3
+    unknown = _either_direction(made, "motor", white(1e-12))
+    assert unknown[wrong].all()
+    assert not unknown[np.abs(points - turn) > 0.05].any(), "no further than half of the kernel"
+
+
+def test_friction_before_a_link_that_nobody_sees_acts_by_its_curvature_too() -> None:
+    """The link hangs on a spring: what friction of unknown signs makes of a row is no more than is
+    allowed for, and with the worst signs as much.
+    """
+    time = 1e-3 * np.arange(6000)
+    seen = Record.from_channels(
+        time,
+        {
+            "motor_torque": 0.4 * np.sign(np.cos(3 * time)) - 0.5 * np.sin(3 * time),
+            "motor_position": np.round(16e4 * np.sin(3 * time)) / 1e3,
+        },
+        name="seen",
+    )
+    joint = Joint(name="bare", gear_ratio=160.0, model_name="hd1", effects=("coulomb@motor",))
+    model = prepared_model(joint, seen)
+    assert model.lagging_load
+    data = load_dataset([seen], [], joint, model)
+    values = dict.fromkeys(model.parameter_names, 0.0) | {
+        "motor_coulomb": 3.0,
+        "inertia": 15.0,
+        "swinging_share": 0.6,
+        "load_compliance": 1 / 2e4,
+    }
+    lag = 15.0 * 0.6 / 2e4
+    (rows,) = data.train
+    allowed = _either_way(model, data, values, data.train)["axis"]
+    either = _either_direction(rows, "motor", data.sources["motor_position"]).astype(float)
+    rng, most = np.random.default_rng(0), np.zeros(rows.rows)
+    for _ in range(300):
+        torque = 3.0 * either * rng.choice([-1.0, 1.0], len(either))
+        most = np.maximum(most, np.abs(rows.average(torque) + lag * rows.curve(torque)))
+    assert np.all(most <= allowed * (1 + 1e-9))
+    weights = rows.averaging + lag * rows.curving
+    worst = 3.0 * np.abs(weights) @ either
+    assert np.all(worst <= allowed * (1 + 1e-9))
+    some = allowed > 0
+    assert np.max(worst[some] / allowed[some]) == pytest.approx(1.0), "it is as bad as that"
+    assert np.max(worst[some] / (3.0 * rows.average(either))[some]) > 1.2, "the curvature counts"
 
 
 def test_what_may_act_either_way_is_the_friction_of_the_motor() -> None:

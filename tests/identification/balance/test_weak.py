@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import casadi as ca
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from casadi_models import EFFECTS, JointModel
@@ -13,6 +15,8 @@ from casadi_models.vectorised import Vectorised
 from identification.balance.memory import Cache
 from identification.balance.noise import noise_level
 from identification.balance.weak import differentiated_kernel, kernel, prepare, whole
+
+FloatArray = npt.NDArray[np.float64]
 
 
 @pytest.mark.parametrize("order", [0, 1, 2, 3])
@@ -51,6 +55,21 @@ def test_a_fast_law_at_the_points_has_the_average_of_its_samples(dt: float) -> N
     samples = data.grid.correlate(fast, differentiated_kernel(data.grid.length, dt, 0))
     points = data.average(fast[:: data.grid.step])
     assert np.abs(points - samples).max() < 1e-3 * np.abs(samples).max()
+
+
+def test_a_stretch_begins_after_each_gap_and_ends_half_a_kernel_from_it() -> None:
+    dt, long = 1e-3, 0.1
+    time = np.concatenate([np.arange(0, 2, dt), np.arange(10, 13, dt), np.arange(20, 21, dt)])
+    parts = (slice(0, 2000), slice(2000, 5000), slice(5000, 6000))
+    made = prepare(time, {"motor_position": np.sin(time)}, parts, pointwise=long)
+    after = np.concatenate([[False], np.diff(made.time) > 1.0])
+    assert np.sum(after) == 2
+    assert np.array_equal(made.begins, after)
+    for part in parts:
+        begin, end = time[part][0], time[part][-1]
+        rows = made.time[(made.time >= begin) & (made.time <= end)]
+        assert rows[0] - begin == pytest.approx(long / 2, abs=8 * dt)
+        assert end - rows[-1] == pytest.approx(long / 2, abs=8 * dt + made.grid.stride * dt)
 
 
 def test_no_row_and_no_block_spans_two_segments() -> None:
@@ -98,11 +117,13 @@ def test_vectorised_evaluation_equals_casadi(key: str) -> None:
     assert fast == pytest.approx(slow, rel=1e-12, abs=1e-12)
 
 
-def test_kernel_of_the_points_is_exact_for_polynomials() -> None:
-    for order in (0, 1):
-        weights = kernel(0.03, 1e-3, order)
-        t = (np.arange(len(weights)) - len(weights) // 2) * 1e-3
-        assert weights @ t**order == pytest.approx(1.0)
+@pytest.mark.parametrize("order", [0, 1, 2, 3])
+def test_kernel_of_the_points_is_exact_for_polynomials(order: int) -> None:
+    weights = kernel(0.03, 1e-3, order)
+    t = (np.arange(len(weights)) - len(weights) // 2) / 15  # half of the kernel is one
+    for power in range(order + 2):
+        expected = math.factorial(order) / 0.015**order if power == order else 0.0
+        assert weights @ t**power == pytest.approx(expected, abs=1e-9 / 0.015**order)
 
 
 @pytest.mark.parametrize("step", [1e-3, 2e-3, 4e-3, 5e-3])
@@ -197,6 +218,21 @@ def test_averages_and_curvatures_of_the_points_are_exact_for_polynomials() -> No
     assert made.curve(3 * t**2 + t - 1) == pytest.approx(6.0, rel=1e-9)
     both = made.curve(np.column_stack([t, t**2]))
     assert both == pytest.approx(np.tile([0.0, 2.0], (made.rows, 1)), abs=1e-8)
+
+
+@pytest.mark.parametrize(("length", "dt"), [(0.06, 1e-3), (0.06, 4e-3), (0.03, 2e-3)])
+@pytest.mark.parametrize("make", [kernel, differentiated_kernel])
+def test_the_kernel_wipes_out_three_and_more_whole_waves(
+    make: Callable[[float, float, int], FloatArray], length: float, dt: float
+) -> None:
+    """Of c cos^4 over its width, the one that ends where the next samples would be, two thirds of
+    one wave are left and a sixth of two.
+    """
+    weights = make(length, dt, 0)
+    count = len(weights) + 1
+    assert abs(count * dt - length) < 3.5 * dt
+    phase = 2 * math.pi * np.outer(np.arange(6), np.arange(1, count) - count / 2) / count
+    assert np.cos(phase) @ weights == pytest.approx([1, 2 / 3, 1 / 6, 0, 0, 0], abs=1e-12)
 
 
 @pytest.mark.parametrize("order", [1, 2, 3, 4])

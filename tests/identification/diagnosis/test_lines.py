@@ -7,25 +7,43 @@ import tomllib
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from benchmarks.lines import Case, Result, results
+from casadi_models import JointModel
 from identification import Record, improve, load_joint, read
-from identification.balance.sensing import sense
+from identification.balance.sensing import Sensing, sense
 from identification.data.joint_file import Joint, parse_joint, toml_text
 from identification.diagnosis.lines import (
     Line,
+    _Joined,
+    _names,
+    _Scan,
+    _Tracked,
+    _without_trend,
     at_every_sample,
     find_lines,
+    line_models,
     named_orders,
     orders_of,
 )
-from identification.diagnosis.order_tracking import ALPHA, Samples, confirmed, peaks, spectrum
+from identification.diagnosis.order_tracking import (
+    ALPHA,
+    Peak,
+    Samples,
+    confirmed,
+    peaks,
+    spectrum,
+)
 from identification.errors import InputError
 from identification.fitting.engine import load_dataset, prepared_model, solve
 
+FloatArray = npt.NDArray[np.float64]
 SHARED = Path(__file__).resolve().parents[3].parent / "shared" / "hidden_effect" / "none"
 
 
@@ -155,6 +173,34 @@ def test_what_runs_at_one_speed_tells_once_a_pass(slow: bool, blocks: int) -> No
     sensing = sense(record, prepared_model(joint, record))
     made = at_every_sample(record, joint, sensing).block
     assert abs(len(np.unique(made)) - blocks) <= 1
+    assert np.array_equal(np.unique(made), np.arange(made.max() + 1)), "numbered without a gap"
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.2])
+def test_samples_are_taken_as_they_are_unless_their_stamps_are_uneven(jitter: float) -> None:
+    """A gap between two stretches makes no stretch uneven."""
+    rng = np.random.default_rng(7)
+    dt = 2e-3
+    even = dt * np.concatenate([np.arange(1500), 4000 + np.arange(1500)])
+    time = even + jitter * dt * rng.uniform(-1, 1, len(even))
+    angle = np.sin(time) + 1e-9 * rng.standard_normal(len(time))
+    record = Record.from_channels(
+        time, {"link_position": angle, "link_torque": 0 * time, "run": np.arange(3000) // 1500}
+    )
+    joint = Joint(name="arm", gear_ratio=1.0, model_name="hd1", effects=("viscous@link",))
+    made = at_every_sample(record, joint, sense(record, prepared_model(joint, record)))
+    assert len(made.starts) == 3
+    assert np.array_equal(made.stretch, np.repeat([0, 1], np.diff(made.starts))), "a row a sample"
+    assert np.median(np.diff(made.time)) == pytest.approx(dt, rel=1e-3)
+    inside = np.delete(np.diff(made.time), made.starts[1:-1] - 1)
+    assert inside == pytest.approx(np.median(inside), rel=1e-6)
+    speed = made.points["link_velocity"] - np.cos(made.time)
+    apart = np.ones(len(speed), dtype=bool)
+    for edge in made.starts:
+        apart[max(edge - 10, 0) : edge + 10] = False
+    assert np.abs(speed[apart]).max() < 2e-3
+    if not jitter:
+        assert np.array_equal(made.points["link_position"], angle)
 
 
 def test_rest_counts_for_nothing() -> None:
@@ -167,6 +213,126 @@ def test_rest_counts_for_nothing() -> None:
         np.concatenate([samples.block, np.full(4000, samples.block[-1])]),
     )
     assert peaks(longer, 6.0)[0].order == pytest.approx(peaks(samples, 6.0)[0].order, abs=1e-3)
+
+
+def along(*parts: tuple[float, float], seed: int = 0) -> Samples:
+    """White noise along a swinging angle, and lines of these orders and sizes in it."""
+    noise = swinging(seed)
+    lines = sum(size * np.sin(order * noise.angle + order) for order, size in parts)
+    return replace(noise, residual=0.3 * noise.residual + lines)
+
+
+def lines_in(
+    monkeypatch: pytest.MonkeyPatch, samples: dict[str, Samples], joint: Joint
+) -> list[Line]:
+    """What is found in the residuals of some balances of a joint."""
+    tracked = [_Tracked(b, 1, s, None, 1e-2, direct=True) for b, s in samples.items()]
+    monkeypatch.setattr("identification.diagnosis.lines._tracked", lambda *_: (tracked, ()))
+    data: Any = SimpleNamespace(sensing=SimpleNamespace(clamped_link=False), joint=joint)
+    nothing: Any = None
+    return find_lines(nothing, data, [], [])
+
+
+def test_a_line_in_two_balances_is_one_and_two_that_can_be_told_apart_are_two(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    axis = Joint("axis", "linear", model_name="hd1")
+    apart = 2 * np.pi / swinging(0).stroke
+    first, second = 2.3, 2.3 + 3.5 * apart
+    both = {b: along((first, 1.0), (second, 0.7), seed=k) for k, b in enumerate(("motor", "link"))}
+    found = lines_in(monkeypatch, both, axis)
+    assert [x.order for x in found] == [
+        pytest.approx(first, abs=apart / 2),
+        pytest.approx(second, abs=apart / 2),
+    ]
+    # the order of one line may be off in each balance
+    beside = {"motor": along((first, 1.0)), "link": along((first + 1.2 * apart, 0.8), seed=1)}
+    assert len(lines_in(monkeypatch, beside, axis)) == 1
+
+
+@pytest.mark.parametrize(("order", "many"), [(0.2, 0), (0.3, 1)])
+def test_what_is_slower_than_a_quarter_of_a_turn_belongs_to_the_link(
+    monkeypatch: pytest.MonkeyPatch, order: float, many: int
+) -> None:
+    seen = {"motor": along((order, 1.0))}
+    assert len(lines_in(monkeypatch, seen, Joint(gear_ratio=100.0))) == many
+    if many:
+        # one period per turn of a screw of ten millimetres is a hundred per metre
+        axis = Joint("axis", "linear", model_name="hd1", pitch=0.01)
+        assert lines_in(monkeypatch, seen, axis) == []
+
+
+def test_the_law_of_an_effect_is_tried_where_its_order_is_not_another(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Nearer to the peak than half of what can be told apart; its own order is where it explains
+    most.
+    """
+    peak = Peak(4.0, 1e-3, sine=1.0, cosine=0.0, prominence=99.0, apart=0.1, amplitude_error=0.1)
+    tried: list[float] = []
+
+    def gains(label: str, model: JointModel, orders: FloatArray, *_: object) -> FloatArray:
+        tried.extend(orders)
+        off = (orders - 4.017) / peak.apart
+        return 100 * (1 - off**2) if label.startswith("torque_ripple") else 0 * off
+
+    monkeypatch.setattr("identification.diagnosis.lines._gains", gains)
+    model = JointModel.harmonic_drive(3)
+    every = Sensing(
+        ("motor", "link", "transmission"),
+        both_positions=True,
+        has_torque=True,
+        has_drive=True,
+        has_temperature=False,
+    )
+    data: Any = SimpleNamespace(sensing=every)
+    solution: Any = SimpleNamespace(model=model)
+    wide = replace(peak, error=0.02)
+    names, order = _names(wide, 4.0, _Scan(solution, data, (), ()))
+    assert names == ("torque_ripple",)
+    assert order == pytest.approx(4.017, abs=1e-9)
+    assert np.max(np.abs(np.array(tried) - 4.0)) < peak.apart / 2
+    assert np.min(tried) < 4.0 < np.max(tried)
+
+
+def test_an_effect_that_is_a_line_is_tried_as_what_is_not_there_yet() -> None:
+    """The first kinematic error with its virtual work and without; a further one as that one is."""
+    every = Sensing(
+        ("motor", "link", "transmission"),
+        both_positions=True,
+        has_torque=True,
+        has_drive=True,
+        has_temperature=False,
+    )
+    plain, ripple = JointModel.harmonic_drive(3), JointModel.harmonic_drive(3).add("torque_ripple")
+    four = replace(JointModel.harmonic_drive(4), virtual_work=False)
+
+    def errors(model: JointModel) -> list[tuple[str, bool]]:
+        made = line_models(model, every)
+        assert all(m.effects == (*model.effects, label) for _, label, m in made)
+        return [(label, m.virtual_work) for key, label, m in made if key == "kinematic_error"]
+
+    assert errors(plain) == [("kinematic_error", True), ("kinematic_error", False)]
+    assert errors(ripple) == errors(plain)
+    assert "torque_ripple#2" in [label for _, label, _ in line_models(ripple, every)]
+    assert errors(four) == [("kinematic_error#4", False)]
+
+
+def test_two_records_at_rest_in_two_places_have_no_line() -> None:
+    joint = Joint(name="arm", gear_ratio=1.0, model_name="hd1", effects=("viscous@link",))
+    time = 2e-3 * np.arange(1000)
+    runs = []
+    for place in (0.0, 0.7):
+        record = Record.from_channels(
+            time, {"link_position": np.full(1000, place), "link_torque": np.cos(time)}
+        )
+        made = at_every_sample(record, joint, sense(record, prepared_model(joint, record)))
+        still = {n: 0 * x for n, x in made.smooth.items() if n.endswith(("velocity", "jerk"))}
+        runs.append(replace(made, smooth={**made.smooth, **still}))
+    residual = np.concatenate([np.cos(w.time) for w in runs])
+    for some in (runs, runs[1:]):
+        joined = _Joined(tuple(some), residual[: 1000 * len(some)], 1.0)
+        assert _without_trend("link", joined, None, direct=True) == []
 
 
 CASES = (

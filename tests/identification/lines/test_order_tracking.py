@@ -8,16 +8,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from identification.diagnosis.lines import _noise, _Tracked, held_out_drop
+from identification.diagnosis.lines import _noise, _Tracked, held_out_drop, highest_order
 from identification.diagnosis.order_tracking import (
     FEWEST_CYCLES,
     MEDIAN_EFFICIENCY,
     NAMED_WITHIN,
     NEAREST,
     OUTLIER,
+    PARTS,
     SURROUNDINGS,
     Peak,
     Samples,
+    apart_from_slow,
     background,
     beside,
     clipped,
@@ -245,6 +247,91 @@ def test_a_line_is_everywhere_or_none(where: str) -> None:
     assert everywhere(peak, [], samples) == (where == "everywhere")
 
 
+@pytest.mark.parametrize(("deviations", "stands"), [(1.8, True), (2.2, False)])
+@pytest.mark.parametrize("part", range(PARTS))
+@pytest.mark.parametrize("forward", [True, False])
+def test_a_part_contradicts_a_line_from_two_errors_of_white_noise_under_half_of_it(
+    forward: bool, part: int, deviations: float, stands: bool
+) -> None:
+    # to and fro at one speed: each part of the stroke has as many samples either way
+    angle = 30 * (1 - np.abs(np.arange(COUNT) / (COUNT / 2) - 1))
+    cells = 2 * PARTS
+    here = (angle // (30 / PARTS) == part) & ((np.arange(COUNT) < COUNT / 2) == forward)
+    prominence = 75.0
+    # a line of unit size has the power (n / 2)^2 and noise of unit variance n: by the prominence
+    # the variance of the noise is n / 4 z, and of the size in a part 2 / (n / parts) times that
+    error = math.sqrt(COUNT / (4 * prominence) * 2 / (COUNT / cells))
+    wave = np.sin(2 * math.pi * angle)
+    shown = np.where(here, (0.5 - deviations * error) * wave, wave)
+    peak = line(2 * math.pi, 1.0, 0.0, prominence=prominence)
+    assert everywhere(peak, [], along(angle, shown)) == stands
+
+
+def test_a_larger_line_beside_another_is_no_contradiction_in_a_part_of_the_stroke() -> None:
+    """Over a third of the stroke lines five independent orders apart are not independent."""
+    angle = 30 * (1 - np.abs(np.arange(COUNT) / (COUNT / 2) - 1))
+    apart = 2 * math.pi / 30
+    small = line(2 * math.pi, 1.0, 0.0, prominence=1e4, apart=apart)
+    large = replace(small, order=small.order + 5 * apart, sine=3.0, cosine=4.0)
+    shown = sum(p.wave(along(angle, angle)) for p in (small, large))
+    samples = along(angle, shown)
+    assert not everywhere(small, [], samples)
+    assert everywhere(small, [large], samples)
+    # what cannot be told apart there counts beside it only where it is known beforehand
+    near = replace(large, order=small.order + 2 * apart)
+    samples = along(angle, small.wave(samples) + near.wave(samples))
+    assert not everywhere(small, [near], samples)
+    assert everywhere(small, [near], samples, (near.order,))
+
+
+def at_whole_periods(share: float, beside: float, size: float) -> tuple[Peak, Samples, float]:
+    """A line of which whole periods lie between two samples in all but a share of the blocks, and
+    of which those beside have a part.
+    """
+    dt, order = 0.01, 2.0
+    still = np.arange(COUNT) // 100 % 20 >= round(20 * share)
+    speed = 2 * math.pi / order * np.where(still, 1.0, 1.37)
+    angle = np.cumsum(speed)
+    peak = line(order, 0.6 * size, -0.8 * size)
+    wave = peak.wave(along(angle, angle))
+    return peak, along(angle, np.where(still, wave, beside * wave)), dt
+
+
+@pytest.mark.parametrize("size", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize("named", [True, False])
+def test_a_line_is_there_beside_the_samples_in_which_it_stands_still(
+    named: bool, size: float
+) -> None:
+    for share in (0.25, 0.5):
+        peak, samples, dt = at_whole_periods(share, 1.0, size)
+        assert apart_from_slow(peak, samples, dt, named=named), "all samples have it"
+        peak, samples, dt = at_whole_periods(share, 0.0, size)
+        assert not apart_from_slow(peak, samples, dt, named=named), "a drift where it stands still"
+    # a twentieth of the samples tells nothing: only what is known beforehand is kept
+    peak, samples, dt = at_whole_periods(0.05, 0.0, size)
+    assert apart_from_slow(peak, samples, dt, named=named) == named
+
+
+def test_nothing_stands_still_in_samples_between_which_less_than_half_a_period_lies() -> None:
+    angle = np.cumsum(0.02 * (1 + np.sin(0.01 * np.arange(COUNT))))
+    samples = along(angle, line().wave(along(angle, angle)))
+    assert apart_from_slow(line(), samples, 0.01, named=False)
+    none = replace(samples, residual=0 * angle)
+    assert not apart_from_slow(line(), none, 0.01, named=True)
+
+
+def test_no_line_is_more_certain_than_it_stands_over_its_surroundings() -> None:
+    angle = 40 * np.sin(0.01 * np.arange(COUNT)) + 7 * np.sin(0.037 * np.arange(COUNT))
+    weight = np.abs(np.gradient(angle))
+    for seed in range(12):
+        noise = np.random.default_rng(seed).standard_normal(COUNT)
+        for found in peaks(along(angle, 0.5 * np.sin(2.3 * angle) + noise, weight), 6.0):
+            assert found.certainty <= found.prominence * (1 + 1e-9)
+            # Cramer-Rao bound of the frequency of a sine of that power
+            least = math.sqrt(6 / found.prominence) * found.apart / (2 * math.pi)
+            assert found.error >= least * (1 - 1e-9)
+
+
 def test_what_a_line_takes_off_held_out_samples() -> None:
     angle = np.linspace(0.0, 50.0, COUNT)
     weight = np.where(np.arange(COUNT) % 2 == 0, 2.0, 1.0)
@@ -267,6 +354,24 @@ def test_the_error_of_a_line_is_the_scatter_of_its_phase_in_noise() -> None:
             tracked = _Tracked("motor", 1, samples, None, 1e-2, direct=True)
             errors.append(_noise(line(2.3), tracked))
     assert np.mean(errors) == pytest.approx(np.sqrt(np.mean(np.square(sines))), rel=0.2)
+
+
+def test_noise_that_rises_with_the_order_is_seen_beyond_half_of_the_sampling_rate() -> None:
+    """There, too, the level has surroundings above it."""
+    angle = 40 * np.sin(0.011 * np.arange(2000)) + 7 * np.sin(0.037 * np.arange(2000))
+    weight = np.abs(np.gradient(angle))
+    rng = np.random.default_rng(3)
+    sines, errors = [], []
+    for seed in range(60):
+        orders = rng.uniform(0.0, 6.0, 150)
+        phase = np.outer(orders, angle) + rng.uniform(0, 2 * math.pi, (150, 1))
+        samples = along(angle, orders @ np.sin(phase), weight)
+        sines.append(phase_fit(2.3, samples)[0])
+        if seed < 12:
+            coarse = _Tracked("motor", 1, samples, None, 10.0, direct=True)
+            assert highest_order(samples, coarse.dt) < 2.3
+            errors.append(_noise(line(2.3), coarse))
+    assert 0.9 < np.mean(errors) / np.sqrt(np.mean(np.square(sines))) < 2.0
 
 
 def test_the_error_of_an_order_is_the_scatter_of_the_orders() -> None:

@@ -107,6 +107,24 @@ def test_the_estimate_is_held_and_comes_back(failure: Change, key: str) -> None:
     assert np.all(theta[first:] <= estimator.high + 1e-12)
 
 
+def test_what_a_failure_left_is_forgotten_when_the_estimate_comes_back() -> None:
+    """The residuals are then again of the size that they have of the readings as they are."""
+    readings = clean("irj1b").copy()
+    biased(readings)
+    estimator = OnlineEstimator(
+        start_of(reference_joint("irj1b")), STEP, OnlineOptions(optimise=False, warm_up=5.0)
+    )
+    told = row = 0
+    for k, values in enumerate(readings.tolist()):
+        made = estimator.update(k * STEP, values, [True] * 6)
+        if not told and "estimate back" in estimator.events:
+            told, row = k, estimator.made
+        if told and made and estimator.made == row + 1:
+            break
+    assert FIRST < told < COUNT - 1
+    assert estimator.ratio * estimator.least == pytest.approx(estimator.level, rel=0.1)
+
+
 def test_frozen_bus_is_told_at_once_and_ends_with_the_first_changed_bits() -> None:
     _, held, fault, _ = follow("hd3", frozen)
     first, last = FIRST // 16, LAST // 16

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 import numpy.typing as npt
 import pytest
 
 from benchmarks.online_filter import KEY, Readings, filter_from, levels_of, plant, recorded
+from casadi_models import EFFECTS, JointModel
+from casadi_models.text.typed_law import TypedLaw, register
 from identification.errors import InputError
 from identification.online.filter import JointFilter, Levels
+from identification.online.filter_step import _inverse
 
 FloatArray = npt.NDArray[np.float64]
 FULL, POSITIONS = (1.0,) * 6, (1.0, 1.0, 0.0, 1.0, 0.0, 1.0)
@@ -146,6 +151,66 @@ def test_derivatives_against_finite_differences() -> None:
         off.append(float(np.abs(after[:4] - flow(mean, length)).max()))
     assert off[0] < 1e-5
     assert 6 < off[0] / off[1] < 10
+
+
+@pytest.fixture
+def pulled() -> Iterator[JointModel]:
+    """A rigid joint with a torque of its time and friction of its temperature."""
+    register(TypedLaw("pulled", "rise*t", ("link",), ("rise=-9..9 N.m/s",)))
+    yield JointModel(gear_ratio=-160.0).add("pulled").add("thermal_friction@motor")
+    EFFECTS.forget("pulled")
+
+
+def test_time_and_temperature_reach_the_laws_that_read_them(pulled: JointModel) -> None:
+    """A torque that grows with time pushes, and friction that grows with temperature brakes."""
+    model = pulled.with_values(
+        {
+            "motor_inertia": 4.0,
+            "link_inertia": 6.0,
+            "pulled_rise": -2.0,
+            "motor_thermal_viscous": 0.5,
+            "motor_thermal_coulomb": 0.0,
+        }
+    )
+    joint = JointFilter(model, 1e-3)
+    mean = np.array([0.1, 3.0, 0.0, 0.0, 0.0])
+    p, h = joint.parameters(Levels()), 1e-3
+    for time, temperature in ((0.0, 0.0), (7.0, 0.0), (0.0, 5.0), (7.0, 5.0)):
+        given = [0.0, 0.0, 1.0, h, h, time, temperature]
+        after = np.array(joint.predict(mean, np.eye(joint.size), given, p)[0]).ravel()
+        torque = 2.0 * time - 0.5 * temperature * 3.0
+        assert (after[1] - 3.0) / h == pytest.approx(torque / 10.0, rel=1e-3, abs=1e-9)
+
+
+@pytest.mark.parametrize("steps", [1, 2])
+@pytest.mark.parametrize("turning", ["motor", "link"])
+def test_a_side_that_turns_is_unsure_by_its_dry_friction_over_one_sample(
+    turning: str, steps: int
+) -> None:
+    """However many steps the sample has; the other side moves and is sure."""
+    joint = JointFilter(plant(), 1e-3)
+    joint.dry, joint.slow = np.array([3.0, 5.0]), np.array([1e-2, 1e-2])
+    values = dict(zip(joint.model.parameter_names, joint.values.values(), strict=True))
+    h, mean = 1e-4 / steps, np.zeros(joint.size)
+    mean[3 if turning == "motor" else 1] = 1.0
+    p = joint.parameters(Levels(drive=0.0, disturbance=(0.0, 0.0, 0.0)))
+    covariance = np.zeros((joint.size, joint.size))
+    for _ in range(steps):
+        given = [0.0, 0.0, 1.0, h * steps, h, 0.0, 0.0]
+        covariance = np.array(joint.predict(mean, covariance, given, p)[1])
+    own, other = (1, 3) if turning == "motor" else (3, 1)
+    dry = 3.0 if turning == "motor" else 5.0
+    deviation = dry * h * steps / values[f"{turning}_inertia"]
+    assert np.sqrt(covariance[own, own]) == pytest.approx(deviation, rel=0.02)
+    assert np.sqrt(covariance[other, other]) < 0.05 * deviation
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_the_inverse_without_pivots_is_the_inverse(count: int) -> None:
+    matrix = ca.SX.sym("m", count, count)
+    inverse = ca.Function("inverse", [matrix], [_inverse(matrix)])
+    given = np.eye(count) + 0.4 * np.random.default_rng(count).uniform(-1, 1, (count, count))
+    assert np.array(inverse(given)) @ given == pytest.approx(np.eye(count), abs=1e-12)
 
 
 def test_interpreted_and_compiled_steps_are_equal(run: Readings) -> None:

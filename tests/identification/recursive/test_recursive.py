@@ -174,7 +174,8 @@ def test_p_is_reset_after_the_factor_stayed_low() -> None:
     estimator.run(np.full(300, 0.01), h[:300])
     assert estimator.resets == 0
     estimator.run(5.0 * rng.choice([-1.0, 1.0], 300), h[300:])
-    assert estimator.resets >= 3
+    # 300 samples of which each 50 give a new start, less those in which the factor was high
+    assert 4 <= estimator.resets <= 6
 
 
 # Many updates

@@ -1,0 +1,118 @@
+"""The online estimator's state in another estimator, and what it takes as noise and as friction."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from benchmarks.native import readings_of
+from identification.online.estimator import OnlineEstimator, OnlineOptions
+from irj_fmu.cosim import link_referred
+from irj_fmu.plant.reference import reference_joint, start_of
+
+FloatArray = npt.NDArray[np.float64]
+STEP = 1e-3
+QUICK = OnlineOptions(optimise=False, detect=False, warm_up=2.0)
+
+
+@cache
+def readings(key: str) -> list[list[float]]:
+    table: FloatArray = readings_of(key, 6.0) * link_referred(reference_joint(key))
+    return table.tolist()
+
+
+def feed(estimator: OnlineEstimator, key: str, first: int, last: int) -> OnlineEstimator:
+    for k in range(first, last):
+        estimator.update(k * STEP, readings(key)[k], [True] * 6)
+    return estimator
+
+
+def shown(estimator: OnlineEstimator) -> list[list[float]]:
+    found = (estimator.theta, estimator.sigma, estimator.residual, estimator.floor, estimator.ratio)
+    return [*(x.tolist() for x in found), estimator.readings, [float(estimator.fault)]]
+
+
+@pytest.mark.parametrize("at", [1000, 3003])
+@pytest.mark.parametrize("detect", [False, True])
+def test_another_estimator_goes_on_from_the_state_as_the_first_one_did(
+    detect: bool, at: int
+) -> None:
+    """Before the first window is full and after it, in the midst of a row."""
+    options = OnlineOptions(optimise=False, detect=detect, warm_up=2.0)
+    joint = reference_joint("hd3")
+    one = feed(OnlineEstimator(joint, STEP, options), "hd3", 0, at)
+    assert (one.detector is not None) == detect
+    saved = one.state()
+    expected = shown(feed(one, "hd3", at, 4000))
+    assert not one.warming_up
+    other = feed(OnlineEstimator(joint, STEP, options), "hd3", 0, 500)
+    for estimator in (other, one):
+        estimator.restore(saved)
+        assert shown(feed(estimator, "hd3", at, 4000)) == expected
+
+
+def test_an_estimator_without_detection_takes_up_the_state_of_one_with_it() -> None:
+    joint = reference_joint("hd3")
+    watched = OnlineOptions(optimise=False, detect=True, warm_up=2.0)
+    saved = feed(OnlineEstimator(joint, STEP, watched), "hd3", 0, 3000).state()
+    plain = feed(OnlineEstimator(joint, STEP, QUICK), "hd3", 0, 3000)
+    again = OnlineEstimator(joint, STEP, QUICK)
+    again.restore(saved)
+    assert np.array_equal(again.theta, plain.theta)
+    assert np.array_equal(
+        feed(again, "hd3", 3000, 3500).theta, feed(plain, "hd3", 3000, 3500).theta
+    )
+    # and the other way round the detection begins anew
+    back = OnlineEstimator(joint, STEP, watched)
+    back.restore(plain.state())
+    assert np.array_equal(feed(back, "hd3", 3500, 3600).theta, feed(plain, "hd3", 3500, 3600).theta)
+
+
+def test_a_margin_of_the_detection_divides_its_scores_and_means_nothing_without_it() -> None:
+    joint, options = reference_joint("hd3"), OnlineOptions(optimise=False, warm_up=2.0)
+    scores = {}
+    for margins in ((1.0,), (2.0,), (2.0, 2.0), (4.0, 1.0)):
+        one = OnlineEstimator(joint, STEP, options)
+        for margin in margins:
+            one.set_fault_margin(margin)
+        scores[margins] = np.array(feed(one, "hd3", 0, 1500).score)
+    assert np.max(scores[1.0,]) > 0.1
+    assert scores[2.0,] == pytest.approx(scores[1.0,] / 2, rel=1e-9)
+    assert np.array_equal(scores[2.0, 2.0], scores[2.0,])
+    assert scores[4.0, 1.0] == pytest.approx(scores[1.0,], rel=1e-9)
+    plain = OnlineEstimator(joint, STEP, QUICK)
+    plain.set_fault_margin(2.0)
+    assert plain.score == OnlineEstimator(joint, STEP, QUICK).score
+
+
+def test_a_share_of_the_torque_is_noise_at_least() -> None:
+    """Of the motor's drive and of the torque into the link, root mean square so far."""
+    shares = (1e-3, 0.2)
+    found = []
+    for share in shares:
+        options = OnlineOptions(optimise=False, detect=False, warm_up=2.0, floor_share=share)
+        one = OnlineEstimator(start_of(reference_joint("hd3")), STEP, options)
+        found.append(feed(one, "hd3", 0, 2600))
+    table = np.array(readings("hd3")[:2500])
+    drive, torque = (float(np.sqrt(np.mean(table[:, k] ** 2))) for k in (0, 5))
+    expected = {"motor": drive, "link": torque, "transmission": torque}
+    for k, balance in enumerate(found[1].balances):
+        assert found[1].least[k] == pytest.approx(0.2 * expected[balance], rel=0.25)
+    assert np.all(found[0].least >= found[0].floor)
+    assert np.all(found[0].least < found[1].least / 20)
+
+
+def test_at_a_reversal_a_row_is_unsure_by_the_dry_friction_of_its_side() -> None:
+    one = OnlineEstimator(start_of(reference_joint("irj2b")), STEP, QUICK)
+    at = {n: k for k, n in enumerate(one.names)}
+    theta = np.full(len(one.names), 7.0)
+    theta[at["motor_coulomb"]], theta[at["link_coulomb"]] = 3.0, -4.0
+    size = np.array([2.0, 0.5, 1.0])
+    shares = np.array([[0.0, 0.0], [1.0, 0.0], [0.25, 0.5]])
+    motor, link = 3.0 * shares[:, 0] / 2.0, 4.0 * shares[:, 1] / 0.5
+    expected = 1 / np.sqrt(1 + np.column_stack([motor, link, 0 * motor]) ** 2)
+    assert one.balances == ("motor", "link", "transmission")
+    assert one._weight_of(shares, theta, size) == pytest.approx(expected, rel=1e-12)
