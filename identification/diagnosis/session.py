@@ -799,7 +799,9 @@ class Session:
                 self._near[claim.label] = _behind(same, ranking)
                 names = confusion_set(same, ranking.everything, base)
                 names = (claim.effects[0], *(n for n in names if n != claim.effects[0]))
-                current[position] = replace(claim, effects=names)
+                current[position] = replace(
+                    claim, effects=names, separate_by=claim.separate_by if len(names) > 1 else None
+                )
         return _Standing(standing.steps, tuple(current))
 
     def _replay(
