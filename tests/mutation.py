@@ -105,7 +105,7 @@ TARGETS: Final[Mapping[str, Judges]] = {
         (f"{_DIAGNOSIS}/test_trials.py", f"{_DIAGNOSIS}/test_claims.py", *_LOOP), _LONG
     ),
     "identification.diagnosis.session": Judges(
-        (f"{_DIAGNOSIS}/test_session_parts.py", *_LOOP), _LONG
+        ("tests/identification/naming/test_session_parts.py", *_LOOP), _LONG
     ),
     "identification.diagnosis.lines": Judges(
         (_TRACKING, f"{_DIAGNOSIS}/test_lines.py"), (f"{_DIAGNOSIS}/test_lines_everywhere.py",)
