@@ -276,12 +276,12 @@ def background(orders: FloatArray, power: FloatArray, stroke: float, lowest: flo
         middle = float(np.median(inside)) if count else 0.0
         return np.full(len(power), middle / math.log(2))
     medians = median_filter(inside, size=width, mode="nearest")
-    at = np.arange(count)
     reach = (near + far) // 2
-    left = np.where(at - far >= 0, medians[np.clip(at - reach, 0, count - 1)], 0.0)
+    left, right = np.zeros(count), np.zeros(count)
+    left[far:] = medians[far - reach : count - reach]
     for k in range(near + round(FEWEST_SURROUNDINGS * one), far):
         left[k] = np.median(inside[: k - near])
-    right = np.where(at + far < count, medians[np.clip(at + reach, 0, count - 1)], 0.0)
+    right[: count - far] = medians[reach : count - far + reach]
     out = np.zeros(len(power))
     out[first:] = np.maximum(left, right) / math.log(2)
     out[:first] = out[first] if count else 0.0
@@ -562,7 +562,7 @@ def everywhere(
         inverse = np.linalg.pinv(gram, rcond=1e-9, hermitian=True)
         size = float((inverse @ (columns[rows] * weight[rows, None]).T @ residual[rows])[0])
         error = SURE * math.sqrt(max(noise * float(inverse[0, 0]), 0.0))
-        told = float(gram[0, 0]) > 0 and float((inverse @ gram)[0, 0]) > 0.5
+        told = float((inverse @ gram)[0, 0]) > 0.5
         if told and not (size + error >= 1 / ALIKE and size - error <= ALIKE):
             return False
     return True

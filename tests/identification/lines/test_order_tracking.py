@@ -191,6 +191,25 @@ def test_background_is_the_mean_power_of_noise(fall: float) -> None:
     assert background(orders, loud, stroke, lowest) == pytest.approx(level, rel=0.35)
 
 
+@pytest.mark.parametrize("way", [-1, 1])
+def test_the_louder_side_counts_at_every_order_that_has_one(way: int) -> None:
+    """Power without any scatter that falls or rises: its side towards the loud end stands over it
+    and is half of its surroundings away.
+    """
+    orders = np.arange(4000) * 0.1 / 4  # four points to an independent order
+    power = np.exp(way * 0.02 * orders)
+    first, near, far = 8, 4 * NEAREST, 4 * SURROUNDINGS
+    level = background(orders, power, 2 * math.pi * 10, orders[first]) * math.log(2)
+    inside = slice(first + far, -far)
+    there = np.exp(0.02 * orders[(near + far) // 2])
+    assert level[inside] / power[inside] == pytest.approx(there, rel=0.01)
+    if way < 0:  # from a few orders on the loud end has a side towards it
+        few = slice(first + 2 * near + 16, first + far)
+        assert np.all(level[few] > power[few])
+    else:  # at the loud end only the other side is there
+        assert level[-far:] == pytest.approx(power[-far:] / there, rel=0.01)
+
+
 def test_background_of_few_orders_is_one_level() -> None:
     orders = np.arange(100) * 0.025
     power = np.random.default_rng(6).exponential(3.0, size=100)
@@ -282,6 +301,22 @@ def test_a_larger_line_beside_another_is_no_contradiction_in_a_part_of_the_strok
     samples = along(angle, small.wave(samples) + near.wave(samples))
     assert not everywhere(small, [near], samples)
     assert everywhere(small, [near], samples, (near.order,))
+
+
+def test_a_part_in_which_two_lines_are_one_contradicts_neither() -> None:
+    """All of it at one end; but whose it is nobody can tell."""
+    angle = 30 * (1 - np.abs(np.arange(COUNT) / (COUNT / 2) - 1))
+    one = line(2 * math.pi, 1.0, 0.0, prominence=1e6)
+    twin = replace(one, sine=2.0)
+    samples = along(angle, np.where(angle > 20, one.wave(along(angle, angle)), 0.0))
+    assert not everywhere(one, [], samples)
+    assert everywhere(one, [twin], samples, (one.order,))
+
+
+def test_a_part_without_a_sample_contradicts_no_line() -> None:
+    angle = np.linspace(0.0, 30.0, COUNT)
+    peak = line(2 * math.pi, 1.0, 0.0, prominence=1e6)
+    assert everywhere(peak, [], along(angle, peak.wave(along(angle, angle))))
 
 
 def at_whole_periods(share: float, beside: float, size: float) -> tuple[Peak, Samples, float]:
