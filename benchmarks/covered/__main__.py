@@ -1,10 +1,10 @@
 """Lines of the workbench that its tests run: ``python -m benchmarks.covered [TEST ...]``.
 
 Runs the tests (by default all of tests/workbench, and the pages of docs, which run every command as
-a user would) and counts lines in every process that they
-start: the server, the processes in which sessions work, the command line, and copies of them that a
-test kills (see sitecustomize.py beside this file). Printed is a line per module under the limit and
-the total; the exit code is 1 below the limit. Needs coverage, which is in the extra ``test``.
+a user would) and counts lines in every process that they start: the server, the processes in which
+sessions work, the command line, and copies of them that a test kills (see sitecustomize.py beside
+this file). Printed is a line per module under the limit and the total; the exit code is 1 below the
+limit. Needs coverage, which is in the extra ``test``.
 """
 
 from __future__ import annotations

@@ -426,9 +426,9 @@ def artefacts(
     tuple of Doubt
         An amplitude that its bound holds back by more than `OUTSIDE` errors, or that was there by
         as much before the additions and has gone to its bound with them, which chance does to
-        `BY_CHANCE` of those so large; dry friction that lies
-        outside the band of a curve over velocity at zero speed. A bare sign does not tell: the fit
-        without the true law gives a positive Coulomb torque where there is none.
+        `BY_CHANCE` of those so large; dry friction that lies outside the band of a curve over
+        velocity at zero speed. A bare sign does not tell: the fit without the true law gives a
+        positive Coulomb torque where there is none.
     """
     stands = at_bounds(solution, data)
     gone = _gone(solution, stands, start)

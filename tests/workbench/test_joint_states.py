@@ -76,6 +76,13 @@ def heard(write: Any) -> None:
         time.sleep(0.02)
 
 
+def all_of(topic: JointStates) -> None:
+    """Listen for five seconds."""
+    for _ in range(100):
+        list(topic.arrived())
+        time.sleep(0.05)
+
+
 def state(t: float, names: Sequence[str], *given: Sequence[float]) -> JointState:
     whole = int(t)
     return JointState(
@@ -123,11 +130,7 @@ def test_what_a_message_leaves_out_is_no_column(write: Any) -> None:
     """Effort that is empty; no stamp: the time of sending counts; an infinite reading is none."""
     joint = replace(
         load_joint(DEMO / "joint.toml"),
-        columns={
-            "time": "time",
-            "motor_position": "a_b.position",
-            "motor_velocity": "a_b.velocity",
-        },
+        columns={"motor_position": {"column": "a_b_position_rad", "unit": "rad"}},
     )
     with JointStates("ros2:///arm/joint_states/", joint) as topic:
         heard(write)
@@ -143,6 +146,34 @@ def test_what_a_message_leaves_out_is_no_column(write: Any) -> None:
     assert cells[0, 0] == 0.0
     assert 0.002 <= np.median(np.diff(cells[:, 0])) < 0.02
     assert np.isnan(cells[:, 2]).nonzero()[0].tolist() == [150]
+
+
+def test_another_sender_on_the_topic_is_left_out(write: Any) -> None:
+    """Two nodes state joints of their own on one topic; and one states its joints in any order."""
+    joint = replace(
+        load_joint(DEMO / "joint.toml"),
+        columns={"motor_position": {"column": "elbow_position_rad", "unit": "rad"}},
+    )
+    with JointStates("ros2://arm/joint_states", joint) as topic:
+        heard(write)
+        for k in range(90):
+            write.write(state(k * 1e-3, ("gripper",), (7.0,), (), ()))
+            names, places = ("elbow", "wrist"), (float(k), -1.0)
+            way = slice(None, None, -1 if k % 2 else 1)
+            write.write(state(k * 1e-3, names[way], places[way], (), ()))
+        rows, end = list(topic.arrived()), time.monotonic() + 10
+        while len(rows) < 91 and time.monotonic() < end:
+            rows += topic.arrived()
+        assert rows[0] == b"time_s,elbow_position_rad,wrist_position_rad"
+        cells = np.array([[float(x) for x in r.split(b",")] for r in rows[1:]])
+        np.testing.assert_array_equal(cells[:, 1], np.arange(90))
+        np.testing.assert_array_equal(cells[:, 2], -1.0)
+    with JointStates("ros2://arm/joint_states", joint) as topic:
+        heard(write)
+        for k in range(100):
+            write.write(state(k * 1e-3, ("gripper",), (7.0,), (), ()))
+        with pytest.raises(InputError, match=r"elbow_position_rad, which no message has; there is"):
+            all_of(topic)
 
 
 def test_a_topic_that_cannot_be_is_said_in_one_line(

@@ -45,6 +45,13 @@ from identification.fitting.engine import load_dataset, prepared_model, solve
 
 FloatArray = npt.NDArray[np.float64]
 SHARED = Path(__file__).resolve().parents[3].parent / "shared" / "hidden_effect" / "none"
+EVERY = Sensing(
+    ("motor", "link", "transmission"),
+    both_positions=True,
+    has_torque=True,
+    has_drive=True,
+    has_temperature=False,
+)
 
 
 def test_scan_peaks_at_the_order() -> None:
@@ -278,14 +285,7 @@ def test_the_law_of_an_effect_is_tried_where_its_order_is_not_another(
 
     monkeypatch.setattr("identification.diagnosis.lines._gains", gains)
     model = JointModel.harmonic_drive(3)
-    every = Sensing(
-        ("motor", "link", "transmission"),
-        both_positions=True,
-        has_torque=True,
-        has_drive=True,
-        has_temperature=False,
-    )
-    data: Any = SimpleNamespace(sensing=every)
+    data: Any = SimpleNamespace(sensing=EVERY)
     solution: Any = SimpleNamespace(model=model)
     wide = replace(peak, error=0.02)
     names, order = _names(wide, 4.0, _Scan(solution, data, (), ()))
@@ -297,24 +297,17 @@ def test_the_law_of_an_effect_is_tried_where_its_order_is_not_another(
 
 def test_an_effect_that_is_a_line_is_tried_as_what_is_not_there_yet() -> None:
     """The first kinematic error with its virtual work and without; a further one as that one is."""
-    every = Sensing(
-        ("motor", "link", "transmission"),
-        both_positions=True,
-        has_torque=True,
-        has_drive=True,
-        has_temperature=False,
-    )
     plain, ripple = JointModel.harmonic_drive(3), JointModel.harmonic_drive(3).add("torque_ripple")
     four = replace(JointModel.harmonic_drive(4), virtual_work=False)
 
     def errors(model: JointModel) -> list[tuple[str, bool]]:
-        made = line_models(model, every)
+        made = line_models(model, EVERY)
         assert all(m.effects == (*model.effects, label) for _, label, m in made)
         return [(label, m.virtual_work) for key, label, m in made if key == "kinematic_error"]
 
     assert errors(plain) == [("kinematic_error", True), ("kinematic_error", False)]
     assert errors(ripple) == errors(plain)
-    assert "torque_ripple#2" in [label for _, label, _ in line_models(ripple, every)]
+    assert "torque_ripple#2" in [label for _, label, _ in line_models(ripple, EVERY)]
     assert errors(four) == [("kinematic_error#4", False)]
 
 

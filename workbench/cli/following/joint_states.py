@@ -12,6 +12,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Any, Final, final
 
 from identification.errors import InputError
+from workbench.cli.following.growing import FIRST_ROWS
 from workbench.cli.following.lines import Lines
 
 if TYPE_CHECKING:
@@ -59,50 +60,79 @@ class JointStates(Lines):
         topic, domain = topic_of(address), _domain()
         found = _library()
         qos = found.qos
+        # heard from senders of either kind; nothing is dropped between two looks
+        asked = qos.Qos(qos.Policy.Reliability.BestEffort, qos.Policy.History.KeepAll)
         try:
-            self._participant = found.domain.DomainParticipant(domain)
+            node = found.domain.DomainParticipant(domain)
+            self._reader = found.sub.DataReader(
+                node, found.topic.Topic(node, PREFIX + topic, found.message), qos=asked
+            )
         except found.core.DDSException as error:
             line = str(error).splitlines()[0]
             raise InputError(f"{address}: no DDS on this machine ({line})") from None
         super().__init__(address, joint)
-        self._reader = found.sub.DataReader(
-            self._participant,
-            found.topic.Topic(self._participant, PREFIX + topic, found.message),
-            # heard from senders of either kind; nothing is dropped between two looks
-            qos=qos.Qos(qos.Policy.Reliability.BestEffort, qos.Policy.History.KeepAll),
-        )
+        self._needed = _named(joint)
         self._begin: int | None = None
         self._columns: tuple[str, ...] = ()
+        self._others = 0
+
+    def __exit__(self, *error: object) -> None:
+        self._reader = None  # the library ends its threads with it
+        super().__exit__(*error)
 
     def arrived(self) -> Iterable[bytes]:
-        """Rows of the messages that came since the last call, and a head before the first."""
+        """Rows of the messages that came since the last call, and a head before the first.
+
+        A topic may have several senders, each with joints of its own: the first message that has
+        what ``[columns]`` names says which columns there are, and those that lack one of them are
+        left out.
+        """
         out: list[bytes] = []
         for message in self._reader.take(N=AT_ONCE):
             if not message.sample_info.valid_data:
                 continue
-            columns, values = _cells(message, COLUMNS[self.joint.kind])
-            if columns != self._columns:
-                self._columns = columns
-                out.append(",".join(["time_s", *columns]).encode())
+            cells = _cells(message, COLUMNS[self.joint.kind])
+            if not self._columns and self._needed <= cells.keys():
+                self._columns = tuple(cells)
+                out.append(",".join(["time_s", *cells]).encode())
+            if not self._columns or not cells.keys() >= set(self._columns):
+                self._lacking(cells)
+                continue
             stamp = message.header.stamp
             now = stamp.sec * 10**9 + stamp.nanosec or message.sample_info.source_timestamp
             self._begin = now if self._begin is None else self._begin
-            seconds = (now - self._begin) * 1e-9
-            out.append(",".join([f"{seconds:.9f}", *map(repr, values)]).encode())
+            values = [(now - self._begin) * 1e-9, *(cells[c] for c in self._columns)]
+            out.append(",".join(map(repr, values)).encode())
         return out
 
+    def _lacking(self, cells: Mapping[str, float]) -> None:
+        """Say what is missing where no message has it."""
+        self._others += 1
+        if not self._columns and self._others >= FIRST_ROWS:
+            lacks = ", ".join(sorted(self._needed - cells.keys()))
+            has = ", ".join(cells) or "nothing"
+            raise InputError(
+                f"{self.name}: [columns] names {lacks}, which no message has; there is {has}"
+            )
 
-def _cells(message: Any, kinds: Mapping[str, str]) -> tuple[tuple[str, ...], list[float]]:
+
+def _named(joint: Joint) -> frozenset[str]:
+    """Columns that the column map of a joint file asks for by name."""
+    entries = (joint.columns or {}).values()
+    plain = (e.get("column") if isinstance(e, Mapping) else e for e in entries)
+    return frozenset(c for c in plain if isinstance(c, str)) - {"time_s"}
+
+
+def _cells(message: Any, kinds: Mapping[str, str]) -> dict[str, float]:
     """Columns and values of a message: a list that is empty, or shorter than the names, is none."""
-    columns, values = [], []
+    out = {}
     for kind, column in kinds.items():
         given = getattr(message, kind)
         if len(given) != len(message.name):
             continue
         for name, value in zip(message.name, given, strict=True):
-            columns.append(_plain(f"{name}_{column}"))
-            values.append(float(value) if math.isfinite(value) else math.nan)
-    return tuple(columns), values
+            out[_plain(f"{name}_{column}")] = float(value) if math.isfinite(value) else math.nan
+    return out
 
 
 def _plain(name: str) -> str:
