@@ -26,6 +26,7 @@ from identification.diagnosis.trials import (
     Trial,
     _refined,
     _unit,
+    _unseen_sizes,
     columns,
     effective_share,
     make_base,
@@ -379,6 +380,41 @@ def test_a_chance_takes_two_blocks_more_than_amplitudes(count: int, says: bool, 
     assert len(found.candidate.amplitudes) == 2
     assert (found.p_value < 0.05) == says
     assert says or found.p_value == 1.0
+
+
+def test_an_amplitude_that_leaves_its_bound_counts_like_a_free_one() -> None:
+    """A drag's size and chance are the same whether the friction beside it was free before or stood
+    at zero: the two are alike.
+    """
+    base = made(lambda q, v: v * np.abs(v))
+    number = base.names.index("motor_coulomb")
+    others = np.delete(base.jacobian, number, axis=1)
+    friction = base.jacobian[:, [number]]
+    q = span_of(others)
+    left = base.residual - 1e3 * friction[:, 0]
+    bound = replace(
+        base,
+        jacobian=others,
+        orthonormal=q,
+        inward=friction,
+        residual=left - q @ (q.T @ left),
+        names=tuple(n for n in base.names if n != "motor_coulomb"),
+        norms=np.delete(base.norms, number),
+        held_residual=np.empty(0),
+    )
+    free, returned = tried(base, "quadratic_drag"), tried(bound, "quadratic_drag")
+    for n in free.candidate.amplitudes:
+        assert returned.values[n] == pytest.approx(free.values[n], rel=1e-6)
+    assert 0 < free.p_value < 0.1
+    assert returned.p_value == pytest.approx(free.p_value, rel=1e-4)
+
+
+def test_a_size_is_seen_where_all_of_it_moves_the_rows_by_a_deviation(base: Base) -> None:
+    """Only of shapes and smoothing: an amplitude without rows is another matter."""
+    names = ("motor_smoothing_velocity", "motor_coulomb")
+    size = np.array([base.solution.values[n] for n in names])
+    for moves in (0.6, 1.5):
+        assert _unseen_sizes(base.solution, names, moves / size).tolist() == [moves < 1, False]
 
 
 @pytest.mark.parametrize("share", [-0.5, -0.1, 0.3])
