@@ -873,8 +873,7 @@ class Session:
         old, new, end = (s.held_out.balances[claim.balance] for s in (before, after, last))
         own = max(old.rms**2 - new.rms**2, 0.0)
         over = max(end.rms**2 - end.floor**2, 0.0)
-        share = own / (own + over) if own + over > 0 else 1.0
-        partial = share < EXPLAINED_SHARE or claim.effect.stage == "late"
+        partial = own < EXPLAINED_SHARE * (own + over) or claim.effect.stage == "late"
         if not partial and left.share_percent >= LOCATED_SHARE and not claim.effect.common:
             partial = is_absorbed(claim, left, last.solution, self.data)
         return replace(claim, partial=partial)
