@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 import pytest
+from scipy.stats import norm
 
 from identification import improve
 from identification.data.formats import chances
@@ -15,7 +16,15 @@ from identification.data.joint_file import Joint
 from identification.diagnosis.claims import Ranking, rank
 from identification.diagnosis.trials import make_base
 from identification.fitting.engine import load_dataset, prepared_model, solve
-from identification.naming.contest import FEWEST, Contest, _by_block, rivals_of
+from identification.naming.contest import (
+    FEWEST,
+    Contest,
+    _by_block,
+    _entitled,
+    _left,
+    _unlikely,
+    rivals_of,
+)
 from identification.naming.odds import Odds, contenders, contest_of, odds_of, unmodelled
 from tests.smooth_laws import Law, record
 
@@ -47,6 +56,16 @@ def contest(law: Law, names: tuple[str, ...], seed: int = 3) -> Contest:
 def drags() -> Contest:
     """Led by the name that is not the hidden one."""
     return contest(drag, NAMES)
+
+
+def bumped(q: FloatArray, v: FloatArray) -> FloatArray:
+    """Beside the drag something that no name has."""
+    return drag(q, v) + 5 * np.exp(-(((q - 0.3) / 0.15) ** 2))
+
+
+@pytest.fixture(scope="module")
+def imitated() -> Contest:
+    return contest(bumped, NAMES)
 
 
 def left_by(found: Contest) -> Ranking:
@@ -143,10 +162,51 @@ def test_what_the_true_law_leaves_holds_no_other(drags: Contest) -> None:
     assert "nats behind" in odds.behind["cubic_viscous@motor"]
 
 
-def test_a_bump_that_no_name_has_is_an_allowance() -> None:
-    found = contest(lambda q, v: drag(q, v) + 5 * np.exp(-(((q - 0.3) / 0.15) ** 2)), NAMES)
-    clean = contest(drag, NAMES)
-    assert unmodelled(left_by(found), "axis") > 10 * max(FEWEST, unmodelled(left_by(clean), "axis"))
+def test_a_bump_that_no_name_has_is_an_allowance(imitated: Contest, drags: Contest) -> None:
+    noise = unmodelled(left_by(drags), "axis")
+    assert unmodelled(left_by(imitated), "axis") > 10 * max(FEWEST, noise)
+
+
+@pytest.mark.parametrize("which", ["drags", "imitated"])
+def test_what_the_leader_leaves_counts_by_its_own_scatter(
+    which: str, request: pytest.FixtureRequest
+) -> None:
+    """Noise, or noise and what is not modelled: over it the rows have a mean square of one, and
+    so they have in the comparison.
+    """
+    found: Contest = request.getfixturevalue(which)
+    entitled = _entitled(found.rivals, found.data)
+    best = found.rivals.index(found.leader)
+    left = [_left(r, found.data)["axis"] * w["axis"] for r, w in zip(found.rivals, entitled)]
+    assert float(np.mean(left[best] ** 2)) == pytest.approx(1.0, abs=0.05)
+    for own, (rows, _, _) in zip(left, found._old, strict=True):
+        # one factor for all rivals: the weights of the leader's own fit
+        scale = found.leader.solution.weights["axis"] / entitled[best]["axis"]
+        assert rows == pytest.approx(own * scale, rel=1e-6, abs=1e-9)
+    # log-likelihood of four tenths of the rows, but for what is the same for all
+    known = [0.4 * norm.logpdf(rows).sum() for rows, _, _ in found._old]
+    assert found.likelihood - found.likelihood[0] == pytest.approx(np.array(known) - known[0])
+
+
+@pytest.mark.parametrize(("deviates", "leads"), [(3.0, True), (-15.0, True), (30.0, False)])
+def test_what_a_name_needs_of_clocks_and_zeros_counts_against_it(
+    deviates: float, leads: bool, drags: Contest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the density of a normal value that far from its mean; the unlikely leads no more."""
+    name = "motor_quadratic_drag"
+    value = drags.leader.solution.values[name]
+    known = {name: (value - deviates * 0.01, 0.01), "elsewhere": (0.0, 1.0)}
+    monkeypatch.setattr("identification.naming.contest.usual", lambda *_, **__: known)
+    found = Contest(drags.rivals, drags.data)
+    cost = float(norm.logpdf(0.0) - norm.logpdf(deviates))
+    assert [_unlikely(r, found.data) for r in found.rivals] == pytest.approx([0.0, cost, 0.0])
+    assert (cost < drags.ahead[0, 0]) == leads
+    assert found.leader is found.rivals[1 if leads else 0]
+    if leads:
+        assert found.ahead[:, 0] == pytest.approx(drags.ahead[:, 0] - [cost, 0.0, cost])
+        assert found.likelihood == pytest.approx(drags.likelihood - [0.0, cost, 0.0])
+    else:
+        assert found.ahead[1, 0] > 0
 
 
 def test_names_that_are_one_column_share_the_chance() -> None:
