@@ -30,6 +30,7 @@ from identification.data.check.relations import (
 )
 from identification.data.check.stamps import check_sampling, check_size, check_stamps
 from identification.data.check.torque import check_torque, check_work
+from identification.data.check.turns import check_turns
 from identification.errors import InputError
 
 if TYPE_CHECKING:
@@ -109,6 +110,7 @@ def check(
         findings += check_stuck(record)
         findings += check_saturation(record)
         findings += check_quantisation(record)
+        findings += check_turns(record, gear_ratio)
         jumps = check_jumps(cut_at_holes(record, most=0))
         findings += jumps
         findings += check_velocity(usable, gear_ratio)

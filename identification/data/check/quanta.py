@@ -26,7 +26,20 @@ _ROUNDING: Final = 1e-9
 
 
 def quantum(values: FloatArray) -> float | None:
-    """Quantisation step of a channel, or None where its values are not multiples of one step."""
+    """Quantisation step of a channel, or None where its values are not multiples of one step, or
+    are so only because few digits were printed.
+    """
+    return _common_step(values, _FEW_SIZES)
+
+
+def grid_step(values: FloatArray) -> float | None:
+    """The step that all changes of a channel are multiples of, an encoder's or the last digit of a
+    file, or None.
+    """
+    return _common_step(values, 1.0)
+
+
+def _common_step(values: FloatArray, few_sizes: float) -> float | None:
     steps = np.abs(np.diff(values[np.isfinite(values)][:200_000]))
     steps = steps[steps > 0.0]
     if steps.size < 3:
@@ -37,8 +50,8 @@ def quantum(values: FloatArray) -> float | None:
     step = float(near.mean())
     ratio = steps / step
     multiples = np.abs(ratio - np.rint(ratio)) < _OFF_STEP[0] + _OFF_STEP[1] * ratio
-    few = float(np.unique(np.rint(ratio)).size) < _FEW_SIZES * steps.size or steps.size < 100
+    few = float(np.unique(np.rint(ratio)).size) <= few_sizes * steps.size or steps.size < 100
     return step if multiples.mean() > _ALL_STEPS and few else None
 
 
-__all__ = ["quantum"]
+__all__ = ["grid_step", "quantum"]

@@ -301,6 +301,48 @@ def test_quantisation_step_is_measured() -> None:
     assert found(check(record(coarse), RATIO), "quantisation").severity == "warn"
 
 
+def in_steps(motor: float, link: float, taken: float = 1.0) -> Record:
+    """Both positions as encoders of so many steps to a turn read them, times a factor."""
+
+    def change(arrays: dict[str, Array]) -> None:
+        for channel, steps in (("motor_position", motor), ("link_position", link)):
+            size = 2.0 * np.pi / steps
+            counted = np.rint(arrays[channel] / size) * size
+            arrays[channel] = np.round(counted * taken, 12)
+            arrays[channel.replace("position", "velocity")] *= taken
+
+    return record(change)
+
+
+@pytest.mark.parametrize("steps", [(4050, 65_550), (2250, 100_050), (810, 20_250)])
+@pytest.mark.parametrize(
+    ("taken", "said"),
+    [
+        (180 / np.pi, "was read in rad, and"),
+        (np.pi / 180, "was read in deg, and"),
+        (0.5 / np.pi, "only in rev"),
+    ],
+)
+def test_the_steps_of_two_encoders_tell_the_unit(
+    steps: tuple[int, int], taken: float, said: str
+) -> None:
+    """Numbers in one unit under the head of another agree in everything but the turn."""
+    finding = found(check(in_steps(*steps, taken), RATIO), "unit")
+    assert finding.severity == "refuse"
+    assert said in finding.message and "whole number of steps" in finding.message
+    assert not [f for f in check(in_steps(*steps), RATIO) if f.code == "unit"]
+
+
+def test_steps_that_are_no_encoders_tell_no_unit() -> None:
+    """Digits of the file, numbers of a fixed point, and the encoder of the motor told at the link
+    are no unit; one position alone is a doubt.
+    """
+    for steps in (2e3 * np.pi, 2e3 * np.pi / 3, 2**12 * np.pi, 4096 * 160.0, 4096 / 160.0):
+        assert not [f for f in check(in_steps(steps, steps), RATIO) if f.code == "unit"], steps
+    alone = found(check(in_steps(4096 * np.pi / 180, 1e6), RATIO), "unit")
+    assert alone.severity == "warn" and alone.channel == "motor_position"
+
+
 def test_a_missing_channel_is_refused() -> None:
     finding = found(check(record(), RATIO, needs=("temperature",)), "missing_channel")
     assert (finding.severity, finding.channel) == ("refuse", "temperature")
