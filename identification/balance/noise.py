@@ -37,7 +37,10 @@ CUT_DEVIATION: Final = 0.87
 JUMP: Final = 5.0
 """Noise levels over which a fourth difference is a jump: one in two million by chance."""
 FEWEST_LEFT: Final = 0.2
-"""Share of the samples around which no jump must be: from fewer their level is no level of all."""
+"""Share of the differences of measured, calm samples in which no jump must be: the level of fewer
+is no level of all."""
+FEWEST_READ: Final = 100
+"""Differences from which a level is read: to 7 %."""
 
 CALM: Final = 0.4
 """Share of the samples at which a joint moves, those with the least acceleration, that are calm: of
@@ -130,21 +133,21 @@ def spaced_levels(
     list of float
         Zero from the spacing on over which too few are left.
     """
-    jumps = np.zeros(len(values)) if calm is None else (~calm).astype(np.float64)
-    least = FEWEST_LEFT * (len(values) - float(jumps.sum()))
+    elsewhere = np.zeros(len(values)) if calm is None else (~calm).astype(np.float64)
+    jumps = elsewhere.copy()
     _mark(jumps, values, segments, 1, JUMP * level)
     out = []
     for spacing in spacings:
-        left = [
-            _spaced(values[s], spacing)[
-                _clear(jumps[s], 4 * spacing)
-                & (True if measured is None else _all_there(measured[s], spacing))
-            ]
-            for s in segments
-            if s.stop - s.start > 8 * spacing
-        ]
-        squares = np.concatenate([*left, np.empty(0)]) ** 2
-        if not len(squares) or len(squares) < least:
+        of_use, left = 0, [np.empty(0)]
+        for s in segments:
+            if s.stop - s.start > 8 * spacing:
+                usable = _clear(elsewhere[s], 4 * spacing)
+                if measured is not None:
+                    usable = usable & _all_there(measured[s], spacing)
+                of_use += int(usable.sum())
+                left.append(_spaced(values[s], spacing)[usable & _clear(jumps[s], 4 * spacing)])
+        squares = np.concatenate(left) ** 2
+        if len(squares) < max(FEWEST_LEFT * of_use, FEWEST_READ):
             break
         count = int(KEPT * (len(squares) - 1)) + 1
         smallest = np.partition(squares, count - 1)[:count]
