@@ -387,12 +387,19 @@ def _best_start(
     limits: Mapping[str, tuple[float, float]],
 ) -> dict[str, float]:
     """Laws with a shape near zero velocity or zero torque have several valleys: the best of a few
-    smoothing velocities and exponents, and of a few sizes of a gap.
+    smoothing velocities and exponents, and of a few sizes of a gap. So has a smoothing velocity
+    that went to nothing while another law was missing: rows no longer tell its size.
     """
     shaped = [t for t in balances.model.terms if t.effect.several_valleys]
-    if not shaped:
+    flat = [
+        n
+        for n in balances.model.named("smoothing")
+        if n in free and values[n] < FLAT * data.ranges["velocity"]
+    ]
+    if not shaped and not flat:
         return values
     smooth = [n for t in shaped for n in balances.model.named("smoothing", t.place)]
+    smooth = list(dict.fromkeys([*smooth, *flat]))
     exponents = [
         n
         for n in balances.model.named("exponent")
@@ -412,7 +419,7 @@ def _best_start(
             {**values, **dict.fromkeys(gaps, share * data.ranges["torsion"])}
             for share in GAP_SHARES
         ]
-    for share in (0.003, 0.01) if smooth else ():
+    for share in SMOOTHING_SHARES if smooth else ():
         for power in (1.0, 2.0) if exponents else (1.0,):
             moved = {
                 n: min(max(share * data.ranges["velocity"], limits[n][0]), limits[n][1])
@@ -439,6 +446,12 @@ def _best_start(
     return best[1] if best is not None else values
 
 
+SMOOTHING_SHARES: Final = (0.003, 0.01)
+"""Smoothing velocities from which laws of low speed are fitted, as shares of the record's speed."""
+FLAT: Final = 1e-3
+"""Smoothing velocity, in the same, under which rows do not tell it: at a hundredth of a record's
+speed already a kernel passes a turn within a row.
+"""
 GAP_FACTORS: Final = (0.1, 0.3, 3.0)
 """Sizes from which a gap of the transmission is fitted beside its start value: inside a gap that is
 too wide nothing is carried, its stiffness goes to its bound, and the gap then moves nothing. A

@@ -19,6 +19,8 @@ from identification.data.joint_file import Known
 from identification.fitting.assess import assess
 from identification.fitting.engine import Dataset, load_dataset, prepared_model, solve
 from identification.fitting.first_fit import first_fit
+from tests.recorded_world._engine import library
+from tests.recorded_world.world import make_case, write_case
 
 DEMO = Path(str(files("workbench"))) / "demo"
 
@@ -102,3 +104,23 @@ def test_values_that_are_kept_are_those_of_the_balances() -> None:
                 assert np.allclose(plain[balance][0], residual, rtol=1e-9, atol=1e-9)
     with pytest.raises(ValueError, match="read-only"):
         plain[balance][0][0] = 0.0
+
+
+@pytest.mark.skipif(library() is None, reason="no C compiler")
+def test_a_smoothing_velocity_that_went_to_nothing_comes_back(tmp_path: Path) -> None:
+    """While a cyclic torque was missing the best friction changed its sign at once; from there no
+    row tells the size of the smoothing, and friction with memory was claimed in its place.
+    """
+    folder = write_case(make_case(13017, seconds=20.0), tmp_path, "all")
+    joint = load_joint(folder / "joint.toml")
+    joint = replace(joint, effects=(*joint.effects, "cyclic_torque@motor"))
+    record = read(folder / "train.csv", joint=joint)
+    model = prepared_model(joint, record)
+    data = load_dataset([record], [], joint, model)
+    fresh, warm = (
+        solve(model, data, start=start) for start in ({}, {"motor_smoothing_velocity": 7e-5})
+    )
+    assert 0.012 < fresh.values["motor_smoothing_velocity"] < 0.025  # 0.018 is true
+    assert warm.values["motor_smoothing_velocity"] == pytest.approx(
+        fresh.values["motor_smoothing_velocity"], rel=0.1
+    )
