@@ -95,3 +95,21 @@ def run(seed: int, law: Law, effects: tuple[str, ...] = ("viscous", "coulomb")) 
     data = load_dataset(records[:1], records[1:], joint, model)
     solution = solve(model, data)
     return Run(solution, data, find_curves(make_base(solution, data), "axis"), tuple(records))
+
+
+def settling(rng: np.random.Generator, law: Law) -> Record:
+    """Back and forth at 0.8 rad/s, then creeping at 4 mrad/s for 3 s, as a joint does that settles:
+    under the speed over which its dry friction turns. Torque by inverse dynamics, 1 N.m of noise.
+    """
+    t = np.arange(20_000) * 1e-3
+    going = 0.5 * (1 - np.tanh((t - 17.0) / 0.05))
+    creeps = 4e-3 * np.sin(2 * np.pi * 0.4 * t)
+    v = 0.8 * np.tanh(8 * np.sin(2 * np.pi * 0.25 * t)) * going + (1 - going) * creeps
+    a = np.gradient(v, t)
+    q = cumulative_trapezoid(v, t, initial=0.0)
+    torque = INERTIA * a + VISCOUS * v + COULOMB * np.tanh(v / 0.016) + law(q, v)
+    channels = {
+        "motor_position": q + 2e-6 * rng.standard_normal(len(t)),
+        "motor_torque": torque + rng.standard_normal(len(t)),
+    }
+    return Record.from_channels(t, channels).renamed("settling")

@@ -32,6 +32,9 @@ TURN_SHARE: Final = 0.25
 either way.
 """
 
+TURN_WIDTHS: Final = 3.0
+"""Smoothing velocities up to which friction has not yet reached its level (to 1 %)."""
+
 SCALED: Final = ("drive", "torque")
 """Measured signals whose scale a balance has: what is left of it has the same."""
 

@@ -26,10 +26,11 @@ from casadi_models.signals import LocalSignals
 from casadi_models.table import SHARP, SLOW
 from casadi_models.term import Term
 from identification.balance.balances import balances_of
+from identification.balance.clocks import CREEP, FAST
 from identification.balance.colour import ChannelNoise
 from identification.balance.dataset import Dataset
 from identification.balance.noise import effective_share
-from identification.balance.stacked import stack
+from identification.balance.stacked import TURN_WIDTHS, stack
 from identification.balance.weak import WeakRecord
 from identification.diagnosis.candidates import OBSERVED_BY, Candidate
 from identification.diagnosis.places import student
@@ -139,15 +140,20 @@ def _range(effect: Effect, shapes: Mapping[str, float]) -> tuple[float, float]:
 # --- which rows tell of a curve -------------------------------------------------------------------
 
 
-def _clear(w: WeakRecord, noise: Mapping[str, ChannelNoise]) -> FloatArray:
-    """Direction of motion at the points of a record: 1, -1, or 0 where it is not beyond doubt."""
+def _clear(
+    w: WeakRecord, noise: Mapping[str, ChannelNoise], turning: Mapping[str, float]
+) -> FloatArray:
+    """Direction of motion at the points of a record: 1, -1, or 0 where it is not beyond doubt, or
+    a side is slower than it turns.
+    """
     out = np.ones(int(w.starts[-1]))
     for side in ("motor", "link"):
         source, name = f"{side}_position", f"{side}_velocity"
         if source not in noise or name not in w.points:
             continue
         v = w.points[name]
-        clear = np.abs(v) > CLEAR * w.grid.velocity_noise(source, noise[source])
+        doubtful = CLEAR * w.grid.velocity_noise(source, noise[source])
+        clear = np.abs(v) > max(doubtful, turning.get(side, 0.0))
         out = np.where(clear & (out != 0), np.sign(v), 0.0)
     return out
 
@@ -157,15 +163,20 @@ def steadily_moving(base: Base) -> Base:
     once.
 
     A smoothing velocity fitted to a wrong law is part of that law: here the curve has to show it.
+    But a joint that creeps under it, as one that settles does, has friction of less than its level
+    whatever the law: such rows count only where the width would be that of a law.
     """
     model, data = base.solution.model, base.data
     sharp: dict[str, float] = {}
+    turning: dict[str, float] = {}
     for side in ("motor", "link"):
         names = model.named("smoothing", side)
         own = any(t.effect.shapes_reversal and t.place == side for t in model.terms)
         speeds = _speeds(data, side)
         if names and not own and len(speeds):
             sharp |= dict.fromkeys(names, SHARP * float(np.quantile(speeds, ENDS[1])))
+            width = TURN_WIDTHS * max(base.solution.values[n] for n in names)
+            turning[side] = min(width, CREEP * float(np.quantile(speeds, FAST)))
     solution = replace(
         base.solution,
         values={**base.solution.values, **sharp},
@@ -173,8 +184,8 @@ def steadily_moving(base: Base) -> Base:
     )
     moved = _refitted(make_base(solution, data))
     count = len(base.balances)
-    clear = np.tile(_steady(data.train, data.sources), count)
-    held = np.tile(_steady(data.held_out, data.sources), count)
+    clear = np.tile(_steady(data.train, data.sources, turning), count)
+    held = np.tile(_steady(data.held_out, data.sources, turning), count)
     return replace(
         moved,
         block=np.where(clear, moved.block, -1),
@@ -213,10 +224,12 @@ def _speeds(data: Dataset, side: str) -> FloatArray:
 
 
 def _steady(
-    records: Sequence[WeakRecord], noise: Mapping[str, ChannelNoise]
+    records: Sequence[WeakRecord],
+    noise: Mapping[str, ChannelNoise],
+    turning: Mapping[str, float] | None = None,
 ) -> npt.NDArray[np.bool_]:
-    """Rows whose whole kernel moves clearly in one direction."""
-    parts = [np.abs(w.average(_clear(w, noise))) >= WHOLE for w in records]
+    """Rows whose whole kernel moves clearly in one direction, faster than each side turns."""
+    parts = [np.abs(w.average(_clear(w, noise, turning or {}))) >= WHOLE for w in records]
     return np.concatenate(parts) if parts else np.empty(0, dtype=np.bool_)
 
 

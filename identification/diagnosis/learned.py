@@ -54,6 +54,8 @@ HALF: Final = 0.5
 OUTSIDE: Final = 3.0
 """Standard errors by which a parameter must want to pass its bound: of ten that may stand at one,
 one in 75 joints would by chance."""
+BAND: Final = 1.96
+"""Standard errors on either side of a curve that are its band of 95 %."""
 BY_CHANCE: Final = 0.05
 """Share of joints on which an amplitude that was there before the additions may come to its bound
 by noise alone: with an error e and a true value anywhere from 0 to a, e / (a sqrt(2 pi)) of them.
@@ -426,9 +428,9 @@ def artefacts(
     tuple of Doubt
         An amplitude that its bound holds back by more than `OUTSIDE` errors, or that was there by
         as much before the additions and has gone to its bound with them, which chance does to
-        `BY_CHANCE` of those so large; dry friction that lies outside the band of a curve over
-        velocity at zero speed. A bare sign does not tell: the fit without the true law gives a
-        positive Coulomb torque where there is none.
+        `BY_CHANCE` of those so large; dry friction that lies `OUTSIDE` of its errors from a
+        curve over velocity at zero speed. A bare sign does not tell: the
+        fit without the true law gives a positive Coulomb torque where there is none.
     """
     stands = at_bounds(solution, data)
     gone = _gone(solution, stands, start)
@@ -542,7 +544,7 @@ def _place(solution: Solution, name: str) -> str:
 
 
 def _no_dry_friction(solution: Solution, curves: Sequence[Curve]) -> list[Doubt]:
-    """Where dry friction lies outside the band of a curve over velocity, carried back to zero
+    """Where dry friction is certainly not that of a curve over velocity, carried back to zero
     speed: as friction that changes its sign at once, and as one that does so as smoothly as the
     model has it, since the first knots may lie where it still does.
     """
@@ -555,7 +557,10 @@ def _no_dry_friction(solution: Solution, curves: Sequence[Curve]) -> list[Doubt]
         torque = sticking_torque(solution.model, solution.values, place)
         smooth = [solution.values[n] for n in solution.model.named("smoothing", place)]
         starts = [_start(c, torque, width) for width in (0.0, *smooth)]
-        if torque and not any(low <= torque <= high for low, high in starts):
+        if torque and not any(
+            abs(torque - (low + high) / 2) <= OUTSIDE / BAND * (high - low) / 2
+            for low, high in starts
+        ):
             low, high = starts[0]
             out[place] = Doubt(
                 place,

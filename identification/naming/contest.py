@@ -17,6 +17,7 @@ from identification.balance.calibration import usual
 from identification.balance.dataset import Dataset
 from identification.balance.stacked import (
     INDEPENDENT_SHARE,
+    TURN_WIDTHS,
     drawn_floors,
     rms,
     stack,
@@ -36,8 +37,6 @@ FEWEST: Final = 3.0
 """Log-likelihood from which a name counts as better: odds of twenty to one [nats]."""
 VALLEY_STEPS: Final = 5
 """Gauss-Newton steps from each point of a grid, to see which valley is the deepest."""
-TURN_WIDTHS: Final = 3.0
-"""Smoothing velocities up to which friction has not yet reached its level (to 1 %)."""
 LEAST_VARIANCE: Final = 1e-24
 """Of a row without noise [N.m squared]: what rounding leaves of torques of 1 N.m."""
 DECIDED: Final = 2.0
