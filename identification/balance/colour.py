@@ -71,6 +71,10 @@ FEWEST_SPACINGS: Final = 4
 SLOWEST_COLOUR: Final = 1.0
 """Memory of a noise from which on it is a drift [s]: twenty times the longest that neighbouring
 samples show."""
+HIDING: Final = 0.5
+"""Noise, in steps, from which on readings toggle between three and more of them, and what the
+steps leave is white.
+"""
 FEWEST: Final = 1000
 """Samples from which a colour is read."""
 
@@ -138,11 +142,15 @@ class ChannelNoise:
         Independent of each other.
     lines : tuple of (float, float)
         Amplitude of each line and its frequency [Hz].
+    step : float
+        Of the reading, where it hides what noise there is beside it: what a step takes off a slow
+        motion follows the motion. 0 where noise moves the readings by steps of their own.
     """
 
     level: float
     parts: tuple[Part, ...]
     lines: tuple[tuple[float, float], ...] = ()
+    step: float = 0.0
 
     @property
     def drift(self) -> Part | None:
@@ -166,11 +174,28 @@ class ChannelNoise:
         if self.level <= 0:
             return white(level)
         factor = level / self.level
-        return ChannelNoise(
-            level,
-            tuple(replace(part, size=factor * part.size) for part in self.parts),
-            tuple((factor * size, frequency) for size, frequency in self.lines),
+        return replace(
+            self,
+            level=level,
+            parts=tuple(replace(part, size=factor * part.size) for part in self.parts),
+            lines=tuple((factor * size, frequency) for size, frequency in self.lines),
         )
+
+    def read_in(self, step: float) -> ChannelNoise:
+        """The same noise of readings in steps, in the channel's unit."""
+        return replace(self, step=step) if self.beside(step) < HIDING * step else self
+
+    def beside(self, step: float) -> float:
+        """Deviation of the noise beside what a step leaves of a quick motion."""
+        return math.sqrt(max(self.level**2 - step**2 / 12, 0.0))
+
+    def rounding(self, rng: np.random.Generator, course: FloatArray) -> FloatArray:
+        """What the step of the reading takes off a course (n,), with the noise beside it; the
+        encoder's own zero is drawn.
+        """
+        step, phase = self.step, rng.uniform(0.0, self.step)
+        seen = course + self.beside(step) * rng.standard_normal(len(course))
+        return np.asarray(np.rint((seen - phase) / step) * step + phase - course)
 
     def after(self, weights: FloatArray, dt: float) -> float:
         """Standard deviation of what a filter with these weights (k,), at steps of `dt` seconds,

@@ -25,6 +25,7 @@ from identification.balance.spikes import without_spikes
 from identification.balance.stamps import bridge_errors, evened
 from identification.balance.weak import (
     CLAIM_KERNEL,
+    HELD_READINGS,
     KERNEL_SAMPLES,
     PAIR,
     POSITION_CHAINS,
@@ -35,6 +36,7 @@ from identification.balance.weak import (
     prepare,
     whole,
 )
+from identification.data.check.quanta import quantum
 from identification.data.joint_file import Joint
 from identification.data.record import Record
 from identification.errors import InputError
@@ -360,6 +362,7 @@ def weak_record(
             curved=curved,
             before=before,
             same=set(signals) - changed,
+            readings={SIGNAL[p]: np.roll(signals[SIGNAL[p]], -round(k)) for p, k in shifts.items()},
         )
         if made.rows < 8:
             parted = f" in {len(segments)} stretches" if len(segments) > 1 else ""
@@ -425,9 +428,11 @@ def _with_rests(made: WeakRecord, noise: Mapping[str, ChannelNoise]) -> WeakReco
     A side stands still where its pointwise speed stays within its noise for at least one kernel of
     that speed: a reversal is shorter, and is kept, because it shows friction at low speed. Laws
     with memory follow a straight line through a rest: the noise of a position that stands still
-    would wear their state down, since they count every step, whatever its sign.
+    would wear their state down, since they count every step, whatever its sign. Where both sides
+    stand still and an encoder reads in steps, the rows have one reading in all of the twist.
     """
     out: dict[str, FloatArray] = {}
+    stills: list[FloatArray] = []
     smooth, paired = dict(made.smooth), dict(made.paired)
     for side in ("motor", "link"):
         source = f"{side}_position"
@@ -450,6 +455,11 @@ def _with_rests(made: WeakRecord, noise: Mapping[str, ChannelNoise]) -> WeakReco
                         held = t[source]
                         held[rows] = np.linspace(held[rows.start], held[rows.stop - 1], end - begin)
         out[side] = made.average(still) if still.any() else np.zeros(made.rows)
+        stills.append(still)
+    if len(stills) == 2:
+        both = stills[0] * stills[1]
+        if both.any() and any(noise[c].step > 0 for c in PAIR):
+            out[HELD_READINGS] = made.average(both)
     return replace(made, rest=out, smooth=smooth, paired=paired)
 
 
@@ -494,7 +504,7 @@ def measured_sources(record: Record, joint: Joint, sensing: Sensing) -> dict[str
     reading.
     """
     signals = signals_of(record, joint, sensing)
-    return {
+    found = {
         c: noise_of(
             record,
             c,
@@ -505,6 +515,12 @@ def measured_sources(record: Record, joint: Joint, sensing: Sensing) -> dict[str
         for c, x in signals.items()
         if c in POSITION_CHAINS
     }
+    for c in found.keys() & set(PAIR) & record.channels.keys():
+        step = record.quanta.get(c) or quantum(np.asarray(record[c]))
+        if step is not None:
+            on_link = joint.gear_ratio if c == "motor_position" else 1.0
+            found[c] = found[c].read_in(step / abs(on_link))
+    return found
 
 
 def pointwise_kernel(

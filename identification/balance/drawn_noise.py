@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from identification.balance.colour import ChannelNoise
-from identification.balance.weak import POSITION_CHAINS, WeakRecord, filtered, paired
+from identification.balance.weak import PAIR, POSITION_CHAINS, WeakRecord, filtered, paired
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -152,7 +152,12 @@ def _drawn(
     present = [
         c for c in POSITION_CHAINS if c in noise and noise[c].level > 0 and c in record.points
     ]
-    drawn = {c: noise[c].draw(rng, count, grid.dt) for c in present}
+    drawn = {
+        c: noise[c].rounding(rng, _course(record, c, noise, count))
+        if noise[c].step > 0
+        else noise[c].draw(rng, count, grid.dt)
+        for c in present
+    }
     for c in present:
         if c in record.bridging:  # what bridges are off by, after the noise: its draws stay
             drawn[c] = drawn[c] + record.bridging[c][:count] * rng.standard_normal(count)
@@ -172,6 +177,26 @@ def _drawn(
             curved=_plus(record.curved, curved),
         ),
     )
+
+
+def _course(
+    record: WeakRecord, channel: str, noise: Mapping[str, ChannelNoise], count: int
+) -> FloatArray:
+    """Where a position is at each sample, (count,), as the finer of the two encoders tells: a slow
+    motion through a coarse one is a staircase itself.
+    """
+    finest = min(
+        (c for c in PAIR if c in noise and c in record.smooth),
+        key=lambda c: (noise[c].level, c != channel),
+    )
+    grid, soft = record.grid, record.smooth[finest]
+    course, first = np.zeros(count), 0
+    for s in grid.segments:
+        at = np.arange(0, s.stop - s.start, grid.step)
+        own = soft[first : first + len(at)]
+        course[s] = np.interp(np.arange(s.stop - s.start), at, own)
+        first += len(at)
+    return course
 
 
 def _plus(

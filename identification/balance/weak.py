@@ -58,6 +58,9 @@ RESTING_SIDES: Final[Mapping[str, tuple[str, ...]]] = {
 }
 """Sides whose dry friction acts in a balance. At rest it is any torque up to its limit: such a row
 is an inequality, no equation. The transmission has no friction against the ground."""
+HELD_READINGS: Final = "twist"
+"""Key of the rests of both sides in which an encoder stands on a step: all rows of such a rest have
+one error, of up to half a step, and it looks like play."""
 
 LEAST_SUPPORT: Final = 0.5
 """Share of a row's kernel that must have been measured: with less, the row is more cubic than
@@ -288,7 +291,8 @@ class WeakRecord:
     curved : mapping of str to (rows,) array
         Second derivative of the average of every signal where it was asked for.
     rest : mapping of str to (rows,) array
-        Kernel average of "this side stands still" (0 to 1), by side: motor, link.
+        Kernel average of "this side stands still" (0 to 1), by side: motor, link, and
+        :data:`HELD_READINGS`.
     between : mapping of str to (rows,) array
         What the average of a measured torque over every other sample differs by from that over the
         samples between them, halved.
@@ -336,11 +340,12 @@ class WeakRecord:
         return np.asarray(~(self.resting(balance) | lost))
 
     def resting(self, balance: str) -> npt.NDArray[np.bool_]:
-        """Rows in which a side whose dry friction acts in the balance stands still, shape
-        (rows,).
+        """Rows in which a side whose dry friction acts in the balance stands still, or the twist is
+        that of two readings which stand, shape (rows,).
         """
         still = np.zeros(self.rows, dtype=np.bool_)
-        for side in RESTING_SIDES.get(balance, ()):
+        held = (HELD_READINGS,) if balance == "transmission" else ()
+        for side in RESTING_SIDES.get(balance, held):
             if side in self.rest:
                 still |= self.rest[side] > REST_SHARE
         return still
@@ -482,6 +487,7 @@ def prepare(
     curved: bool = False,
     before: WeakRecord | None = None,
     same: Collection[str] = (),
+    readings: Mapping[str, FloatArray] | None = None,
 ) -> WeakRecord:
     """Average a uniformly sampled record with the kernel.
 
@@ -511,6 +517,9 @@ def prepare(
         signals `same` are taken over.
     same : collection of str
         Signals that are as they were in `before`.
+    readings : mapping, optional
+        Torques as they were read, at their nearest samples, of those that `signals` has between
+        two readings: an interpolation smooths the jump away that falls between them.
 
     Returns
     -------
@@ -557,7 +566,7 @@ def prepare(
     between = {
         n: before.between[n]
         if before is not None and n in over
-        else grid.correlate(signals[n], grid.alternating)
+        else grid.correlate((readings or {}).get(n, signals[n]), grid.alternating)
         for n in TORQUES
         if n in signals
     }

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 _UNITS: Final = {"rad": 1.0, "deg": math.pi / 180.0, "rev": 2.0 * math.pi}
 """Units of an angle [rad]."""
+_WORDS: Final = {"rad": "radians", "deg": "degrees", "rev": "turns"}
 _ON_GRID: Final = 0.05
 """Scatter of the values around whole steps [steps] up to which they are on a grid."""
 _WHOLE: Final = 2e-3
@@ -54,9 +55,9 @@ def check_turns(record: Record, gear_ratio: float | None = None) -> list[Finding
         Finding(
             "refuse" if sure else "warn",
             "unit",
-            f"{record.name}: {channel} was read in {read}, and its encoder has a whole number of "
-            f"steps to a turn only in {unit}: give the column its unit, in its header or in "
-            "[columns]",
+            f"{record.name}: {channel} was read in {_WORDS[read]}, and its encoder has a whole "
+            f"number of steps to a turn only in {_WORDS[unit]}: give the column its unit, in its "
+            "header or in [columns]",
             channel,
         )
         for channel, (read, unit) in said.items()

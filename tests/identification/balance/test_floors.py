@@ -12,6 +12,7 @@ import pytest
 
 from identification import Record, fit
 from identification.balance.balances import balances_of
+from identification.balance.clocks import shifted
 from identification.balance.colour import white
 from identification.balance.drawn_noise import LONGEST, draws_of, excerpt
 from identification.balance.excitation import attenuation, excitation_warnings
@@ -49,7 +50,14 @@ def test_motion_between_uneven_stamps_is_no_noise(jitter: float) -> None:
 
 @pytest.mark.parametrize("factor", [1, 2, 4])
 def test_each_record_has_the_floor_of_its_own_rate(factor: int) -> None:
+    """Of white noise, which moves readings by steps of their own: what steps alone take off a slow
+    motion is the same at any rate.
+    """
     healthy = {n: record(n, seed, False, *FAST) for n, seed in (("train", 3), ("other rate", 7))}
+    rng = np.random.default_rng(2)
+    for name, made in healthy.items():
+        shaken = made["link_position"] + 2 * np.pi / 100_000 * rng.standard_normal(len(made))
+        healthy[name] = made.with_channel("link_position", shaken)
     train, other = healthy["train"], healthy["other rate"]
     held = Record.from_channels(
         other.time[::factor], {c: x[::factor] for c, x in other.channels.items()}, name="other rate"
@@ -166,6 +174,50 @@ def test_an_addition_is_judged_by_what_it_leaves_and_not_by_its_floor() -> None:
     assert "motor" in made_worse(error(1.0, 0.01), error(1.3, 0.5))
     assert made_worse(error(0.1, 1.0), error(0.1, 1.0)) == ""
     assert made_worse(error(1.0, 0.5), error(1.05, 0.5)).startswith("the held-out error rises")
+
+
+@pytest.mark.parametrize("speed", [0.002, 0.02, 0.2])
+@pytest.mark.parametrize("beside", [0.0, 0.2])
+def test_what_the_steps_of_an_encoder_take_off_a_slow_motion_is_drawn(
+    speed: float, beside: float
+) -> None:
+    """A motion of less than a step in a kernel has one error for many rows, and no derivative: of
+    white noise of the same size a kernel leaves a third, or three times as much.
+    """
+    dt, step = 2e-3, 2 * np.pi / 4096
+    t = dt * np.arange(20_000)
+    rng = np.random.default_rng(4)
+    motion = speed / 0.6 * np.sin(0.6 * t) + 0.1 * speed * np.sin(3.1 * t)
+    link = step * np.rint(
+        (motion + beside * step * rng.standard_normal(len(t)) + 0.3 * step) / step
+    )
+    w = prepare(t, {"motor_position": motion, "link_position": link}, (slice(0, len(t)),))
+    still = prepare(t, {"link_position": motion}, (slice(0, len(t)),))
+    noise = white(step * np.hypot(beside, 12**-0.5))
+    assert noise.read_in(step).step == step and noise.read_in(0.3 * step).step == 0.0
+    sources = {"motor_position": white(1e-9), "link_position": noise.read_in(step)}
+    for name in ("link_position", "link_velocity"):
+        found = np.concatenate(
+            [d.noisy.averaged[name] - d.calm.averaged[name] for d in draws_of(w, sources)]
+        )
+        true = w.averaged[name] - still.averaged[name]
+        assert np.std(found) == pytest.approx(np.std(true), rel=0.2), name
+
+
+def test_a_jump_between_two_samples_is_seen_where_readings_are_interpolated() -> None:
+    """A torque that is shifted by half a sample alternates by a quarter, and its jumps are as
+    uncertain as before.
+    """
+    t = 5e-3 * np.arange(4000)
+    torque = np.where(np.arange(4000) % 37 < 18, 1.0, -1.0)
+    signals = {"motor_position": np.sin(t), "torque": torque}
+    every = (slice(0, len(t)),)
+    moved, parts = shifted(signals, every, {"torque_sensor": 0.5})
+    plain, bare = prepare(t, signals, parts), prepare(t, moved, parts)
+    seen = prepare(t, moved, parts, readings={"torque": torque})
+    assert rms(bare.between["torque"]) < 0.3 * rms(plain.between["torque"])
+    np.testing.assert_array_equal(seen.between["torque"], plain.between["torque"])
+    np.testing.assert_array_equal(seen.averaged["torque"], bare.averaged["torque"])
 
 
 def test_pieces_of_a_long_record_have_its_rows_and_its_floor() -> None:

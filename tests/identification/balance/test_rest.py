@@ -16,7 +16,7 @@ from identification.balance.dataset import weak_record
 from identification.balance.excitation import excitation_warnings
 from identification.balance.rest import rest_check, rest_warnings
 from identification.balance.sensing import sense
-from identification.balance.weak import REST_SHARE, prepare
+from identification.balance.weak import HELD_READINGS, REST_SHARE, prepare
 from identification.data.joint_file import Joint
 from tests.hidden_effect.generator import QUANTUM, generate_case
 
@@ -75,10 +75,22 @@ def test_what_a_standing_joint_reads_changes_nothing(folder: Path) -> None:
     assert any("at rest" in w for w in excitation_warnings(first.data))
 
 
-def test_reversals_stay_and_the_transmission_keeps_every_row(folder: Path) -> None:
-    joint = load_joint(folder / "joint.toml")
-    w = fit(joint, [read(folder / "train.csv")]).data.train[0]
-    assert w.taking("transmission").all()
+def test_reversals_stay_and_the_transmission_keeps_what_noise_averages(folder: Path) -> None:
+    """Encoders that stand on a step have one reading of the twist for all rows of a rest; those
+    that toggle by their noise have as many as rows.
+    """
+    joint, record = load_joint(folder / "joint.toml"), read(folder / "train.csv")
+    w = fit(joint, [record]).data.train[0]
+    both = np.minimum(w.rest["motor"], w.rest["link"]) > 0.5
+    assert both.mean() > 0.25 and not w.taking("transmission")[both].any()
+    assert w.taking("transmission").mean() > 0.4
+    rng = np.random.default_rng(1)
+    toggling = record
+    for channel in ("motor_position", "link_position"):
+        step = QUANTUM[f"{channel}_rad"]
+        noise = np.rint(rng.standard_normal(len(record))) * step
+        toggling = toggling.with_channel(channel, toggling[channel] + noise)
+    assert fit(joint, [toggling]).data.train[0].taking("transmission").all()
     assert 0.3 < w.resting("motor").mean() < 0.6
     edges = np.flatnonzero(np.diff(w.resting("motor").astype(int)))
     assert len(edges) < 40, "stretches at rest, not scattered rows"
@@ -111,6 +123,8 @@ def test_a_mask_is_the_union_of_its_sides() -> None:
     assert np.array_equal(w.taking("link"), half)
     assert not w.taking("sum").any()
     assert w.taking("transmission").all()
+    on_steps = replace(w, rest={**w.rest, HELD_READINGS: 2 * REST_SHARE * half})
+    assert np.array_equal(on_steps.taking("transmission"), ~half)
     assert not replace(w, masked=frozenset({"transmission"})).taking("transmission").any()
 
 

@@ -5,6 +5,7 @@ after an unloaded run.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
@@ -222,11 +223,11 @@ def test_the_links_parameters_are_those_of_the_first_payload() -> None:
     )
     # the skew of the loaded run is what both share: it moves them within their bands
     for name in ("link_inertia", "gravity_torque"):
-        error = alone.steps[0].solution.stderr[name]
-        assert error is not None
+        errors = [found.steps[0].solution.stderr[name] or 0.0 for found in (alone, both)]
+        assert min(errors) > 0.0
         assert both.steps[0].solution.values[name] == pytest.approx(TRUE[name], rel=0.02)
         assert both.steps[0].solution.values[name] == pytest.approx(
-            alone.steps[0].solution.values[name], abs=error
+            alone.steps[0].solution.values[name], abs=math.hypot(*errors)
         )
 
 

@@ -11,6 +11,7 @@ import pytest
 
 from identification import Record, fit, improve, load_joint, read
 from identification.balance.excitation import excitation_warnings
+from identification.data.check.quanta import quantum
 from identification.errors import InputError
 
 DEMO = Path(str(files("workbench") / "demo"))
@@ -54,9 +55,23 @@ def test_record_in_degrees_beside_one_in_radians_is_refused() -> None:
     joint = load_joint(DEMO / "joint.toml")
     train, held = read(DEMO / "train.npz"), read(DEMO / "held_out.npz")
     moved = ("motor_position", "motor_velocity", "link_position", "link_velocity")
-    degrees = train
-    for channel in moved:
-        degrees = degrees.with_channel(channel, np.rad2deg(train[channel]))
+    rng = np.random.default_rng(5)
+
+    def in_degrees(steps: float) -> Record:
+        """The training record, its positions with noise of so many steps of their encoders."""
+        out = train
+        for channel in moved:
+            values = train[channel]
+            if channel.endswith("position"):
+                values = values + steps * (quantum(values) or 0.0) * rng.standard_normal(
+                    len(values)
+                )
+            out = out.with_channel(channel, np.rad2deg(values))
+        return out
+
+    with pytest.raises(InputError, match="was read in radians, .* only in degrees: give the col"):
+        improve([in_degrees(0.0)], joint, [held])  # the steps of the encoders tell
+    degrees = in_degrees(2.0)
     with pytest.raises(
         InputError,
         match=r"^train moves .* are its positions in degrees\? Set their unit in \[columns\]$",
