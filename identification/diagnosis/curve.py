@@ -158,13 +158,21 @@ def _clear(
     return out
 
 
-def steadily_moving(base: Base) -> Base:
+def steadily_moving(base: Base, *, creeping: bool = True) -> Base:
     """The base on the rows in which no side turns or hardly moves, friction changing its sign at
     once.
 
+    Parameters
+    ----------
+    base : Base
+    creeping : bool
+        Whether rows count in which a side is slower than it turns.
+
+    Notes
+    -----
     A smoothing velocity fitted to a wrong law is part of that law: here the curve has to show it.
     But a joint that creeps under it, as one that settles does, has friction of less than its level
-    whatever the law: such rows count only where the width would be that of a law.
+    whatever the law: a name is not held against such rows, which a curve is drawn through.
     """
     model, data = base.solution.model, base.data
     sharp: dict[str, float] = {}
@@ -175,8 +183,9 @@ def steadily_moving(base: Base) -> Base:
         speeds = _speeds(data, side)
         if names and not own and len(speeds):
             sharp |= dict.fromkeys(names, SHARP * float(np.quantile(speeds, ENDS[1])))
-            width = TURN_WIDTHS * max(base.solution.values[n] for n in names)
-            turning[side] = min(width, CREEP * float(np.quantile(speeds, FAST)))
+            if not creeping:
+                width = TURN_WIDTHS * max(base.solution.values[n] for n in names)
+                turning[side] = min(width, CREEP * float(np.quantile(speeds, FAST)))
     solution = replace(
         base.solution,
         values={**base.solution.values, **sharp},

@@ -299,10 +299,16 @@ def equivalences(
             groups.setdefault(mark, []).append(c)
     if not groups:
         return {}
-    named = steadily_moving(make_base(solution, data))
+    base = make_base(solution, data)
+    named, moving = steadily_moving(base), None
     out: dict[str, Equivalence] = {}
     for (place, _, balance), group in groups.items():
         found = _held_against(group, place, balance, named)
+        if found is not None and not found.is_name:
+            # a joint that settles has less friction than its level, whatever the law
+            moving = moving or steadily_moving(base, creeping=False)
+            faster = _held_against(group, place, balance, moving)
+            found = faster if faster is not None and faster.is_name else found
         if found is not None:
             out |= {c.label: found for c in group}
     return out
