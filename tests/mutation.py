@@ -95,6 +95,7 @@ _ROWS: Final = Judges(
         f"{_BALANCE}/test_innovations.py",
         "tests/identification/fitting/test_signed_fit.py",
         f"{_BALANCE}/test_floors.py",
+        f"{_BALANCE}/test_stacked.py",
         *_LOOP[:1],
     ),
     (*_LOOP[1:], f"{_BALANCE}/test_bench.py", *_LONG[:2]),

@@ -220,6 +220,31 @@ def test_averages_and_curvatures_of_the_points_are_exact_for_polynomials() -> No
     assert both == pytest.approx(np.tile([0.0, 2.0], (made.rows, 1)), abs=1e-8)
 
 
+@pytest.mark.parametrize("dt", [1e-3, 2e-3, 4e-3])
+def test_a_kernel_of_eight_samples_reaches_over_no_end_of_a_stretch(dt: float) -> None:
+    """A second derivative takes more points than the kernel has where these are half as many."""
+    time = dt * np.arange(300)
+    parts = (slice(0, 140), slice(140, 300))
+    beside = np.where(np.arange(300) < 140, time, 1e6 * time)
+    made = prepare(time, {"motor_position": time}, parts, length=8 * dt, pointwise=2 * dt)
+    t, of_points = made.points["time"], beside[:: made.grid.step]
+    first = made.stretch == 0
+    for matrix in (made.averaging, made.curving):  # a point outside would be another one's memory
+        assert 0 <= matrix.indices.min() and matrix.indices.max() < len(t)
+    assert made.curve(t**2) == pytest.approx(2.0, abs=1e-6)
+    assert made.average(of_points)[first] == pytest.approx(made.time[first], abs=1e-9)
+    assert made.curve(of_points)[first] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_stretch_of_two_kernels_has_rows_and_one_of_a_kernel_none() -> None:
+    time = 1e-3 * np.arange(3000)
+    parts = (slice(0, 120), slice(120, 180), slice(180, 3000))
+    made = prepare(time, {"motor_position": np.sin(time)}, parts, length=0.06)
+    assert np.sum(made.time < time[120]) > 2
+    assert not np.any((made.time >= time[120]) & (made.time < time[180]))
+    assert made.starts.tolist() == [0, 60, 60 + 2820 // made.grid.step]
+
+
 @pytest.mark.parametrize(("length", "dt"), [(0.06, 1e-3), (0.06, 4e-3), (0.03, 2e-3)])
 @pytest.mark.parametrize("make", [kernel, differentiated_kernel])
 def test_the_kernel_wipes_out_three_and_more_whole_waves(

@@ -1,0 +1,129 @@
+"""Stacked rows of several records: what takes part, what drifts, and which noise is believed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from casadi_models import JointModel
+from identification import Record
+from identification.balance.balances import balances_of
+from identification.balance.colour import white
+from identification.balance.dataset import Dataset, load_dataset
+from identification.balance.stacked import (
+    _either_direction,
+    drift_rows,
+    noise_believed,
+    noise_rows,
+    rms,
+    stack,
+    sure_levels,
+    together,
+)
+from identification.balance.weak import WeakRecord, differentiated_kernel, prepare
+from identification.data.joint_file import Joint
+from identification.fitting.engine import prepared_model
+
+FloatArray = npt.NDArray[np.float64]
+VALUES = {"inertia": 12.0, "motor_viscous": 25.0, "motor_smoothing_velocity": 0.01}
+NOISE = 1.0
+"""Of the torque [N.m]."""
+
+
+def axis(seconds: float, name: str = "axis") -> Record:
+    """A rigid axis without friction and without any noise."""
+    t = 1e-3 * np.arange(round(1e3 * seconds))
+    q, v, a = np.sin(3 * t), 3 * np.cos(3 * t), -9 * np.sin(3 * t)
+    torque = VALUES["inertia"] * a + VALUES["motor_viscous"] * v
+    return Record.from_channels(t, {"motor_position": q, "motor_torque": torque}, name=name)
+
+
+def world(*seconds: float) -> tuple[JointModel, Dataset]:
+    """Such records of these lengths, and the model that they follow."""
+    records = [axis(s, f"run {k}") for k, s in enumerate(seconds)]
+    joint = Joint(model_name="hd1", effects=("viscous",))
+    model = prepared_model(joint, records[0])
+    return model, load_dataset(records, [], joint, model)
+
+
+def moved(record: WeakRecord, more: FloatArray) -> WeakRecord:
+    """The record with so much more torque in its rows."""
+    torque = record.averaged["drive"] + more
+    return replace(record, averaged={**record.averaged, "drive": torque})
+
+
+def test_a_drift_of_one_record_is_not_spread_over_another() -> None:
+    """The even part of a drift is its RMS in the rows of each record that take part."""
+    _, data = world(6.0, 3.0, 4.0)
+    rng = np.random.default_rng(0)
+    records = [replace(w, rest={"motor": (rng.random(w.rows) < 0.3) * 1.0}) for w in data.train]
+    drifts = [size * rng.standard_normal(w.rows) for size, w in zip((1.0, 5.0, 20.0), records)]
+    quick = np.full(sum(w.rows for w in records), 2.0)
+    found = together({"axis": quick}, {"axis": np.concatenate(drifts)}, records)["axis"]
+    expected = [
+        np.full(w.rows, np.sqrt(4.0 + np.mean(x[w.rest["motor"] == 0] ** 2)))
+        for w, x in zip(records, drifts)
+    ]
+    assert found == pytest.approx(np.concatenate(expected), rel=1e-12)
+
+
+def test_rows_that_take_no_part_are_zero_in_the_residual_and_its_slopes() -> None:
+    model, data = world(4.0)
+    (record,) = data.train
+    still = np.arange(record.rows) % 3 == 0
+    resting = replace(moved(record, np.full(record.rows, 7.0)), rest={"motor": still * 1.0})
+    found = stack(balances_of(model, data.sensing), [resting], VALUES)
+    assert np.all(found.residual["axis"][still] == 0.0)
+    assert np.all(found.jacobian["axis"][still] == 0.0)
+    assert np.all(np.abs(found.residual["axis"][~still]) > 1.0)
+
+
+def test_no_records_have_no_rows_and_rows_of_none_no_level() -> None:
+    model, data = world(4.0)
+    assert [x.shape for x in drift_rows(model, data, VALUES, []).values()] == [(0,)]
+    for part in noise_rows(model, data, VALUES, []):
+        assert {b: x.shape for b, x in part.items()} == {"axis": (0,)}
+    (record,) = data.train
+    masked = replace(data, train=(replace(record, masked=frozenset({"axis"})),))
+    assert sure_levels(model, masked, VALUES) == {"axis": 0.0}
+
+
+@pytest.mark.parametrize("seconds", [4.0, 30.0])
+def test_a_level_of_noise_that_is_right_is_believed_and_one_too_high_is_not(seconds: float) -> None:
+    """White noise leaves a residual that scatters about its level: of a hundred records hardly one
+    lies three standard errors lower. Twice that level is lowered to it and no further than by these
+    errors.
+    """
+    model, data = world(seconds)
+    (record,) = data.train
+    weights = differentiated_kernel(record.grid.length, record.grid.dt, 0)
+    level = NOISE * float(np.linalg.norm(weights))
+    rng = np.random.default_rng(1)
+    left, right, double = [], [], []
+    for _ in range(100):
+        noise = NOISE * rng.standard_normal(round(1e3 * seconds))
+        rows = record.grid.correlate(noise, weights)
+        drawn = replace(data, train=(moved(record, rows),))
+        left.append(rms(rows) / level)
+        right.append(noise_believed(model, drawn, VALUES, [{"axis": level}])["axis"])
+        double.append(noise_believed(model, drawn, VALUES, [{"axis": 2 * level}])["axis"])
+    assert np.sum(np.array(right) < 1.0) <= 2
+    error = float(np.std(left))
+    assert np.max(double) < 1.0
+    assert np.mean(double) == pytest.approx(0.5 / (1 - 3 * error), rel=0.1)
+
+
+@pytest.mark.parametrize(("deviations", "known"), [(2.9, False), (3.1, True)])
+def test_a_move_between_two_samples_tells_a_direction_from_three_deviations_of_a_difference(
+    deviations: float, known: bool
+) -> None:
+    """Two readings of a slow logger differ by the root of two of the noise of one."""
+    dt, noise = 0.01, 1e-4
+    step = deviations * np.sqrt(2) * noise
+    time = dt * np.arange(400)
+    made = prepare(time, {"motor_position": step * np.arange(400)}, (slice(0, 400),))
+    assert made.grid.step == 1
+    assert np.all(_either_direction(made, "motor", white(noise)) != known)
