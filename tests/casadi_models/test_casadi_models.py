@@ -558,6 +558,26 @@ def test_delayed_reading_is_corrected_with_its_rate() -> None:
     assert found["link_rate"] == pytest.approx(0.8, rel=1e-12)
 
 
+def test_a_late_sensor_with_a_gain_shows_what_its_correction_gives_back() -> None:
+    """A torque that winds up steadily: the reading rises by the gain faster than the torque."""
+    gain, rate = 0.25, 2.1513e4 * 0.3
+    model = JointModel.harmonic_drive(3).with_values({**TABLE_4_3, "structural_damping": 0.0})
+    for effect in ("torque_sensor_gain", "torque_sensor_offset", "channel_delay@torque_sensor"):
+        model = model.add(effect)
+    model = model.with_values(
+        {
+            "torque_sensor_gain": gain,
+            "torque_sensor_offset": 2.5,
+            "torque_sensor_delay": 4e-3,
+        }
+    )
+    shown = np.array(
+        model.functions.outputs([2e-3, 0.8, 0.0, 0.5], np.zeros(3), model.value_vector())
+    ).ravel()
+    found = corrected(model, torque=shown[4], torque_rate=(1 + gain) * rate)
+    assert found["torque"] == pytest.approx(2.1513e4 * 2e-3, rel=1e-12)
+
+
 def test_time_derivative_follows_the_chain_rule() -> None:
     s: Any = Signals.symbols()
     rate = time_derivative(ca.sin(s.motor_position) * s.torque, s)

@@ -230,7 +230,7 @@ def test_a_kernel_of_eight_samples_reaches_over_no_end_of_a_stretch(dt: float) -
     t, of_points = made.points["time"], beside[:: made.grid.step]
     first = made.stretch == 0
     for matrix in (made.averaging, made.curving):  # a point outside would be another one's memory
-        assert 0 <= matrix.indices.min() and matrix.indices.max() < len(t)
+        assert matrix.indices.min() >= 0 and matrix.indices.max() < len(t)
     assert made.curve(t**2) == pytest.approx(2.0, abs=1e-6)
     assert made.average(of_points)[first] == pytest.approx(made.time[first], abs=1e-9)
     assert made.curve(of_points)[first] == pytest.approx(0.0, abs=1e-6)

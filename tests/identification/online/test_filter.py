@@ -12,6 +12,7 @@ import pytest
 
 from benchmarks.online_filter import KEY, Readings, filter_from, levels_of, plant, recorded
 from casadi_models import EFFECTS, JointModel
+from casadi_models.simulate import simulate
 from casadi_models.text.typed_law import TypedLaw, register
 from identification.errors import InputError
 from identification.online.filter import JointFilter, Levels
@@ -19,6 +20,7 @@ from identification.online.filter_step import _inverse
 
 FloatArray = npt.NDArray[np.float64]
 FULL, POSITIONS = (1.0,) * 6, (1.0, 1.0, 0.0, 1.0, 0.0, 1.0)
+MASSES = {"motor_inertia": 4.447, "link_inertia": 10.277, "stiffness": 2.15e4}
 MOST = 0.02
 """Error of a key parameter after 20 s, from values that are wrong by 1.3: well inside the 5 % that
 the online estimator promises after 40 s."""
@@ -203,6 +205,51 @@ def test_a_side_that_turns_is_unsure_by_its_dry_friction_over_one_sample(
     deviation = dry * h * steps / values[f"{turning}_inertia"]
     assert np.sqrt(covariance[own, own]) == pytest.approx(deviation, rel=0.02)
     assert np.sqrt(covariance[other, other]) < 0.05 * deviation
+
+
+def test_a_law_with_memory_goes_on_in_the_filter_as_in_the_simulator() -> None:
+    """Of three elements and two bodies; nothing is read, and nothing else acts."""
+    torques = {f"hysteresis_torque_{k}": 2.0 for k in (1, 2, 3)}
+    model = JointModel.harmonic_drive(3).add("viscous").add("hysteresis")
+    model = model.with_values({**MASSES, **torques, "hysteresis_width": 1e-2})
+    joint, h, start = JointFilter(model, 1e-3), 1e-3, np.zeros(7)
+    start[:4] = (0.21, 0.5, 0.20, 0.3)
+    drive = 30.0 + 10.0 * np.sin(0.1 * np.arange(200))
+    true = simulate(model, drive, h, x0=start).states
+    p = joint.parameters(Levels(drive=0.0, disturbance=(0.0, 0.0, 0.0)))
+    mean, covariance = np.zeros(joint.size), np.zeros((joint.size, joint.size))
+    mean[:7] = start
+    for now in drive[:-1]:
+        mean, covariance = joint.predict(mean, covariance, [now, now, 1.0, h, h, 0.0, 0.0], p)
+    after = np.array(mean).ravel()
+    moved = np.abs(true[-1] - true[0])
+    assert np.all(moved[4:] > 0.05), "the elements have filled"
+    assert np.all(np.abs(after[:7] - true[-1]) < 0.01 * moved)
+    assert np.all(after[7:] == 0.0)
+
+
+@pytest.mark.parametrize("read", [1.0, 0.0])
+def test_a_torque_from_elsewhere_fades_and_its_uncertainty_stays(read: float) -> None:
+    """A Markov process of first order: what it is worth fades with its time constant, and what is
+    not known of it is its standard deviation, however long nothing is read. A free parameter walks
+    by the root of the time. Where the drive is not read the first torque is that of the motor.
+    """
+    size, lasting, steps, h = (3.0, 0.4, 2.0), (0.3, 0.1, 0.2), 100, 1e-3
+    levels = Levels(disturbance=size, lasting=lasting, unknown_drive=80.0, unknown_lasting=0.05)
+    joint = JointFilter(plant(), h, KEY[3:5]).with_walks({KEY[3]: 0.5, KEY[4]: 3.0})
+    at = joint.states
+    acting = ((size[0], lasting[0]) if read else (80.0, 0.05), *zip(size[1:], lasting[1:]))
+    deviation, fading = (np.array(x) for x in zip(*acting))
+    mean, covariance = np.zeros(joint.size), np.zeros((joint.size, joint.size))
+    mean[at : at + 3] = 1.0
+    covariance[range(at, at + 3), range(at, at + 3)] = deviation**2
+    p = joint.parameters(levels)
+    for _ in range(steps):
+        mean, covariance = joint.predict(mean, covariance, [0.0, 0.0, read, h, h, 0.0, 0.0], p)
+    left, spread = np.array(mean).ravel()[at:], np.sqrt(np.diag(np.array(covariance))[at:])
+    assert left[:3] == pytest.approx(np.exp(-steps * h / fading), rel=1e-9)
+    assert spread[:3] == pytest.approx(deviation, rel=1e-9)
+    assert spread[3:] == pytest.approx(np.array([0.5, 3.0]) * np.sqrt(steps * h), rel=1e-9)
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])
