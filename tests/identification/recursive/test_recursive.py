@@ -11,8 +11,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import casadi as ca
 import numpy as np
 import pytest
+from scipy.stats import chi2, norm
 
 from benchmarks import joint_regressor as joint
 from identification.errors import InputError
@@ -32,6 +34,7 @@ from identification.recursive.estimator import (
     StartupOutcome,
     forgetting_curve,
 )
+from identification.recursive.ud_step import _alarm_limit
 
 ROOT = Path(__file__).resolve().parents[3]
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
@@ -125,6 +128,23 @@ def test_units_of_the_parameters_do_not_matter() -> None:
     other = RecursiveLeastSquares(np.zeros(4), 2.0 * units).run(y, h / units)
     np.testing.assert_array_equal(other.theta / units, plain.theta)
     np.testing.assert_allclose(plain.theta[-1], theta, atol=0.05)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_units_of_the_outputs_do_not_matter(method: str) -> None:
+    """Neither for the first guess of R2 nor for what counts as a large error of an output."""
+    theta, h, y = _data(300)
+    for unit in (2.0**20, 2.0**-20):
+        plain = RecursiveLeastSquares(np.full(4, 0.5), np.full(4, 2.0), method)
+        other = RecursiveLeastSquares(np.full(4, 0.5 * unit), np.full(4, 2.0 * unit), method)
+        one, two = plain.run(y, h), other.run(unit * y, h)
+        np.testing.assert_allclose(two.theta / unit, one.theta, rtol=1e-9)
+        np.testing.assert_allclose(other.forgetting, plain.forgetting, rtol=1e-9)
+        np.testing.assert_allclose(
+            other.measurement_covariance / unit**2, plain.measurement_covariance, rtol=1e-9
+        )
+        if method != "schedule":
+            np.testing.assert_allclose(one.theta[-1], theta, atol=0.2)
 
 
 # Thesis forgetting
@@ -484,6 +504,19 @@ def test_r2_is_found_from_the_innovations() -> None:
 
 
 # Alarm
+
+@pytest.mark.parametrize("freedom", [20.0, 80.0])
+@pytest.mark.parametrize("probability", [1e-2, 1e-4])
+@pytest.mark.parametrize("inflation", [1.0, 2.0])
+def test_the_limit_of_the_alarm_is_that_of_chi_square(
+    freedom: float, probability: float, inflation: float
+) -> None:
+    normal = float(norm.isf(probability))
+    config = {"alarm_freedom": [freedom], "alarm_normal": [normal]}
+    limit = float(ca.DM(_alarm_limit(config, inflation)))  # type: ignore[arg-type]
+    left = freedom / (2 * inflation - 1)
+    assert limit == pytest.approx(float(chi2.isf(probability, left)) / left, rel=0.02)
+
 
 
 def test_the_alarm_keeps_quiet_on_noise_and_fires_on_a_step_but_not_on_one_outlier() -> None:
