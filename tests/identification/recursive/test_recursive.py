@@ -505,6 +505,7 @@ def test_r2_is_found_from_the_innovations() -> None:
 
 # Alarm
 
+
 @pytest.mark.parametrize("freedom", [20.0, 80.0])
 @pytest.mark.parametrize("probability", [1e-2, 1e-4])
 @pytest.mark.parametrize("inflation", [1.0, 2.0])
@@ -516,7 +517,6 @@ def test_the_limit_of_the_alarm_is_that_of_chi_square(
     limit = float(ca.DM(_alarm_limit(config, inflation)))  # type: ignore[arg-type]
     left = freedom / (2 * inflation - 1)
     assert limit == pytest.approx(float(chi2.isf(probability, left)) / left, rel=0.02)
-
 
 
 def test_the_alarm_keeps_quiet_on_noise_and_fires_on_a_step_but_not_on_one_outlier() -> None:
