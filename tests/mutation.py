@@ -85,6 +85,7 @@ _UPDATES: Final = Judges(
         f"{_ONLINE}/test_common_mode.py",
         f"{_ONLINE}/test_exact_rows.py",
         f"{_ONLINE}/test_filter.py",
+        f"{_ONLINE}/test_online_clocks.py",
         f"{_ONLINE}/test_state.py",
     ),
     (f"{_ONLINE}/test_faulty_files.py", "tests/irj_fmu/test_estimator_rows.py"),

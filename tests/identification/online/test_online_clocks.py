@@ -12,8 +12,9 @@ import pytest
 from benchmarks.native import PLAIN, STEP
 from casadi_models.hold import HOLD_NAME
 from casadi_models.simulate import simulate
+from identification.balance.clocks import MOST_SKEW
 from identification.data.joint_file import Joint
-from identification.online.estimator import OnlineEstimator
+from identification.online.estimator import OnlineEstimator, OnlineOptions
 from identification.online.rows import SOURCES
 from identification.online.timing import Alignment
 from irj_fmu.plant.reference import reference_joint, start_of
@@ -69,6 +70,22 @@ def test_the_hold_of_a_current_is_found_and_taken_off(late: float) -> None:
     assert made.theta[at] == pytest.approx(true, abs=min(0.1 * dt, 4 * made.sigma[at]))
     assert made.ratio.max() < 1.3
     near_the_truth(made)
+
+
+@pytest.mark.parametrize("way", [-1, 1])
+def test_no_clock_is_shown_further_off_than_any_may_be(way: int) -> None:
+    dt = 2 * STEP
+    time, table = (x[::2] for x in readings())
+    time, table = time[:1500], table[:1500]
+    noise = np.random.default_rng(5).normal(size=table.shape) * NOISE
+    table = np.column_stack([drive(time - way * 6 * dt), table[:, 1:]]) + noise
+    made = OnlineEstimator(
+        start_of(reference_joint("hd3")), dt, OnlineOptions(optimise=False, warm_up=2.0)
+    )
+    for at, row in zip(time.tolist(), table.tolist(), strict=True):
+        made.update(at, row, [True] * 6)
+    assert not made.warming_up
+    assert made.theta[made.names.index(HOLD_NAME)] == pytest.approx(way * MOST_SKEW * dt)
 
 
 def test_a_joint_whose_torque_is_known_has_no_hold() -> None:

@@ -10,6 +10,7 @@ import pytest
 
 from benchmarks.native import readings_of
 from identification.online.estimator import OnlineEstimator, OnlineOptions
+from irj_fmu.convergence import forgotten
 from irj_fmu.cosim import link_referred
 from irj_fmu.plant.reference import reference_joint, start_of
 
@@ -116,3 +117,43 @@ def test_at_a_reversal_a_row_is_unsure_by_the_dry_friction_of_its_side() -> None
     expected = 1 / np.sqrt(1 + np.column_stack([motor, link, 0 * motor]) ** 2)
     assert one.balances == ("motor", "link", "transmission")
     assert one._weight_of(shares, theta, size) == pytest.approx(expected, rel=1e-12)
+
+
+def test_what_the_first_window_leaves_is_told_over_its_noise_at_once() -> None:
+    """Before another row is made; a joint that is as the model says is not strained."""
+    one, at = OnlineEstimator(start_of(reference_joint("hd3")), STEP, QUICK), 0
+    while one.warming_up:
+        feed(one, "hd3", at, at + 1)
+        at += 1
+    assert one.ratio == pytest.approx(one.level / one.least, rel=1e-12)
+    assert np.all((one.ratio > 0.1) & (one.ratio < 1.5))
+    for _ in range(4):
+        feed(one, "hd3", at, at + 500)
+        at += 500
+        assert not one.wanted
+
+
+def test_a_reading_that_is_missing_is_told_once_each_time() -> None:
+    one = OnlineEstimator(start_of(reference_joint("hd3")), STEP, QUICK)
+    for k in range(4500):
+        missing = 3000 <= k < 3400 or 3900 <= k < 4200
+        one.update(k * STEP, readings("hd3")[k], [not missing, *[True] * 5])
+        if k == 3700:
+            assert one.fault == 0
+            first = one.events
+    assert len(first) == 1 and first[0].startswith("fault ")
+    assert one.events == 2 * first
+
+
+def test_the_rows_go_on_with_the_shapes_that_a_search_has_found() -> None:
+    options = OnlineOptions(detect=False, warm_up=2.0, portions=50)
+    one = OnlineEstimator(forgotten(reference_joint("hd3")), STEP, options)
+    assert one.two_step is not None
+    start = one.two_step.eta.copy()
+    feed(one, "hd3", 0, 2500)
+    assert not one.two_step.searching
+    assert one.two_step.searches == 1
+    assert not np.array_equal(one.two_step.eta, start)
+    assert np.array_equal(one.rows.shape_values, one.two_step.eta)
+    feed(one, "hd3", 2500, 3500)
+    assert np.all(one.ratio < 1.5), "what they leave is noise"
