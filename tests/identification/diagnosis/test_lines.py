@@ -18,9 +18,12 @@ from benchmarks.lines import Case, Result, results
 from casadi_models import JointModel
 from identification import Record, improve, load_joint, read
 from identification.balance.sensing import Sensing, sense
+from identification.balance.weak import WeakRecord
 from identification.data.joint_file import Joint, parse_joint, toml_text
 from identification.diagnosis.lines import (
+    SMOOTHED,
     Line,
+    _encoder_orders,
     _Joined,
     _names,
     _Scan,
@@ -210,6 +213,79 @@ def test_samples_are_taken_as_they_are_unless_their_stamps_are_uneven(jitter: fl
         assert np.array_equal(made.points["link_position"], angle)
 
 
+def turning(time: FloatArray, angle: FloatArray) -> Record:
+    """An arm whose link follows such a motion."""
+    return Record.from_channels(time, {"link_position": angle, "link_torque": 0 * time})
+
+
+def sampled(record: Record) -> WeakRecord:
+    """Signals of such a record at every sample."""
+    joint = Joint(name="arm", gear_ratio=1.0, model_name="hd1", effects=("viscous@link",))
+    return at_every_sample(record, joint, sense(record, prepared_model(joint, record)))
+
+
+@pytest.mark.parametrize("dt", [1e-3, 2e-3])
+def test_smoothing_over_thirty_milliseconds_keeps_what_is_slower_and_drops_what_is_faster(
+    dt: float,
+) -> None:
+    time = dt * np.arange(round(3.0 / dt))
+    for period, least, most in ((0.12, 0.9, 1.0), (0.01, 0.0, 0.01)):
+        made = sampled(turning(time, 0.5 * time + np.sin(2 * np.pi * time / period)))
+        left = made.smooth["link_position"] - 0.5 * made.time
+        inside = slice(200, -200)
+        assert least <= np.abs(left[inside]).max() <= most
+
+
+def test_stretches_that_are_too_short_have_no_sample() -> None:
+    time = 2e-3 * np.concatenate([np.arange(40), 1000 + np.arange(40)])
+    record = Record.from_channels(
+        time,
+        {"link_position": np.sin(time), "link_torque": 0 * time, "run": np.arange(80) // 40},
+    )
+    made = sampled(record)
+    assert made.starts.tolist() == [0]
+    assert {len(x) for x in (made.time, made.block, *made.points.values())} == {0}
+
+
+def test_no_block_holds_samples_of_two_records() -> None:
+    time = 2e-3 * np.arange(3000)
+    runs = tuple(sampled(turning(time[:n], np.sin(2 * time[:n]))) for n in (1500, 3000, 2000))
+    count = sum(len(w.time) for w in runs)
+    block = _Joined(runs, np.zeros(count), 1.0).samples(1).block
+    assert np.array_equal(np.unique(block), np.arange(block.max() + 1)), "numbered without a gap"
+    parts = np.split(block, np.cumsum([len(w.time) for w in runs])[:-1])
+    assert [len(np.unique(p)) for p in parts] == [len(np.unique(w.block)) for w in runs]
+    assert sum(len(np.unique(p)) for p in parts) == len(np.unique(block))
+
+
+@pytest.mark.parametrize("told", [True, False])
+@pytest.mark.parametrize("share", [0.0, 0.04])
+def test_the_steps_of_an_encoder_stand_at_its_counts_per_turn(told: bool, share: float) -> None:
+    """Per turn of the motor: those of the link over the gear ratio, as far apart as the
+    transmission winds up with the position. The record says what a step is, or its readings do.
+    """
+    counts, own, ratio = 4096, 200, 50.0
+    time = 2e-3 * np.arange(4000)
+    steps = {"motor_position": 2 * np.pi / own, "link_position": 2 * np.pi / counts}
+    angle = {"motor_position": ratio * np.sin(1.3 * time)}
+    angle["link_position"] = (1 - share) * np.sin(1.3 * time)
+    read_out = {n: np.round(x / steps[n]) * steps[n] for n, x in angle.items()}
+    record = Record.from_channels(time, {**read_out, "link_torque": 0 * time})
+    record = replace(record, quanta=steps if told else {})
+    joint = Joint(name="arm", gear_ratio=ratio, model_name="hd3")
+    data: Any = SimpleNamespace(joint=joint)
+    run = at_every_sample(record, joint, sense(record, prepared_model(joint, record)))
+    bands = _encoder_orders(record, run, data)
+    assert len(bands) == 6
+    for k, (low, high) in enumerate(bands[:3], 1):
+        assert (low + high) / 2 == pytest.approx(k * counts / ratio, rel=1e-3)
+        assert (high - low) / (high + low) == pytest.approx(share, abs=0.01)
+    for k, band in enumerate(bands[3:], 1):
+        assert band == pytest.approx((k * own, k * own), rel=1e-3)
+    still = replace(run, smooth={**run.smooth, "motor_position": 0 * run.time})
+    assert all(low == high for low, high in _encoder_orders(record, still, data))
+
+
 def test_rest_counts_for_nothing() -> None:
     samples = swinging(0, 2.3, 0.25)
     rest = np.full(4000, 12.0)
@@ -255,6 +331,26 @@ def test_a_line_in_two_balances_is_one_and_two_that_can_be_told_apart_are_two(
     # the order of one line may be off in each balance
     beside = {"motor": along((first, 1.0)), "link": along((first + 1.2 * apart, 0.8), seed=1)}
     assert len(lines_in(monkeypatch, beside, axis)) == 1
+
+
+def test_a_joint_whose_residuals_are_noise_has_no_line_at_any_smoothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of a hundred joints at most one has, all smoothings of a balance together: more than two of
+    sixty happen once in forty times.
+    """
+    count = len(SMOOTHED)
+    seen = sum(
+        bool(
+            lines_in(
+                monkeypatch,
+                {f"smoothed {n}": swinging(count * seed + k) for k, n in enumerate(SMOOTHED)},
+                Joint("axis", "linear", model_name="hd1"),
+            )
+        )
+        for seed in range(60)
+    )
+    assert seen <= 2, ALPHA
 
 
 @pytest.mark.parametrize(("order", "many"), [(0.2, 0), (0.3, 1)])

@@ -249,6 +249,25 @@ def test_two_lines_are_both_found_the_strongest_first() -> None:
     assert all(p.order > 2.5 for p in peaks(along(angle, residual, weight), 6.0, lowest=2.5))
 
 
+@pytest.mark.parametrize(
+    ("cycles", "anywhere", "by_name"), [(1.5, 0, 0), (3.0, 0, 1), (5.0, 1, 1), (12.3, 1, 1)]
+)
+def test_an_order_without_a_name_needs_four_periods_over_the_stroke_and_a_named_one_two(
+    cycles: float, anywhere: int, by_name: int
+) -> None:
+    """What is slower is the trend over the position; lines one over the stroke apart are two."""
+    angle = 37.0 * (1 - np.abs(np.arange(COUNT) / (COUNT / 2) - 1))
+    noise = 0.1 * np.random.default_rng(3).standard_normal(COUNT)
+    order = 2 * math.pi * cycles / 37.0
+    samples = along(angle, np.sin(order * angle + 0.3) + noise)
+    assert len(peaks(samples, 6.0, most=1)) == anywhere
+    found = peaks(samples, 0.0, (order,), most=1)
+    assert len(found) == by_name
+    for one in found:
+        assert one.order == pytest.approx(order, abs=one.apart / 20)
+        assert one.apart == pytest.approx(2 * math.pi / 37.0, rel=0.01)
+
+
 @pytest.mark.parametrize("where", ["everywhere", "one end", "one direction", "turned"])
 def test_a_line_is_everywhere_or_none(where: str) -> None:
     rng = np.random.default_rng(9)
@@ -267,10 +286,11 @@ def test_a_line_is_everywhere_or_none(where: str) -> None:
 
 
 @pytest.mark.parametrize(("deviations", "stands"), [(1.8, True), (2.2, False)])
+@pytest.mark.parametrize(("limit", "beyond"), [(0.5, -1), (2.0, 1)])
 @pytest.mark.parametrize("part", range(PARTS))
 @pytest.mark.parametrize("forward", [True, False])
-def test_a_part_contradicts_a_line_from_two_errors_of_white_noise_under_half_of_it(
-    forward: bool, part: int, deviations: float, stands: bool
+def test_a_part_contradicts_a_line_from_two_errors_of_white_noise_under_half_or_over_twice_of_it(
+    forward: bool, part: int, limit: float, beyond: int, deviations: float, stands: bool
 ) -> None:
     # to and fro at one speed: each part of the stroke has as many samples either way
     angle = 30 * (1 - np.abs(np.arange(COUNT) / (COUNT / 2) - 1))
@@ -281,7 +301,7 @@ def test_a_part_contradicts_a_line_from_two_errors_of_white_noise_under_half_of_
     # the variance of the noise is n / 4 z, and of the size in a part 2 / (n / parts) times that
     error = math.sqrt(COUNT / (4 * prominence) * 2 / (COUNT / cells))
     wave = np.sin(2 * math.pi * angle)
-    shown = np.where(here, (0.5 - deviations * error) * wave, wave)
+    shown = np.where(here, (limit + beyond * deviations * error) * wave, wave)
     peak = line(2 * math.pi, 1.0, 0.0, prominence=prominence)
     assert everywhere(peak, [], along(angle, shown)) == stands
 
