@@ -27,6 +27,7 @@ from identification.diagnosis.trials import (
     _refined,
     _unit,
     _unseen_sizes,
+    by_whole_fit,
     columns,
     effective_share,
     make_base,
@@ -222,8 +223,14 @@ def test_blocks_and_balances_are_counted_once(base: Base) -> None:
     assert (held.sum(axis=0) == 1).all()
 
 
-def test_what_the_base_leaves_of_blocks_that_it_was_not_fitted_to(base: Base) -> None:
-    """The same by a fit of the rows themselves, fold by fold."""
+@pytest.mark.parametrize("blocks", [None, 2, 3])
+def test_what_the_base_leaves_of_blocks_that_it_was_not_fitted_to(
+    blocks: int | None, base: Base
+) -> None:
+    """The same by a fit of the rows themselves, fold by fold; of two blocks, too."""
+    if blocks is not None:
+        base = replace(base, block=np.where(base.block >= 0, base.block % blocks, -1))
+        assert base.folds == blocks
     assert base.inward.shape[1] == 0
     used = base.block >= 0
     for out in base.held_out_folds():
@@ -278,6 +285,44 @@ def test_the_figures_of_a_trial_by_plain_sums(base: Base) -> None:
     assert found.rms[0] == pytest.approx(math.sqrt(after.sum() / rows_in), rel=1e-4)
     score = (before - after) / (2 * after.sum() / rows_in) * base.share[0]
     assert found.block_score == pytest.approx(score, rel=1e-3, abs=1e-3)
+
+
+@pytest.mark.parametrize("left", [0.5, 1.0, 3.0])
+def test_a_whole_fit_counts_by_what_it_leaves_of_each_row(left: float, base: Base) -> None:
+    """So many deviations of each training row, and half of what the base leaves held out."""
+    found = tried(base, "cyclic_torque")
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], len(base.weight))
+    kept = base.held_residual - base.held_own @ (base.held_own.T @ base.held_residual)
+    values = dict.fromkeys(found.values, 7.0)
+    whole = by_whole_fit(
+        found,
+        base,
+        values,
+        left=left * signs / base.weight,
+        held_left=0.5 * kept / base.held_weight,
+    )
+    assert whole.values == values
+    assert whole.rms == pytest.approx(np.full(len(base.balances), left))
+    before = math.sqrt(float(base.crossed.sum()) / int(np.sum(base.block >= 0)))
+    assert whole.cv_drop_percent == pytest.approx(100 * (1 - left / before))
+    assert whole.held_out_drop_percent == pytest.approx(50.0)
+    assert math.isnan(
+        by_whole_fit(
+            found, base, values, left=signs / base.weight, held_left=np.empty(0)
+        ).held_out_drop_percent
+    )
+
+
+def test_a_shape_a_little_beyond_its_grid_is_found() -> None:
+    """The widest velocity that is tried is three tenths of the range; this law has more."""
+    key, name = "stribeck", "motor_stribeck_velocity"
+    grid = next(p for p in EFFECTS[key].parameters if p.name == "stribeck_velocity").grid
+    range_ = made(wave, held=False).data.ranges["velocity"]
+    width = 1.15 * grid[-1] * range_
+    hidden = made(lambda q, v: 15 * np.exp(-np.abs(v) / width) * np.sign(v), held=False)
+    assert hidden.data.ranges["velocity"] == pytest.approx(range_, rel=0.01)
+    found = tried(hidden, key)
+    assert found.values[name] == pytest.approx(width, rel=0.07)
 
 
 def test_the_size_by_one_fit_of_all_rows(base: Base) -> None:

@@ -23,6 +23,7 @@ from identification.naming.contest import (
     _entitled,
     _left,
     _unlikely,
+    from_every_valley,
     rivals_of,
 )
 from identification.naming.odds import Odds, contenders, contest_of, odds_of, unmodelled
@@ -159,7 +160,17 @@ def test_what_the_true_law_leaves_holds_no_other(drags: Contest) -> None:
     odds = odds_of(drags, allowance)
     assert odds.names == ("quadratic_drag",)
     assert odds.probability["quadratic_drag"] > 0.99
+    assert list(odds.behind) == ["cubic_viscous@motor"], "neither the leader nor nothing at all"
     assert "nats behind" in odds.behind["cubic_viscous@motor"]
+
+
+def test_who_has_no_other_valley_stays_as_it_was_fitted(drags: Contest) -> None:
+    """Names without shapes, and one behind that is not on offer beside the model any more."""
+    first, second, nothing = drags.rivals
+    assert drags.ahead[0, 0] > FEWEST
+    for behind in (first, replace(first, label="gone@motor")):
+        again = from_every_valley([behind, second], nothing.solution, drags.data)
+        assert [x is y for x, y in zip(again, (behind, second), strict=True)] == [True, True]
 
 
 def test_a_bump_that_no_name_has_is_an_allowance(imitated: Contest, drags: Contest) -> None:
