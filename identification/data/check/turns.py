@@ -55,9 +55,9 @@ def check_turns(record: Record, gear_ratio: float | None = None) -> list[Finding
         Finding(
             "refuse" if sure else "warn",
             "unit",
-            f"{record.name}: {channel} was read in {_WORDS[read]}, and its encoder has a whole "
-            f"number of steps to a turn only in {_WORDS[unit]}: give the column its unit, in its "
-            "header or in [columns]",
+            f"{record.name}: {channel} was read in {_WORDS[read]}: are its positions in "
+            f"{_WORDS[unit]}? Its encoder has a whole number of steps to a turn only there: give "
+            "the column its unit, in its header or in [columns]",
             channel,
         )
         for channel, (read, unit) in said.items()

@@ -318,9 +318,9 @@ def in_steps(motor: float, link: float, taken: float = 1.0) -> Record:
 @pytest.mark.parametrize(
     ("taken", "said"),
     [
-        (180 / np.pi, "was read in radians, and"),
-        (np.pi / 180, "was read in degrees, and"),
-        (0.5 / np.pi, "only in turns"),
+        (180 / np.pi, "was read in radians: are its positions in degrees?"),
+        (np.pi / 180, "was read in degrees: are its positions in radians?"),
+        (0.5 / np.pi, "are its positions in turns?"),
     ],
 )
 def test_the_steps_of_two_encoders_tell_the_unit(

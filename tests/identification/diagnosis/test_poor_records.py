@@ -69,7 +69,9 @@ def test_record_in_degrees_beside_one_in_radians_is_refused() -> None:
             out = out.with_channel(channel, np.rad2deg(values))
         return out
 
-    with pytest.raises(InputError, match="was read in radians, .* only in degrees: give the col"):
+    with pytest.raises(
+        InputError, match=r"radians: are its positions in degrees\? Its encoder .* give"
+    ):
         improve([in_degrees(0.0)], joint, [held])  # the steps of the encoders tell
     degrees = in_degrees(2.0)
     with pytest.raises(
