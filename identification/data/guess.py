@@ -180,8 +180,11 @@ def numbered(names: Sequence[str]) -> dict[int, tuple[str, ...]]:
     families: dict[tuple[str, str], dict[int, str]] = {}
     for name in names:
         for found in re.finditer(r"\d+", name):
+            digits = found.group().lstrip("0")
+            if len(digits) > len(str(len(names))):
+                continue  # numbers that count on have no more digits than their count
             ends = name[: found.start()], name[found.end() :]
-            families.setdefault(ends, {})[int(found.group())] = name
+            families.setdefault(ends, {})[int(digits or "0")] = name
     real = [f for f in families.values() if len(f) > 1 and min(f) <= 1 and max(f) - min(f) < len(f)]
     if not real:
         return {}

@@ -101,6 +101,12 @@ def test_a_sound_record_raises_no_question(seed: int, tmp_path: Path) -> None:
     assert max(high for _, high in seen.spark) == seen.high
 
 
+def test_a_name_may_hold_a_number_of_any_length() -> None:
+    """Python reads no number of more than 4300 digits."""
+    assert numbered(["q1", "q2", "q" + "7" * 5000]) == {1: ("q1",), 2: ("q2",)}
+    assert numbered(["q000", "q" + "0" * 5000 + "1"]).keys() == {0, 1}
+
+
 def test_joints_are_told_by_numbers_that_count_on() -> None:
     names = ["time", *(f"axis{k}_{q}_Nm" for k in range(1, 7) for q in ("drive", "link"))]
     assert list(numbered(names)) == [1, 2, 3, 4, 5, 6]
