@@ -182,7 +182,7 @@ class ChannelNoise:
         )
 
     def read_in(self, step: float) -> ChannelNoise:
-        """The same noise of readings in steps, in the channel's unit."""
+        """The same noise of readings in steps, in the channel's unit; 0: not in steps."""
         return replace(self, step=step) if self.beside(step) < HIDING * step else self
 
     def beside(self, step: float) -> float:

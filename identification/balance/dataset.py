@@ -36,7 +36,6 @@ from identification.balance.weak import (
     prepare,
     whole,
 )
-from identification.data.check.quanta import quantum
 from identification.data.joint_file import Joint
 from identification.data.record import Record
 from identification.errors import InputError
@@ -504,7 +503,7 @@ def measured_sources(record: Record, joint: Joint, sensing: Sensing) -> dict[str
     reading.
     """
     signals = signals_of(record, joint, sensing)
-    found = {
+    return {
         c: noise_of(
             record,
             c,
@@ -515,12 +514,6 @@ def measured_sources(record: Record, joint: Joint, sensing: Sensing) -> dict[str
         for c, x in signals.items()
         if c in POSITION_CHAINS
     }
-    for c in found.keys() & set(PAIR) & record.channels.keys():
-        step = record.quanta.get(c) or quantum(np.asarray(record[c]))
-        if step is not None:
-            on_link = joint.gear_ratio if c == "motor_position" else 1.0
-            found[c] = found[c].read_in(step / abs(on_link))
-    return found
 
 
 def pointwise_kernel(

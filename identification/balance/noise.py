@@ -17,6 +17,7 @@ from identification.balance.colour import (
     spacings_of,
     white,
 )
+from identification.data.check.quanta import quantum
 from identification.data.record import Record
 
 FloatArray = npt.NDArray[np.float64]
@@ -200,7 +201,7 @@ def noise_of(
     position: FloatArray | None = None,
 ) -> ChannelNoise:
     """Noise of a signal made from a record, estimated once per record, signal and gear ratio; its
-    colour is read where the stamps are even.
+    colour is read where the stamps are even, the step of a position from its values.
 
     Parameters
     ----------
@@ -233,6 +234,11 @@ def noise_of(
         if even and position is not None and level > 0:
             found = _where_calm(values, position, stretches, float(np.median(steps)), there)
             known[signal, ratio] = found or known[signal, ratio]
+        if signal.endswith("position") and record.has(signal):
+            step = quantum(values)
+            if signal in record.quanta:
+                step = record.quanta[signal] / (abs(ratio) if signal == "motor_position" else 1.0)
+            known[signal, ratio] = known[signal, ratio].read_in(step or 0.0)
     return known[signal, ratio]
 
 

@@ -52,8 +52,8 @@ more, a sum of laws imitates the curve."""
 HALF: Final = 0.5
 """Share missed from which a curve over any variable, and not the name, is what is missing."""
 OUTSIDE: Final = 3.0
-"""Standard errors by which a parameter must want to pass its bound: of ten that may stand at one,
-one in 75 joints would by chance."""
+"""Standard errors by which a parameter must want to pass its bound, or dry friction lie beside the
+curve: of ten that may stand at a bound, one in 75 joints would by chance."""
 BAND: Final = 1.96
 """Standard errors on either side of a curve that are its band of 95 %."""
 BY_CHANCE: Final = 0.05
@@ -434,9 +434,9 @@ def artefacts(
     tuple of Doubt
         An amplitude that its bound holds back by more than `OUTSIDE` errors, or that was there by
         as much before the additions and has gone to its bound with them, which chance does to
-        `BY_CHANCE` of those so large; dry friction that lies `OUTSIDE` of its errors from a
-        curve over velocity at zero speed. A bare sign does not tell: the
-        fit without the true law gives a positive Coulomb torque where there is none.
+        `BY_CHANCE` of those so large; dry friction that lies `OUTSIDE` errors from a curve over
+        velocity at zero speed. A bare sign does not tell: the fit without the true law gives a
+        positive Coulomb torque where there is none.
     """
     stands = at_bounds(solution, data)
     gone = _gone(solution, stands, start)

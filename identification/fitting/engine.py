@@ -449,8 +449,8 @@ def _best_start(
 SMOOTHING_SHARES: Final = (0.003, 0.01)
 """Smoothing velocities from which laws of low speed are fitted, as shares of the record's speed."""
 FLAT: Final = 1e-3
-"""Smoothing velocity, in the same, under which rows do not tell it: at a hundredth of a record's
-speed already a kernel passes a turn within a row.
+"""Smoothing velocity, in the same, under which no row tells its size: a turn is over between two of
+the points at which friction is evaluated.
 """
 GAP_FACTORS: Final = (0.1, 0.3, 3.0)
 """Sizes from which a gap of the transmission is fitted beside its start value: inside a gap that is
