@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from identification import Record, load_joint, read
+from identification import Joint, Record, load_joint, read
 from identification.errors import InputError
 from workbench.cli.following import joint_states
 from workbench.cli.following.growing import follow
@@ -126,20 +126,29 @@ def test_a_topic_gives_what_the_file_gives(write: Any) -> None:
         np.testing.assert_allclose(came, sent, rtol=0, atol=1e-6 if channel == "time" else 0)
 
 
+def of_column(name: str) -> Joint:
+    """The demo's joint with the motor's position in a column of that name [rad]."""
+    columns = {"motor_position": {"column": name, "unit": "rad"}}
+    return replace(load_joint(DEMO / "joint.toml"), columns=columns)
+
+
+def arrived(topic: JointStates, count: int) -> list[bytes]:
+    """The rows of a topic, so many of them or those of 10 s."""
+    rows, end = list(topic.arrived()), time.monotonic() + 10
+    while len(rows) < count and time.monotonic() < end:
+        rows += topic.arrived()
+    return rows
+
+
 def test_what_a_message_leaves_out_is_no_column(write: Any) -> None:
     """Effort that is empty; no stamp: the time of sending counts; an infinite reading is none."""
-    joint = replace(
-        load_joint(DEMO / "joint.toml"),
-        columns={"motor_position": {"column": "a_b_position_rad", "unit": "rad"}},
-    )
+    joint = of_column("a_b_position_rad")
     with JointStates("ros2:///arm/joint_states/", joint) as topic:
         heard(write)
         for k in range(300):
             write.write(state(0.0, ("a,b",), (0.1 * k,), (np.inf if k == 150 else 1.0,), ()))
             time.sleep(0.002)
-        rows, end = list(topic.arrived()), time.monotonic() + 10
-        while len(rows) < 301 and time.monotonic() < end:
-            rows += topic.arrived()
+        rows = arrived(topic, 301)
     assert rows[0] == b"time_s,a_b_position_rad,a_b_velocity_rad_s"
     cells = np.array([[float(x) for x in r.split(b",")] for r in rows[1:]])
     assert len(cells) == 300
@@ -150,10 +159,7 @@ def test_what_a_message_leaves_out_is_no_column(write: Any) -> None:
 
 def test_another_sender_on_the_topic_is_left_out(write: Any) -> None:
     """Two nodes state joints of their own on one topic; and one states its joints in any order."""
-    joint = replace(
-        load_joint(DEMO / "joint.toml"),
-        columns={"motor_position": {"column": "elbow_position_rad", "unit": "rad"}},
-    )
+    joint = of_column("elbow_position_rad")
     with JointStates("ros2://arm/joint_states", joint) as topic:
         heard(write)
         for k in range(90):
@@ -161,9 +167,7 @@ def test_another_sender_on_the_topic_is_left_out(write: Any) -> None:
             names, places = ("elbow", "wrist"), (float(k), -1.0)
             way = slice(None, None, -1 if k % 2 else 1)
             write.write(state(k * 1e-3, names[way], places[way], (), ()))
-        rows, end = list(topic.arrived()), time.monotonic() + 10
-        while len(rows) < 91 and time.monotonic() < end:
-            rows += topic.arrived()
+        rows = arrived(topic, 91)
         assert rows[0] == b"time_s,elbow_position_rad,wrist_position_rad"
         cells = np.array([[float(x) for x in r.split(b",")] for r in rows[1:]])
         np.testing.assert_array_equal(cells[:, 1], np.arange(90))
