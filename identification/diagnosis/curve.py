@@ -69,6 +69,24 @@ CLEAR: Final = 4.0
 """Speed, in standard deviations of its noise, from which the direction of motion is beyond
 doubt.
 """
+ONE_TERM: Final[Mapping[str, Callable[[FloatArray, float], FloatArray]]] = {
+    "power": lambda x, p: x**p,
+    "tanh": lambda x, s: np.tanh(x / s),
+    "rational": lambda x, s: x / (x + s),
+    "exponential": lambda x, s: 1 - np.exp(-x / s),
+    "knee": lambda x, s: np.maximum(x - s, 0.0),
+}
+"""Laws of a speed, 0 to 1 over its range, with one number of shape: what friction without a name
+looks like."""
+SHAPES: Final[Mapping[str, FloatArray]] = {
+    "power": np.concatenate([np.linspace(0.05, 0.95, 19), np.linspace(1.05, 3.5, 26)]),
+    "tanh": np.geomspace(0.02, 1.5, 24),
+    "rational": np.geomspace(0.02, 1.5, 24),
+    "exponential": np.geomspace(0.02, 1.5, 24),
+    "knee": np.linspace(0.05, 0.9, 18),
+}
+"""Their shapes: steps of a fifth, or a twentieth of the range; from as steep as the densest knots
+to nearly straight, which viscous friction is."""
 WHOLE: Final = 0.999
 """Share of a row's kernel that must move clearly in one direction: beside a reversal the torque
 hangs on where exactly friction changes its sign, which bends every curve over velocity."""
@@ -201,6 +219,7 @@ def steadily_moving(base: Base, *, creeping: bool = True) -> Base:
         held_weight=moved.held_weight * held,
         held_residual=moved.held_residual * held,
         held_jacobian=moved.held_jacobian * held[:, None],
+        held_inward=moved.held_inward * held[:, None],
     )
 
 
@@ -654,9 +673,58 @@ def squares_left(base: Base, balance: str) -> FloatArray:
     return _system(base, (), base.balances.index(balance)).crossed
 
 
+def one_term_squares(
+    base: Base, balance: str, only: Callable[[Candidate], bool]
+) -> FloatArray | None:
+    """Cross-validated squares of each block of a balance with the best law of one term.
+
+    Parameters
+    ----------
+    base : Base
+        From `steadily_moving`, without the names that are judged.
+    balance : str
+    only : callable
+        ``only(candidate)`` leaves out variables.
+
+    Returns
+    -------
+    (blocks,) array or None
+        Of the law in `ONE_TERM` that leaves the least; None where no table over a speed is left.
+
+    Notes
+    -----
+    A law of one term is written in the control values of the table, whose products with the rows
+    are made once.
+    """
+    where, evaluate = base.balances.index(balance), _unweighted(base)
+    best: FloatArray | None = None
+    for candidate in _candidates(base, balance):
+        t = _tried(candidate, base, evaluate) if only(candidate) else None
+        if t is None or not _table(candidate.effect).of_speed:
+            continue
+        system, first = _system(base, (t,), where), base.jacobian.shape[1]
+        reach = _range(candidate.effect, t.shapes)[1]
+        x = SLOW * np.sinh(np.linspace(0.0, math.asinh(1 / SLOW), 4 * POINTS))
+        onto = np.linalg.pinv(basis(candidate.effect, t.shapes, reach * x))
+        for family, law in ONE_TERM.items():
+            for shape in SHAPES[family]:
+                mix = np.zeros((first + len(onto) + 1, first + 2))
+                mix[:first, :first] = np.eye(first)
+                mix[first:-1, first] = onto @ law(x, float(shape))
+                mix[-1, -1] = 1.0
+                grams = mix.T @ system.grams @ mix
+                left = _System(grams, np.zeros((first + 1, first + 1)), base, where).crossed
+                if best is None or left.sum() < best.sum():
+                    best = left
+    return best
+
+
 def lacking(base: Base, labels: Collection[str]) -> Base:
     """The base without some terms of its model: their torque goes back into the residual, the
     rest is fitted anew by whoever solves it.
+
+    What stands at its bound is fitted with the rest: a law that did the work of dry friction, say,
+    has pushed it there, and its absence is not what the law explains.
     """
     solution, data = base.solution, base.data
     terms = [t for t in solution.model.terms if t.label in labels]
@@ -674,15 +742,16 @@ def lacking(base: Base, labels: Collection[str]) -> Base:
     )
     torque = np.concatenate([without_them[b] - with_them[b] for b in base.balances])
     kept = [i for i, n in enumerate(base.names) if n not in gone]
-    jacobian = base.jacobian[:, kept]
+    freed = [i for i, n in enumerate(base.inward_names) if n not in gone]
+    jacobian = np.column_stack([base.jacobian[:, kept], base.inward[:, freed]])
     return replace(
         base,
         residual=base.residual + torque * base.weight,
         jacobian=jacobian,
         orthonormal=span_of(jacobian),
-        names=tuple(base.names[i] for i in kept),
-        norms=base.norms[kept],
-        held_jacobian=base.held_jacobian[:, kept],
+        names=tuple(base.names[i] for i in kept) + tuple(base.inward_names[i] for i in freed),
+        norms=np.concatenate([base.norms[kept], base.inward_norms[freed]]),
+        held_jacobian=np.column_stack([base.held_jacobian[:, kept], base.held_inward[:, freed]]),
     )
 
 
@@ -903,6 +972,7 @@ __all__ = [
     "find_curves",
     "gain",
     "lacking",
+    "one_term_squares",
     "penalty",
     "squares_left",
     "steadily_moving",

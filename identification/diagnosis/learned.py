@@ -18,12 +18,14 @@ from identification.balance.stacked import references, sticking_torque
 from identification.diagnosis.candidates import Candidate
 from identification.diagnosis.claims import Claim
 from identification.diagnosis.curve import (
+    LEAST_T,
     Curve,
     Gain,
     curves_on,
     find_curves,
     gain,
     lacking,
+    one_term_squares,
     squares_left,
     steadily_moving,
 )
@@ -232,7 +234,8 @@ class Equivalence:
         False where the law is no curve over one variable: the best curve of any may then show
         something else that is missing beside it.
     beaten : bool
-        True where more than one name of one variable share the work of a curve that is simpler.
+        True where a law of one term does the work of the names as well, or more than one name of
+        one variable share the work of a curve that is simpler.
     """
 
     share_missed: float
@@ -356,7 +359,20 @@ def _held_against(
         names = {n for t in named.solution.model.terms if t.label in labels for n in t.names}
         if len(names & set(named.names)) > FEWER * alone.freedom:
             found = replace(found, beaten=True, sentence=_like(title, found.share_missed))
+    if over and found.is_name:
+        rival = one_term_squares(bare, balance, own)
+        if rival is not None and _as_good(rival, beside.before, alone=len(group) == 1):
+            found = replace(found, beaten=True, sentence=f"{title} or a law like it")
     return found
+
+
+def _as_good(rival: FloatArray, name: FloatArray, *, alone: bool) -> bool:
+    """Whether a law of one term takes the place of names: of one where it is better, of a sum of
+    them where the sum is not certainly better, as a sum imitates any curve.
+    """
+    if alone:
+        return gain(name, rival).t > ONE_SIDED
+    return gain(rival, name).t < LEAST_T
 
 
 def _rows(base: Base, balance: str) -> int:
@@ -502,7 +518,12 @@ def at_bounds(solution: Solution, data: Dataset) -> dict[str, AtBound]:
     return {
         n: AtBound(float(d) / size, float(e) / size, room / size)
         for n, d, e, room, size in zip(
-            base.inward_names, step[-count:], errors[-count:], rooms, base.inward_norms, strict=True
+            base.inward_names,
+            step[-count:],
+            errors[-count:],
+            rooms,
+            np.abs(base.inward_norms),
+            strict=True,
         )
     }
 

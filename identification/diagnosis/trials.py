@@ -88,7 +88,7 @@ class Base:
     inward_names : tuple of str
         Parameters of the columns of `inward`.
     inward_norms : (m,) array
-        What these columns were divided by.
+        What these columns were divided by; negative where inward is downward.
     """
 
     solution: Solution
@@ -287,7 +287,7 @@ def make_base(solution: Solution, data: Dataset) -> Base:
         names=tuple(n for n, a in zip(free, alive, strict=False) if a),
         norms=norms[alive],
         inward_names=tuple(n for n, b in zip(names, back, strict=True) if b),
-        inward_norms=norms[back],
+        inward_norms=(norms * towards)[back],
     )
 
 

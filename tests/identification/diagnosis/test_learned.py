@@ -25,7 +25,7 @@ from smooth_laws import (
 from identification.data.joint_file import Joint, load_joint
 from identification.diagnosis.candidates import Candidate
 from identification.diagnosis.claims import Claim
-from identification.diagnosis.curve import curves_on, steadily_moving
+from identification.diagnosis.curve import curves_on, lacking, squares_left, steadily_moving
 from identification.diagnosis.improve import RATIO_LIMIT, Improvement, improve
 from identification.diagnosis.learned import (
     BY_CHANCE,
@@ -33,6 +33,7 @@ from identification.diagnosis.learned import (
     Equivalence,
     artefacts,
     equivalence,
+    equivalences,
     learned_claims,
     with_curves,
 )
@@ -71,6 +72,55 @@ def test_a_wrong_name_misses_more_than_it_may(key: str) -> None:
     assert answer.share_missed > 0.05
     assert answer.sentence.startswith(("not ", "like "))
     assert set(answer.as_json()) == {"share_missed", "stderr", "sentence"}
+
+
+# where friction grows with a power of the speed, or saturates, beside viscous and dry friction
+IMITATED: dict[str, tuple[Law, tuple[str, ...]]] = {
+    "power": (lambda q, v: 8 * np.abs(v) ** 1.44 * np.sign(v), ("stribeck",)),
+    "saturating": (lambda q, v: 6 * np.tanh(v), ("quadratic_drag", "cubic_viscous")),
+}
+
+
+@pytest.mark.parametrize("law", IMITATED)
+def test_names_are_no_more_than_alike_where_a_law_of_one_term_does_as_well(law: str) -> None:
+    """Names with three numbers, and sums of names, imitate them to .3 % of what they explain."""
+    torque, keys = IMITATED[law]
+    labels = tuple(f"{k}@motor" for k in keys)
+    found = run(39, torque, ("viscous", "coulomb", *labels))
+    claims = [Claim((k,), f"{k}@motor", "axis", 0.0) for k in keys]
+    answers = equivalences(claims, found.solution, found.data)
+    assert set(answers) == set(labels)
+    for a in answers.values():
+        assert a.share_missed < 0.01
+        assert a.beaten
+        assert not a.is_name
+        assert a.sentence.endswith("or a law like it")
+
+
+def test_a_sum_that_no_single_term_replaces_keeps_its_names() -> None:
+    both = ("stribeck", "cubic_viscous")
+    found = run(
+        40,
+        lambda q, v: 8 * np.exp(-((v / 0.1) ** 2)) * np.sign(v) + v**3,
+        ("viscous", "coulomb", *(f"{k}@motor" for k in both)),
+    )
+    claims = [Claim((k,), f"{k}@motor", "axis", 0.0) for k in both]
+    assert all(a.is_name for a in equivalences(claims, found.solution, found.data).values())
+
+
+def test_dry_friction_that_a_name_pushed_away_is_not_what_the_name_explains() -> None:
+    """Without the name dry friction comes back; else a name that takes its place explains nearly
+    everything, whatever the law is.
+    """
+    found = run(39, IMITATED["power"][0], ("viscous", "coulomb", "stribeck@motor"))
+    assert "motor_coulomb" in found.solution.at_bound
+    named = steadily_moving(make_base(found.solution, found.data))
+    bare = lacking(named, {"stribeck@motor"})
+    assert "motor_coulomb" in bare.names
+    plain = run(39, IMITATED["power"][0])
+    alone = steadily_moving(make_base(plain.solution, plain.data))
+    left = [squares_left(b, "axis").sum() / np.median(b.weight) ** 2 for b in (bare, alone)]
+    assert left[0] == pytest.approx(left[1], rel=0.25)
 
 
 @pytest.fixture(scope="module")
