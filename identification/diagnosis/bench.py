@@ -28,6 +28,7 @@ from identification.diagnosis.learned import (
     artefacts,
     equivalences,
     learned_claims,
+    with_curves,
 )
 from identification.diagnosis.lines import Line, find_lines, orders_of, other_orders
 from identification.diagnosis.locate import Unexplained, locate
@@ -104,6 +105,11 @@ class Bench(Protocol):
 
     def learned(self, step: Step, error: Error) -> tuple[LearnedClaim, ...]:
         """Curves over one variable of what is left in the balances over their floor."""
+
+    def ratios_with(
+        self, step: Step, learned: Sequence[LearnedClaim]
+    ) -> Mapping[str, BalanceError]:
+        """As `ratios`, with learned curves in the model of the step."""
 
     def held_against(self, claims: Sequence[Claim], step: Step) -> Mapping[str, Equivalence]:
         """The names of claims against curves over their own variables, by label."""
@@ -341,6 +347,12 @@ class JointBench:
     def learned(self, step: Step, error: Error) -> tuple[LearnedClaim, ...]:
         """See :func:`identification.diagnosis.learned.learned_claims`."""
         return learned_claims(step.solution, self.data, error, RATIO_LIMIT)
+
+    def ratios_with(
+        self, step: Step, learned: Sequence[LearnedClaim]
+    ) -> Mapping[str, BalanceError]:
+        """Residual over floor with curves in the model, at the values of their fit."""
+        return self._judged(with_curves(step.solution, learned), held_out=True)
 
     def held_against(self, claims: Sequence[Claim], step: Step) -> Mapping[str, Equivalence]:
         """See :func:`identification.diagnosis.learned.equivalences`; worked out once a model."""

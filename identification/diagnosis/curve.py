@@ -720,8 +720,7 @@ def one_term_squares(
 
 
 def lacking(base: Base, labels: Collection[str]) -> Base:
-    """The base without some terms of its model: their torque goes back into the residual, the
-    rest is fitted anew by whoever solves it.
+    """The base without some terms of its model: the rest is fitted anew by whoever solves it.
 
     What stands at its bound is fitted with the rest: a law that did the work of dry friction, say,
     has pushed it there, and its absence is not what the law explains.
@@ -737,16 +736,15 @@ def lacking(base: Base, labels: Collection[str]) -> Base:
     }
     balances = balances_of(solution.model, data.sensing, wrt=())
     values = solution.values
-    with_them, without_them = (
-        stack(balances, data.train, v).residual for v in (values, {**values, **absent})
-    )
-    torque = np.concatenate([without_them[b] - with_them[b] for b in base.balances])
+    # not from the base's residual: where a step of the refit is large, laws are not linear in it
+    rows = stack(balances, data.train, {**values, **absent}).residual
+    left = np.concatenate([rows[b] for b in base.balances]) * base.weight
     kept = [i for i, n in enumerate(base.names) if n not in gone]
     freed = [i for i, n in enumerate(base.inward_names) if n not in gone]
     jacobian = np.column_stack([base.jacobian[:, kept], base.inward[:, freed]])
     return replace(
         base,
-        residual=base.residual + torque * base.weight,
+        residual=left,
         jacobian=jacobian,
         orthonormal=span_of(jacobian),
         names=tuple(base.names[i] for i in kept) + tuple(base.inward_names[i] for i in freed),

@@ -51,6 +51,10 @@ ALIKE: Final = 0.05
 FEWER: Final = 0.4
 """Numbers that names of one variable may have together, as a share of the curve's freedom: with
 more, a sum of laws imitates the curve."""
+SMOOTHING_TRIED: Final = (3e-4, 0.1)
+SMOOTHING_STEPS: Final = 14
+"""Velocities over which dry friction changes its sign, as shares of the largest speed: steps of a
+half, from where no row tells it from a sudden one to where it is a law of its own."""
 HALF: Final = 0.5
 """Share missed from which a curve over any variable, and not the name, is what is missing."""
 OUTSIDE: Final = 3.0
@@ -162,7 +166,31 @@ def learned_claims(
             continue
         seen = {c.curve.label for c in out}  # a side that two balances show is told once
         out += [LearnedClaim(c, drop) for c in found.curves if c.label not in seen]
-    return tuple(out)
+    smoothing = _smoothing_beside(solution, data, out)
+    return tuple(
+        replace(c, curve=replace(c.curve, beside={**c.curve.beside, **smoothing})) for c in out
+    )
+
+
+def _smoothing_beside(
+    solution: Solution, data: Dataset, learned: Sequence[LearnedClaim]
+) -> dict[str, float]:
+    """Velocities over which dry friction changes its sign, as all training rows have them beside
+    the curves: those of the fit may have done a part of the curve's work, and the curve was drawn
+    on rows that tell nothing of them.
+    """
+    found = with_curves(solution, learned)
+    values = dict(found.values)
+    names = [n for n in found.model.named("smoothing") if n in solution.free] if learned else []
+    speed = data.ranges["velocity"]
+    for name in names:
+        tried = [values[name], *np.geomspace(*SMOOTHING_TRIED, SMOOTHING_STEPS) * speed]
+        errors = [
+            relative_error_percent(found.model, data, data.train, {**values, name: v})
+            for v in tried
+        ]
+        values[name] = float(tried[int(np.argmin(errors))])
+    return {n: values[n] for n in names}
 
 
 def with_curves(solution: Solution, learned: Sequence[LearnedClaim]) -> Solution:

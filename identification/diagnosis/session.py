@@ -327,6 +327,12 @@ class Session:
             )
         if standing.claims:
             standing, ranking, base = self._by_whole_fits(standing, ranking, base, stale=stale)
+        if standing.claims and stopped is None and not lean:
+            by_curves = self._by_curves(standing)
+            if by_curves is not None:
+                standing = by_curves
+                base = self.bench.base(standing.now.solution)
+                ranking = self.bench.ranking(base)
         last = None if lean else (ranking, base)
         found = self.finish(
             first, last, standing.steps, standing.claims, following=stopped, unnamed=unnamed
@@ -751,6 +757,40 @@ class Session:
                 self._refused[c.label] = f"is held against a curve: {wrong[c.label].sentence}"
                 self._located[c.balance] = variable_of(c.effect)
         return self._replay([c for c in standing.claims if c.label not in wrong], standing)
+
+    def _by_curves(self, standing: _Standing) -> _Standing | None:
+        """The steps without the names of a balance that they cannot explain, where a curve over a
+        variable explains it in their place; None where it is not so.
+
+        A sum of laws that each imitate a part of another one stays over the floor, and a curve
+        beside them has to undo what they do. What stays: a name that is as good as the curve of its
+        own variable, what hardly a joint is without, and what is no law.
+        """
+        over = {b for b, e in self.bench.ratios(standing.now).items() if e.ratio > RATIO_LIMIT}
+        held = self.bench.held_against(standing.claims, standing.now) if over else {}
+        kept, gone = list[Claim](), list[Claim]()
+        for c in standing.claims:
+            is_name = len(c.effects) == 1 and c.label in held and held[c.label].is_name
+            stays = is_name or c.effect.common or c.effect.stage != "law" or c.balance not in over
+            (kept if stays else gone).append(c)
+        needed = {n for c in kept for n in c.effect.needs}
+        if not gone or needed & {c.effects[0] for c in gone}:
+            return None
+        fewer = self._replay(kept, standing)
+        balances = {c.balance for c in gone}
+        with_names, with_curves = (self._left_by_curves(s.now) for s in (standing, fewer))
+        if balances <= with_names or not (balances | with_names) <= with_curves:
+            return None
+        for c in gone:
+            self._refused[c.label] = "leaves what a curve over one variable explains without it"
+        return fewer
+
+    def _left_by_curves(self, step: Step) -> set[str]:
+        """Balances that learned curves in the model of a step explain."""
+        ratios = self.bench.ratios(step)
+        learned = self.bench.learned(step, replace(step.held_out, balances=ratios))
+        left = self.bench.ratios_with(step, learned)
+        return {b for b, e in left.items() if e.ratio <= RATIO_LIMIT}
 
     def _revise(self, standing: _Standing) -> _Standing:
         """Judge every earlier claim given all the others: drop it, swap it, or renew its set."""

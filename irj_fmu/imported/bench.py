@@ -303,6 +303,12 @@ class FmuBench:
         """None: a curve cannot ride outside an FMU yet."""
         return ()
 
+    def ratios_with(
+        self, step: Step, learned: Sequence[LearnedClaim]
+    ) -> Mapping[str, BalanceError]:
+        """Those without curves: a curve cannot ride outside an FMU yet."""
+        return self.ratios(step)
+
     def held_against(self, claims: Sequence[Claim], step: Step) -> Mapping[str, Equivalence]:
         """None: a curve cannot ride outside an FMU yet."""
         return {}

@@ -82,6 +82,8 @@ class World:
         Share of what is left that one variable holds [%].
     wrong : mapping of str to Equivalence
         Labels that a curve is held against.
+    undone : mapping of set to float
+        Share of what these names leave that curves beside them cannot explain.
     chances : callable
         Odds of the names of a claim.
     """
@@ -102,6 +104,7 @@ class World:
     without: str = ""
     located: float = 0.0
     wrong: Mapping[str, Equivalence] = field(default_factory=dict)
+    undone: Mapping[frozenset[str], float] = field(default_factory=dict)
     chances: Callable[[Claim, Step], Odds | None] = lambda claim, now: None
     asked: list[tuple[frozenset[str], bool]] = field(default_factory=list)
     fitted_whole: list[str] = field(default_factory=list)
@@ -230,6 +233,14 @@ class World:
 
     def learned(self, step: Step, error: Error) -> tuple[Any, ...]:
         return self.curves
+
+    def ratios_with(self, step: Step, learned: Sequence[Any]) -> dict[str, BalanceError]:
+        left = self.ratios(step)
+        if not learned:
+            return left
+        share = self.undone.get(self.names(step.solution.model), 0.0)
+        part = {b: e.ratio**2 - 1 for b, e in left.items()}
+        return {b: replace(e, ratio=math.sqrt(1 + share * part[b])) for b, e in left.items()}
 
     def artefacts(self, step: Step, curves: Sequence[Curve], start: Step) -> tuple[Doubt, ...]:
         self.doubted.append((len(step.effects), tuple(curves), len(start.effects)))
@@ -965,3 +976,40 @@ def test_names_that_come_near_one_are_the_others_that_help_in_its_balance(base: 
     )
     both = replace(ranking, everything=(*ranking.everything, worse))
     assert _behind(best, both) == pytest.approx(near), "of several places the best counts"
+
+
+# --- curves in the place of names -----------------------------------------------------------------
+
+BOTH = frozenset({"quadratic_drag", "stribeck"})
+"""Two names that each explain a part of a law that they are not."""
+
+
+def in_parts(base: Base, **other: Any) -> World:
+    """What is hidden is explained in parts by two names, and whole by curves without them."""
+    explains = {"quadratic_drag": {"p": 0.9}, "stribeck": {"q": 0.9}}
+    made: dict[str, Any] = {"curves": (SimpleNamespace(curve=None),), "undone": {BOTH: 1.0}}
+    return World(base, {"p": 80.0, "q": 40.0}, explains, **(made | other))
+
+
+def test_names_that_explain_parts_give_way_to_a_curve_that_explains_all(base: Base) -> None:
+    found = ended(in_parts(base))
+    assert found.claims == ()
+    assert found.learned
+    assert found.verdict == "unexplained"
+    for name in BOTH:
+        assert "a curve over one variable explains" in found.why(name)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"undone": {BOTH: 1.0, frozenset(): 1.0}},  # curves do no better
+        {"undone": {}},  # curves explain what the names leave
+        {"curves": ()},
+        # each is as good as the curve of its own variable
+        {"wrong": {f"{n}@motor": Equivalence(0.0, 0.001, n) for n in BOTH}},
+    ],
+    ids=["no better", "beside them", "no curve", "names"],
+)
+def test_they_stay_where_curves_do_no_better(base: Base, other: dict[str, Any]) -> None:
+    assert {*named(ended(in_parts(base, **other)))} == BOTH
