@@ -56,6 +56,8 @@ straight line."""
 RIDGE: Final = 1e-9
 """Share of its own information by which each column is held, so that what the curve shares with the
 base (a constant, a slope) has a solution."""
+TINY: Final = 1e-200
+"""Information on a number, of columns scaled to one, under which it has none."""
 POINTS: Final = 61
 """Points at which a curve is given."""
 INSIDE: Final = (0.005, 0.995)
@@ -422,7 +424,8 @@ class _System:
 
     def _scaled(self, total: FloatArray) -> tuple[FloatArray, FloatArray]:
         a = total[:-1, :-1] + self.smooth
-        size = np.sqrt(np.maximum(np.diag(a), 1e-300))
+        # a column that shows on none of the rows has no size, and its number stays
+        size = np.sqrt(np.where(np.diag(a) > TINY, np.diag(a), 1.0))
         return a / np.outer(size, size) + RIDGE * np.eye(len(a)), size
 
     @cached_property

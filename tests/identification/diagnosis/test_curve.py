@@ -4,6 +4,7 @@ predicts as well as the law itself.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import casadi as ca
@@ -12,7 +13,8 @@ import pytest
 from smooth_laws import COULOMB, LAWS, VISCOUS, FloatArray, Law, Run, nothing, run
 
 from casadi_models.table import KNOTS, Table, bump, heaped
-from identification.diagnosis.curve import Located, gain
+from identification.diagnosis.curve import Located, curves_on, gain, steadily_moving
+from identification.diagnosis.trials import make_base
 
 
 @pytest.fixture(scope="module")
@@ -90,3 +92,21 @@ def test_a_table_over_speed_goes_on_as_a_line() -> None:
     f = ca.Function("f", [x], [table.value(x, p)])
     y = np.array(f(np.array([[1.0, 2.0, 3.0, 4.0]]))).ravel()
     assert y[2] - y[1] == pytest.approx(y[1] - y[0]) == pytest.approx(y[3] - y[2])
+
+
+def test_a_number_that_no_row_tells_stays_and_does_not_disturb(runs: dict[str, Run]) -> None:
+    found = runs["bump"]
+    moving = steadily_moving(make_base(found.solution, found.data))
+    values = {**moving.solution.values, "gravity_torque": 5.0}
+    untold = replace(
+        moving,
+        jacobian=np.column_stack([moving.jacobian, np.zeros(len(moving.residual))]),
+        held_jacobian=np.column_stack([moving.held_jacobian, np.zeros(len(moving.held_residual))]),
+        names=(*moving.names, "gravity_torque"),
+        norms=np.append(moving.norms, 1.0),
+        solution=replace(moving.solution, values=values),
+    )
+    (plain,), beside = curves_on(moving, "axis").curves, curves_on(untold, "axis")
+    assert beside.base_values["gravity_torque"] == 5.0
+    np.testing.assert_allclose(beside.curves[0].y, plain.y, atol=1e-6)
+    assert np.all(np.isfinite(beside.curves[0].high))
