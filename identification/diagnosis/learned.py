@@ -18,6 +18,7 @@ from identification.balance.stacked import references, sticking_torque
 from identification.diagnosis.candidates import Candidate
 from identification.diagnosis.claims import Claim
 from identification.diagnosis.curve import (
+    LEAST_FALL,
     LEAST_T,
     Curve,
     Gain,
@@ -262,8 +263,8 @@ class Equivalence:
         False where the law is no curve over one variable: the best curve of any may then show
         something else that is missing beside it.
     beaten : bool
-        True where a law of one term does the work of the names as well, or more than one name of
-        one variable share the work of a curve that is simpler.
+        True where a law of one term does the work of the names as well, a curve beside them is
+        better, or more than one name of one variable share the work of a curve that is simpler.
     """
 
     share_missed: float
@@ -387,6 +388,8 @@ def _held_against(
         names = {n for t in named.solution.model.terms if t.label in labels for n in t.names}
         if len(names & set(named.names)) > FEWER * alone.freedom:
             found = replace(found, beaten=True, sentence=_like(title, found.share_missed))
+    if over and found.is_name and beside.gain.fall >= LEAST_FALL and beside.gain.t > ONE_SIDED:
+        found = replace(found, beaten=True, sentence=_like(title, found.share_missed))
     if over and found.is_name:
         rival = one_term_squares(bare, balance, own)
         if rival is not None and _as_good(rival, beside.before, alone=len(group) == 1):
