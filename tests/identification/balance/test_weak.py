@@ -201,6 +201,25 @@ def test_an_average_of_every_so_many_samples_ends_where_that_of_all_does(step: i
     assert here / here.max() == pytest.approx((there / there.max())[: len(here)], abs=1e-12)
 
 
+def test_time_and_temperature_of_a_row_are_those_at_its_middle() -> None:
+    """Of signals that rise evenly, over both stretches of a record."""
+    time = np.concatenate([1e-3 * np.arange(1000), 10 + 1e-3 * np.arange(1000)])
+    signals = {"motor_position": np.sin(time), "temperature": 300.0 + 0.5 * time}
+    made = prepare(time, signals, (slice(0, 1000), slice(1000, 2000)))
+    assert made.averaged["time"] == pytest.approx(made.time, abs=1e-9)
+    assert made.averaged["temperature"] == pytest.approx(300.0 + 0.5 * made.time, abs=1e-9)
+    assert made.points["temperature"] == pytest.approx(300.0 + 0.5 * made.points["time"])
+
+
+def test_a_record_without_a_stretch_that_is_long_enough_has_no_row_and_no_point() -> None:
+    time = np.linspace(0.0, 0.059, 60)
+    signals = {"motor_position": np.sin(time), "temperature": 300.0 + time}
+    made = prepare(time, signals, (slice(0, 30), slice(30, 60)))
+    assert made.rows == 0
+    every = (made.averaged, made.points, made.smooth)
+    assert {len(x) for of in every for x in of.values()} == {0}
+
+
 def test_a_signal_that_is_given_no_kernel_has_that_of_thirty_milliseconds() -> None:
     time = np.arange(2000) * 1e-3
     signals = {"motor_position": np.sin(time), "link_position": np.sin(time)}
@@ -220,13 +239,17 @@ def test_averages_and_curvatures_of_the_points_are_exact_for_polynomials() -> No
     assert both == pytest.approx(np.tile([0.0, 2.0], (made.rows, 1)), abs=1e-8)
 
 
-@pytest.mark.parametrize("dt", [1e-3, 2e-3, 4e-3])
-def test_a_kernel_of_eight_samples_reaches_over_no_end_of_a_stretch(dt: float) -> None:
-    """A second derivative takes more points than the kernel has where these are half as many."""
-    time = dt * np.arange(300)
-    parts = (slice(0, 140), slice(140, 300))
-    beside = np.where(np.arange(300) < 140, time, 1e6 * time)
-    made = prepare(time, {"motor_position": time}, parts, length=8 * dt, pointwise=2 * dt)
+@pytest.mark.parametrize(
+    ("dt", "samples"), [(1e-3, 8), (2e-3, 8), (4e-3, 8), (2.5e-4, 40), (1e-4, 100)]
+)
+def test_a_kernel_of_few_points_reaches_over_no_end_of_a_stretch(dt: float, samples: int) -> None:
+    """A second derivative takes more points than the kernel has where these are half as many as its
+    samples, or many samples apart.
+    """
+    time = dt * np.arange(1500)
+    parts = (slice(0, 700), slice(700, 1500))
+    beside = np.where(np.arange(1500) < 700, time, 1e6 * time)
+    made = prepare(time, {"motor_position": time}, parts, length=samples * dt, pointwise=2 * dt)
     t, of_points = made.points["time"], beside[:: made.grid.step]
     first = made.stretch == 0
     for matrix in (made.averaging, made.curving):  # a point outside would be another one's memory

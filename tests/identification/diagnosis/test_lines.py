@@ -26,6 +26,7 @@ from identification.diagnosis.lines import (
     _encoder_orders,
     _Joined,
     _names,
+    _Pointwise,
     _Scan,
     _Tracked,
     _without_trend,
@@ -169,6 +170,41 @@ def test_a_line_of_which_held_out_samples_have_next_to_nothing_is_not_confirmed(
     quiet = [swinging(1, 2.3, size) for size in (0.25, 0.01)]
     quiet = [replace(s, residual=line.wave(s) * size) for s, size in zip(quiet, (1.0, 0.05))]
     assert [confirmed(line, s, 1) for s in quiet] == [True, False]
+
+
+@pytest.mark.parametrize("candidates", [1, 10, 50])
+def test_many_lines_have_together_the_chance_of_one_to_be_confirmed_by_noise(
+    candidates: int,
+) -> None:
+    """Records of five seconds; within three deviations of the number that is to be expected."""
+    line, records = peaks(swinging(0, 2.3, 0.25), 6.0)[0], 300
+    seen = sum(confirmed(line, swinging(s, count=500), candidates) for s in range(1, 1 + records))
+    expected = records * ALPHA / candidates
+    assert seen <= expected + 3 * np.sqrt(expected)
+
+
+@pytest.mark.parametrize(
+    "names", [("stiffness",), ("link_inertia",), ("link_inertia", "stiffness", "link_viscous")]
+)
+def test_one_unit_of_a_parameter_changes_each_balance_by_its_column(names: tuple[str, ...]) -> None:
+    """Of one parameter as of several."""
+    time = 2e-3 * np.arange(1000)
+    angle = {"motor_position": 1.001 * np.sin(1.3 * time), "link_position": np.sin(1.3 * time)}
+    record = Record.from_channels(time, {**angle, "link_torque": np.cos(time)})
+    joint = Joint(name="arm", gear_ratio=1.0, model_name="hd3", effects=("viscous@link",))
+    model = prepared_model(joint, record)
+    sensing = sense(record, model)
+    rows = at_every_sample(record, joint, sensing)
+    values = dict(zip(model.parameter_names, model.value_vector(), strict=True))
+    law, slopes = _Pointwise(model, sensing), _Pointwise(model, sensing, names)
+    before, columns = law.at(rows, values), slopes.at(rows, values)
+    assert set(columns) == set(sensing.balances) == {"link", "transmission"}
+    for k, name in enumerate(names):
+        after = law.at(rows, {**values, name: values[name] + 1.0})
+        for balance, own in columns.items():
+            assert own.shape == (len(rows.time), len(names))
+            assert own[:, k] == pytest.approx(after[balance] - before[balance], abs=1e-9)
+        assert any(np.ptp(own[:, k]) > 0 for own in columns.values())
 
 
 @pytest.mark.parametrize(("slow", "blocks"), [(True, 8), (False, 40)])

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import MappingProxyType
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +17,7 @@ from scipy.stats import f as fisher
 from casadi_models import EFFECTS
 from identification.balance.balances import balances_of
 from identification.data.check.gate import passed
-from identification.data.joint_file import Joint, load_joint
+from identification.data.joint_file import Joint, Known, load_joint
 from identification.data.read import read
 from identification.diagnosis.candidates import Candidate, NotTestable
 from identification.diagnosis.claims import MAJOR_DROP
@@ -55,8 +57,9 @@ def made(
     held: bool = True,
     seed: int = 0,
     effects: tuple[str, ...] = ("viscous", "coulomb"),
+    known: Mapping[str, Known] = MappingProxyType({}),
 ) -> Base:
-    joint = Joint(model_name="hd1", effects=effects)
+    joint = Joint(model_name="hd1", effects=effects, known=known)
     runs = [record(np.random.default_rng([seed, k]), seconds, law) for k in (0, 1)]
     model = prepared_model(joint, runs[0])
     data = load_dataset(runs[:1], runs[1:] if held else [], joint, model)
@@ -200,6 +203,36 @@ def test_held_out_rows_that_are_the_training_rows_have_their_columns() -> None:
         (driven.held_weight, alike.held_weight),
     ):
         assert one.shape == (0, *other.shape[1:])
+
+
+@pytest.mark.parametrize("upper", [False, True])
+def test_an_amplitude_that_a_bound_holds_can_only_step_back_from_it(upper: bool) -> None:
+    """Friction that would have to drive the joint, and friction that may be half of what is there:
+    up from the lower bound, down from the upper one. Such a step leaves more, and no trial moves
+    the amplitude as it moves what is free.
+    """
+    name = "motor_coulomb"
+    held = (
+        made(lambda q, v: 0 * q, held=False, known={name: Known(high=COULOMB / 2)})
+        if upper
+        else made(lambda q, v: -2 * COULOMB * np.sign(v), held=False)
+    )
+    assert held.solution.values[name] == pytest.approx(COULOMB / 2 if upper else 0.0)
+    assert held.inward_names == (name,)
+    assert name not in held.names
+    assert held.residual @ held.inward[:, 0] > 0
+    free = make_base(replace(held.solution, at_bound=()), held.data)
+    more, way = free.jacobian[:, free.names.index(name)], -1 if upper else 1
+    assert held.inward[:, 0] == pytest.approx(way * more)
+    assert held.inward_norms == pytest.approx([way * free.norms[free.names.index(name)]])
+
+
+def test_the_speed_over_which_friction_turns_is_free_at_its_bound(base: Base) -> None:
+    name = "motor_smoothing_velocity"
+    found = make_base(replace(base.solution, at_bound=(name, "motor_viscous")), base.data)
+    assert name in found.names
+    assert found.inward_names == ("motor_viscous",)
+    assert set(found.names) == set(base.names) - {"motor_viscous"}
 
 
 def test_the_base_leaves_nothing_that_its_own_columns_explain(base: Base) -> None:

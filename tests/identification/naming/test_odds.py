@@ -11,14 +11,16 @@ import pytest
 from scipy.stats import norm
 
 from identification import improve
+from identification.balance.dataset import Dataset
 from identification.data.formats import chances
 from identification.data.joint_file import Joint
 from identification.diagnosis.claims import Ranking, rank
 from identification.diagnosis.trials import make_base
-from identification.fitting.engine import load_dataset, prepared_model, solve
+from identification.fitting.engine import Solution, load_dataset, prepared_model, solve
 from identification.naming.contest import (
     FEWEST,
     Contest,
+    Rival,
     _by_block,
     _entitled,
     _left,
@@ -32,6 +34,8 @@ from tests.smooth_laws import Law, record
 FloatArray = npt.NDArray[np.float64]
 JOINT = Joint("axis", model_name="hd1", effects=("viscous", "coulomb"))
 NAMES = ("cubic_viscous", "quadratic_drag")
+WIDTH = 0.1
+Valley = tuple[tuple[Rival, Rival], Solution, Dataset]
 
 
 def drag(q: FloatArray, v: FloatArray) -> FloatArray:
@@ -42,6 +46,11 @@ def drag(q: FloatArray, v: FloatArray) -> FloatArray:
 def level(q: FloatArray, v: FloatArray) -> FloatArray:
     """A constant: an offset of the current, or a Coulomb friction that differs by direction."""
     return 4.0 + 0 * q
+
+
+def falling(q: FloatArray, v: FloatArray) -> FloatArray:
+    """`stribeck` of the library."""
+    return 15 * np.exp(-np.abs(v) / WIDTH) * np.sign(v)
 
 
 def contest(law: Law, names: tuple[str, ...], seed: int = 3) -> Contest:
@@ -171,6 +180,46 @@ def test_who_has_no_other_valley_stays_as_it_was_fitted(drags: Contest) -> None:
     for behind in (first, replace(first, label="gone@motor")):
         again = from_every_valley([behind, second], nothing.solution, drags.data)
         assert [x is y for x, y in zip(again, (behind, second), strict=True)] == [True, True]
+
+
+@pytest.fixture(scope="module")
+def another_valley() -> Valley:
+    """Extra friction that falls over 0.1 rad/s: its name with another width, and a name that does
+    better than that; the model without either.
+    """
+    runs = [record(np.random.default_rng([3, k]), 4.0, falling) for k in (0, 1)]
+    model = prepared_model(JOINT, runs[0])
+    data = load_dataset(runs[:1], runs[1:], JOINT, model)
+    bare = solve(model, data)
+    own, other = rivals_of(("stribeck", "quadratic_drag"), "axis", bare, data)
+    values = {**own.solution.values, "motor_stribeck_velocity": 3 * WIDTH}
+    wrong = replace(own, solution=replace(own.solution, values=values))
+    return (wrong, other), bare, data
+
+
+def test_a_name_that_is_behind_in_another_valley_is_fitted_from_every_point_of_its_grid(
+    another_valley: Valley,
+) -> None:
+    """Then it leads; the one that was ahead of it stays as it was fitted."""
+    rivals, bare, data = another_valley
+    before = Contest(rivals, data)
+    assert before.leader is rivals[1]
+    assert before.ahead[0, 0] > FEWEST
+    again = from_every_valley(rivals, bare, data)
+    assert again[1] is rivals[1]
+    after = Contest(again, data)
+    assert after.leader is again[0]
+    assert after.ahead[1, 0] > FEWEST
+    assert again[0].name == "stribeck"
+    assert again[0].solution.values["motor_stribeck_velocity"] == pytest.approx(WIDTH, rel=0.15)
+
+
+def test_every_point_of_a_grid_begins_where_the_leader_has_ended(another_valley: Valley) -> None:
+    """In what the two laws share: how the model without them was fitted says nothing."""
+    rivals, bare, data = another_valley
+    elsewhere = replace(bare, values={n: 3 * x for n, x in bare.values.items()})
+    one, other = (from_every_valley(rivals, start, data)[0] for start in (bare, elsewhere))
+    assert one.solution.values == other.solution.values
 
 
 def test_a_bump_that_no_name_has_is_an_allowance(imitated: Contest, drags: Contest) -> None:

@@ -142,6 +142,39 @@ def test_a_clock_that_jumps_costs_nothing() -> None:
     )
 
 
+@pytest.mark.parametrize(("lost", "filled"), [(0, 0), (13, 13), (20, 0), (400, 0)])
+def test_a_short_gap_is_bridged_and_a_longer_one_is_not(lost: int, filled: int) -> None:
+    """Up to a quarter of a row's kernel of 60 ms readings are put between the two samples; over
+    more than that there are none, and so no rows of them.
+    """
+    estimator = OnlineEstimator(
+        reference_joint("hd3"), STEP, OnlineOptions(optimise=False, detect=False)
+    )
+    stride = estimator.rows.timing.stride
+    table, before = clean("hd3").tolist(), 10 * stride
+    for k in range(before):
+        estimator.update(k * STEP, table[k], [True] * 6)
+    rows = estimator.made
+    for k in range(before + lost, before + lost + 11 * stride - 13):
+        estimator.update(k * STEP, table[k], [True] * 6)
+    assert estimator.made - rows == (11 * stride - 13 + filled) // stride
+
+
+def test_a_frozen_bus_in_the_first_window_is_no_missing_reading() -> None:
+    """There is no estimate yet that would be held; the readings are there and stand still."""
+    estimator = OnlineEstimator(
+        reference_joint("hd3"), STEP, OnlineOptions(optimise=False, detect=False)
+    )
+    table, still = clean("hd3"), 0
+    for k in range(2000):
+        row = table[1500 if 1500 <= k < 1900 else k].tolist()
+        estimator.update(k * STEP, row, [True] * 6)
+        still += estimator.pulse.failed
+        assert estimator.fault == 0
+    assert still > 300
+    assert estimator.events == []
+
+
 def test_standstill_from_the_first_sample_is_no_failure() -> None:
     """Ten seconds without one changed bit, then motion: no fault, and the estimator starts as
     it would have done.

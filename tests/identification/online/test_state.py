@@ -1,8 +1,12 @@
-"""The online estimator's state in another estimator, and what it takes as noise and as friction."""
+"""The online estimator's state in another estimator, what it takes as noise and as friction, and
+what it makes of readings that are missing, no numbers or of wrong scale.
+"""
 
 from __future__ import annotations
 
+import math
 from functools import cache
+from itertools import product
 
 import numpy as np
 import numpy.typing as npt
@@ -157,3 +161,98 @@ def test_the_rows_go_on_with_the_shapes_that_a_search_has_found() -> None:
     assert np.array_equal(one.rows.shape_values, one.two_step.eta)
     feed(one, "hd3", 2500, 3500)
     assert np.all(one.ratio < 1.5), "what they leave is noise"
+
+
+def test_a_reading_that_is_no_number_is_told_alone_and_harms_nothing() -> None:
+    """As if that one were missing: the others count, whatever they are, and what is shown is a
+    number.
+    """
+    one, other = (OnlineEstimator(reference_joint("hd3"), STEP, QUICK) for _ in range(2))
+    for value, wrong in product((1e300, -1e300, math.nan, math.inf, -math.inf), range(6)):
+        one.reset()
+        other.reset()
+        for k in range(4):
+            row = list(readings("hd3")[k])
+            other.update(k * STEP, row, [not (k == 2 and i == wrong) for i in range(6)])
+            assert other.unusable == ()
+            if k == 2:
+                row[wrong] = value
+            one.update(k * STEP, row, [True] * 6)
+            assert one.unusable == ((wrong,) if k == 2 else ())
+            assert one.readings == other.readings
+            assert np.all(np.isfinite(one.readings))
+
+
+@pytest.mark.parametrize("key", ["hd1", "hd3"])
+def test_a_link_that_is_not_read_is_shown_as_far_from_the_motor_as_the_torque_twists(
+    key: str,
+) -> None:
+    """A rigid joint does not twist."""
+    one = feed(OnlineEstimator(reference_joint(key), STEP, QUICK), key, 0, 40)
+    twists = []
+    for k in range(40, 400):
+        row = readings(key)[k]
+        one.update(k * STEP, [*row[:3], 0.0, 0.0, row[5]], [True, True, True, False, False, True])
+        twists.append((row[3] - row[1], one.readings[3] - row[1]))
+        assert one.readings[4] == row[2]
+    read, shown = np.array(twists).T
+    if key == "hd1":
+        assert np.all(shown == 0.0)
+    else:
+        assert np.ptp(read) > 1e-3
+        assert np.abs(shown - read).max() < 0.05 * np.ptp(read)
+
+
+@pytest.mark.parametrize(("reading", "code"), [(0, 31), (5, 36)])
+def test_a_torque_of_wrong_scale_is_told_when_the_first_window_is_full(
+    reading: int, code: int
+) -> None:
+    """An inertia that is five times that of the joint file; before that nothing is told."""
+    one = OnlineEstimator(reference_joint("hd3"), STEP, QUICK)
+    said = set()
+    for k in range(2600):
+        row = list(readings("hd3")[k])
+        row[reading] *= 5.0
+        one.update(k * STEP, row, [True] * 6)
+        if one.warming_up:
+            assert one.fault == 0
+        elif one.made > 140:
+            said.add(one.fault)
+    assert said == {code}
+
+
+def test_the_estimate_goes_on_from_what_a_search_has_found() -> None:
+    """What the new shapes leave is told over its noise at once, and where nothing is read after
+    that, the estimate shown stays: it does not go back to that of the old shapes.
+    """
+    options = OnlineOptions(detect=False, warm_up=2.0, portions=50)
+    one, at = OnlineEstimator(forgotten(reference_joint("hd3")), STEP, options), 0
+    assert one.two_step is not None
+    before = one.theta
+    while one.two_step.searches == 0 or one.two_step.searching:
+        before = one.theta
+        feed(one, "hd3", at, at + 1)
+        at += 1
+    assert one.ratio == pytest.approx(one.level / one.least, rel=1e-9)
+    found = one.theta
+    assert np.max(np.abs(found - before) / one.sigma) > 1.0
+    for k in range(at, at + 200):
+        one.update(k * STEP, readings("hd3")[k], [False] * 6)
+        assert np.array_equal(one.theta, found)
+
+
+def test_the_recursion_takes_no_reading_for_better_than_the_share_of_its_torque() -> None:
+    """What it holds for the noise of each balance, and so how sure it says that it is."""
+    found = []
+    for share in (1e-3, 0.05, 0.5):
+        options = OnlineOptions(optimise=False, detect=False, warm_up=2.0, floor_share=share)
+        one = OnlineEstimator(reference_joint("hd3"), STEP, options)
+        feed(one, "hd3", 0, 3000)
+        assert one.estimator is not None
+        noise = np.sqrt(one.estimator.engine_for("test").part("fast", "noise"))
+        assert np.all(noise > 0.9 * one.least)
+        if share > 1e-3:
+            assert noise == pytest.approx(one.least, rel=0.1), "the readings are better than that"
+        found.append(one.sigma)
+    assert np.all(found[2] > found[1])
+    assert np.all(found[1] > found[0])

@@ -157,6 +157,19 @@ def test_schedule_follows_equation_3_50() -> None:
     np.testing.assert_allclose(run.forgetting, 1.0 - 0.05 * 0.99 ** np.arange(1, 401), rtol=1e-12)
 
 
+def test_a_random_walk_forgets_by_its_process_noise_and_by_no_factor() -> None:
+    """In calm and in the alarm after a step."""
+    theta, h, y = _data(400)
+    y[200:] += h[200:] @ (10.0 + np.abs(theta))
+    estimator = RecursiveLeastSquares(np.zeros(4), np.full(4, 5.0))
+    assert estimator.method == "random_walk"
+    run = estimator.run(y, h)
+    assert np.any(run.alarm)
+    assert not np.all(run.alarm)
+    np.testing.assert_array_equal(run.forgetting, 1.0)
+    assert estimator.forgetting == 1.0
+
+
 @pytest.mark.parametrize("method", ["bell", "polynomial"])
 def test_variable_forgetting_falls_from_one_to_its_bound(method: str) -> None:
     error = np.linspace(0.0, 5.0, 2001)
