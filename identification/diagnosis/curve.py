@@ -697,7 +697,7 @@ def one_term_squares(
     Notes
     -----
     A law of one term is written in the control values of the table, whose products with the rows
-    are made once.
+    are made once; the shape of each is the one that explains most of all rows.
     """
     where, evaluate = base.balances.index(balance), _unweighted(base)
     best: FloatArray | None = None
@@ -709,16 +709,21 @@ def one_term_squares(
         reach = _range(candidate.effect, t.shapes)[1]
         x = SLOW * np.sinh(np.linspace(0.0, math.asinh(1 / SLOW), 4 * POINTS))
         onto = np.linalg.pinv(basis(candidate.effect, t.shapes, reach * x))
+        beside = np.linalg.pinv(system.total[:first, :first], RIDGE, hermitian=True)
+        over = system.total[first:, :first]
+        outside = system.total[first:, first:] - over @ beside @ over.T
         for family, law in ONE_TERM.items():
-            for shape in SHAPES[family]:
-                mix = np.zeros((first + len(onto) + 1, first + 2))
-                mix[:first, :first] = np.eye(first)
-                mix[first:-1, first] = onto @ law(x, float(shape))
-                mix[-1, -1] = 1.0
-                grams = mix.T @ system.grams @ mix
-                left = _System(grams, np.zeros((first + 1, first + 1)), base, where).crossed
-                if best is None or left.sum() < best.sum():
-                    best = left
+            tried = onto @ np.column_stack([law(x, float(s)) for s in SHAPES[family]])
+            size = np.einsum("ik,ij,jk->k", tried, outside[:-1, :-1], tried)
+            explained = (outside[-1, :-1] @ tried) ** 2 / np.maximum(size, TINY)
+            mix = np.zeros((first + len(onto) + 1, first + 2))
+            mix[:first, :first] = np.eye(first)
+            mix[first:-1, first] = tried[:, int(np.argmax(explained))]
+            mix[-1, -1] = 1.0
+            grams = mix.T @ system.grams @ mix
+            left = _System(grams, np.zeros((first + 1, first + 1)), base, where).crossed
+            if best is None or left.sum() < best.sum():
+                best = left
     return best
 
 
