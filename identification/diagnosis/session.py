@@ -51,7 +51,7 @@ from identification.diagnosis.improvement import (
     judged_drop,
     made_worse,
 )
-from identification.diagnosis.learned import marked, variable_of
+from identification.diagnosis.learned import LearnedClaim, marked, variable_of
 from identification.diagnosis.locate import Unexplained, spectral_peak
 from identification.diagnosis.outcome import refusals
 from identification.diagnosis.rival_table import is_absorbed
@@ -776,6 +776,8 @@ class Session:
         needed = {n for c in kept for n in c.effect.needs}
         if not gone or needed & {c.effects[0] for c in gone}:
             return None
+        if not self._learned(standing.steps[0]):
+            return None
         fewer = self._replay(kept, standing)
         balances = {c.balance for c in gone}
         with_names, with_curves = (self._left_by_curves(s.now) for s in (standing, fewer))
@@ -785,11 +787,13 @@ class Session:
             self._refused[c.label] = "leaves what a curve over one variable explains without it"
         return fewer
 
+    def _learned(self, step: Step) -> tuple[LearnedClaim, ...]:
+        """Curves of what a step leaves over the floor."""
+        return self.bench.learned(step, replace(step.held_out, balances=self.bench.ratios(step)))
+
     def _left_by_curves(self, step: Step) -> set[str]:
         """Balances that learned curves in the model of a step explain."""
-        ratios = self.bench.ratios(step)
-        learned = self.bench.learned(step, replace(step.held_out, balances=ratios))
-        left = self.bench.ratios_with(step, learned)
+        left = self.bench.ratios_with(step, self._learned(step))
         return {b for b, e in left.items() if e.ratio <= RATIO_LIMIT}
 
     def _revise(self, standing: _Standing) -> _Standing:
