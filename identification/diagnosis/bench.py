@@ -160,6 +160,7 @@ class JointBench:
         self._stepped: dict[tuple[object, ...], Solution] = {}
         self._ratios: dict[tuple[int, bool], tuple[Solution, dict[str, BalanceError]]] = {}
         self._equal: dict[tuple[object, ...], tuple[Solution, dict[str, Equivalence]]] = {}
+        self._curves: dict[tuple[object, ...], tuple[Solution, tuple[LearnedClaim, ...]]] = {}
         self._drifts: dict[tuple[int, bool], Mapping[str, Part]] = {}
         self._kernels: dict[float, Dataset] = {round(data.kernel, 9): data}
 
@@ -345,8 +346,13 @@ class JointBench:
         return locate(step.solution, self.data, error, lines, limit)
 
     def learned(self, step: Step, error: Error) -> tuple[LearnedClaim, ...]:
-        """See :func:`identification.diagnosis.learned.learned_claims`."""
-        return learned_claims(step.solution, self.data, error, RATIO_LIMIT)
+        """See :func:`identification.diagnosis.learned.learned_claims`; worked out once a model."""
+        over = (b for b, e in error.balances.items() if e.ratio > RATIO_LIMIT)
+        mark = (id(step.solution), *over)
+        if mark not in self._curves:
+            found = learned_claims(step.solution, self.data, error, RATIO_LIMIT)
+            self._curves[mark] = step.solution, found
+        return self._curves[mark][1]
 
     def ratios_with(
         self, step: Step, learned: Sequence[LearnedClaim]

@@ -776,10 +776,10 @@ class Session:
         needed = {n for c in kept for n in c.effect.needs}
         if not gone or needed & {c.effects[0] for c in gone}:
             return None
+        balances = {c.balance for c in gone}
         if not self._learned(standing.steps[0]):
             return None
         fewer = self._replay(kept, standing)
-        balances = {c.balance for c in gone}
         with_names, with_curves = (self._left_by_curves(s.now) for s in (standing, fewer))
         if balances <= with_names or not (balances | with_names) <= with_curves:
             return None

@@ -987,7 +987,10 @@ BOTH = frozenset({"quadratic_drag", "stribeck"})
 def in_parts(base: Base, **other: Any) -> World:
     """What is hidden is explained in parts by two names, and whole by curves without them."""
     explains = {"quadratic_drag": {"p": 0.9}, "stribeck": {"q": 0.9}}
-    made: dict[str, Any] = {"curves": (SimpleNamespace(curve=None),), "undone": {BOTH: 1.0}}
+    made: dict[str, Any] = {
+        "curves": (SimpleNamespace(curve=None, balance="axis"),),
+        "undone": {BOTH: 1.0},
+    }
     return World(base, {"p": 80.0, "q": 40.0}, explains, **(made | other))
 
 
