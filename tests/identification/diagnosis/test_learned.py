@@ -327,6 +327,7 @@ def test_dry_friction_turns_as_the_rows_have_it_beside_a_curve() -> None:
     assert left(as_fitted) > 1.3 * left(whole.values)
 
 
+@pytest.mark.slow
 def test_a_step_over_the_position_is_a_curve_and_no_sum_of_backlash_and_offsets() -> None:
     """Gravity of any zero stays: hardly a joint is without."""
     found = asked(43, lambda q, v: 5 * np.tanh((q + 0.1) / 0.2))
