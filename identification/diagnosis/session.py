@@ -328,11 +328,13 @@ class Session:
         if standing.claims:
             standing, ranking, base = self._by_whole_fits(standing, ranking, base, stale=stale)
         if standing.claims and stopped is None and not lean:
-            by_curves = self._by_curves(standing)
+            by_curves = self._by_curves(standing, decided)
             if by_curves is not None:
                 standing = by_curves
                 base = self.bench.base(standing.now.solution)
                 ranking = self.bench.ranking(base)
+            if by_curves is not None and standing.claims:
+                standing, ranking, base = self._by_whole_fits(standing, ranking, base, stale=False)
         last = None if lean else (ranking, base)
         found = self.finish(
             first, last, standing.steps, standing.claims, following=stopped, unnamed=unnamed
@@ -758,9 +760,12 @@ class Session:
                 self._located[c.balance] = variable_of(c.effect)
         return self._replay([c for c in standing.claims if c.label not in wrong], standing)
 
-    def _by_curves(self, standing: _Standing) -> _Standing | None:
+    def _by_curves(self, standing: _Standing, decided: Sequence[Claim]) -> _Standing | None:
         """The steps without the names of a balance that they cannot explain, where a curve over a
         variable explains it in their place; None where it is not so.
+
+        `decided`: the claims as they were first made. What stays has that set again: it became
+        smaller beside names that are gone.
 
         A sum of laws that each imitate a part of another one stays over the floor, and a curve
         beside them has to undo what they do. What stays: a name that is as good as the curve of its
@@ -776,10 +781,11 @@ class Session:
         needed = {n for c in kept for n in c.effect.needs}
         if not gone or needed & {c.effects[0] for c in gone}:
             return None
-        balances = {c.balance for c in gone}
         if not self._learned(standing.steps[0]):
             return None
-        fewer = self._replay(kept, standing)
+        balances = {c.balance for c in gone}
+        first = {c.label: c for c in decided}
+        fewer = self._replay([first.get(c.label, c) for c in kept], standing)
         with_names, with_curves = (self._left_by_curves(s.now) for s in (standing, fewer))
         if balances <= with_names or not (balances | with_names) <= with_curves:
             return None
