@@ -227,7 +227,7 @@ class ObserverCore:
                 / 1e-6
             )
         keep = [i for i in range(5) if rows[i]]
-        if not keep:
+        if not any(rows[:4]):  # torque alone does not tell where a joint is, or how fast
             return np.zeros((5, size + 2))
         deviations = self.noise[1:].copy()
         deviations[4] = self.torque_deviation

@@ -130,6 +130,7 @@ class OnlineEstimator:
         self.pulse = Pulse(dt, self.rows.timing.length, self.present)
         own = {p.name: (p.low, p.high) for p in self.model.parameters}
         start = dict(zip(self.model.parameter_names, self.model.value_vector(), strict=True))
+        self.held_stiffness = start.get(self.model.stiffness_name or "", 0.0)
         own |= dict.fromkeys(CLOCKS, (-MOST_SKEW * dt, MOST_SKEW * dt))
         self.low = np.array([min(own[n][0], start[n]) for n in self.names])
         self.high = np.array([max(own[n][1], start[n]) for n in self.names])
@@ -410,9 +411,11 @@ class OnlineEstimator:
 
     def _link_from_motor(self, q: list[float]) -> tuple[float, float]:
         """Link position and velocity from the motor, torsion taken off."""
-        name = self.model.stiffness_name
-        at = self.names.index(name) if name in self.names and self.options.has_torque else -1
-        stiffness = float(self.theta[at]) if at >= 0 else 0.0
+        name, stiffness = self.model.stiffness_name, 0.0
+        if self.options.has_torque and name in self.names:
+            stiffness = float(self.theta[self.names.index(name)])
+        elif self.options.has_torque:
+            stiffness = self.held_stiffness
         return (q[Q_M] - q[TAU] / stiffness if stiffness > 0 else q[Q_M]), q[W_M]
 
     # --- rows -------------------------------------------------------------------------------------

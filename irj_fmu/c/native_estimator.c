@@ -265,7 +265,7 @@ static void judge(State *s, const int good[SENSORS]) {
 
 /* Link position and velocity from the motor, torsion taken off. */
 static void link_from_motor(State *s) {
-    const double stiffness = STIFFNESS_THETA < 0 ? 0 : s->theta[STIFFNESS_THETA < 0 ? 0 : STIFFNESS_THETA];
+    const double stiffness = STIFFNESS_THETA < 0 ? HELD_STIFFNESS : s->theta[STIFFNESS_THETA < 0 ? 0 : STIFFNESS_THETA];
     s->readings[Q_L] = s->last_good[Q_M];
     s->readings[W_L] = s->last_good[W_M];
     if (LINK_FROM_TORSION && stiffness > 0) s->readings[Q_L] -= s->last_good[TAU] / stiffness;

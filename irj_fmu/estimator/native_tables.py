@@ -332,6 +332,7 @@ def _watch_tables(header: _Header, made: OnlineEstimator) -> None:
     names = made.names
     stiffness = made.model.stiffness_name
     header.define("STIFFNESS_THETA", names.index(stiffness) if stiffness in names else -1)
+    header.define("HELD_STIFFNESS", float(made.held_stiffness))
     header.define("LINK_FROM_TORSION", int(made.model.is_elastic and made.options.has_torque))
     found = [
         (names.index(n), made.joint.fitted[n], code)

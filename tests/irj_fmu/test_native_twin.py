@@ -21,7 +21,7 @@ import numpy.typing as npt
 import pytest
 
 from benchmarks.native import hurt, readings_of
-from identification.data.joint_file import Joint, load_joint, toml_text
+from identification.data.joint_file import Joint, Known, load_joint, toml_text
 from identification.errors import InputError
 from identification.faults.detector import FaultDetector
 from identification.online.estimator import (
@@ -231,6 +231,12 @@ def test_equals_python_over_40_s_with_faults(
     assert not np.array_equal(expected[-1, :reals], expected[7000, :reals])
 
 
+def stiffness_known(joint: Joint) -> Joint:
+    """The joint with its stiffness given and not estimated."""
+    fitted = dict(joint.fitted)
+    return replace(joint, known={"stiffness": Known(fitted.pop("stiffness"))}, fitted=fitted)
+
+
 CASES: dict[str, tuple[str, OnlineOptions, Callable[[Joint], Joint]]] = {
     "rigid, not fitted": ("irj1b", PLAIN, start_of),
     "motor side only": ("irj1b", replace(PLAIN, has_link=False, has_torque=False), lambda j: j),
@@ -244,6 +250,7 @@ CASES: dict[str, tuple[str, OnlineOptions, Callable[[Joint], Joint]]] = {
             fitted=dict(j.fitted) | {"drive_delay": 2.3e-3, "link_position_sensor_delay": 4.4e-3},
         ),
     ),
+    "known stiffness": ("irj2a", replace(PLAIN, detect=False), stiffness_known),
     "internal states": ("irj2a", PLAIN, lambda j: replace(j, effects=(*j.effects, "lugre"))),
 }
 
@@ -277,6 +284,18 @@ def test_equals_python_for_other_joints_and_sensors(case: str, tmp_path: Path) -
         found[-1, reals + names["Integer"].index("n_rows")]
         < found[4799, reals + names["Integer"].index("n_rows")]
     )
+
+
+def test_a_link_that_is_not_read_is_the_motor_less_the_twist_of_a_known_stiffness() -> None:
+    joint = stiffness_known(reference_joint("irj2a"))
+    estimator = OnlineEstimator(joint, STEP, replace(PLAIN, detect=False))
+    row = readings_of("irj2a", 3.0)[2900]
+    scaled = [row[0], row[1], row[2], row[3], row[4], row[5]]
+    valid = [True, True, True, False, False, True]
+    estimator.update(0.0, scaled, valid)
+    motor, twist = estimator.readings[1], row[5] / joint.known["stiffness"].value
+    assert abs(twist) > 1e-4
+    assert estimator.readings[3] == pytest.approx(motor - twist, abs=1e-12)
 
 
 def test_equals_python_on_whole_encoder_steps(spec: NativeSpec, fmu: Path, tmp_path: Path) -> None:

@@ -32,6 +32,7 @@ from identification.faults.detector import (
 from identification.planning.follow import Follower
 from identification.planning.trajectories import sinusoidal, triangular
 from identification.recursive.estimator import RecursiveLeastSquares
+from irj_fmu.plant.reference import NAMES, reference_joint
 
 FloatArray = npt.NDArray[np.float64]
 DT = 1e-3
@@ -605,3 +606,18 @@ def test_limits_do_not_fall_below_the_noise(calibrated: FaultDetector) -> None:
     rule = calibrated._rule
     low = floors(rule.core, rule.settings)  # type: ignore[arg-type]
     assert all(a >= b and math.isfinite(a) for a, b in zip(rule.residuals.limits, low, strict=True))  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_joint_has_a_gain_for_every_set_of_sensors(name: str) -> None:
+    """A joint without friction, too, of which the torque alone is left: there is none then, since
+    torque tells neither where a joint is nor how fast.
+    """
+    model = reference_joint(name).model()
+    if not model.is_elastic:
+        pytest.skip("a detector needs an elastic joint")
+    for has_torque in (True, False):
+        gains = FaultDetector(model, DT, has_torque=has_torque).tables().gains
+        assert np.isfinite(gains).all()
+        assert not gains[[0, 16]].any()
+        assert gains[1:16].any(axis=1).all()
