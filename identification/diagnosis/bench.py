@@ -26,6 +26,7 @@ from identification.diagnosis.learned import (
     Equivalence,
     LearnedClaim,
     artefacts,
+    carried,
     equivalences,
     learned_claims,
     with_curves,
@@ -41,6 +42,7 @@ from identification.naming.contest import FEWEST, Rival
 from identification.naming.odds import Odds, contenders, contest_of, odds_of, unmodelled
 
 Progress = Callable[[str, float], None]
+Curved = tuple[tuple[LearnedClaim, ...], Step | None]
 
 
 class Bench(Protocol):
@@ -110,6 +112,9 @@ class Bench(Protocol):
         self, step: Step, learned: Sequence[LearnedClaim]
     ) -> Mapping[str, BalanceError]:
         """As `ratios`, with learned curves in the model of the step."""
+
+    def curved(self, step: Step, learned: Sequence[LearnedClaim]) -> Curved:
+        """The curves that a model of the step takes along, and the step that it is with them."""
 
     def held_against(self, claims: Sequence[Claim], step: Step) -> Mapping[str, Equivalence]:
         """The names of claims against curves over their own variables, by label."""
@@ -359,6 +364,13 @@ class JointBench:
     ) -> Mapping[str, BalanceError]:
         """Residual over floor with curves in the model, at the values of their fit."""
         return self._judged(with_curves(step.solution, learned), held_out=True)
+
+    def curved(self, step: Step, learned: Sequence[LearnedClaim]) -> Curved:
+        """See :func:`identification.diagnosis.learned.carried`."""
+        kept = carried(step.solution, learned, self.data)
+        if not kept:
+            return (), None
+        return kept, self.shown(self.step("learned", None, with_curves(step.solution, kept)))
 
     def held_against(self, claims: Sequence[Claim], step: Step) -> Mapping[str, Equivalence]:
         """See :func:`identification.diagnosis.learned.equivalences`; worked out once a model."""

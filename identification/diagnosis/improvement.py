@@ -15,7 +15,7 @@ from identification.balance.dataset import HOLD_DELAY, Dataset, visible_labels
 from identification.data.joint_file import Joint
 from identification.diagnosis.candidates import NotTestable
 from identification.diagnosis.claims import Claim, Ranking
-from identification.diagnosis.learned import LearnedClaim, carried, with_curves
+from identification.diagnosis.learned import LearnedClaim
 from identification.diagnosis.lines import Line
 from identification.diagnosis.locate import Unexplained
 from identification.diagnosis.outcome import Refusal, outcome_of, why_not
@@ -44,7 +44,7 @@ class Step:
     Attributes
     ----------
     added : str or None
-        Key of the effect that was added (None for the start model).
+        Key of the effect that was added (None for the start model), "learned" for curves.
     effects : tuple of str
         Keys in the model.
     train, held_out : Error
@@ -94,6 +94,10 @@ class Improvement:
         them.
     learned : tuple of LearnedClaim
         Where the verdict is ``unexplained``: curves over one variable of what is left.
+    carried : tuple of LearnedClaim
+        Those that the joint file has: with the others the error of held-out records would rise.
+    curved : Step or None
+        The last model with these curves, behind the steps that names made.
     """
 
     joint: Joint
@@ -112,6 +116,8 @@ class Improvement:
     refused: tuple[Refusal, ...] = ()
     decided: tuple[Claim, ...] = ()
     learned: tuple[LearnedClaim, ...] = ()
+    carried: tuple[LearnedClaim, ...] = ()
+    curved: Step | None = None
 
     @property
     def outcome(self) -> str:
@@ -152,16 +158,16 @@ class Improvement:
         """The joint with all that was added, learned curves that lower the error of held-out
         records included, as the text of a joint file.
         """
-        return joint_text(self.joint, with_curves(self.steps[-1].solution, self.carried), self.data)
+        return joint_text(self.joint, self.stairs[-1].solution, self.data)
 
     @property
-    def carried(self) -> tuple[LearnedClaim, ...]:
-        """The learned curves that the joint file has."""
-        return carried(self.steps[-1].solution, self.learned, self.data)
+    def stairs(self) -> tuple[Step, ...]:
+        """The falling error: start model, a step for each name, one for learned curves."""
+        return self.steps if self.curved is None else (*self.steps, self.curved)
 
     def __str__(self) -> str:
         lines = [self.reason]
-        for step in self.steps:
+        for step in self.stairs:
             ratios = "  ".join(f"{b} {e.ratio:.3g}" for b, e in step.held_out.balances.items())
             name = f"+ {step.added}" if step.added else "start model"
             lines.append(
@@ -198,6 +204,7 @@ class Improvement:
                 "note": self.data.note,
             },
             "steps": [s.as_json(self.data) for s in self.steps],
+            "with_curves": self.curved.as_json(self.data) if self.curved else None,
             "added": list(self.added),
             "claims": [
                 *(c.as_json() for c in self.claims),

@@ -57,6 +57,7 @@ from identification.diagnosis.outcome import refusals
 from identification.diagnosis.rival_table import is_absorbed
 from identification.diagnosis.trials import Base, Trial
 from identification.diagnosis.verdict import (
+    curves_told,
     hardly_a_model,
     open_notes,
     unseen,
@@ -407,6 +408,9 @@ class Session:
         if doubts and verdict in ("complete", "nothing_missing"):
             why = "; ".join(d.sentence for d in doubts)
             verdict, reason = "unexplained", f"{reason} But {why}."
+        kept, curved = self.bench.curved(end, learned)
+        if curved is not None:
+            reason = f"{reason} {curves_told(end, curved, len(kept))}"
         named = {c for x in judged for c in x.effects}
         shown = tuple(self.bench.shown(s) for s in steps)
         return Improvement(
@@ -441,6 +445,8 @@ class Session:
                 self.bench.tried(steps[0].solution),
             ),
             learned=learned,
+            carried=kept,
+            curved=curved,
         )
 
     # --- inside -----------------------------------------------------------------------------------

@@ -113,6 +113,13 @@ def verdict_of(
     )
 
 
+def curves_told(last: Step, curved: Step, count: int) -> str:
+    """How far the error falls with learned curves behind the last name."""
+    was, now = (step.held_out.relative_error_percent for step in (last, curved))
+    what = f"{count} learned curves" if count > 1 else "the learned curve"
+    return f"With {what} in the model it falls from {was:.3g} % to {now:.3g} %."
+
+
 def hardly_a_model(start: Step) -> tuple[str, ...]:
     """A start model that explains next to nothing, or has no stiffness: what is claimed on top
     of it hangs in the air.

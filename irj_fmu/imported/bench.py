@@ -22,7 +22,7 @@ from identification.balance.stamps import evened
 from identification.balance.weak import WeakRecord, differentiated_kernel, filtered
 from identification.data.joint_file import Known
 from identification.data.record import Record
-from identification.diagnosis.bench import Progress
+from identification.diagnosis.bench import Curved, Progress
 from identification.diagnosis.candidates import Candidate, NotTestable, offered
 from identification.diagnosis.claims import Claim, Ranking, rank
 from identification.diagnosis.curve import Curve
@@ -308,6 +308,10 @@ class FmuBench:
     ) -> Mapping[str, BalanceError]:
         """Those without curves: a curve cannot ride outside an FMU yet."""
         return self.ratios(step)
+
+    def curved(self, step: Step, learned: Sequence[LearnedClaim]) -> Curved:
+        """None: a curve cannot ride outside an FMU yet."""
+        return (), None
 
     def held_against(self, claims: Sequence[Claim], step: Step) -> Mapping[str, Equivalence]:
         """None: a curve cannot ride outside an FMU yet."""

@@ -17,6 +17,7 @@ from identification.data.plain_text import from_toml
 from identification.diagnosis.improve import HOLD_DELAY
 from identification.errors import InputError
 from workbench.page.analysis import Progress
+from workbench.page.desk.curves import story_of
 from workbench.page.jobs.place import Place, confirmed_map
 from workbench.page.report import improvement_of, records_of
 from workbench.page.session import FileEntry, State, StepEntry, write_atomic
@@ -117,8 +118,8 @@ def joint_file(live: Place) -> str:
     state = live.state
     if not state.steps:
         return _given(state)
-    story = state.improvement or {}
-    if story.get("joint_text") and story["exact"] == state.steps[-1].exact:
+    story = story_of(state)
+    if story.get("joint_text"):
         return str(story["joint_text"])  # with the curves that the loop has learned
     return live.analysis().to_joint_file()
 

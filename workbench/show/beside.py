@@ -10,7 +10,7 @@ from typing import Any, Final
 from identification.data.formats import number, percent, pretty_unit, ratio, with_error
 from identification.data.plain_text import from_json
 from identification.errors import InputError
-from workbench.show.results import step_names, table, text
+from workbench.show.results import stairs_of, step_names, table, text
 from workbench.show.words import headline, plain_name
 
 APART: Final = 3.0
@@ -61,7 +61,7 @@ def beside_html(own: Mapping[str, Any], others: Mapping[str, Mapping[str, Any]])
 
 
 def _one(own: Mapping[str, Any], name: str, other: Mapping[str, Any]) -> str:
-    last, its = own["steps"][-1], other["steps"][-1]
+    last, its = stairs_of(own)[-1], stairs_of(other)[-1]
     facts = [
         ["verdict", text(headline(own)), text(headline(other))],
         ["added", _added(own), _added(other)],

@@ -73,7 +73,8 @@ def law_html(improvement: Improvement, result: Mapping[str, Any]) -> str:
     parts = _parts(model)
     balances = {k: c["balance"] for c in result["claims"] for k in c["effects"]}
     rows = []
-    for step, name in zip(improvement.steps[1:], step_names(result)[1:], strict=True):
+    named = step_names(result)[: len(improvement.steps)]
+    for step, name in zip(improvement.steps[1:], named[1:], strict=True):
         label = step.label or step.added or ""
         formula = parts.get(label, "")
         where = balances.get(step.added or "", "")

@@ -33,6 +33,7 @@ from workbench.show.results import (
     not_testable_html,
     parameters_html,
     ranking_html,
+    stairs_of,
     text,
     verdict_html,
     warnings_html,
@@ -260,13 +261,14 @@ def _tiles(result: dict[str, Any]) -> str:
     """Three figures at a glance."""
     if not result["steps"]:
         return ""
-    first, last = result["steps"][0]["held_out"], result["steps"][-1]["held_out"]
+    steps = stairs_of(result)
+    first, last = steps[0]["held_out"], steps[-1]["held_out"]
     floor = floor_percent(last)
     names = ", ".join(
         f"<span class='nowrap'>{text(b)} {ratio(e['ratio'])}</span>"
         for b, e in last["balances"].items()
     )
-    before = f"{percent(first['relative_error_percent'])} → " if len(result["steps"]) > 1 else ""
+    before = f"{percent(first['relative_error_percent'])} → " if len(steps) > 1 else ""
     tiles = [
         (
             "error on records the fit never saw",

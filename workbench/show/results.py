@@ -23,7 +23,7 @@ from identification.data.formats import (
     words,
 )
 from workbench.show.pictures import bar, place_picture, staircase_picture
-from workbench.show.words import headline
+from workbench.show.words import CURVES, headline
 from workbench.show.words import title_of as effect_title
 
 if TYPE_CHECKING:
@@ -123,14 +123,22 @@ def floor_percent(error: Mapping[str, Any]) -> float | None:
     return float(error["relative_error_percent"]) * floor / size if size > 0 and floor > 0 else None
 
 
+def stairs_of(result: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """The steps of the falling error: those of names, then that of learned curves, if any."""
+    curved = result.get("with_curves")
+    return [*result["steps"], *([curved] if curved else [])]
+
+
 def step_names(result: Mapping[str, Any]) -> list[str]:
-    """What each step added: a set where its claim is one."""
+    """What each of these steps added: a set where its claim is one."""
     sets = {k: c["effects"] for c in result["claims"] if "curve" not in c for k in c["effects"]}
     return [
         "start model"
         if s["added"] is None
+        else CURVES
+        if s["added"] == "learned"
         else " or ".join(effect_title(k) for k in sets.get(s["added"], [s["added"]]))
-        for s in result["steps"]
+        for s in stairs_of(result)
     ]
 
 
@@ -138,7 +146,7 @@ def ledger_html(result: Mapping[str, Any]) -> str:
     """The ledger: error of every step on training and held-out records, ratio to the noise
     floor per balance.
     """
-    steps = result["steps"]
+    steps = stairs_of(result)
     if not steps:
         return "<p>No model was fitted.</p>"
     names = list(steps[0]["held_out"]["balances"])
@@ -164,7 +172,7 @@ def ledger_html(result: Mapping[str, Any]) -> str:
 
 def staircase_html(result: Mapping[str, Any]) -> str:
     """The held-out error as a falling staircase."""
-    steps = result["steps"]
+    steps = stairs_of(result)
     if not steps:
         return ""
     values = [float(s["held_out"]["relative_error_percent"]) for s in steps]

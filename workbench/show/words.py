@@ -61,6 +61,8 @@ OUTCOME_WORDS: Final[Mapping[str, Outcome]] = {
 }
 PART: Final = "Found a part of what is missing; something is left"
 """Headline where effects were named and structure is left beside them."""
+CURVES: Final = "learned curves"
+"""What the step behind the names is called."""
 
 GLOSSARY: Final[Mapping[str, str]] = {
     "balance": "sum of the torques that must be zero on one side of the gear: at the motor, at the "
@@ -129,9 +131,10 @@ def step_lines(found: Improvement) -> list[str]:
     """The note on the records, and the falling error as a table."""
     lines = [f"note: {found.data.note}"] if found.data.note else []
     lines.append(f"{'step':<32} {'train %':>8} {'held-out %':>10}   residual over noise floor")
-    for step in found.steps:
+    for step in found.stairs:
         ratios = "  ".join(f"{b} {e.ratio:.3g}" for b, e in step.held_out.balances.items())
-        name = f"+ {step.added}" if step.added else "start model"
+        what = CURVES if step.added == "learned" else step.added
+        name = f"+ {what}" if what else "start model"
         lines.append(
             f"{name:<32} {step.train.relative_error_percent:8.3f} "
             f"{step.held_out.relative_error_percent:10.3f}   {ratios}"

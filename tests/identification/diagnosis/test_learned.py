@@ -263,6 +263,16 @@ def test_the_loop_leaves_a_true_name_plain(key: str) -> None:
     assert found.verdict == "complete"
 
 
+def test_a_spring_rests_where_it_rests() -> None:
+    """Not at the joint's zero, and nothing stands in for the torque that it has there."""
+    found = asked(51, lambda q, v: 20 * (q - 0.3))
+    assert [(c.effects, c.like) for c in found.claims] == [(("added_spring",), "")]
+    assert found.verdict == "complete"
+    values = found.steps[-1].solution.values
+    rest = -values["motor_added_spring_preload"] / values["motor_added_spring"]
+    assert rest == pytest.approx(0.3, abs=0.005)
+
+
 @pytest.mark.parametrize(
     "law",
     [
@@ -376,7 +386,18 @@ def test_improve_writes_a_joint_file_that_every_door_takes(
     assert "The curve in the place of a name" in Path(report).read_text()
     label = "learned_position_friction@motor"
     assert label in load_joint(better).effects
-    assert f"({label})" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert f"({label})" in said
+    first, last = (s["held_out"] for s in (result["steps"][-1], result["with_curves"]))
+    fall = [s["relative_error_percent"] for s in (first, last)]
+    assert fall[1] < 0.5 * fall[0]
+    assert f"it falls from {fall[0]:.3g} % to {fall[1]:.3g} %." in result["reason"]
+    assert "\n+ learned curves " in said
+    assert Path(report).read_text().count("+ learned curves") >= 2, "staircase and ledger"
+    compared = str(tmp_path / "compared.json")
+    assert main(["compare", names[1], "--joint", better, "--json", compared]) == 0
+    shown = json.loads(Path(compared).read_text())["relative_error_percent"]
+    assert shown == pytest.approx(fall[1], rel=0.05)  # its kernel is that of this record alone
     assert main(["fit", names[0], "--joint", better, "--json", str(tmp_path / "fit.json")]) == 0
     fitted = json.loads((tmp_path / "fit.json").read_text())["parameters"]
     half = load_joint(better).fitted["motor_learned_position_friction_half_range"]

@@ -22,7 +22,7 @@ from identification.fitting.engine import references
 from workbench.page.analysis import Analysis
 from workbench.page.charts.choices import limits_of, within
 from workbench.page.charts.learned import curve_chart, shown_residual
-from workbench.page.desk.curves import learned_of
+from workbench.page.desk.curves import learned_of, story_of
 from workbench.page.jobs.place import hint_for
 from workbench.page.live import Live
 from workbench.page.records import plot_time
@@ -39,7 +39,7 @@ from workbench.show.pictures import (
 )
 from workbench.show.plots import decimated, explained, step_place
 from workbench.show.results import floor_percent
-from workbench.show.words import GLOSSARY, OUTCOME_WORDS, title_of
+from workbench.show.words import CURVES, GLOSSARY, OUTCOME_WORDS, title_of
 
 Query = Mapping[str, Any]
 FloatArray = npt.NDArray[np.float64]
@@ -101,6 +101,10 @@ def _staircase(live: Live, query: Query) -> dict[str, Any]:
         raise InputError("no fit yet: press Fit first")
     values = [float(s.held_out["relative_error_percent"]) for s in steps]
     names, floor = [step_title(s) for s in steps], floor_percent(steps[-1].held_out)
+    curved = story_of(live.state).get("with_curves")
+    if curved:
+        values.append(float(curved["held_out"]["relative_error_percent"]))
+        names.append(f"+ {CURVES}")
     out: dict[str, Any] = {
         "names": names,
         "floor": floor,

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from identification.diagnosis.improve import Improvement
+from workbench.page.session import State
 
 
 def kept_curves(found: Improvement) -> dict[str, Any]:
@@ -17,6 +18,13 @@ def kept_curves(found: Improvement) -> dict[str, Any]:
     for claim in found.learned:
         values |= {n: float(v) for n, v in {**claim.curve.beside, **claim.curve.values}.items()}
     return {"learned": [c.as_json() for c in found.learned], "learned_values": values}
+
+
+def story_of(state: State) -> Mapping[str, Any]:
+    """What the whole loop found, where the last step of the ledger is its last; else nothing."""
+    story = state.improvement or {}
+    current = bool(state.steps) and story.get("exact") == state.steps[-1].exact
+    return story if current else {}
 
 
 def learned_of(story: Mapping[str, Any] | None, label: str) -> Mapping[str, Any] | None:
