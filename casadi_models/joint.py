@@ -145,9 +145,8 @@ class JointModel:
         if name not in MODELS:
             raise KeyError(f"unknown model {name!r}; known: {', '.join(MODELS)}")
         for label in (*MODELS[name], *effects):
-            key = label.partition("#")[0]
-            there = model.has(key) or model.has_form_of(key)
-            if label in model.effects or ("@" not in label and "#" not in label and there):
+            there = "#" not in label and model.has_form_of(label)
+            if there or label in model.effects or (label in EFFECTS and model.has(label)):
                 continue
             model = model.add(label)
         known = set(model.parameter_names)
@@ -256,12 +255,13 @@ class JointModel:
         """True where the effect is in the model (in `place`, if given)."""
         return any(t.effect.key == key and place in (None, t.place) for t in self.terms)
 
-    def has_form_of(self, key: str) -> bool:
+    def has_form_of(self, label: str) -> bool:
         """True where another form of the effect, with parameters of the same names, is in the
-        model.
+        model: in its place, or in any where the label names none.
         """
-        first = EFFECTS[key.partition("@")[0]]
-        names = {n for p in first.acts_on for n in first.parameter_names(p)}
+        key, _, place = label.partition("@")
+        first = EFFECTS[key]
+        names = {n for p in first.acts_on if p == (place or p) for n in first.parameter_names(p)}
         return any(t.effect is not first and names & set(t.names) for t in self.terms)
 
     @property

@@ -33,7 +33,7 @@ MODELS: Final[dict[str, tuple[str, ...]]] = {
     "irj2b": (
         "transmission_compliance",
         "cubic_stiffness",
-        "added_spring@motor",
+        "added_spring_at_zero@motor",
         "viscous@motor",
         "viscous@link",
         "coulomb@motor",
@@ -43,7 +43,7 @@ MODELS: Final[dict[str, tuple[str, ...]]] = {
     "irj_ts": (
         "transmission_compliance",
         "cubic_stiffness",
-        "added_spring@motor",
+        "added_spring_at_zero@motor",
         "viscous@motor",
         "coulomb@motor",
         "smooth_stribeck@motor",

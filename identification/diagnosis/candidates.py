@@ -264,7 +264,7 @@ def _placed(effect: Effect, place: Place, model: JointModel) -> list[Candidate]:
         t.effect.key == effect.key and t.place == place and t.label != HOLD_DELAY
         for t in model.terms
     )
-    if model.has_form_of(effect.key):
+    if model.has_form_of(label):
         return []
     if there:
         if not effect.periodic:

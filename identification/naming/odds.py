@@ -20,8 +20,9 @@ NOTHING: Final = ""
 SCREEN: Final = 2.0
 """Factor by which a linear trial may make a name worse than its whole fit: shapes and smoothing of
 the model stand still in a trial."""
-MOST_FITTED: Final = 6
-"""Names that are fitted whole at most: those of the largest set that is an answer, and two more."""
+MOST_FITTED: Final = 8
+"""Names that are fitted whole at most: those of the largest set that is an answer, and as many
+more."""
 
 
 @final

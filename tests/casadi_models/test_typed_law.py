@@ -25,7 +25,8 @@ from workbench.cli.main import main
 DEMO = Path(__file__).resolve().parents[2] / "workbench" / "demo"
 
 LIBRARY: dict[str, tuple[str, dict[str, str]]] = {
-    "added_spring": ("k*q", {"k": "-100..100 N.m/rad"}),
+    "added_spring": ("k*q + m", {"k": "-100..100 N.m/rad", "m": "-100..100 N.m"}),
+    "added_spring_at_zero": ("k*q", {"k": "-100..100 N.m/rad"}),
     "asymmetric_coulomb": ("c*abs(direction)", {"c": "-10..10 N.m"}),
     "asymmetric_viscous": ("c*abs(v)", {"c": "-9..9 N.m.s/rad"}),
     "backlash": ("-c*min(max(twist, -b), b)", {"c": "0..3e4 N.m/rad", "b": "1e-5..1e-2 rad"}),

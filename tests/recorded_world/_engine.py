@@ -23,12 +23,13 @@ FloatArray = npt.NDArray[np.float64]
 
 SIDE: Final = (
     *("B", "B2", "B3", "BA", "O1", "V1", "O2", "V2", "O3", "V3", "TC", "TCA", "TS", "VS", "DS"),
-    *("MU", "CYC", "CYC_P", "V0", "ZS", "SIN", "COS", "KA", "BUMP", "BUMP_X", "BUMP_W", "ONE"),
+    *("MU", "CYC", "CYC_P", "V0", "ZS", "SIN", "COS", "KA", "KA_Q", "BUMP", "BUMP_X", "BUMP_W"),
+    "ONE",
 )
 """What each side has: viscous, quadratic, cubic and even viscous; three tanh terms with their
 velocities; Coulomb, its asymmetry, Stribeck torque, velocity, exponent; load factor; cyclic
-friction; smoothing velocity; bristle distance; torques of the link position; spring; a rub at one
-place, in one direction where ONE is +1 or -1."""
+friction; smoothing velocity; bristle distance; torques of the link position; spring and where it
+rests; a rub at one place, in one direction where ONE is +1 or -1."""
 COMMON: Final = (
     *(
         "STEP",

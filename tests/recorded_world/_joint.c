@@ -114,8 +114,8 @@ int simulate(const double *p, const double *state, const double *ref, const long
             hys += p[P_HK1 + k] * z[k];
         }
         old = x;
-        pm = fm[F_KA] * qm + fm[F_SIN] * sin(tm) + fm[F_COS] * cos(tm);
-        pl = fl[F_KA] * tm - p[P_TG] * sin(tm + p[P_TG_P]);
+        pm = fm[F_KA] * (qm - fm[F_KA_Q]) + fm[F_SIN] * sin(tm) + fm[F_COS] * cos(tm);
+        pl = fl[F_KA] * (tm - fl[F_KA_Q]) - p[P_TG] * sin(tm + p[P_TG_P]);
         if (fl[F_SIN] != 0.0 || fl[F_COS] != 0.0) pl += fl[F_SIN] * sin(tm) + fl[F_COS] * cos(tm);
         if (p[P_COG] != 0.0) pm += p[P_COG] * sin(p[P_COG_O] * p[P_N] * qm + p[P_COG_P]);
         if (fm[F_CYC] != 0.0) cm = fm[F_CYC] * sin(tm + fm[F_CYC_P]);

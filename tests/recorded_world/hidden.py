@@ -135,7 +135,9 @@ def cyclic_torque(s: Setting) -> Law:
 
 
 def added_spring(s: Setting) -> Law:
-    return s.on_side(KA=s.some(0.25, 0.5, s.joint.friction / s.joint.make.stroke))
+    """A spring or a cable that rests anywhere in the middle half of the travel."""
+    stiffness = s.some(0.25, 0.5, s.joint.friction / s.joint.make.stroke)
+    return s.on_side(KA=stiffness, KA_Q=s.shape(-0.5, 0.5, s.joint.make.stroke))
 
 
 def coulomb(s: Setting) -> Law:

@@ -20,6 +20,7 @@ import tempfile
 import time
 import tomllib
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, final
 
@@ -206,9 +207,16 @@ def _ripple(rig: Rig, m: Motion, size: float) -> FloatArray:
     return 0.15 * size * rig.friction * np.sin(2.0 * np.pi * m.q / rig.pitch + 0.7)
 
 
+@cache
+def travel(rig: Rig) -> tuple[float, float]:
+    """Lowest and highest position of all records: a law is one law for each of them."""
+    positions = [t[rig.position] * rig.to_si for tables in rig.load() for t in tables]
+    return min(float(q.min()) for q in positions), max(float(q.max()) for q in positions)
+
+
 def _spring(rig: Rig, m: Motion, size: float) -> FloatArray:
-    middle = 0.5 * (m.q.max() + m.q.min())
-    return np.asarray(size * rig.friction / np.ptp(m.q) * (m.q - middle))
+    low, high = travel(rig)
+    return np.asarray(size * rig.friction / (high - low) * (m.q - 0.5 * (low + high)))
 
 
 def _offset(rig: Rig, m: Motion, size: float) -> FloatArray:
@@ -228,7 +236,8 @@ def _stribeck(rig: Rig, m: Motion, size: float) -> FloatArray:
 
 def _dahl(rig: Rig, m: Motion, size: float) -> FloatArray:
     """Part of the dry friction builds up over a distance: bristle minus sign."""
-    distance = 0.01 * float(np.ptp(m.q))
+    low, high = travel(rig)
+    distance = 0.01 * (high - low)
     z = np.zeros_like(m.q)
     for i in range(1, len(z)):
         z[i] = np.clip(z[i - 1] + (m.q[i] - m.q[i - 1]) / distance, -1.0, 1.0)

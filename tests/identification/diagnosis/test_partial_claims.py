@@ -28,7 +28,7 @@ def improved(folder: Path) -> Improvement:
 def test_laws_of_the_position_that_imitate_a_soft_stop_give_way_to_its_curve(
     tmp_path: Path,
 ) -> None:
-    found = improved(generate_case("soft_stop", 6005, folder=tmp_path / "case"))
+    found = improved(generate_case("soft_stop", 6003, folder=tmp_path / "case"))
     assert found.verdict == "unexplained"
     assert all(c.partial for c in found.claims)
     assert "Missing:" not in found.reason
@@ -47,6 +47,19 @@ def test_laws_of_the_position_that_imitate_a_soft_stop_give_way_to_its_curve(
     jsonschema.validate(data, json.loads(SCHEMA.read_text()))
     curves = [c["effects"] for c in data["claims"] if "curve" in c]
     assert curves == [["learned"]] * len(found.learned)
+
+
+def test_a_spring_that_does_most_of_a_soft_stop_is_like_it_and_in_part(tmp_path: Path) -> None:
+    """Where the stop takes most of the travel; the curve beside it takes the rest."""
+    found = improved(generate_case("soft_stop", 6005, folder=tmp_path / "case"))
+    assert found.verdict == "unexplained"
+    (claim,) = found.claims
+    assert (claim.effects, claim.partial) == (("added_spring",), True)
+    assert claim.like.startswith("like additional spring to ground, which explains 9")
+    assert found.curved is not None
+    errors = [s.held_out.relative_error_percent for s in found.stairs]
+    assert errors[1] < 0.3 * errors[0]
+    assert errors[2] < 0.4 * errors[1]
 
 
 def test_a_law_of_the_position_that_is_really_there_is_whole(tmp_path: Path) -> None:

@@ -291,7 +291,7 @@ def test_who_is_worth_a_whole_fit() -> None:
     )
     assert "added_spring" in contenders(("quadratic_drag",), near, 3.1)
     assert "cubic_viscous" not in contenders(("viscous",), near, 0.0), "it holds the other"
-    many = tuple("abcdef")
+    many = tuple("abcdefgh")
     assert contenders(many, near, 0.0) == many
 
 

@@ -242,6 +242,9 @@ class World:
         part = {b: e.ratio**2 - 1 for b, e in left.items()}
         return {b: replace(e, ratio=math.sqrt(1 + share * part[b])) for b, e in left.items()}
 
+    def curved(self, step: Step, learned: Sequence[Any]) -> tuple[tuple[Any, ...], None]:
+        return tuple(learned), None
+
     def artefacts(self, step: Step, curves: Sequence[Curve], start: Step) -> tuple[Doubt, ...]:
         self.doubted.append((len(step.effects), tuple(curves), len(start.effects)))
         return self.doubts
@@ -458,13 +461,13 @@ def test_how_near_a_name_must_come_to_be_fitted_whole(
 def test_what_is_alike_after_whole_fits_is_the_set(base: Base) -> None:
     laws = {
         "cyclic_torque": {"p": 0.6},
-        "added_spring": {"p": 0.95},
+        "asymmetric_viscous": {"p": 0.95},
         "quadratic_drag": {"p": 0.945},
         "stribeck": {"p": 0.93},
     }
     first = {"cyclic_torque": {"p": 0.95}, **{n: {"p": 0.8} for n in list(laws)[1:]}}
     found = ended(World(base, {"p": 24.0}, laws, first), 1)
-    assert found.claims[0].effects == ("added_spring", "quadratic_drag")
+    assert found.claims[0].effects == ("asymmetric_viscous", "quadratic_drag")
     laws["gravity"] = {"p": 0.945}
     usual = ended(World(base, {"p": 24.0}, laws, {**first, "gravity": {"p": 0.8}}), 1)
     assert named(usual) == ["gravity"], "hardly a joint is without it"
@@ -661,7 +664,7 @@ def test_the_set_of_an_earlier_claim_is_that_of_the_last_model(
 # --- whole fits of the names of a claim -----------------------------------------------------------
 
 TWO: Mapping[str, Shares] = {
-    "added_spring": {"p": 1.0},
+    "cubic_viscous": {"p": 1.0},
     "cyclic_torque": {"p": 1.0},
     "quadratic_drag": {"q": 1.0},
 }
@@ -679,10 +682,10 @@ def told(now: Step, chances: Shares, behind: Mapping[str, str], rest: float = 0.
 @pytest.mark.parametrize(
     ("chances", "behind", "effects"),
     [
-        ({"added_spring": 0.4, "cyclic_torque": 0.6}, {}, ("added_spring", "cyclic_torque")),
-        ({"added_spring": 1.0}, {}, ("added_spring",)),
-        ({"added_spring": 0.001, "cyclic_torque": 0.999}, {}, ("cyclic_torque", "added_spring")),
-        ({"cyclic_torque": 1.0}, {"added_spring@motor": "is far behind"}, ("cyclic_torque",)),
+        ({"cubic_viscous": 0.4, "cyclic_torque": 0.6}, {}, ("cubic_viscous", "cyclic_torque")),
+        ({"cubic_viscous": 1.0}, {}, ("cubic_viscous",)),
+        ({"cubic_viscous": 0.001, "cyclic_torque": 0.999}, {}, ("cyclic_torque", "cubic_viscous")),
+        ({"cyclic_torque": 1.0}, {"cubic_viscous@motor": "is far behind"}, ("cyclic_torque",)),
     ],
 )
 def test_a_claim_has_the_names_that_whole_fits_leave(
@@ -698,7 +701,7 @@ def test_a_claim_has_the_names_that_whole_fits_leave(
     assert claim.label == f"{effects[0]}@motor"
     assert claim.separate_by == (EFFECTS[effects[0]].separate_by if len(effects) > 1 else None)
     if behind:
-        assert "is far behind" in found.why("added_spring")
+        assert "is far behind" in found.why("cubic_viscous")
 
 
 def test_a_claim_that_is_less_probable_than_nothing_goes_and_the_others_stay(base: Base) -> None:
@@ -712,8 +715,8 @@ def test_a_claim_that_is_less_probable_than_nothing_goes_and_the_others_stay(bas
     found = ended(World(base, {"p": 24.0, "q": 8.0}, TWO, chances=odds))
     assert named(found) == ["quadratic_drag"]
     assert found.claims[0].confidence == {"quadratic_drag": 1.0}
-    assert asked == ["added_spring", "quadratic_drag"], "each once"
-    assert "nothing is 90% probable" in found.why("added_spring")
+    assert asked == ["cubic_viscous", "quadratic_drag"], "each once"
+    assert "nothing is 90% probable" in found.why("cubic_viscous")
 
 
 def test_a_law_that_another_one_needs_is_not_less_than_nothing(base: Base) -> None:
@@ -726,16 +729,16 @@ def test_a_law_that_another_one_needs_is_not_less_than_nothing(base: Base) -> No
 @pytest.mark.parametrize("beside", [True, False])
 def test_a_name_that_has_a_place_takes_no_other(beside: bool, base: Base) -> None:
     """Even where it is by far the most probable; the other one stays, as sure as it is."""
-    chances = {"added_spring": 0.999} | ({"quadratic_drag": 0.001} if beside else {})
+    chances = {"cubic_viscous": 0.999} | ({"quadratic_drag": 0.001} if beside else {})
 
     def odds(claim: Claim, now: Step) -> Odds | None:
         return told(now, chances, {}) if claim.effects[0] == "quadratic_drag" else None
 
     laws = {k: v for k, v in TWO.items() if k != "cyclic_torque"}
     found = ended(World(base, {"p": 24.0, "q": 8.0}, laws, chances=odds))
-    assert named(found) == ["added_spring", "quadratic_drag"]
+    assert named(found) == ["cubic_viscous", "quadratic_drag"]
     last = found.claims[1]
-    assert last.effects == (("quadratic_drag", "added_spring") if beside else ("quadratic_drag",))
+    assert last.effects == (("quadratic_drag", "cubic_viscous") if beside else ("quadratic_drag",))
     assert last.confidence == (chances if beside else {})
 
 
