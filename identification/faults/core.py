@@ -40,11 +40,16 @@ sensor 0.0010 deg, link encoder 0.0036 deg, torque sensor 50 mNm); current: 15 b
 N.m; velocities are not printed there and are assumed."""
 
 ABSURD: Final = 1e9
+"""A reading beyond this (SI) counts as missing, as NaN and infinity do."""
 OPEN: Final = 1e9
 """Gate of an innovation that is taken whole: beyond every reading."""
-"""A reading beyond this (SI) counts as missing, as NaN and infinity do."""
 DISTURBANCE: Final = (50.0, 15.0)
 """Random walk of the unknown torque on motor and link that the observer allows [N.m/sqrt(s)]."""
+FADING: Final = 0.99999
+"""Factor of a sample by which what no reading shows fades in the design of a gain."""
+FADING_OF_TORQUE: Final = 0.999
+"""The same where the torque alone is read, which shows no position and, of a joint without
+friction, no velocity: with less the equation has roots on the unit circle."""
 GATE: Final = 5.0
 """Innovations are cut at this many standard deviations, so that a faulty reading moves the
 estimate little.
@@ -227,7 +232,7 @@ class ObserverCore:
                 / 1e-6
             )
         keep = [i for i in range(5) if rows[i]]
-        if not any(rows[:4]):  # torque alone does not tell where a joint is, or how fast
+        if not keep:
             return np.zeros((5, size + 2))
         deviations = self.noise[1:].copy()
         deviations[4] = self.torque_deviation
@@ -241,7 +246,8 @@ class ObserverCore:
         r = np.diag(deviations[keep] ** 2)
         active = [*range(4), size, size + 1]
         sub = np.ix_(active, active)
-        p = solve_discrete_are(0.99999 * a[sub].T, kept[:, active].T, np.diag(q[active] + 1e-14), r)
+        fading = FADING if any(rows[:4]) else FADING_OF_TORQUE
+        p = solve_discrete_are(fading * a[sub].T, kept[:, active].T, np.diag(q[active] + 1e-14), r)
         k = p @ kept[:, active].T @ np.linalg.inv(kept[:, active] @ p @ kept[:, active].T + r)
         gain = np.zeros((5, size + 2))
         gain[np.ix_(keep, active)] = k.T
