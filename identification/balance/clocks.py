@@ -59,6 +59,10 @@ ENCODERS: Final = frozenset({"link_position_sensor"})
 """Places whose readings are positions."""
 HALF_A_CYCLE: Final = 0.5
 """Half the cycle of a drive's filter [samples]: it is read by a logger that is no faster."""
+USUAL_HALF: Final = 0.1
+"""Half the cycle that drives usually have [samples], the deviation of what is expected before the
+rows are asked: from .025 for a logger of 100 Hz to .25 for one of 1 kHz beside a filter at 2 kHz.
+"""
 PRICE: Final = 2.5
 """Squares, in units of the variance, that rows must lose for each that independent ones would: they
 are four to a kernel length, and 0.4 of them count.
@@ -253,9 +257,10 @@ def _filter(
     Rows that neither meets, as those of slow motion whose friction is not the law's, say nothing:
     the sum of squares that is compared is Tukey's, bounded. So those in which the joint creeps may
     stay: what changes fast there tells best. Of the first two neither is the rule: the likelier is
-    taken. The third has a number more, and its price: it takes more off than that, whether the
-    noise that a rate makes louder is taken off too, which is not known so well, or not. And it does
-    so by a parabola: where rows fall in and out of what is bounded there are other minima.
+    taken. Of the third the rows say as much as the squares that it takes off, whether the noise
+    that a rate makes louder is taken off too, which is not known so well, or not; what drives
+    usually have says the rest. The squares fall along a parabola: where rows fall in and out of
+    what is bounded there are other minima.
     """
     from scipy.optimize import minimize_scalar
 
@@ -291,9 +296,11 @@ def _filter(
             options={"xatol": SHARE_ERROR},
         )
         at, gain = float(found.x), unmet(0.0) - float(found.fun)
-        sure = min(gain, gain + louder(at) - louder(0.0)) > PRICE * math.log(len(friction))
-        if sure and unmet(0.0) - unmet(at / 2) > HALF_WAY * gain:
-            return Filter(whole * dt, better, at * dt, gain)
+        told = min(gain, gain + louder(at) - louder(0.0))
+        if told > 0 and unmet(0.0) - unmet(at / 2) > HALF_WAY * gain:
+            # a parabola that falls by `told` has an error of at * sqrt(PRICE / told)
+            at *= told / (told + PRICE * (at / USUAL_HALF) ** 2)
+            return Filter(whole * dt, better, at * dt, told)
     return Filter(whole * dt, better)
 
 

@@ -248,7 +248,20 @@ def test_a_held_out_record_is_read_through_the_filter_of_the_training_records() 
     data = load_dataset([runs[0]], [runs[1]], joint, prepared_model(joint, runs[0]))
     train, held_out = data.train[0], data.held_out[0]
     assert train.filters["drive"].behind < 0.0
-    assert held_out.filters["drive"].behind == 0.0, "of itself it tells none"
+    assert held_out.filters["drive"].gain < 0.2 * train.filters["drive"].gain, "it tells little"
     assert held_out.shifts["drive"] == pytest.approx(train.shifts["drive"], abs=1e-9)
     swapped = load_dataset([runs[1]], [runs[0]], joint, prepared_model(joint, runs[1]))
-    assert swapped.train[0].shifts["drive"] == swapped.held_out[0].shifts["drive"] == 0.0
+    shifts = [w.shifts["drive"] for w in (*swapped.train, *swapped.held_out)]
+    assert shifts[0] == pytest.approx(shifts[1], abs=1e-9)
+    assert shifts[0] < 0.0
+
+
+def test_how_far_a_filter_is_behind_is_weighed_with_what_drives_have() -> None:
+    """Where rows say something of half its cycle but not surely, it is no zero either: a zero
+    left 1.1 N over a floor of .6 N on this axis.
+    """
+    cycle, runs, joint = through_a_filter(13009)
+    data = load_dataset([runs[0]], [runs[1]], joint, prepared_model(joint, runs[0]))
+    said = data.train[0].filters["drive"]
+    assert 0 < said.gain < 30, "not surely"
+    assert said.behind / runs[0].dt == pytest.approx(-cycle / 2, abs=0.03)
