@@ -647,8 +647,10 @@ def curves_on(
     most: int = MOST_CURVES,
     certain: bool = True,
 ) -> Located:
-    """As `find_curves`, on a base from `steadily_moving`."""
+    """As `find_curves`, on a base from `steadily_moving`; none where no row moves steadily."""
     where = base.balances.index(balance)
+    if not np.any((base.block >= 0) & (base.balance == where)):
+        return Located(balance, (), before=np.zeros(0), after=np.zeros(0))
     evaluate = _unweighted(base)
     candidates = [c for c in _candidates(base, balance) if only is None or only(c)]
     open_ = [t for t in (_tried(c, base, evaluate) for c in candidates) if t is not None]

@@ -94,6 +94,15 @@ def test_a_table_over_speed_goes_on_as_a_line() -> None:
     assert y[2] - y[1] == pytest.approx(y[1] - y[0]) == pytest.approx(y[3] - y[2])
 
 
+def test_a_joint_that_never_moves_steadily_has_no_curve(runs: dict[str, Run]) -> None:
+    found = runs["bump"]
+    moving = steadily_moving(make_base(found.solution, found.data))
+    still = replace(moving, block=np.full_like(moving.block, -1))
+    told = curves_on(still, "axis", most=1, certain=False)
+    assert told.curves == ()
+    assert len(told.before) == len(told.after) == 0
+
+
 def test_a_number_that_no_row_tells_stays_and_does_not_disturb(runs: dict[str, Run]) -> None:
     found = runs["bump"]
     moving = steadily_moving(make_base(found.solution, found.data))
