@@ -337,10 +337,11 @@ def equivalences(
     for (place, _, balance), group in groups.items():
         found = _held_against(group, place, balance, named)
         if found is not None and not found.is_name:
-            # a joint that settles has less friction than its level, whatever the law
+            # a joint that settles has less friction than its level, whatever the law: what such
+            # rows alone say against a name says nothing
             moving = moving or steadily_moving(base, creeping=False)
             faster = _held_against(group, place, balance, moving)
-            found = faster if faster is not None and faster.is_name else found
+            found = faster if faster is not None and (faster.is_name or found.is_wrong) else found
         if found is not None:
             out |= {c.label: found for c in group}
     return out

@@ -277,7 +277,8 @@ def unbiased(problem: WeakForm, limits: Mapping[str, tuple[float, float]]) -> Un
     for equations in dict.fromkeys((better, start)):
         for moving in (moves, moves & ~problem.bent):
             found = equations.solved(bounds, moving)
-            share = found.largest_share(moving)
+            # where it began: a correction that ran away may end where all is noise
+            share = equations.largest_share(moving)
             hidden = found.rows @ found.rows <= began * (1 + MOST_HIDDEN * share / (1 - share))
             if hidden and found.as_near_as(start):
                 return Unbiased(dict(found.problem.values), found.noise, found.instruments)
