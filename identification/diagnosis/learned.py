@@ -4,7 +4,7 @@ does.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, final
 
@@ -344,7 +344,51 @@ def equivalences(
             found = faster if faster is not None and (faster.is_name or found.is_wrong) else found
         if found is not None:
             out |= {c.label: found for c in group}
+    for (place, _, balance), group in groups.items():
+        mark = out.get(group[0].label)
+        if mark is not None and mark.own and not mark.is_name:
+            beside = [
+                c
+                for c in claims
+                if c.balance == balance and c.label in places and c not in group
+                if not c.effect.common and (c.label not in out or out[c.label].is_name)
+            ]
+            out |= _parts_of_it(group, beside, (place, balance), named)
     return out
+
+
+def _parts_of_it(
+    group: Sequence[Claim], beside: Sequence[Claim], where: tuple[str, str], named: Base
+) -> dict[str, Equivalence]:
+    """Names that are asked for beside others which are no more than like a law, and not beside the
+    curve of the variable of these: both may be parts of that law.
+    """
+    balance, labels = where[1], {c.label for c in group}
+    own = _own(group, *where)
+    out: dict[str, Equivalence] = {}
+    for c in beside:
+        with_it = curves_on(lacking(named, labels), balance, own, most=1, certain=False)
+        without = curves_on(lacking(named, labels | {c.label}), balance, own, most=1, certain=False)
+        found = gain(without.after, with_it.after)
+        if with_it.curves and found.t < LEAST_T:
+            over = variable_of(group[0].effect).replace("_", " ")
+            said = f"{c.effect.title} or a part of one law of the {over}"
+            out[c.label] = Equivalence(1 - found.fall, 0.0, said, beaten=True)
+    return out
+
+
+def _own(group: Sequence[Claim], place: str, balance: str) -> Callable[[Candidate], bool]:
+    """Which tables are over the variable of names, or over any where they have none."""
+    over = variable_of(group[0].effect)
+    one_balance = balance in ("axis", "sum")
+
+    def own(candidate: Candidate) -> bool:
+        table = candidate.effect.table
+        if table is None or not (one_balance or candidate.place == place):
+            return False
+        return not over or table.over == over
+
+    return own
 
 
 def variable_of(effect: Effect) -> str:
@@ -364,15 +408,7 @@ def _tables() -> list[Table]:
 def _held_against(
     group: Sequence[Claim], place: str, balance: str, named: Base
 ) -> Equivalence | None:
-    over = variable_of(group[0].effect)
-    one_balance = balance in ("axis", "sum")
-
-    def own(candidate: Candidate) -> bool:
-        table = candidate.effect.table
-        if table is None or not (one_balance or candidate.place == place):
-            return False
-        return not over or table.over == over
-
+    over, own = variable_of(group[0].effect), _own(group, place, balance)
     beside = curves_on(named, balance, own, most=1, certain=False)
     if not beside.curves:
         return None

@@ -41,6 +41,7 @@ from identification.diagnosis.learned import (
 from identification.diagnosis.trials import make_base
 from identification.fitting.assess import assess
 from identification.fitting.engine import load_dataset, prepared_model, solve
+from tests.smooth_campaign import run as answer_to
 from workbench.cli.main import main
 
 NAMES: dict[str, Law] = {
@@ -290,6 +291,15 @@ def test_the_loop_marks_names_that_imitate_another_law(law: Law) -> None:
     assert found.claims or found.learned
     assert found.verdict == "unexplained"
     assert all("like" in c.as_json() for c in found.claims)
+
+
+def test_what_only_a_name_like_a_law_asks_for_is_a_part_of_that_law() -> None:
+    """A knee over the position is a spring, gravity and a gap together; beside a curve over the
+    position no gap is asked for.
+    """
+    found = answer_to(100342)
+    assert found.named == ()
+    assert "backlash or a part of one law of the position" in found.others
 
 
 def test_where_a_balance_fails_the_curve_is_a_claim(snag: Run) -> None:
