@@ -74,6 +74,8 @@ def test_the_page_says_what_the_terminal_says(tmp_path: Path, name: str, most: i
                     page.click("#nav-export")
         story = state_of(page, "improvement")
         left = sum(c["label"] not in story["joint_text"] for c in story["learned"])
+        stairs = page.evaluate("get('/view/staircase')")["names"]
+        assert (stairs[-1] == "+ learned curves") == bool(story["with_curves"])
         page.click("#nav-export")
         page.wait_for_selector("#get-joint-toml")
         said = f"It is without {left} of the learned curves"
