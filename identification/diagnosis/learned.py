@@ -345,8 +345,8 @@ def equivalences(
         if found is not None:
             out |= {c.label: found for c in group}
     for (place, _, balance), group in groups.items():
-        mark = out.get(group[0].label)
-        if mark is not None and mark.own and not mark.is_name:
+        said = out.get(group[0].label)
+        if said is not None and said.own and not said.is_name:
             beside = [
                 c
                 for c in claims

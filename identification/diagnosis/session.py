@@ -31,6 +31,7 @@ from identification.diagnosis.bench import Bench, JointBench, Progress
 from identification.diagnosis.claims import (
     HELD_OUT_DROP,
     LARGEST_SET,
+    MAJOR_DROP,
     SET_RMS,
     Claim,
     Ranking,
@@ -278,7 +279,7 @@ class Session:
                 continue
             share = len(standing.claims) / most
             self.progress(f"adding {best.key}", 0.2 + 0.6 * share if not lean else 0.65)
-            told = self._told_apart(claim, standing)
+            told = self._told_apart(claim, best, standing)
             if told is not None:
                 standing = told
                 base = self.bench.base(standing.now.solution)
@@ -657,9 +658,9 @@ class Session:
             ranking = self.bench.ranking(base)
         return _with_hints(standing), ranking, base
 
-    def _told_apart(self, new: Claim, standing: _Standing) -> _Standing | None:
+    def _told_apart(self, new: Claim, trial: Trial, standing: _Standing) -> _Standing | None:
         """A name of an earlier set that asks to be added beside it: where it alone does better,
-        it takes the set's place.
+        it takes the set's place, unless both together do better still: then both are missing.
         """
         for position, claim in enumerate(standing.claims):
             if new.effects[0] not in claim.effects[1:]:
@@ -678,6 +679,9 @@ class Session:
                 and held_drop(standing.now.held_out, told.now.held_out, claim.balance)
                 >= LEAST_ADDED_DROP
             ):
+                both = self.bench.added(trial, standing.now).held_out
+                if judged_drop(told.now.held_out, both, claim.balance) >= MAJOR_DROP:
+                    continue
                 self._refused[claim.label] = (
                     f"explains less than {EFFECTS[new.effects[0]].title} alone"
                 )

@@ -478,10 +478,17 @@ def test_what_is_alike_after_whole_fits_is_the_set(base: Base) -> None:
 
 def test_a_name_of_a_set_that_does_better_alone_takes_its_place(base: Base) -> None:
     first = {"cyclic_torque": {"p": 0.95}}
-    laws = {"added_spring": {"p": 1.0}, "cyclic_torque": {"p": 0.97, "q": 1.0}}
+    laws = {"added_spring": {"p": 1.0}, "cyclic_torque": {"p": 0.9998, "q": 1.0}}
     found = ended(World(base, {"p": 24.0, "q": 8.0}, laws, first))
     assert named(found) == ["cyclic_torque"]
     assert "alone" in found.why("added_spring")
+
+
+def test_both_names_of_a_set_stay_where_either_alone_leaves_what_both_explain(base: Base) -> None:
+    first = {"cyclic_torque": {"p": 0.95}}
+    laws = {"added_spring": {"p": 1.0}, "cyclic_torque": {"p": 0.97, "q": 1.0}}
+    found = ended(World(base, {"p": 24.0, "q": 8.0}, laws, first))
+    assert named(found) == ["added_spring", "cyclic_torque"]
 
 
 def test_a_name_of_a_set_that_does_worse_alone_is_added_beside_it(base: Base) -> None:
