@@ -52,6 +52,8 @@ UNSEEN: Final = 1.0
 """Standard deviations, over all rows together, by which a change of a shape by all of its size must
 move them to be seen at all."""
 
+LEAST_UNIT: Final = 1e-9
+"""Least length that counts as noise: any fall in units of it is none."""
 MINOR_DROP: Final = 2.5
 """Cross-validated fall from which a small effect is told [%]: a quarter of what a claim asks."""
 DEPENDENT: Final = 1e-9
@@ -600,12 +602,12 @@ def _unit(
         (_noise_alone(model, base.data, own), base.noise_alone),
         (_torques_alone(model, base.data, own), base.torques_alone),
     )
-    return np.array(
-        [
-            min([1.0, *(after[b] / before[b] for after, before in pairs if before[b] > 0)])
-            for b in base.balances
-        ]
-    )
+    unit = [
+        min([1.0, *(after[b] / before[b] for after, before in pairs if before[b] > 0)])
+        for b in base.balances
+    ]
+    # a candidate that takes a torque out of its balance wholly has no noise of it to be counted in
+    return np.maximum(unit, LEAST_UNIT)
 
 
 def _torques_alone(

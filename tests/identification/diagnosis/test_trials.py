@@ -19,6 +19,7 @@ from identification.balance.balances import balances_of
 from identification.data.check.gate import passed
 from identification.data.joint_file import Joint, Known, load_joint
 from identification.data.read import read
+from identification.diagnosis import trials
 from identification.diagnosis.candidates import Candidate, NotTestable
 from identification.diagnosis.claims import MAJOR_DROP
 from identification.diagnosis.trials import (
@@ -292,6 +293,17 @@ def test_the_law_that_is_there_is_found_with_its_size(base: Base) -> None:
         for key in ("stribeck", "added_spring", "quadratic_drag")
         if isinstance(t := try_candidate(candidate(base, key), base), Trial)
     )
+
+
+def test_a_fall_counts_for_nothing_where_a_torque_leaves_its_balance(
+    base: Base, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As where a candidate sends the inertia of a balance to nothing, and its torque with it."""
+    assert base.torques_alone[base.balances[0]] > 0
+    monkeypatch.setattr(trials, "_torques_alone", lambda *_: dict.fromkeys(base.balances, 0.0))
+    found = tried(base, "cyclic_torque")
+    assert found.cv_drop_percent > 70
+    assert found.beyond_noise(found.cv_drop_percent) < 0
 
 
 def test_the_figures_of_a_trial_by_plain_sums(base: Base) -> None:
