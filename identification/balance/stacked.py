@@ -20,7 +20,7 @@ from identification.balance.dataset import Dataset
 from identification.balance.drawn_noise import draws_of
 from identification.balance.memory import numbers_of
 from identification.balance.slow_noise import drift_of_rest
-from identification.balance.weak import JUMPING, WeakRecord, whole
+from identification.balance.weak import WeakRecord, whole
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -572,9 +572,9 @@ def _between_samples(
             told = sum((k * w.between[c] for k, c in entering), np.zeros(w.rows))
             noise = math.hypot(
                 *(
-                    k * data.sources[read].after(w.grid.alternating(order), w.grid.dt)
-                    for k, (read, order) in ((k, JUMPING[c]) for k, c in entering)
-                    if read in data.sources
+                    k * data.sources[c].after(w.grid.alternating, w.grid.dt)
+                    for k, c in entering
+                    if c in data.sources
                 )
             )
             parts.append(np.sqrt(np.maximum(told**2 - (SURE_JUMP * noise) ** 2, 0.0) / 3))

@@ -36,16 +36,8 @@ POSITION_CHAINS: Final = {
 PAIR: Final = ("motor_position", "link_position")
 """Positions of which the difference is the torsion."""
 
-JUMPING: Final[Mapping[str, tuple[str, int]]] = {
-    "torque": ("torque", 0),
-    "drive": ("drive", 0),
-    "coupling_torque": ("coupling_torque", 0),
-    "torque_rate": ("torque", 1),
-    "drive_rate": ("drive", 1),
-}
-"""Signals that may jump or bend between two samples: what was read, and how often it is derived.
-The rate is in the balance of a reading that comes through a low-pass: there a jump is a corner.
-"""
+TORQUES: Final = ("torque", "drive", "coupling_torque")
+"""Measured signals that may jump between two samples."""
 
 HIGHEST_DERIVATIVE: Final = 4
 CLAIM_KERNEL: Final = 0.06
@@ -193,12 +185,12 @@ class Grid:
     pointwise: Mapping[str, float]
     torsion: float = 0.0
 
-    def alternating(self, order: int) -> FloatArray:
-        """The kernel, or its derivative, with every other weight turned round: nothing is left of
-        what the samples resolve, and half of the weight of a sample of what jumps between two of
-        them.
+    @property
+    def alternating(self) -> FloatArray:
+        """The kernel with every other weight turned round: nothing is left of what the samples
+        resolve, and half of the weight of a sample of what jumps between two of them.
         """
-        weights = differentiated_kernel(self.length, self.dt, order)
+        weights = differentiated_kernel(self.length, self.dt, 0)
         return np.asarray(weights * (-1.0) ** np.arange(len(weights)), dtype=np.float64)
 
     def velocity_noise(self, source: str, noise: ChannelNoise) -> float:
@@ -302,8 +294,8 @@ class WeakRecord:
         Kernel average of "this side stands still" (0 to 1), by side: motor, link, and
         :data:`HELD_READINGS`.
     between : mapping of str to (rows,) array
-        What the average of a measured torque, or of its rate, over every other sample differs by
-        from that over the samples between them, halved.
+        What the average of a measured torque over every other sample differs by from that over the
+        samples between them, halved.
     support : (rows,) array, optional
         Share of each row's kernel that was measured and not bridged; 1 everywhere where it is None.
     bridging : mapping of str to (samples,) array
@@ -573,10 +565,10 @@ def prepare(
             )
     between = {
         n: before.between[n]
-        if before is not None and read in over
-        else grid.correlate((readings or {}).get(read, signals[read]), grid.alternating(order))
-        for n, (read, order) in JUMPING.items()
-        if read in signals
+        if before is not None and n in over
+        else grid.correlate((readings or {}).get(n, signals[n]), grid.alternating)
+        for n in TORQUES
+        if n in signals
     }
     stamps = grid.pick(time)
     numbers = np.concatenate(

@@ -24,6 +24,7 @@ from smooth_laws import (
 )
 
 from identification.data.joint_file import Joint, load_joint
+from identification.data.read import read
 from identification.diagnosis.candidates import Candidate
 from identification.diagnosis.claims import Claim
 from identification.diagnosis.curve import curves_on, lacking, squares_left, steadily_moving
@@ -41,6 +42,7 @@ from identification.diagnosis.learned import (
 from identification.diagnosis.trials import make_base
 from identification.fitting.assess import assess
 from identification.fitting.engine import load_dataset, prepared_model, solve
+from tests.recorded_world.world import make_case, write_case
 from tests.smooth_campaign import run as answer_to
 from workbench.cli.main import main
 
@@ -300,6 +302,17 @@ def test_what_only_a_name_like_a_law_asks_for_is_a_part_of_that_law() -> None:
     found = answer_to(100342)
     assert found.named == ()
     assert "backlash or a part of one law of the position" in found.others
+
+
+def test_what_slow_rows_alone_say_against_a_name_says_nothing(tmp_path: Path) -> None:
+    """Of a joint that creeps at its turns: dry friction under its level bends the curve there."""
+    folder = write_case(make_case(13312, names=("stribeck",), size=1.0), tmp_path, "all")
+    joint = load_joint(folder / "joint.toml")
+    train, held = (read(folder / f"{n}.csv", joint=joint) for n in ("train", "test"))
+    found = improve(train, joint, [held])
+    assert found.added == ("stribeck",)
+    errors = [s.held_out.relative_error_percent for s in found.steps]
+    assert errors[1] < 0.3 * errors[0]
 
 
 def test_where_a_balance_fails_the_curve_is_a_claim(snag: Run) -> None:

@@ -256,3 +256,18 @@ def test_a_neighbour_of_a_parameter_at_its_bound_is_less_sure_than_without_that_
     assert least is not None
     assert error > 1.2 * least
     assert abs(found.values["link_coulomb"] - true["link_coulomb"]) < 2 * error
+
+
+def test_what_noise_is_taken_off_by_does_not_run_away_from_a_law_with_shapes(
+    tmp_path: Path,
+) -> None:
+    """On steps at 100 Hz the correction sent Coulomb friction to zero and Stribeck friction to 580
+    N.m, with six times the squares: more than the noise can have hidden where it began.
+    """
+    case = make_case(13306, names=("stribeck",), size=1.0)
+    folder = write_case(case, tmp_path, "all")
+    joint = load_joint(folder / "joint.toml")
+    joint = replace(joint, effects=(*joint.effects, "stribeck@motor"))
+    found = fit(joint, read(folder / "train.csv", joint=joint)).solution.values
+    assert found["motor_coulomb"] == pytest.approx(case.values["M_TC"], rel=0.3)
+    assert found["motor_stribeck_extra"] == pytest.approx(case.values["M_TS"], rel=0.3)
