@@ -7,6 +7,7 @@ side by side.
 
 from __future__ import annotations
 
+import argparse
 import ast
 import io
 import json
@@ -327,7 +328,11 @@ def demo_calls(root: Path = ROOT) -> tuple[int, int]:
 
 def main() -> None:
     """Print the table."""
-    root = Path(sys.argv[1]).resolve() if len(sys.argv) > 1 else ROOT
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", nargs="?", type=Path, default=ROOT, help="another checkout")
+    root = parser.parse_args().folder.resolve()
+    if not modules(root):
+        parser.error(f"{root} holds none of {', '.join(LAYERS)}: give the folder of a checkout")
     found = circles(root)
     library, comments = lines(root, LAYERS)
     tests, _ = lines(root, ("tests",))

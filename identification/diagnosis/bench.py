@@ -22,6 +22,7 @@ from identification.diagnosis.claims import Claim, Ranking, rank
 from identification.diagnosis.curve import Curve
 from identification.diagnosis.improvement import Step, visible_keys
 from identification.diagnosis.learned import (
+    LEARNED,
     Doubt,
     Equivalence,
     LearnedClaim,
@@ -370,7 +371,7 @@ class JointBench:
         kept = carried(step.solution, learned, self.data)
         if not kept:
             return (), None
-        return kept, self.shown(self.step("learned", None, with_curves(step.solution, kept)))
+        return kept, self.shown(self.step(LEARNED, None, with_curves(step.solution, kept)))
 
     def held_against(self, claims: Sequence[Claim], step: Step) -> Mapping[str, Equivalence]:
         """See :func:`identification.diagnosis.learned.equivalences`; worked out once a model."""

@@ -44,7 +44,8 @@ class Step:
     Attributes
     ----------
     added : str or None
-        Key of the effect that was added (None for the start model), "learned" for curves.
+        Key of the effect that was added (None for the start model);
+        :data:`~identification.diagnosis.learned.LEARNED` for curves.
     effects : tuple of str
         Keys in the model.
     train, held_out : Error

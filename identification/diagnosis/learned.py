@@ -38,6 +38,8 @@ from identification.fitting.engine import Solution
 
 FloatArray = npt.NDArray[np.float64]
 
+LEARNED: Final = "learned"
+"""What stands in the place of an effect's key for curves without a name."""
 EQUIVALENT: Final = 0.01
 """Share of what a curve explains that a name may miss: true names miss .6 % at most, the best wrong
 name on a law outside the library 18 % in the median and 5 % in one of twenty."""
@@ -129,7 +131,7 @@ class LearnedClaim:
         """The shape of a claim in `improve --json`."""
         drop = self.held_out_drop_percent
         return {
-            "effects": ["learned"],
+            "effects": [LEARNED],
             "balance": self.balance,
             "label": self.curve.label,
             "held_out_drop_percent": drop if np.isfinite(drop) else 100 * self.curve.gain.fall,

@@ -270,6 +270,9 @@ class Session:
             label = best.candidate.label
             self._near[label] = _behind(best, ranking)
             if len(claim.effects) > LARGEST_SET:
+                best, claim = self._fewer(best, claim, ranking, base, standing.now)
+                label = best.candidate.label
+            if len(claim.effects) > LARGEST_SET:
                 unnamed = unnamed or claim
                 for t in ranking.everything:
                     if t.key in claim.effects:
@@ -603,6 +606,31 @@ class Session:
         others = names if found.key in names else tuple(t.key for t in alike)
         kept |= set(others) - set(left)
         return found, (found.key, *(k for k in others if k in kept and k != found.key))
+
+    def _fewer(
+        self, best: Trial, claim: Claim, ranking: Ranking, base: Base, now: Step
+    ) -> tuple[Trial, Claim]:
+        """The same claim with the names that whole fits leave, where the trials leave too many for
+        an answer: one block that no law meets makes trials alike that are hundreds of nats apart.
+        """
+        after = self.bench.added(best, now)
+        last = self.bench.ranking(self.bench.base(after.solution))
+        odds = self.bench.odds(claim, _behind(best, ranking), after, last)
+        if odds is None or odds.empty or not 0 < len(odds.rivals) <= LARGEST_SET:
+            return best, claim
+        first = odds.rivals[0].label
+        trial = next(
+            (
+                t
+                for t in ranking.everything
+                if t.candidate.label == first and first in ranking.significant
+            ),
+            None,
+        )
+        if trial is None:
+            return best, claim
+        self._doubted.update(odds.behind)
+        return trial, make_claim(trial, ranking, base, odds.names)
 
     def _by_whole_fits(
         self, standing: _Standing, ranking: Ranking, base: Base, *, stale: bool

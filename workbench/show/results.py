@@ -22,6 +22,7 @@ from identification.data.formats import (
     with_error,
     words,
 )
+from identification.diagnosis.learned import LEARNED
 from workbench.show.pictures import bar, place_picture, staircase_picture
 from workbench.show.words import CURVES, headline
 from workbench.show.words import title_of as effect_title
@@ -136,7 +137,7 @@ def step_names(result: Mapping[str, Any]) -> list[str]:
         "start model"
         if s["added"] is None
         else CURVES
-        if s["added"] == "learned"
+        if s["added"] == LEARNED
         else " or ".join(effect_title(k) for k in sets.get(s["added"], [s["added"]]))
         for s in stairs_of(result)
     ]

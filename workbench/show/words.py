@@ -13,6 +13,7 @@ from typing import Any, Final, final
 from casadi_models import EFFECTS
 from identification.data.formats import words
 from identification.diagnosis.improve import Improvement
+from identification.diagnosis.learned import LEARNED
 from identification.diagnosis.locate import Unexplained
 
 
@@ -133,7 +134,7 @@ def step_lines(found: Improvement) -> list[str]:
     lines.append(f"{'step':<32} {'train %':>8} {'held-out %':>10}   residual over noise floor")
     for step in found.stairs:
         ratios = "  ".join(f"{b} {e.ratio:.3g}" for b, e in step.held_out.balances.items())
-        what = CURVES if step.added == "learned" else step.added
+        what = CURVES if step.added == LEARNED else step.added
         name = f"+ {what}" if what else "start model"
         lines.append(
             f"{name:<32} {step.train.relative_error_percent:8.3f} "
