@@ -312,6 +312,20 @@ class _Builder:
                 found = found + t.effect.law(self.local(t, view), t.bound(self.symbols.parameters))
         return found
 
+    def load(self, view: _View) -> Expression:
+        """What presses the gear's teeth: the torque where one is known, else what the link's own
+        gravity and motion ask for.
+        """
+        signals = view.signals
+        if self.model.load_from == "torque":
+            return signals.torque
+        asked = self.gravity(view)
+        if self.model.load_from == "motion":
+            # the link's acceleration by the finer of two encoders, or the only one
+            inertia = self.model.swinging_inertia(self.symbols.parameters)
+            asked = asked + inertia * signals.motor_acceleration
+        return asked
+
     def levers(self, error: Expression) -> tuple[Expression, Expression]:
         """Shares of the transmitted torque from the virtual work of the kinematic error."""
         raw = self.symbols.signals
@@ -371,7 +385,7 @@ def build_equations(model: Structure, symbols: Symbols, *, sensors: bool) -> Equ
     error = builder.total("torsion", _View(s, twist, s.torque, _zero(), _zero()))
     torsion = twist - error
     unloaded = _View(s, torsion, _zero(), _zero(), _zero())
-    load = s.torque if model.load_from == "torque" else builder.gravity(unloaded)
+    load = builder.load(unloaded)
     view = _View(s, torsion, load, _zero(), _zero())
     motor_lever, link_lever = builder.levers(error)
     beyond_gap = builder.beyond(view)
@@ -464,7 +478,7 @@ def swept(model: Structure, symbols: Symbols) -> tuple[Expression, Expression]:
     twist = bare_twist(model, s)
     torsion = twist - builder.total("torsion", _View(s, twist, s.torque, _zero(), _zero()))
     view = _View(s, torsion, _zero(), _zero(), _zero())
-    load = s.torque if model.load_from == "torque" else builder.gravity(view)
+    load = builder.load(view)
     view = replace(view, load=load)
     beyond, rate = builder.beyond(view), ca.SX.sym("rate")
     states = ca.vertcat(*(z for zs in symbols.memory.values() for z in zs))
@@ -524,7 +538,7 @@ def placed_laws(
     builder, s = _Builder(model, symbols), symbols.signals
     zero = _zero()
     outside = _View(s, torsion, zero, zero, zero)
-    load = s.torque if model.load_from == "torque" else builder.gravity(outside)
+    load = builder.load(outside)
     views = {
         "drive": _View(s, zero, zero, s.drive, s.drive_rate),
         "torsion": _View(s, bare_twist(model, s), s.torque, zero, zero),

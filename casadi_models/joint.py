@@ -75,8 +75,9 @@ class JointModel:
     virtual_work : bool
         True (default): the motor also feels -T d(err)/d(q_m) of a kinematic error. False: the
         thesis's approximation (2.58).
-    load_from : {"torque", "gravity"}
-        What presses the gear's teeth in load-dependent laws.
+    load_from : {"torque", "motion", "gravity"}
+        What presses the gear's teeth in load-dependent laws: the torque, what gravity and the
+        link's inertia ask for, or gravity alone where that inertia has no name of its own.
     clamped_link : bool
         True for a torque-against-displacement test: the torsion is the position itself.
     lagging_load : bool

@@ -30,7 +30,7 @@ from identification.balance.beside import (
     rest_beside,
     scaled,
 )
-from identification.balance.weak import Filter, WeakRecord
+from identification.balance.weak import PAIR, Filter, WeakRecord
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -317,7 +317,8 @@ def _parts(
     """
     a = {n: x[kept] for n, x in made.averaged.items()}
     if place == "torque_sensor":
-        motion, column = motion_of(a, "link"), -a["torque_rate"]
+        side = "link" if "link_position" in a else "motor"
+        motion, column = motion_of(a, side), -a["torque_rate"]
         if through_motor:
             through = scaled(np.column_stack([*motion_of(a, "motor"), column]))
             motion = [through @ np.linalg.lstsq(through, x, rcond=None)[0] for x in motion]
@@ -366,10 +367,11 @@ def lateness(made: WeakRecord, place: str, *, torque: bool) -> tuple[float, floa
     a = {n: x[kept] for n, x in made.averaged.items()}
     if place not in ENCODERS:
         late, error = _slope(*_parts(made, place, kept, torque=torque))
-        if place == "torque_sensor" and "motor_position" in a:
+        if place == "torque_sensor" and set(PAIR) <= set(a):
             sure = _slope(*_parts(made, place, kept, torque=torque, through_motor=True))
             if abs(late - sure[0]) > UNLIKE * sure[1]:
                 late, error = sure
+        if place == "torque_sensor" and set(PAIR) <= set(a):
             # read against the link's encoder, which may itself be late by less than it is shifted
             own, own_error, _ = lateness(made, "link_position_sensor", torque=torque)
             late, error = late + own, math.hypot(error, own_error)

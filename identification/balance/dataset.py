@@ -626,4 +626,12 @@ def prepared_model(joint: Joint, record: Record) -> JointModel:
     if sensing.has_drive and not record.has("motor_torque") and not adapted.named("delay", "drive"):
         adapted = adapted.add(HOLD_DELAY)
     lagging = seen_from_the_motor(sensing, joint) and sensing.has_drive
-    return replace(adapted, lagging_load=lagging, calibration=unknowns_of(adapted, sensing))
+    # the link's own motion loads the gear, where its inertia has a name
+    moved = lagging or (sensing.both_positions and "link_inertia" in adapted.inertias)
+    load = "motion" if moved and not sensing.has_torque else adapted.load_from
+    return replace(
+        adapted,
+        lagging_load=lagging,
+        load_from=load,
+        calibration=unknowns_of(adapted, sensing),
+    )

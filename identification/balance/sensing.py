@@ -301,7 +301,7 @@ def adapt(
     model: JointModel, sensing: Sensing, known: Mapping[str, object] | None = None
 ) -> JointModel:
     """The model in the form these channels can carry: one inertia for one balance, load from
-    gravity without a torque sensor.
+    gravity and motion without a torque sensor.
     """
     if sensing.clamped_link:
         # torque against twist shows the transmission, whatever else the model has or has not

@@ -15,6 +15,7 @@ from identification.balance.colour import Part
 from identification.balance.dataset import without
 from identification.balance.sensing import Sensing
 from identification.balance.stacked import drifts_beside
+from identification.balance.weak import CLAIM_KERNEL
 from identification.data.joint_file import Joint
 from identification.data.record import Record
 from identification.diagnosis.candidates import offered
@@ -126,6 +127,9 @@ class Bench(Protocol):
     def same_sign(self, trial: Trial, solution: Solution) -> bool:
         """Whether a small effect has the same sign at half and at double kernel."""
 
+    def slower(self, factor: float) -> Bench | None:
+        """The same records with a longer kernel; None where there is none."""
+
     def odds(
         self, claim: Claim, near: Mapping[str, float], now: Step, last: Ranking
     ) -> Odds | None:
@@ -161,6 +165,7 @@ class JointBench:
         like: Sensing | None = None,
     ) -> None:
         self.joint, self.data, self._like = joint, data, like
+        self._slower: dict[float, JointBench] = {}
         self._train, self._held = list(train), list(held)
         self._solved: dict[tuple[object, ...], Solution] = {}
         self._stepped: dict[tuple[object, ...], Solution] = {}
@@ -414,6 +419,21 @@ class JointBench:
         if contest.ahead[0, 0] > FEWEST:  # what a wrong name leaves is not what is unmodelled
             last = self.ranking(self.base(contest.leader.solution))
         return odds_of(contest, unmodelled(last, claim.balance))
+
+    def slower(self, factor: float) -> JointBench | None:
+        """See :class:`Bench`; made once. A motor alone is seen at a long kernel from the start."""
+        if self.data.kernel > CLAIM_KERNEL or self.data.sensing.one_sided:
+            return None
+        if factor not in self._slower:
+            data = replace(
+                self._at_kernel(self.data.kernel * factor),
+                orders=self.data.orders,
+                other_orders=self.data.other_orders,
+            )
+            made = JointBench(self.joint, data, self._train, self._held, like=self._like)
+            made._kernels |= self._kernels
+            self._slower[factor] = made
+        return self._slower[factor]
 
     def _at_kernel(self, length: float) -> Dataset:
         """The same records with another kernel, prepared once."""

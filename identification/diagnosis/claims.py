@@ -90,6 +90,8 @@ class Claim:
     confidence : mapping of str to float
         Chance of each name that it is the one that is missing, from the likelihoods of whole fits;
         empty where none were made.
+    kernel : float or None
+        Length of the rows that show it [s], where those of the claims' own kernel are too noisy.
     """
 
     effects: tuple[str, ...]
@@ -101,6 +103,7 @@ class Claim:
     contribution: float = 0.0
     like: str = ""
     confidence: Mapping[str, float] = field(default_factory=dict)
+    kernel: float | None = None
 
     @property
     def effect(self) -> Effect:
@@ -129,6 +132,8 @@ class Claim:
             out["partial"] = True
         if self.like:
             out["like"] = self.like
+        if self.kernel is not None:
+            out["kernel_s"] = self.kernel
         if self.confidence:
             out["confidence"] = dict(self.confidence)
         return out

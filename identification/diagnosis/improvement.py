@@ -20,7 +20,7 @@ from identification.diagnosis.lines import Line
 from identification.diagnosis.locate import Unexplained
 from identification.diagnosis.outcome import Refusal, outcome_of, why_not
 from identification.diagnosis.trials import Trial
-from identification.fitting.assess import BalanceError, Error
+from identification.fitting.assess import RATIO_LIMIT, BalanceError, Error
 from identification.fitting.engine import Solution
 from identification.fitting.joint_text import joint_text
 from identification.fitting.parameters import parameter_table
@@ -263,9 +263,16 @@ def made_worse(before: Error, after: Error) -> str:
 
     Balances are compared by their RMS on one weighting, common to both models. A floor alone
     refuses nothing: a balance is spoilt where its own RMS rises, and above what noise explains
-    under the larger of both floors.
+    under the larger of both floors; and where it was noise and is none any more. A law that takes
+    over what a stiffness carries leaves less of the encoders' noise, and structure in it.
     """
     for b, e in after.balances.items():
+        was = before.balances[b].ratio
+        if was <= SPOILT_RATIO and e.ratio > RATIO_LIMIT:
+            return (
+                f"what was noise in the {b} balance on held-out records ({was:.3g} times its "
+                f"floor) is {e.ratio:.3g} times what noise leaves with it"
+            )
         old, new = common_rms(before, after, b)
         floor = max(before.balances[b].floor, e.floor)
         if new > SPOILT_RISE * old and e.rms > SPOILT_RATIO * floor:

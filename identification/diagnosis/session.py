@@ -72,6 +72,10 @@ from identification.fitting.engine import Solution, load_dataset, prepared_model
 from identification.naming.odds import SCREEN
 
 MAX_ADDITIONS: Final = 6
+SLOWER: Final = (2.0, 4.0)
+"""Kernels, in units of that of the claims, at which the library is tried where that one shows
+nothing more: the noise of a position in the torque of an inertia falls with the length to the power
+of 2.5, and a law of speed or place hardly changes."""
 ATTEMPTS: Final = 2 * MAX_ADDITIONS
 """Candidates that are taken up at most, named or refused; the same however few additions are
 asked for.
@@ -178,6 +182,7 @@ class Session:
         self._doubted: dict[str, str] = {}
         self._located: dict[str, str] = {}
         self._near: dict[str, Mapping[str, float]] = {}
+        self._asked: set[tuple[object, ...]] = set()
 
     @property
     def data(self) -> Dataset:
@@ -249,6 +254,13 @@ class Session:
             best = ranking.best(self._out(ranking, aside))
             may_move = not late and not self.data.sensing.one_sided
             over = max(e.ratio for e in standing.now.held_out.balances.values()) > RATIO_LIMIT
+            if best is None:
+                slower = self._at_slower(standing)
+                if slower is not None:
+                    standing = slower
+                    base = self.bench.base(standing.now.solution)
+                    ranking = self.bench.ranking(base)
+                    continue
             if best is None and may_move and over:
                 late = True
                 ranking = self.bench.ranking(base, late=True)
@@ -607,6 +619,35 @@ class Session:
         kept |= set(others) - set(left)
         return found, (found.key, *(k for k in others if k in kept and k != found.key))
 
+    def _at_slower(self, standing: _Standing) -> _Standing | None:
+        """The steps with a name that only rows of a longer kernel show; None where there is none.
+
+        Asked once of a model, where nothing else is left to claim.
+        """
+        now = standing.now.solution
+        if now.model.structure in self._asked:
+            return None
+        self._asked.add(now.model.structure)
+        for factor in SLOWER:
+            bench = self.bench.slower(factor)
+            if bench is None:
+                return None
+            inner = Session(bench)
+            inner._refused.update(self._refused)
+            found = inner.diagnose(bench.fitted(now.model, now.values, again=True))
+            if not found.claims:
+                continue
+            claim = replace(found.claims[0], kernel=bench.data.kernel, partial=False)
+            model = with_effect(now.model, claim.label)
+            start = {**now.values, **found.steps[-1].solution.values}
+            after = self.bench.step(
+                claim.effects[0], claim.label, self.bench.fitted(model, start, again=True)
+            )
+            if made_worse(standing.now.held_out, after.held_out):
+                continue
+            return _Standing((*standing.steps, after), (*standing.claims, claim))
+        return None
+
     def _fewer(
         self, best: Trial, claim: Claim, ranking: Ranking, base: Base, now: Step
     ) -> tuple[Trial, Claim]:
@@ -648,6 +689,8 @@ class Session:
         while position + 1 < len(standing.claims):
             position += 1
             claim = standing.claims[position]
+            if claim.kernel is not None:
+                continue
             if stale:
                 base = self.bench.base(standing.now.solution)
                 ranking, stale = self.bench.ranking(base), False
@@ -846,6 +889,8 @@ class Session:
         last = standing.now.solution
         for claim in standing.claims[:-1]:
             needed = {n for c in current if c is not claim for n in c.effect.needs}
+            if claim.kernel is not None:  # these rows say little of it
+                continue
             if claim.effect.stage == "structure" or claim.effects[0] in needed:
                 continue
             if without(last.model, claim.label).terms == last.model.terms:

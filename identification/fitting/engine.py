@@ -145,7 +145,10 @@ def solve(
     if not model.lagging_load or LOAD_COMPLIANCE.name in data.joint.known:
         return _fitted(model, data, iterations, start or {}, progress)
     tied = {**(start or {}), LOAD_COMPLIANCE.name: 0.0}
-    rigid = _fitted(model, data, iterations, tied, progress, frozenset(HANGING))
+    # what hangs on the link loads the gear, however stiff it is
+    loaded = any(t.effect.needs_load for t in model.terms)
+    held = frozenset((LOAD_COMPLIANCE.name,) if loaded else HANGING)
+    rigid = _fitted(model, data, iterations, tied, progress, held)
     swinging = _swings(rigid, data)
     if swinging is None:
         return rigid

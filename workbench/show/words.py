@@ -161,7 +161,9 @@ def finding_lines(found: Improvement) -> list[str]:
         )
         lines.append(
             f"{said}: {names}, {claim.balance} balance, held-out RMS falls by "
-            f"{claim.held_out_drop_percent:.1f} %{rest}"
+            f"{claim.held_out_drop_percent:.1f} %"
+            + (f" of rows of {claim.kernel:.2g} s" if claim.kernel is not None else "")
+            + rest
         )
         if claim.confidence:
             lines.append(f"  by the likelihoods of whole fits: {claim.surety}")
@@ -185,10 +187,15 @@ def finding_lines(found: Improvement) -> list[str]:
     lines += [f"learned: {learned.sentence}" for learned in found.learned]
     for c in found.calibration:
         if c.bounded:
+            would = (
+                "a motion that changes faster would"
+                if found.data.sensing.has_torque
+                else "a torque sensor would"
+            )
             lines.append(
                 f"calibration bounded: {c.what} of {c.sensor} in {found.data.train_names[c.run]} "
                 f"within {2 * (c.stderr or 0.0):.2g} {c.unit} of {c.value:.4g} {c.unit}; these "
-                "records cannot tell it from viscous friction, a torque sensor would"
+                f"records cannot tell it from viscous friction, {would}"
             )
         elif c.stderr is not None and abs(c.value) > 2 * c.stderr:
             name = found.data.train_names[c.run]
