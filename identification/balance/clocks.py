@@ -30,7 +30,7 @@ from identification.balance.beside import (
     rest_beside,
     scaled,
 )
-from identification.balance.weak import PAIR, Filter, WeakRecord
+from identification.balance.weak import Filter, WeakRecord
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -76,6 +76,11 @@ second order is then off by, is what :data:`NEAR` leaves.
 """
 LOW_PASSED: Final = frozenset({"drive"})
 """Places whose readings may come through a low-pass and not late: drives filter their current."""
+BEGUN: Final = (-3.0, -1.0, 1.0, 3.0)
+"""Shifts of a torque from which its lateness is looked for beside the motor alone [samples]: none
+of up to :data:`MOST_SKEW` is farther than a sample from one of them or from zero."""
+INDEPENDENT: Final = 0.4
+"""Share of the rows that count as independent: four to a kernel length."""
 SURE: Final = 4.53
 """Standard errors by which a channel must be late: of an error from eight stretches (Student's t,
 seven degrees of freedom) as rare as three of a known one."""
@@ -194,9 +199,11 @@ def in_time(
     fast : callable
         As `make`, with a short kernel: a filter and a wait are alike in all that is slow.
     """
-    shifts: dict[str, float] = {}
     filters: dict[str, Filter] = {}
-    made, wanted = make(shifts), tuple(places)
+    made, wanted = make({}), tuple(places)
+    beside_motor = torque and "torque_sensor" in wanted and _one_sided(made.averaged)
+    shifts = _begun(make, made) if beside_motor else {}
+    made = make(shifts) if shifts else made
     for _ in range(SHIFTS):
         moved = dict(shifts)
         for place in wanted:
@@ -213,6 +220,8 @@ def in_time(
         other, late = make(unshifted), shifts[place] * made.grid.dt
         found = [lateness(x, place, torque=torque)[0] for x in (other, made)]
         taken = (found[0] - found[1]) / late > ANSWERS
+        if beside_motor and place == "torque_sensor":
+            taken = taken or _explains(made, other)
         # what is later than that is no filter of a drive
         if taken and place in LOW_PASSED and abs(shifts[place]) <= MOST_SKEW:
             # noise is one whatever the kernel
@@ -304,6 +313,31 @@ def _filter(
     return Filter(whole * dt, better)
 
 
+def _begun(
+    make: Callable[[Mapping[str, float]], WeakRecord], alone: WeakRecord
+) -> dict[str, float]:
+    """Where the search for the lateness of a torque begins beside the motor alone: its rate is that
+    of the drive but for an inertia, and a straight line reaches no farther than a sample.
+    """
+    tried = [make({"torque_sensor": shift}) for shift in BEGUN]
+    best = min(range(len(tried)), key=lambda k: _unexplained(tried[k]))
+    return {"torque_sensor": BEGUN[best]} if _explains(tried[best], alone) else {}
+
+
+def _explains(shifted: WeakRecord, alone: WeakRecord) -> bool:
+    """Whether a shift certainly lowers what the drive leaves beside the torque and the motion."""
+    nats = 0.5 * INDEPENDENT * alone.rows * math.log(_unexplained(alone) / _unexplained(shifted))
+    return nats > SURE**2 / 2
+
+
+def _unexplained(made: WeakRecord) -> float:
+    """Mean square of what the drive leaves beside the motion, the torque and their rates."""
+    kept = steady(made)
+    values, others, column = _parts(made, "torque_sensor", kept, torque=True)
+    curve = any_curve(made, "motor_velocity", kept)
+    return float(np.mean(rest_beside(values, [*others, column, curve], 1) ** 2))
+
+
 def _parts(
     made: WeakRecord,
     place: str,
@@ -317,15 +351,28 @@ def _parts(
     """
     a = {n: x[kept] for n, x in made.averaged.items()}
     if place == "torque_sensor":
-        side = "link" if "link_position" in a else "motor"
-        motion, column = motion_of(a, side), -a["torque_rate"]
+        if _one_sided(a):
+            # a soft joint's torque is no law of the motor's motion: it is part of what drives it
+            drives = [*motion_of(a, "motor"), a["torque"], -a["drive_rate"]]
+            return a["drive"], drives, a["torque_rate"]
+        motion, column = motion_of(a, "link"), -a["torque_rate"]
         if through_motor:
             through = scaled(np.column_stack([*motion_of(a, "motor"), column]))
             motion = [through @ np.linalg.lstsq(through, x, rcond=None)[0] for x in motion]
         return a["torque"], motion, column
     # unlike the motor's by the wind-up of the transmission, whose rates look like a lateness
     load = [a["torque"]] if torque else [x for n, x in a.items() if n == "link_acceleration"]
+    if torque and _one_sided(a):  # nothing else tells how late the torque is
+        load = [*load, a["torque_rate"]]
     return a["drive"], [*motion_of(a, "motor"), *load], -a["drive_rate"]
+
+
+def _one_sided(averaged: Mapping[str, FloatArray]) -> bool:
+    """Whether one side alone is measured, and the other taken to move with it."""
+    return all(
+        np.array_equal(averaged[f"motor_{what}"], averaged[f"link_{what}"])
+        for what in ("position", "velocity")
+    )
 
 
 def one_way(record: WeakRecord) -> npt.NDArray[np.bool_]:
@@ -367,11 +414,10 @@ def lateness(made: WeakRecord, place: str, *, torque: bool) -> tuple[float, floa
     a = {n: x[kept] for n, x in made.averaged.items()}
     if place not in ENCODERS:
         late, error = _slope(*_parts(made, place, kept, torque=torque))
-        if place == "torque_sensor" and set(PAIR) <= set(a):
+        if place == "torque_sensor" and not _one_sided(a):
             sure = _slope(*_parts(made, place, kept, torque=torque, through_motor=True))
             if abs(late - sure[0]) > UNLIKE * sure[1]:
                 late, error = sure
-        if place == "torque_sensor" and set(PAIR) <= set(a):
             # read against the link's encoder, which may itself be late by less than it is shifted
             own, own_error, _ = lateness(made, "link_position_sensor", torque=torque)
             late, error = late + own, math.hypot(error, own_error)

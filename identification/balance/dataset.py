@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from casadi_models import JointModel, hold
+from casadi_models.term import SIDE_INERTIAS
 from identification.balance.calibration import named_late, unknowns_of
 from identification.balance.clocks import SIGNAL, as_told, in_time, places_of, shifted
 from identification.balance.colour import ChannelNoise, Part, white
@@ -627,7 +628,7 @@ def prepared_model(joint: Joint, record: Record) -> JointModel:
         adapted = adapted.add(HOLD_DELAY)
     lagging = seen_from_the_motor(sensing, joint) and sensing.has_drive
     # the link's own motion loads the gear, where its inertia has a name
-    moved = lagging or (sensing.both_positions and "link_inertia" in adapted.inertias)
+    moved = lagging or (sensing.both_positions and adapted.inertias == SIDE_INERTIAS)
     load = "motion" if moved and not sensing.has_torque else adapted.load_from
     return replace(
         adapted,

@@ -15,7 +15,6 @@ from identification.balance.colour import Part
 from identification.balance.dataset import without
 from identification.balance.sensing import Sensing
 from identification.balance.stacked import drifts_beside
-from identification.balance.weak import CLAIM_KERNEL
 from identification.data.joint_file import Joint
 from identification.data.record import Record
 from identification.diagnosis.candidates import offered
@@ -153,6 +152,10 @@ class JointBench:
     train, held : sequence of Record
     like : Sensing, optional
         Of the fit that is judged on these records: temperature counts as there.
+    slow : bool
+        The rows of `data` are slow ones already (:meth:`slower`).
+    kernels : mapping of float to Dataset
+        The same records at other kernels, as far as they are prepared.
     """
 
     def __init__(
@@ -163,8 +166,10 @@ class JointBench:
         held: Sequence[Record],
         *,
         like: Sensing | None = None,
+        slow: bool = False,
+        kernels: Mapping[float, Dataset] = MappingProxyType({}),
     ) -> None:
-        self.joint, self.data, self._like = joint, data, like
+        self.joint, self.data, self._like, self._slow = joint, data, like, slow
         self._slower: dict[float, JointBench] = {}
         self._train, self._held = list(train), list(held)
         self._solved: dict[tuple[object, ...], Solution] = {}
@@ -173,7 +178,7 @@ class JointBench:
         self._equal: dict[tuple[object, ...], tuple[Solution, dict[str, Equivalence]]] = {}
         self._curves: dict[tuple[object, ...], tuple[Solution, tuple[LearnedClaim, ...]]] = {}
         self._drifts: dict[tuple[int, bool], Mapping[str, Part]] = {}
-        self._kernels: dict[float, Dataset] = {round(data.kernel, 9): data}
+        self._kernels = {**kernels, round(data.kernel, 9): data}
 
     def start(self) -> Solution:
         """The fit of the joint's own model."""
@@ -422,7 +427,7 @@ class JointBench:
 
     def slower(self, factor: float) -> JointBench | None:
         """See :class:`Bench`; made once. A motor alone is seen at a long kernel from the start."""
-        if self.data.kernel > CLAIM_KERNEL or self.data.sensing.one_sided:
+        if self._slow or self.data.sensing.one_sided:
             return None
         if factor not in self._slower:
             data = replace(
@@ -430,9 +435,15 @@ class JointBench:
                 orders=self.data.orders,
                 other_orders=self.data.other_orders,
             )
-            made = JointBench(self.joint, data, self._train, self._held, like=self._like)
-            made._kernels |= self._kernels
-            self._slower[factor] = made
+            self._slower[factor] = JointBench(
+                self.joint,
+                data,
+                self._train,
+                self._held,
+                like=self._like,
+                slow=True,
+                kernels=self._kernels,
+            )
         return self._slower[factor]
 
     def _at_kernel(self, length: float) -> Dataset:

@@ -260,6 +260,18 @@ def visible_keys(model: JointModel) -> tuple[str, ...]:
 def made_worse(before: Error, after: Error) -> str:
     """Why an addition is refused on held-out records: a balance that it spoils, or the error as a
     whole; empty where it is not.
+    """
+    why = spoilt(before, after)
+    if not why and after.relative_error_percent > RISE_LIMIT * before.relative_error_percent:
+        return (
+            f"the held-out error rises from {before.relative_error_percent:.3g} to "
+            f"{after.relative_error_percent:.3g} %"
+        )
+    return why
+
+
+def spoilt(before: Error, after: Error) -> str:
+    """Which balance an addition spoils on held-out records; empty where it spoils none.
 
     Balances are compared by their RMS on one weighting, common to both models. A floor alone
     refuses nothing: a balance is spoilt where its own RMS rises, and above what noise explains
@@ -280,11 +292,6 @@ def made_worse(before: Error, after: Error) -> str:
                 f"the RMS of the {b} balance rises by {100 * (new / old - 1):.3g} % on "
                 "held-out records"
             )
-    if after.relative_error_percent > RISE_LIMIT * before.relative_error_percent:
-        return (
-            f"the held-out error rises from {before.relative_error_percent:.3g} to "
-            f"{after.relative_error_percent:.3g} %"
-        )
     return ""
 
 

@@ -51,6 +51,7 @@ from identification.diagnosis.improvement import (
     held_drop,
     judged_drop,
     made_worse,
+    spoilt,
 )
 from identification.diagnosis.learned import LearnedClaim, marked, variable_of
 from identification.diagnosis.locate import Unexplained, spectral_peak
@@ -170,15 +171,21 @@ class Session:
         ``progress(text, share)``.
     warnings : sequence of str
         What the check gate said about the records.
+    refused : mapping of str to str
+        Labels that are not taken up, with the reason.
     """
 
     def __init__(
-        self, bench: Bench, progress: Progress | None = None, warnings: Sequence[str] = ()
+        self,
+        bench: Bench,
+        progress: Progress | None = None,
+        warnings: Sequence[str] = (),
+        refused: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         self.bench, self.joint = bench, bench.joint
         self.progress: Progress = progress or (lambda text, share: None)
         self._warnings = tuple(warnings)
-        self._refused: dict[str, str] = {}
+        self._refused = dict(refused)
         self._doubted: dict[str, str] = {}
         self._located: dict[str, str] = {}
         self._near: dict[str, Mapping[str, float]] = {}
@@ -632,10 +639,11 @@ class Session:
             bench = self.bench.slower(factor)
             if bench is None:
                 return None
-            inner = Session(bench)
-            inner._refused.update(self._refused)
-            found = inner.diagnose(bench.fitted(now.model, now.values, again=True))
-            if not found.claims:
+            found = Session(bench, refused=self._refused).diagnose(
+                bench.fitted(now.model, now.values, again=True)
+            )
+            # a whole fit has no linear form to allow for, and these are further looks
+            if not found.claims or found.claims[0].held_out_drop_percent < MAJOR_DROP:
                 continue
             claim = replace(found.claims[0], kernel=bench.data.kernel, partial=False)
             model = with_effect(now.model, claim.label)
@@ -643,7 +651,8 @@ class Session:
             after = self.bench.step(
                 claim.effects[0], claim.label, self.bench.fitted(model, start, again=True)
             )
-            if made_worse(standing.now.held_out, after.held_out):
+            # by how much the short rows fall or rise is their noise
+            if spoilt(standing.now.held_out, after.held_out):
                 continue
             return _Standing((*standing.steps, after), (*standing.claims, claim))
         return None

@@ -71,6 +71,13 @@ def verdict_of(
         f"the error on held-out data {'falls' if now < was else 'goes'} from {was:.3g} % to "
         f"{now:.3g} %"
     )
+    slow = dict.fromkeys(
+        f"in rows of {c.kernel:.2g} s, whose noise is lower, the {c.balance} balance falls by "
+        f"{c.held_out_drop_percent:.2g} %"
+        for c in claims
+        if c.kernel is not None
+    )
+    fall = "; ".join([fall, *slow])
     if where:
         left = ", ".join(
             f"{u.balance} ({number(ratios[u.balance].ratio, 2)} times its noise floor)"

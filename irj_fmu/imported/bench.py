@@ -325,6 +325,9 @@ class FmuBench:
         """No minor effects are looked for."""
         return False
 
+    def slower(self, factor: float) -> None:
+        """The FMU's rows have one kernel: its noise is that of the torque that it asks for."""
+
     def odds(
         self, claim: Claim, near: Mapping[str, float], now: Step, last: Ranking
     ) -> Odds | None:

@@ -252,6 +252,9 @@ class World:
     def same_sign(self, trial: Trial, solution: Solution) -> bool:
         return self.steady
 
+    def slower(self, factor: float) -> None:
+        return None
+
     def drifts(self, step: Step) -> dict[str, Any]:
         return {}
 
@@ -294,7 +297,20 @@ def test_names_of_which_there_are_too_many_are_set_aside_and_others_are_not(base
     for name in MANY:
         assert "one of 5 names that explain the same" in found.why(name)
     assert "one of" not in found.why("gravity")
-    assert not {*world.fitted_whole} & {*MANY}, "none of them is worth a whole fit"
+
+
+@pytest.mark.parametrize("left", [2, len(MANY)])
+def test_whole_fits_are_asked_before_names_are_set_aside(left: int, base: Base) -> None:
+    chances = dict.fromkeys(MANY[-left:], 1.0 / left)
+    odds = lambda claim, now: told(now, chances, {"lugre@motor": "is far behind"})  # noqa: E731
+    world = World(base, {"p": 24.0}, dict.fromkeys(MANY, {"p": 1.0}), chances=odds)
+    found = ended(world)
+    if left == 2:
+        (claim,) = found.claims
+        assert {*claim.effects} == {*chances}
+    else:
+        assert not found.claims
+        assert "cannot be named" in found.reason
 
 
 def test_a_set_of_too_many_is_forgotten_where_a_later_law_takes_its_work_along(base: Base) -> None:
