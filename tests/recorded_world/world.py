@@ -369,8 +369,16 @@ def write_case(case: Case, folder: Path, given: str) -> Path:
 
 
 def asked(case: Case, given: str) -> bool:
-    """Whether these sensors are asked to show all that is hidden."""
-    return all(name in OUTSIDE or visible(name, given) for name in case.names)
+    """Whether these sensors are asked to show all that is hidden.
+
+    A torque sensor beside the motor alone measures what the link asks for, whatever its laws: they
+    stand in no balance of these readings.
+    """
+    behind = given == "motor_torque"
+    return all(
+        (name in OUTSIDE or visible(name, given)) and not (behind and law.place == "link")
+        for name, law in case.laws.items()
+    )
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -188,8 +188,11 @@ def claims_html(result: Mapping[str, Any]) -> str:
         names = " or ".join(f"<strong>{title_of(k)}</strong>" for k in claim["effects"])
         line = (
             f"{names}: lowers the error of the {text(claim['balance'])} balance by "
-            f"{percent(claim['held_out_drop_percent'])} on held-out records."
+            f"{percent(claim['held_out_drop_percent'])} on held-out records"
         )
+        if claim.get("kernel_s"):
+            line += f", in rows of {number(claim['kernel_s'], 2)} s, whose noise is lower"
+        line += "."
         if "curve" in claim:
             plain = claim["sentence"].replace(f" ({claim['label']})", "")
             line = f"<strong>free curve</strong>: {text(plain)}"

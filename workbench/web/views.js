@@ -131,7 +131,7 @@ const views = {
     return [
       h("div", { class: "row between head" }, h("div", {}, heading("What is missing?")), again),
       outcomeCard(d, [h("p", { class: "figure", id: "claim" }, claim ? claim.effects.map(effectTitle).join(" or ") : sentence(d.headline || "Nothing is named")),
-        claim ? h("p", {}, claim.effects.length > 1 ? `These records cannot tell the ${claim.effects.length} apart.${claim.separate_by ? ` ${claim.separate_by} would.` : ""}` : `The ${claim.balance} balance says so: with it the held-out residual there falls by ${digits(claim.held_out_drop_percent, 2)} %.`) : null,
+        claim ? h("p", {}, claim.effects.length > 1 ? `These records cannot tell the ${claim.effects.length} apart.${claim.separate_by ? ` ${claim.separate_by} would.` : ""}` : `The ${claim.balance} balance says so: with it the held-out residual there falls by ${digits(claim.held_out_drop_percent, 2)} %${claim.kernel_s ? ` in rows of ${digits(claim.kernel_s, 2)} s, whose noise is lower` : ""}.`) : null,
         claim && claim.confidence ? h("p", { class: "small soft", id: "confidence" }, `By the likelihoods of whole fits: ${Object.entries(claim.confidence).map(([k, p]) => `${p > 0.99 ? "over 99" : p < 0.01 ? "under 1" : Math.round(100 * p)} % ${effectTitle(k)}`).join(", ")}.`) : null,
         h("p", { id: "reason" }, sentence(d.reason || ""))]),
       d.warnings.map((w) => h("p", { class: "note small" }, sentence(w))),

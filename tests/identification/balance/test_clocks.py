@@ -30,7 +30,8 @@ from tests.identification.diagnosis.test_other_payload import (
     follower,
 )
 from tests.recorded_world._engine import ROWS_PER_SECOND
-from tests.recorded_world.world import make_case, write_case
+from tests.recorded_world.sensors import CHANNELS as SENSED
+from tests.recorded_world.world import RECORDS, TROUBLES, make_case, write_case
 
 DEMO = Path(__file__).resolve().parents[3] / "workbench" / "demo"
 CHANNELS = ("link_position", "link_torque", "motor_current")
@@ -138,6 +139,35 @@ def test_part_of_a_sample_is_found_too(channel: str, samples: float) -> None:
         assert found.solution.values[name] == pytest.approx(
             plain.solution.values[name], abs=3 * float(np.hypot(*errors))
         ), name
+
+
+@pytest.mark.parametrize("motion", ["steps", "sweeps"])
+@pytest.mark.parametrize("late_by", [0, 2, 5, 11])
+def test_a_torque_beside_the_motor_alone_is_put_in_time(motion: str, late_by: int) -> None:
+    """The link swings at 7 Hz: the torque is no law of the motor's motion."""
+    case = make_case(5, without=TROUBLES, names=(), seconds=16.0, make="harmonic160", motion=motion)
+    every = 4
+    records = []
+    for name in RECORDS:
+        read_at = np.arange(12, len(case.time[name]), every)
+        channels = {
+            c: case.measured[name][read_at - (late_by if c == "link_torque" else 0), k]
+            for k, c in enumerate(SENSED)
+            if c in ("motor_current", "motor_position", "link_torque")
+        }
+        records.append(Record.from_channels(case.time[name][read_at], channels, name=name))
+    joint = Joint(
+        name="soft",
+        gear_ratio=case.joint.gear_ratio,
+        torque_per_current=case.joint.make.per_current * case.joint.sign,
+        model_name="hd1",
+        effects=("viscous", "coulomb", "gravity"),
+    )
+    found = improve(records[:1], joint, records[1:])
+    assert (found.claims, found.verdict) == ((), "nothing_missing")
+    (skew,) = (c for c in found.calibration if c.sensor == "link_torque")
+    period = every * float(np.diff(case.time["train"][:2])[0])
+    assert skew.value == pytest.approx(late_by * period / every, abs=0.15 * period)
 
 
 @pytest.mark.parametrize("damping", [0.0, 60.0, 150.0])

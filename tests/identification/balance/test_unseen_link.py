@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from identification import improve
 from identification.balance.balances import Balances
 from identification.balance.dataset import load_dataset, prepared_model
 from identification.data.joint_file import Joint
@@ -88,6 +89,34 @@ def test_a_rigid_joint_has_no_compliance_to_find() -> None:
     found = solve(model, load_dataset([record], [], joint, model)).values
     assert found["inertia"] == pytest.approx(MOTOR + LINK, rel=1e-6)
     assert found["load_compliance"] == 0.0
+
+
+def test_the_share_of_the_inertia_that_loads_the_gear_is_found_with_its_friction() -> None:
+    """Gravity alone is not the load, and a stiff joint shows no swing to tell the share from."""
+    t = np.arange(0.0, 40.0, 1e-3)
+    q, v, a = np.zeros_like(t), np.zeros_like(t), np.zeros_like(t)
+    for i, f in enumerate((0.13, 0.37, 0.71, 1.3)):
+        w, size = 2 * math.pi * f, 0.5 / (1 + i)
+        q += size * np.sin(w * t + i)
+        v += size * w * np.cos(w * t + i)
+        a -= size * w**2 * np.sin(w * t + i)
+    motor, link, gravity, share = 0.6, 1.4, 9.0, 0.08
+    load = link * a - gravity * np.sin(q + 0.4)
+    friction = (2.0 + share * np.abs(load)) * np.tanh(v / 1e-3) + 0.5 * v
+    noise = np.random.default_rng(3).normal(0, 0.02, len(t))
+    drive = motor * a + load + friction + noise
+    record = Record.from_channels(
+        t, {"motor_torque": drive / RATIO, "motor_position": q * RATIO}, name="loaded"
+    )
+    joint = Joint(
+        name="loaded", gear_ratio=RATIO, model_name="hd1", effects=("viscous", "coulomb", "gravity")
+    )
+    found = improve([record], joint)
+    assert [c.effects for c in found.claims] == [("load_dependent_friction",)]
+    values = found.steps[-1].solution.values
+    assert values["motor_load_friction"] == pytest.approx(share, rel=0.02)
+    assert values["swinging_share"] == pytest.approx(link / (motor + link), rel=0.02)
+    assert values["load_compliance"] == 0.0
 
 
 def test_refinement_says_that_it_cannot_simulate_an_unseen_link() -> None:

@@ -4,14 +4,17 @@ said.
 
 from __future__ import annotations
 
+import math
 from functools import cache
 from typing import Final
 
+import numpy as np
 import pytest
 
-from identification import Joint, Record, improve
+from identification import Joint, Record, diagnose, fit, improve
 from identification.errors import InputError
 from tests.recorded_world import sensors, world
+from workbench.show.words import printed
 
 CHANNELS: Final = {
     "current": "motor_current",
@@ -35,12 +38,12 @@ BLIND: Final = [("current", "torque"), ("current",), ("motor",)]
 
 
 @cache
-def case(hidden: tuple[str, ...]) -> world.Case:
+def case(hidden: tuple[str, ...], seconds: float = 12.0) -> world.Case:
     """One joint, recorded without any trouble."""
     return world.make_case(
         11,
         without=world.TROUBLES,
-        seconds=12.0,
+        seconds=seconds,
         names=hidden,
         kind="single" if hidden else "none",
         size=1.0,
@@ -49,8 +52,8 @@ def case(hidden: tuple[str, ...]) -> world.Case:
     )
 
 
-def records(given: tuple[str, ...], hidden: tuple[str, ...]) -> list[Record]:
-    made = case(hidden)
+def records(given: tuple[str, ...], hidden: tuple[str, ...], seconds: float = 12.0) -> list[Record]:
+    made = case(hidden, seconds)
     return [
         Record.from_channels(
             made.time[name],
@@ -92,6 +95,28 @@ def test_coulomb_friction_is_named(given: tuple[str, ...]) -> None:
     found = improve(train, joint(given, ("viscous", "gravity")), [held])
     assert found.claims
     assert {c.effects for c in found.claims if len(c.effects) == 1} == {("coulomb",)}
+
+
+@pytest.mark.parametrize("hidden", [(), ("quadratic_drag",)])
+def test_what_a_coarse_encoder_hides_is_seen_in_longer_rows(hidden: tuple[str, ...]) -> None:
+    """With the encoder the answer was that nothing is missing, and without it the law was found."""
+    given, step = ("current", "motor", "link"), 2 * math.pi / 2**12
+    train, held = (
+        r.with_channel("link_position", np.round(r["link_position"] / step) * step)
+        for r in records(given, hidden, 24.0)
+    )
+    model = joint(given, ("viscous", "coulomb", "gravity"))
+    found = improve(train, model, [held])
+    if not hidden:
+        assert (found.claims, found.verdict) == ((), "nothing_missing")
+        return
+    (claim,) = found.claims
+    assert hidden[0] in claim.effects
+    assert claim.kernel in (0.12, 0.24), "the short rows show nothing"
+    assert claim.as_json()["kernel_s"] == claim.kernel
+    assert f"in rows of {claim.kernel:g} s" in found.reason
+    assert f"of rows of {claim.kernel:g} s" in printed(found)
+    assert diagnose(fit(model, [train]), [held]).claims[0].kernel == claim.kernel
 
 
 def test_what_stands_in_no_balance_keeps_its_value_and_is_said() -> None:

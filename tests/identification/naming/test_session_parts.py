@@ -22,7 +22,7 @@ from identification.diagnosis.bench import Progress
 from identification.diagnosis.candidates import NotTestable, offered
 from identification.diagnosis.claims import LARGEST_SET, Claim, Ranking
 from identification.diagnosis.curve import Curve
-from identification.diagnosis.improvement import Improvement, Step
+from identification.diagnosis.improvement import Improvement, Step, made_worse
 from identification.diagnosis.learned import Doubt, Equivalence
 from identification.diagnosis.locate import Unexplained
 from identification.diagnosis.outcome import key_of
@@ -1042,3 +1042,17 @@ def test_names_that_explain_parts_give_way_to_a_curve_that_explains_all(base: Ba
 )
 def test_they_stay_where_curves_do_no_better(base: Base, other: dict[str, Any]) -> None:
     assert {*named(ended(in_parts(base, **other)))} == BOTH
+
+
+@pytest.mark.parametrize(
+    ("was", "now", "refused"), [(1.1, 1.9, True), (1.1, 1.2, False), (5.0, 1.9, False)]
+)
+def test_noise_that_becomes_structure_refuses_an_addition(
+    was: float, now: float, refused: bool
+) -> None:
+    """However far the RMS falls: it does so because the noise counts less."""
+    before, after = (
+        Error(5.0, 95.0, 99.0, {"deflection": BalanceError(rms, rms / ratio, ratio, "N.m")})
+        for rms, ratio in ((1.4, was), (0.14, now))
+    )
+    assert bool(made_worse(before, after)) == refused
