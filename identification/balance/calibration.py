@@ -296,7 +296,7 @@ def _fitted_on_itself(
     size = USUAL_SKEW * record.grid.dt
     usually, limits = dict(now), limits_of_runs(balances.model, [record])
     seen = [b for b in balances.balances if rows[b].any()]
-    for _ in range(ROUNDS):
+    for _ in range(ROUNDS if seen else 0):
         found = balances.evaluate(record, at_stamps(balances.model, record, {**values, **now}))
         scale = {b: max(float(np.sqrt(np.mean(found[b][0][rows[b]] ** 2))), 1e-300) for b in seen}
         share = min(effective_share(found[b][0][rows[b]]) for b in seen)

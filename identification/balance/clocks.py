@@ -79,8 +79,13 @@ LOW_PASSED: Final = frozenset({"drive"})
 BEGUN: Final = (-3.0, -1.0, 1.0, 3.0)
 """Shifts of a torque from which its lateness is looked for beside the motor alone [samples]: none
 of up to :data:`MOST_SKEW` is farther than a sample from one of them or from zero."""
-INDEPENDENT: Final = 0.4
-"""Share of the rows that count as independent: four to a kernel length."""
+BEGINS: Final = 3.5
+"""Standard errors by which what is left must fall there: of eight stretches as rare as one in a
+hundred. Only where the search begins hangs on it."""
+LEAST_SPREAD: Final = 1e-9
+"""Of the logarithm of a fall: rounding."""
+LEAST_SQUARE: Final = 1e-30
+"""Of a record without noise [(N.m)^2]: what rounding leaves of torques of 1 N.m."""
 SURE: Final = 4.53
 """Standard errors by which a channel must be late: of an error from eight stretches (Student's t,
 seven degrees of freedom) as rare as three of a known one."""
@@ -203,7 +208,8 @@ def in_time(
     made, wanted = make({}), tuple(places)
     beside_motor = torque and "torque_sensor" in wanted and _one_sided(made.averaged)
     shifts = _begun(make, made) if beside_motor else {}
-    made = make(shifts) if shifts else made
+    begun = bool(shifts)
+    made = make(shifts) if begun else made
     for _ in range(SHIFTS):
         moved = dict(shifts)
         for place in wanted:
@@ -221,7 +227,8 @@ def in_time(
         found = [lateness(x, place, torque=torque)[0] for x in (other, made)]
         taken = (found[0] - found[1]) / late > ANSWERS
         if beside_motor and place == "torque_sensor":
-            taken = taken or _explains(made, other)
+            # from where the search did not begin the rows answer to nothing
+            taken = (taken or begun) and abs(shifts[place]) <= MOST_SKEW
         # what is later than that is no filter of a drive
         if taken and place in LOW_PASSED and abs(shifts[place]) <= MOST_SKEW:
             # noise is one whatever the kernel
@@ -319,23 +326,27 @@ def _begun(
     """Where the search for the lateness of a torque begins beside the motor alone: its rate is that
     of the drive but for an inertia, and a straight line reaches no farther than a sample.
     """
-    tried = [make({"torque_sensor": shift}) for shift in BEGUN]
-    best = min(range(len(tried)), key=lambda k: _unexplained(tried[k]))
-    return {"torque_sensor": BEGUN[best]} if _explains(tried[best], alone) else {}
+    before = _unexplained(alone)
+    left = {}
+    for shift in BEGUN:
+        squares = _unexplained(make({"torque_sensor": shift}))
+        fall = np.log(before / squares)
+        spread = max(float(fall.std(ddof=1)), LEAST_SPREAD)
+        if math.sqrt(STRETCHES) * float(fall.mean()) / spread > BEGINS:
+            left[shift] = float(squares.mean())
+    return {"torque_sensor": min(left, key=lambda k: left[k])} if left else {}
 
 
-def _explains(shifted: WeakRecord, alone: WeakRecord) -> bool:
-    """Whether a shift certainly lowers what the drive leaves beside the torque and the motion."""
-    nats = 0.5 * INDEPENDENT * alone.rows * math.log(_unexplained(alone) / _unexplained(shifted))
-    return nats > SURE**2 / 2
-
-
-def _unexplained(made: WeakRecord) -> float:
-    """Mean square of what the drive leaves beside the motion, the torque and their rates."""
+def _unexplained(made: WeakRecord) -> FloatArray:
+    """Mean square of what the drive leaves beside the motion, the torque and their rates, in each
+    of a few stretches.
+    """
     kept = steady(made)
     values, others, column = _parts(made, "torque_sensor", kept, torque=True)
     curve = any_curve(made, "motor_velocity", kept)
-    return float(np.mean(rest_beside(values, [*others, column, curve], 1) ** 2))
+    rest = rest_beside(values, [*others, column, curve], 1)
+    squares = [float(np.mean(x**2)) for x in np.array_split(rest, STRETCHES)]
+    return np.maximum(squares, LEAST_SQUARE)
 
 
 def _parts(

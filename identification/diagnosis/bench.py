@@ -7,7 +7,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
-from typing import Protocol, final
+from typing import Final, Protocol, final
+
+import numpy as np
 
 from casadi_models import JointModel
 from identification.balance.calibration import settled
@@ -35,6 +37,7 @@ from identification.diagnosis.learned import (
 from identification.diagnosis.lines import Line, find_lines, orders_of, other_orders
 from identification.diagnosis.locate import Unexplained, locate
 from identification.diagnosis.trials import Base, Trial, make_base, try_candidate
+from identification.errors import InputError
 from identification.fitting.assess import RATIO_LIMIT, VERDICT_KERNELS, BalanceError, Error, assess
 from identification.fitting.engine import Dataset, Solution, load_dataset, prepared_model, solve
 from identification.fitting.first_fit import first_fit
@@ -42,6 +45,9 @@ from identification.fitting.left_open import LeftOpen
 from identification.naming.contest import FEWEST, Rival
 from identification.naming.odds import Odds, contenders, contest_of, odds_of, unmodelled
 
+FEWEST_ROWS: Final = 40
+"""Rows of each balance that longer kernels must leave in the training and in the held-out records:
+four to a kernel length, ten of them that are independent."""
 Progress = Callable[[str, float], None]
 Curved = tuple[tuple[LearnedClaim, ...], Step | None]
 
@@ -429,12 +435,16 @@ class JointBench:
         """See :class:`Bench`; made once. A motor alone is seen at a long kernel from the start."""
         if self._slow or self.data.sensing.one_sided:
             return None
+        try:
+            slow = self._at_kernel(self.data.kernel * factor)
+        except InputError:  # a record is too short for it, or stands still at its ends
+            return None
+        for part in (slow.train, slow.held_out):
+            for b in self.data.sensing.balances:
+                if sum(np.count_nonzero(w.taking(b)) for w in part) < FEWEST_ROWS:
+                    return None
         if factor not in self._slower:
-            data = replace(
-                self._at_kernel(self.data.kernel * factor),
-                orders=self.data.orders,
-                other_orders=self.data.other_orders,
-            )
+            data = replace(slow, orders=self.data.orders, other_orders=self.data.other_orders)
             self._slower[factor] = JointBench(
                 self.joint,
                 data,

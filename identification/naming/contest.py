@@ -221,7 +221,7 @@ class Contest:
     @cached_property
     def ahead(self) -> FloatArray:
         """By how much the leader is ahead of each rival on the old records, and how sure that is
-        over blocks, as a normal deviate: by their mean or by their signs.  (rivals, 2)
+        over blocks, as a normal deviate: by their mean or by their signed ranks.  (rivals, 2)
 
         Rows at a turn count only where one of the two laws says what happens there.
         """
@@ -235,10 +235,10 @@ class Contest:
             count = len(difference)
             spread = float(np.std(difference, ddof=1)) * math.sqrt(count) if count > 1 else 0.0
             mean = float(difference.sum()) / spread if spread > 0 else 0.0
-            # one block may hold most of a difference that all of them show
-            signs = float(np.sign(difference).sum()) / math.sqrt(count)
+            # one block may hold most of a difference that all large ones show
+            ranked = _signed_ranks(difference)
             beforehand = float(self._unlikely[k] - self._unlikely[leader])
-            out[k] = difference.sum() + beforehand, max(mean, signs)
+            out[k] = difference.sum() + beforehand, max(mean, ranked)
         return out
 
     def alive(self, unmodelled: float = 0.0) -> tuple[Rival, ...]:
@@ -374,6 +374,17 @@ def _cost(
         np.count_nonzero(counted[b]) * math.log(max(float(np.linalg.norm(r[counted[b]])), 1e-300))
         for b, r in weighted.items()
     )
+
+
+def _signed_ranks(values: FloatArray) -> float:
+    """Normal deviate of Wilcoxon's signed ranks: large values of one sign beside small ones of both
+    speak for it, however much the largest of them scatter.
+    """
+    count = len(values)
+    ranks = np.empty(count)
+    ranks[np.argsort(np.abs(values))] = np.arange(1.0, count + 1.0)
+    spread = math.sqrt(count * (count + 1) * (2 * count + 1) / 6)
+    return float(np.sign(values) @ ranks) / max(spread, 1.0)
 
 
 def _by_block(residual: FloatArray, block: npt.NDArray[np.int64]) -> FloatArray:
