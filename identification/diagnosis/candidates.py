@@ -159,7 +159,8 @@ def offered(
             and effect.key not in data.orders
             and (data.joint.kind == "linear" or _turns(data) < 2)
         ):
-            places = []
+            refused.append(NotTestable(effect.key, _no_line(data)))
+            continue
         if effect.memory is not None and "motor" in places and turns_unseen(data):
             places.remove("motor")
             if not places:
@@ -189,6 +190,13 @@ def offered(
                 continue
             out.extend(_placed(effect, place, model))
     return out, refused
+
+
+def _no_line(data: Dataset) -> str:
+    """Why what repeats with the position is no candidate on these records."""
+    if data.joint.kind == "linear":
+        return "no line of its order stands out of what the model leaves over the position"
+    return "needs two turns of the motor, or a line of its order in what the model leaves"
 
 
 def turns_unseen(data: Dataset) -> bool:
