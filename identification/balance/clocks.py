@@ -80,8 +80,8 @@ BEGUN: Final = (-3.0, -1.0, 1.0, 3.0)
 """Shifts of a torque from which its lateness is looked for beside the motor alone [samples]: none
 of up to :data:`MOST_SKEW` is farther than a sample from one of them or from zero."""
 SERIES: Final = 0.05
-"""Share of the kernel up to which the lateness of a torque beside the motor alone is left to the
-fit: its series is off by 4 % of what that changes at the edge of the kernel, and a law that is missing
+"""Share of the kernel up to which a torque that is late beside the motor alone is left to the fit:
+its series is off by 4 % of what that changes at the edge of the kernel. A law that is missing
 looks like a lateness of some milliseconds to rows without it."""
 BEGINS: Final = 3.5
 """Standard errors by which what is left must fall there: of eight stretches as rare as one in a
