@@ -106,7 +106,7 @@ def unknowns_of(model: JointModel, sensing: Sensing) -> tuple[str, ...]:
     there = {
         "link_encoder_zero": twist,
         "link_encoder_skew": twist,
-        "torque_sensor_skew": torque and (len(sensing.balances) > 1 or sensing.has_drive),
+        "torque_sensor_skew": torque and (len(sensing.balances) > 1 or sensing.motor_and_torque),
         HOLD_NAME: (torque or twist) and HOLD_DELAY in model.effects,
     }
     return _without_named(model, tuple(n for n, is_there in there.items() if is_there))

@@ -191,6 +191,7 @@ def in_time(
     *,
     torque: bool,
     fast: Callable[[Mapping[str, float]], WeakRecord],
+    motor_alone: bool = False,
 ) -> WeakRecord:
     """A record whose late channels are shifted.
 
@@ -207,10 +208,12 @@ def in_time(
         Whether the torque of the link is measured.
     fast : callable
         As `make`, with a short kernel: a filter and a wait are alike in all that is slow.
+    motor_alone : bool
+        Whether the torque is measured beside the motor, and the link is not.
     """
     filters: dict[str, Filter] = {}
     made, wanted = make({}), tuple(places)
-    beside_motor = torque and "torque_sensor" in wanted and _one_sided(made.averaged)
+    beside_motor = motor_alone and "torque_sensor" in wanted
     shifts = _begun(make, made) if beside_motor else {}
     begun = bool(shifts)
     made = make(shifts) if begun else made
@@ -220,7 +223,7 @@ def in_time(
         for _ in range(SHIFTS if together else 0):
             moved = dict(shifts)
             for place in together:
-                late = _late(made, place, torque=torque) / made.grid.dt
+                late = _late(made, place, torque=torque, motor_alone=motor_alone) / made.grid.dt
                 step = late if abs(late) > NEAR else 0.0
                 moved[place] = moved.get(place, 0.0) + step
             if moved == shifts:
@@ -231,7 +234,9 @@ def in_time(
         # a shift of zero keeps the rows: what is compared are the same instants
         unshifted = {**shifts, place: 0.0}
         other, late = make(unshifted), shifts[place] * made.grid.dt
-        found = [lateness(x, place, torque=torque)[0] for x in (other, made)]
+        found = [
+            lateness(x, place, torque=torque, motor_alone=motor_alone)[0] for x in (other, made)
+        ]
         taken = (found[0] - found[1]) / late > ANSWERS
         if beside_motor and place == "torque_sensor":
             # from where the search did not begin the rows answer to nothing
@@ -241,9 +246,17 @@ def in_time(
         if taken and place in LOW_PASSED and abs(shifts[place]) <= MOST_SKEW:
             # noise is one whatever the kernel
             louder = partial(noise, make(shifts))
-            told = _filter(make, shifts, place, louder, torque=torque)
+            asked = partial(
+                _filter,
+                shifts=shifts,
+                place=place,
+                noise=louder,
+                torque=torque,
+                motor_alone=motor_alone,
+            )
+            told = asked(make)
             # slow rows are calm, fast ones show most of what neither makes good: both are asked
-            quick = _filter(fast, shifts, place, louder, torque=torque, share=False)
+            quick = asked(fast, share=False)
             filters[place] = told = replace(told, better=told.better + quick.better)
             shifts = {**shifts, place: as_told([told], told) / made.grid.dt}
             made = make(shifts)
@@ -268,6 +281,7 @@ def _filter(
     noise: Callable[[float, str, float], float],
     *,
     torque: bool,
+    motor_alone: bool,
     share: bool = True,
 ) -> Filter:
     """What rows say of a late reading, by how well they are met with all of its lateness shifted,
@@ -293,7 +307,7 @@ def _filter(
     friction = any_curve(alone, "motor_velocity", kept)
 
     def rest(made: WeakRecord) -> FloatArray:
-        values, others, column = _parts(made, place, kept, torque=torque)
+        values, others, column = _parts(made, place, kept, torque=torque, motor_alone=motor_alone)
         return rest_beside(values, [*others, friction, column])
 
     left = {0.0: rest(alone), whole: rest(waiting)}
@@ -350,7 +364,7 @@ def _unexplained(made: WeakRecord) -> FloatArray:
     of a few stretches.
     """
     kept = steady(made)
-    values, others, column = _parts(made, "torque_sensor", kept, torque=True)
+    values, others, column = _parts(made, "torque_sensor", kept, torque=True, motor_alone=True)
     curve = any_curve(made, "motor_velocity", kept)
     rest = rest_beside(values, [*others, column, curve], 1)
     squares = [float(np.mean(x**2)) for x in np.array_split(rest, STRETCHES)]
@@ -364,13 +378,15 @@ def _parts(
     *,
     torque: bool,
     through_motor: bool = False,
+    motor_alone: bool = False,
 ) -> tuple[FloatArray, list[FloatArray], FloatArray]:
     """Reading of a torque, what it follows from, and the column of its lateness, in the rows
-    `kept`; `through_motor`: as far as the motion of the motor tells that of the link.
+    `kept`; `through_motor`: as far as the motion of the motor tells that of the link;
+    `motor_alone`: the link is not read.
     """
     a = {n: x[kept] for n, x in made.averaged.items()}
     if place == "torque_sensor":
-        if _one_sided(a):
+        if motor_alone:
             # a soft joint's torque is no law of the motor's motion: it is part of what drives it
             drives = [*motion_of(a, "motor"), a["torque"], -a["drive_rate"]]
             return a["drive"], drives, a["torque_rate"]
@@ -381,17 +397,9 @@ def _parts(
         return a["torque"], motion, column
     # unlike the motor's by the wind-up of the transmission, whose rates look like a lateness
     load = [a["torque"]] if torque else [x for n, x in a.items() if n == "link_acceleration"]
-    if torque and _one_sided(a):  # nothing else tells how late the torque is
+    if motor_alone:  # nothing else tells how late the torque is
         load = [*load, a["torque_rate"]]
     return a["drive"], [*motion_of(a, "motor"), *load], -a["drive_rate"]
-
-
-def _one_sided(averaged: Mapping[str, FloatArray]) -> bool:
-    """Whether one side alone is measured, and the other taken to move with it."""
-    return all(
-        np.array_equal(averaged[f"motor_{what}"], averaged[f"link_{what}"])
-        for what in ("position", "velocity")
-    )
 
 
 def one_way(record: WeakRecord) -> npt.NDArray[np.bool_]:
@@ -415,13 +423,15 @@ def _within(record: WeakRecord, way: FloatArray) -> npt.NDArray[np.bool_]:
     return np.asarray(same if np.mean(same) > FEW else np.ones(record.rows, dtype=np.bool_))
 
 
-def _late(made: WeakRecord, place: str, *, torque: bool) -> float:
+def _late(made: WeakRecord, place: str, *, torque: bool, motor_alone: bool) -> float:
     """Time by which a channel is certainly late [s]."""
-    late, error, _ = lateness(made, place, torque=torque)
+    late, error, _ = lateness(made, place, torque=torque, motor_alone=motor_alone)
     return late if abs(late) > SURE * error else 0.0
 
 
-def lateness(made: WeakRecord, place: str, *, torque: bool) -> tuple[float, float, float]:
+def lateness(
+    made: WeakRecord, place: str, *, torque: bool, motor_alone: bool = False
+) -> tuple[float, float, float]:
     """Time by which a channel is late, its standard error, and the part of it that viscous friction
     may be [s]: reading = what it follows from, less the time times its rate.
 
@@ -432,8 +442,8 @@ def lateness(made: WeakRecord, place: str, *, torque: bool) -> tuple[float, floa
     kept = steady(made)
     a = {n: x[kept] for n, x in made.averaged.items()}
     if place not in ENCODERS:
-        late, error = _slope(*_parts(made, place, kept, torque=torque))
-        if place == "torque_sensor" and not _one_sided(a):
+        late, error = _slope(*_parts(made, place, kept, torque=torque, motor_alone=motor_alone))
+        if place == "torque_sensor" and not motor_alone:
             sure = _slope(*_parts(made, place, kept, torque=torque, through_motor=True))
             if abs(late - sure[0]) > UNLIKE * sure[1]:
                 late, error = sure

@@ -70,6 +70,11 @@ class Sensing:
         return self.balances == ("axis",) or self.clamped_link
 
     @property
+    def motor_and_torque(self) -> bool:
+        """True where drive, motor and torque are recorded, and the link is not."""
+        return self.has_torque and self.balances == ("motor",)
+
+    @property
     def kinematic(self) -> bool:
         """True where both positions are recorded and no torque at all."""
         return self.balances == ("kinematic",)

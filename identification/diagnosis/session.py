@@ -629,7 +629,8 @@ class Session:
     def _at_slower(self, standing: _Standing) -> _Standing | None:
         """The steps with a name that only rows of a longer kernel show; None where there is none.
 
-        Asked once of a model, where nothing else is left to claim.
+        Asked once of a model, where nothing else is left to claim, and of the balances that stand
+        over their floor there.
         """
         now = standing.now.solution
         if now.model.structure in self._asked:
@@ -639,11 +640,22 @@ class Session:
             bench = self.bench.slower(factor)
             if bench is None:
                 return None
-            found = Session(bench, refused=self._refused).diagnose(
-                bench.fitted(now.model, now.values, again=True)
-            )
-            # a whole fit has no linear form to allow for, and these are further looks
-            if not found.claims or found.claims[0].held_out_drop_percent < MAJOR_DROP:
+            slow = bench.fitted(now.model, now.values, again=True)
+            over = {
+                b
+                for b, e in bench.step(None, None, slow).held_out.balances.items()
+                if e.ratio > RATIO_LIMIT
+            }
+            if not over:
+                continue
+            found = Session(bench, refused=self._refused).diagnose(slow)
+            if (
+                not found.claims
+                or found.claims[0].balance not in over
+                or len(found.claims[0].effects) > LARGEST_SET
+                # a whole fit has no linear form to allow for, and these are further looks
+                or found.claims[0].held_out_drop_percent < MAJOR_DROP
+            ):
                 continue
             claim = replace(found.claims[0], kernel=bench.data.kernel, partial=False)
             model = with_effect(now.model, claim.label)

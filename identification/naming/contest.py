@@ -221,7 +221,7 @@ class Contest:
     @cached_property
     def ahead(self) -> FloatArray:
         """By how much the leader is ahead of each rival on the old records, and how sure that is
-        over blocks, as a normal deviate: by their mean or by their signed ranks.  (rivals, 2)
+        over blocks, as a normal deviate: by their mean, signs or signed ranks.  (rivals, 2)
 
         Rows at a turn count only where one of the two laws says what happens there.
         """
@@ -235,10 +235,11 @@ class Contest:
             count = len(difference)
             spread = float(np.std(difference, ddof=1)) * math.sqrt(count) if count > 1 else 0.0
             mean = float(difference.sum()) / spread if spread > 0 else 0.0
-            # one block may hold most of a difference that all large ones show
+            # one block may hold most of a difference that all of them, or all large ones, show
+            signs = float(np.sign(difference).sum()) / math.sqrt(count)
             ranked = _signed_ranks(difference)
             beforehand = float(self._unlikely[k] - self._unlikely[leader])
-            out[k] = difference.sum() + beforehand, max(mean, ranked)
+            out[k] = difference.sum() + beforehand, max(mean, signs, ranked)
         return out
 
     def alive(self, unmodelled: float = 0.0) -> tuple[Rival, ...]:
