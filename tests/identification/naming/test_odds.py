@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 import pytest
-from scipy.stats import norm
+from scipy.stats import norm, wilcoxon
 
 from identification import improve
 from identification.balance.dataset import Dataset
@@ -24,6 +24,7 @@ from identification.naming.contest import (
     _by_block,
     _entitled,
     _left,
+    _signed_ranks,
     _unlikely,
     from_every_valley,
     rivals_of,
@@ -145,6 +146,18 @@ def test_the_lead_by_plain_sums_over_blocks(drags: Contest) -> None:
         signs = (np.sum(by > 0) - np.sum(by < 0)) / math.sqrt(len(by))
         # neither has a clock or a zero that would cost anything beforehand
         assert drags.ahead[k] == pytest.approx([by.sum(), max(t, signs)])
+
+
+def test_large_differences_of_one_sign_are_sure_beside_small_ones_of_the_other() -> None:
+    """As scipy ranks them; their mean stands at 1.5 of its scatter, their signs at .6."""
+    small = [-28.6, -12.4, -8.8, -11.3, -12.0, -10.5, -12.5, -8.7, -12.8, -8.4]
+    large = [27.5, 22.8, 49.5, 39.7, 41.7, 1.3, 38.5, 62.1, 67.1, 39.0, 2.7, 151.9, 151.0, 27.9]
+    values = np.array([*small, *large, 1161.0])
+    sure = _signed_ranks(values)
+    said = wilcoxon(values, method="asymptotic", correction=False).pvalue
+    assert 2 * norm.sf(sure) == pytest.approx(said, rel=1e-9)
+    assert sure > 2.0 > max(values.sum() / (values.std(ddof=1) * 5), np.sign(values).sum() / 5)
+    assert _signed_ranks(-values) == -sure
 
 
 def test_squares_are_summed_over_the_rows_of_each_block_and_no_others() -> None:
