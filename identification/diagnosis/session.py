@@ -623,8 +623,11 @@ class Session:
                 )
         kept = {k for k, rms in left.items() if rms <= SET_RMS * left[found.key]}
         others = names if found.key in names else tuple(t.key for t in alike)
+        # a trial holds what stands at its bound: names of one column are told apart by that
+        others += tuple(t.key for t in alike if t.key in found.effect.confused_with)
         kept |= set(others) - set(left)
-        return found, (found.key, *(k for k in others if k in kept and k != found.key))
+        kept_others = (k for k in dict.fromkeys(others) if k in kept and k != found.key)
+        return found, (found.key, *kept_others)
 
     def _at_slower(self, standing: _Standing) -> _Standing | None:
         """The steps with a name that only rows of a longer kernel show; None where there is none.
