@@ -309,14 +309,9 @@ def common_rms(before: Error, after: Error, balance: str) -> tuple[float, float]
 
 
 def judged_drop(before: Error, after: Error, balance: str) -> float:
-    """Fall of a balance's RMS in percent, on one weighting: what an addition is judged by. Of a
-    balance that was noise it is no more than that of its ratio to the floor: what a gain takes off
-    a noisy reading explains nothing.
-    """
+    """Fall of a balance's RMS in percent, on one weighting: what an addition is judged by."""
     old, new = common_rms(before, after, balance)
-    fall = 100 * (1 - new / old) if old > 0 else 0.0
-    was, now = before.balances[balance].ratio, after.balances[balance].ratio
-    return min(fall, 100 * (1 - now / was)) if 0 < was <= SPOILT_RATIO else fall
+    return 100 * (1 - new / old) if old > 0 else 0.0
 
 
 def held_drop(before: Error, after: Error, balance: str) -> float:

@@ -22,7 +22,7 @@ from identification.diagnosis.bench import Progress
 from identification.diagnosis.candidates import NotTestable, offered
 from identification.diagnosis.claims import LARGEST_SET, Claim, Ranking
 from identification.diagnosis.curve import Curve
-from identification.diagnosis.improvement import Improvement, Step, judged_drop, made_worse
+from identification.diagnosis.improvement import Improvement, Step, made_worse
 from identification.diagnosis.learned import Doubt, Equivalence
 from identification.diagnosis.locate import Unexplained
 from identification.diagnosis.outcome import key_of
@@ -1056,14 +1056,3 @@ def test_noise_that_becomes_structure_refuses_an_addition(
         for rms, ratio in ((1.4, was), (0.14, now))
     )
     assert bool(made_worse(before, after)) == refused
-
-
-def test_what_falls_of_noise_counts_as_far_as_it_falls_against_the_floor() -> None:
-    """A gain that shrinks a noisy reading lowers the RMS and the floor alike."""
-
-    def error(rms: float, ratio: float) -> Error:
-        return Error(5.0, 95.0, 99.0, {"motor": BalanceError(rms, rms / ratio, ratio, "N.m")})
-
-    assert judged_drop(error(1.0, 0.81), error(0.7, 0.82), "motor") < 0.0
-    assert judged_drop(error(1.0, 1.2), error(0.7, 0.9), "motor") == pytest.approx(25.0)
-    assert judged_drop(error(1.0, 5.0), error(0.7, 5.0), "motor") == pytest.approx(30.0)
