@@ -265,6 +265,7 @@ class Session:
                 slower = self._at_slower(standing)
                 if slower is not None:
                     standing = slower
+                    decided.append(slower.claims[-1])
                     base = self.bench.base(standing.now.solution)
                     ranking = self.bench.ranking(base)
                     continue
@@ -882,6 +883,7 @@ class Session:
         for c in standing.claims:
             is_name = len(c.effects) == 1 and c.label in held and held[c.label].is_name
             stays = is_name or c.effect.common or c.effect.stage != "law" or c.balance not in over
+            stays = stays or c.kernel is not None  # these rows say little of it
             (kept if stays else gone).append(c)
         needed = {n for c in kept for n in c.effect.needs}
         if not gone or needed & {c.effects[0] for c in gone}:
