@@ -448,6 +448,21 @@ def test_whole_fits_decide_between_relatives_in_any_unit(unit: float, base: Base
     assert f"{100 * (left - 1):.3g} % more than" in found.why("cyclic_torque")
 
 
+@pytest.mark.parametrize(("other", "beside"), [("added_spring", True), ("quadratic_drag", False)])
+def test_names_of_one_column_but_for_what_is_held_stand_together(
+    other: str, beside: bool, base: Base
+) -> None:
+    """The trial of one is far behind; its whole fit is as good. Only what is declared as confused
+    joins a set so late: others are told apart by their trials.
+    """
+    laws = {"cyclic_torque": {"p": 0.95}, other: {"p": 0.95}}
+    first = {"cyclic_torque": {"p": 0.95}, other: {"p": 0.8}}
+    assert (other in EFFECTS["cyclic_torque"].confused_with) == beside
+    found = ended(World(base, {"p": 24.0}, laws, first), 1)
+    (claim,) = found.claims
+    assert claim.effects == (("cyclic_torque", other) if beside else ("cyclic_torque",))
+
+
 @pytest.mark.parametrize(
     ("key", "seemed", "asked"),
     [
