@@ -282,14 +282,16 @@ def methods(loaded_modules: list[str]) -> list[str]:
 
 _COUNT: Final = """
 import io, sys, collections, contextlib, tempfile, os
-calls = collections.Counter()
+calls, answers = collections.Counter(), {}
 import importlib
 def counted(module, name):
     home = importlib.import_module(module)
     inner = getattr(home, name)
     def outer(*args, **kwargs):
         calls[name] += 1
-        return inner(*args, **kwargs)
+        found = inner(*args, **kwargs)
+        answers[name, id(found)] = found
+        return found
     for other in list(sys.modules.values()):
         if other is not None and getattr(other, name, None) is inner:
             setattr(other, name, outer)
@@ -303,12 +305,14 @@ with contextlib.redirect_stdout(io.StringIO()):
         main(["demo"])
     except SystemExit:
         pass
-print(calls["sense"], calls["noise_level"])
+print(calls["sense"], sum(n == "sense" for n, _ in answers), calls["noise_level"])
 """
 
 
-def demo_calls(root: Path = ROOT) -> tuple[int, int]:
-    """How often one `irj demo` runs `sense` and `noise_level`."""
+def demo_calls(root: Path = ROOT) -> tuple[int, int, int]:
+    """How often one `irj demo` asks `sense`, how often that is worked out and not looked up, and
+    how often it runs `noise_level`.
+    """
     homes = {
         name: m for m in modules(root) for name in ("sensing", "noise") if m.endswith(f".{name}")
     }
@@ -322,8 +326,8 @@ def demo_calls(root: Path = ROOT) -> tuple[int, int]:
         text=True,
         check=True,
     )
-    sensed, noise = done.stdout.split()[-2:]
-    return int(sensed), int(noise)
+    asked, sensed, noise = map(int, done.stdout.split()[-3:])
+    return asked, sensed, noise
 
 
 def main() -> None:
@@ -336,7 +340,7 @@ def main() -> None:
     found = circles(root)
     library, comments = lines(root, LAYERS)
     tests, _ = lines(root, ("tests",))
-    sensed, noise = demo_calls(root)
+    asked, sensed, noise = demo_calls(root)
     at_import, after = loaded(root, improve=True)
     rows = [
         ("import circles (late and type-only imports too)", f"{len(found)}"),
@@ -355,7 +359,10 @@ def main() -> None:
             "modules loaded after one `irj improve` / of methods that it does not call",
             f"{len(after)} / {len(methods(after))}",
         ),
-        ("`irj demo`: calls of sense / noise_level", f"{sensed} / {noise}"),
+        (
+            "`irj demo`: sense worked out (asked) / noise_level, two records",
+            f"{sensed} ({asked}) / {noise}",
+        ),
         ("library lines (Python, C, web)", str(library)),
         ("comments per 100 library lines", f"{100 * comments / library:.2f}"),
         ("test lines : library lines", f"{tests / library:.2f}"),

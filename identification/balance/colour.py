@@ -75,8 +75,9 @@ HIDING: Final = 0.5
 """Noise, in steps, from which on readings toggle between three and more of them, and what the
 steps leave is white.
 """
-FEWEST: Final = 1000
-"""Samples from which a colour is read."""
+FEWEST: Final = 400
+"""Samples from which a colour is read: the power of a difference is known to a sixth then, and the
+tests of the readings count with that."""
 
 
 @final
@@ -240,7 +241,7 @@ def coloured(
     part: slice,
     dt: float,
     levels: Sequence[float],
-    share: float = 1.0,
+    samples: float,
     *,
     calm: bool = False,
 ) -> ChannelNoise:
@@ -257,13 +258,13 @@ def coloured(
     levels : sequence of float
         Deviations of white noise with the same fourth differences over each of
         :func:`spacings_of`; zeros where that is not known.
-    share : float
-        Share of the samples that count.
+    samples : float
+        Number of those that count, in all stretches together.
     calm : bool
         Whether these are those at which the joint is calm.
     """
     spacings, level = spacings_of(dt, calm=calm), levels[0]
-    if level <= 0 or len(spacings) < FEWEST_SPACINGS or share * (part.stop - part.start) < FEWEST:
+    if level <= 0 or len(spacings) < FEWEST_SPACINGS or samples < FEWEST:
         return white(level)
     count = sum(1 for x in levels if x > 0)
     if count < FEWEST_SPACINGS:
@@ -287,7 +288,6 @@ def coloured(
     spacings, rest = [m for m, u in zip(spacings, use, strict=True) if u], rest[use]
     if float(np.median(rest[1:])) < COLOURED * rest[0]:
         return ChannelNoise(level, (Part(math.sqrt(rest[0])),), lines)
-    samples = share * (part.stop - part.start)
     found = _with_memory(rest, spacings, dt, SCATTER * float(np.sqrt(SAMPLES / samples)))
     return ChannelNoise(level, found, lines)
 

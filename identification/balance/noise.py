@@ -191,6 +191,7 @@ def _clear(jumps: FloatArray, length: int) -> npt.NDArray[np.bool_]:
 _LEVELS: Final[WeakKeyDictionary[Record, dict[tuple[str, float], ChannelNoise]]] = (
     WeakKeyDictionary()
 )
+_CALM: Final[WeakKeyDictionary[Record, dict[float, npt.NDArray[np.bool_]]]] = WeakKeyDictionary()
 
 
 def noise_of(
@@ -226,13 +227,17 @@ def noise_of(
             (level,) = spaced_levels(values, stretches, np.inf, [1], there)
         level = level or noise_level(values, stretches, time)
         known[signal, ratio] = white(level)
+        dt = float(np.median(steps)) if even else 0.0
         if even and level > 0:
-            dt = float(np.median(steps))
             further = spaced_levels(values, stretches, level, spacings_of(dt)[1:], there)
             longest = max(stretches, key=lambda s: s.stop - s.start)
-            known[signal, ratio] = coloured(values, longest, dt, [level, *further])
+            samples = sum(s.stop - s.start for s in stretches)
+            known[signal, ratio] = coloured(values, longest, dt, [level, *further], samples)
         if even and position is not None and level > 0:
-            found = _where_calm(values, position, stretches, float(np.median(steps)), there)
+            known_calm = _CALM.setdefault(record, {})
+            if ratio not in known_calm:
+                known_calm[ratio] = calm_of(position, stretches, dt)
+            found = _where_calm(values, known_calm[ratio], stretches, dt, there)
             known[signal, ratio] = found or known[signal, ratio]
         if signal.endswith("position") and record.has(signal):
             step = quantum(values)
@@ -244,20 +249,19 @@ def noise_of(
 
 def _where_calm(
     values: FloatArray,
-    position: FloatArray,
+    calm: npt.NDArray[np.bool_],
     stretches: Sequence[slice],
     dt: float,
     there: npt.NDArray[np.bool_] | None,
 ) -> ChannelNoise | None:
     """Noise of a channel read where the joint moves evenly; None where that is too short."""
-    calm = calm_of(position, stretches, dt)
     spacings = spacings_of(dt, calm=True)
     levels = spaced_levels(values, stretches, np.inf, spacings, there, calm)
     if sum(1 for x in levels if x > 0) < min(FEWEST_SPACINGS, len(spacings)):
         return None
     longest = max(stretches, key=lambda s: s.stop - s.start)
-    share = float(np.mean(calm if there is None else calm & there))
-    return coloured(values, longest, dt, levels, share, calm=True)
+    samples = int(np.sum(calm if there is None else calm & there))
+    return coloured(values, longest, dt, levels, samples, calm=True)
 
 
 def calm_of(position: FloatArray, stretches: Sequence[slice], dt: float) -> npt.NDArray[np.bool_]:

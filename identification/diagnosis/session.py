@@ -61,6 +61,7 @@ from identification.diagnosis.trials import Base, Trial
 from identification.diagnosis.verdict import (
     curves_told,
     hardly_a_model,
+    longer_rows,
     open_notes,
     unseen,
     verdict_of,
@@ -190,6 +191,8 @@ class Session:
         self._located: dict[str, str] = {}
         self._near: dict[str, Mapping[str, float]] = {}
         self._asked: set[tuple[object, ...]] = set()
+        self._crowd: Claim | None = None
+        self._longer: dict[tuple[object, ...], dict[str, tuple[float, float]]] = {}
 
     @property
     def data(self) -> Dataset:
@@ -297,8 +300,7 @@ class Session:
                 for t in ranking.everything:
                     if t.key in claim.effects:
                         aside.add(t.candidate.label)
-                        size = f"is one of {len(claim.effects)} names that explain the same"
-                        self._doubted[t.candidate.label] = f"{size}: too many to be an answer"
+                        self._doubted[t.candidate.label] = _too_many(claim.effects)
                 continue
             share = len(standing.claims) / most
             self.progress(f"adding {best.key}", 0.2 + 0.6 * share if not lean else 0.65)
@@ -336,11 +338,6 @@ class Session:
                 ranking = self.bench.ranking(base, progress=self._within(0.2 + 0.6 * share, 0.0))
         if len(standing.claims) >= most:
             standing = self._without_wrong(standing, decided=lean) or standing
-        if unnamed is not None and not any(
-            t.key in unnamed.effects and t.candidate.label in ranking.significant
-            for t in ranking.everything
-        ):
-            unnamed = None  # an addition has taken it along
         full = len(standing.claims) >= most and not stale
         left = ranking.best(frozenset(self._refused)) if full else None
         stopped = None
@@ -360,6 +357,12 @@ class Session:
                 ranking = self.bench.ranking(base)
             if by_curves is not None and standing.claims:
                 standing, ranking, base = self._by_whole_fits(standing, ranking, base, stale=False)
+        unnamed = unnamed or self._crowd
+        if unnamed is not None and not any(
+            t.key in unnamed.effects and t.candidate.label in ranking.significant
+            for t in ranking.everything
+        ):
+            unnamed = None  # an addition has taken it along
         last = None if lean else (ranking, base)
         found = self.finish(
             first, last, standing.steps, standing.claims, following=stopped, unnamed=unnamed
@@ -460,6 +463,7 @@ class Session:
                 *unseen(solution),
                 *without_link(solution),
                 *without_motor(self.data),
+                *longer_rows(self._longer.get(solution.model.structure, {})),
                 *self._warnings,
             ),
             refused=refusals(
@@ -634,22 +638,27 @@ class Session:
         """The steps with a name that only rows of a longer kernel show; None where there is none.
 
         Asked once of a model, where nothing else is left to claim, and of the balances that stand
-        over their floor there.
+        over their floor there alone: what short rows show their noise does not hide.
         """
         now = standing.now.solution
         if now.model.structure in self._asked:
             return None
         self._asked.add(now.model.structure)
+        shown = _standing_over(standing.now)
         for factor in SLOWER:
             bench = self.bench.slower(factor)
             if bench is None:
                 return None
-            if not _standing_over(bench.step(None, None, now)):  # a fit of its own leaves less
+            if not _standing_over(bench.step(None, None, now)) - shown:  # its own fit leaves less
                 continue
             slow = bench.fitted(now.model, now.values, again=True)
-            over = _standing_over(bench.step(None, None, slow))
+            there = bench.step(None, None, slow)
+            over = _standing_over(there) - shown
             if not over:
                 continue
+            self._longer.setdefault(now.model.structure, {}).update(
+                (b, (bench.data.kernel, there.held_out.balances[b].ratio)) for b in over
+            )
             found = Session(bench, refused=self._refused).diagnose(slow)
             if (
                 not found.claims
@@ -722,7 +731,14 @@ class Session:
                 continue
             self._doubted.update(odds.behind)
             others = tuple(c for c in standing.claims if c is not claim)
-            if odds.empty and not any(claim.effects[0] in c.effect.needs for c in others):
+            needed = any(claim.effects[0] in c.effect.needs for c in others)
+            if len(odds.rivals) > LARGEST_SET and not needed:
+                self._crowd = self._crowd or replace(claim, effects=odds.names)
+                self._refused.update((r.label, _too_many(odds.names)) for r in odds.rivals)
+                standing, stale = self._replay(others, standing), True
+                position -= 1
+                continue
+            if odds.empty and not needed:
                 self._refused[claim.label] = (
                     f"gains no more than laws that are not missing: nothing is {odds.nothing:.0%} "
                     "probable"
@@ -1071,6 +1087,11 @@ def _behind(best: Trial, ranking: Ranking) -> dict[str, float]:
         for t in reversed(ranking.everything)
         if t.balance == best.balance and t.key != best.key and t.score > 0
     }
+
+
+def _too_many(names: Sequence[str]) -> str:
+    """Why a name of a set is not claimed."""
+    return f"is one of {len(names)} names that explain the same: too many to be an answer"
 
 
 def _with_hints(standing: _Standing) -> _Standing:

@@ -194,3 +194,17 @@ def without_link(solution: Solution) -> tuple[str, ...]:
         f"with the motor held the link would swing at {swing:.3g} Hz; its motion leaves a rest "
         "over the noise",
     )
+
+
+def longer_rows(over: Mapping[str, tuple[float, float]]) -> tuple[str, ...]:
+    """What longer rows still show over their floor that no name explains: the rows of the verdict
+    do not show it.
+
+    `over`: length of the rows [s] and ratio to their floor, by balance.
+    """
+    return tuple(
+        f"in rows of {kernel:.2g} s, whose noise is lower, the {balance} balance still stands at "
+        f"{number(ratio, 2)} times its noise floor, and no name explains it: a small effect, or "
+        "slow errors of a sensor"
+        for balance, (kernel, ratio) in over.items()
+    )

@@ -149,7 +149,6 @@ def odds_of(contest: Contest, allowance: float) -> Odds:
     alive = {r.name for r in contest.alive(allowance) if r.name}
     shares = contest.probability(allowance)
     chance = {r.name: float(p) for r, p in zip(contest.rivals, shares, strict=True)}
-    left = [r for r in contest.rivals if r.name in alive]
     title = EFFECTS[contest.leader.name].title if contest.leader.name else "nothing"
     least = max(allowance, FEWEST)
     behind = {
@@ -158,9 +157,27 @@ def odds_of(contest: Contest, allowance: float) -> Odds:
         for r, (nats, _) in zip(contest.rivals, contest.ahead, strict=True)
         if r.name and r.name not in alive
     }
+    gains = _gains(contest)
+    if any(gains.get(name, 0.0) > least for name in alive):
+        # blocks may not tell a law from one that does nothing: that is no second explanation
+        for r in contest.rivals:
+            if r.name in alive and gains[r.name] <= least:
+                alive.remove(r.name)
+                behind[r.label] = (
+                    f"gains {max(gains[r.name], 0.0):.3g} nats over nothing once fitted with the "
+                    f"rest: no more than laws that are not missing gain ({least:.3g})"
+                )
+    left = [r for r in contest.rivals if r.name in alive]
     return Odds(
         tuple(sorted(left, key=lambda r: -chance[r.name])),
         MappingProxyType({r.name: chance[r.name] for r in left}),
         MappingProxyType(behind),
         chance.get(NOTHING, 0.0),
     )
+
+
+def _gains(contest: Contest) -> dict[str, float]:
+    """By how much each name is ahead of nothing at all [nats]; none where that was not fitted."""
+    nats = {r.name: float(x) for r, (x, _) in zip(contest.rivals, contest.ahead, strict=True)}
+    empty = nats.pop(NOTHING, None)
+    return {} if empty is None else {name: empty - x for name, x in nats.items()}

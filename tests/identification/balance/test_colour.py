@@ -84,6 +84,17 @@ def test_noise_through_a_filter_is_read_with_its_memory(corner: float, within: f
     assert read(torque + again).level == pytest.approx(found.level, rel=0.1)
 
 
+@pytest.mark.parametrize("runs", [1, 4, 40])
+def test_a_noise_is_read_as_well_from_many_short_runs(runs: int) -> None:
+    """The same samples, cut into runs: what is read counts them all."""
+    rng = np.random.default_rng(7)
+    torque = motion()[1] + TORQUE * filtered(20.0)(rng, COUNT)
+    channels = {"link_torque": torque, "run": np.arange(COUNT) * runs // COUNT}
+    found = noise_of(Record.from_channels(TIME, channels), "torque", torque, 1.0)
+    slow = sum(p.size**2 * max(2 * p.stages * p.memory, DT) for p in found.parts)
+    assert np.sqrt(slow) == pytest.approx(TORQUE / np.sqrt(np.pi * 20.0), rel=0.3)
+
+
 @pytest.mark.parametrize("lost", [0.01, 0.05, 0.2])
 @pytest.mark.parametrize("corner", [20.0, 50.0])
 def test_lost_samples_take_nothing_off_a_noise_with_a_memory(corner: float, lost: float) -> None:
@@ -116,8 +127,8 @@ def test_calm_stretches_with_lost_samples_show_a_slow_noise_whole() -> None:
         there = rng.random(count) >= 0.2
         levels = spaced_levels(noise, [slice(0, count)], np.inf, spacings, there, calm)
         assert min(levels) > 0
-        share = float(np.mean(calm & there))
-        found = coloured(noise, slice(0, count), dt, levels, share, calm=True)
+        samples = int(np.sum(calm & there))
+        found = coloured(noise, slice(0, count), dt, levels, samples, calm=True)
         slow.append(sum(p.size**2 * max(2 * p.stages * p.memory, dt) for p in found.parts))
     assert np.sqrt(np.median(slow) / (2 * memory)) == pytest.approx(TORQUE, rel=0.1)
 

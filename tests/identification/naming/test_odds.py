@@ -186,6 +186,35 @@ def test_what_the_true_law_leaves_holds_no_other(drags: Contest) -> None:
     assert "nats behind" in odds.behind["cubic_viscous@motor"]
 
 
+@pytest.mark.parametrize(
+    ("behind", "nothing", "unmodelled", "names"),
+    [
+        (137.0, 142.6, 22.6, {"quadratic_drag"}),
+        (137.0, 142.6, 0.0, {*NAMES}),
+        (110.0, 142.6, 22.6, {*NAMES}),
+        (8.0, 10.0, 22.6, {*NAMES}),
+        (8.0, 2.0, 0.0, {*NAMES}),
+    ],
+    ids=["does nothing", "does a little", "does its part", "neither", "worse than nothing"],
+)
+def test_a_name_that_does_nothing_is_no_second_explanation(
+    behind: float, nothing: float, unmodelled: float, names: set[str], drags: Contest
+) -> None:
+    """Few blocks tell nothing apart, however far a name is behind; but where one name explains
+    what is missing, another one that gains no more than laws which are not missing does not.
+    """
+    found = Contest(drags.rivals, drags.data)
+    assert found.leader is found.rivals[1]
+    found.__dict__["ahead"] = np.array([[behind, 1.9], [0.0, 0.0], [nothing, 1.8]])
+    assert len(found.alive(unmodelled)) == 3
+    odds = odds_of(found, unmodelled)
+    assert {*odds.names} == names
+    assert {*odds.probability} == names
+    told = odds.behind.get("cubic_viscous@motor", "over nothing")
+    assert ("cubic_viscous" in names) == ("cubic_viscous@motor" not in odds.behind)
+    assert "over nothing" in told
+
+
 def test_who_has_no_other_valley_stays_as_it_was_fitted(drags: Contest) -> None:
     """Names without shapes, and one behind that is not on offer beside the model any more."""
     first, second, nothing = drags.rivals

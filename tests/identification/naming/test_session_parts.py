@@ -86,6 +86,8 @@ class World:
         Share of what these names leave that curves beside them cannot explain.
     chances : callable
         Odds of the names of a claim.
+    longer : mapping of float to World
+        What rows of so many times the length show.
     """
 
     based: Base
@@ -106,6 +108,7 @@ class World:
     wrong: Mapping[str, Equivalence] = field(default_factory=dict)
     undone: Mapping[frozenset[str], float] = field(default_factory=dict)
     chances: Callable[[Claim, Step], Odds | None] = lambda claim, now: None
+    longer: Mapping[float, World] = field(default_factory=dict)
     asked: list[tuple[frozenset[str], bool]] = field(default_factory=list)
     fitted_whole: list[str] = field(default_factory=list)
     doubted: list[tuple[int, tuple[Curve, ...], int]] = field(default_factory=list)
@@ -252,8 +255,8 @@ class World:
     def same_sign(self, trial: Trial, solution: Solution) -> bool:
         return self.steady
 
-    def slower(self, factor: float) -> None:
-        return None
+    def slower(self, factor: float) -> World | None:
+        return self.longer.get(factor)
 
     def drifts(self, step: Step) -> dict[str, Any]:
         return {}
@@ -313,6 +316,29 @@ def test_whole_fits_are_asked_before_names_are_set_aside(left: int, base: Base) 
         assert "cannot be named" in found.reason
 
 
+def test_a_claim_of_which_whole_fits_leave_too_many_names_is_none(base: Base) -> None:
+    """However few its trials had left; what another balance holds is claimed beside it."""
+    crowd = {"cubic_viscous": 0.4, "cyclic_torque": 0.3, **dict.fromkeys(MANY[:3], 0.1)}
+    odds = lambda claim, now: told(now, crowd, {}) if claim.balance == "axis" else None  # noqa: E731
+    laws = {"cubic_viscous": {"p": 1.0}, "quadratic_drag": {"q@link": 1.0}}
+    found = ended(World(base, {"p": 24.0, "q@link": 8.0}, laws, chances=odds))
+    assert named(found) == ["quadratic_drag"]
+    assert found.verdict == "unexplained"
+    assert "cannot be named" in found.reason
+    assert all(name in found.reason for name in crowd)
+    assert "one of 5 names that explain the same" in found.why("cubic_viscous")
+
+
+def test_names_may_be_many_where_a_claim_needs_the_first(base: Base) -> None:
+    crowd = {"coulomb": 0.4, "cyclic_torque": 0.3, **dict.fromkeys(MANY[:3], 0.1)}
+    odds = lambda claim, now: (  # noqa: E731
+        told(now, crowd, {}) if claim.effects[0] == "coulomb" else None
+    )
+    laws = {"coulomb": {"p": 0.9}, "stribeck": {"p": 1.0, "q": 1.0}}
+    world = World(base, {"p": 24.0, "q": 8.0}, laws, chances=odds, without="coulomb@motor")
+    assert named(ended(world)) == ["coulomb", "stribeck"]
+
+
 def test_a_set_of_too_many_is_forgotten_where_a_later_law_takes_its_work_along(base: Base) -> None:
     alike = dict.fromkeys(MANY, {"p": 1.0})
     world = World(
@@ -325,6 +351,58 @@ def test_a_set_of_too_many_is_forgotten_where_a_later_law_takes_its_work_along(b
         assert named(found) == ["quadratic_drag"]
         assert found.verdict == "complete"
         assert "cannot be named" not in found.reason
+
+
+# --- rows of a longer kernel ----------------------------------------------------------------------
+
+HIDDEN_BY_NOISE = 0.1
+"""Power of a part that stands in the noise of short rows: they fall by 5 %."""
+
+
+@pytest.mark.parametrize(
+    ("short", "shown"),
+    [
+        ({}, True),
+        ({"q@link": 8.0}, True),
+        ({"q": 8.0}, False),
+    ],
+    ids=["nothing beside it", "structure elsewhere", "structure beside it"],
+)
+def test_longer_rows_tell_what_the_noise_of_short_ones_hides(
+    short: Shares, shown: bool, base: Base
+) -> None:
+    """Where short rows stand over their floor themselves it is no noise that hides a name."""
+    laws: dict[str, Shares] = {"quadratic_drag": {"p": 1.0}}
+    length, quiet = 0.24, World(base, {"p": HIDDEN_BY_NOISE}, laws)
+    long = World(base, {"p": 8.0, **short}, laws)
+    (w,) = long.data.train
+    long.data = replace(long.data, train=(replace(w, grid=replace(w.grid, length=length)),))
+    world = World(base, {"p": HIDDEN_BY_NOISE, **short}, laws, longer={2.0: quiet, 4.0: long})
+    found = ended(world)
+    if not shown:
+        assert not found.claims
+        assert not long.asked, "a search that nothing asks for costs its time"
+        return
+    (claim,) = found.claims
+    assert claim.effects == ("quadratic_drag",)
+    assert claim.kernel == length
+    assert found.verdict == ("unexplained" if short else "complete")
+
+
+@pytest.mark.parametrize("named_there", [True, False])
+def test_what_longer_rows_leave_over_their_floor_is_said(named_there: bool, base: Base) -> None:
+    """Whether or not they name a part of it: the verdict is about shorter ones."""
+    laws: dict[str, Shares] = {"quadratic_drag": {"p": 1.0}} if named_there else {"gravity": {}}
+    long = World(base, {"p": 8.0, "q": 3.0}, laws)
+    (w,) = long.data.train
+    long.data = replace(long.data, train=(replace(w, grid=replace(w.grid, length=0.12)),))
+    short = {"p": HIDDEN_BY_NOISE, "q": HIDDEN_BY_NOISE}
+    found = ended(World(base, short, laws, longer={2.0: long, 4.0: World(base, short, laws)}))
+    assert found.verdict == ("complete" if named_there else "nothing_missing")
+    ratio = math.sqrt(1 + 3.0 + (0 if named_there else 8.0))
+    (said,) = (x for x in found.warnings if "rows" in x)
+    assert said.startswith("in rows of 0.12 s")
+    assert f"the axis balance still stands at {ratio:.2g} times its noise floor" in said
 
 
 # --- the number of additions and what is looked for -----------------------------------------------
