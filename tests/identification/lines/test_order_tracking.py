@@ -11,6 +11,7 @@ import pytest
 from identification.diagnosis.lines import _noise, _Tracked, held_out_drop, highest_order
 from identification.diagnosis.order_tracking import (
     FEWEST_CYCLES,
+    FINEST,
     MEDIAN_EFFICIENCY,
     NAMED_WITHIN,
     NEAREST,
@@ -23,6 +24,7 @@ from identification.diagnosis.order_tracking import (
     background,
     beside,
     clipped,
+    confirmed,
     everywhere,
     independent_orders,
     peaks,
@@ -73,6 +75,7 @@ def test_stroke_of_an_even_spread_is_its_span_and_rest_has_no_weight_in_it() -> 
     assert along(rest, 0 * rest, weight).stroke == pytest.approx(20.0, rel=1e-3)
     assert along(angle, 0 * angle, 0 * angle).stroke == 0.0
     assert independent_orders(2.0, 7.0, 20.0) == pytest.approx(5.0 * 20.0 / (2 * math.pi))
+    assert independent_orders(2.0, 2.1, 20.0) == 1.0, "all of them are one"
 
 
 def test_trend_takes_out_what_it_is_made_of() -> None:
@@ -151,6 +154,17 @@ def test_scan_is_the_power_of_the_samples_over_even_orders() -> None:
     base = samples.residual * samples.weight
     direct = [abs(np.sum(base * np.exp(-1j * h * angle))) ** 2 for h in orders[k - 3 : k + 4]]
     assert power[k - 3 : k + 4] == pytest.approx(direct, rel=0.05)
+
+
+@pytest.mark.parametrize("bins", [2.5, 5.5, 8.5, 16.5, 33.5, 64.5])
+def test_a_scan_has_four_points_to_an_independent_order_however_short_the_stroke(
+    bins: float,
+) -> None:
+    highest = 6.0
+    span = bins * 2 * math.pi / highest / FINEST
+    angle = np.linspace(3.0, 3.0 + span, COUNT)
+    orders, _ = spectrum(along(angle, np.cos(highest * angle)), highest)
+    assert 4 * orders[1] <= 2 * math.pi / span
 
 
 def test_a_peak_between_points_is_that_of_their_parabola() -> None:
@@ -387,6 +401,20 @@ def test_no_line_is_more_certain_than_it_stands_over_its_surroundings() -> None:
             assert found.error >= least * (1 - 1e-9)
 
 
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize(
+    ("times", "stands"), [(0.3, False), (0.7, True), (1.0, True), (1.6, True), (3.0, False)]
+)
+def test_held_out_samples_confirm_a_line_of_up_to_twice_its_size_in_any_unit(
+    times: float, stands: bool, unit: float
+) -> None:
+    angle = np.linspace(0.0, 300.0, COUNT)
+    found = line(2.0, 0.6 * unit, -0.8 * unit)
+    noise = 0.2 * unit * np.random.default_rng(4).standard_normal(COUNT)
+    samples = along(angle, times * found.wave(along(angle, angle)) + noise)
+    assert confirmed(found, samples, 1) == stands
+
+
 def test_what_a_line_takes_off_held_out_samples() -> None:
     angle = np.linspace(0.0, 50.0, COUNT)
     weight = np.where(np.arange(COUNT) % 2 == 0, 2.0, 1.0)
@@ -439,3 +467,40 @@ def test_the_error_of_an_order_is_the_scatter_of_the_orders() -> None:
         off.append((found.order - 2.3) / found.error)
     # the larger one of two estimates of the error, so rather too large
     assert 0.5 < np.sqrt(np.mean(np.square(off))) < 1.4
+
+
+def test_the_error_of_an_order_in_white_noise_is_that_of_the_frequency_of_a_sine() -> None:
+    """Cramer-Rao bound over n even samples: the variance is 24 (noise / size)^2 / n / stroke^2."""
+    angle, size, noise = np.linspace(0.0, 300.0, COUNT), 0.2, 1.0
+    rng, errors = np.random.default_rng(11), []
+    for _ in range(20):
+        residual = size * np.sin(2.3 * angle) + noise * rng.standard_normal(COUNT)
+        errors.append(peaks(along(angle, residual), 6.0, most=1)[0].error)
+    bound = math.sqrt(24 / COUNT) * noise / size / 300.0
+    assert np.mean(errors) == pytest.approx(bound, rel=0.2)
+
+
+def test_a_phase_that_changes_from_block_to_block_moves_an_order_within_its_error() -> None:
+    """A straight line through the phases of the blocks has this scatter of its slope."""
+    angle, blocks, deviation = np.linspace(0.0, 300.0, COUNT), 20, 0.3
+    block = np.arange(COUNT) * blocks // COUNT
+    slope = deviation / 300.0 * math.sqrt(12 / blocks)
+    off, errors = [], []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        phase = deviation * rng.standard_normal(blocks)
+        residual = np.sin(2.3 * angle + phase[block]) + 0.02 * rng.standard_normal(COUNT)
+        samples = replace(along(angle, residual), block=block)
+        found = peaks(samples, 6.0, most=1)[0]
+        off.append(found.order - 2.3)
+        errors.append(found.error)
+    assert np.sqrt(np.mean(np.square(off))) == pytest.approx(slope, rel=0.25)
+    assert np.mean(errors) == pytest.approx(slope, rel=0.25)
+
+
+def test_an_order_that_nobody_named_needs_its_periods_whatever_chance_noise_is_given() -> None:
+    angle = np.linspace(0.0, 300.0, COUNT)
+    for seed in range(10):
+        samples = along(angle, np.random.default_rng(seed).standard_normal(COUNT))
+        found = peaks(samples, 6.0, alpha=0.5)
+        assert all(p.order > 3.5 * 2 * math.pi / 300.0 for p in found)
