@@ -147,6 +147,18 @@ def test_units_of_the_outputs_do_not_matter(method: str) -> None:
             np.testing.assert_allclose(one.theta[-1], theta, atol=0.2)
 
 
+@pytest.mark.parametrize("start", [-10.0, 0.3, 10.0, 1e3])
+@pytest.mark.parametrize("says", [0.0, 0.1, -2.0, 400.0])
+def test_the_first_sample_moves_the_estimate_towards_what_it_says_and_not_beyond(
+    start: float, says: float
+) -> None:
+    """However far off the start is: noise that is not known yet has a variance, too."""
+    estimator = RecursiveLeastSquares([start], [1.0])
+    (found,) = estimator.update(2.0 * says, [2.0])
+    assert 0.0 < (found - start) / (says - start) < 1.0
+    assert estimator.measurement_covariance.item() > 0.0
+
+
 # Thesis forgetting
 
 
