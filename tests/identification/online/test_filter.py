@@ -252,6 +252,25 @@ def test_a_torque_from_elsewhere_fades_and_its_uncertainty_stays(read: float) ->
     assert spread[3:] == pytest.approx(np.array([0.5, 3.0]) * np.sqrt(steps * h), rel=1e-9)
 
 
+@pytest.mark.parametrize("read", range(5))
+def test_an_innovation_is_what_a_reading_is_off_in_its_standard_deviations(read: int) -> None:
+    """Of a state that is known but for the noise of the reading that is the noise alone."""
+    levels = Levels()
+    joint, unknown = JointFilter(plant(), 1e-3), np.zeros(5)
+    mean, known = np.zeros(joint.size), np.zeros((joint.size, joint.size))
+    used, p = np.zeros(8), joint.parameters(levels)
+    used[1 + read] = 1.0
+    for off in (-2.0, 0.5):
+        readings = np.zeros(6)
+        readings[1 + read] = off * levels.readings[read]
+        out = np.array(joint.update(mean, known, readings, used, p)[2]).ravel()
+        innovation, spread = out[:5], out[5:10]
+        unknown[read] = off
+        assert innovation == pytest.approx(unknown, rel=1e-9, abs=1e-12)
+        assert spread[read] == pytest.approx(levels.readings[read], rel=1e-9)
+        assert np.all(np.delete(spread, read) == 1.0), "what is not used has none"
+
+
 @pytest.mark.parametrize("count", [1, 2, 5])
 def test_the_inverse_without_pivots_is_the_inverse(count: int) -> None:
     matrix = ca.SX.sym("m", count, count)
