@@ -17,6 +17,7 @@ import pytest
 from benchmarks.lines import Case, Result, results
 from casadi_models import JointModel
 from identification import Record, improve, load_joint, read
+from identification.balance.dataset import OF_TORQUE
 from identification.balance.sensing import Sensing, sense
 from identification.balance.weak import WeakRecord
 from identification.data.joint_file import Joint, parse_joint, toml_text
@@ -24,6 +25,7 @@ from identification.diagnosis.lines import (
     SMOOTHED,
     Line,
     _encoder_orders,
+    _in_step,
     _Joined,
     _names,
     _Pointwise,
@@ -48,6 +50,7 @@ from identification.errors import InputError
 from identification.fitting.engine import load_dataset, prepared_model, solve
 
 FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
 SHARED = Path(__file__).resolve().parents[3].parent / "shared" / "hidden_effect" / "none"
 EVERY = Sensing(
     ("motor", "link", "transmission"),
@@ -220,6 +223,57 @@ def test_what_runs_at_one_speed_tells_once_a_pass(slow: bool, blocks: int) -> No
     made = at_every_sample(record, joint, sensing).block
     assert abs(len(np.unique(made)) - blocks) <= 1
     assert np.array_equal(np.unique(made), np.arange(made.max() + 1)), "numbered without a gap"
+
+
+def in_step(position: npt.NDArray[Any], dt: float) -> IntArray:
+    """Blocks of one stretch."""
+    time = np.asarray(dt * np.arange(len(position)), dtype=np.float64)
+    return _in_step(time, position, np.array([0, len(position)]))
+
+
+@pytest.mark.parametrize("rate", [64, 100, 512])
+def test_what_changes_its_speed_tells_once_a_second_from_its_first_sample(rate: int) -> None:
+    time = np.arange(20 * rate + rate // 3) / rate
+    assert np.array_equal(in_step(np.exp(time), 1 / rate), time.astype(int))
+
+
+@pytest.mark.parametrize("more", [2, 3, 10, 24])
+def test_one_speed_is_one_block_from_two_samples_of_its_last_quarter_of_a_second_on(
+    more: int,
+) -> None:
+    assert np.all(in_step(0.7 * np.arange(300 + more), 0.01) == 0)
+
+
+def test_a_wobble_over_a_quarter_of_a_second_leaves_a_hum_in_step_with_the_angle() -> None:
+    """The angle is a tenth of a period of 10 Hz off at most, and after a second not at all."""
+    time = np.arange(5000) / 1000
+    speed, beat = 3.0, 2 * np.pi * 4
+    angle = speed * (time + 0.2 / beat * np.cos(beat * time))
+    assert np.max(np.abs(angle / speed - time)) < 0.01
+    assert np.ptp(np.gradient(angle, time)) > 0.35 * speed
+    assert np.all(in_step(angle, 1e-3) == 0)
+
+
+def test_a_late_reading_is_taken_at_its_time_as_in_the_rows() -> None:
+    time, late = 2e-3 * np.arange(2000), 6e-3
+    torque = np.sin(5 * (time - late))
+    record = Record.from_channels(
+        time,
+        {
+            "motor_position": 50 * np.sin(time),
+            "link_position": np.sin(time),
+            "link_torque": torque,
+        },
+    )
+    joint = Joint(name="arm", gear_ratio=50.0, model_name="hd3")
+    sensing = sense(record, prepared_model(joint, record))
+    rows: Any = SimpleNamespace(shifts={OF_TORQUE: late}, name="arm")
+    made = at_every_sample(record, joint, sensing, rows)
+    assert made.shifts == {OF_TORQUE: pytest.approx(late)}
+    assert made.points["torque"] == pytest.approx(np.sin(5 * made.time), abs=1e-9)
+    plain = at_every_sample(record, joint, sensing)
+    assert plain.shifts == {}
+    assert plain.points["torque"] == pytest.approx(np.sin(5 * (plain.time - late)), abs=1e-9)
 
 
 @pytest.mark.parametrize("jitter", [0.0, 0.2])
@@ -425,6 +479,25 @@ def test_the_law_of_an_effect_is_tried_where_its_order_is_not_another(
     assert order == pytest.approx(4.017, abs=1e-9)
     assert np.max(np.abs(np.array(tried) - 4.0)) < peak.apart / 2
     assert np.min(tried) < 4.0 < np.max(tried)
+
+
+@pytest.mark.parametrize("at_its_order", [("kinematic_error",), ("torque_ripple",), ()])
+def test_without_a_torque_sensor_a_line_has_the_names_that_are_declared_as_confused_once(
+    at_its_order: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The laws of the others peak beside the order: the balances do not tell the sides apart."""
+    peak = Peak(4.0, 1e-3, sine=1.0, cosine=0.0, prominence=99.0, apart=0.1, amplitude_error=0.1)
+
+    def gains(label: str, model: JointModel, orders: FloatArray, *_: object) -> FloatArray:
+        off = (orders - (4.0 if label.startswith(at_its_order) else 4.03)) / peak.apart
+        return 100 * (1 - off**2)
+
+    monkeypatch.setattr("identification.diagnosis.lines._gains", gains)
+    data: Any = SimpleNamespace(sensing=replace(EVERY, has_torque=False))
+    solution: Any = SimpleNamespace(model=JointModel.harmonic_drive(3))
+    names, _ = _names(peak, 4.0, _Scan(solution, data, (), ()))
+    assert sorted(names) == (["kinematic_error", "torque_ripple"] if at_its_order else [])
+    assert names[:1] == at_its_order
 
 
 def test_an_effect_that_is_a_line_is_tried_as_what_is_not_there_yet() -> None:

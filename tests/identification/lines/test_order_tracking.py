@@ -439,6 +439,15 @@ def test_the_error_of_a_line_is_the_scatter_of_its_phase_in_noise() -> None:
     assert np.mean(errors) == pytest.approx(np.sqrt(np.mean(np.square(sines))), rel=0.2)
 
 
+@pytest.mark.parametrize("slower", [1.0, 1e-2, 1e-4])
+def test_half_of_the_sampling_rate_is_a_higher_order_the_slower_the_joint_is(slower: float) -> None:
+    """At one speed pi / (dt speed); what hardly moves beside it does not count."""
+    weight = slower * np.where(np.arange(COUNT) % 3 == 0, 1e-3, 5.0)
+    samples = along(np.arange(COUNT) * 0.1, np.ones(COUNT), weight)
+    assert highest_order(samples, 0.01) == pytest.approx(math.pi / (0.01 * slower * 5.0))
+    assert highest_order(along(samples.angle, samples.residual, 0 * weight), 0.01) == 0.0
+
+
 def test_noise_that_rises_with_the_order_is_seen_beyond_half_of_the_sampling_rate() -> None:
     """There, too, the level has surroundings above it."""
     angle = 40 * np.sin(0.011 * np.arange(2000)) + 7 * np.sin(0.037 * np.arange(2000))
