@@ -295,16 +295,17 @@ def test_noise_alone_tells_no_direction_and_hides_none_that_is_well_above_it() -
     assert known[1] > 0.95
 
 
+@pytest.mark.parametrize("length", [0.06, 0.08, 0.1])
 @pytest.mark.parametrize(("before", "after"), [(1.0, -0.2), (-0.2, 1.0), (-1.0, 0.2)])
 def test_the_direction_is_unknown_wherever_a_kernel_takes_a_turn_for_another_instant(
-    before: float, after: float
+    before: float, after: float, length: float
 ) -> None:
     """A joint that bounces back is slower after the turn: smoothed, it turns elsewhere."""
     dt = 1e-3
     time = dt * np.arange(4000)
     turn = 2.0
     position = np.where(time < turn, before, after) * (time - turn)
-    made = prepare(time, {"motor_position": position}, (slice(0, len(time)),), pointwise=0.1)
+    made = prepare(time, {"motor_position": position}, (slice(0, len(time)),), pointwise=length)
     points = time[:: made.grid.step]
     wrong = np.sign(made.points["motor_velocity"]) != np.sign(
         np.where(points < turn, before, after)
@@ -312,7 +313,8 @@ def test_the_direction_is_unknown_wherever_a_kernel_takes_a_turn_for_another_ins
     assert np.sum(wrong) > 3
     unknown = _either_direction(made, "motor", white(1e-12))
     assert unknown[wrong].all()
-    assert not unknown[np.abs(points - turn) > 0.05].any(), "no further than half of the kernel"
+    far = np.abs(points - turn) > length / 2
+    assert not unknown[far].any(), "no further than half of the kernel"
 
 
 def test_friction_before_a_link_that_nobody_sees_acts_by_its_curvature_too() -> None:

@@ -15,6 +15,7 @@ from identification.balance.colour import white
 from identification.balance.dataset import Dataset, load_dataset
 from identification.balance.stacked import (
     _either_direction,
+    _sure_rms,
     drift_rows,
     noise_believed,
     noise_rows,
@@ -89,6 +90,22 @@ def test_no_records_have_no_rows_and_rows_of_none_no_level() -> None:
     (record,) = data.train
     masked = replace(data, train=(replace(record, masked=frozenset({"axis"})),))
     assert sure_levels(model, masked, VALUES) == {"axis": 0.0}
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize("share", [0.02, 0.05])
+def test_the_noise_of_rows_shows_beside_some_that_may_go_either_way(
+    share: float, unit: float
+) -> None:
+    """These scatter by their own deviation, too; by the plain RMS the level would be theirs."""
+    rng = np.random.default_rng(3)
+    either = np.where(rng.random(20_000) < share, 30.0, 0.0)
+    change = np.hypot(1.0, either) * rng.standard_normal(20_000)
+    assert rms(change) > 4.0
+    assert _sure_rms(unit * change, unit * either) == pytest.approx(unit, rel=0.05)
+    assert _sure_rms(unit * change, 0 * either) == pytest.approx(unit * rms(change))
+    still = np.where(either > 0, change, 0.0)
+    assert _sure_rms(unit * still, unit * either) == pytest.approx(unit * rms(still))
 
 
 @pytest.mark.parametrize("seconds", [4.0, 30.0])

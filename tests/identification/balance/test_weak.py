@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -291,6 +292,41 @@ def test_every_derivative_of_the_kernel_averages_that_of_a_fast_wave(order: int)
     truth = omega**order * np.sin(omega * t + 0.4 + order * math.pi / 2)
     averaged = float(found @ np.sin(omega * t + 0.4))
     assert averaged == pytest.approx(float(mean @ truth), rel=2e-3)
+
+
+def test_a_row_of_which_less_than_half_was_measured_takes_no_part() -> None:
+    time = np.arange(0, 2, 1e-3)
+    made = prepare(time, {"motor_position": np.sin(time)}, (slice(0, 2000),))
+    assert made.taking("axis").all(), "where nothing was bridged"
+    gap = (made.points["time"] > 0.8) & (made.points["time"] < 0.9)
+    part = made.average(np.where(gap, 0.0, 1.0))
+    taking = replace(made, support=part).taking("axis")
+    assert np.array_equal(taking, part >= 0.5)
+    # as many as stand in the gap
+    assert np.ptp(made.time[~taking]) == pytest.approx(0.1, abs=1.5 * made.grid.stride * 1e-3)
+
+
+def test_a_record_made_of_an_earlier_one_is_the_one_made_anew() -> None:
+    """Whichever signals have moved, and whether they jump between two samples."""
+    time = np.arange(0, 2, 1e-3)
+    before = {
+        "motor_position": np.sin(time),
+        "torque": np.sign(np.sin(9 * time)),
+        "drive": np.sign(np.cos(7 * time)),
+    }
+    earlier = prepare(time, before, (slice(0, 2000),), curved=True)
+    for moved in (("torque",), ("drive",), ("motor_position", "torque"), ()):
+        after = {n: np.roll(x, 3) if n in moved else x for n, x in before.items()}
+        same = set(before) - set(moved)
+        made = prepare(time, after, (slice(0, 2000),), curved=True, before=earlier, same=same)
+        anew = prepare(time, after, (slice(0, 2000),), curved=True)
+        for kind in ("averaged", "points", "smooth", "curved", "between"):
+            own, other = getattr(made, kind), getattr(anew, kind)
+            assert set(own) == set(other)
+            for name, values in own.items():
+                assert np.array_equal(values, other[name]), (kind, name, moved)
+        for name in moved:
+            assert np.any(made.averaged[name] != earlier.averaged[name])
 
 
 def test_what_was_made_of_a_record_goes_with_the_record() -> None:
