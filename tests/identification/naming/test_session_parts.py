@@ -582,6 +582,28 @@ def test_what_is_alike_after_whole_fits_is_the_set(base: Base) -> None:
     assert named(usual) == ["gravity"], "hardly a joint is without it"
 
 
+@pytest.mark.parametrize("backwards", [True, False])
+def test_a_set_loses_a_name_that_leaves_half_as_much_again_where_laws_are_read_backwards(
+    backwards: bool, base: Base
+) -> None:
+    """Only there names of one set are fitted whole against each other; no name stands twice."""
+    laws = {"cyclic_torque": 0.95, "added_spring": 0.88, "stribeck": 0.86, "lugre": 0.8}
+    left = {n: math.sqrt((25 - 24 * x) / (25 - 24 * 0.95)) for n, x in laws.items()}
+    first = {n: {"p": 0.95} for n in laws}
+    world = World(base, {"p": 24.0}, {n: {"p": x} for n, x in laws.items()}, first)
+    now, ranking = world.step(None, None, world.start()), world.ranking(base)
+    best = next(t for t in ranking.trials if t.key == "cyclic_torque")
+    if backwards:
+        world.data = replace(
+            world.data, sensing=replace(world.data.sensing, balances=("kinematic",))
+        )
+    session = Session(world)
+    found, names = session._by_whole_fit(best, tuple(laws), ranking, now, ())
+    assert found.key == "cyclic_torque"
+    assert names == tuple(n for n in laws if not backwards or left[n] <= 1.5)
+    assert 1 < sum(x <= 1.5 for x in left.values()) < len(left)
+
+
 # --- what becomes of earlier claims ---------------------------------------------------------------
 
 
