@@ -25,6 +25,7 @@ from identification.diagnosis.claims import MAJOR_DROP
 from identification.diagnosis.trials import (
     FOLDS,
     KERNEL_SHARE,
+    UNNAMED_LINE,
     Base,
     Trial,
     _refined,
@@ -228,6 +229,16 @@ def test_an_amplitude_that_a_bound_holds_can_only_step_back_from_it(upper: bool)
     assert held.inward_norms == pytest.approx([way * free.norms[free.names.index(name)]])
 
 
+@pytest.mark.parametrize("off", [1e-9, 1e-3])
+def test_an_amplitude_a_little_inside_its_bound_steps_back_from_the_nearer_one(off: float) -> None:
+    """Friction that may be half of what is there: from the upper bound, though it is not on it."""
+    name, high = "motor_coulomb", COULOMB / 2
+    held = made(lambda q, v: 0 * q, held=False, known={name: Known(high=high)})
+    for value, way in ((high * (1 - off), -1), (high * off, 1)):
+        inside = replace(held.solution, values={**held.solution.values, name: value})
+        assert make_base(inside, held.data).inward_norms * way > 0
+
+
 def test_the_speed_over_which_friction_turns_is_free_at_its_bound(base: Base) -> None:
     name = "motor_smoothing_velocity"
     found = make_base(replace(base.solution, at_bound=(name, "motor_viscous")), base.data)
@@ -368,6 +379,25 @@ def test_a_shape_a_little_beyond_its_grid_is_found() -> None:
     assert hidden.data.ranges["velocity"] == pytest.approx(range_, rel=0.01)
     found = tried(hidden, key)
     assert found.values[name] == pytest.approx(width, rel=0.07)
+
+
+@pytest.mark.parametrize(("order", "elsewhere"), [(2.5, True), (2.52, True), (3.3, False)])
+def test_a_line_that_another_order_explains_better_is_no_effect_of_its_own_orders(
+    order: float, elsewhere: bool
+) -> None:
+    """Of orders of the motor turn at 2.5; the law may have 1, 2, 4 and 6."""
+    ripple = made(lambda q, v: SIZE * np.sin(2.5 * q + PHASE), held=False)
+    beside = replace(ripple, data=replace(ripple.data, other_orders=(order,)))
+    before = tried(ripple, "torque_ripple")
+    found = try_candidate(candidate(beside, "torque_ripple"), beside)
+    if elsewhere:
+        assert isinstance(found, NotTestable)
+        assert (found.effect, found.why) == ("torque_ripple", UNNAMED_LINE)
+    else:
+        assert isinstance(found, Trial)
+        assert found.values == before.values
+    # what has no order is tried as ever
+    assert tried(beside, "cyclic_torque").values == tried(ripple, "cyclic_torque").values
 
 
 def test_the_size_by_one_fit_of_all_rows(base: Base) -> None:
