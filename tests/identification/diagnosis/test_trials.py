@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -39,6 +40,7 @@ from identification.diagnosis.trials import (
     try_candidate,
 )
 from identification.fitting.engine import load_dataset, prepared_model, solve
+from identification.fitting.start_values import bounds_of
 from identification.fitting.weak_form import WeakForm
 from identification.naming.contest import rivals_of
 from tests.recorded_world.world import TROUBLES, make_case, write_case
@@ -379,6 +381,27 @@ def test_a_shape_a_little_beyond_its_grid_is_found() -> None:
     assert hidden.data.ranges["velocity"] == pytest.approx(range_, rel=0.01)
     found = tried(hidden, key)
     assert found.values[name] == pytest.approx(width, rel=0.07)
+
+
+@pytest.mark.parametrize("key", ["stribeck", "smooth_stribeck", "load_dependent_presliding"])
+def test_shapes_that_a_trial_looks_at_are_those_that_a_fit_may_have(
+    key: str, base: Base, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A fit that starts at the shape of a trial is not moved to a bound first."""
+    seen: dict[str, tuple[float, float]] = {}
+
+    def refined(projected: Any, best: Any, limits: Mapping[str, tuple[float, float]]) -> Any:
+        seen.update(limits)
+        return _refined(projected, best, limits)
+
+    monkeypatch.setattr(trials, "_refined", refined)
+    monkeypatch.setattr(trials, "REFINE_SHARE", 0.0)
+    found = tried(base, key)
+    bounds = bounds_of(found.candidate.model, {}, base.data)
+    assert seen
+    for name, (low, high) in seen.items():
+        assert bounds[name][0] <= low < high <= bounds[name][1]
+        assert low <= found.values[name] <= high
 
 
 @pytest.mark.parametrize(("order", "elsewhere"), [(2.5, True), (2.52, True), (3.3, False)])
