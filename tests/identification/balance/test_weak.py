@@ -306,6 +306,22 @@ def test_a_row_of_which_less_than_half_was_measured_takes_no_part() -> None:
     assert np.ptp(made.time[~taking]) == pytest.approx(0.1, abs=1.5 * made.grid.stride * 1e-3)
 
 
+def test_no_row_is_off_by_more_than_a_hundredth_of_what_may_hold_a_joint_at_rest() -> None:
+    """Whatever holds it there, up to the limit of its friction; rows that a rest touches with their
+    edge alone take part.
+    """
+    time = np.arange(0, 4, 1e-3)
+    made = prepare(time, {"motor_position": np.sin(time)}, (slice(0, 4000),), overlap=30)
+    t, rng, limit = made.points["time"], np.random.default_rng(2), 20.0
+    still = ((t > 1.0) & (t < 1.5)) | ((t > 2.0) & (t < 2.02))
+    taking = replace(made, rest={"motor": made.average(still.astype(float))}).taking("axis")
+    for holding in (np.full(len(t), limit), limit * rng.uniform(-1, 1, len(t))):
+        off = np.abs(made.average(np.where(still, holding, 0.0)))
+        assert np.max(off[taking]) <= 0.01 * limit
+    touched = made.average(still.astype(float)) > 1e-6
+    assert np.sum(taking & touched) > 4
+
+
 def test_a_record_made_of_an_earlier_one_is_the_one_made_anew() -> None:
     """Whichever signals have moved, and whether they jump between two samples."""
     time = np.arange(0, 2, 1e-3)
