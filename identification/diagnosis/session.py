@@ -348,7 +348,9 @@ class Session:
                 "would be the next."
             )
         if standing.claims:
-            standing, ranking, base = self._by_whole_fits(standing, ranking, base, stale=stale)
+            standing, ranking, base = self._by_whole_fits(
+                standing, ranking, base, stale=stale, crowded=stopped is None
+            )
         if standing.claims and stopped is None and not lean:
             by_curves = self._by_curves(standing, decided)
             if by_curves is not None:
@@ -356,7 +358,9 @@ class Session:
                 base = self.bench.base(standing.now.solution)
                 ranking = self.bench.ranking(base)
             if by_curves is not None and standing.claims:
-                standing, ranking, base = self._by_whole_fits(standing, ranking, base, stale=False)
+                standing, ranking, base = self._by_whole_fits(
+                    standing, ranking, base, stale=False, crowded=True
+                )
         unnamed = unnamed or self._crowd
         if unnamed is not None and not any(
             t.key in unnamed.effects and t.candidate.label in ranking.significant
@@ -706,14 +710,15 @@ class Session:
         return trial, make_claim(trial, ranking, base, odds.names)
 
     def _by_whole_fits(
-        self, standing: _Standing, ranking: Ranking, base: Base, *, stale: bool
+        self, standing: _Standing, ranking: Ranking, base: Base, *, stale: bool, crowded: bool
     ) -> tuple[_Standing, Ranking, Base]:
         """The claims with the names that whole fits leave and how sure each is, and the ranking on
         the model that this ends with.
 
         A name of the model that falls out, or is much less probable than another one, gives its
         place to the one that fits best; one that is less probable than nothing at all goes.
-        `stale`: the ranking is that of an earlier model.
+        `stale`: the ranking is that of an earlier model; `crowded`: too many names are no answer,
+        as they are where no other name is next, whose work all of them do.
         """
         self.progress("fitting the names of each claim", 0.8)
         swapped: set[str] = set()
@@ -732,7 +737,7 @@ class Session:
             self._doubted.update(odds.behind)
             others = tuple(c for c in standing.claims if c is not claim)
             needed = any(claim.effects[0] in c.effect.needs for c in others)
-            if len(odds.rivals) > LARGEST_SET and not needed:
+            if crowded and len(odds.rivals) > LARGEST_SET and not needed:
                 self._crowd = self._crowd or replace(claim, effects=odds.names)
                 self._refused.update((r.label, _too_many(odds.names)) for r in odds.rivals)
                 standing, stale = self._replay(others, standing), True

@@ -111,7 +111,9 @@ def quanser() -> Improvement:
 def test_quanser_is_elastic_with_coulomb_friction_and_not_explained() -> None:
     found = quanser()
     assert found.claims[0].effects == ("coulomb",)
-    assert any("transmission_compliance" in c.effects for c in found.claims[1:])
+    # ten seconds do not tell it from seven others, which are named with it
+    assert "cannot be named" in found.reason
+    assert "transmission_compliance" in found.reason
     errors = [s.held_out.relative_error_percent for s in found.steps]
     assert 37.0 < errors[0] < 41.0
     assert errors[-1] <= 8.0, "half of the rows are at rest: scored, they read 18 %"
