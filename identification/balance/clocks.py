@@ -213,17 +213,21 @@ def in_time(
     """
     filters: dict[str, Filter] = {}
     made, wanted = make({}), tuple(places)
-    beside_motor = motor_alone and "torque_sensor" in wanted
-    shifts = _begun(make, made) if beside_motor else {}
+    by_motor = "torque_sensor" in wanted and (motor_alone or link_hidden(made))
+    shifts = _begun(make, made) if by_motor else {}
     begun = bool(shifts)
     made = make(shifts) if begun else made
+
+    def alone(place: str) -> bool:
+        return by_motor if place == "torque_sensor" else motor_alone
+
     # a drive that is filtered and not late would take the torque along: its rate says more of it
-    first = tuple(p for p in wanted if beside_motor and p == "torque_sensor")
+    first = tuple(p for p in wanted if by_motor and p == "torque_sensor")
     for together in (first, tuple(p for p in wanted if p not in first)):
         for _ in range(SHIFTS if together else 0):
             moved = dict(shifts)
             for place in together:
-                late = _late(made, place, torque=torque, motor_alone=motor_alone) / made.grid.dt
+                late = _late(made, place, torque=torque, motor_alone=alone(place)) / made.grid.dt
                 step = late if abs(late) > NEAR else 0.0
                 moved[place] = moved.get(place, 0.0) + step
             if moved == shifts:
@@ -235,10 +239,10 @@ def in_time(
         unshifted = {**shifts, place: 0.0}
         other, late = make(unshifted), shifts[place] * made.grid.dt
         found = [
-            lateness(x, place, torque=torque, motor_alone=motor_alone)[0] for x in (other, made)
+            lateness(x, place, torque=torque, motor_alone=alone(place))[0] for x in (other, made)
         ]
         taken = (found[0] - found[1]) / late > ANSWERS
-        if beside_motor and place == "torque_sensor":
+        if by_motor and place == "torque_sensor":
             # from where the search did not begin the rows answer to nothing
             in_reach = SERIES * made.grid.length / made.grid.dt < abs(shifts[place]) <= MOST_SKEW
             taken = (taken or begun) and in_reach
@@ -342,6 +346,19 @@ def _filter(
     return Filter(whole * dt, better)
 
 
+def link_hidden(made: WeakRecord) -> bool:
+    """Whether noise of the link's encoder leaves open how late the torque is by more than is left
+    to the model, and the motor's rows tell it better.
+    """
+    if not {"drive", "link_position", "torque"} <= set(made.averaged):
+        return False
+    _, error, _ = lateness(made, "torque_sensor", torque=True)
+    if error < NEAR * made.grid.dt:
+        return False
+    _, by_motor, _ = lateness(made, "torque_sensor", torque=True, motor_alone=True)
+    return by_motor < error
+
+
 def _begun(
     make: Callable[[Mapping[str, float]], WeakRecord], alone: WeakRecord
 ) -> dict[str, float]:
@@ -397,8 +414,6 @@ def _parts(
         return a["torque"], motion, column
     # unlike the motor's by the wind-up of the transmission, whose rates look like a lateness
     load = [a["torque"]] if torque else [x for n, x in a.items() if n == "link_acceleration"]
-    if motor_alone:  # nothing else tells how late the torque is
-        load = [*load, a["torque_rate"]]
     return a["drive"], [*motion_of(a, "motor"), *load], -a["drive_rate"]
 
 
@@ -500,6 +515,7 @@ __all__ = [
     "cubic",
     "in_time",
     "lateness",
+    "link_hidden",
     "one_way",
     "places_of",
     "shifted",

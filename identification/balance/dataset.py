@@ -15,7 +15,14 @@ import numpy.typing as npt
 from casadi_models import JointModel, hold
 from casadi_models.term import SIDE_INERTIAS
 from identification.balance.calibration import named_late, unknowns_of
-from identification.balance.clocks import SIGNAL, as_told, in_time, places_of, shifted
+from identification.balance.clocks import (
+    SIGNAL,
+    as_told,
+    in_time,
+    link_hidden,
+    places_of,
+    shifted,
+)
 from identification.balance.colour import ChannelNoise, Part, white
 from identification.balance.contacts import TOLD_BY, restored
 from identification.balance.memory import cache_of
@@ -198,7 +205,8 @@ def load_dataset(
     for number, (record, made) in enumerate(zip((*train, *held_out), prepared, strict=True)):
         seen = {p: [w.filters[p] for w in prepared[:count] if p in w.filters] for p in made.filters}
         agreed = {p: as_told(seen[p], f) for p, f in made.filters.items() if seen[p]}
-        if sensing.motor_and_torque and not made.shifts.get(OF_TORQUE, 0.0):
+        by_motor = sensing.motor_and_torque or link_hidden(made)
+        if by_motor and not made.shifts.get(OF_TORQUE, 0.0):
             # a record that tells nothing of it has the torque sensor of the others
             late = [w.shifts[OF_TORQUE] for w in prepared[:count] if w.shifts.get(OF_TORQUE, 0.0)]
             agreed |= {OF_TORQUE: float(np.median(late))} if late else {}

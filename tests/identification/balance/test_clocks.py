@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -10,6 +11,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
+from scipy.signal import lfilter
 
 from casadi_models import JointModel
 from identification import Improvement, Record, fit, improve, load_joint, read
@@ -141,33 +143,81 @@ def test_part_of_a_sample_is_found_too(channel: str, samples: float) -> None:
         ), name
 
 
-@pytest.mark.parametrize("motion", ["steps", "sweeps"])
-@pytest.mark.parametrize("late_by", [0, 2, 5, 11])
-def test_a_torque_beside_the_motor_alone_is_put_in_time(motion: str, late_by: int) -> None:
-    """The link swings at 7 Hz: the torque is no law of the motor's motion."""
-    case = make_case(5, without=TROUBLES, names=(), seconds=16.0, make="harmonic160", motion=motion)
-    every = 4
+def soft(
+    motion: str,
+    late_by: int,
+    *,
+    drive: float = 0.0,
+    link: float | None = None,
+    make: str = "harmonic160",
+) -> tuple[list[Record], Joint, float]:
+    """A joint whose link swings at 7 Hz (`harmonic160`), read every fourth sample, its torque late
+    by so many samples of the plant; the joint file and the time between readings [s].
+
+    `drive`: time constant of the current's low-pass [readings]; `link`: noise of the link's encoder
+    [rad], which is not read without it.
+    """
+    case = make_case(5, without=TROUBLES, names=(), seconds=16.0, make=make, motion=motion)
+    every, rng = 4, np.random.default_rng(11)
     records = []
+    sides = ("motor_current", "motor_position", "link_torque")
     for name in RECORDS:
         read_at = np.arange(12, len(case.time[name]), every)
+        sensed = case.measured[name].copy()
+        if drive:
+            kept, current = math.exp(-1 / (every * drive)), SENSED.index("motor_current")
+            sensed[:, current] = lfilter([1 - kept], [1, -kept], sensed[:, current])
         channels = {
-            c: case.measured[name][read_at - (late_by if c == "link_torque" else 0), k]
+            c: sensed[read_at - (late_by if c == "link_torque" else 0), k]
             for k, c in enumerate(SENSED)
-            if c in ("motor_current", "motor_position", "link_torque")
+            if c in (*sides, *(["link_position"] if link is not None else []))
         }
+        if link is not None:
+            channels["link_position"] = channels["link_position"] + link * rng.standard_normal(
+                len(read_at)
+            )
         records.append(Record.from_channels(case.time[name][read_at], channels, name=name))
     joint = Joint(
         name="soft",
         gear_ratio=case.joint.gear_ratio,
         torque_per_current=case.joint.make.per_current * case.joint.sign,
-        model_name="hd1",
+        model_name="hd1" if link is None else "hd3",
         effects=("viscous", "coulomb", "gravity"),
     )
+    return records, joint, every * float(np.diff(case.time["train"][:2])[0])
+
+
+@pytest.mark.parametrize("motion", ["steps", "sweeps"])
+@pytest.mark.parametrize("late_by", [0, 2, 5, 11])
+def test_a_torque_beside_the_motor_alone_is_put_in_time(motion: str, late_by: int) -> None:
+    """The torque is no law of the motor's motion."""
+    records, joint, period = soft(motion, late_by)
     found = improve(records[:1], joint, records[1:])
     assert (found.claims, found.verdict) == ((), "nothing_missing")
     (skew,) = (c for c in found.calibration if c.sensor == "link_torque")
-    period = every * float(np.diff(case.time["train"][:2])[0])
-    assert skew.value == pytest.approx(late_by * period / every, abs=0.15 * period)
+    assert skew.value == pytest.approx(late_by * period / 4, abs=0.15 * period)
+
+
+@pytest.mark.parametrize("late_by", [0, 6])
+def test_a_filter_of_the_drive_is_no_wait_beside_the_torque(late_by: int) -> None:
+    """The torque of a light motor is most of what its drive shows: one as late as the other looks
+    the same, and the filter was taken for a wait of four readings.
+    """
+    records, joint, period = soft("multisine", late_by, drive=3.0, make="belt9")
+    found = improve(records[:1], joint, records[1:])
+    assert (found.claims, found.verdict) == ((), "nothing_missing")
+    by = {c.sensor: c.value / period for c in found.calibration}
+    assert by["motor_current"] == pytest.approx(3.0, abs=0.1)
+    assert by["link_torque"] == pytest.approx(late_by / 4, abs=0.2)
+
+
+def test_a_late_torque_is_told_by_the_motor_where_noise_hides_the_link() -> None:
+    """In every record of the joint, also in those of which the link alone would say another."""
+    records, joint, period = soft("sweeps", 8, link=1e-3)
+    found = improve(records[:1], joint, records[1:])
+    assert (found.claims, found.verdict) == ((), "nothing_missing")
+    (skew,) = (c for c in found.calibration if c.sensor == "link_torque")
+    assert skew.value == pytest.approx(2 * period, abs=0.1 * period)
 
 
 @pytest.mark.parametrize("damping", [0.0, 60.0, 150.0])
