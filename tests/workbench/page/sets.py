@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import difflib
 import json
+import re
 import subprocess
 import sys
 import tempfile
@@ -154,6 +155,8 @@ class Answers:
         The diagnosis on the page and of `irj diagnose --json`.
     joint_files : (str, str)
         Taken home from the page, written by `irj improve -o`.
+    left_behind : (str, str)
+        What each says that its joint file is without; empty where it has all.
     clicks : int
         From the empty page to the falling error.
     """
@@ -165,6 +168,7 @@ class Answers:
     seen: Mapping[str, Any]
     diagnosed: Mapping[str, Any]
     joint_files: tuple[str, str]
+    left_behind: tuple[str, str]
     clicks: int
 
     def differences(self) -> list[str]:
@@ -179,6 +183,8 @@ class Answers:
             out.append("diagnosis: claim")
         if self.joint_files[0] != self.joint_files[1]:
             out.append("joint file")
+        if self.left_behind[0] != self.left_behind[1]:
+            out.append("what the joint file is without")
         return out
 
 
@@ -331,6 +337,8 @@ def answers(page: Any, address: str, recorded: Recorded, folder: Path) -> Answer
     words = page.inner_text("#printed").rstrip("\n") + "\n"
     found = state_of(page, "improvement")
     home = hand.taken_home(folder / "page.toml")
+    card = page.inner_text("main")
+    without = re.search(r"It is (without \d+ of the learned curves: [^.]*)\.", card)
     # the joint as it was described, before anything was fitted
     described = folder / "joint.toml"
     described.write_text(joint_before_the_fit(page, home), encoding="utf-8")
@@ -340,9 +348,11 @@ def answers(page: Any, address: str, recorded: Recorded, folder: Path) -> Answer
     _, diagnosed = irj(folder, "diagnose", *given)
     written = folder / "better.toml"
     text, improved = irj(folder, "improve", *given, "-o", str(written))
-    text = text.removesuffix(f"joint file: {written}\n")
+    # its last line is of the file that only the terminal writes; what it lacks, the page says, too
+    text, _, last = text.partition(f"joint file: {written}")
+    left = (without[1] if without else "", last.strip().removeprefix(", "))
     files = (home, written.read_text(encoding="utf-8"))
-    return Answers(words, text, found, improved, seen, diagnosed, files, clicks)
+    return Answers(words, text, found, improved, seen, diagnosed, files, left, clicks)
 
 
 def joint_before_the_fit(page: Any, home: str) -> str:
@@ -386,6 +396,7 @@ def main() -> int:
             for what, (here, there) in (
                 ("words", (made.page, made.terminal)),
                 ("joint file", made.joint_files),
+                ("what the joint file is without", made.left_behind),
             ):
                 if what in differ:
                     lines = difflib.unified_diff(

@@ -1,0 +1,53 @@
+"""What would be odd about the joint stands on the import screen before the columns are used, in
+Debian's Chromium: wrong units, a supply voltage, several joints, runs with restarting time, a
+linear axis.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.identification.data.test_survey import CASES, written
+from tests.workbench.chromium import context_of, launched, needs_chromium, served
+
+pytestmark = needs_chromium
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    problems: list[str] = []
+    with (
+        served(tmp_path_factory.mktemp("sessions")) as address,
+        launched() as chromium,
+    ):
+        context = context_of(chromium, viewport={"width": 1280, "height": 860})
+        context.on("weberror", lambda e: problems.append(str(e.error)))
+        made = context.new_page()
+        made.set_default_timeout(15_000)
+        made.goto(address)
+        yield made
+    assert problems == []
+
+
+def test_there_are_twelve_of_them() -> None:
+    assert len(CASES) == 12
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_what_is_odd_stands_there_before_it_is_confirmed(
+    page: Any, case: str, tmp_path: Path
+) -> None:
+    columns, expected = CASES[case]
+    page.click("#fresh")
+    page.wait_for_selector("#demo")
+    page.set_input_files("#files", [written(tmp_path, **columns)])
+    use = page.locator("section:has(.map-table) button.primary:has-text('Use these columns')")
+    use.wait_for()
+    said = " ".join(page.locator(".import .odd, .import .import-problem").all_inner_texts())
+    assert expected.lower() in said.lower()
+    assert page.locator(".import .odd").first.is_visible()
+    assert page.evaluate("app.state.files.map((f) => f.status)") == ["columns"], "nothing is used"
