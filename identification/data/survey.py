@@ -5,7 +5,7 @@ may be and why, and what would be odd about the joint if that were so.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, final
@@ -167,8 +167,8 @@ def survey(
     table = open_table(Path(path))
     axis = kind or _kind(table.names, table.units, number)
     joints = numbered(table.names)
-    if number is None and joints:
-        number = min(joints) if columns is None else _of_map(columns, joints)
+    if number is None and joints and columns is None:
+        number = min(joints)
     if columns is None:
         proposed = _proposed(table.names, table.units, axis, number)
     else:
@@ -178,6 +178,8 @@ def survey(
         used = {c.column for c in entries if c.formula is None}
         more = {k: g for k, g in own.items() if k not in chosen and g.column.column not in used}
         proposed = tuple({**chosen, **more}.values())
+        if number is None and joints:
+            number = _of_map(proposed, joints)
     seen, rows = _seen(table)
     made = Survey(table.reader, rows, seen, axis, proposed, joints=tuple(joints), number=number)
     said = _looked(made, Path(path), gear_ratio, name or Path(path).name)
@@ -194,11 +196,7 @@ def _looked(made: Survey, path: Path, ratio: float | None, name: str) -> Survey:
     except InputError as error:
         problem = str(error).partition("; check this guess")[0].replace(str(path), name)
         return replace(made, problem=problem)
-    spans = {
-        c: (float(np.nanmin(v)), float(np.nanmax(v)), record.unit(c))
-        for c, v in (("time", record.time), *record.channels.items())
-        if c != "run" and np.isfinite(v).any()
-    }
+    spans = _spans(record)
     findings = inspected(record, None)
     said = tuple(f for f in findings if f.severity != "ok")
     reverses = any(f.code == "reversal" for f in findings)
@@ -206,9 +204,48 @@ def _looked(made: Survey, path: Path, ratio: float | None, name: str) -> Survey:
     return replace(made, spans=spans, findings=said, questions=questions)
 
 
-def _of_map(columns: Mapping[str, Any], joints: Mapping[int, tuple[str, ...]]) -> int:
+def _spans(record: Record) -> dict[str, tuple[float, float, str]]:
+    """Range of each channel, and its unit."""
+    return {
+        c: (float(np.nanmin(v)), float(np.nanmax(v)), record.unit(c))
+        for c, v in (("time", record.time), *record.channels.items())
+        if c != "run" and np.isfinite(v).any()
+    }
+
+
+def questions_of(
+    record: Record, path: str | Path, findings: Sequence[Finding], gear_ratio: float | None = None
+) -> tuple[str, ...]:
+    """What would be odd about the joint of a record whose headers said everything: nobody was asked
+    what its columns are.
+
+    Parameters
+    ----------
+    record : Record
+        As it was read, without a map.
+    path : str or Path
+        Its file.
+    findings : sequence of Finding
+        What the check gate said of it.
+    gear_ratio : float, optional
+        Without it the turns of a motor say nothing of the link.
+    """
+    table = open_table(Path(path))
+    proposed = tuple(_recognised(table.names, table.units, record.kind).values())
+    joints = numbered(table.names)
+    number = _of_map(proposed, joints) if joints else None
+    made = Survey(
+        table.reader, len(record), (), record.kind, proposed, joints=tuple(joints), number=number
+    )
+    reverses = any(f.code == "reversal" for f in findings)
+    asked = _questions(made, record, _spans(record), gear_ratio, reverses=reverses)
+    unknown = "motor_position" if gear_ratio is None else None
+    return tuple(text for channel, text in asked if channel != unknown)
+
+
+def _of_map(proposed: Sequence[Guess], joints: Mapping[int, tuple[str, ...]]) -> int:
     """The joint that a map takes its columns from; -1 where it takes them from several."""
-    used = {v.get("column") if isinstance(v, Mapping) else v for v in columns.values()}
+    used = {g.column.column for g in proposed}
     found = [k for k, own in joints.items() if used & set(own)]
     return found[0] if len(found) == 1 else -1
 
@@ -349,4 +386,4 @@ def _of_time(record: Record) -> list[tuple[str, str]]:
     return out
 
 
-__all__ = ["Seen", "Survey", "survey"]
+__all__ = ["Seen", "Survey", "questions_of", "survey"]

@@ -198,7 +198,8 @@ class Live(Place):
             if record is None:
                 made = self.examine(entry)
             else:
-                made, whole = checked(entry, record, self.session.path_of(entry), joint)
+                path, mapped = self.session.path_of(entry), bool(self.columns_of(entry))
+                made, whole = checked(entry, record, path, joint, mapped=mapped)
                 with self.lock:
                     self._records.pop(identifier, None)
                     if whole is not None:

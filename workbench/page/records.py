@@ -16,7 +16,7 @@ from identification.data.guess import guess_columns
 from identification.data.joint_file import Joint
 from identification.data.read import open_table, read
 from identification.data.record import Record
-from identification.data.survey import survey
+from identification.data.survey import questions_of, survey
 from identification.errors import InputError
 from workbench.page.session import FileEntry
 from workbench.page.uploads import check_unpacked
@@ -90,9 +90,10 @@ def opened(
 
 
 def checked(
-    entry: FileEntry, record: Record, path: Path, joint: Joint | None
+    entry: FileEntry, record: Record, path: Path, joint: Joint | None, *, mapped: bool = False
 ) -> tuple[FileEntry, Record | None]:
-    """Run the check gate on a record that `opened` gave; None where it is refused.
+    """Run the check gate on a record that `opened` gave; None where it is refused. Where nobody was
+    asked for the columns, what would be odd about the joint stands among the findings.
 
     Parameters
     ----------
@@ -101,9 +102,11 @@ def checked(
     path : Path
     joint : Joint or None
         Where it is known already.
+    mapped : bool
+        It was read with a column map.
     """
     findings = inspected(record, joint)
-    shown = tuple(
+    shown: tuple[dict[str, Any], ...] = tuple(
         {
             "severity": f.severity,
             "code": f.code,
@@ -112,11 +115,22 @@ def checked(
         }
         for f in findings
     )
+    if not mapped:
+        asked = questions_of(record, path, findings, joint.gear_ratio if joint else None)
+        odd = (
+            {"severity": "warn", "code": "odd", "message": text, "channel": ""} for text in asked
+        )
+        shown = (*odd, *shown)
     bad = next((f for f in findings if f.severity == "refuse"), None)
     entry = replace(entry, findings=shown, message="", status="ready")
     if bad is not None:
         return replace(entry, status="refused", message=_plain(bad.message, path, entry.name)), None
     return entry, stamped(record, joint, findings)
+
+
+def _odd(text: str) -> dict[str, Any]:
+    """A question about the joint, as a finding of the page."""
+    return {"severity": "warn", "code": "odd", "message": text, "channel": ""}
 
 
 def _record(path: Path, entry: FileEntry, kind: str, columns: Mapping[str, Any] | None) -> Record:

@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from identification.data.check.gate import inspected
 from identification.data.guess import guess_columns, numbered, of_joint
 from identification.data.read import read
-from identification.data.survey import BUCKETS, Survey, survey
+from identification.data.survey import BUCKETS, Survey, questions_of, survey
 from identification.errors import InputError
 from workbench.cli.main import main
 
@@ -80,6 +81,54 @@ CASES = {
 def test_what_is_odd_is_said_before_the_file_is_used(case: str, tmp_path: Path) -> None:
     columns, expected = CASES[case]
     assert expected in said(survey(written(tmp_path, **columns)))
+
+
+NAMED = {
+    "degrees in a column of radians": (
+        {"time_s": T, "link_position_rad": 70 * SWING, "motor_current_A": SPEED},
+        "the link would swing 22 turns: degrees?",
+    ),
+    "a supply": (
+        {"time_s": T, "link_position_rad": SWING, "motor_voltage_V": 48 + 0.2 * SPEED},
+        "motor_voltage never changes sign while the joint turns back: a supply voltage?",
+    ),
+    "a magnitude": (
+        {"time_s": T, "link_position_rad": SWING, "motor_current_A": np.abs(SPEED)},
+        "motor_current comes to zero and never changes sign: a magnitude without its sign?",
+    ),
+    "time that starts again": (
+        {
+            "time_s": np.concatenate([T[:1000]] * 3),
+            "link_position_rad": SWING,
+            "motor_current_A": SPEED,
+        },
+        "the time starts again 2 times: 3 runs",
+    ),
+    "joints side by side": (
+        {
+            "time_s": T,
+            "motor_position_1_rad": SWING,
+            "motor_position_2_rad": SPEED,
+            "motor_current_1_A": SPEED,
+            "motor_current_2_A": SWING,
+        },
+        "columns of 2 joints, 1 to 2: this is joint 1",
+    ),
+    "the angle of a motor": (
+        {"time_s": T, "motor_position_rad": 160 * SWING, "motor_current_A": SPEED},
+        None,
+    ),
+}
+"""Files whose headers say everything, so that no map is asked for."""
+
+
+@pytest.mark.parametrize("case", NAMED)
+def test_headers_that_say_everything_are_doubted_too(case: str, tmp_path: Path) -> None:
+    columns, expected = NAMED[case]
+    file = written(tmp_path, **columns)
+    record = read(file)
+    found = questions_of(record, file, inspected(record, None))
+    assert found == (() if expected is None else (expected,))
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from tests.identification.data.test_survey import CASES, written
+from tests.identification.data.test_survey import CASES, NAMED, written
 from tests.workbench.chromium import context_of, launched, needs_chromium, served
 
 pytestmark = needs_chromium
@@ -51,3 +51,22 @@ def test_what_is_odd_stands_there_before_it_is_confirmed(
     assert expected.lower() in said.lower()
     assert page.locator(".import .odd").first.is_visible()
     assert page.evaluate("app.state.files.map((f) => f.status)") == ["columns"], "nothing is used"
+
+
+@pytest.mark.parametrize("case", ["a supply", "joints side by side"])
+def test_headers_that_say_everything_are_doubted_on_the_card_of_the_record(
+    page: Any, case: str, tmp_path: Path
+) -> None:
+    """No map is asked for, so the card says it before a fit; the map can be changed."""
+    columns, expected = NAMED[case]
+    page.click("#fresh")
+    page.wait_for_selector("#demo")
+    page.set_input_files("#files", [written(tmp_path, **columns)])
+    page.wait_for_function("() => app.state.files.length === 1 && !busy()")
+    assert expected in page.inner_text("section[aria-label='rig.csv'] .findings >> nth=0")
+    page.click("button[aria-label='Columns of rig.csv']")
+    page.wait_for_selector(".import .odd")
+    said = " ".join(page.locator(".import .odd").all_inner_texts()).lower()
+    assert expected in said
+    if case == "joints side by side":
+        assert page.input_value("select[aria-label='Joint']") == "1"

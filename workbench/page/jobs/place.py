@@ -148,9 +148,11 @@ class Place:
             A record of more samples comes back with the status ``checking``: it can be looked at.
         """
         path = self.session.path_of(entry)
-        made, record = opened(entry, path, self.kind_of(entry), self.columns_of(entry))
+        columns = self.columns_of(entry)
+        made, record = opened(entry, path, self.kind_of(entry), columns)
         if record is not None and not (longest is not None and len(record) > longest):
-            made, record = checked(made, record, path, self.joint_or_none())
+            joint = self.joint_or_none()
+            made, record = checked(made, record, path, joint, mapped=bool(columns))
         with self.lock:
             self._records.pop(entry.id, None)
             if record is not None:
