@@ -37,6 +37,7 @@ from identification.fitting.engine import (
     references,
     solve,
     stack,
+    taking_part,
 )
 from identification.fitting.joint_text import joint_text
 from identification.fitting.parameters import parameter_table
@@ -132,6 +133,7 @@ class Analysis:
         self.solution: Solution | None = None
         self.trials: dict[str, Trial] = {}
         self._rows: Rows | None = None
+        self._assessed: tuple[Solution, Dataset, Error] | None = None
         self._solved: dict[str, Solution] = {}
         self._prepared: dict[str, tuple[Solution, Solution, StepEntry]] = {}
 
@@ -416,20 +418,42 @@ class Analysis:
         rows = self.rows
         residual = self.residuals()
         found = places_of(residual, rows)
-        error = self.bench.judged(now, assess(now.model, self.data, self.data.held_out, now.values))
+        assessed = self.assessed()
+        error = self.bench.judged(now, assessed)
         out: dict[str, Any] = clean(
             {
                 "error": error.as_json(),
                 "places": [p.as_json() | {"chart": place_chart(p).as_json()} for p in found],
-                "worst": self._worst(residual, error, rows),
+                "worst": self._worst(residual, rows),
                 "records": list(self.data.held_out_names),
                 "note": self.note,
             }
         )
         return out
 
-    def balance_series(self, balance: str) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Time, measured torque and what the model explains of it, on the held-out records.
+    def assessed(self) -> Error:
+        """Error of the current model on the held-out records, before the verdict is heard."""
+        now = self.current
+        kept = self._assessed
+        if kept is None or kept[0] is not now or kept[1] is not self.data:
+            found = assess(now.model, self.data, self.data.held_out, now.values)
+            kept = self._assessed = (now, self.data, found)
+        return kept[2]
+
+    def noise(self) -> dict[str, FloatArray]:
+        """Scatter that noise alone allows each held-out row of every balance; NaN in rows that take
+        no part.
+        """
+        out = {}
+        for balance, error in self.assessed().balances.items():
+            rows = taking_part(balance, self.data.held_out)
+            out[balance] = np.full(len(rows), np.nan)
+            out[balance][rows] = 1.0 / np.maximum(error.weight, 1e-300)
+        return out
+
+    def balance_series(self, balance: str) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Time, measured torque, what the model explains of it, and the scatter that noise alone
+        allows what it leaves, on the held-out records.
 
         Raises
         ------
@@ -444,7 +468,8 @@ class Analysis:
         # a curve breaks where a new stretch begins
         breaks = np.concatenate([np.where(w.begins, np.nan, 0.0) for w in self.data.held_out])
         measured = references(self.data, self.data.held_out)[balance] + breaks
-        return self.rows.axes["time"].values, measured, measured - residual[balance]
+        time = self.rows.axes["time"].values
+        return time, measured, measured - residual[balance], self.noise()[balance] + breaks
 
     def parameters(self) -> dict[str, Any]:
         """Table of the parameters of the current model."""
@@ -503,19 +528,17 @@ class Analysis:
             ).residual
         )
 
-    def _worst(
-        self, residual: Mapping[str, FloatArray], error: Error, rows: Rows
-    ) -> dict[str, Any]:
-        """The two seconds in which the residual stands highest over its floor."""
-        stamps = rows.axes["time"].values
-        power = sum((r / max(error.balances[b].floor, 1e-12)) ** 2 for b, r in residual.items())
+    def _worst(self, residual: Mapping[str, FloatArray], rows: Rows) -> dict[str, Any]:
+        """The two seconds in which the residual stands highest over what noise allows its rows: by
+        one floor for all, a reversal would be the worst of every record.
+        """
+        stamps, noise = rows.axes["time"].values, self.noise()
+        over = {b: np.nan_to_num(r / noise[b]) ** 2 for b, r in residual.items()}
+        power = sum(over.values())
         step = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1.0
         width = max(1, min(len(stamps), round(2.0 / step)))
         k = int(np.argmax(np.convolve(np.asarray(power), np.ones(width), "valid")))
-        where = {
-            b: float(np.sum(r[k : k + width] ** 2)) / max(error.balances[b].floor, 1e-12) ** 2
-            for b, r in residual.items()
-        }
+        where = {b: float(np.sum(p[k : k + width])) for b, p in over.items()}
         return {
             "low": float(stamps[k]),
             "high": float(stamps[min(k + width, len(stamps) - 1)]),

@@ -36,6 +36,8 @@ from workbench.page.verbs import addable, wait_settled
 
 Query = Mapping[str, Any]
 MOST_POINTS: Final = 4000
+NOISE_95: Final = 1.96
+"""Standard deviations that hold 95 % of normal noise."""
 
 
 def _config(live: Any, query: Query) -> dict[str, Any]:
@@ -100,12 +102,14 @@ def first_plot(live: Live, file: str, query: Query) -> dict[str, Any] | None:
 def _balance(live: Live, query: Query) -> dict[str, Any]:
     """Measured torque, model and residual of a balance, decimated."""
     analysis = live.analysis()
-    time, measured, model = analysis.balance_series(str(query.get("balance", "")))
+    time, measured, model, noise = analysis.balance_series(str(query.get("balance", "")))
+    kept = NOISE_95 * noise
     stamps, columns, full = decimated(
-        time, [measured, model, measured - model], _points(query), _window(query)
+        time, [measured, model, measured - model, kept, -kept], _points(query), _window(query)
     )
     unit = residual_unit(str(query.get("balance", "")), analysis.joint.kind)
-    drawn = _drawn(stamps, ("measured", "model", "residual"), [unit] * 3, columns, full)
+    names = ("measured", "model", "residual", "noise, upper", "noise, lower")
+    drawn = _drawn(stamps, names, [unit] * len(names), columns, full)
     return {**drawn, "along": along(analysis, stamps)}
 
 

@@ -306,6 +306,7 @@ class Chart:
             "csv": self.csv(),
             "x": str(self.x),
             "y": str(self.y),
+            "dashed": any(c.dashed for c in self.curves),
             "frame": None
             if frame is None
             else {

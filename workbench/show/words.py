@@ -73,6 +73,9 @@ GLOSSARY: Final[Mapping[str, str]] = {
     "noise.",
     "noise floor": "the residual that measurement noise alone would leave in a complete model.",
     "÷ noise": "residual over the noise floor of its balance; 1 × cannot be improved.",
+    "fit": "100 % less the share of the torque's variation about its mean that is not explained.",
+    "VAF": "variance accounted for: 100 % less the share of the torque's variance that is not "
+    "explained.",
     "set": "names that these records cannot tell apart: one of them is missing, and a named run "
     "would say which.",
     "in part": "explains some of what is missing in its balance; structure is left there that is "

@@ -82,8 +82,9 @@ class ServedChart {
       }
     }
     this.picture = made;
+    const ways = spec.dashed ? h("p", { class: "small soft ways" }, "Solid: forward; dashed: backward.") : null;
     const body = this.brush && f ? h("div", { class: "brushed", tabindex: "0", role: "group", "aria-label": `${this.name}: arrow keys choose a stretch that the time plot marks, Escape clears it`, onkeydown: (e) => this.key(e) }, made) : made;
-    this.node.replaceChildren(body, h("div", { class: "row between under" }, this.said, saver(this.name, () => svgFile(this.picture), () => this.spec.csv)));
+    this.node.replaceChildren(...[body, ways].filter(Boolean), h("div", { class: "row between under" }, this.said, saver(this.name, () => svgFile(this.picture), () => this.spec.csv)));
   }
   X(v) { const f = this.spec.frame; return f.left + ((v - f.x[0]) / (f.x[1] - f.x[0])) * (f.right - f.left); }
   valueAt(e) {

@@ -22,7 +22,7 @@ function columnMap(f) {
     const channels = (id, chosen, label) => h("select", { id, "aria-label": label, onchange: again }, h("option", { value: "" }, "not used"), app.config.channels.map((c) => h("option", { value: c, selected: c === chosen }, c.replace(/_/g, " "))));
     const box = (id, value, label, size) => h("input", { id, value, size: size || "7", placeholder: label.split(" of ")[0], "aria-label": label, autocomplete: "off", onchange: again });
     const si = (p) => (p && p.si ? h("div", { class: "small soft si" }, `= ${digits(p.si[0], 4)} … ${digits(p.si[1], 4)} ${unit(p.si[2])}`) : null);
-    const odd = (p) => (p ? about(p.channel).map((q) => h("p", { class: "odd small" }, q.text)) : []);
+    const asks = (text) => sentence(plainly(text), text.endsWith("?") ? "?" : "."), odd = (p) => (p ? about(p.channel).map((q) => h("p", { class: "odd small" }, asks(q.text))) : []);
     const rows = found.columns.map((c, k) => {
       const p = mapped[c.name], id = `${key}-${k}`, name = c.name;
       const parts = { channel: channels(`${id}-channel`, p && p.channel, `Channel of column ${name}`), unit: box(`${id}-unit`, (p && p.unit) || c.unit || "", `Unit of column ${name}`), scale: box(`${id}-scale`, p && p.scale ? String(p.scale) : "", `Scale of column ${name}`), counts: box(`${id}-counts`, p && p.counts_per_turn ? String(p.counts_per_turn) : "", `Counts/turn of column ${name}`, "9"), sign: h("select", { id: `${id}-sign`, "aria-label": `Sign of column ${name}`, onchange: again }, h("option", { value: "1" }, "+"), h("option", { value: "-1", selected: p && p.sign === -1 }, "−")) };
@@ -60,7 +60,7 @@ function columnMap(f) {
     const whole = [...found.questions, ...found.findings.map((x) => ({ channel: x.channel, text: x.message }))].filter((q) => !q.channel || !found.proposed.some((p) => p.channel === q.channel));
     const focus = document.activeElement && body.contains(document.activeElement) ? document.activeElement.id : null;
     body.replaceChildren(h("div", { class: "row" }, joint, kind, h("span", { class: "soft small" }, `${plural(found.rows, "row")}. Check the guess by what it says of the joint, then use it.`)),
-      ...whole.map((q) => h("p", { class: "odd" }, sentence(q.text, q.text.endsWith("?") ? "?" : "."))), h("p", { class: "bad import-problem", hidden: !found.problem }, found.problem),
+      ...whole.map((q) => h("p", { class: "odd" }, asks(q.text))), h("p", { class: "bad import-problem", hidden: !found.problem }, plainly(found.problem)),
       h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": `Columns of ${f.name}` }, h("table", { class: "map-table" }, h("thead", {}, h("tr", {}, ["Column", "Shape", "Range", "Channel", "Unit, sign, scale, counts/turn", "Why"].map((t) => h("th", { scope: "col" }, t)))), h("tbody", {}, [...rows, ...extra].map((r) => [r.node, r.more.length ? h("tr", { class: "odd-row" }, h("td", { colspan: "6" }, r.more)) : null])))),
       h("div", { class: "row gap" }, button(found.same > 1 ? `Use for all ${found.same} files with these columns` : "Use these columns", confirm, { kind: "primary", id: `use-${f.id}`, key: `use-${f.id}-${JSON.stringify(request)}` }), f.status === "columns" ? null : button("Close", () => { app.drafts[opened] = false; render(false); }, { kind: "quiet", work: false })));
     if (focus && $(focus)) $(focus).focus({ preventScroll: true });

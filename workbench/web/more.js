@@ -1,9 +1,9 @@
 "use strict";
 /* Physics or sensor, online replay, planning: the views beside the loop. */
 const seconds = (v) => `${digits(v, 3)} s`;
-const words = (name) => name.replace(/#\d+/g, "").replace(/_/g, " ");
+const words = (name) => name.replace(/#\d+/g, "").replace(/_delay_0$/, "_delay").replace(/_/g, " "); /* the estimator has one delay of the drive, of the one record it is fed */
 const field = (id, label, value, hint, more) => h("div", { class: "field" }, h("label", { for: id }, label), h("input", { id, value: value == null ? "" : String(value), "aria-describedby": `${id}-hint`, autocomplete: "off", inputmode: "decimal", ...more }), h("span", { class: "small soft", id: `${id}-hint` }, hint));
-const choice = (id, label, options, chosen, hint, onchange) => h("div", { class: "field" }, h("label", { for: id }, label), h("select", { id, onchange, "aria-describedby": hint ? `${id}-hint` : null }, options.map(([v, t]) => h("option", { value: v, selected: v === chosen }, t))), hint && h("span", { class: "small soft", id: `${id}-hint` }, hint));
+const choice = (id, label, options, chosen, hint, onchange, size = "") => h("div", { class: `field ${size}` }, h("label", { for: id }, label), h("select", { id, onchange, "aria-describedby": hint ? `${id}-hint` : null }, options.map(([v, t]) => h("option", { value: v, selected: v === chosen }, t))), hint && h("span", { class: "small soft", id: `${id}-hint` }, hint));
 
 /* --- physics or sensor ---------------------------------------------------------------------------------------- */
 
@@ -115,7 +115,7 @@ views.replay = async (state) => {
   if (!last.time) return [head, live, form];
   const stale = last.effects.join() !== state.steps[state.steps.length - 1].effects.join();
   const marks = last.verdicts.filter((v) => v.about.length), host = h("div", { class: "plot" });
-  later(() => { const plot = new SeriesPlot(host, () => Promise.resolve({ time: last.time, full: true, series: Object.entries(last.ratio).map(([b, v]) => ({ name: b, unit: "× floor", values: v })) }), { title: "Residual over floor of each balance", local: true }); app.plots.push(plot); plot.show(null).catch(fail); });
+  later(() => { const plot = new SeriesPlot(host, () => Promise.resolve({ time: last.time, full: true, series: Object.entries(last.ratio).map(([b, v]) => ({ name: b, unit: "× floor", values: v })) }), { title: "Residual over floor of each balance", local: true, side: "residual of each balance" }); app.plots.push(plot); plot.show(null).catch(fail); });
   const verdict = last.standing ? last.standing.replace(/\.$/, "") : !last.detector ? "Sensor faults were not looked for" : marks.length ? `${words(marks[0].about.join(" or "))}: ${marks[0].text.charAt(0).toLowerCase()}${marks[0].text.slice(1)}` : "No reading was doubted";
   return [head, live, form, stale ? h("p", { class: "note" }, "This replay belongs to an earlier model; replay again.") : null,
     h("section", { class: "card", id: "timeline" }, h("h2", {}, "Fault timeline"), h("p", {}, h("strong", { id: "standing" }, sentence(verdict)), ` ${last.record}, ${seconds(last.end)}${last.live ? " so far" : ""}.`), last.note ? h("p", { class: "note small" }, last.note) : null, last.no_detector ? h("p", { class: "note small" }, `${last.no_detector.charAt(0).toUpperCase()}${last.no_detector.slice(1)}.`) : null,
@@ -150,15 +150,15 @@ views.plan = async (state) => {
   const go = () => run("plan", { position: $("plan-position").value, speed: $("plan-speed").value, torque: $("plan-torque").value, label: $("plan-label").value });
   const now = last.limits || limits;
   const groups = [["set", "Cannot be told apart"], ["untested", "Cannot be shown by these records"], ["warning", "Weak spots of the records"]].map(([k, t]) => [t, asked.filter((o) => o.kind === k)]).filter(([, rows]) => rows.length);
-  const item = (o) => h("li", {}, h("strong", {}, o.title), `: ${o.text}.`, o.run ? h("span", { class: "soft" }, ` What would show it: ${o.run}.`) : null);
+  const item = (o) => h("li", {}, h("strong", {}, o.title), `: ${askedFor(o.text, "under What is known on the Model page")}.`, o.run ? h("span", { class: "soft" }, ` What would show it: ${o.run}.`) : null);
   const form = h("form", { class: "card", onsubmit: (e) => e.preventDefault(), oninput: (e) => { draft[e.target.id] = e.target.value; } }, h("h2", {}, "What the joint may do"), h("div", { class: "fields" },
     field("plan-position", "Range ± [°]", draft["plan-position"] ?? now.position, "of the link"), field("plan-speed", "Speed [°/s]", draft["plan-speed"] ?? now.speed, "of the link"), field("plan-torque", "Drive torque [N·m]", draft["plan-torque"] ?? now.torque, "on the link side"),
-    choice("plan-label", "Must also show", [["", "only what is in the model"], ...labels.map((l) => [l, effectTitle(l)])], draft["plan-label"] ?? last.label ?? "", "an effect to look for")), button("Plan a motion", go, { kind: "primary", id: "plan" }));
+    choice("plan-label", "Must also show", [["", "only what is in the model"], ...labels.map((l) => [l, effectTitle(l)])], draft["plan-label"] ?? last.label ?? "", "an effect to look for", null, "long")), button("Plan a motion", go, { kind: "primary", id: "plan" }));
   const head = [heading("Plan the next experiment", "What the records leave open, and a motion that answers it: the fitted joint is simulated along the reference motions, and the one that pins the parameters best within your limits is kept."),
     h("section", { class: "card" }, h("h2", {}, "What these records leave open"), groups.length ? groups.map(([t, rows], k) => h("details", { open: k === 0 && rows.length < 6 }, h("summary", {}, `${t} (${rows.length})`), h("ul", { class: "findings" }, rows.map(item)))) : h("p", { class: "soft" }, state.left_open && state.left_open.warnings ? "Nothing that the diagnosis could name." : "Diagnose first: it says what cannot be told apart and what is not testable.")), form];
   if (!last.motion) return head;
   const host = h("div", { class: "plot" });
-  later(() => { const plot = new SeriesPlot(host, () => Promise.resolve(last.motion), { title: "Reference motion", local: true }); app.plots.push(plot); plot.show(null).catch(fail); });
+  later(() => { const plot = new SeriesPlot(host, () => Promise.resolve(last.motion), { title: "Reference motion", local: true, side: "of the link" }); app.plots.push(plot); plot.show(null).catch(fail); });
   const p = last.parameters, said = [`${digits((180 / Math.PI) * p.speed)}°/s`, p.period && `period ${seconds(p.period)}`, seconds(last.duration) + " long"].filter(Boolean).join(", "), missed = last.deviations.filter((d) => !d.good).length;
   return [...head, h("section", { class: "card", id: "best-motion" }, h("div", { class: "row between" }, h("div", {}, h("h2", {}, "The best motion"), h("p", {}, h("strong", {}, `${last.family === "sinusoidal" ? "Sinusoidal" : "Triangular"}, ${said}`), `: ${missed ? `${last.deviations.length - missed} of ${last.deviations.length} parameters` : `all ${last.deviations.length} parameters`} to better than 10 %.`)), h("a", { class: "button primary", href: `${base()}/view/motion.csv`, download: "", id: "get-motion" }, "Download as CSV")),
     last.note ? h("p", { class: "note small" }, last.note) : null, host, h("p", { class: "small soft" }, "Reference for the link: time, position, velocity and acceleration, link-referred, at 1 kHz.")),

@@ -49,6 +49,7 @@ function stepName(step) {
 const effort = () => (/^kind\s*=\s*"linear"/m.test(app.state.joint_text) ? "force" : "torque");
 const vaf = (v) => digits(v, v > 99.9 ? 5 : 4);
 
+const noisy = (s) => s.name.startsWith("noise, ");
 const plotPoints = (width) => Math.max(200, Math.min(1600, Math.round(width)));
 
 /* A series with min-max decimation on the server; a drag zooms and asks for the samples of the window.
@@ -83,7 +84,7 @@ class SeriesPlot {
   }
   colours() {
     const css = getComputedStyle(document.documentElement), colour = (name) => css.getPropertyValue(name).trim();
-    const palette = { measured: "--measured", model: "--after", residual: "--before" }, cycle = ["--after", "--before", "--good", "--measured", "--warn"];
+    const palette = { measured: "--measured", model: "--after", residual: "--before", "noise, upper": "--soft", "noise, lower": "--soft" }, cycle = ["--after", "--before", "--good", "--measured", "--warn"];
     return { of: (s, k) => colour(palette[s.name] || cycle[k % cycle.length]), axis: { stroke: colour("--soft"), grid: { stroke: colour("--grid"), width: 1 }, ticks: { stroke: colour("--grid") } } };
   }
   picked(u) { if (u.select.width > 3) this.show([u.posToVal(u.select.left, "x"), u.posToVal(u.select.left + u.select.width, "x")]).catch(fail); }
@@ -107,13 +108,13 @@ class SeriesPlot {
     const groups = this.panels ? this.panels.map((names) => data.series.filter((s) => names.includes(s.name))).filter((g) => g.length) : [data.series];
     this.plots = groups.map((group, panel) => {
       const units = [...new Set(group.map((s) => s.unit))], last = panel === groups.length - 1;
-      const label = (u) => { const first = group.find((s) => s.unit === u), side = this.side || first.side, what = this.panels ? (group.length > 1 ? effort() : first.name) : ""; return [[what, side].filter(Boolean).join(" "), unit(u) && `[${unit(u)}]`].filter(Boolean).join(" "); };
+      const label = (u) => { const first = group.find((s) => s.unit === u), side = this.side || first.side, what = this.panels ? (group.includes(data.series[0]) ? effort() : first.name) : ""; return [[what, side].filter(Boolean).join(" "), unit(u) && `[${unit(u)}]`].filter(Boolean).join(" "); };
       const made = new uPlot({
         width: this.host.clientWidth || 800, height: this.height(), legend: { live: true }, cursor: { drag: { x: true, y: false, setScale: false }, sync: this.panels ? { key: "series", setSeries: false } : undefined },
         scales: { x: { time: false, range: this.range ? () => this.range : undefined } },
         series: [{ label: "time [s]", value: (u, v) => digits(v, 6) }, ...group.map((s) => { const k = data.series.indexOf(s); return {
           label: s.name.replace(/_/g, " ") + (unit(s.unit) ? ` [${unit(s.unit)}]` : ""), stroke: of(s, k), width: data.time.length < 600 ? 1.5 : 1, scale: s.unit,
-          dash: s.name === "model" ? [6, 3] : k % 2 && s.name !== "residual" ? [8, 3] : undefined, value: (u, v) => digits(v, 4), points: { show: data.full && data.time.length < 200 && !this.local },
+          dash: s.name === "model" ? [6, 3] : noisy(s) ? [2, 3] : k % 2 && s.name !== "residual" ? [8, 3] : undefined, value: (u, v) => digits(v, 4), points: { show: data.full && data.time.length < 200 && !this.local && !noisy(s) },
         }; })],
         axes: [{ ...axis, label: last ? "time [s]" : undefined, labelSize: 20, size: last ? 40 : 24 }, ...units.map((u, k) => ({ ...axis, scale: u, side: k ? 1 : 3, label: label(u), labelSize: 18, size: 58, grid: k ? { show: false } : axis.grid }))],
         hooks: { setSelect: [(u) => this.picked(u)], drawClear: [(u) => this.shade(u)], setCursor: [(u) => { if (this.onCursor) this.onCursor(u.cursor.left < 0 ? null : u.cursor.idx); }] },
@@ -150,12 +151,12 @@ class SeriesPlot {
     this.strip.hidden = !this.range;
     if (!this.range) return;
     if (!this.small) {
-      const { of, axis } = this.colours(), scales = Object.fromEntries([...new Set(all.series.map((s) => s.unit))].map((u) => [u, {}]));
+      const { of, axis } = this.colours(), drawn = all.series.filter((s) => !noisy(s)), scales = Object.fromEntries([...new Set(drawn.map((s) => s.unit))].map((u) => [u, {}]));
       this.small = new uPlot({
         width: this.host.clientWidth || 800, height: 74, legend: { show: false }, cursor: { drag: { x: true, y: false, setScale: false }, points: { show: false }, y: false }, scales: { x: { time: false }, ...scales },
-        series: [{}, ...all.series.map((s, k) => ({ stroke: of(s, k), width: 1, scale: s.unit, points: { show: false } }))],
-        axes: [{ ...axis, size: 24 }, ...all.series.slice(0, 1).map((s) => ({ ...axis, scale: s.unit, size: 58, values: () => [] }))], hooks: { setSelect: [(u) => this.picked(u)] },
-      }, [all.time, ...all.series.map((s) => s.values)], this.strip);
+        series: [{}, ...drawn.map((s, k) => ({ stroke: of(s, k), width: 1, scale: s.unit, points: { show: false } }))],
+        axes: [{ ...axis, size: 24 }, ...drawn.slice(0, 1).map((s) => ({ ...axis, scale: s.unit, size: 58, values: () => [] }))], hooks: { setSelect: [(u) => this.picked(u)] },
+      }, [all.time, ...drawn.map((s) => s.values)], this.strip);
       this.small.root.setAttribute("role", "img");
       this.small.root.setAttribute("aria-label", "The whole record; the shaded part is shown above");
     }

@@ -63,7 +63,7 @@ function besideCard(state) {
 function fitsTable(found) {
   const [a, b] = found.steps, changed = found.values.filter((v) => v.first !== v.second), cell = (v, of) => h("td", { class: "num", "data-label": stepTitle(of) }, v == null ? "–" : digits(v, 4));
   return h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Two fits compared" }, h("table", { class: "stack" }, h("caption", {}, "Two fits side by side"), h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Parameter"), h("th", { scope: "col", class: "num" }, stepTitle(a)), h("th", { scope: "col", class: "num" }, stepTitle(b)))),
-    h("tbody", {}, h("tr", { class: "now" }, h("th", { scope: "row" }, "Held-out error [%]"), cell(a.error, a), cell(b.error, b)), h("tr", {}, h("th", { scope: "row" }, "Only in it"), found.only.map((o, k) => h("td", { "data-label": stepTitle(found.steps[k]) }, o.length ? o.map(effectTitle).join(", ") : "–"))),
+    h("tbody", {}, h("tr", { class: "now" }, h("th", { scope: "row" }, "Held-out error [%]"), cell(a.error, a), cell(b.error, b)), h("tr", {}, h("th", { scope: "row" }, "Only in it"), found.only.map((o, k) => h("td", { class: "num wraps", "data-label": stepTitle(found.steps[k]) }, o.length ? o.map(effectTitle).join(", ") : "–"))),
       changed.map((v) => h("tr", {}, h("th", { scope: "row" }, words(v.name)), cell(v.first, a), cell(v.second, b))))));
 }
 

@@ -5,6 +5,10 @@ const button = (text, onclick, { kind = "", id, off, work = true, label, key } =
 const sentence = (text, end = ".") => text.charAt(0).toUpperCase() + text.slice(1) + (text.endsWith(end) ? "" : end);
 const plural = (n, one, many) => `${n.toLocaleString("en")} ${n === 1 ? one : many || one + "s"}`;
 const effectTitle = (label) => { const [key, at] = label.split("#")[0].split("@"), e = app.config.effects.find((x) => x.key === key); return (e ? e.title : key.replace(/_/g, " ")) + (at ? ` (${at.replace(/_/g, " ")})` : ""); };
+/* Channels as a person says them: their names stand in what the check says, column names in quotes stay. */
+const plainly = (text) => text.replace(/(?<!['"\w])[a-z]+(?:_[a-z]+)+(?!['"\w])/g, (name) => (app.config.channels.includes(name) ? name.replace(/_/g, " ") : name));
+/* What the diagnosis asks for, where the page has fields for it. */
+const askedFor = (why, where) => why.replace(/give (.*) in \[known\]/, (_, what) => `give ${what.replace(/_/g, " ")} ${where}`);
 const SEVERITY = { refuse: ["bad", "refused"], repair: ["warn", "repaired"], warn: ["warn", "check"], ok: ["good", "fine"] };
 
 function heading(title, lead) { return [h("h1", {}, title), lead && h("p", { class: "lead" }, lead)]; }
@@ -86,13 +90,13 @@ const views = {
     const draft = app.drafts.compare || (app.drafts.compare = {});
     let balance = balances.includes(draft.balance) ? draft.balance : found.worst.balance;
     forgetCharts();
-    const plot = new SeriesPlot(host, (range, points) => get(`/view/balance?balance=${balance}&points=${points}${range ? `&from=${range[0]}&to=${range[1]}` : ""}`), { title: "Measured torque, model and residual", panels: [["measured", "model"], ["residual"]], side: "at the link" });
+    const plot = new SeriesPlot(host, (range, points) => get(`/view/balance?balance=${balance}&points=${points}${range ? `&from=${range[0]}&to=${range[1]}` : ""}`), { title: "Measured torque, model and residual", panels: [["measured", "model"], ["residual", "noise, upper", "noise, lower"]], side: "at the link" });
     plot.marks = () => linked.marks; linked.plot = plot;
     plot.onCursor = (index) => plot.data && cursorInCharts(plot.data)(index);
     app.plots.push(plot);
     later(() => plot.show([found.worst.low, found.worst.high]).catch(fail));
     const pick = h("select", { id: "balance", "aria-label": "Balance in the time plot", onchange: (e) => { balance = draft.balance = e.target.value; plot.forget(); plot.show(plot.range).catch(fail); } }, balances.map((b) => h("option", { value: b, selected: b === balance }, `${b} balance`)));
-    const strong = found.places.filter((p) => p.share_percent > 5 && (found.error.balances[p.balance].ratio ?? 9) > 1.2), rest = found.places.filter((p) => !strong.includes(p));
+    const strong = found.places.filter((p) => p.share_percent > 5 && (found.error.balances[p.balance].ratio ?? 9) > 1.2), shown = strong.length ? strong : found.places.slice(0, 1), rest = found.places.filter((p) => !shown.includes(p));
     const figure = (p) => chartFigure([`${p.balance} balance against ${p.title}`, h("span", {}, p.share_percent > 1 ? `explains ${digits(p.share_percent, 2)} % of the residual's variance on blocks it was not drawn from` : "explains next to nothing")], p.chart, { name: `${p.balance} residual against ${p.title}`, axis: p.axis, brush: markInTime(p.axis) });
     const curves = await get("/view/as-such");
     return [
@@ -102,11 +106,11 @@ const views = {
         balances.map((b) => { const e = found.error.balances[b]; return h("div", { class: "card" }, h("p", { class: "soft" }, `${b} balance`), h("div", { class: "figure" }, digits(e.ratio), h("small", {}, " ", term("÷ noise", "× noise"))), h("p", { class: "small soft" }, `residual ${digits(e.rms)} ${unit(e.unit)} rms; noise alone would leave ${digits(e.floor)}. ${e.ratio < 1.5 ? "Down to the noise." : "There is something left."}`)); })),
       h("h2", { class: "gap" }, strong.length ? "Places where the residual is not chance" : "No place stands out"),
       strong.length && first ? h("p", { class: "soft" }, `Line: mean residual; shade: 95 % band. The ${first.balance} balance fails most clearly against ${first.title}.`) : h("p", { class: "soft" }, nowhere(found)),
-      h("div", { class: "grid" }, (strong.length ? strong : found.places.slice(0, 1)).map(figure)),
+      h("div", { class: "grid" }, shown.map(figure)),
       h("details", {}, h("summary", {}, `Other places (${rest.length})`), h("div", { class: "grid" }, rest.map(figure))),
       curves.length ? h("section", { class: "gap", id: "as-such" }, h("h2", {}, "Curves as such"), h("p", { class: "soft" }, "◆ as measured, with a band of 95 %; line: as the model has it."), h("div", { class: "grid" }, curves.map((c) => chartFigure([c.title, h("span", {}, `${c.balance} balance`)], c.chart, { name: `${c.title}, ${c.balance} balance` })))) : null,
       patternCard(found.pattern),
-      h("section", { class: "card gap" }, h("h2", {}, "In time, at the worst two seconds"), h("p", { class: "soft small" }, "Drag to zoom: up close every row is drawn. The strip below shows the whole record: drag across it to look elsewhere."),
+      h("section", { class: "card gap" }, h("h2", {}, "In time, at the worst two seconds"), h("p", { class: "soft small" }, "Drag to zoom: up close every row is drawn. The strip below shows the whole record: drag across it to look elsewhere. Dotted: what noise alone keeps the residual within, 95 times in 100; where a joint turns back or creeps it allows more."),
         plotControls(plot, [pick, button("Worst window", () => plot.show([found.worst.low, found.worst.high]), { kind: "quiet", work: false })]), host),
     ];
   },
@@ -137,9 +141,9 @@ const views = {
       d.warnings.map((w) => h("p", { class: "note small" }, sentence(w))),
       clear.length ? h("div", { class: "two ranking" }, h("div", { class: "card" }, h("h2", {}, "Ranked effects"), h("p", { class: "soft small" }, "The bar is the fall of the residual on held-out records if the effect is added to the model as it stands. Falls do not add up: add one, then diagnose again."), h("ol", { class: "ranked" }, clear.map(row))), panel.node) : null,
       curves.length ? h("div", { class: "two ranking" }, h("div", { class: "card", id: "learned" }, h("h2", {}, "Curves without a name"), curveList(curves, panel)), clear.length ? null : panel.node) : null,
-      faint.length ? h("details", { class: "card" }, h("summary", {}, `Not to be told from chance, or too small (${faint.length})`), h("ol", { class: "ranked" }, faint.map((r, k) => row(r, k + clear.length)))) : null,
-      d.refused && d.refused.length ? h("details", { class: "card", id: "refused" }, h("summary", {}, `Why not another? (${d.refused.length})`), h("ul", {}, d.refused.map((r) => h("li", {}, h("strong", {}, effectTitle(r.effect)), r.why.startsWith("with ") ? `: ${r.why}.` : `: it ${r.why}.`)))) : null,
-      d.not_testable.length ? h("details", { class: "card" }, h("summary", {}, `Not testable with these records (${d.not_testable.length})`), h("ul", {}, d.not_testable.map((n) => h("li", {}, h("strong", {}, n.title), `: ${n.why}.`, n.asks && n.asks.length ? knownAsk(n, known) : null)))) : null,
+      faint.length ? h("details", { class: "card" }, h("summary", {}, h("h2", {}, `Not to be told from chance, or too small (${faint.length})`)), h("ol", { class: "ranked" }, faint.map((r, k) => row(r, k + clear.length)))) : null,
+      d.refused && d.refused.length ? h("details", { class: "card", id: "refused" }, h("summary", {}, `Why not another? (${d.refused.length})`), h("ul", {}, d.refused.map((r) => h("li", {}, h("strong", {}, effectTitle(r.effect)), `: ${r.why.startsWith("with ") ? "" : "it "}${r.why.replace(/(?<=[ e])-(?=\d)/g, "−")}.`)))) : null,
+      d.not_testable.length ? h("details", { class: "card" }, h("summary", {}, `Not testable with these records (${d.not_testable.length})`), h("ul", {}, d.not_testable.map((n) => h("li", {}, h("strong", {}, n.title), `: ${n.asks && n.asks.length ? askedFor(n.why, "here") : n.why}.`, n.asks && n.asks.length ? knownAsk(n, known) : null)))) : null,
       glossaryCard(),
     ];
   },
@@ -161,7 +165,7 @@ const views = {
         h("div", { class: "card" }, h("h2", {}, "In the model now"), h("ul", { class: "plain" }, inside.map((e) => h("li", {}, h("div", { class: "row between" }, effectTitle(e), button("Remove", () => run("remove", { label: e }), { kind: "quiet", label: `Remove ${effectTitle(e)}`, off: e === "transmission_compliance" && inside.includes("structural_damping") })))))),
       ),
       stairs.told ? h("div", { class: "grid" }, chartFigure([`The place that told: ${stairs.told.name}`, h("span", {}, `${stairs.told.balance} balance, before (◆) and after (■); line: what it explains`)], stairs.told.chart, { name: "The place that told", kind: "told" })) : null,
-      h("div", { class: "card scroll", tabindex: "0", role: "region", "aria-label": "Ledger" }, h("table", { class: "stack" }, h("caption", {}, "Ledger"), h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Step"), h("th", { scope: "col", class: "num" }, "Held-out error"), h("th", { scope: "col", class: "num" }, "Fit"), h("th", { scope: "col", class: "num" }, "VAF"), Object.keys(last.held_out.balances).map((b) => h("th", { scope: "col", class: "num" }, [`${b} `, term("÷ noise")])))),
+      h("div", { class: "card scroll", tabindex: "0", role: "region", "aria-label": "Ledger" }, h("table", { class: "stack" }, h("caption", {}, "Ledger"), h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Step"), h("th", { scope: "col", class: "num" }, "Held-out error"), h("th", { scope: "col", class: "num" }, term("fit", "Fit")), h("th", { scope: "col", class: "num" }, term("VAF")), Object.keys(last.held_out.balances).map((b) => h("th", { scope: "col", class: "num" }, [`${b} `, term("÷ noise")])))),
         h("tbody", {}, steps.map((s, k) => h("tr", { class: k === steps.length - 1 ? "now" : null }, h("td", {}, stepName(s)), h("td", { class: "num", "data-label": "Held-out error" }, `${digits(s.held_out.relative_error_percent)} %`), h("td", { class: "num", "data-label": "Fit" }, `${digits(s.held_out.fit_percent)} %`), h("td", { class: "num", "data-label": "VAF" }, `${vaf(s.held_out.vaf_percent)} %`), Object.keys(last.held_out.balances).map((b) => h("td", { class: "num", "data-label": `${b} ÷ noise` }, s.held_out.balances[b] ? digits(s.held_out.balances[b].ratio) : "–"))))))),
       treeCard(state),
       lawCard(state),
@@ -228,12 +232,12 @@ function fileCard(f) {
   return h("section", { class: "card", "aria-label": f.name }, h("div", { class: "row between" },
     h("div", {}, h("h2", {}, f.name), shown ? h("p", { class: "soft small" }, `${plural(s.samples, "sample")}, ${digits(s.duration, 4)} s, every ${digits(1000 * s.dt, 3)} ms${s.segments > 1 ? `, ${s.segments} stretches` : ""}. ${f.role_reason.charAt(0).toUpperCase()}${f.role_reason.slice(1)}.`) : null),
     h("div", { class: "row" }, shown ? role : null, f.status === "columns" ? null : button("Columns", () => { app.drafts[`columns-${f.id}`] = !app.drafts[`columns-${f.id}`]; app.drafts[`map-${f.id}`] = { now: true }; render(false); }, { kind: "quiet", work: false, id: `columns-${f.id}`, label: `Columns of ${f.name}` }), button("Remove", () => act(async () => { await call("DELETE", `${base()}/file/${f.id}`); await refresh(); }), { kind: "quiet", label: `Remove ${f.name}` }))),
-    f.status === "refused" ? h("p", { class: "bad" }, f.message) : null,
+    f.status === "refused" ? h("p", { class: "bad" }, plainly(f.message)) : null,
     f.status === "checking" ? h("p", { class: "small soft", role: "status" }, "Going through the check gate …") : null,
     f.status === "columns" ? columnMap(f) : null,
-    bad.length ? h("ul", { class: "findings" }, bad.map((x) => h("li", {}, h("span", { class: `tag ${SEVERITY[x.severity][0]}` }, SEVERITY[x.severity][1]), " ", x.message))) : null,
+    bad.length ? h("ul", { class: "findings" }, bad.map((x) => h("li", {}, h("span", { class: `tag ${SEVERITY[x.severity][0]}` }, SEVERITY[x.severity][1]), " ", plainly(x.message)))) : null,
     f.status !== "columns" && app.drafts[`columns-${f.id}`] ? columnMap(f) : null,
-    f.status === "ready" ? h("details", {}, h("summary", {}, bad.length ? `Checked: ${fine.length} fine; columns` : "Checked, nothing to repair; columns"), h("ul", { class: "findings" }, s.columns.map((c) => h("li", {}, c)), s.notes.map((n) => h("li", {}, n)), fine.map((x) => h("li", {}, x.message)))) : null);
+    f.status === "ready" ? h("details", {}, h("summary", {}, bad.length ? `Checked: ${fine.length} fine; columns` : "Checked, nothing to repair; columns"), h("ul", { class: "findings" }, s.columns.map((c) => h("li", {}, plainly(c))), s.notes.map((n) => h("li", {}, plainly(n))), fine.map((x) => h("li", {}, plainly(x.message))))) : null);
 }
 
 function seriesCard(files) {
