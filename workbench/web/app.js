@@ -202,9 +202,13 @@ function open(view, { moved = true } = {}) {
   app.view = view;
   if (moved) try { if (same || !location.hash) history.replaceState(null, "", address); else history.pushState(null, "", address); } catch (error) { location.hash = address; }
   surround();
-  const here = $(`nav-${view}`);
-  if (here) here.closest(".steps").scrollLeft = here.offsetLeft - here.closest(".steps").clientWidth / 2 + here.offsetWidth / 2; /* on a phone the steps are wider than the screen */
+  showStep();
   render(true);
+}
+/* On a phone the steps are wider than the screen: the one that is open stands in its middle. */
+function showStep() {
+  const here = $(`nav-${app.view}`);
+  if (here) here.closest(".steps").scrollLeft = here.offsetLeft - here.closest(".steps").clientWidth / 2 + here.offsetWidth / 2;
 }
 
 /* Where the focus is: by id, else by its place among the elements of its kind. */
@@ -304,7 +308,7 @@ async function boot() {
   theme(wished());
   dark.addEventListener("change", () => { theme(wished()); render(false); });
   let turned = null;
-  addEventListener("resize", () => { clearTimeout(turned); turned = setTimeout(() => { if (app.drawn && Math.abs(pictureRoom() / app.drawn - 1) > 0.1) render(false); }, 200); }); /* of a phone that was turned, pictures are drawn anew: their letters would shrink or be cut */
+  addEventListener("resize", () => { clearTimeout(turned); turned = setTimeout(() => { showStep(); if (app.drawn && Math.abs(pictureRoom() / app.drawn - 1) > 0.1) render(false); }, 200); }); /* of a phone that was turned, pictures are drawn anew: their letters would shrink or be cut */
   $("theme").addEventListener("click", () => { const next = document.documentElement.dataset.theme === "dark" ? "light" : "dark"; remembered("irj-theme", next); theme(next); render(false); });
   $("undo").addEventListener("click", () => run("undo"));
   $("redo").addEventListener("click", () => run("redo"));

@@ -115,7 +115,7 @@ views.replay = async (state) => {
   if (!last.time) return [head, live, form];
   const stale = last.effects.join() !== state.steps[state.steps.length - 1].effects.join();
   const marks = last.verdicts.filter((v) => v.about.length), host = h("div", { class: "plot" });
-  later(() => { const plot = new SeriesPlot(host, () => Promise.resolve({ time: last.time, full: true, series: Object.entries(last.ratio).map(([b, v]) => ({ name: b, unit: "× floor", values: v })) }), { title: "Residual over floor of each balance", local: true, side: "residual of each balance" }); app.plots.push(plot); plot.show(null).catch(fail); });
+  later(() => { const plot = new SeriesPlot(host, () => Promise.resolve({ time: last.time, full: true, series: Object.entries(last.ratio).map(([b, v]) => ({ name: b, unit: "× floor", values: v })) }), { title: "Residual over floor of each balance", local: true, side: "residual" }); app.plots.push(plot); plot.show(null).catch(fail); });
   const verdict = last.standing ? last.standing.replace(/\.$/, "") : !last.detector ? "Sensor faults were not looked for" : marks.length ? `${words(marks[0].about.join(" or "))}: ${marks[0].text.charAt(0).toLowerCase()}${marks[0].text.slice(1)}` : "No reading was doubted";
   return [head, live, form, stale ? h("p", { class: "note" }, "This replay belongs to an earlier model; replay again.") : null,
     h("section", { class: "card", id: "timeline" }, h("h2", {}, "Fault timeline"), h("p", {}, h("strong", { id: "standing" }, sentence(verdict)), ` ${last.record}, ${seconds(last.end)}${last.live ? " so far" : ""}.`), last.note ? h("p", { class: "note small" }, last.note) : null, last.no_detector ? h("p", { class: "note small" }, `${last.no_detector.charAt(0).toUpperCase()}${last.no_detector.slice(1)}.`) : null,
@@ -139,8 +139,8 @@ function triedTable(tried) {
 
 function deviationTable(rows) {
   const most = Math.max(...rows.map((d) => Math.min(d.percent ?? 100, 100)), 1);
-  return h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "What the motion makes identifiable" }, h("table", {}, h("caption", {}, "What it makes identifiable"), h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Parameter"), h("th", { scope: "col", class: "num" }, "± to expect"), h("th", { scope: "col" }, "Identifiable?"))),
-    h("tbody", {}, rows.map((d) => h("tr", {}, h("th", { scope: "row" }, words(d.name), h("div", { class: "small soft plain" }, d.meaning)), h("td", { class: "num" }, d.percent == null ? "–" : `${digits(d.percent, 2)} %`, h("span", { class: "bar thin", "aria-hidden": "true" }, later2(h("i"), `${(100 * Math.min(d.percent ?? 100, most)) / most}%`))), h("td", {}, h("span", { class: `tag ${d.good ? "good" : "warn"}` }, d.percent == null ? "not by this motion" : d.good ? "yes" : "poorly")))))));
+  return h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "What the motion makes identifiable" }, h("table", { class: "stack" }, h("caption", {}, "What it makes identifiable"), h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Parameter"), h("th", { scope: "col", class: "num" }, "± to expect"), h("th", { scope: "col" }, "Identifiable?"))),
+    h("tbody", {}, rows.map((d) => h("tr", {}, h("th", { scope: "row" }, words(d.name), h("div", { class: "small soft plain" }, d.meaning)), h("td", { class: "num", "data-label": "± to expect" }, d.percent == null ? "–" : `${digits(d.percent, 2)} %`, h("span", { class: "bar thin", "aria-hidden": "true" }, later2(h("i"), `${(100 * Math.min(d.percent ?? 100, most)) / most}%`))), h("td", { "data-label": "Identifiable?" }, h("span", { class: `tag ${d.good ? "good" : "warn"}` }, d.percent == null ? "not by this motion" : d.good ? "yes" : "poorly")))))));
 }
 const later2 = (bar, width) => { later(() => { bar.style.width = width; }); return bar; };
 

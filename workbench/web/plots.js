@@ -49,7 +49,12 @@ function stepName(step) {
 const effort = () => (/^kind\s*=\s*"linear"/m.test(app.state.joint_text) ? "force" : "torque");
 const vaf = (v) => digits(v, v > 99.9 ? 5 : 4);
 
+/* What noise allows is drawn beside the residual; where it allows much, at a reversal, it must not flatten it. */
 const noisy = (s) => s.name.startsWith("noise, ");
+function reach(group, low, high) {
+  const upper = group.filter(noisy).flatMap((s) => s.values).filter((v) => v > 0).sort((a, b) => a - b), usual = upper.length ? 1.3 * upper[upper.length >> 1] : 0;
+  return [Math.min(low, -usual), Math.max(high, usual)];
+}
 const plotPoints = (width) => Math.max(200, Math.min(1600, Math.round(width)));
 
 /* A series with min-max decimation on the server; a drag zooms and asks for the samples of the window.
@@ -109,11 +114,12 @@ class SeriesPlot {
     this.plots = groups.map((group, panel) => {
       const units = [...new Set(group.map((s) => s.unit))], last = panel === groups.length - 1;
       const label = (u) => { const first = group.find((s) => s.unit === u), side = this.side || first.side, what = this.panels ? (group.includes(data.series[0]) ? effort() : first.name) : ""; return [[what, side].filter(Boolean).join(" "), unit(u) && `[${unit(u)}]`].filter(Boolean).join(" "); };
+      const beside = group.some(noisy) ? Object.fromEntries(units.map((u) => [u, { range: (p, low, high) => uPlot.rangeNum(...reach(group, low ?? 0, high ?? 0), 0.1, true) }])) : {};
       const made = new uPlot({
         width: this.host.clientWidth || 800, height: this.height(), legend: { live: true }, cursor: { drag: { x: true, y: false, setScale: false }, sync: this.panels ? { key: "series", setSeries: false } : undefined },
-        scales: { x: { time: false, range: this.range ? () => this.range : undefined } },
+        scales: { x: { time: false, range: this.range ? () => this.range : undefined }, ...beside },
         series: [{ label: "time [s]", value: (u, v) => digits(v, 6) }, ...group.map((s) => { const k = data.series.indexOf(s); return {
-          label: s.name.replace(/_/g, " ") + (unit(s.unit) ? ` [${unit(s.unit)}]` : ""), stroke: of(s, k), width: data.time.length < 600 ? 1.5 : 1, scale: s.unit,
+          label: s.name.replace(/_/g, " ") + (unit(s.unit) ? ` [${unit(s.unit)}]` : ""), stroke: of(s, k), width: data.time.length < 600 ? 1.5 : 1, scale: s.unit, auto: !noisy(s),
           dash: s.name === "model" ? [6, 3] : noisy(s) ? [2, 3] : k % 2 && s.name !== "residual" ? [8, 3] : undefined, value: (u, v) => digits(v, 4), points: { show: data.full && data.time.length < 200 && !this.local && !noisy(s) },
         }; })],
         axes: [{ ...axis, label: last ? "time [s]" : undefined, labelSize: 20, size: last ? 40 : 24 }, ...units.map((u, k) => ({ ...axis, scale: u, side: k ? 1 : 3, label: label(u), labelSize: 18, size: 58, grid: k ? { show: false } : axis.grid }))],
@@ -136,13 +142,13 @@ class SeriesPlot {
     const groups = this.panels ? this.panels.map((names) => this.data.series.filter((s) => names.includes(s.name))).filter((g) => g.length) : [this.data.series], time = this.data.time, [x0, x1] = this.range || this.full;
     const out = svg("svg", { xmlns: SVG, viewBox: `0 0 ${W} ${high * groups.length}`, width: W, height: high * groups.length, "font-family": "system-ui, sans-serif" }, svg("rect", { width: "100%", height: "100%", fill: "#ffffff" }));
     groups.forEach((group, k) => {
-      const seen = time.map((t, i) => i).filter((i) => time[i] >= x0 && time[i] <= x1), ys = group.flatMap((s) => seen.map((i) => s.values[i])).filter((v) => v != null), top = k * high + T, base = (k + 1) * high - B;
-      let [y0, y1] = [Math.min(...ys), Math.max(...ys)];
+      const seen = time.map((t, i) => i).filter((i) => time[i] >= x0 && time[i] <= x1), ys = group.filter((s) => !noisy(s)).flatMap((s) => seen.map((i) => s.values[i])).filter((v) => v != null), top = k * high + T, base = (k + 1) * high - B;
+      let [y0, y1] = group.some(noisy) ? reach(group, Math.min(...ys), Math.max(...ys)) : [Math.min(...ys), Math.max(...ys)];
       if (!(y1 > y0)) { y0 -= 1; y1 += 1; }
       const X = (t) => L + ((t - x0) / (x1 - x0)) * (W - L - R), Y = (v) => base - ((v - y0) / (y1 - y0)) * (base - top), word = (x, y, text, anchor = "middle") => svg("text", { x, y, "text-anchor": anchor, "font-size": 11, fill: ink }, text);
       for (const t of ticks(y0, y1, 4)) out.append(svg("path", { d: `M${L} ${Y(t)}H${W - R}`, stroke: "#cccccc", fill: "none" }), word(L - 5, Y(t) + 4, digits(t), "end"));
       for (const t of ticks(x0, x1, 8)) out.append(svg("path", { d: `M${X(t)} ${top}V${base}`, stroke: "#cccccc", fill: "none" }), word(X(t), base + 15, digits(t, 5)));
-      group.forEach((s, n) => { let pen = "M"; const d = seen.map((i) => { if (s.values[i] == null) { pen = "M"; return ""; } const at = `${pen}${X(time[i]).toFixed(1)} ${Y(s.values[i]).toFixed(1)}`; pen = "L"; return at; }).join(""); out.append(svg("path", { d, stroke: of(s, this.data.series.indexOf(s)), fill: "none" }), svg("text", { x: L + 150 * n, y: top - 6, "font-size": 11, fill: of(s, this.data.series.indexOf(s)) }, `${s.name.replace(/_/g, " ")}${unit(s.unit) ? ` [${unit(s.unit)}]` : ""}`)); });
+      group.forEach((s, n) => { let pen = "M"; const d = seen.map((i) => { if (s.values[i] == null) { pen = "M"; return ""; } const at = `${pen}${X(time[i]).toFixed(1)} ${Y(Math.min(y1, Math.max(y0, s.values[i]))).toFixed(1)}`; pen = "L"; return at; }).join(""); out.append(svg("path", { d, stroke: of(s, this.data.series.indexOf(s)), fill: "none", ...(noisy(s) ? { "stroke-dasharray": "2 3" } : {}) }), svg("text", { x: L + 150 * n, y: top - 6, "font-size": 11, fill: of(s, this.data.series.indexOf(s)) }, `${s.name.replace(/_/g, " ")}${unit(s.unit) ? ` [${unit(s.unit)}]` : ""}`)); });
       out.append(word((L + W - R) / 2, base + 29, "time [s]"));
     });
     return new XMLSerializer().serializeToString(out);
