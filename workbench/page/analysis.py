@@ -423,7 +423,10 @@ class Analysis:
         out: dict[str, Any] = clean(
             {
                 "error": error.as_json(),
-                "places": [p.as_json() | {"chart": place_chart(p).as_json()} for p in found],
+                "places": [
+                    p.as_json() | {"tells": p.tells, "chart": place_chart(p).as_json()}
+                    for p in found
+                ],
                 "worst": self._worst(residual, rows),
                 "records": list(self.data.held_out_names),
                 "note": self.note,
@@ -520,12 +523,12 @@ class Analysis:
         return self._rows
 
     def residuals(self) -> dict[str, FloatArray]:
-        """Residual of every balance on the held-out rows."""
+        """Residual of every balance on the held-out rows; NaN in rows that take no part."""
         now = self.current
         return dict(
             stack(
                 Balances(now.model, self.data.sensing, wrt=()), self.data.held_out, now.values
-            ).residual
+            ).shown
         )
 
     def _worst(self, residual: Mapping[str, FloatArray], rows: Rows) -> dict[str, Any]:

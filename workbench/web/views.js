@@ -86,7 +86,7 @@ const views = {
 
   async compare(state) {
     const found = await get("/view/compare"), last = state.steps[state.steps.length - 1];
-    const balances = Object.keys(found.error.balances), first = found.places[0], host = h("div", { class: "plot" });
+    const balances = Object.keys(found.error.balances), host = h("div", { class: "plot" });
     const draft = app.drafts.compare || (app.drafts.compare = {});
     let balance = balances.includes(draft.balance) ? draft.balance : found.worst.balance;
     forgetCharts();
@@ -96,8 +96,8 @@ const views = {
     app.plots.push(plot);
     later(() => plot.show([found.worst.low, found.worst.high]).catch(fail));
     const pick = h("select", { id: "balance", "aria-label": "Balance in the time plot", onchange: (e) => { balance = draft.balance = e.target.value; plot.forget(); plot.show(plot.range).catch(fail); } }, balances.map((b) => h("option", { value: b, selected: b === balance }, `${b} balance`)));
-    const strong = found.places.filter((p) => p.share_percent > 5 && (found.error.balances[p.balance].ratio ?? 9) > 1.2), shown = strong.length ? strong : found.places.slice(0, 1), rest = found.places.filter((p) => !shown.includes(p));
-    const figure = (p) => chartFigure([`${p.balance} balance against ${p.title}`, h("span", {}, p.share_percent > 1 ? `explains ${digits(p.share_percent, 2)} % of the residual's variance on blocks it was not drawn from` : "explains next to nothing")], p.chart, { name: `${p.balance} residual against ${p.title}`, axis: p.axis, brush: markInTime(p.axis) });
+    const strong = found.places.filter((p) => p.tells), shown = strong.length ? strong : found.places.slice(0, 1), rest = found.places.filter((p) => !shown.includes(p));
+    const figure = (p) => chartFigure([`${p.balance} balance against ${p.title}`, h("span", {}, p.tells ? `explains ${digits(p.share_percent, 2)} % of the residual's variance on blocks it was not drawn from` : "no dependence beyond chance")], p.chart, { name: `${p.balance} residual against ${p.title}`, axis: p.axis, brush: markInTime(p.axis) });
     const curves = await get("/view/as-such");
     return [
       h("div", { class: "row between head" }, h("div", {}, heading("Where does the model fail?")), button("What is missing? Diagnose", () => run("diagnose", {}, "diagnose"), { kind: "primary", id: "diagnose" })),
@@ -105,7 +105,7 @@ const views = {
       h("div", { class: "tiles" }, h("div", { class: "card" }, h("p", { class: "soft" }, "Held-out error"), h("div", { class: "figure", id: "held-out-error" }, `${digits(found.error.relative_error_percent)} %`), h("p", { class: "small soft" }, `of the measured ${effort()} is not explained, on records the fit did not see (${found.records.join(", ")}). On the fit's own: ${digits(last.train.relative_error_percent)} %.`)),
         balances.map((b) => { const e = found.error.balances[b]; return h("div", { class: "card" }, h("p", { class: "soft" }, `${b} balance`), h("div", { class: "figure" }, digits(e.ratio), h("small", {}, " ", term("÷ noise", "× noise"))), h("p", { class: "small soft" }, `residual ${digits(e.rms)} ${unit(e.unit)} rms; noise alone would leave ${digits(e.floor)}. ${e.ratio < 1.5 ? "Down to the noise." : "There is something left."}`)); })),
       h("h2", { class: "gap" }, strong.length ? "Places where the residual is not chance" : "No place stands out"),
-      strong.length && first ? h("p", { class: "soft" }, `Line: mean residual; shade: 95 % band. The ${first.balance} balance fails most clearly against ${first.title}.`) : h("p", { class: "soft" }, nowhere(found)),
+      strong.length ? h("p", { class: "soft" }, `Line: mean residual; shade: 95 % band. The ${strong[0].balance} balance fails most clearly against ${strong[0].title}.`) : h("p", { class: "soft" }, nowhere(found)),
       h("div", { class: "grid" }, shown.map(figure)),
       h("details", {}, h("summary", {}, `Other places (${rest.length})`), h("div", { class: "grid" }, rest.map(figure))),
       curves.length ? h("section", { class: "gap", id: "as-such" }, h("h2", {}, "Curves as such"), h("p", { class: "soft" }, "◆ as measured, with a band of 95 %; line: as the model has it."), h("div", { class: "grid" }, curves.map((c) => chartFigure([c.title, h("span", {}, `${c.balance} balance`)], c.chart, { name: `${c.title}, ${c.balance} balance` })))) : null,
