@@ -67,14 +67,21 @@ function fitsTable(found) {
       changed.map((v) => h("tr", {}, h("th", { scope: "row" }, words(v.name)), cell(v.first, a), cell(v.second, b))))));
 }
 
+/* The law in one line that is nearest to a learned curve, put where a law is typed: it is tried as one's own. */
+const pickLaw = (label) => act(async () => {
+  const made = await get(`/view/shape?label=${encodeURIComponent(label)}`);
+  app.drafts.law = { law: made.law, on: made.on, parameters: made.parameters, said: `Nearest to the curve in one line: it follows ${digits(made.share, 3)} % of it.` };
+  later(() => requestAnimationFrame(() => { if ($("law-law")) $("law-law").focus(); }));
+  if (app.view === "ledger") render(false); else open("ledger");
+});
 /* A law of one's own: typed in one line, fitted at once to what the model leaves, kept in the joint file. */
 function lawCard(state) {
   const draft = app.drafts.law || (app.drafts.law = { law: "", on: "motor", parameters: "" });
-  const field = (key, label, placeholder, size) => h("input", { id: `law-${key}`, value: draft[key], placeholder, size, "aria-label": label, autocomplete: "off", spellcheck: "false", oninput: (e) => { draft[key] = e.target.value; } });
+  const field = (key, label, placeholder, size) => h("input", { id: `law-${key}`, value: draft[key], placeholder, size, "aria-label": label, autocomplete: "off", spellcheck: "false", oninput: (e) => { draft[key] = e.target.value; delete draft.said; } });
   const place = h("select", { id: "law-on", "aria-label": "Where it acts", onchange: (e) => { draft.on = e.target.value; } }, app.config.places.map((p) => h("option", { value: p, selected: p === draft.on }, words(p))));
   const row = (t) => h("li", {}, h("div", { class: "row between" }, h("span", {}, h("code", {}, t.law), ` on ${t.on.replace(/_/g, " ")}: the held-out error ${t.after < t.before ? "falls" : "goes"} from ${digits(t.before)} to `, h("strong", {}, `${digits(t.after)} %`)),
     button("Add", () => run("add", { label: t.label }, "ledger"), { kind: t.after < t.before ? "primary" : "", id: `add-${t.label}`, label: `Add ${t.law}` })));
   return h("form", { class: "card", id: "own-law", onsubmit: (e) => { e.preventDefault(); $("try-law").click(); } }, h("h2", {}, "A law of your own"), h("div", { class: "row" }, field("law", "Law", "c*tanh(v/w)", "28"), place, field("parameters", "Parameters with ranges and units", "c=0..10 N.m, w=0.01..1 rad/s", "34"),
-    button("Try it", () => run("law", { ...draft }), { id: "try-law" })), h("p", { class: "small soft" }, "Signals: q, v, a (angle, speed, acceleration of the place), twist, T, t; name your parameters otherwise. It is fitted at once to what the model leaves, and stays in the joint file."),
+    button("Try it", () => run("law", { ...draft }), { id: "try-law" })), draft.said ? h("p", { class: "small", id: "law-said" }, draft.said) : null, h("p", { class: "small soft" }, "Signals: q, v, a (angle, speed, acceleration of the place), twist, T, t; name your parameters otherwise. It is fitted at once to what the model leaves, and stays in the joint file."),
     state.laws.length ? h("ul", { class: "plain", id: "tried-laws" }, state.laws.map(row)) : null);
 }

@@ -207,7 +207,7 @@ function foundCard(story) {
     h("details", {}, h("summary", {}, "As irj improve prints it"), h("pre", { id: "printed", tabindex: "0", "aria-label": "As irj improve prints it" }, story.printed)));
   return panel ? h("div", { class: "two ranking" }, list, panel.node) : list;
 }
-const curveList = (curves, panel) => h("ul", {}, curves.map((c) => h("li", { class: "points", tabindex: "0", ...pointsAt(panel, c.label) }, c.sentence.replace(` (${c.label})`, ""))));
+const curveList = (curves, panel) => h("ul", {}, curves.map((c) => h("li", { class: "points", tabindex: "0", ...pointsAt(panel, c.label) }, c.sentence.replace(` (${c.label})`, ""), " ", button("Make it a law", () => pickLaw(c.label), { kind: "quiet", id: `law-of-${c.label.replace(/[@#]/g, "-")}`, label: `Make a law of the curve: ${effectTitle(c.label)}` }))));
 
 /* What no place shows: noise, or something that hangs on no measured signal. A balance over its noise is said. */
 function nowhere(found) {

@@ -23,6 +23,7 @@ from workbench.page.analysis import Analysis
 from workbench.page.charts.choices import limits_of, within
 from workbench.page.charts.learned import curve_chart, shown_residual
 from workbench.page.desk.curves import learned_of, story_of
+from workbench.page.desk.shape import nearest
 from workbench.page.jobs.place import hint_for
 from workbench.page.live import Live
 from workbench.page.records import plot_time
@@ -182,6 +183,15 @@ def _law(live: Live, query: Query) -> dict[str, Any]:
     found = {"label": label, "title": title_of(label), "balance": balance, "chart": drawn.as_json()}
     live.kept[f"law {label}"] = ((mark, id(analysis.current)), found)
     return found
+
+
+def _shape(live: Live, query: Query) -> dict[str, Any]:
+    """A learned curve as a law in one line, for the field in which a law is typed."""
+    for story in (live.state.improvement, live.state.diagnosis):
+        claim = learned_of(story, str(query.get("label", "")))
+        if claim is not None:
+            return nearest(claim)
+    raise InputError("law: there is no such curve any more; diagnose again")
 
 
 # --- curves as such -------------------------------------------------------------------------------
@@ -477,6 +487,7 @@ def along(analysis: Analysis, stamps: Sequence[float] | FloatArray) -> dict[str,
 CHART_VIEWS: Final[Mapping[str, Callable[[Any, Query], Any]]] = {
     "staircase": _staircase,
     "law": _law,
+    "shape": _shape,
     "as-such": _as_such,
     "spans": _spans,
     "against": _against,
