@@ -24,6 +24,7 @@ LONGEST = (
     "test_estimator_fmu.py",
     "test_other_payload.py",
     "test_app_known.py",
+    "test_app_sets.py",
     "test_doors.py",
     "test_app_charts.py",
     "test_app_clumsy.py",

@@ -180,13 +180,14 @@ class LawPanel {
   }
   show(label) {
     this.shown = label;
-    const ready = this.kept.get(label), put = (made) => { if (this.shown === label && !made.stale) { this.host.replaceChildren(h("p", {}, h("strong", {}, made.title)), new ServedChart(made.chart, { name: `${made.title} through the residual` }).node); this.node.dataset.label = label; } };
+    const ready = this.kept.get(label), put = (made) => { if (this.shown === label && !made.stale) { this.host.replaceChildren(h("p", {}, h("strong", {}, made.title)), made.drawn === false ? h("p", { class: "note small", id: "no-line" }, NO_LINE) : "", new ServedChart(made.chart, { name: `${made.title} through the residual` }).node); this.node.dataset.label = label; } };
     if (ready && !ready.then) put(ready); else this.fetch(label).then(put).catch((e) => { if (this.shown === label) this.host.replaceChildren(h("p", { class: "small bad" }, e.message)); });
   }
 }
 
 /* What a list needs so that pointing at an item, or the focus on it, draws its law. */
 const pointsAt = (panel, label) => ({ "data-label": label, onpointerenter: () => panel.show(label), onfocusin: () => panel.show(label) });
+const NO_LINE = "No line: on all these rows together the learned curves take nothing off. They were learned where the joint moves steadily.";
 const LEARNED_NOTE = "line: what the learned curves of this balance take off it together. Point at a curve to see it.";
 
 /* --- any signal against any ----------------------------------------------------------------------------------- */

@@ -169,7 +169,7 @@ def _law(live: Live, query: Query) -> dict[str, Any]:
         if story is not None and curve is not None:
             chart = curve_chart(analysis, story, curve)
             found = {"label": label, "title": title_of(label), "balance": curve["balance"]}
-            found |= {"chart": chart}
+            found |= {"chart": chart, "drawn": chart["law"]}
             live.kept[f"law {label}"] = ((mark, id(analysis.current)), found)
             return found
     before = shown_residual(analysis, analysis.current.model, analysis.current.values)

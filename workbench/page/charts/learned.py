@@ -48,7 +48,8 @@ def curve_chart(
     rows = _over(analysis, axis, str(claim["curve"]["unit"]))
     first = place(rows, before, balance, axis)
     law = explained(first, place(rows, after, balance, axis, like=first))
-    return place_chart(first, law=law if law is not None and _helps(first, law) else None).as_json()
+    shown = law if law is not None and _helps(first, law) else None
+    return place_chart(first, law=shown).as_json() | {"law": shown is not None}
 
 
 def _helps(residual: Place, law: Place) -> bool:
