@@ -149,7 +149,7 @@ const views = {
   },
 
   async ledger(state) {
-    const [library, stairs] = await Promise.all([get("/view/library"), get(`/view/staircase?width=${Math.round(pictureWidth(560))}`)]), steps = state.steps, last = steps[steps.length - 1], before = steps[steps.length - 2];
+    const [library, stairs] = await Promise.all([get("/view/library"), get(`/view/staircase?width=${Math.round(pictureWidth(560))}`)]), steps = state.steps, last = steps[steps.length - 1], before = steps.length > 1 ? steps[state.improvement ? 0 : steps.length - 2] : null; /* the whole loop is told from its start */
     const now = last.held_out.relative_error_percent, was = before && before.held_out.relative_error_percent;
     const story = state.improvement, inside = last.effects.filter((e) => e !== "channel_delay@drive");
     const add = h("select", { id: "add-label", "aria-label": "Effect to add", onchange: (e) => { app.drafts.add = e.target.value; } }, library.filter((e) => !e.inside).map((e) => h("option", { value: e.label, selected: e.label === app.drafts.add }, `${e.title} (${e.place.replace(/_/g, " ")})`)));

@@ -137,7 +137,7 @@ class Look:
             for width in WIDTHS:
                 page.set_viewport_size({"width": width, "height": 860})
                 page.evaluate(UNFOLDED)
-                page.evaluate("c => theme(c)", colours)
+                page.evaluate("c => { theme(c); render(false); }", colours)
                 page.wait_for_function(
                     "v => document.querySelector('#main').dataset.view === v",
                     arg=view,

@@ -537,7 +537,10 @@ def test_the_worst_window_and_the_places_come_with_the_comparison(
     close = client.get(f"{fitted}/view/balance?balance=motor&points=600&from={low}&to={high}")
     assert not whole["full"]
     assert close["full"]
-    measured, model, residual = (np.array(s["values"]) for s in close["series"])
+    series = {s["name"]: np.array(s["values"], dtype=np.float64) for s in close["series"]}
+    measured, model, residual = (series[k] for k in ("measured", "model", "residual"))
+    upper = series["noise, upper"]
+    np.testing.assert_array_equal(series["noise, lower"], -upper)
     np.testing.assert_allclose(measured - model, residual, atol=1e-3)
 
 

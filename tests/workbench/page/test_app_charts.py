@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from tests.workbench.chromium import context_of, launched, needs_chromium
@@ -244,6 +245,29 @@ def test_the_falling_staircase_has_its_floor_and_the_place_that_told(page: Any) 
             assert bad == [], view
 
 
+def test_what_noise_allows_stands_beside_the_residual_and_no_place_stands_twice(page: Any) -> None:
+    """A complete model keeps to it; where the joint turns back it allows more, and must not flatten
+    the residual.
+    """
+    go(page, "compare")
+    captions = page.locator("figure.place figcaption").all_text_contents()
+    assert len(captions) == len(set(captions)) > 10
+    for balance in ("motor", "link", "transmission"):
+        made = page.evaluate("b => get(`/view/balance?balance=${b}&points=4000`)", balance)
+        assert made["full"]
+        series = {s["name"]: np.array(s["values"], dtype=np.float64) for s in made["series"]}
+        left, allowed = np.abs(series["residual"]), series["noise, upper"]
+        rows = np.isfinite(left + allowed)
+        assert 0.9 < np.mean(left[rows] <= allowed[rows]) < 0.995, balance
+        if balance == "motor":
+            assert allowed[np.nanargmax(left)] > 5 * np.nanmedian(allowed), "at a reversal"
+            page.select_option("#balance", balance)
+            page.evaluate("() => app.plots[0].show(null)")
+            page.wait_for_function("() => app.plots[0].range === null && app.plots[0].data.full")
+            scale = page.evaluate("() => app.plots[0].plots[1].scales['N.m']")
+            assert np.nanmax(left) < scale["max"] < 1.5 * np.nanmax(left) < np.nanmax(allowed)
+
+
 def test_two_steps_show_their_parameters_beside_one_another(page: Any) -> None:
     """The last two steps until others are chosen; the same step twice differs in nothing."""
     go(page, "parameters")
@@ -320,6 +344,10 @@ TO_WRITE = re.compile(r"give \w+(?: or \w+)* in \[known\]")
 """Keys that the reader is asked to write into the joint file stand as they are written there."""
 
 
+QUOTED = re.compile(r"'[^']*'")
+"""Columns stand as the file has them."""
+
+
 def test_neither_the_job_nor_these_views_show_a_name_of_the_code(page: Any) -> None:
     page.evaluate(
         "() => { app.told = []; const seen = () => app.told.push($('job-text').textContent);"
@@ -332,12 +360,14 @@ def test_neither_the_job_nor_these_views_show_a_name_of_the_code(page: Any) -> N
     assert [text for text in told if INTERNAL.search(text)] == []
     records = {Path(n).stem for n in page.evaluate("() => app.state.files.map((f) => f.name)")}
     found: dict[str, set[str]] = {}
-    for view in ("compare", "diagnose", "parameters", "replay", "plan"):
+    unfold = "document.querySelectorAll('#main details').forEach((d) => { d.open = true; })"
+    for view in ("load", "compare", "diagnose", "ledger", "parameters", "replay", "plan"):
         idle(page, page.evaluate("() => app.view"))
         page.click(f"#nav-{view}")
         idle(page, view)
+        page.evaluate(unfold)
         shown = page.evaluate("() => $('main').innerText")
         assert len(shown) > 100
-        shown = TO_WRITE.sub("", shown)
+        shown = QUOTED.sub("", TO_WRITE.sub("", shown))
         found[view] = set(INTERNAL.findall(shown)) - records
     assert not any(found.values()), found

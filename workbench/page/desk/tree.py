@@ -21,6 +21,7 @@ from identification.data.plain_text import from_toml
 from identification.data.typed_laws import LAWS
 from identification.errors import InputError
 from workbench.page.session import Branch, FileEntry, State, StepEntry
+from workbench.show.words import title_of
 
 LONGEST_NAME: Final = 200
 LONGEST_NOTE: Final = 5000
@@ -352,9 +353,19 @@ def _joint_words(a: Any, b: Any) -> str:
         return "another file"
     head = [d.get("joint", {}) if isinstance(d.get("joint"), Mapping) else {} for d in (a, b)]
     keys = [k for k in dict.fromkeys([*head[0], *head[1]]) if head[0].get(k) != head[1].get(k)]
-    words = [f"{k} {_short(head[0].get(k))} → {_short(head[1].get(k))}" for k in keys]
+    words = [_key_words(k, head[0].get(k), head[1].get(k)) for k in keys]
     words += [f"[{t}]" for t in dict.fromkeys([*a, *b]) if t != "joint" and a.get(t) != b.get(t)]
     return ", ".join(words) or "another file"
+
+
+def _key_words(key: str, old: Any, new: Any) -> str:
+    """How a key of [joint] changed; of the effects those that came and went, by their titles."""
+    if key != "effects":
+        return f"{key.replace('_', ' ')} {_short(old)} → {_short(new)}"
+    was, now = old or [], new or []
+    came = [f"+ {title_of(str(e))}" for e in now if e not in was]
+    went = [f"− {title_of(str(e))}" for e in was if e not in now]
+    return ", ".join([*came, *went]) or "effects in another order"
 
 
 def _short(value: Any) -> str:
