@@ -485,16 +485,20 @@ def provenance_html(
                 folded,
             ]
         )
-    shown = (
-        table(
-            ["record", "used for", "size", "file: SHA-256", "how it was read"],
-            rows,
-            "Records",
-            wide=True,
-        )
-        if rows
-        else ""
+    listed = table(
+        ["record", "used for", "size", "file: SHA-256", "how it was read"],
+        rows,
+        "Records",
+        wide=True,
     )
+    # what is folded on a screen stands below the table on paper
+    read = "".join(
+        f"<p class='note print-only'>{text(r.name)} was read as: "
+        f"{text('; '.join((*r.provenance.columns, *r.provenance.notes)))}.</p>"
+        for r in records
+        if r.provenance.columns or r.provenance.notes
+    )
+    shown = f"<div class='records'>{listed}{read}</div>" if rows else ""
     if not rows:
         names = ", ".join(
             text(n) for n in (*improvement.data.train_names, *improvement.data.held_out_names)

@@ -37,6 +37,17 @@ WORST = (
 )
 
 
+HARDEST = (moves.refused_upload, moves.full_disk, moves.worker_killed, moves.killed_at_a_diagnosis)
+"""What an engineer's machine does by itself, in every run of the tests."""
+
+
+def test_no_kill_and_no_full_disk_loses_a_fit(tmp_path: Path) -> None:
+    """The process of the work is killed and its end is one sentence; the server is killed and what
+    ran is taken up again.
+    """
+    assert moves.made(tmp_path, list(HARDEST), print) >= 2
+
+
 @pytest.mark.slow
 def test_no_move_loses_a_fit(tmp_path: Path) -> None:
     assert moves.made(tmp_path, list(WORST), print) >= 5

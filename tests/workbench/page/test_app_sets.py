@@ -101,6 +101,11 @@ def test_the_page_says_what_the_terminal_says(tmp_path: Path, name: str, most: i
         left = sum(c["label"] not in story["joint_text"] for c in story["learned"])
         stairs = page.evaluate("get('/view/staircase')")["names"]
         assert (stairs[-1] == "+ learned curves") == bool(story["with_curves"])
+        sets = [c["effects"] for c in made.improved["claims"] if len(c.get("effects", ())) > 1]
+        page.click("#nav-ledger")
+        page.wait_for_selector("#found")
+        steps = page.locator("main table tbody tr").all_inner_texts()
+        assert sum(" or " in step for step in steps) == len(sets), "a set stays a set"
         page.click("#nav-export")
         page.wait_for_selector("#get-joint-toml")
         said = f"It is without {left} of the learned curves"
