@@ -234,7 +234,8 @@ function typedNumber(text, name, low, high) {
 
 /* Every parameter as a slider: the held-out error and the residual follow; nothing is changed until it is said. */
 function slidersCard(rows, error) {
-  const values = {}, figure = h("output", { class: "figure", id: "slider-error" }, `${digits(error)} %`), charts = h("div", { class: "grid" }), state = { turn: 0, loads: 0, busy: false, again: false }, step = app.state.steps.at(-1).id;
+  const asked = app.state.steps.at(-1).id, kept = app.drafts.slid && app.drafts.slid.step === asked ? app.drafts.slid : (app.drafts.slid = { step: asked, values: {}, load: {} }); /* colours that change draw the view anew: what was slid stands */
+  const values = kept.values, figure = h("output", { class: "figure", id: "slider-error" }, `${digits(error)} %`), charts = h("div", { class: "grid" }), state = { turn: 0, loads: 0, busy: false, again: false }, step = app.state.steps.at(-1).id;
   const look = async () => {
     if (state.busy) { state.again = true; return; }
     state.busy = true;
@@ -253,9 +254,9 @@ function slidersCard(rows, error) {
   };
   const inputs = [], set = {};
   /* A mass on the link moves its inertia and its weight together. */
-  const load = async () => { const turn = state.turn, asked = (state.loads += 1); try { clearError(); const made = await get(`/view/payload?mass=${encodeURIComponent($("payload-mass").value)}&distance=${encodeURIComponent($("payload-distance").value)}`); if (turn !== state.turn || asked !== state.loads) return; /* what was asked later counts, in whichever order answers come */ for (const [k, v] of Object.entries(made.values)) if (set[k]) set[k](v); look(); } catch (e) { fail(e); } };
+  const load = async () => { for (const k of ["mass", "distance"]) kept.load[k] = $(`payload-${k}`).value; const turn = state.turn, asked = (state.loads += 1); try { clearError(); const made = await get(`/view/payload?mass=${encodeURIComponent($("payload-mass").value)}&distance=${encodeURIComponent($("payload-distance").value)}`); if (turn !== state.turn || asked !== state.loads) return; /* what was asked later counts, in whichever order answers come */ for (const [k, v] of Object.entries(made.values)) if (set[k]) set[k](v); look(); } catch (e) { fail(e); } };
   const turning = !Object.values(rows).some((p) => p.unit === "kg");
-  const payload = h("fieldset", { class: "known", id: "payload" }, h("legend", {}, "Another payload", h("span", { class: "small soft plain" }, " on the link; negative: taken off")), [["mass", "Mass [kg]"], ["distance", "From the joint's axis [m]"]].filter(([k]) => turning || k === "mass").map(([k, t]) => h("label", { class: "small pick", for: `payload-${k}` }, t, h("input", { id: `payload-${k}`, value: "0", inputmode: "decimal", autocomplete: "off", onchange: load }))), turning ? null : h("input", { type: "hidden", id: "payload-distance", value: "0" }));
+  const payload = h("fieldset", { class: "known", id: "payload" }, h("legend", {}, "Another payload", h("span", { class: "small soft plain" }, " on the link; negative: taken off")), [["mass", "Mass [kg]"], ["distance", "From the joint's axis [m]"]].filter(([k]) => turning || k === "mass").map(([k, t]) => h("label", { class: "small pick", for: `payload-${k}` }, t, h("input", { id: `payload-${k}`, value: kept.load[k] || "0", inputmode: "decimal", autocomplete: "off", onchange: load }))), turning ? null : h("input", { type: "hidden", id: "payload-distance", value: "0" }));
   const row = ([name, p]) => {
     const size = Math.abs(p.value), spread = Math.max(3 * (p.stderr || 0), 0.5 * size, 1e-9), low = Math.max(p.low ?? -Infinity, p.value - spread), high = Math.min(p.high ?? Infinity, p.value + spread);
     const id = `slide-${name}`, short = (v) => String(Number(v.toPrecision(6)));
@@ -268,7 +269,8 @@ function slidersCard(rows, error) {
     inputs.push(() => { input.value = String(p.value); typed.value = short(p.value); why.hidden = true; typed.removeAttribute("aria-invalid"); });
     return h("div", { class: "slide" }, h("label", { for: id, class: "small" }, words(name), h("span", { class: "soft plain" }, ` ${p.side} ${unit(p.unit) ? `[${unit(p.unit)}]` : ""}`), p.held ? h("span", { class: "tag" }, "held") : null), input, typed, hold, why);
   };
-  const moved = Object.entries(rows).filter(([, p]) => !p.nuisance);
-  const reset = () => { state.turn += 1; state.again = false; for (const k of Object.keys(values)) delete values[k]; inputs.forEach((f) => f()); payload.querySelectorAll("input").forEach((i) => { i.value = "0"; }); figure.textContent = `${digits(error)} %`; charts.replaceChildren(); };
-  return h("section", { class: "card", id: "sliders" }, h("h2", {}, "What if?"), h("p", { class: "soft small" }, "Move a parameter: the held-out error and the residual follow at once. The fit stays as it is. Hold fixes a parameter at its value, typed or slid, and fits the model again as a new branch."), h("div", { class: "two" }, h("div", {}, moved.map(row), payload, button("Back to the fit", reset, { kind: "quiet", work: false, id: "slider-reset" })), h("div", {}, h("p", { class: "soft" }, "Held-out error"), figure, charts)));
+  const moved = Object.entries(rows).filter(([, p]) => !p.nuisance), lines = moved.map(row);
+  if (Object.keys(values).length) { for (const [k, v] of Object.entries(values)) if (set[k]) set[k](v); later(() => look()); }
+  const reset = () => { state.turn += 1; state.again = false; for (const k of Object.keys(values)) delete values[k]; kept.load = {}; inputs.forEach((f) => f()); payload.querySelectorAll("input").forEach((i) => { i.value = "0"; }); figure.textContent = `${digits(error)} %`; charts.replaceChildren(); };
+  return h("section", { class: "card", id: "sliders" }, h("h2", {}, "What if?"), h("p", { class: "soft small" }, "Move a parameter: the held-out error and the residual follow at once. The fit stays as it is. Hold fixes a parameter at its value, typed or slid, and fits the model again as a new branch."), h("div", { class: "two" }, h("div", {}, lines, payload, button("Back to the fit", reset, { kind: "quiet", work: false, id: "slider-reset" })), h("div", {}, h("p", { class: "soft" }, "Held-out error"), figure, charts)));
 }

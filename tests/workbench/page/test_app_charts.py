@@ -221,6 +221,8 @@ def test_a_slider_shows_the_held_out_error_at_once_and_changes_nothing(page: Any
     )
     assert shown == pytest.approx(exact["relative_error_percent"], rel=0.01)
     assert shown > float(before.split()[0])
+    page.evaluate("() => render(false)")  # as where the colours change
+    page.wait_for_function("was => $('slider-error').textContent.startsWith(was)", arg=str(shown))
     page.evaluate(slide, 1.05)  # its answer comes after the next click
     page.click("#slider-reset")
     page.wait_for_selector("#slider-error:not([aria-busy])")
