@@ -134,7 +134,9 @@ function adopt(state) {
   const changed = !app.state || state.revision !== app.state.revision || state.id !== app.state.id;
   app.state = state;
   if (arrive(state)) { goOn(); return; }
-  if (state.error) fail(new Error(state.error));
+  const told = [state.id, state.teller, state.begun, state.error].join(); /* how a job ended is said once: asked for again, it would stand over a newer refusal */
+  if (state.error && app.endedAs !== told) fail(new Error(state.error));
+  app.endedAs = told;
   surround();
   if (changed && !usable(state)[app.view]) open("load");
   else if (changed) render(false);

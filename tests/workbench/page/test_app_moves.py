@@ -37,7 +37,12 @@ WORST = (
 )
 
 
-HARDEST = (moves.refused_upload, moves.full_disk, moves.worker_killed, moves.killed_at_a_diagnosis)
+HARDEST = (
+    moves.full_disk,
+    moves.refused_joint,  # says what is refused, and not how the work before ended
+    moves.worker_killed,
+    moves.killed_at_a_diagnosis,
+)
 """What an engineer's machine does by itself, in every run of the tests."""
 
 
