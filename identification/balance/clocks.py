@@ -192,6 +192,7 @@ def in_time(
     torque: bool,
     fast: Callable[[Mapping[str, float]], WeakRecord],
     motor_alone: bool = False,
+    both_encoders: bool = False,
 ) -> WeakRecord:
     """A record whose late channels are shifted.
 
@@ -210,10 +211,13 @@ def in_time(
         As `make`, with a short kernel: a filter and a wait are alike in all that is slow.
     motor_alone : bool
         Whether the torque is measured beside the motor, and the link is not.
+    both_encoders : bool
+        Whether motor and link have an encoder each.
     """
     filters: dict[str, Filter] = {}
     made, wanted = make({}), tuple(places)
-    by_motor = "torque_sensor" in wanted and (motor_alone or link_hidden(made))
+    hidden = both_encoders and link_hidden(made)
+    by_motor = "torque_sensor" in wanted and (motor_alone or hidden)
     shifts = _begun(make, made) if by_motor else {}
     begun = bool(shifts)
     made = make(shifts) if begun else made
@@ -348,9 +352,9 @@ def _filter(
 
 def link_hidden(made: WeakRecord) -> bool:
     """Whether noise of the link's encoder leaves open how late the torque is by more than is left
-    to the model, and the motor's rows tell it better.
+    to the model, and the motor's rows tell it better; of a record with an encoder on either side.
     """
-    if not {"drive", "link_position", "torque"} <= set(made.averaged):
+    if not {"drive", "torque"} <= set(made.averaged):
         return False
     _, error, _ = lateness(made, "torque_sensor", torque=True)
     if error < NEAR * made.grid.dt:

@@ -205,7 +205,7 @@ def load_dataset(
     for number, (record, made) in enumerate(zip((*train, *held_out), prepared, strict=True)):
         seen = {p: [w.filters[p] for w in prepared[:count] if p in w.filters] for p in made.filters}
         agreed = {p: as_told(seen[p], f) for p, f in made.filters.items() if seen[p]}
-        by_motor = sensing.motor_and_torque or link_hidden(made)
+        by_motor = sensing.motor_and_torque or (sensing.both_positions and link_hidden(made))
         if by_motor and not made.shifts.get(OF_TORQUE, 0.0):
             # a record that tells nothing of it has the torque sensor of the others
             late = [w.shifts[OF_TORQUE] for w in prepared[:count] if w.shifts.get(OF_TORQUE, 0.0)]
@@ -405,6 +405,7 @@ def weak_record(
                 torque=sensing.has_torque,
                 fast=partial(made_with, length=telling),
                 motor_alone=sensing.motor_and_torque,
+                both_encoders=sensing.both_positions,
             )
             if late
             else made_with({})

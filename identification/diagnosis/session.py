@@ -660,8 +660,9 @@ class Session:
             over = _standing_over(there) - shown
             if not over:
                 continue
+            left = {b: e.ratio for b, e in there.held_out.balances.items() if b in over}
             self._longer.setdefault(now.model.structure, {}).update(
-                (b, (bench.data.kernel, there.held_out.balances[b].ratio)) for b in over
+                (b, (bench.data.kernel, ratio)) for b, ratio in left.items()
             )
             found = Session(bench, refused=self._refused).diagnose(slow)
             if (
