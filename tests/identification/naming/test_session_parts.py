@@ -405,6 +405,15 @@ def test_what_longer_rows_leave_over_their_floor_is_said(named_there: bool, base
     assert f"the axis balance still stands at {ratio:.2g} times its noise floor" in said
 
 
+def test_what_longer_rows_leave_is_said_in_the_order_of_the_balances(base: Base) -> None:
+    parts = ("p", "p@motor", "p@link", "p@sum", "p@deflection", "p@transmission")
+    long = World(base, dict.fromkeys(parts, 8.0), {"gravity": {}})
+    short = dict.fromkeys(parts, HIDDEN_BY_NOISE)
+    found = ended(World(base, short, {"gravity": {}}, longer={2.0: long, 4.0: long}))
+    said = [x.partition(" balance")[0].rpartition(" ")[2] for x in found.warnings if "rows" in x]
+    assert said == list(long.rms())
+
+
 # --- the number of additions and what is looked for -----------------------------------------------
 
 
