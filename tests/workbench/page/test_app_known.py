@@ -247,7 +247,10 @@ def test_no_view_has_a_finding_of_any_level(page: Any) -> None:
         for theme, width in (("light", 1280), ("dark", 375)):
             page.set_viewport_size({"width": width, "height": 860})
             page.evaluate("t => theme(t)", theme)
-            assert page.evaluate("document.documentElement.scrollWidth") <= width, view
+            # a width that changed is drawn for a moment later, as a window's edge is dragged
+            page.wait_for_function(
+                "w => document.documentElement.scrollWidth <= w", arg=width, timeout=5_000
+            )
             assert findings(page) == [], (view, theme)
         page.evaluate("theme('light')")
         page.set_viewport_size({"width": 1280, "height": 860})
