@@ -14,9 +14,12 @@ from identification.balance.balances import balances_of
 from identification.balance.colour import white
 from identification.balance.dataset import Dataset, load_dataset
 from identification.balance.stacked import (
+    _between_samples,
     _either_direction,
     _sure_rms,
+    drawn_floors,
     drift_rows,
+    measured,
     noise_believed,
     noise_rows,
     rms,
@@ -87,6 +90,8 @@ def test_no_records_have_no_rows_and_rows_of_none_no_level() -> None:
     assert [x.shape for x in drift_rows(model, data, VALUES, []).values()] == [(0,)]
     for part in noise_rows(model, data, VALUES, []):
         assert {b: x.shape for b, x in part.items()} == {"axis": (0,)}
+    jumps = _between_samples(balances_of(model, data.sensing), data, VALUES, [])
+    assert [x.shape for x in jumps] == [(0,)]
     (record,) = data.train
     masked = replace(data, train=(replace(record, masked=frozenset({"axis"})),))
     assert sure_levels(model, masked, VALUES) == {"axis": 0.0}
@@ -144,3 +149,28 @@ def test_a_move_between_two_samples_tells_a_direction_from_three_deviations_of_a
     made = prepare(time, {"motor_position": step * np.arange(400)}, (slice(0, 400),))
     assert made.grid.step == 1
     assert np.all(_either_direction(made, "motor", white(noise)) != known)
+
+
+@pytest.mark.parametrize("seconds", [3.0, 8.0, 40.0])
+def test_the_floor_of_white_noise_is_that_of_its_average_however_short_a_record_is(
+    seconds: float,
+) -> None:
+    """A short record is drawn several times, and a long one once."""
+    model, data = world(seconds)
+    (record,) = data.train
+    noisy = replace(data, noise={**data.noise, "drive": NOISE}, colours={})
+    weights = differentiated_kernel(record.grid.length, record.grid.dt, 0)
+    (floor,) = drawn_floors(model, noisy, VALUES, record).values()
+    assert floor == pytest.approx(NOISE * float(np.linalg.norm(weights)), rel=0.15)
+
+
+def test_what_is_measured_of_a_gear_is_its_twist_about_the_middle_of_it() -> None:
+    """However far both sides turn, and wherever their zeros are."""
+    time = 1e-3 * np.arange(4000)
+    turn, twist = 3 * np.sin(2 * time), 1e-3 * np.sin(9 * time)
+    signals = {"motor_position": turn + twist + 0.7, "link_position": turn}
+    record = prepare(time, signals, (slice(0, 4000),))
+    weights = differentiated_kernel(record.grid.length, record.grid.dt, 0)
+    averaged = record.grid.correlate(twist, weights)
+    found = measured("kinematic", record)
+    assert found == pytest.approx(averaged - np.median(averaged), abs=1e-9)

@@ -269,6 +269,14 @@ def test_a_bump_that_no_name_has_is_an_allowance(imitated: Contest, drags: Conte
     assert unmodelled(left_by(imitated), "axis") > 10 * max(FEWEST, noise)
 
 
+def test_a_balance_in_which_no_law_gains_has_no_allowance(drags: Contest) -> None:
+    """Of another balance or of no trial at all."""
+    found = left_by(drags)
+    assert {t.balance for t in found.everything} == {"axis"}
+    assert unmodelled(found, "link") == 0.0
+    assert unmodelled(replace(found, everything=()), "axis") == 0.0
+
+
 @pytest.mark.parametrize("which", ["drags", "imitated"])
 def test_what_the_leader_leaves_counts_by_its_own_scatter(
     which: str, request: pytest.FixtureRequest
@@ -371,6 +379,7 @@ def test_names_that_are_less_probable_than_nothing_are_no_claim(drags: Contest) 
     for nothing, empty in ((0.49, False), (0.51, True)):
         share = {first.name: 0.6 * (1 - nothing), second.name: 0.4 * (1 - nothing)}
         assert Odds((first, second), share, {}, nothing).empty == empty
+    assert not Odds((first,), {first.name: 0.3}, {}).empty, "nothing was not asked"
     sure = odds_of(drags, 0.0)
     assert not sure.empty
     assert sum(sure.probability.values()) + sure.nothing <= 1 + 1e-12
