@@ -15,7 +15,7 @@ from casadi_models import EFFECTS, JointModel
 from casadi_models.vectorised import Vectorised
 from identification.balance.memory import Cache
 from identification.balance.noise import noise_level
-from identification.balance.weak import differentiated_kernel, kernel, prepare, whole
+from identification.balance.weak import _blocks, differentiated_kernel, kernel, prepare, whole
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -190,6 +190,16 @@ def test_short_blocks_keep_three_quarters_of_their_rows() -> None:
     assert made.block.max() + 1 == round((made.time[-1] - made.time[0]) / 0.2)
 
 
+@pytest.mark.parametrize("rows", [1, 2, 3])
+def test_a_stretch_of_few_rows_is_a_block_of_its_own_and_all_of_it(rows: int) -> None:
+    time = np.concatenate([np.arange(40) * 0.1, 10 + np.arange(rows) * 0.1])
+    segment = np.repeat([0, 1], [40, rows])
+    number, inside = _blocks(time, segment, 2.0, 0.05)
+    assert set(number[:40]) == {0, 1}
+    assert number[40:].tolist() == [2] * rows
+    assert inside[40:].all()
+
+
 @pytest.mark.parametrize("step", [1, 5, 7, 11])
 def test_an_average_of_every_so_many_samples_ends_where_that_of_all_does(step: int) -> None:
     every, some = (differentiated_kernel(0.06, 1e-3, 0, step=k) for k in (1, step))
@@ -282,6 +292,16 @@ def test_the_kernel_wipes_out_three_and_more_whole_waves(
     assert abs(count * dt - length) < 3.5 * dt
     phase = 2 * math.pi * np.outer(np.arange(6), np.arange(1, count) - count / 2) / count
     assert np.cos(phase) @ weights == pytest.approx([1, 2 / 3, 1 / 6, 0, 0, 0], abs=1e-12)
+
+
+@pytest.mark.parametrize("order", [0, 1, 2, 3, 4])
+def test_a_kernel_too_short_for_its_derivative_is_the_shortest_that_has_it(order: int) -> None:
+    """Two points more than the order on either side, over the width that these span."""
+    dt = 2e-3
+    shortest = differentiated_kernel(2 * (order + 2) * dt, dt, order)
+    assert len(shortest) == 2 * (order + 2) + 1
+    for length in (0.5 * dt, 2 * dt, 3.9 * dt):
+        assert np.array_equal(differentiated_kernel(length, dt, order), shortest)
 
 
 @pytest.mark.parametrize("order", [1, 2, 3, 4])
