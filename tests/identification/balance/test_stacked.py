@@ -30,6 +30,7 @@ from identification.balance.stacked import (
 from identification.balance.weak import WeakRecord, differentiated_kernel, prepare
 from identification.data.joint_file import Joint
 from identification.fitting.engine import prepared_model
+from identification.fitting.weak_form import WeakForm
 
 FloatArray = npt.NDArray[np.float64]
 VALUES = {"inertia": 12.0, "motor_viscous": 25.0, "motor_smoothing_velocity": 0.01}
@@ -174,3 +175,18 @@ def test_what_is_measured_of_a_gear_is_its_twist_about_the_middle_of_it() -> Non
     averaged = record.grid.correlate(twist, weights)
     found = measured("kinematic", record)
     assert found == pytest.approx(averaged - np.median(averaged), abs=1e-9)
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
+def test_what_is_known_of_a_parameter_is_a_row_in_its_standard_deviations(unit: float) -> None:
+    """Below those of the balance, in any unit; a parameter of which nothing is known has none."""
+    model, data = world(4.0)
+    free = ("inertia", "motor_viscous")
+    values = {**VALUES, "motor_viscous": 25.0 * unit}
+    known = {"motor_viscous": (20.0 * unit, 2.0 * unit), "elsewhere": (0.0, 1.0)}
+    balances = balances_of(model, data.sensing, wrt=free)
+    form = WeakForm(balances, data, values, free, {"axis": 1.0}, known)
+    x = np.array([values[n] for n in free])
+    (rows,) = {w.rows for w in data.train}
+    assert form.residual(x)[rows:] == pytest.approx([2.5])
+    assert form.jacobian(x)[rows:] == pytest.approx(np.array([[0.0, 0.5 / unit]]))

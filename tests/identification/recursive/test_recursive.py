@@ -223,6 +223,26 @@ def test_p_is_reset_after_the_factor_stayed_low() -> None:
     assert 4 <= estimator.resets <= 6
 
 
+@pytest.mark.parametrize("method", ["bell", "polynomial"])
+def test_a_sample_after_which_p_was_reset_is_the_first_of_a_new_start(method: str) -> None:
+    """The first P and this one sample are all that P knows, whatever was told before."""
+    _, h, y = _data(2000)
+    scale, noise = np.array([2.0, 3.0, 1.0, 5.0]), np.array([0.01, 0.04])
+    settings = Settings(reset_seconds=0.05, output_floor=0.1, freeze=False)
+    estimator = RecursiveLeastSquares(np.zeros(4), scale, method, R2=noise, settings=settings)
+    y += 5.0 * np.sign(np.sin(3.0 * np.arange(2000)))[:, None]
+    k = 0
+    while not estimator.resets:
+        known = np.linalg.inv(estimator.covariance)
+        estimator.update(y[k], h[k])
+        k += 1
+    one = (h[k - 1].T / noise) @ h[k - 1]
+    np.testing.assert_allclose(
+        np.linalg.inv(estimator.covariance), np.diag(1 / scale**2) + one, rtol=1e-9
+    )
+    assert np.trace(known) > 10 * np.trace(one), "much was told before"
+
+
 # Many updates
 
 
@@ -555,6 +575,19 @@ def test_the_alarm_keeps_quiet_on_noise_and_fires_on_a_step_but_not_on_one_outli
     assert np.flatnonzero(stepped.alarm)[0] < 20
     assert not stepped.alarm[1000:].any()
     np.testing.assert_allclose(stepped.theta[400], theta + 0.3, atol=0.02)
+
+
+@pytest.mark.parametrize(("far_off", "fires"), [(1, []), (2, []), (3, [2]), (30, [2])])
+def test_the_alarm_fires_at_the_third_sample_far_off_and_at_no_two(
+    far_off: int, fires: list[int]
+) -> None:
+    """In a row, by 40 standard deviations each."""
+    begin, deviation = 2000, 0.05
+    y = deviation * np.random.default_rng(1).standard_normal(3000)
+    y[begin : begin + far_off] += 40 * deviation
+    estimator = RecursiveLeastSquares([0.0], [1.0], R2=[deviation**2])
+    alarm = estimator.run(y, np.ones((3000, 1))).alarm
+    assert (np.flatnonzero(alarm)[:1] - begin).tolist() == fires
 
 
 # Excitation
