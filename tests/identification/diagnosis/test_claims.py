@@ -14,7 +14,7 @@ import pytest
 from casadi_models import EFFECTS
 from identification.balance.dataset import HOLD_DELAY, HOLD_NAME
 from identification.data.joint_file import Joint
-from identification.diagnosis.candidates import Candidate, NotTestable
+from identification.diagnosis.candidates import Candidate, NotTestable, offered
 from identification.diagnosis.claims import (
     Ranking,
     _discoveries,
@@ -398,3 +398,22 @@ def test_a_name_that_is_not_significant_stands_behind_those_that_are(
     sure = [t.candidate.label in found.significant for t in found.trials]
     assert sure == [True] * (len(sure) - 1) + [False]
     assert found.trials[-1].candidate.label == best
+
+
+def test_a_name_stands_with_the_best_of_its_candidates(
+    base: Base, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In whichever order they are tried: each counts as it was tried, and the best for the name."""
+    offers = offered(base.solution.model, base.data)[0]
+    twins = [replace(c, label=f"{c.label}#2") for c in offers]
+    scores = np.random.default_rng(0).permutation(2 * len(offers)) + 1.0
+    given = dict(zip((c.label for c in (*offers, *twins)), scores.tolist(), strict=True))
+    monkeypatch.setattr(
+        "identification.diagnosis.claims.try_candidate",
+        lambda c, based: trial(based, c.effect.key, given[c.label], label=c.label),
+    )
+    found = rank(base, twins)
+    assert {t.candidate.label: t.score for t in found.everything} == given
+    for t in found.trials:
+        own = [c.label for c in (*offers, *twins) if c.effect.key == t.key]
+        assert t.score == max(given[label] for label in own)

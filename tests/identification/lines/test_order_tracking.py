@@ -224,6 +224,17 @@ def test_the_louder_side_counts_at_every_order_that_has_one(way: int) -> None:
         assert level[-far:] == pytest.approx(power[-far:] / there, rel=0.01)
 
 
+def test_the_side_of_a_low_order_ends_where_its_own_lobe_begins() -> None:
+    """A plateau over the lobe of one order is no background of that order."""
+    orders = np.arange(4000) * 0.1 / 4  # four points to an independent order
+    near, first = 4 * NEAREST, 8
+    for k in (first + 2 * near + 10, first + 3 * near):
+        power = np.ones(len(orders))
+        power[k - near : k + near] = 1e6
+        level = background(orders, power, 2 * math.pi * 10, orders[first])
+        assert level[k] == pytest.approx(1 / math.log(2))
+
+
 def test_background_of_few_orders_is_one_level() -> None:
     orders = np.arange(100) * 0.025
     power = np.random.default_rng(6).exponential(3.0, size=100)
