@@ -396,10 +396,13 @@ def along(*parts: tuple[float, float], seed: int = 0) -> Samples:
 
 
 def lines_in(
-    monkeypatch: pytest.MonkeyPatch, samples: dict[str, Samples], joint: Joint
+    monkeypatch: pytest.MonkeyPatch,
+    samples: dict[str, Samples],
+    joint: Joint,
+    held: Samples | None = None,
 ) -> list[Line]:
     """What is found in the residuals of some balances of a joint."""
-    tracked = [_Tracked(b, 1, s, None, 1e-2, direct=True) for b, s in samples.items()]
+    tracked = [_Tracked(b, 1, s, held, 1e-2, direct=True) for b, s in samples.items()]
     monkeypatch.setattr("identification.diagnosis.lines._tracked", lambda *_: (tracked, ()))
     data: Any = SimpleNamespace(sensing=SimpleNamespace(clamped_link=False), joint=joint)
     nothing: Any = None
@@ -441,6 +444,24 @@ def test_a_joint_whose_residuals_are_noise_has_no_line_at_any_smoothing(
         for seed in range(60)
     )
     assert seen <= 2, ALPHA
+
+
+def test_a_line_is_one_of_all_records_and_of_all_of_the_stroke(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Not one that held-out records do not have, nor one of half of the stroke."""
+    axis, seen = Joint("axis", "linear", model_name="hd1"), along((2.3, 1.0))
+    half = replace(seen, residual=np.where(seen.angle > 0, 2.0, 0.0) * seen.residual)
+    held, other = along((2.3, 1.0), seed=1), along((3.1, 1.0), seed=1)
+    assert len(peaks(half, 6.0, most=1)) == 1
+    for samples, of_held, many in (
+        (seen, None, 1),
+        (seen, held, 1),
+        (seen, other, 0),
+        (half, None, 0),
+        (half, held, 0),
+    ):
+        assert len(lines_in(monkeypatch, {"motor": samples}, axis, of_held)) == many
 
 
 @pytest.mark.parametrize(("order", "many"), [(0.2, 0), (0.3, 1)])
