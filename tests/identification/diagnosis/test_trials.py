@@ -17,6 +17,7 @@ from scipy.stats import f as fisher
 
 from casadi_models import EFFECTS
 from identification.balance.balances import balances_of
+from identification.balance.weak import prepare
 from identification.data.check.gate import passed
 from identification.data.joint_file import Joint, Known, load_joint
 from identification.data.read import read
@@ -90,6 +91,30 @@ def tried(base: Base, key: str, place: str = "motor") -> Trial:
     return found
 
 
+def without_friction(base: Base) -> Base:
+    """The base whose friction stands at zero, and with it is missing on all records."""
+    number = base.names.index("motor_coulomb")
+    others, held_others = (
+        np.delete(c, number, axis=1) for c in (base.jacobian, base.held_jacobian)
+    )
+    friction, held_friction = base.jacobian[:, [number]], base.held_jacobian[:, [number]]
+    q = span_of(others)
+    left = base.residual - 1e3 * friction[:, 0]
+    missing = np.linalg.lstsq(others, left, rcond=None)[0]
+    return replace(
+        base,
+        jacobian=others,
+        orthonormal=q,
+        inward=friction,
+        residual=left - q @ (q.T @ left),
+        names=tuple(n for n in base.names if n != "motor_coulomb"),
+        norms=np.delete(base.norms, number),
+        held_jacobian=held_others,
+        held_inward=held_friction,
+        held_residual=base.held_residual - 1e3 * held_friction[:, 0] - held_others @ missing,
+    )
+
+
 def raw_columns(base: Base, found: Trial) -> FloatArray:
     """Weighted columns of a trial at its shape."""
     balances = balances_of(
@@ -135,6 +160,17 @@ def test_rows_that_count_in_a_process_of_first_order(rho: float) -> None:
     for k in range(1, len(x)):
         x[k] = rho * x[k - 1] + noise[k]
     assert effective_share(x + 3.0) == pytest.approx((1 - rho) / (1 + rho), rel=0.15)
+
+
+@pytest.mark.parametrize("dt", [1e-3, 2e-3, 4e-3])
+def test_rows_of_white_noise_count_by_what_their_kernels_share(dt: float) -> None:
+    """Four rows to a kernel: no more count than such rows tell, and no third less."""
+    time = dt * np.arange(round(200 / dt))
+    noise = np.random.default_rng(0).standard_normal(len(time))
+    signals = {"motor_position": np.sin(time), "drive": noise}
+    rows = prepare(time, signals, (slice(0, len(time)),))
+    assert rows.grid.length / (rows.grid.stride * dt) == pytest.approx(4.0, rel=0.1)
+    assert 2 / 3 < KERNEL_SHARE / effective_share(rows.averaged["drive"]) < 1
 
 
 def test_rows_that_count_where_nothing_is_left() -> None:
@@ -423,6 +459,25 @@ def test_a_line_that_another_order_explains_better_is_no_effect_of_its_own_order
     assert tried(beside, "cyclic_torque").values == tried(ripple, "cyclic_torque").values
 
 
+@pytest.mark.parametrize("times", [1e-8, 1e8])
+@pytest.mark.parametrize("key", ["cyclic_torque", "quadratic_drag"])
+def test_a_trial_is_the_same_in_any_unit_of_the_noise(key: str, times: float, base: Base) -> None:
+    """Rows that all weigh so many times more say the same of every law."""
+    other = replace(
+        base,
+        weight=times * base.weight,
+        residual=times * base.residual,
+        norms=times * base.norms,
+        held_weight=times * base.held_weight,
+        held_residual=times * base.held_residual,
+    )
+    before, after = tried(base, key), tried(other, key)
+    assert after.values == pytest.approx(before.values, rel=1e-4)
+    for figure in ("score", "cv_drop_percent", "held_out_drop_percent", "contribution"):
+        assert getattr(after, figure) == pytest.approx(getattr(before, figure), rel=1e-4)
+    assert math.log(after.p_value) == pytest.approx(math.log(before.p_value), rel=1e-4)
+
+
 def test_the_size_by_one_fit_of_all_rows(base: Base) -> None:
     found = tried(base, "cyclic_torque")
     used = base.block >= 0
@@ -475,6 +530,35 @@ def test_the_fall_on_records_that_the_fit_never_saw(base: Base) -> None:
     assert found.held_out_drop_percent == pytest.approx(100 * (1 - ratio), rel=1e-4)
     alone = made(wave, held=False)
     assert math.isnan(tried(alone, "cyclic_torque").held_out_drop_percent)
+
+
+def test_the_fall_on_held_out_records_is_beside_what_is_their_own() -> None:
+    """What these records leave of it, a clock or a zero, says nothing for a law; a friction that
+    leaves its bound for the law goes with it.
+    """
+    base = without_friction(made(lambda q, v: v * np.abs(v)))
+    rng = np.random.default_rng(0)
+    noise = rng.standard_normal((len(base.held_residual), 2))
+    size = np.linalg.norm(base.held_residual) / np.linalg.norm(noise)
+    own = np.column_stack([base.held_residual + size * noise[:, 0], noise[:, 1]])
+    found = tried(replace(base, held_own=span_of(own)), "quadratic_drag")
+    balances = balances_of(
+        found.candidate.model, base.data.sensing, wrt=found.candidate.amplitudes, columns_only=True
+    )
+    used = base.block >= 0
+    both = np.column_stack([base.jacobian, base.inward, raw_columns(base, found)])
+    fit = np.linalg.lstsq(both[used], -base.residual[used], rcond=None)[0]
+    assert fit[base.jacobian.shape[1]] > 0
+    c = columns(found.candidate, base, {}, base.data.held_out, balances)
+    held = np.column_stack([base.held_jacobian, base.held_inward, c * base.held_weight[:, None]])
+    before, after = (
+        x - own @ np.linalg.lstsq(own, x, rcond=None)[0]
+        for x in (base.held_residual, base.held_residual + held @ fit)
+    )
+    ratio = np.linalg.norm(after) / np.linalg.norm(before)
+    assert found.held_out_drop_percent == pytest.approx(100 * (1 - ratio), rel=1e-6)
+    alone = tried(base, "quadratic_drag").held_out_drop_percent
+    assert abs(found.held_out_drop_percent - alone) > 1.0
 
 
 def test_what_the_model_has_already_is_not_testable(base: Base) -> None:
@@ -530,21 +614,7 @@ def test_an_amplitude_that_leaves_its_bound_counts_like_a_free_one() -> None:
     at zero: the two are alike.
     """
     base = made(lambda q, v: v * np.abs(v))
-    number = base.names.index("motor_coulomb")
-    others = np.delete(base.jacobian, number, axis=1)
-    friction = base.jacobian[:, [number]]
-    q = span_of(others)
-    left = base.residual - 1e3 * friction[:, 0]
-    bound = replace(
-        base,
-        jacobian=others,
-        orthonormal=q,
-        inward=friction,
-        residual=left - q @ (q.T @ left),
-        names=tuple(n for n in base.names if n != "motor_coulomb"),
-        norms=np.delete(base.norms, number),
-        held_residual=np.empty(0),
-    )
+    bound = replace(without_friction(base), held_residual=np.empty(0))
     free, returned = tried(base, "quadratic_drag"), tried(bound, "quadratic_drag")
     for n in free.candidate.amplitudes:
         assert returned.values[n] == pytest.approx(free.values[n], rel=1e-6)
