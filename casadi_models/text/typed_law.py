@@ -525,6 +525,30 @@ def _si(text: str, unit: BaseUnit) -> str:
     return ".".join(above) or "1"
 
 
+def value_of(text: str, values: Mapping[str, Any]) -> Expression:
+    """A law where its names have these values, expressions or numbers.
+
+    Raises
+    ------
+    LawError
+        The text is no law.
+    """
+    return _value(parse(text), {**CONSTANTS, **values}, lambda node: None)
+
+
+def _value(
+    node: Node, values: Mapping[str, Any], known: Callable[[Node], Expression | None]
+) -> Expression:
+    """A part of a law; `known`: what stands for it whatever its parts are."""
+    if node.kind in ("number", "name"):
+        found = node.value if node.kind == "number" else values[node.name]
+        return ca.DM(found) if isinstance(found, float | int) else found  # 1/0 is inf there
+    own = known(node)
+    if own is not None:
+        return own
+    return _applied(node, [_value(part, values, known) for part in node.parts])
+
+
 @final
 @dataclass(frozen=True)
 class TypedLaw:
@@ -577,16 +601,13 @@ class _Law:
     def __call__(self, s: LocalSignals, p: SimpleNamespace) -> Expression:
         values = {n: getattr(s, f) for n, (f, _) in SIGNALS.items()} | dict(CONSTANTS)
         values |= {short: getattr(p, full) for short, full in self.own}
-        return self._value(parse(self.text), values, s)
+        # smoothed, as in the friction laws of the library
+        known = lambda node: s.direction if self._is_way(node) else None  # noqa: E731
+        return _value(parse(self.text), values, known)
 
-    def _value(self, node: Node, values: Mapping[str, Any], s: LocalSignals) -> Expression:
-        if node.kind in ("number", "name"):
-            found = node.value if node.kind == "number" else values[node.name]
-            return ca.DM(found) if isinstance(found, float | int) else found  # 1/0 is inf there
-        velocity = node.kind == "call" and self._is_velocity(node.parts[0])
-        if self.smooth_sign and node.name == "sign" and velocity:
-            return s.direction  # smoothed, as in the friction laws of the library
-        return _applied(node, [self._value(part, values, s) for part in node.parts])
+    def _is_way(self, node: Node) -> bool:
+        call = node.kind == "call" and node.name == "sign"
+        return self.smooth_sign and call and self._is_velocity(node.parts[0])
 
     def _is_velocity(self, node: Node) -> bool:
         own = {short for short, _ in self.own}

@@ -216,22 +216,17 @@ def in_time(
     """
     filters: dict[str, Filter] = {}
     made, wanted = make({}), tuple(places)
-    hidden = both_encoders and link_hidden(made)
-    by_motor = "torque_sensor" in wanted and (motor_alone or hidden)
+    by_motor = "torque_sensor" in wanted and (motor_alone or (both_encoders and link_hidden(made)))
     shifts = _begun(make, made) if by_motor else {}
     begun = bool(shifts)
     made = make(shifts) if begun else made
-
-    def alone(place: str) -> bool:
-        return by_motor if place == "torque_sensor" else motor_alone
-
     # a drive that is filtered and not late would take the torque along: its rate says more of it
     first = tuple(p for p in wanted if by_motor and p == "torque_sensor")
     for together in (first, tuple(p for p in wanted if p not in first)):
         for _ in range(SHIFTS if together else 0):
             moved = dict(shifts)
             for place in together:
-                late = _late(made, place, torque=torque, motor_alone=alone(place)) / made.grid.dt
+                late = _late(made, place, torque=torque, by_motor=by_motor) / made.grid.dt
                 step = late if abs(late) > NEAR else 0.0
                 moved[place] = moved.get(place, 0.0) + step
             if moved == shifts:
@@ -242,9 +237,7 @@ def in_time(
         # a shift of zero keeps the rows: what is compared are the same instants
         unshifted = {**shifts, place: 0.0}
         other, late = make(unshifted), shifts[place] * made.grid.dt
-        found = [
-            lateness(x, place, torque=torque, motor_alone=alone(place))[0] for x in (other, made)
-        ]
+        found = [lateness(x, place, torque=torque, by_motor=by_motor)[0] for x in (other, made)]
         taken = (found[0] - found[1]) / late > ANSWERS
         if by_motor and place == "torque_sensor":
             # from where the search did not begin the rows answer to nothing
@@ -260,7 +253,6 @@ def in_time(
                 place=place,
                 noise=louder,
                 torque=torque,
-                motor_alone=motor_alone,
             )
             told = asked(make)
             # slow rows are calm, fast ones show most of what neither makes good: both are asked
@@ -289,7 +281,6 @@ def _filter(
     noise: Callable[[float, str, float], float],
     *,
     torque: bool,
-    motor_alone: bool,
     share: bool = True,
 ) -> Filter:
     """What rows say of a late reading, by how well they are met with all of its lateness shifted,
@@ -315,7 +306,7 @@ def _filter(
     friction = any_curve(alone, "motor_velocity", kept)
 
     def rest(made: WeakRecord) -> FloatArray:
-        values, others, column = _parts(made, place, kept, torque=torque, motor_alone=motor_alone)
+        values, others, column = _parts(made, place, kept, torque=torque)
         return rest_beside(values, [*others, friction, column])
 
     left = {0.0: rest(alone), whole: rest(waiting)}
@@ -359,8 +350,8 @@ def link_hidden(made: WeakRecord) -> bool:
     _, error, _ = lateness(made, "torque_sensor", torque=True)
     if error < NEAR * made.grid.dt:
         return False
-    _, by_motor, _ = lateness(made, "torque_sensor", torque=True, motor_alone=True)
-    return by_motor < error
+    _, other, _ = lateness(made, "torque_sensor", torque=True, by_motor=True)
+    return other < error
 
 
 def _begun(
@@ -385,7 +376,7 @@ def _unexplained(made: WeakRecord) -> FloatArray:
     of a few stretches.
     """
     kept = steady(made)
-    values, others, column = _parts(made, "torque_sensor", kept, torque=True, motor_alone=True)
+    values, others, column = _parts(made, "torque_sensor", kept, torque=True, by_motor=True)
     curve = any_curve(made, "motor_velocity", kept)
     rest = rest_beside(values, [*others, column, curve], 1)
     squares = [float(np.mean(x**2)) for x in np.array_split(rest, STRETCHES)]
@@ -399,15 +390,15 @@ def _parts(
     *,
     torque: bool,
     through_motor: bool = False,
-    motor_alone: bool = False,
+    by_motor: bool = False,
 ) -> tuple[FloatArray, list[FloatArray], FloatArray]:
     """Reading of a torque, what it follows from, and the column of its lateness, in the rows
     `kept`; `through_motor`: as far as the motion of the motor tells that of the link;
-    `motor_alone`: the link is not read.
+    `by_motor`: the torque is read beside what drives the motor, and not against the link.
     """
     a = {n: x[kept] for n, x in made.averaged.items()}
     if place == "torque_sensor":
-        if motor_alone:
+        if by_motor:
             # a soft joint's torque is no law of the motor's motion: it is part of what drives it
             drives = [*motion_of(a, "motor"), a["torque"], -a["drive_rate"]]
             return a["drive"], drives, a["torque_rate"]
@@ -442,14 +433,14 @@ def _within(record: WeakRecord, way: FloatArray) -> npt.NDArray[np.bool_]:
     return np.asarray(same if np.mean(same) > FEW else np.ones(record.rows, dtype=np.bool_))
 
 
-def _late(made: WeakRecord, place: str, *, torque: bool, motor_alone: bool) -> float:
+def _late(made: WeakRecord, place: str, *, torque: bool, by_motor: bool) -> float:
     """Time by which a channel is certainly late [s]."""
-    late, error, _ = lateness(made, place, torque=torque, motor_alone=motor_alone)
+    late, error, _ = lateness(made, place, torque=torque, by_motor=by_motor)
     return late if abs(late) > SURE * error else 0.0
 
 
 def lateness(
-    made: WeakRecord, place: str, *, torque: bool, motor_alone: bool = False
+    made: WeakRecord, place: str, *, torque: bool, by_motor: bool = False
 ) -> tuple[float, float, float]:
     """Time by which a channel is late, its standard error, and the part of it that viscous friction
     may be [s]: reading = what it follows from, less the time times its rate.
@@ -461,8 +452,8 @@ def lateness(
     kept = steady(made)
     a = {n: x[kept] for n, x in made.averaged.items()}
     if place not in ENCODERS:
-        late, error = _slope(*_parts(made, place, kept, torque=torque, motor_alone=motor_alone))
-        if place == "torque_sensor" and not motor_alone:
+        late, error = _slope(*_parts(made, place, kept, torque=torque, by_motor=by_motor))
+        if place == "torque_sensor" and not by_motor:
             sure = _slope(*_parts(made, place, kept, torque=torque, through_motor=True))
             if abs(late - sure[0]) > UNLIKE * sure[1]:
                 late, error = sure

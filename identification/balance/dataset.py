@@ -205,11 +205,12 @@ def load_dataset(
     for number, (record, made) in enumerate(zip((*train, *held_out), prepared, strict=True)):
         seen = {p: [w.filters[p] for w in prepared[:count] if p in w.filters] for p in made.filters}
         agreed = {p: as_told(seen[p], f) for p, f in made.filters.items() if seen[p]}
-        by_motor = sensing.motor_and_torque or (sensing.both_positions and link_hidden(made))
-        if by_motor and not made.shifts.get(OF_TORQUE, 0.0):
+        if not made.shifts.get(OF_TORQUE, 0.0) and told is None:
             # a record that tells nothing of it has the torque sensor of the others
             late = [w.shifts[OF_TORQUE] for w in prepared[:count] if w.shifts.get(OF_TORQUE, 0.0)]
-            agreed |= {OF_TORQUE: float(np.median(late))} if late else {}
+            hidden = sensing.both_positions and late and link_hidden(made)
+            if late and (sensing.motor_and_torque or hidden):
+                agreed |= {OF_TORQUE: float(np.median(late))}
         if any(abs(made.shifts.get(p, 0.0) - late) > NANOSECOND for p, late in agreed.items()):
             made = replace(again[number](known={**made.shifts, **agreed}), filters=made.filters)
         if record.payload != train[0].payload:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, Any, Final, final
 
 import numpy as np
 import numpy.typing as npt
@@ -16,9 +16,9 @@ from identification.balance.rest import rest_check, rest_warnings
 from identification.data.check.gate import gate_warnings, gated
 from identification.data.record import Record, listed
 from identification.diagnosis.bench import JointBench
-from identification.diagnosis.places import Place, gather, places_of
+from identification.diagnosis.places import Place, gather, places_of, worst_window
 from identification.diagnosis.session import refuse_unlike
-from identification.fitting.assess import Error, assess
+from identification.fitting.assess import Error, assess, over_noise
 from identification.fitting.engine import load_dataset, stack
 from identification.fitting.fit import Fit
 from identification.representation import html_of
@@ -27,6 +27,9 @@ if TYPE_CHECKING:
     from identification.linear.ceiling import Ceiling
 
 FloatArray = npt.NDArray[np.float64]
+
+WORST: Final = 1.0
+"""Length of the window in which a model is said to fail most [s]."""
 
 
 @final
@@ -153,13 +156,12 @@ def compare(fitted: Fit, records: Record | Sequence[Record], *, linear: bool = T
     residual = stacked.residual
     places = places_of(stacked.shown, gather(data))
     time = np.concatenate([w.time for w in compared])
-    sigma = {b: max(error.balances[b].floor, 1e-12) for b in residual}
-    power = sum((residual[b] / sigma[b]) ** 2 for b in residual)
+    power = sum(x**2 for x in over_noise(error, compared).values())
     counts = np.cumsum([0, *(int(w.stretch.max(initial=0)) + 1 for w in compared)])
     stretch = np.concatenate(
         [w.stretch + first for w, first in zip(compared, counts[:-1], strict=True)]
     )
-    worst = _worst(time, np.asarray(power), stretch)
+    worst = worst_window(time, np.asarray(power), WORST, stretch)
     floor = {b: e.floor for b, e in error.balances.items()}
     above = None
     if linear:  # the one place that fits models without physics: no other verb loads them
@@ -189,22 +191,6 @@ def _same(one: Record, other: Record) -> bool:
     if not one.provenance.sha256 or one.provenance.sha256 != other.provenance.sha256:
         return False
     return len(one) == len(other) and bool(np.array_equal(one.time[[0, -1]], other.time[[0, -1]]))
-
-
-def _worst(
-    time: FloatArray, power: FloatArray, stretch: npt.NDArray[np.int64]
-) -> tuple[float, float]:
-    """Start and end of the second with the largest residual; it does not reach over a hole or
-    from one run into the next.
-    """
-    if len(time) < 2:
-        return float(time[0]), float(time[0])
-    step = float(np.median(np.diff(time)))
-    width = max(1, min(len(power), round(1.0 / max(step, 1e-9))))
-    whole = stretch[: len(power) - width + 1] == stretch[width - 1 :]
-    summed = np.convolve(power, np.ones(width), "valid")
-    k = int(np.argmax(np.where(whole, summed, -1.0) if whole.any() else summed))
-    return float(time[k]), float(time[min(k + width, len(time) - 1)])
 
 
 def _lagged(r: FloatArray, lag: int = 4) -> float:

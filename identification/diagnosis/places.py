@@ -422,3 +422,38 @@ def places_of(residual: Mapping[str, FloatArray], rows: Rows) -> tuple[Place, ..
     """All places of given residuals, the most telling first."""
     found = [place(rows, r, balance, axis) for balance, r in residual.items() for axis in rows.axes]
     return tuple(sorted(found, key=lambda p: (-max(p.share_percent, 0.0), -p.strength)))
+
+
+def worst_window(
+    time: FloatArray,
+    power: FloatArray,
+    length: float,
+    stretch: npt.NDArray[np.int64] | None = None,
+) -> tuple[float, float]:
+    """Window of a length in which most of a power stands.
+
+    Parameters
+    ----------
+    time : (rows,) array
+        [s].
+    power : (rows,) array
+        NaN counts for nothing.
+    length : float
+        [s].
+    stretch : (rows,) array of int, optional
+        The window does not reach over a hole or from one run into the next.
+
+    Returns
+    -------
+    tuple of float
+        Its first and last stamp [s].
+    """
+    step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
+    width = max(1, min(len(time), round(length / max(step, 1e-9))))
+    total = np.concatenate([[0.0], np.cumsum(np.nan_to_num(power))])
+    summed = total[width:] - total[:-width]
+    if stretch is not None:
+        whole = stretch[: len(stretch) - width + 1] == stretch[width - 1 :]
+        summed = np.where(whole, summed, -1.0) if whole.any() else summed
+    k = int(np.argmax(summed))
+    return float(time[k]), float(time[k + width - 1])

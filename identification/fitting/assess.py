@@ -118,6 +118,24 @@ class Error:
         }
 
 
+def over_noise(error: Error, records: Sequence[WeakRecord]) -> dict[str, FloatArray]:
+    """Residual of every row over the scatter that noise allows it, by balance; zero in rows that
+    take no part.
+
+    Parameters
+    ----------
+    error : Error
+        Of these records, as :func:`assess` gives it.
+    records : sequence of WeakRecord
+    """
+    out = {}
+    for balance, e in error.balances.items():
+        rows = taking_part(balance, records)
+        out[balance] = np.zeros(len(rows))
+        out[balance][rows] = e.residual * e.weight
+    return out
+
+
 def relative_error_percent(
     model: JointModel, data: Dataset, records: Sequence[WeakRecord], values: Mapping[str, float]
 ) -> float:

@@ -30,7 +30,7 @@ from identification.diagnosis.improve import Improvement, improve
 from identification.diagnosis.lines import Line
 from identification.diagnosis.locate import Unexplained
 from identification.diagnosis.outcome import OUTCOMES
-from identification.diagnosis.places import AXIS_TITLES
+from identification.diagnosis.places import AXIS_TITLES, worst_window
 from identification.errors import InputError
 from identification.fitting.fit import fit
 from workbench.cli.loop import results_beside
@@ -45,7 +45,6 @@ from workbench.show.plots import (
     explained,
     overlay_json,
     report_plots,
-    worst_window,
 )
 from workbench.show.report import json_for_html, render_report, write_report
 from workbench.show.results import floor_percent
@@ -452,7 +451,7 @@ def long_overlay(rows: int = 50_000) -> Overlay:
         measured,
         start,
         measured,
-        worst_window(time, measured - start, 2.0),
+        worst_window(time, (measured - start) ** 2, 2.0),
     )
 
 
@@ -479,9 +478,13 @@ def test_short_curves_are_left_alone() -> None:
 def test_worst_window_is_the_largest() -> None:
     time = np.arange(0, 10, 0.1)
     residual = np.where((time > 6.0) & (time < 6.95), 1.0, 0.1)
-    low, high = worst_window(time, residual, 1.0)
+    low, high = worst_window(time, residual**2, 1.0)
     assert low == pytest.approx(6.0, abs=0.15)
     assert high == pytest.approx(6.9, abs=0.15)
+    # the same samples as two runs: no window reaches from one into the other
+    parted = worst_window(time, residual**2, 1.0, (time > 6.45).astype(np.int64))
+    assert parted[1] <= 6.45 or parted[0] > 6.4
+    assert worst_window(time, np.where(time < 5, np.nan, residual**2), 1.0) == (low, high)
 
 
 @pytest.mark.parametrize(

@@ -24,11 +24,11 @@ from identification.diagnosis.bench import JointBench
 from identification.diagnosis.diagnose import Diagnosis
 from identification.diagnosis.improve import HOLD_DELAY, ranked_json
 from identification.diagnosis.outcome import key_of
-from identification.diagnosis.places import Rows, gather, places_of
+from identification.diagnosis.places import Rows, gather, places_of, worst_window
 from identification.diagnosis.session import Session, with_held_out
 from identification.diagnosis.trials import Trial
 from identification.errors import InputError
-from identification.fitting.assess import Error, assess
+from identification.fitting.assess import Error, assess, over_noise
 from identification.fitting.engine import (
     Dataset,
     Solution,
@@ -56,6 +56,8 @@ QUICK_HELD_OUT: Final = 30.0
 """Seconds of record that a click fits and judges at once; longer records are taken in windows
 [s].
 """
+SHOWN_WINDOW: Final = 2.0
+"""Length of the window that the time plot opens with [s]."""
 USUAL_RATE: Final = 1000.0
 """Records of fewer samples than the seconds above have at this rate are short, however long
 they last [1/s].
@@ -427,7 +429,7 @@ class Analysis:
                     p.as_json() | {"tells": p.tells, "chart": place_chart(p).as_json()}
                     for p in found
                 ],
-                "worst": self._worst(residual, rows),
+                "worst": self._worst(rows),
                 "records": list(self.data.held_out_names),
                 "note": self.note,
             }
@@ -531,21 +533,18 @@ class Analysis:
             ).shown
         )
 
-    def _worst(self, residual: Mapping[str, FloatArray], rows: Rows) -> dict[str, Any]:
-        """The two seconds in which the residual stands highest over what noise allows its rows: by
-        one floor for all, a reversal would be the worst of every record.
+    def _worst(self, rows: Rows) -> dict[str, Any]:
+        """The window in which the residual stands highest over what noise allows its rows: by one
+        floor for all, a reversal would be the worst of every record.
         """
-        stamps, noise = rows.axes["time"].values, self.noise()
-        over = {b: np.nan_to_num(r / noise[b]) ** 2 for b, r in residual.items()}
-        power = sum(over.values())
-        step = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1.0
-        width = max(1, min(len(stamps), round(2.0 / step)))
-        k = int(np.argmax(np.convolve(np.asarray(power), np.ones(width), "valid")))
-        where = {b: float(np.sum(p[k : k + width])) for b, p in over.items()}
+        stamps, held = rows.axes["time"].values, self.data.held_out
+        power = {b: x**2 for b, x in over_noise(self.assessed(), held).items()}
+        low, high = worst_window(stamps, np.asarray(sum(power.values())), SHOWN_WINDOW)
+        inside = (stamps >= low) & (stamps <= high)
         return {
-            "low": float(stamps[k]),
-            "high": float(stamps[min(k + width, len(stamps) - 1)]),
-            "balance": max(where, key=lambda b: where[b]),
+            "low": low,
+            "high": high,
+            "balance": max(power, key=lambda b: power[b][inside].sum()),
         }
 
     def _entry(

@@ -117,10 +117,7 @@ def checked(
     )
     if not mapped:
         asked = questions_of(record, path, findings, joint.gear_ratio if joint else None)
-        odd = (
-            {"severity": "warn", "code": "odd", "message": text, "channel": ""} for text in asked
-        )
-        shown = (*odd, *shown)
+        shown = (*map(_odd, asked), *shown)
     bad = next((f for f in findings if f.severity == "refuse"), None)
     entry = replace(entry, findings=shown, message="", status="ready")
     if bad is not None:

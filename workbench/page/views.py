@@ -17,6 +17,7 @@ from casadi_models.effect import PLACE_SIDE
 from casadi_models.transmission import MODELS
 from identification.balance.kinematic import residual_unit
 from identification.data.channels import CHANNELS
+from identification.diagnosis.lines import NORMAL_95
 from identification.errors import InputError
 from workbench.page import export as app_export
 from workbench.page import plan as app_plan
@@ -36,8 +37,6 @@ from workbench.page.verbs import addable, wait_settled
 
 Query = Mapping[str, Any]
 MOST_POINTS: Final = 4000
-NOISE_95: Final = 1.96
-"""Standard deviations that hold 95 % of normal noise."""
 
 
 def _config(live: Any, query: Query) -> dict[str, Any]:
@@ -103,7 +102,7 @@ def _balance(live: Live, query: Query) -> dict[str, Any]:
     """Measured torque, model and residual of a balance, decimated."""
     analysis = live.analysis()
     time, measured, model, noise = analysis.balance_series(str(query.get("balance", "")))
-    kept = NOISE_95 * noise
+    kept = NORMAL_95 * noise
     stamps, columns, full = decimated(
         time, [measured, model, measured - model, kept, -kept], _points(query), _window(query)
     )

@@ -26,6 +26,7 @@ from identification.diagnosis.places import (
     places_of,
     residuals,
     running_time,
+    worst_window,
 )
 from identification.errors import InputError
 from identification.fitting.engine import Dataset, Solution, references, stack
@@ -178,15 +179,6 @@ def _rounded(values: FloatArray) -> list[float | None]:
     return [v if math.isfinite(v) else None for v in short]
 
 
-def worst_window(time: FloatArray, residual: FloatArray, length: float) -> tuple[float, float]:
-    """Window of a length [s] in which the residual is largest."""
-    step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
-    width = max(1, min(len(time), round(length / max(step, 1e-9))))
-    power = np.concatenate([[0.0], np.cumsum(np.nan_to_num(residual) ** 2)])
-    k = int(np.argmax(power[width:] - power[:-width]))
-    return float(time[k]), float(time[k + width - 1])
-
-
 def overlays(
     data: Dataset,
     records: Sequence[WeakRecord],
@@ -217,7 +209,7 @@ def overlays(
             drawn = np.where(w.taking(balance) & ~w.begins, 0.0, np.nan)
             m, before, after = measured[balance][rows] + drawn, residual[rows], final[balance][rows]
             time = running_time([w])
-            window = worst_window(time, before, WINDOW_KERNELS * data.kernel)
+            window = worst_window(time, before**2, WINDOW_KERNELS * data.kernel)
             size = float(np.sqrt(np.nanmean(before**2)))
             out.append(
                 (

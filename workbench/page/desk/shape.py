@@ -6,18 +6,20 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Final, final
 
+import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
 from casadi_models import EFFECTS
+from casadi_models.text.typed_law import value_of
 from identification.errors import InputError
 
 FloatArray = npt.NDArray[np.float64]
-Columns = Callable[..., Sequence[FloatArray]]
 
 WIDTHS: Final = np.geomspace(1 / 30, 2.0, 24)
 """Widths that are tried, in spans of the curve."""
@@ -43,38 +45,47 @@ class Form:
         With ``u`` for the signal.
     powers : tuple of int
         Of the variable in the unit of each amplitude: ``c`` and ``d``.
-    columns : callable
-        What the amplitudes multiply, at the curve's points and with the shapes.
     shapes : str
         A letter for each shape: ``w`` a width, ``m`` a place, ``k`` a number of turns.
     """
 
     text: str
     powers: tuple[int, ...]
-    columns: Columns
     shapes: str = ""
+
+    def columns(self, x: FloatArray, *shapes: float) -> FloatArray:
+        """What each amplitude multiplies, (points, amplitudes)."""
+        return np.asarray(self._columns(x[None, :], *shapes), dtype=np.float64).T
+
+    @cached_property
+    def _columns(self) -> ca.Function:
+        u, *own = (ca.SX.sym(n) for n in ("u", *self.shapes))
+        amplitudes = [ca.SX.sym(n) for n in "cd"[: len(self.powers)]]
+        names = dict(zip((*"cd"[: len(self.powers)], *self.shapes), (*amplitudes, *own)))
+        law = value_of(self.text, {"u": u, **names})
+        return ca.Function("columns", [u, *own], [ca.jacobian(law, ca.vertcat(*amplitudes)).T])
 
 
 _ODD: Final = (
-    Form("c*u", (1,), lambda x: [x]),
-    Form("c*u*abs(u)", (2,), lambda x: [x * np.abs(x)]),
-    Form("c*u^3", (3,), lambda x: [x**3]),
-    Form("c*u + d*u^3", (1, 3), lambda x: [x, x**3]),
-    Form("c*tanh(u/w)", (0,), lambda x, w: [np.tanh(x / w)], "w"),
-    Form("c*tanh(u/w) + d*u", (0, 1), lambda x, w: [np.tanh(x / w), x], "w"),
-    Form("c*u*exp(-abs(u)/w)", (1,), lambda x, w: [x * np.exp(-np.abs(x) / w)], "w"),
+    Form("c*u", (1,)),
+    Form("c*u*abs(u)", (2,)),
+    Form("c*u^3", (3,)),
+    Form("c*u + d*u^3", (1, 3)),
+    Form("c*tanh(u/w)", (0,), "w"),
+    Form("c*tanh(u/w) + d*u", (0, 1), "w"),
+    Form("c*u*exp(-abs(u)/w)", (1,), "w"),
 )
 _EVEN: Final = (
-    Form("c*abs(u)", (1,), lambda x: [np.abs(x)]),
-    Form("c*u^2", (2,), lambda x: [x**2]),
-    Form("c + d*abs(u)", (0, 1), lambda x: [np.ones_like(x), np.abs(x)]),
-    Form("c*exp(-abs(u)/w)", (0,), lambda x, w: [np.exp(-np.abs(x) / w)], "w"),
+    Form("c*abs(u)", (1,)),
+    Form("c*u^2", (2,)),
+    Form("c + d*abs(u)", (0, 1)),
+    Form("c*exp(-abs(u)/w)", (0,), "w"),
 )
 _PLACED: Final = (
-    Form("c*u", (1,), lambda x: [x]),
-    Form("c + d*u", (0, 1), lambda x: [np.ones_like(x), x]),
-    Form("c*sin(k*u) + d*cos(k*u)", (0, 0), lambda x, k: [np.sin(k * x), np.cos(k * x)], "k"),
-    Form("c*exp(-((u - m)/w)^2)", (0,), lambda x, m, w: [np.exp(-(((x - m) / w) ** 2))], "mw"),
+    Form("c*u", (1,)),
+    Form("c + d*u", (0, 1)),
+    Form("c*sin(k*u) + d*cos(k*u)", (0, 0), "k"),
+    Form("c*exp(-((u - m)/w)^2)", (0,), "mw"),
 )
 _FORMS: Final[Mapping[str, tuple[str, tuple[Form, ...], bool]]] = {
     "learned_velocity": ("v", _ODD, False),
@@ -119,7 +130,7 @@ def nearest(claim: Mapping[str, Any]) -> dict[str, Any]:
     law = re.sub(r"\bu\b", signal, form.text)
     size = float(np.max(np.abs(y)))
     units = [_unit(str(curve["y_unit"]), str(curve["unit"]), p) for p in form.powers]
-    scales = [size / float(np.max(np.abs(c))) for c in form.columns(x, *shapes)]
+    scales = (size / np.max(np.abs(form.columns(x, *shapes)), axis=0)).tolist()
     sizes = [max(abs(a), s) for a, s in zip(amplitudes.tolist(), scales, strict=True)]
     names = "cd"[: len(sizes)]
     parameters = [
@@ -161,7 +172,7 @@ def _best(
     """Of all shapes on a grid those that leave least, with their amplitudes."""
     made = []
     for shapes in itertools.product(*(g.tolist() for g in grids)):
-        columns = np.column_stack(form.columns(x, *shapes))
+        columns = form.columns(x, *shapes)
         size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
         amplitudes = np.linalg.lstsq(columns / size, y, rcond=None)[0] / size
         made.append((float(np.sum((y - columns @ amplitudes) ** 2)), shapes, amplitudes))
