@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -51,27 +50,3 @@ def context_of(chromium: Any, **options: Any) -> Any:
     if LATE:
         context.add_init_script(HOLD_BACK.replace("LATE", str(LATE)))
     return context
-
-
-@contextmanager
-def served(root: Path) -> Iterator[str]:
-    """The page's server on sessions under `root`; gives its address."""
-    import uvicorn
-
-    from workbench.page.server import _listen, create_app
-
-    listening = _listen(0)
-    port = int(listening.getsockname()[1])
-    server = uvicorn.Server(
-        uvicorn.Config(
-            create_app(root, port=port), log_level="error", ws="none", timeout_graceful_shutdown=1
-        )
-    )
-    thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
-    thread.start()
-    try:
-        yield f"http://127.0.0.1:{port}/"
-    finally:
-        server.should_exit = True
-        thread.join(10)
-        listening.close()

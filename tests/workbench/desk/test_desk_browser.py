@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import numpy as np
 import pytest
 
 from tests.workbench.chromium import context_of, launched, needs_chromium
+from tests.workbench.served import serving
 
 pytestmark = needs_chromium
 
@@ -24,22 +24,8 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def address(root: Path) -> Iterator[str]:
-    import uvicorn
-
-    from workbench.page.server import _listen, create_app
-
-    listening = _listen(0)
-    port = int(listening.getsockname()[1])
-    app = create_app(root, port=port)
-    server = uvicorn.Server(
-        uvicorn.Config(app, log_level="error", ws="none", timeout_graceful_shutdown=1)
-    )
-    thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
-    thread.start()
-    yield f"http://127.0.0.1:{port}/"
-    server.should_exit = True
-    thread.join(10)
-    listening.close()
+    with serving(root) as there:
+        yield there.address
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,8 @@ from typing import Any
 import pytest
 
 from tests.identification.data.test_survey import CASES, NAMED, written
-from tests.workbench.chromium import context_of, launched, needs_chromium, served
+from tests.workbench.chromium import context_of, launched, needs_chromium
+from tests.workbench.served import serving
 
 pytestmark = needs_chromium
 
@@ -21,14 +22,14 @@ pytestmark = needs_chromium
 def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     problems: list[str] = []
     with (
-        served(tmp_path_factory.mktemp("sessions")) as address,
+        serving(tmp_path_factory.mktemp("sessions")) as there,
         launched() as chromium,
     ):
         context = context_of(chromium, viewport={"width": 1280, "height": 860})
         context.on("weberror", lambda e: problems.append(str(e.error)))
         made = context.new_page()
         made.set_default_timeout(15_000)
-        made.goto(address)
+        made.goto(there.address)
         yield made
     assert problems == []
 

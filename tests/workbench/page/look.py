@@ -18,7 +18,8 @@ from typing import Any, Final, final
 
 import numpy as np
 
-from tests.workbench.chromium import context_of, launched, served
+from tests.workbench.chromium import context_of, launched
+from tests.workbench.served import serving
 
 LONGEST: Final = 120_000
 """What one wait may take at most [ms]."""
@@ -178,13 +179,13 @@ def main() -> int:
     count = 0
     with tempfile.TemporaryDirectory() as place, launched() as chromium:
         folder = Path(place)
-        with served(folder / "sessions") as address:
+        with serving(folder / "sessions") as there:
             context = context_of(chromium, viewport={"width": WIDTHS[0], "height": 860})
             context.on("weberror", lambda e: thrown.append(str(e.error)))
             context.on("console", lambda m: thrown.append(m.text) if m.type == "error" else None)
             page = context.new_page()
             look = Look(page, given.folder, axe)
-            for name in views(page, address, folder):
+            for name in views(page, there.address, folder):
                 said = look.at(name)
                 print(f"{name}: {len(said)} findings", *said, sep="\n  ", flush=True)
                 wrong += said

@@ -23,7 +23,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, final
 
-from tests.workbench.chromium import context_of, launched, served
+from tests.workbench.chromium import context_of, launched
+from tests.workbench.served import serving
 
 ROOT: Final = Path(__file__).resolve().parents[3]
 SHARED: Final = ROOT.parent / "shared"
@@ -380,9 +381,9 @@ def main() -> int:
             folder = Path(place) / name
             folder.mkdir()
             began = time.perf_counter()
-            with served(folder / "sessions") as address:
+            with serving(folder / "sessions") as there:
                 context = context_of(chromium, viewport={"width": 1280, "height": 860})
-                made = answers(context.new_page(), address, SETS[name], folder)
+                made = answers(context.new_page(), there.address, SETS[name], folder)
                 context.close()
             differ = made.differences()
             wrong += bool(differ)

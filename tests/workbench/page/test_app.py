@@ -27,10 +27,11 @@ pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 
 from identification.errors import InputError
+from tests.workbench.served import serving
 from workbench.page.demo import demo_files
 from workbench.page.records import decimated, guessed_role, thinned
 from workbench.page.security import CSP
-from workbench.page.server import _listen, create_app, with_files
+from workbench.page.server import _listen, with_files
 from workbench.page.session import Session, State, Store, safe_name, write_atomic
 from workbench.page.uploads import check_unpacked
 
@@ -94,30 +95,6 @@ class Client:
         return self.wait(where, settled=settled)
 
 
-class Server:
-    """A server in this process."""
-
-    def __init__(self, root: Path) -> None:
-        import uvicorn
-
-        self.listening = _listen(0)
-        self.port = int(self.listening.getsockname()[1])
-        app = create_app(root, port=self.port, max_upload=LIMIT)
-        self.server = uvicorn.Server(
-            uvicorn.Config(app, log_level="critical", ws="none", timeout_graceful_shutdown=1)
-        )
-        self.thread = threading.Thread(
-            target=self.server.run, kwargs={"sockets": [self.listening]}, daemon=True
-        )
-        self.thread.start()
-        self.client = Client(self.port)
-
-    def stop(self) -> None:
-        self.server.should_exit = True
-        self.thread.join(10)
-        self.listening.close()
-
-
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("sessions")
@@ -125,9 +102,8 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def client(root: Path) -> Iterator[Client]:
-    server = Server(root)
-    yield server.client
-    server.stop()
+    with serving(root, max_upload=LIMIT) as there:
+        yield Client(there.port)
 
 
 @pytest.fixture(scope="module")
@@ -674,24 +650,21 @@ def test_a_changed_record_begins_a_branch_and_the_fit_is_kept(client: Client) ->
 
 
 def test_a_restart_finds_everything(tmp_path: Path) -> None:
-    server = Server(tmp_path)
-    where = server.client.session()
-    server.client.post(f"{where}/demo")
-    server.client.run(where, "fit")
-    server.client.run(where, "diagnose")
-    before = server.client.run(where, "add", label="stribeck@motor")
-    value = server.client.get(f"{where}/view/parameters")["motor_stribeck_extra"]["value"]
-    server.stop()
-    server = Server(tmp_path)
-    try:
-        after = server.client.get(where)
+    with serving(tmp_path) as there:
+        client = Client(there.port)
+        where = client.session()
+        client.post(f"{where}/demo")
+        client.run(where, "fit")
+        client.run(where, "diagnose")
+        before = client.run(where, "add", label="stribeck@motor")
+        value = client.get(f"{where}/view/parameters")["motor_stribeck_extra"]["value"]
+    with serving(tmp_path) as there:
+        client = Client(there.port)
+        after = client.get(where)
         assert after["steps"] == before["steps"]
-        assert server.client.get(f"{where}/view/parameters")["motor_stribeck_extra"][
-            "value"
-        ] == pytest.approx(value, rel=1e-3)
-        assert len(server.client.run(where, "undo")["steps"]) == 1
-    finally:
-        server.stop()
+        found = client.get(f"{where}/view/parameters")["motor_stribeck_extra"]["value"]
+        assert found == pytest.approx(value, rel=1e-3)
+        assert len(client.run(where, "undo")["steps"]) == 1
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="kill -9")

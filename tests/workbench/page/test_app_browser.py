@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import os
 import re
-import threading
 import tomllib
 import zipfile
 from collections.abc import Iterator
@@ -17,6 +16,7 @@ from typing import Any
 import pytest
 
 from tests.workbench.chromium import CI, context_of, launched, needs_chromium
+from tests.workbench.served import Served, serving
 
 SHARED = Path(__file__).resolve().parents[3].parent / "shared"
 AXE = os.environ.get("IRJ_AXE", "")
@@ -24,38 +24,10 @@ AXE = os.environ.get("IRJ_AXE", "")
 pytestmark = needs_chromium
 
 
-@dataclass
-class Served:
-    """A running server."""
-
-    address: str
-    root: Path
-    server: Any
-    thread: threading.Thread
-
-
 @pytest.fixture
 def served(tmp_path: Path) -> Iterator[Served]:
-    import uvicorn
-
-    from workbench.page.server import _listen, create_app
-
-    listening = _listen(0)
-    port = int(listening.getsockname()[1])
-    server = uvicorn.Server(
-        uvicorn.Config(
-            create_app(tmp_path / "sessions", port=port),
-            log_level="error",
-            ws="none",
-            timeout_graceful_shutdown=1,
-        )
-    )
-    thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
-    thread.start()
-    yield Served(f"http://127.0.0.1:{port}/", tmp_path / "sessions", server, thread)
-    server.should_exit = True
-    thread.join(10)
-    listening.close()
+    with serving(tmp_path / "sessions") as there:
+        yield there
 
 
 @dataclass

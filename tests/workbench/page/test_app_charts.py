@@ -7,7 +7,6 @@ from __future__ import annotations
 import csv
 import os
 import re
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ import numpy as np
 import pytest
 
 from tests.workbench.chromium import context_of, launched, needs_chromium
+from tests.workbench.served import serving
 
 AXE = os.environ.get("IRJ_AXE", "")
 
@@ -24,22 +24,8 @@ pytestmark = needs_chromium
 
 @pytest.fixture(scope="module")
 def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    import uvicorn
-
-    from workbench.page.server import _listen, create_app
-
-    listening = _listen(0)
-    port = int(listening.getsockname()[1])
-    app = create_app(tmp_path_factory.mktemp("sessions"), port=port)
-    server = uvicorn.Server(
-        uvicorn.Config(app, log_level="error", ws="none", timeout_graceful_shutdown=1)
-    )
-    thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
-    thread.start()
-    yield f"http://127.0.0.1:{port}/"
-    server.should_exit = True
-    thread.join(10)
-    listening.close()
+    with serving(tmp_path_factory.mktemp("sessions")) as there:
+        yield there.address
 
 
 @pytest.fixture(scope="module")

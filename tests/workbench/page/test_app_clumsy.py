@@ -4,7 +4,6 @@ pasted into an open tab, fields with nothing, too much or words in them.
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -12,6 +11,7 @@ from typing import Any
 import pytest
 
 from tests.workbench.chromium import context_of, launched, needs_chromium
+from tests.workbench.served import serving
 
 pytestmark = needs_chromium
 
@@ -30,38 +30,22 @@ class Opened:
 @pytest.fixture(scope="module")
 def opened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Opened]:
     """The demo, fitted."""
-    import uvicorn
-
     from workbench.page.desk import home
-    from workbench.page.server import _listen, create_app
     from workbench.page.session import Store
 
     root = tmp_path_factory.mktemp("sessions")
-    listening = _listen(0)
-    port = int(listening.getsockname()[1])
-    server = uvicorn.Server(
-        uvicorn.Config(
-            create_app(root, port=port), log_level="error", ws="none", timeout_graceful_shutdown=1
-        )
-    )
-    thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
-    thread.start()
-    address = f"http://127.0.0.1:{port}/"
-    with launched() as chromium:
+    with serving(root) as there, launched() as chromium:
         context = context_of(chromium, viewport={"width": 1280, "height": 860})
         problems: list[str] = []
         context.on("weberror", lambda e: problems.append(str(e.error)))
         context.on("console", lambda m: problems.append(m.text) if m.type == "error" else None)
         page = context.new_page()
-        page.goto(address)
+        page.goto(there.address)
         page.click("#demo")
         page.wait_for_selector("#fit", timeout=60_000)
         page.click("#fit")
         drawn(page, "compare")
-        yield Opened(address, home.key_of(Store(root)), context, page, problems)
-    server.should_exit = True
-    thread.join(10)
-    listening.close()
+        yield Opened(there.address, home.key_of(Store(root)), context, page, problems)
     assert problems == []
 
 

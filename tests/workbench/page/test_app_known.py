@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import math
 import os
-import threading
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import Any
 import pytest
 
 from tests.workbench.chromium import context_of, launched, needs_chromium
+from tests.workbench.served import serving
 
 AXE = os.environ.get("IRJ_AXE", "")
 SHOTS = os.environ.get("IRJ_SHOTS", "")
@@ -26,34 +26,17 @@ pytestmark = needs_chromium
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     """The demo, fitted and diagnosed."""
-    import uvicorn
-
-    from workbench.page.server import _listen, create_app
-
-    listening = _listen(0)
-    port = int(listening.getsockname()[1])
-    app = create_app(tmp_path_factory.mktemp("sessions"), port=port)
-    server = uvicorn.Server(
-        uvicorn.Config(app, log_level="error", ws="none", timeout_graceful_shutdown=1)
-    )
-    thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
-    thread.start()
-    try:
-        with launched() as chromium:
-            made = context_of(chromium, viewport={"width": 1280, "height": 860}).new_page()
-            made.goto(f"http://127.0.0.1:{port}/")
-            made.click("#demo")
-            made.wait_for_selector("#fit", timeout=60_000)
-            made.click("#fit")
-            idle(made, "compare")
-            made.click("#diagnose")
-            idle(made, "diagnose")
-            yield made
-            idle(made)
-    finally:
-        server.should_exit = True
-        thread.join(10)
-        listening.close()
+    with serving(tmp_path_factory.mktemp("sessions")) as there, launched() as chromium:
+        made = context_of(chromium, viewport={"width": 1280, "height": 860}).new_page()
+        made.goto(there.address)
+        made.click("#demo")
+        made.wait_for_selector("#fit", timeout=60_000)
+        made.click("#fit")
+        idle(made, "compare")
+        made.click("#diagnose")
+        idle(made, "diagnose")
+        yield made
+        idle(made)
 
 
 def idle(page: Any, view: str = "") -> None:

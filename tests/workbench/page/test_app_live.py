@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from tests.workbench.chromium import context_of, launched, needs_chromium
+from tests.workbench.served import serving
 
 AXE = os.environ.get("IRJ_AXE", "")
 SHOTS = os.environ.get("IRJ_SHOTS", "")
@@ -58,37 +59,21 @@ def stream() -> str:
 @pytest.fixture(scope="module")
 def page(root: Path, growing: Path, stream: str) -> Iterator[Any]:
     """The demo with what it lacks, fitted."""
-    import uvicorn
-
     from workbench.page.desk.sources import allow
-    from workbench.page.server import _listen, create_app
 
-    listening = _listen(0)
-    port = int(listening.getsockname()[1])
     allow(root, [growing, stream])
-    app = create_app(root, port=port)
-    server = uvicorn.Server(
-        uvicorn.Config(app, log_level="error", ws="none", timeout_graceful_shutdown=1)
-    )
-    thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
-    thread.start()
-    try:
-        with launched() as chromium:
-            made = context_of(chromium, viewport={"width": 1280, "height": 860}).new_page()
-            made.goto(f"http://127.0.0.1:{port}/")
-            made.click("#demo")
-            made.wait_for_selector("#fit", timeout=60_000)
-            made.click("#fit")
-            idle(made, "compare")
-            made.evaluate("run('add', { label: 'stribeck@motor' }, 'ledger')")
-            made.wait_for_function("() => app.state.steps.length === 2", timeout=60_000)
-            idle(made, "ledger")
-            yield made
-            idle(made)
-    finally:
-        server.should_exit = True
-        thread.join(10)
-        listening.close()
+    with serving(root) as there, launched() as chromium:
+        made = context_of(chromium, viewport={"width": 1280, "height": 860}).new_page()
+        made.goto(there.address)
+        made.click("#demo")
+        made.wait_for_selector("#fit", timeout=60_000)
+        made.click("#fit")
+        idle(made, "compare")
+        made.evaluate("run('add', { label: 'stribeck@motor' }, 'ledger')")
+        made.wait_for_function("() => app.state.steps.length === 2", timeout=60_000)
+        idle(made, "ledger")
+        yield made
+        idle(made)
 
 
 def lines() -> list[str]:

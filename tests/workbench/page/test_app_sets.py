@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.workbench.chromium import CI, context_of, launched, needs_chromium, served
+from tests.workbench.chromium import CI, context_of, launched, needs_chromium
 from tests.workbench.page.sets import SETS, SHARED, answers, state_of
+from tests.workbench.served import serving
 
 pytestmark = needs_chromium
 KINDS = ("before", "law")
@@ -81,13 +82,13 @@ def test_the_page_says_what_the_terminal_says(tmp_path: Path, name: str, most: i
     if not folder.is_dir() and not CI:
         pytest.skip(f"{folder} is not beside the checkout")
     shots = os.environ.get("IRJ_SCREENSHOTS")
-    with served(tmp_path / "sessions") as address, launched() as chromium:
+    with serving(tmp_path / "sessions") as there, launched() as chromium:
         context = context_of(chromium, viewport={"width": 1280, "height": 860})
         problems: list[str] = []
         context.on("weberror", lambda e: problems.append(str(e.error)))
         context.on("console", lambda m: problems.append(m.text) if m.type == "error" else None)
         page = context.new_page()
-        made = answers(page, address, SETS[name], tmp_path)
+        made = answers(page, there.address, SETS[name], tmp_path)
         if shots:
             for colours in ("light", "dark"):
                 page.emulate_media(color_scheme=colours)
