@@ -17,6 +17,7 @@ from identification.fitting.fit import fit
 from tests.metamorphic import (
     HIDDEN,
     NOTATION,
+    RECORDED,
     SHARED,
     TRANSFORMS,
     Case,
@@ -67,6 +68,23 @@ def test_another_notation_is_the_same_joint(
     given = told(other, tmp_path)
     if not given.same(base):
         assert values(given) == pytest.approx(fitted, rel=NOTATION, abs=0)
+
+
+@pytest.mark.parametrize("name", [*HIDDEN, *RECORDED])
+@pytest.mark.parametrize("transform", ["positions in deg", "positions in rev"])
+def test_units_change_no_parameter_of_any_joint(name: str, transform: str, tmp_path: Path) -> None:
+    """Rounding decides nothing: no turn at rest, no step of an encoder, no sample as calm."""
+    case = short(name)
+    other = TRANSFORMS[transform][1](case)
+    assert other is not None
+    begun, found = told(case, tmp_path), told(other, tmp_path)
+    if not found.same(begun):
+        before, after = (fit(g.joint, g.train).parameters for g in (begun, found))
+        for n, p in before.items():
+            # what may be nothing is held against its error
+            assert after[n]["value"] == pytest.approx(
+                p["value"], rel=NOTATION, abs=NOTATION * (p["stderr"] or 0.0)
+            ), n
 
 
 @pytest.mark.parametrize("name", ["mirrored", "records reversed", "two runs each"])

@@ -18,22 +18,36 @@ FloatArray = npt.NDArray[np.float64]
 
 DEVIATION: Final = 1.4826
 """Standard deviation of a normal value over the median of its size."""
+LINEAR: Final = 1.345
+"""Deviations from which a row counts by its size and no more by its square: 95 % of the efficiency
+of least squares on normal noise (Huber 1981). Sizes have one minimum; a sum that leaves far rows
+out has several, and lets go of the very rows that tell two candidates apart.
+"""
 BIWEIGHT: Final = 4.685
-"""Deviations from which a row says nothing: 95 % of the efficiency of least squares on normal noise
+"""Deviations from which a row says nothing where candidates are compared: the same efficiency
 (Holland, Welsch 1977).
 """
 REWEIGHTED: Final = 15
 """Rounds of reweighting: the columns are fixed to a thousandth after ten."""
 NODES: Final = 24
 """Nodes of a free curve, each with the same share of the samples: twelve in each direction follow a
-Stribeck curve."""
+law of fast motion."""
+HALVINGS: Final = 6
+"""Further nodes over a velocity on either side of zero, each at half of the one before: what
+friction does in slow motion, a Stribeck curve or its turn over a few mrad/s, is over before a share
+of the samples is.
+"""
 
 
 def any_curve(record: WeakRecord, signal: str, kept: npt.NDArray[np.bool_]) -> FloatArray:
     """Columns of a free curve over a signal, shape (rows, nodes): whatever law of it there is."""
     points = record.points[signal]
     moving = points[points != 0.0] if np.any(points) else points
-    nodes = np.unique(np.quantile(moving, np.linspace(0.0, 1.0, NODES)))
+    nodes = np.quantile(moving, np.linspace(0.0, 1.0, NODES))
+    if signal.endswith("velocity"):
+        slow = 2 * float(np.quantile(np.abs(moving), 1 / NODES)) * 0.5 ** np.arange(HALVINGS)
+        nodes = np.clip([*nodes, *slow, *-slow], nodes[0], nodes[-1])
+    nodes = np.unique(nodes)
     hats = [np.interp(points, nodes, unit) for unit in np.eye(len(nodes))]
     return np.column_stack([record.average(hat)[kept] for hat in hats])
 
@@ -45,23 +59,35 @@ def motion_of(a: Mapping[str, FloatArray], side: str) -> list[FloatArray]:
 
 
 def rest_beside(
-    values: FloatArray, columns: Sequence[FloatArray], rounds: int = REWEIGHTED
+    values: FloatArray,
+    columns: Sequence[FloatArray],
+    rounds: int = REWEIGHTED,
+    *,
+    without_far: bool = False,
 ) -> FloatArray:
-    """What is left of the values (rows,) beside all columns, (rows,) or (rows, k) each, those that
-    most rows agree on, after so many rounds of reweighting.
+    """What is left of the values (rows,) beside all columns, (rows,) or (rows, k) each, as most
+    rows have it, after so many rounds of reweighting.
+
+    `without_far`: from there on, and for as many rounds, rows that are far off say nothing (Yohai
+    1987). It finds what is small beside them, but only near where it begins.
     """
     matrix = scaled(np.column_stack(columns))
-    weight = np.ones(len(values))
-    rest = values
-    for _ in range(rounds):
+
+    def beside(weight: FloatArray) -> FloatArray:
         root = np.sqrt(weight)
         solution, *_ = np.linalg.lstsq(matrix * root[:, None], values * root, rcond=None)
-        rest = values - matrix @ solution
+        return np.asarray(values - matrix @ solution)
+
+    weight, scale, rest = np.ones(len(values)), 0.0, values
+    for _ in range(rounds):
+        rest = beside(weight)
         scale = DEVIATION * float(np.median(np.abs(rest)))
         if not scale:
-            break
-        weight = np.maximum(1.0 - (rest / (BIWEIGHT * scale)) ** 2, 0.0) ** 2
-    return np.asarray(rest)
+            return rest
+        weight = np.minimum(1.0, LINEAR * scale / np.maximum(np.abs(rest), 1e-300))
+    for _ in range(rounds if without_far else 0):
+        rest = beside(np.maximum(1.0 - (rest / (BIWEIGHT * scale)) ** 2, 0.0) ** 2)
+    return rest
 
 
 def bounded(x: FloatArray) -> FloatArray:

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from typing import Final
 
 import numpy as np
@@ -305,26 +305,28 @@ def _filter(
     dt, kept = alone.grid.dt, one_way(alone)
     friction = any_curve(alone, "motor_velocity", kept)
 
-    def rest(made: WeakRecord) -> FloatArray:
+    def rest(made: WeakRecord, *, without_far: bool = False) -> FloatArray:
         values, others, column = _parts(made, place, kept, torque=torque)
-        return rest_beside(values, [*others, friction, column])
+        return rest_beside(values, [*others, friction, column], without_far=without_far)
 
-    left = {0.0: rest(alone), whole: rest(waiting)}
-    scale = min(DEVIATION * float(np.median(np.abs(x))) for x in left.values())
+    left = [rest(waiting), rest(alone)]
+    scale = min(DEVIATION * float(np.median(np.abs(x))) for x in left)
     if not scale:
         return Filter(whole * dt, -1.0)
+    shifted, rated = (float(np.sum(bounded(x / scale))) for x in left)
 
+    @cache
     def unmet(shift: float) -> float:
-        """Squares in units of the variance."""
-        if shift not in left:
-            left[shift] = rest(make({**shifts, place: shift}))
-        return float(np.sum(bounded(left[shift] / scale)))
+        """Squares in units of the variance where a part is shifted; these are near one another, and
+        rows that none of them meets would hide what is between them."""
+        made = make({**shifts, place: shift}) if shift else alone
+        return float(np.sum(bounded(rest(made, without_far=True) / scale)))
 
     def louder(shift: float) -> float:
         """Those of them by which noise is louder."""
         return len(friction) * noise(waiting.grid.length, place, (whole - shift) * dt) / scale**2
 
-    better = unmet(whole) - louder(whole) - unmet(0.0) + louder(0.0)
+    better = shifted - louder(whole) - rated + louder(0.0)
     if share and whole > NEAR:
         found = minimize_scalar(
             unmet,

@@ -54,6 +54,8 @@ AROUND: Final = 0.1
 NOISE_BEND: Final = (1.95, 1.5)
 """Mean size of the second difference of white noise, root of 12 over pi, in units of the noise; and
 two standard errors of a mean of such sizes, as a share of it, times the root of their number."""
+TIE: Final = 1e-14
+"""Share of a position below which differences of it are alike: some roundings of it."""
 MOVING: Final = 0.05
 """Share of the usual speed from which a joint moves: at rest a reading may stand on one step."""
 
@@ -276,13 +278,17 @@ def calm_of(position: FloatArray, stretches: Sequence[slice], dt: float) -> npt.
         bent = np.abs(q[2 * apart :] - 2 * q[apart:-apart] + q[: -2 * apart])
         bend[inner] = np.convolve(bent, np.full(width, 1 / width), "same")
         speed[inner] = np.abs(q[2 * apart :] - q[: -2 * apart])
-    moving = speed > MOVING * float(np.median(speed[speed > 0] if np.any(speed) else [0.0]))
+    # whole steps of an encoder stand at the very limits: rounding would decide of each alone
+    slack = TIE * float(np.abs(position).max(initial=0.0))
+    usual = float(np.median(speed[speed > slack])) if np.any(speed > slack) else 0.0
+    moving = speed > MOVING * usual + slack
     if not moving.any():
         return moving
     # a bend that the encoder's own noise makes is none, and would cut an even motion to pieces
     mean, spread = NOISE_BEND
     even = mean * (1 + spread / math.sqrt(width)) * noise_level(position, tuple(stretches))
-    return np.asarray(moving & (bend <= max(float(np.quantile(bend[moving], CALM)), even)))
+    limit = max(float(np.quantile(bend[moving], CALM)), even)
+    return np.asarray(moving & (bend <= limit + slack))
 
 
 def _fourth(x: FloatArray, time: FloatArray | None) -> FloatArray:

@@ -208,6 +208,8 @@ class Grid:
 
 CANCELLED: Final = 1e-9
 """Share of their sizes below which the sum of weights is rounding: that of thousands of terms."""
+ROUNDED: Final = 1e-14
+"""The same of a derivative: weights of a kernel fall off, so that some tens of terms count."""
 
 
 def _at(windows: FloatArray, where: IntArray, weights: FloatArray) -> FloatArray:
@@ -215,17 +217,23 @@ def _at(windows: FloatArray, where: IntArray, weights: FloatArray) -> FloatArray
     would not stay in the cache.
 
     Weights of a derivative see what is over the middle sample of each window: nothing at rest,
-    where rounding of the whole position would give a velocity of either sign.
+    where rounding of the whole position would give a velocity of either sign. Steps of an encoder
+    that cancel leave rounding, too: it is zero.
     """
     out = np.empty(len(where))
-    derivative = abs(float(weights.sum())) < CANCELLED * float(np.abs(weights).sum())
+    size = float(np.abs(weights).sum())
+    derivative = abs(float(weights.sum())) < CANCELLED * size
     middle = len(weights) // 2
     for first in range(0, len(where), STRETCH):
         part = where[first : first + STRETCH]
         seen = windows[part]
         if derivative:
             seen -= seen[:, middle : middle + 1].copy()
-        np.matmul(seen, weights, out=out[first : first + STRETCH])
+        own = out[first : first + STRETCH]
+        np.matmul(seen, weights, out=own)
+        if derivative:
+            reach = max(float(seen.max(initial=0.0)), -float(seen.min(initial=0.0)))
+            own[np.abs(own) <= ROUNDED * size * reach] = 0.0
     return out
 
 

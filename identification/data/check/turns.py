@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from identification.data.check.finding import Finding
-from identification.data.check.quanta import grid_step
+from identification.data.check.quanta import precise_step
 
 if TYPE_CHECKING:
     from identification.data.record import FloatArray, Record
@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 _UNITS: Final = {"rad": 1.0, "deg": math.pi / 180.0, "rev": 2.0 * math.pi}
 """Units of an angle [rad]."""
 _WORDS: Final = {"rad": "radians", "deg": "degrees", "rev": "turns"}
-_ON_GRID: Final = 0.05
-"""Scatter of the values around whole steps [steps] up to which they are on a grid."""
 _WHOLE: Final = 2e-3
 """Distance from a whole number of steps to a turn: by chance a number lies as near in one case of
 250, and two angles that both do so for one pair of six units in one case of ten thousand.
@@ -66,10 +64,10 @@ def check_turns(record: Record, gear_ratio: float | None = None) -> list[Finding
 
 def _other_units(values: FloatArray, gear_ratio: float | None) -> tuple[str, str] | None:
     """The unit that an angle [rad] was read in and the one that it is in, where its steps tell."""
-    found = _step(values)
+    found = precise_step(values)
     if found is None:
         return None
-    step, error = found
+    step, error = found[0], max(found[1], _PRINTED)
     turn = 2.0 * math.pi / step
     sides = (1.0,) if not gear_ratio else (1.0, abs(gear_ratio), 1.0 / abs(gear_ratio))
     if any(_off(turn * side) <= max(_WHOLE, _SIGMAS * error * turn * side) for side in sides):
@@ -83,25 +81,6 @@ def _other_units(values: FloatArray, gear_ratio: float | None) -> tuple[str, str
             if unit != read and steps > 1.0 and max(_off(steps), _SIGMAS * error * steps) < _WHOLE:
                 whole.append((steps, read, unit))
     return min(whole)[1:] if whole else None  # what goes into a turn goes into 360 of them
-
-
-def _step(values: FloatArray) -> tuple[float, float] | None:
-    """The step of an encoder and its relative error, by all values at once."""
-    rough = grid_step(values)
-    if rough is None:
-        return None
-    finite = values[np.isfinite(values)]
-    shifted = finite - finite[0]
-    count = np.concatenate(([0.0], np.cumsum(np.rint(np.diff(finite) / rough))))
-    spread = count - count.mean()
-    total = float(spread @ spread)
-    if total == 0.0:
-        return None
-    step = float(spread @ shifted) / total
-    left = shifted - shifted.mean() - step * spread
-    if not float(np.sqrt(np.mean(left**2))) < _ON_GRID * step:
-        return None
-    return step, max(float(np.sqrt(np.mean(left**2) / total)) / step, _PRINTED)
 
 
 def _off(steps: float) -> float:

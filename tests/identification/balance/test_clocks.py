@@ -72,6 +72,15 @@ def test_claims_and_parameters_do_not_hang_on_a_late_channel(channel: str, sampl
     assert abs(now.value - was.value - moved) < 2 * now.stderr + 1e-7
 
 
+@pytest.mark.parametrize("samples", [2, 3, 4])
+def test_a_reading_that_waits_is_no_filter_beside_a_hidden_stribeck_curve(samples: int) -> None:
+    """Its slow rows tell the two apart, and a fit that leaves them out agrees with a filter."""
+    found = fit(
+        load_joint(DEMO / "joint.toml"), [late(read(DEMO / "train.npz"), "motor_current", samples)]
+    )
+    assert found.data.train[0].filters["drive"].better < -100.0
+
+
 def test_a_skew_is_in_the_joint_file_and_on_the_page_and_is_no_effect() -> None:
     found = demo("link_position", 3)
     assert "[calibration]" in found.to_joint_file()

@@ -182,6 +182,18 @@ def test_noise_is_read_where_a_joint_is_calm(rate: float) -> None:
     assert np.abs(shaken[calm]).max() < 0.05 * np.abs(shaken).max()
 
 
+def test_rounding_makes_no_sample_calm() -> None:
+    """Whole steps of an encoder stand at the very limits."""
+    t = np.arange(4000) / 500.0
+    steps = np.rint(30 * np.sin(2 * t) + 4 * np.sin(7 * t))
+    calm = [
+        calm_of(position, (slice(0, len(t)),), 1 / 500.0)
+        for position in (steps * 0.0015, steps * 3.0)
+    ]
+    assert 0.2 < calm[0].mean() < 0.6
+    assert np.array_equal(calm[0], calm[1])
+
+
 @pytest.mark.parametrize("seed", [4, 7, 10])
 def test_what_a_drift_foretells_is_told_from_what_the_model_lacks(seed: int) -> None:
     """Of one course of a drift nobody knows its size beforehand: a ratio to that says little."""

@@ -158,6 +158,18 @@ def test_a_joint_at_rest_has_no_velocity_wherever_it_stands(place: float) -> Non
     assert made.points["motor_velocity"][~still].max() == pytest.approx(3.6, rel=0.03)
 
 
+@pytest.mark.parametrize("unit", [1.0, np.pi / 180, 1e-3])
+def test_steps_of_an_encoder_that_cancel_are_no_velocity(unit: float) -> None:
+    """There and back within a kernel, its middle at the turn: rounding would give it a sign."""
+    time = np.arange(400) * 1e-3
+    steps = np.rint(7 * np.sin(2 * np.pi * (time - 0.2) / 0.05) ** 2)  # even about 0.2 s
+    made = prepare(time, {"motor_position": 0.1 * steps * unit}, (slice(0, 400),), length=0.02)
+    speed = made.points["motor_velocity"]
+    at = round(0.2 / (made.grid.dt * made.grid.step))
+    assert speed[at] == 0.0
+    assert np.abs(speed).max() > 1.0 * unit
+
+
 def test_blocks_are_even_and_no_row_reaches_over_their_ends() -> None:
     """Two stretches of 4 s and 2 s in blocks of about 1.5 s: three and one."""
     time = np.concatenate([np.arange(2000) * 2e-3, 10 + np.arange(1000) * 2e-3])

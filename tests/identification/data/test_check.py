@@ -14,6 +14,7 @@ import numpy.typing as npt
 import pytest
 
 from identification.data.check.checks import Finding, check, gate, repair, require
+from identification.data.check.quanta import quantum
 from identification.data.read import read
 from identification.data.record import Record
 from identification.errors import InputError
@@ -548,3 +549,11 @@ def test_series_elastic_actuator_shows_its_ratio_and_its_time_skew() -> None:
     )
     assert "273.16" in found(findings, "gear_ratio").message
     assert bad(findings) == ["jitter", "delay"]
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e3, 1 / 7])
+def test_a_quantum_is_as_exact_as_the_values(unit: float) -> None:
+    """A quarter of a metre in steps of 50 nm: an error of 1e-11 is a half of a step over it."""
+    counts = np.rint(5e6 * np.sin(np.linspace(0.0, 6.0, 20_000)))
+    values = counts * 5e-8 * unit
+    assert quantum(values / unit) == pytest.approx(5e-8, rel=1e-15, abs=0)
