@@ -30,6 +30,7 @@ from identification.balance.beside import (
     rest_beside,
     scaled,
 )
+from identification.balance.colour import LEVEL_ERROR
 from identification.balance.weak import Filter, WeakRecord
 
 FloatArray = npt.NDArray[np.float64]
@@ -57,6 +58,10 @@ that of an acceleration in the model lack, is under a hundredth.
 """
 ENCODERS: Final = frozenset({"link_position_sensor"})
 """Places whose readings are positions."""
+TELLING: Final = 0.2
+"""Share of the rows that are asked whether a reading waits or is filtered, those in which the two
+differ most: calm rows tell nothing, and are so many that what is not known of their noise decides.
+"""
 HALF_A_CYCLE: Final = 0.5
 """Half the cycle of a drive's filter [samples]: it is read by a logger that is no faster."""
 USUAL_HALF: Final = 0.1
@@ -190,7 +195,6 @@ def in_time(
     noise: Callable[[WeakRecord, float, str, float], float],
     *,
     torque: bool,
-    fast: Callable[[Mapping[str, float]], WeakRecord],
     motor_alone: bool = False,
     both_encoders: bool = False,
 ) -> WeakRecord:
@@ -207,8 +211,6 @@ def in_time(
         kernel of some length [s], its rate times a lateness [s] added.
     torque : bool
         Whether the torque of the link is measured.
-    fast : callable
-        As `make`, with a short kernel: a filter and a wait are alike in all that is slow.
     motor_alone : bool
         Whether the torque is measured beside the motor, and the link is not.
     both_encoders : bool
@@ -217,7 +219,7 @@ def in_time(
     filters: dict[str, Filter] = {}
     made, wanted = make({}), tuple(places)
     by_motor = "torque_sensor" in wanted and (motor_alone or (both_encoders and link_hidden(made)))
-    shifts = _begun(make, made) if by_motor else {}
+    shifts = _begun(make, made, noise) if by_motor else {}
     begun = bool(shifts)
     made = make(shifts) if begun else made
     # a drive that is filtered and not late would take the torque along: its rate says more of it
@@ -247,17 +249,7 @@ def in_time(
         if taken and place in LOW_PASSED and abs(shifts[place]) <= MOST_SKEW:
             # noise is one whatever the kernel
             louder = partial(noise, make(shifts))
-            asked = partial(
-                _filter,
-                shifts=shifts,
-                place=place,
-                noise=louder,
-                torque=torque,
-            )
-            told = asked(make)
-            # slow rows are calm, fast ones show most of what neither makes good: both are asked
-            quick = asked(fast, share=False)
-            filters[place] = told = replace(told, better=told.better + quick.better)
+            filters[place] = told = _filter(make, shifts, place, louder, torque=torque)
             shifts = {**shifts, place: as_told([told], told) / made.grid.dt}
             made = make(shifts)
         elif not taken:
@@ -281,7 +273,6 @@ def _filter(
     noise: Callable[[float, str, float], float],
     *,
     torque: bool,
-    share: bool = True,
 ) -> Filter:
     """What rows say of a late reading, by how well they are met with all of its lateness shifted,
     with its rate in the place of that, or with a part shifted the other way and its rate.
@@ -291,9 +282,10 @@ def _filter(
     and nothing is left of higher order. A low-pass of a computer weighs its last reading and the
     one before: its rate is that of half its cycle ago, and so much is to be shifted the other way.
 
-    Rows that neither meets, as those of slow motion whose friction is not the law's, say nothing:
-    the sum of squares that is compared is Tukey's, bounded. So those in which the joint creeps may
-    stay: what changes fast there tells best. Of the first two neither is the rule: the likelier is
+    Rows in which the first two hardly differ say nothing, nor do those that neither meets, as those
+    of slow motion whose friction is not the law's: the sum of squares that is compared is Tukey's,
+    bounded. So those in which the joint creeps may stay: what changes fast there tells best. Of the
+    first two neither is the rule: the likelier is
     taken. Of the third the rows say as much as the squares that it takes off, whether the noise
     that a rate makes louder is taken off too, which is not known so well, or not; what drives
     usually have says the rest. The squares fall along a parabola: where rows fall in and out of
@@ -313,21 +305,28 @@ def _filter(
     scale = min(DEVIATION * float(np.median(np.abs(x))) for x in left)
     if not scale:
         return Filter(whole * dt, -1.0)
-    shifted, rated = (float(np.sum(bounded(x / scale))) for x in left)
+
+    (shifted, _, _), (read, _, column) = (
+        _parts(made, place, kept, torque=torque) for made in (waiting, alone)
+    )
+    apart = np.abs(shifted - read + whole * dt * column)
+    telling = apart >= np.quantile(apart, 1 - TELLING)
+
+    def louder(shift: float) -> float:
+        """Squares of the telling rows, in units of the variance, by which noise is louder."""
+        louder = noise(waiting.grid.length, place, (whole - shift) * dt) / scale**2
+        return int(telling.sum()) * louder
 
     @cache
     def unmet(shift: float) -> float:
-        """Squares in units of the variance where a part is shifted; these are near one another, and
-        rows that none of them meets would hide what is between them."""
+        """Their squares where a part is shifted; candidates are near one another here, and rows
+        that none of them meets would hide what is between them."""
         made = make({**shifts, place: shift}) if shift else alone
-        return float(np.sum(bounded(rest(made, without_far=True) / scale)))
+        return float(np.sum(bounded(rest(made, without_far=True)[telling] / scale)))
 
-    def louder(shift: float) -> float:
-        """Those of them by which noise is louder."""
-        return len(friction) * noise(waiting.grid.length, place, (whole - shift) * dt) / scale**2
-
-    better = shifted - louder(whole) - rated + louder(0.0)
-    if share and whole > NEAR:
+    met = [float(np.sum(bounded(x[telling] / scale))) for x in left]
+    better = met[0] - louder(whole) - met[1] + louder(0.0)
+    if whole > NEAR:
         found = minimize_scalar(
             unmet,
             bounds=(-HALF_A_CYCLE, 0.0),
@@ -357,32 +356,47 @@ def link_hidden(made: WeakRecord) -> bool:
 
 
 def _begun(
-    make: Callable[[Mapping[str, float]], WeakRecord], alone: WeakRecord
+    make: Callable[[Mapping[str, float]], WeakRecord],
+    alone: WeakRecord,
+    noise: Callable[[WeakRecord, float, str, float], float],
 ) -> dict[str, float]:
     """Where the search for the lateness of a torque begins beside the motor alone: its rate is that
     of the drive but for an inertia, and a straight line reaches no farther than a sample.
+
+    Where less is taken of the two rates their noise is less, too: what is sure of that is no reason
+    to begin there.
     """
-    before = _unexplained(alone)
+
+    def asked(made: WeakRecord) -> tuple[FloatArray, float]:
+        squares, lateness = _unexplained(made)
+        return squares, sum(noise(made, made.grid.length, p, x) for p, x in lateness.items())
+
+    before, loud = asked(alone)
     left = {}
     for shift in BEGUN:
-        squares = _unexplained(make({"torque_sensor": shift}))
-        fall = np.log(before / squares)
+        squares, own = asked(make({"torque_sensor": shift}))
+        fall = np.log(before / (squares + (1 - LEVEL_ERROR) * max(loud - own, 0.0)))
         spread = max(float(fall.std(ddof=1)), LEAST_SPREAD)
         if math.sqrt(STRETCHES) * float(fall.mean()) / spread > BEGINS:
             left[shift] = float(squares.mean())
     return {"torque_sensor": min(left, key=lambda k: left[k])} if left else {}
 
 
-def _unexplained(made: WeakRecord) -> FloatArray:
+def _unexplained(made: WeakRecord) -> tuple[FloatArray, dict[str, float]]:
     """Mean square of what the drive leaves beside the motion, the torque and their rates, in each
-    of a few stretches.
+    of a few stretches; and the lateness that each rate is taken for [s].
     """
     kept = steady(made)
     values, others, column = _parts(made, "torque_sensor", kept, torque=True, by_motor=True)
     curve = any_curve(made, "motor_velocity", kept)
-    rest = rest_beside(values, [*others, column, curve], 1)
+    matrix = np.column_stack([*others, column, curve])
+    size = np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
+    solution, *_ = np.linalg.lstsq(matrix / size, values, rcond=None)
+    rest = values - matrix @ (solution / size)
     squares = [float(np.mean(x**2)) for x in np.array_split(rest, STRETCHES)]
-    return np.maximum(squares, LEAST_SQUARE)
+    drive, torque = (solution / size)[len(others) - 1 : len(others) + 1]
+    rates = {"drive": float(drive), "torque_sensor": float(torque)}
+    return np.maximum(squares, LEAST_SQUARE), rates
 
 
 def _parts(

@@ -75,6 +75,9 @@ HIDING: Final = 0.5
 """Noise, in steps, from which on readings toggle between three and more of them, and what the
 steps leave is white.
 """
+LEVEL_ERROR: Final = 0.3
+"""Share by which the squares of a noise level may be off, a choice: heavy tails, steps of an
+encoder and a colour that is not white make it."""
 FEWEST: Final = 400
 """Samples from which a colour is read: the power of a difference is known to a sixth then, and the
 tests of the readings count with that."""

@@ -37,7 +37,6 @@ from identification.balance.weak import (
     KERNEL_SAMPLES,
     PAIR,
     POSITION_CHAINS,
-    TELLING_KERNEL,
     WeakRecord,
     differentiated_kernel,
     kernel,
@@ -352,7 +351,7 @@ def weak_record(
         c: without_spikes(x, segments, noise[c].level) if c in noise else x for c, x in read.items()
     }
     shortest = KERNEL_SAMPLES * record.dt
-    length, telling = max(length, shortest), max(min(length, TELLING_KERNEL), shortest)
+    length = max(length, shortest)
     longest = length / 2 if length <= CLAIM_KERNEL else 0.06
     pointwise = {
         c: pointwise_kernel(signals[c], segments, record.dt, longest, own)
@@ -360,11 +359,11 @@ def weak_record(
     }
     torsion = torsion_kernel(signals, segments, record.dt, pointwise, noise)
 
-    last: dict[float, tuple[Mapping[str, float], WeakRecord]] = {}
+    last: list[tuple[Mapping[str, float], WeakRecord]] = []
 
-    def made_with(shifts: Mapping[str, float], length: float = length) -> WeakRecord:
+    def made_with(shifts: Mapping[str, float]) -> WeakRecord:
         moved, parts = shifted(signals, segments, shifts)
-        known, before = last.pop(length, ({}, None))
+        known, before = last.pop() if last else ({}, None)
         changed = {SIGNAL[p] for p in {*shifts, *known} if shifts.get(p, 0.0) != known.get(p, 0.0)}
         made = prepare(
             record.time,
@@ -387,7 +386,7 @@ def weak_record(
                 f"{' with fewer gaps' if parted else ''}"
             )
         made = replace(made, shifts={p: k * record.dt for p, k in shifts.items()})
-        last[length] = dict(shifts), made
+        last.append((dict(shifts), made))
         return made
 
     def spread(heard: WeakRecord, length: float, place: str, lateness: float) -> float:
@@ -404,7 +403,6 @@ def weak_record(
                 late,
                 spread,
                 torque=sensing.has_torque,
-                fast=partial(made_with, length=telling),
                 motor_alone=sensing.motor_and_torque,
                 both_encoders=sensing.both_positions,
             )

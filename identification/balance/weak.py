@@ -42,9 +42,6 @@ TORQUES: Final = ("torque", "drive", "coupling_torque")
 HIGHEST_DERIVATIVE: Final = 4
 CLAIM_KERNEL: Final = 0.06
 """Length of the balances' kernel [s]."""
-TELLING_KERNEL: Final = 0.03
-"""The same where a filter of the drive is told from a wait [s]: that of the verdict on the motor,
-which is fast enough to show what neither makes good."""
 KERNEL_SAMPLES: Final = 8
 """Samples that a kernel has at least, however slow the logger."""
 

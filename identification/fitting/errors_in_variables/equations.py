@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from identification.balance.balances import balances_of
+from identification.balance.colour import LEVEL_ERROR
 from identification.balance.drawn_noise import draws_of
 from identification.balance.stacked import (
     INDEPENDENT_SHARE,
@@ -54,9 +55,6 @@ SURE_STEP: Final = 0.01
 MOST_HIDDEN: Final = 2.0
 """Times what noise hides in the direction that holds most of it: other directions hide some, too,
 and a correction that diverges leaves powers of ten more."""
-LEVEL_ERROR: Final = 0.3
-"""Share by which the squares of a noise level may be off, a choice: heavy tails, steps of an
-encoder and a colour that is not white make it."""
 STEPS: Final = 3
 """Newton steps from the least squares: the products change little with the parameters."""
 

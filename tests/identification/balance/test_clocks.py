@@ -14,11 +14,12 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
 from casadi_models import JointModel
-from identification import Improvement, Record, fit, improve, load_joint, read
+from identification import Improvement, Record, compare, fit, improve, load_joint, read
 from identification.balance.calibration import values_on
 from identification.balance.clocks import MOST_SKEW, NEAR, as_told, lateness
 from identification.balance.dataset import run_name
 from identification.balance.weak import Filter
+from identification.data.check.gate import passed
 from identification.data.joint_file import Joint
 from identification.fitting.engine import floors, load_dataset, prepared_model, solve
 from identification.fitting.fit import Fit
@@ -78,7 +79,7 @@ def test_a_reading_that_waits_is_no_filter_beside_a_hidden_stribeck_curve(sample
     found = fit(
         load_joint(DEMO / "joint.toml"), [late(read(DEMO / "train.npz"), "motor_current", samples)]
     )
-    assert found.data.train[0].filters["drive"].better < -100.0
+    assert found.data.train[0].filters["drive"].better < -30.0
 
 
 def test_a_skew_is_in_the_joint_file_and_on_the_page_and_is_no_effect() -> None:
@@ -301,11 +302,11 @@ def test_what_is_taken_off_the_rows_is_not_taken_off_the_value() -> None:
 
 
 @cache
-def through_a_filter(seed: int) -> tuple[float, tuple[Record, ...], Joint]:
+def through_a_filter(seed: int, given: str = "all") -> tuple[float, tuple[Record, ...], Joint]:
     """Cycle of the drive's filter as a part of a sample, the records of a joint, and its file."""
     case = make_case(seed, kind="none")
     with TemporaryDirectory() as folder:
-        where = write_case(case, Path(folder), "all")
+        where = write_case(case, Path(folder), given)
         joint = load_joint(where / "joint.toml")
         runs = tuple(read(where / f"{n}.csv", joint=joint) for n in ("train", "test"))
         return case.sensors.rate / ROWS_PER_SECOND, runs, joint
@@ -337,7 +338,7 @@ def test_a_held_out_record_is_read_through_the_filter_of_the_training_records() 
     data = load_dataset([runs[0]], [runs[1]], joint, prepared_model(joint, runs[0]))
     train, held_out = data.train[0], data.held_out[0]
     assert train.filters["drive"].behind < 0.0
-    assert held_out.filters["drive"].gain < 0.2 * train.filters["drive"].gain, "it tells little"
+    assert held_out.filters["drive"].gain < 0.5 * train.filters["drive"].gain, "it tells less"
     assert held_out.shifts["drive"] == pytest.approx(train.shifts["drive"], abs=1e-9)
     swapped = load_dataset([runs[1]], [runs[0]], joint, prepared_model(joint, runs[1]))
     shifts = [w.shifts["drive"] for w in (*swapped.train, *swapped.held_out)]
@@ -354,3 +355,26 @@ def test_how_far_a_filter_is_behind_is_weighed_with_what_drives_have() -> None:
     said = data.train[0].filters["drive"]
     assert 0 < said.gain < 30, "not surely"
     assert said.behind / runs[0].dt == pytest.approx(-cycle / 2, abs=0.03)
+
+
+@pytest.mark.parametrize(("seed", "given"), [(173009, "all"), (173020, "encoders")])
+def test_calm_rows_do_not_say_that_a_filter_waits(seed: int, given: str) -> None:
+    """A triangle and a slow sweep at one speed: of calm rows the noise is all there is, and it is
+    louder in a rate by a few percent more than is believed."""
+    _, runs, joint = through_a_filter(seed, given)
+    data = load_dataset([runs[0]], [runs[1]], joint, prepared_model(joint, runs[0]))
+    for made in (*data.train, *data.held_out):
+        assert made.filters["drive"].better > 0.0
+        assert made.shifts["drive"] <= 0.0
+
+
+def test_less_noise_of_a_rate_is_no_lateness_of_a_torque() -> None:
+    """With the torque of 3.5 samples later less of the drive's rate is taken, and its noise is most
+    of what is left of 10 % lost samples: 1.88 N over a floor of .31 N on the held-out record."""
+    _, runs, joint = through_a_filter(173004, "motor_torque")
+    runs = tuple(passed(r, joint)[0] for r in runs)
+    data = load_dataset([runs[0]], [runs[1]], joint, prepared_model(joint, runs[0]))
+    assert all("torque_sensor" not in w.shifts for w in (*data.train, *data.held_out))
+    found = fit(joint, [runs[0]])
+    (error,) = compare(found, [runs[1]]).error.balances.values()
+    assert error.ratio < 1.2
