@@ -50,6 +50,8 @@ WEIGHINGS: Final = 12
 """Rounds in which the weights of the rows and their RMS are made to agree; more change nothing
 in the third digit.
 """
+NOTHING_SURE: Final = 1e6
+"""Times the level of the others from which a row that may go either way counts no less."""
 INDEPENDENT_SHARE: Final = 0.4
 """Share of the rows that count as independent: four rows to a kernel length."""
 SURE_ERRORS: Final = 3.0
@@ -378,8 +380,11 @@ def _sure_rms(change: FloatArray, either: FloatArray) -> float:
     if level <= 0 or not np.any(either):
         return rms(change)
     for _ in range(WEIGHINGS):
-        weight = 1 / np.hypot(level, either)
+        # what a law that ran away leaves open counts for nothing, and not for a square of nothing
+        weight = 1 / np.hypot(1.0, np.minimum(either / level, NOTHING_SURE))
         level = rms(change * weight) / rms(weight)
+        if not math.isfinite(level):
+            break
     return level
 
 

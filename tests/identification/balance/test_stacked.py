@@ -112,6 +112,11 @@ def test_the_noise_of_rows_shows_beside_some_that_may_go_either_way(
     assert _sure_rms(unit * change, 0 * either) == pytest.approx(unit * rms(change))
     still = np.where(either > 0, change, 0.0)
     assert _sure_rms(unit * still, unit * either) == pytest.approx(unit * rms(still))
+    # a law that ran away leaves every row open, one of infinity, too
+    for far in (1e200, np.inf):
+        assert _sure_rms(unit * change, np.full(len(change), far)) == pytest.approx(
+            unit * rms(change)
+        )
 
 
 @pytest.mark.parametrize("seconds", [4.0, 30.0])
