@@ -1,6 +1,7 @@
 """Sensor faults in files: what the fault bank sees and names where no velocity is measured.
 
-    python -m benchmarks.fault_files --cases 140 [--joints 3] [--first 100] [--keep results.json]
+    python -m benchmarks.fault_files --cases 140 [--joints 3] [--first 100] [--hours 2]
+        [--keep results.json]
 
 Every joint is another one, drawn by the generator of `tests/hidden_effect` (true sticking,
 unmodelled bump, snags, kinematic error of an odd order and a stiff link mode in every record).
@@ -8,18 +9,20 @@ Files have time, motor current, both positions and the link torque. `irj improve
 from two training files of 24 s; limits come from two other healthy files; faults are put into files
 of a motion that nobody has seen. Case numbers decide sensor, kind, sign, and time. `--keep` adds to
 what is there, so that a campaign can be run in pieces. Printed: share detected, share in which the
-failed sensor is named and nothing else, alarms per healthy hour.
+failed sensor is named and nothing else, alarms in healthy time. `--hours` adds healthy records of
+motions of their own, so many hours of all joints together.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -40,6 +43,7 @@ from identification.faults.types import FaultEvent, Verdict
 from irj_fmu.estimator.bank import bank_for, judged
 from irj_fmu.estimator.healthy import online_readings
 from tests.hidden_effect.generator import COLUMNS, DT, KM, simulate_case
+from tests.hidden_effect.motion import multisine, triangle
 from workbench.cli.main import main as irj
 
 FloatArray = npt.NDArray[np.float64]
@@ -73,6 +77,8 @@ CHANGES: Final[Mapping[str, Mapping[str, float]]] = {
     "stiffness -20 %": {"K": 0.8},
 }
 """Changes of the joint, by the generator's names: no sensor fails there."""
+MORE_SPAN: Final = SPAN
+"""Length of a healthy record that `--hours` adds [s]."""
 CHANGED_SPAN: Final = 40.0
 """Length of a record of a changed joint [s]."""
 PIECE: Final = 16.0
@@ -87,6 +93,7 @@ class Bench:
     """One joint: its model from `improve`, its bank, and an unseen healthy record."""
 
     folder: Path
+    hidden: str | None
     joint: Joint
     bank: FaultBank
     smallest: Mapping[str, tuple[float, float]]
@@ -147,6 +154,7 @@ def bench(seed: int, folder: Path) -> Bench:
     rows = np.array(online_readings(records[1], joint)[0])
     return Bench(
         here,
+        hidden,
         joint,
         bank,
         smallest=bank.smallest(Piece(records[1].time, rows)),
@@ -232,11 +240,22 @@ def said_about(at: Bench, table: FloatArray) -> tuple[float, list[str]]:
     ]
 
 
-def aside(at: Bench) -> dict[str, Any]:
+def more_healthy(at: Bench, hours: float) -> Iterator[FloatArray]:
+    """Healthy records of a joint, each of a motion of its own."""
+    seed, rows = int(at.folder.name), round(MORE_SPAN / DT)
+    rng = np.random.default_rng([9, seed])
+    for number in range(math.ceil(3600.0 * hours / MORE_SPAN)):
+        motion = triangle(rng, rows, DT, 8.5, 44.0) if number % 2 == 0 else multisine(rng, rows, DT)
+        name = f"healthy {number}"
+        case = simulate_case(at.hidden, seed, dirt=True, references={name: motion})
+        yield case.measured[name]
+
+
+def aside(at: Bench, hours_more: float) -> dict[str, Any]:
     """Healthy time, changes of the joint, and offsets of the announced sizes, of one joint."""
     hours = 0.0
     said: list[str] = []
-    for table in (at.table, at.more):
+    for table in (at.table, at.more, *more_healthy(at, hours_more)):
         more, texts = said_about(at, table)
         hours, said = hours + more, said + texts
     changes = {text: said_about(at, table)[1] for text, table in at.changed.items()}
@@ -302,6 +321,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--joints", type=int, default=3)
     parser.add_argument("--first", type=int, default=100, help="seed of the first joint")
     parser.add_argument("--start", type=int, default=0, help="number of the first case")
+    parser.add_argument(
+        "--hours", type=float, default=0.0, help="healthy time of more motions, all joints together"
+    )
     parser.add_argument("--seconds", type=float, default=330.0, help="stop after so many seconds")
     parser.add_argument("--folder", type=Path, help="keep joints and files here")
     parser.add_argument("--keep", type=Path)
@@ -321,7 +343,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             break
         at = bench(seed, folder)
         if str(seed) not in results["healthy"]:
-            results["healthy"][str(seed)] = aside(at)
+            results["healthy"][str(seed)] = aside(at, options.hours / options.joints)
         found = judge(at, number)
         results["cases"].append(found)
         if not found["right"]:
