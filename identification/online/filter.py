@@ -70,6 +70,9 @@ class Levels:
     shift : float
         Torque between two samples: share of the later reading of the drive. 0 for a command that is
         held, 0.5 for a torque that changes steadily; a late reading has more.
+    creeping : tuple of 2 floats
+        Standard deviation of what the friction of motor and link is wrong by while that side creeps
+        through a turn [N.m].
     clip : float
         Innovations beyond this many standard deviations weigh less (Huber).
     """
@@ -81,6 +84,7 @@ class Levels:
     unknown_drive: float = 100.0
     unknown_lasting: float = 0.05
     shift: float = 0.0
+    creeping: tuple[float, float] = (0.0, 0.0)
     clip: float = 4.0
 
     def vector(self) -> list[float]:
@@ -93,6 +97,7 @@ class Levels:
             self.unknown_drive,
             self.unknown_lasting,
             self.shift,
+            *self.creeping,
             self.clip,
         ]
 

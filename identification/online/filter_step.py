@@ -18,8 +18,12 @@ BALANCES: Final = 3
 """Disturbance torques: motor, transmission, link."""
 READINGS: Final = 6
 """Drive, motor position and velocity, link position and velocity, torque."""
-LEVELS: Final = 16
+LEVELS: Final = 18
 """Numbers of :meth:`identification.online.filter.Levels.vector`."""
+
+CREEP: Final = 0.1
+"""Time for which a side stays at one part of the friction law while it turns [s]: what the law is
+wrong by there lasts as long, and no record tells the law at such speeds well."""
 
 
 class _Layout:
@@ -93,14 +97,15 @@ def predict_function(
         ca.horzcat(ca.SX(count, a.states + BALANCES), ca.SX.eye(count)),
     )
     motor, link = a.x[1], a.x[3] if len(functions.state_names) > 2 else a.x[1]
-    # torque at a turn is unsure anew in each sample: white over one sample
-    turning = [
-        a.dry[i] ** 2 * sample * ca.exp(-((speed / a.slow[i]) ** 2))
-        for i, speed in enumerate((motor, link))
-    ]
+    slow = [ca.exp(-((speed / a.slow[i]) ** 2)) for i, speed in enumerate((motor, link))]
+    # at a turn dry friction is unsure anew in each sample: white over one sample ...
+    turning = [a.dry[i] ** 2 * sample * slow[i] for i in range(2)]
     white = ca.vertcat(noise**2 + turning[0], 0, turning[1]) / h
+    # ... and what its law is wrong by lasts while the side creeps
+    wrong = [a.levels[15 + i] ** 2 * slow[i] for i in range(2)]
+    creeping = (1 - ca.exp(-2 * h / CREEP)) * ca.vertcat(wrong[0], 0, wrong[1])
     new = ca.mtimes(ca.mtimes(kicked, ca.diag(white)), kicked.T)
-    tail = ca.vertcat(spread**2 * (1 - fade**2), a.walks**2 * h)
+    tail = ca.vertcat(spread**2 * (1 - fade**2) + creeping, a.walks**2 * h)
     covariance = ca.mtimes(transition, ca.mtimes(a.covariance, transition.T)) + ca.diagcat(
         new, ca.diag(tail)
     )
@@ -126,7 +131,7 @@ def update_function(
     """
     a = _Layout(functions, model, free, logarithmic)
     readings, used = ca.SX.sym("y", READINGS), ca.SX.sym("used", READINGS + 2)
-    clip = a.levels[15]
+    clip = a.levels[17]
     _, expected = a.joint(used[0] * readings[0], used[READINGS:])
     rows = ca.jacobian(expected, a.mean)
     mean, covariance = a.mean, a.covariance

@@ -16,7 +16,7 @@ from casadi_models.simulate import simulate
 from casadi_models.text.typed_law import TypedLaw, register
 from identification.errors import InputError
 from identification.online.filter import JointFilter, Levels
-from identification.online.filter_step import _inverse
+from identification.online.filter_step import CREEP, _inverse
 
 FloatArray = npt.NDArray[np.float64]
 FULL, POSITIONS = (1.0,) * 6, (1.0, 1.0, 0.0, 1.0, 0.0, 1.0)
@@ -205,6 +205,30 @@ def test_a_side_that_turns_is_unsure_by_its_dry_friction_over_one_sample(
     deviation = dry * h * steps / values[f"{turning}_inertia"]
     assert np.sqrt(covariance[own, own]) == pytest.approx(deviation, rel=0.02)
     assert np.sqrt(covariance[other, other]) < 0.05 * deviation
+
+
+@pytest.mark.parametrize("steps", [1, 2])
+@pytest.mark.parametrize("creeps", ["motor", "link"])
+def test_what_friction_is_wrong_by_lasts_while_a_side_creeps(creeps: str, steps: int) -> None:
+    """The disturbance of that side opens to the level of its law, that of the other does not."""
+    joint = JointFilter(plant(), 1e-3)
+    joint.dry, joint.slow = np.zeros(2), np.array([1e-2, 1e-2])
+    h, mean = 1e-3 / steps, np.zeros(joint.size)
+    mean[3 if creeps == "motor" else 1] = 1.0
+    levels = Levels(
+        drive=0.0, disturbance=(0.0, 0.0, 0.0), lasting=(10.0, 10.0, 10.0), creeping=(3.0, 5.0)
+    )
+    p = joint.parameters(levels)
+    covariance = np.zeros((joint.size, joint.size))
+    for _ in range(round(1e-2 / h)):
+        given = [0.0, 0.0, 1.0, h * steps, h, 0.0, 0.0]
+        covariance = np.array(joint.predict(mean, covariance, given, p)[1])
+    own, other = (0, 2) if creeps == "motor" else (2, 0)
+    spread = np.sqrt(np.diag(covariance)[joint.states : joint.states + 3])
+    level = 3.0 if creeps == "motor" else 5.0
+    assert spread[own] == pytest.approx(level * np.sqrt(2 * 1e-2 / CREEP), rel=0.02)
+    assert spread[1] == 0.0
+    assert spread[other] == 0.0
 
 
 def test_a_law_with_memory_goes_on_in_the_filter_as_in_the_simulator() -> None:
