@@ -24,15 +24,26 @@ DEGREES: Final = 5.0
 """Degrees of freedom of Student's t, whose tails keep single events from setting the levels."""
 ENOUGH: Final = 16_000
 """Samples for the search of the levels: the error of a level is then under a percent."""
+STRETCH: Final = 4.0
+"""Shortest stretch of a record for the search [s]: most of it counts after :data:`SETTLE`."""
+ROUGHLY: Final = 2
+"""Every so-manieth stretch tells which start is best."""
 STEPS: Final = (4.0, 2.0, 1.4, 1.15)
 """Factors by which a level is tried up and down, one after the other."""
 SWEEPS: Final = 3
 """Sweeps over all levels for each factor at most."""
+ALONE: Final = 0.03
+"""Share that the other balances' disturbances begin with where one balance is tried as the one that
+lacks most."""
 GAIN: Final = 2.0
 """Rise of the log-likelihood worth a change: two standard deviations of one parameter."""
 SHIFTS: Final = (-1.0, 3.0)
 """Bounds of the share of the later drive reading: from half a sample early to three late."""
-BOUNDS: Final = {"disturbance": (1e-4, 1e4), "lasting": (3e-3, 10.0)}
+VALLEYS: Final = (2.0, -2.0)
+"""A disturbance's size and time constant are tried together, too, the constant as this power of the
+size: the first keeps how far it goes from sample to sample, the second what it is over long times.
+Likelihoods have such valleys, and steps of one level alone end on their walls."""
+BOUNDS: Final = {"disturbance": (1e-4, 1e4), "creeping": (1e-4, 1e4), "lasting": (3e-3, 10.0)}
 """Bounds of the disturbances' sizes [N.m] and time constants [s]: slower than ten seconds is a
 parameter, faster than some samples is noise."""
 
@@ -87,9 +98,9 @@ def likeliest(
     few = _few(pieces)
     used = np.array(measured, dtype=np.float64)
 
-    def cost(levels: Levels, flags: FloatArray = used) -> float:
+    def cost(levels: Levels, flags: FloatArray = used, every: int = 1) -> float:
         total = 0.0
-        for piece in few:
+        for piece in few[::every]:
             table = np.broadcast_to(flags, (1, len(piece.time), 6))
             state = joint.start(
                 float(piece.time[0]), piece.rows[0].tolist(), flags.tolist(), levels=levels
@@ -103,20 +114,28 @@ def likeliest(
         return total
 
     moves = _moves(measured)
-    best, least = first, cost(first)
-    for factor in STEPS:
-        for _ in range(SWEEPS):
-            before = least
-            for move in moves:
-                for step in (factor, 1 / factor):
-                    while True:
-                        tried = move(best, step)
-                        found = cost(tried) if tried != best else math.inf
-                        if not found < least - GAIN:
-                            break
-                        best, least = tried, found
-            if before - least < GAIN * len(moves):
-                break
+
+    def climbed(best: Levels, factors: Sequence[float], every: int) -> tuple[float, Levels]:
+        least = cost(best, every=every)
+        for factor in factors:
+            for _ in range(SWEEPS):
+                before = least
+                for move in moves:
+                    for step in (factor, 1 / factor):
+                        while True:
+                            tried = move(best, step)
+                            found = cost(tried, every=every) if tried != best else math.inf
+                            if not found < least - GAIN:
+                                break
+                            best, least = tried, found
+                if before - least < GAIN * len(moves):
+                    break
+        return least, best
+
+    turns = replace(first, creeping=(float(joint.dry[0]), float(joint.dry[1])))
+    roughly = [climbed(start, STEPS[:1], ROUGHLY) for start in _starts(turns)]
+    _, rough = min(roughly, key=lambda found: found[0])
+    _, best = climbed(rough, STEPS, 1)
     without = used.copy()
     without[0] = 0.0
     least = cost(best, without)
@@ -132,9 +151,33 @@ def likeliest(
 
 
 def _few(pieces: Sequence[Piece]) -> list[Piece]:
-    """Stretches from all pieces that together have :data:`ENOUGH` samples."""
-    each = max(ENOUGH // max(len(pieces), 1), 1)
-    return [Piece(p.time[:each], p.rows[:each]) for p in pieces]
+    """Stretches from all of the pieces that together have :data:`ENOUGH` samples: what a joint
+    lacks at a turn or at one place is not in the first seconds of a motion.
+    """
+    total = sum(len(p.time) for p in pieces)
+    out = []
+    for p in pieces:
+        span = float(p.time[-1] - p.time[0])
+        share = min(ENOUGH / max(total, 1), 1.0)
+        count = max(round(share * span / STRETCH), 1)
+        each = max(round(share * len(p.time) / count), 1)
+        slack = len(p.time) - each
+        begins = np.linspace(0, slack, count).astype(int) if count > 1 else np.array([slack // 2])
+        out += [Piece(p.time[k : k + each], p.rows[k : k + each]) for k in begins.tolist()]
+    return out
+
+
+def _starts(first: Levels) -> list[Levels]:
+    """Levels to search from: what the model lacks may act on one balance or on all; between these
+    likelihoods have hollows that no step crosses.
+    """
+    out = [first]
+    for lacks in range(3):
+        a, b, c = (
+            size * (1.0 if i == lacks else ALONE) for i, size in enumerate(first.disturbance)
+        )
+        out.append(replace(first, disturbance=(a, b, c)))
+    return out
 
 
 Move = Callable[[Levels, float], Levels]
@@ -159,18 +202,24 @@ def _moves(measured: Sequence[bool]) -> list[Move]:
         step = factor - 1 if factor > 1 else 1 - 1 / factor
         return replace(levels, shift=float(np.clip(levels.shift + 0.25 * step, *SHIFTS)))
 
-    def triple(name: str, i: int) -> Move:
+    def one_of(name: str, i: int) -> Move:
         def moved(levels: Levels, factor: float) -> Levels:
             a = list(getattr(levels, name))
             a[i] = float(np.clip(a[i] * factor, *BOUNDS[name]))
-            changed: dict[str, Any] = {name: (a[0], a[1], a[2])}
+            changed: dict[str, Any] = {name: tuple(a)}
             return replace(levels, **changed)
 
         return moved
 
+    def paired(i: int, power: float) -> Move:
+        size, lasting = one_of("disturbance", i), one_of("lasting", i)
+        return lambda levels, factor: lasting(size(levels, factor), factor**power)
+
     return [
         shift,
         drive,
-        *(triple(name, i) for i in range(3) for name in ("disturbance", "lasting")),
+        *(one_of(name, i) for i in range(3) for name in ("disturbance", "lasting")),
+        *(one_of("creeping", i) for i in range(2)),
+        *(paired(i, power) for i in range(3) for power in VALLEYS),
         *(reading(i) for i in range(5) if measured[i + 1]),
     ]
