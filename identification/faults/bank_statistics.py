@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from identification.online.filter import Course
+from identification.online.filter import Course, JointFilter
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -33,7 +33,7 @@ EULER: Final = 0.5772156649
 """Mean of the standard Gumbel distribution."""
 
 
-def statistics(course: Course, which: int, dt: float) -> FloatArray:
+def statistics(course: Course, which: int, joint: JointFilter) -> FloatArray:
     """Energies and means of the innovations over all windows, and the disturbances, (n, count).
 
     Parameters
@@ -41,28 +41,28 @@ def statistics(course: Course, which: int, dt: float) -> FloatArray:
     course : Course
     which : int
         Number of the filter.
-    dt : float
-        Sample time [s].
+    joint : JointFilter
 
     Returns
     -------
     array
         Root mean square (5 readings x 4 windows), size of the mean (the same), size of the three
-        disturbances beyond what they are unsure by [N.m]. Before a window is full, what is missing
-        counts as expected.
+        disturbances beyond what they and the friction of a side that creeps are unsure by [N.m].
+        Before a window is full, what is missing counts as expected.
     """
     e = np.clip(course.innovation[which], -1e6, 1e6)
     rows = len(e)
     squares = np.concatenate([np.zeros((1, 5)), np.cumsum(e**2, axis=0)])
     sums = np.concatenate([np.zeros((1, 5)), np.cumsum(e, axis=0)])
     energy, mean = [], []
-    for length in lengths(dt):
+    for length in lengths(joint.dt):
         at = np.arange(1, rows + 1)
         before = np.maximum(at - length, 0)
         missing = np.maximum(length - at, 0)[:, None]
         energy.append(np.sqrt(np.maximum(squares[at] - squares[before] + missing, 0.0) / length))
         mean.append(np.abs(sums[at] - sums[before]) / length)
-    known = np.maximum(np.abs(course.disturbance[which]) - UNSURE * course.deviation[which], 0.0)
+    unsure = UNSURE * course.deviation[which] + joint.unsure_friction(course, which)
+    known = np.maximum(np.abs(course.disturbance[which]) - unsure, 0.0)
     return np.concatenate([*energy, *mean, known], axis=1)
 
 

@@ -21,6 +21,7 @@ from identification.errors import InputError
 from identification.fitting.window_run import WindowRun
 from identification.online.filter_step import (
     BALANCES,
+    CREEP,
     READINGS,
     predict_function,
     update_function,
@@ -426,6 +427,20 @@ class JointFilter:
         return Course(
             cut[0], cut[1], cut[2], cut[3], cut[4], used_drive=bool(used[0, 0, 0]), last=last
         )
+
+    def unsure_friction(self, course: Course, which: int) -> FloatArray:
+        """What the friction of motor and link may be wrong by along a filter's course, (n, 3) as
+        its disturbances [N.m]: all of the dry friction while a side creeps, and
+        :data:`identification.online.filter_step.CREEP` later, when the filter has not yet seen that
+        it turns freely again.
+        """
+        speeds = course.states[which][:, [1, self.states_of_motion - 1]]
+        near = np.exp(-((speeds / self.slow) ** 2))
+        length = max(1, round(CREEP / self.dt))
+        before = np.concatenate([np.zeros((length - 1, 2)), near])
+        lately = np.lib.stride_tricks.sliding_window_view(before, length, axis=0).max(axis=2)
+        motor, link = (self.dry / AT_A_TURN * lately).T
+        return np.column_stack([motor, np.zeros(len(motor)), link])
 
     def expected(self, course: Course, readings: FloatArray) -> FloatArray:
         """Readings (n, 6) as the first filter of a course expects them after each sample.

@@ -1,5 +1,5 @@
 """Levels of the fault bank: the likeliest ones, wherever the search starts and whatever is hidden
-when.
+when; friction of a side that creeps.
 """
 
 from __future__ import annotations
@@ -13,7 +13,9 @@ import pytest
 from casadi_models import JointModel
 from identification.faults import bank_levels
 from identification.faults.bank_levels import Piece, first_levels, likeliest
-from identification.online.filter import LINK, TRANSMISSION, JointFilter
+from identification.faults.bank_statistics import statistics
+from identification.online.filter import AT_A_TURN, LINK, TRANSMISSION, Course, JointFilter
+from identification.online.filter_step import CREEP
 from tests.hidden_effect.generator import DT, KM, simulate_case
 
 THERE = (True, True, False, True, False, True)
@@ -59,6 +61,23 @@ def joint() -> tuple[JointFilter, tuple[Piece, ...]]:
             rows[:, to] = table[:, column] * scale.get(column, 1.0)
         pieces.append(Piece(table[:, 0], rows))
     return JointFilter(model, DT), tuple(pieces)
+
+
+def test_friction_of_a_side_that_creeps_is_no_sign_of_a_fault() -> None:
+    """The motor's disturbance is half its dry friction throughout; it creeps for a while."""
+    made, _ = joint()
+    dry, count, creeps = made.dry[0] / AT_A_TURN, 1000, slice(200, 500)
+    states = np.ones((1, count, 4))
+    states[0, creeps, 1] = 0.1 * made.slow[0]
+    lacks = np.full((1, count, 3), 0.5 * dry)
+    none = np.zeros((1, count, 5))
+    course = Course(none, none + 1, lacks, np.zeros((1, count, 3)), states, True, last=())
+    motor, transmission, link = statistics(course, 0, made)[:, -3:].T
+    late = round(CREEP / DT)
+    assert np.all(motor[200 : 500 + late - 1] == 0)
+    assert motor[[*range(200), *range(500 + late, count)]] == pytest.approx(0.5 * dry)
+    assert transmission == pytest.approx(0.5 * dry)
+    assert link == pytest.approx(0.5 * dry)
 
 
 @pytest.mark.slow
