@@ -129,6 +129,11 @@ class Factor:
                 self.d[j] = raised
             self.d[0] = self.d[0] + weight * v[0] * v[0]
 
+    def variance(self, h: list[SX]) -> SX:
+        """h' P h."""
+        f = self.transposed_times(h)
+        return total([d * item * item for d, item in zip(self.d, f, strict=True)])
+
     def measure(self, h: list[SX], variance: SX) -> tuple[list[SX], SX]:
         """Measurement update by one scalar (Bierman); gives P h and h' P h + variance."""
         f = self.transposed_times(h)

@@ -153,15 +153,18 @@ def _correct(
         )
         # Correlated noise (filtered measurements) tells less per sample than its variance says.
         used_noise = noise * select(config["noise_known"][o], 1.0, sample.inflation[o])
-        gain, expected = factor.measure(h, used_noise)
+        unsure = factor.variance(h)
         limit = _alarm_limit(config, sample.inflation[o])
         # One sample far off among quiet ones is an outlier; where its neighbours are as far off,
-        # the parameters have moved.
-        bound = config["huber"][0] * ca.sqrt(ca.fmax(expected - used_noise, 0.0) + noise)
-        cut = select(fast["innovation"][o] <= limit, ca.fmax(-bound, ca.fmin(error, bound)), error)
-        step = cut / expected
+        # the parameters have moved. An outlier has that much more noise: it moves the estimate by
+        # no more than the bound, and P knows no more than was believed.
+        bound = config["huber"][0] * ca.sqrt(unsure + noise)
+        beyond = ca.fmax(ca.fabs(error) / ca.fmax(bound, _NOISE_LOW), 1.0) - 1.0
+        believed = select(fast["innovation"][o] <= limit, beyond, 0.0)
+        gain, expected = factor.measure(h, used_noise + believed * (unsure + used_noise))
+        step = error / expected
         theta = [theta[i] + sample.free[i] * (gain[i] * step) for i in range(layout.n)]
-        expected = ca.fmax(expected - used_noise, 0.0) + noise
+        expected = unsure + noise
         normalised = error * error / expected
         power = fast["power"][o] + used * ca.fmax(config["noise_rate"][0], 1.0 / (1.0 + count)) * (
             square - fast["power"][o]

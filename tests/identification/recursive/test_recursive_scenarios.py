@@ -100,6 +100,18 @@ def test_single_outliers_do_not_move_the_estimate_where_r2_is_known() -> None:
     )
 
 
+def test_a_sample_that_is_hardly_believed_tells_hardly_anything() -> None:
+    """A column that is seen once, 100 of its standard deviations off: the estimate moves by 2.5 of
+    them, and stays as unsure as what it leaves.
+    """
+    estimator = RecursiveLeastSquares(
+        [0.0], [1.0], settings=Settings(drift=0.0, alarm_drift=0.0, freeze=False), R2=[1e-4]
+    )
+    estimator.update([100.0], [[1.0]])
+    assert estimator.theta[0] == pytest.approx(2.5, rel=1e-3)
+    assert estimator.deviation[0] == pytest.approx((1 - 2.5 / 100) ** 0.5, rel=1e-3)
+
+
 def test_a_declared_inflation_is_used_as_it_is() -> None:
     """Rows that share their samples: the standard deviation is larger by the root of the
     inflation.
