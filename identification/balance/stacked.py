@@ -50,8 +50,8 @@ WEIGHINGS: Final = 12
 """Rounds in which the weights of the rows and their RMS are made to agree; more change nothing
 in the third digit.
 """
-NOTHING_SURE: Final = 1e6
-"""Times the level of the others from which a row that may go either way counts no less."""
+NOTHING_SURE: Final = 1e100
+"""What a row of which nothing is sure is unsure by at most [N.m]: a number with a square."""
 INDEPENDENT_SHARE: Final = 0.4
 """Share of the rows that count as independent: four rows to a kernel length."""
 SURE_ERRORS: Final = 3.0
@@ -380,8 +380,9 @@ def _sure_rms(change: FloatArray, either: FloatArray) -> float:
     if level <= 0 or not np.any(either):
         return rms(change)
     for _ in range(WEIGHINGS):
-        # what a law that ran away leaves open counts for nothing, and not for a square of nothing
-        weight = 1 / np.hypot(1.0, np.minimum(either / level, NOTHING_SURE))
+        # from the surest row: where a law ran away the square of each alone may be nothing
+        unsure_by = np.hypot(level, np.minimum(either, NOTHING_SURE))
+        weight = float(unsure_by.min()) / unsure_by
         level = rms(change * weight) / rms(weight)
         if not math.isfinite(level):
             break
