@@ -314,8 +314,8 @@ def _filter(
 
     def louder(shift: float) -> float:
         """Squares of the telling rows, in units of the variance, by which noise is louder."""
-        louder = noise(waiting.grid.length, place, (whole - shift) * dt) / scale**2
-        return int(telling.sum()) * louder
+        of_a_row = noise(waiting.grid.length, place, (whole - shift) * dt) / scale**2
+        return int(telling.sum()) * of_a_row
 
     @cache
     def unmet(shift: float) -> float:

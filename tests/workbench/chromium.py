@@ -50,3 +50,11 @@ def context_of(chromium: Any, **options: Any) -> Any:
     if LATE:
         context.add_init_script(HOLD_BACK.replace("LATE", str(LATE)))
     return context
+
+
+def fit_demo(page: Any, address: str) -> None:
+    """The page with the embedded demo, its fit asked for."""
+    page.goto(address)
+    page.click("#demo")
+    page.wait_for_selector("#fit", timeout=60_000)
+    page.click("#fit")

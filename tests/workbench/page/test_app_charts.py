@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.workbench.chromium import context_of, launched, needs_chromium
+from tests.workbench.chromium import context_of, fit_demo, launched, needs_chromium
 from tests.workbench.served import serving
 
 AXE = os.environ.get("IRJ_AXE", "")
@@ -39,10 +39,7 @@ def page(address: str) -> Iterator[Any]:
         context.on("weberror", lambda e: problems.append(str(e.error)))
         context.on("console", lambda m: problems.append(m.text) if m.type == "error" else None)
         made = context.new_page()
-        made.goto(address)
-        made.click("#demo")
-        made.wait_for_selector("#fit", timeout=60_000)
-        made.click("#fit")
+        fit_demo(made, address)
         idle(made, "compare")
         made.click("#diagnose")
         idle(made, "diagnose")

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from tests.workbench.chromium import context_of, launched, needs_chromium
+from tests.workbench.chromium import context_of, fit_demo, launched, needs_chromium
 from tests.workbench.served import serving
 
 pytestmark = needs_chromium
@@ -40,10 +40,7 @@ def opened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Opened]:
         context.on("weberror", lambda e: problems.append(str(e.error)))
         context.on("console", lambda m: problems.append(m.text) if m.type == "error" else None)
         page = context.new_page()
-        page.goto(there.address)
-        page.click("#demo")
-        page.wait_for_selector("#fit", timeout=60_000)
-        page.click("#fit")
+        fit_demo(page, there.address)
         drawn(page, "compare")
         yield Opened(there.address, home.key_of(Store(root)), context, page, problems)
     assert problems == []

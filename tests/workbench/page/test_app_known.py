@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from tests.workbench.chromium import context_of, launched, needs_chromium
+from tests.workbench.chromium import context_of, fit_demo, launched, needs_chromium
 from tests.workbench.served import serving
 
 AXE = os.environ.get("IRJ_AXE", "")
@@ -28,10 +28,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     """The demo, fitted and diagnosed."""
     with serving(tmp_path_factory.mktemp("sessions")) as there, launched() as chromium:
         made = context_of(chromium, viewport={"width": 1280, "height": 860}).new_page()
-        made.goto(there.address)
-        made.click("#demo")
-        made.wait_for_selector("#fit", timeout=60_000)
-        made.click("#fit")
+        fit_demo(made, there.address)
         idle(made, "compare")
         made.click("#diagnose")
         idle(made, "diagnose")

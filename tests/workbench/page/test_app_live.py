@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.workbench.chromium import context_of, launched, needs_chromium
+from tests.workbench.chromium import context_of, fit_demo, launched, needs_chromium
 from tests.workbench.served import serving
 
 AXE = os.environ.get("IRJ_AXE", "")
@@ -64,10 +64,7 @@ def page(root: Path, growing: Path, stream: str) -> Iterator[Any]:
     allow(root, [growing, stream])
     with serving(root) as there, launched() as chromium:
         made = context_of(chromium, viewport={"width": 1280, "height": 860}).new_page()
-        made.goto(there.address)
-        made.click("#demo")
-        made.wait_for_selector("#fit", timeout=60_000)
-        made.click("#fit")
+        fit_demo(made, there.address)
         idle(made, "compare")
         made.evaluate("run('add', { label: 'stribeck@motor' }, 'ledger')")
         made.wait_for_function("() => app.state.steps.length === 2", timeout=60_000)
