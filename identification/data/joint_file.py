@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, final
 
-from casadi_models import JointModel
+from casadi_models import JointModel, hold
 from casadi_models.term import INERTIAS
 from casadi_models.text.typed_law import TypedLaw
 from identification.data.joint_schema import (
@@ -117,6 +117,20 @@ class Joint:
             raise InputError(f"{self.source or self.name}: {error.args[0]}") from None
         names = set(model.parameter_names)
         return model.with_values({k: v for k, v in self.fitted.items() if k in names})
+
+    def lacks(self, model: JointModel) -> list[str]:
+        """Parameters of a model of which the file has no value, fitted or known; the calibration of
+        a run is its own.
+        """
+        there = {*self.held().known, hold.HOLD_NAME, *model.calibration}
+        return [n for n in model.parameter_names if n not in there]
+
+    def held(self) -> Joint:
+        """The joint with its fitted values taken as known: a fit finds the calibration of each run
+        and nothing else.
+        """
+        given = {n: k for n, k in self.known.items() if k.value is not None}
+        return replace(self, known={**{n: Known(v) for n, v in self.fitted.items()}, **given})
 
 
 def load_joint(path: str | Path) -> Joint:

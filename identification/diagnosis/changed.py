@@ -326,17 +326,14 @@ def _prepared(reference: Joint, records: Sequence[Record], tell: Progress) -> _S
     if not records:
         raise InputError("no record to compare with the reference; give at least one")
     plain = prepared_model(replace(reference, known={}), records[0])
-    own = (HOLD_NAME, *plain.calibration)
-    lacking = [n for n in plain.parameter_names if n not in reference.fitted and n not in own]
-    if lacking:
+    if lacking := reference.lacks(plain):
         raise InputError(
             f"{where}: has no fitted value of {', '.join(lacking)}, which these records ask for; "
             "fit the reference on records with the same channels"
         )
     free = replace(reference, known={})
-    plain = plain.with_values(
-        {n: reference.fitted[n] for n in plain.parameter_names if n in reference.fitted}
-    )
+    stands = {n: k.value for n, k in reference.held().known.items() if k.value is not None}
+    plain = plain.with_values({n: v for n, v in stands.items() if n in plain.parameter_names})
     data = load_dataset(records, [], free, plain)
     if data.blocks < FEWEST_BLOCKS:
         raise InputError(

@@ -56,6 +56,8 @@ class Comparison:
         do.
     warnings : tuple of str
         What the check gate said about the records.
+    fitted_to : tuple of str
+        Records that the values were fitted to; none where they were all known before.
     """
 
     name: str
@@ -67,6 +69,7 @@ class Comparison:
     at_rest: float = 0.0
     at_rest_beyond: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+    fitted_to: tuple[str, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
         """Errors and places as data."""
@@ -80,6 +83,7 @@ class Comparison:
             "at_rest_percent": 100 * self.at_rest,
             "at_rest_beyond": list(self.at_rest_beyond),
             "warnings": list(self.warnings),
+            "fitted_to": list(self.fitted_to),
         }
 
     def __str__(self) -> str:
@@ -167,7 +171,8 @@ def compare(fitted: Fit, records: Record | Sequence[Record], *, linear: bool = T
     if linear:  # the one place that fits models without physics: no other verb loads them
         from identification.linear.ceiling import ceiling
 
-        above = ceiling(fitted.data, compared, residual, floor, unseen=unseen)
+        own = bool(fitted.solution.free)
+        above = ceiling(fitted.data, compared, residual, floor, unseen=unseen, fitted=own)
     return Comparison(
         ", ".join(r.name for r in given),
         error,
@@ -181,6 +186,7 @@ def compare(fitted: Fit, records: Record | Sequence[Record], *, linear: bool = T
             "N.m" if data.joint.kind == "rotary" else "N",
         ),
         warnings=gate_warnings(given),
+        fitted_to=tuple(r.name for r in fitted.records) if fitted.solution.free else (),
     )
 
 

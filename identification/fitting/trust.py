@@ -167,6 +167,8 @@ def trust(solution: Solution, data: Dataset, *, profiles: bool = True) -> Trust:
     profiles : bool
         Intervals of shapes from refits on either side; without, from standard errors.
     """
+    if set(solution.free) <= set(solution.at_bound):  # all is known: no value was found here
+        return Trust(())
     return _Judge(solution, data).all(profiles=profiles)
 
 

@@ -95,6 +95,8 @@ class Ceiling:
         Rows there are; more than `rows` where the cap cut them.
     unseen : bool
         True where neither model was fitted to the judged records.
+    fitted : bool
+        False where the physical model was fitted to no record here.
     """
 
     balances: Mapping[str, BalanceCeiling]
@@ -106,6 +108,7 @@ class Ceiling:
     rows: int
     all_rows: int
     unseen: bool
+    fitted: bool = True
 
     @property
     def meaning(self) -> str:
@@ -141,6 +144,7 @@ class Ceiling:
             "rows": self.rows,
             "all_rows": self.all_rows,
             "unseen": self.unseen,
+            "fitted": self.fitted,
             "balances": {b: asdict(c) for b, c in self.balances.items()},
         }
 
@@ -154,7 +158,8 @@ class Ceiling:
             f"{b} {left(c.vaf_percent)} against {left(c.physical_vaf_percent)} %"
             for b, c in self.balances.items()
         )
-        seen = "records neither was fitted to" if self.unseen else "records both were fitted to"
+        both = "both were" if self.fitted else "the linear ones were"
+        seen = f"records {'neither was' if self.unseen else both} fitted to"
         return (
             f"linear ceiling: the best of {self.tried} linear models without physics leaves "
             f"{left(self.vaf_percent)} % of the torque's "
@@ -176,6 +181,7 @@ def ceiling(
     floor: Mapping[str, float],
     *,
     unseen: bool,
+    fitted: bool = True,
 ) -> Ceiling | None:
     """Compare a physical model with linear black boxes fitted to the same records.
 
@@ -191,6 +197,8 @@ def ceiling(
         RMS that measurement noise alone would leave in each balance.
     unseen : bool
         True where the judged records had no part in the fit.
+    fitted : bool
+        False where the values of the physical model stood before any record here.
 
     Returns
     -------
@@ -243,6 +251,7 @@ def ceiling(
         rows=rows,
         all_rows=sum(w.rows for w in tested),
         unseen=unseen,
+        fitted=fitted,
     )
 
 

@@ -147,16 +147,18 @@ class OnlineEstimator:
             2 * len(self.names), round(self.options.warm_up / (self.rows.timing.stride * dt))
         )
         self.from_link = [b in ("link", "transmission") for b in self.balances]
-        self.friction = [
+        torques = [
             [
-                self.names.index(p.name)
+                p.name
                 for t in self.model.terms
                 if t.place == place and t.effect.family == "friction"
                 for p in t.parameters
-                if p.unit == "N.m" and p.name in self.names
+                if p.unit == "N.m"
             ]
             for place in ("motor", "link")
         ]
+        self.friction = [[self.names.index(n) for n in t if n in self.names] for t in torques]
+        known = [sum(abs(start[n]) for n in t if n not in self.names) for t in torques]
         self.feels = np.array(
             [
                 [
@@ -171,6 +173,7 @@ class OnlineEstimator:
             len(self.balances),
             len(self.names),
             self.friction,
+            known,
             self.feels,
             rate,
             _STRAIN.error_limit,

@@ -63,6 +63,8 @@ class RowCheck:
     balances, parameters : int
     friction : (2) sequence of sequence of int
         Parameters that are friction torques, of motor and link.
+    known : (2) sequence of float
+        Sum of the friction torques of motor and link that are known and no parameters [N.m].
     feels : (balances, 2) bool array
         Balances that the friction of motor and link enters.
     rate, limit : float
@@ -93,6 +95,7 @@ class RowCheck:
         balances: int,
         parameters: int,
         friction: Sequence[Sequence[int]],
+        known: Sequence[float],
         feels: npt.NDArray[np.bool_],
         rate: float,
         limit: float,
@@ -110,7 +113,7 @@ class RowCheck:
         }
         v = {name: ca.SX.sym(name, *sizes.get(name, (balances, 1))) for name in _INTO}
         size = ca.fmax(ca.fmax(v["floor"], ca.sqrt(v["square"])), LEAST)
-        self.weight = _weight_function(balances, parameters, friction, feels)
+        self.weight = _weight_function(balances, parameters, friction, known, feels)
         weight = self.weight(v["share"], v["theta"], size)
         error = v["y"] - v["h"].T @ v["theta"]
         moves = ca.DM.ones(parameters)
@@ -151,8 +154,7 @@ class RowCheck:
         )
         self.function = ca.Function("row_check", list(v.values()), [ca.densify(e) for e in out])
         self._into = [
-            np.zeros(v[name].shape[::-1] if min(v[name].shape) > 1 else v[name].numel())
-            for name in _INTO
+            np.zeros((balances, parameters) if name == "h" else v[name].numel()) for name in _INTO
         ]
         shapes = {
             "h": (balances, parameters),
@@ -219,6 +221,7 @@ def _weight_function(
     balances: int,
     parameters: int,
     friction: Sequence[Sequence[int]],
+    known: Sequence[float],
     feels: npt.NDArray[np.bool_],
 ) -> Any:
     """Weights of the balances' rows at a reversal, where friction may take any value between its
@@ -229,7 +232,9 @@ def _weight_function(
         ca.SX.sym("theta", parameters),
         ca.SX.sym("size", balances),
     )
-    force = [share[i] * sum((ca.fabs(theta[j]) for j in friction[i]), ca.SX(0)) for i in range(2)]
+    force = [
+        share[i] * sum((ca.fabs(theta[j]) for j in friction[i]), ca.SX(known[i])) for i in range(2)
+    ]
     weights = []
     for b in range(balances):
         doubt = sum((force[i] * force[i] for i in range(2) if feels[b, i]), ca.SX(0))

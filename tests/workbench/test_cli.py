@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shlex
 import shutil
 import subprocess
@@ -212,6 +213,36 @@ def test_improved_joint_file_is_a_joint_file_with_the_true_values(
     assert "held_out: fit" in capsys.readouterr().out
     after = data(demo)["steps"][-1]["held_out"]["relative_error_percent"]
     assert data(demo, "compared.json")["relative_error_percent"] == pytest.approx(after, rel=0.05)
+
+
+def test_what_a_fit_has_written_is_compared_as_it_stands(
+    demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Values were fitted anew to the very record that they were to be judged on: a joint file with
+    twice the true stiffness was as good as the right one.
+    """
+
+    def asked(joint: Path) -> tuple[dict[str, Any], str]:
+        command = ["compare", str(DEMO / "held_out.npz"), "--joint", str(joint), "--no-linear"]
+        assert main([*command, "--json", str(tmp_path / "compared.json")]) == 0
+        return data(tmp_path, "compared.json"), capsys.readouterr().out
+
+    found, said = asked(demo / "better.toml")
+    after = data(demo)["steps"][-1]["held_out"]["relative_error_percent"]
+    # the clock of the current is read from the held-out record alone here
+    assert found["relative_error_percent"] == pytest.approx(after, rel=0.01)
+    assert (found["fitted_to"], "as they stand" in said) == ([], True)
+    right = (demo / "better.toml").read_text()
+    wrong = tmp_path / "wrong.toml"
+    wrong.write_text(
+        re.sub(r"(?m)^stiffness = \{ value = [\d.]+", "stiffness = { value = 44e3", right)
+    )
+    other, _ = asked(wrong)
+    assert other["balances"]["transmission"]["ratio"] > 20
+    motor = found["balances"]["motor"]["ratio"]
+    assert other["balances"]["motor"]["ratio"] == pytest.approx(motor, rel=0.02)
+    start, said = asked(DEMO / "joint.toml")
+    assert (start["fitted_to"], "fitted to these very records" in said) == (["held_out"], True)
 
 
 def test_fit_prints_values_with_errors_and_writes_a_joint_file(

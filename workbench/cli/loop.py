@@ -16,6 +16,7 @@ from identification.data.joint_file import Joint
 from identification.data.record import Record
 from identification.diagnosis.improve import Improvement, improve
 from identification.diagnosis.outcome import known_key
+from identification.fitting.engine import prepared_model
 from identification.fitting.fit import Fit, fit
 from identification.fitting.trust import Trust, trust
 from workbench.cli.files import (
@@ -320,9 +321,18 @@ def run_compare(arguments: Namespace) -> int:
         joint,
         once=False,
     )
-    fitted = fit(joint, basis)
+    # what a fit has written is judged as it stands, not fitted to what it is judged on
+    stands = not arguments.fit_records and not joint.lacks(prepared_model(joint, records[0]))
+    fitted = fit(joint.held() if stands else joint, basis)
     comparison = compare(fitted, records, linear=not arguments.no_linear)
     print(comparison)
+    if not comparison.fitted_to:
+        print(f"  with the values of {arguments.joint} as they stand")
+    elif not arguments.fit_records:
+        print(
+            "  fitted to these very records; --fit REC... fits to others, for an error on records "
+            "that the fit has not seen"
+        )
     for place in [p for p in comparison.places if p.tells][:5]:
         print(
             f"  {place.balance} balance against {place.title}: explains "

@@ -229,7 +229,8 @@ def parser() -> OneLineParser:
         action="extend",
         metavar="REC",
         default=[],
-        help="fit to these records and compare with REC",
+        help="fit to these records and compare with REC (default: the values of the joint file as "
+        "they stand, and where it lacks one a fit to REC itself)",
     )
     compared.add_argument(
         "--no-linear",

@@ -44,7 +44,7 @@ def followed(failure: str, first: int, last: int, rows: int) -> tuple[Told, Floa
     guard = Guard(NAMES, ("motor", "link"), PERIOD)
     guard.start(recursion)
     feels = np.array([[True, False], [False, True]])
-    check = RowCheck(2, len(NAMES), ((2,), ()), feels, PERIOD / 2, 3.0)
+    check = RowCheck(2, len(NAMES), ((2,), ()), (0.0, 0.0), feels, PERIOD / 2, 3.0)
     level, on, theta, stuck = np.full(2, NOISE), np.ones(2, dtype=bool), recursion.theta, 0.0
     square, torque = level**2, np.full(2, 100.0)
     told, shown = [], []

@@ -5,6 +5,7 @@ what it makes of readings that are missing, no numbers or of wrong scale.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cache
 from itertools import product
 
@@ -13,6 +14,7 @@ import numpy.typing as npt
 import pytest
 
 from benchmarks.native import readings_of
+from identification.balance.dataset import HOLD_NAME
 from identification.online.estimator import OnlineEstimator, OnlineOptions
 from irj_fmu.convergence import forgotten
 from irj_fmu.cosim import link_referred
@@ -121,6 +123,26 @@ def test_at_a_reversal_a_row_is_unsure_by_the_dry_friction_of_its_side() -> None
     expected = 1 / np.sqrt(1 + np.column_stack([motor, link, 0 * motor]) ** 2)
     assert one.balances == ("motor", "link", "transmission")
     assert one._weight_of(shares, theta, size) == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("free", [(), ("motor_viscous",)])
+def test_what_is_known_is_no_less_sure_than_what_is_followed(free: tuple[str, ...]) -> None:
+    """Where friction was known its turns counted in full: a healthy joint stood at three times its
+    floor. With one parameter left, or none, the first row was an internal error.
+    """
+    joint = reference_joint("irj2b")
+    held = joint.held()
+    some = replace(held, known={n: k for n, k in held.known.items() if n not in free})
+    every, few = (feed(OnlineEstimator(j, STEP, QUICK), "irj2b", 0, 5000) for j in (joint, some))
+    assert set(few.names) - {HOLD_NAME} == set(free)
+    assert few.balances == every.balances == ("motor", "link", "transmission")
+    size, theta = np.array([2.0, 0.5, 1.0]), np.zeros(len(few.names))
+    dry = [joint.fitted[f"{side}_coulomb"] for side in ("motor", "link")]
+    expected = 1 / np.sqrt(1 + (np.array([*dry, 0.0]) / size) ** 2)
+    assert few._weight_of(np.ones((1, 2)), theta, size)[0] == pytest.approx(expected, rel=1e-12)
+    gear = [few.balances.index(b) for b in ("motor", "transmission")]  # gravity is another here
+    assert np.all(few.ratio[gear] < 1.0)
+    assert few.level[gear] == pytest.approx(every.level[gear], rel=0.3)
 
 
 def test_what_the_first_window_leaves_is_told_over_its_noise_at_once() -> None:
