@@ -175,8 +175,8 @@ class OnlineEstimator:
             self.friction,
             known,
             self.feels,
-            rate,
-            _STRAIN.error_limit,
+            rate=rate,
+            limit=_STRAIN.error_limit,
         )
         self.reference = [11 if from_link else 1 for from_link in self.from_link]
         self.reset()
