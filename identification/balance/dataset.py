@@ -174,10 +174,12 @@ def load_dataset(
     kernel: float | None = None,
     like: Sensing | None = None,
     told: Dataset | None = None,
+    late: Sequence[Mapping[str, float]] | None = None,
 ) -> Dataset:
     """Prepare records for the balances that their common channels allow (`like`: temperature counts
     as in the records of a fit; `told`: the same records at the kernel that has told how late their
-    channels are and what their sensors' noise is, neither of which hangs on a kernel).
+    channels are and what their sensors' noise is, neither of which hangs on a kernel; `late`: of
+    each record, by how much its channels are to be shifted [s], where that is known).
 
     Raises
     ------
@@ -195,7 +197,7 @@ def load_dataset(
     prepared: list[WeakRecord] = []
     first, count = 0, len(train)
     again: list[Callable[..., WeakRecord]] = []
-    shifts = None if told is None else [w.shifts for w in (*told.train, *told.held_out)]
+    shifts = late if told is None else [w.shifts for w in (*told.train, *told.held_out)]
     for number, record in enumerate((*train, *held_out)):
         way = partial(_once, curved=model.lagging_load, late=places_of(model))
         again.append(partial(way, record, joint, sensing, length, first))
@@ -204,13 +206,13 @@ def load_dataset(
     for number, (record, made) in enumerate(zip((*train, *held_out), prepared, strict=True)):
         seen = {p: [w.filters[p] for w in prepared[:count] if p in w.filters] for p in made.filters}
         agreed = {p: as_told(seen[p], f) for p, f in made.filters.items() if seen[p]}
-        if not made.shifts.get(OF_TORQUE, 0.0) and told is None:
+        if not made.shifts.get(OF_TORQUE, 0.0) and shifts is None:
             # a record that tells nothing of it has the torque sensor of the others
-            late = [w.shifts[OF_TORQUE] for w in prepared[:count] if w.shifts.get(OF_TORQUE, 0.0)]
-            hidden = sensing.both_positions and late and link_hidden(made)
-            if late and (sensing.motor_and_torque or hidden):
-                agreed |= {OF_TORQUE: float(np.median(late))}
-        if any(abs(made.shifts.get(p, 0.0) - late) > NANOSECOND for p, late in agreed.items()):
+            others = [w.shifts[OF_TORQUE] for w in prepared[:count] if w.shifts.get(OF_TORQUE, 0.0)]
+            hidden = sensing.both_positions and others and link_hidden(made)
+            if others and (sensing.motor_and_torque or hidden):
+                agreed |= {OF_TORQUE: float(np.median(others))}
+        if any(abs(made.shifts.get(p, 0.0) - x) > NANOSECOND for p, x in agreed.items()):
             made = replace(again[number](known={**made.shifts, **agreed}), filters=made.filters)
         if record.payload != train[0].payload:
             made = replace(made, masked=_of_the_link(record, sensing))

@@ -23,7 +23,7 @@ from casadi_models import EFFECTS, JointModel
 from casadi_models.term import LINK_INERTIA, TOTAL_INERTIA
 from identification.balance.balances import balances_of
 from identification.balance.calibration import names_of_runs, of_run
-from identification.balance.dataset import HOLD_NAME, Dataset, load_dataset, prepared_model
+from identification.balance.dataset import HOLD_NAME, Dataset, prepared_model
 from identification.balance.noise import effective_share
 from identification.balance.stacked import taking_part
 from identification.data.joint_file import Joint
@@ -41,6 +41,7 @@ from identification.fitting.covariance import (
     inverse,
     windows_over,
 )
+from identification.fitting.dataset import dataset_of
 from identification.fitting.engine import Solution, solve, stack
 from identification.fitting.errors_in_variables.equations import (
     noise_products,
@@ -334,7 +335,7 @@ def _prepared(reference: Joint, records: Sequence[Record], tell: Progress) -> _S
     free = replace(reference, known={})
     stands = {n: k.value for n, k in reference.held().known.items() if k.value is not None}
     plain = plain.with_values({n: v for n, v in stands.items() if n in plain.parameter_names})
-    data = load_dataset(records, [], free, plain)
+    data = dataset_of(records, [], free, plain)
     if data.blocks < FEWEST_BLOCKS:
         raise InputError(
             f"{records[0].name}: too short to tell a change from chance; give at least "

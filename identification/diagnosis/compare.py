@@ -19,7 +19,8 @@ from identification.diagnosis.bench import JointBench
 from identification.diagnosis.places import Place, gather, places_of, worst_window
 from identification.diagnosis.session import refuse_unlike
 from identification.fitting.assess import Error, assess, over_noise
-from identification.fitting.engine import load_dataset, stack
+from identification.fitting.dataset import dataset_of
+from identification.fitting.engine import stack
 from identification.fitting.fit import Fit
 from identification.representation import html_of
 
@@ -138,13 +139,14 @@ def compare(fitted: Fit, records: Record | Sequence[Record], *, linear: bool = T
     # records of its own are judged as the loop judges the training records, others as it judges
     # held-out ones: one figure for one state
     train, held = (list(fitted.records), given) if unseen else (given, [])
-    data = load_dataset(
+    data = dataset_of(
         train,
         held,
         fitted.joint,
         fitted.model,
         kernel=fitted.data.kernel,
         like=fitted.data.sensing,
+        values=fitted.solution.values,
     )
     compared = data.held_out if unseen else data.train
     bench = JointBench(fitted.joint, data, train, held, like=fitted.data.sensing)

@@ -70,7 +70,8 @@ from identification.diagnosis.verdict import (
 )
 from identification.errors import InputError
 from identification.fitting.assess import RATIO_LIMIT
-from identification.fitting.engine import Solution, load_dataset, prepared_model
+from identification.fitting.dataset import dataset_of
+from identification.fitting.engine import Solution, prepared_model
 from identification.naming.odds import SCREEN
 
 MAX_ADDITIONS: Final = 6
@@ -223,7 +224,7 @@ class Session:
         given, apart = gated(given, joint), gated(apart, joint)
         train, held, note = with_held_out(given, apart)
         model = prepared_model(joint, train[0])
-        data = replace(load_dataset(train, held, joint, model), note=note)
+        data = replace(dataset_of(train, held, joint, model), note=note)
         return cls(JointBench(joint, data, train, held), progress, gate_warnings([*given, *apart]))
 
     def start(self) -> Solution:

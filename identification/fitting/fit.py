@@ -14,7 +14,8 @@ from identification.data.joint_file import Joint
 from identification.data.record import Record, listed
 from identification.errors import InputError
 from identification.fitting.assess import Error, assess
-from identification.fitting.engine import Dataset, Solution, load_dataset, prepared_model
+from identification.fitting.dataset import dataset_of
+from identification.fitting.engine import Dataset, Solution, prepared_model
 from identification.fitting.first_fit import first_fit
 from identification.fitting.joint_text import calibration_of, joint_text
 from identification.fitting.parameters import parameter_table
@@ -170,7 +171,7 @@ def fit(
     if not train:
         raise InputError("no record to fit; give at least one")
     prepared = prepared_model(whole, train[0])
-    data = load_dataset(train, gated(listed(held_out), whole), whole, prepared)
+    data = dataset_of(train, gated(listed(held_out), whole), whole, prepared)
     solution = first_fit(prepared, data)
     return Fit(
         whole,

@@ -29,10 +29,10 @@ from identification.diagnosis.session import Session, with_held_out
 from identification.diagnosis.trials import Trial
 from identification.errors import InputError
 from identification.fitting.assess import Error, assess, over_noise
+from identification.fitting.dataset import dataset_of
 from identification.fitting.engine import (
     Dataset,
     Solution,
-    load_dataset,
     prepared_model,
     references,
     solve,
@@ -130,7 +130,7 @@ class Analysis:
             )
             self.note = f"{self.note}; {part}" if self.note else part
         self.start_model = prepared_model(joint, whole[0])
-        self.data = load_dataset(quick_train, quick_held, joint, self.start_model)
+        self.data = dataset_of(quick_train, quick_held, joint, self.start_model)
         self.bench = JointBench(joint, self.data, quick_train, quick_held)
         self.solution: Solution | None = None
         self.trials: dict[str, Trial] = {}
@@ -395,7 +395,7 @@ class Analysis:
         """Fit the current model to every sample, and judge it on every held-out sample."""
         began = time.perf_counter()
         progress("preparing every sample", 0.1)
-        data = load_dataset(self._train, self._held, self.joint, self.start_model)
+        data = dataset_of(self._train, self._held, self.joint, self.start_model)
         progress("fitting every sample", 0.4)
         now = self.current
         self.solution = solve(

@@ -17,7 +17,8 @@ from identification.diagnosis.outcome import key_of
 from identification.diagnosis.session import Session
 from identification.diagnosis.trials import make_base
 from identification.fitting.assess import BalanceError, Error, assess
-from identification.fitting.engine import Dataset, Solution, load_dataset, solve
+from identification.fitting.dataset import dataset_of
+from identification.fitting.engine import Dataset, Solution, solve
 from workbench.page.analysis import Analysis, Progress
 from workbench.page.session import StepEntry
 
@@ -41,7 +42,7 @@ def improvement_of(
     data = (
         analysis.data
         if train is analysis.quick[0]
-        else load_dataset(train, held, analysis.joint, analysis.start_model)
+        else dataset_of(train, held, analysis.joint, analysis.start_model)
     )
     data = replace(data, note=analysis.note)
     progress("fitting the steps", 0.1)
