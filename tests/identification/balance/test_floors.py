@@ -171,6 +171,9 @@ def test_an_addition_is_judged_by_what_it_leaves_and_not_by_its_floor() -> None:
 
     assert made_worse(error(1.0, 0.5), error(0.9, 0.01)) == ""
     assert judged_drop(error(1.0, 0.5), error(0.9, 0.01), "motor") == pytest.approx(10.0)
+    # but what takes noise alone from a balance of noise alone explains nothing of it
+    assert judged_drop(error(0.9, 1.0), error(0.6, 0.65), "motor") < 0
+    assert judged_drop(error(0.9, 1.0), error(0.6, 1.0), "motor") == pytest.approx(100 / 3)
     assert "motor" in made_worse(error(1.0, 0.01), error(1.3, 0.5))
     assert made_worse(error(0.1, 1.0), error(0.1, 1.0)) == ""
     assert made_worse(error(1.0, 0.5), error(1.05, 0.5)).startswith("the held-out error rises")
