@@ -311,12 +311,12 @@ def common_rms(before: Error, after: Error, balance: str) -> tuple[float, float]
 def judged_drop(before: Error, after: Error, balance: str) -> float:
     """Fall of a balance's RMS in percent, on one weighting: what an addition is judged by.
 
-    In a balance that is noise already it is in units of what noise alone leaves: a gain that stands
-    for an inertia takes the noise of an encoder away and explains nothing.
+    In a balance that is noise before and after it is in units of what noise alone leaves: a gain
+    that stands for an inertia takes the noise of an encoder away and explains nothing.
     """
     old, new = common_rms(before, after, balance)
     one, two = before.balances[balance], after.balances[balance]
-    noise = one.ratio <= RATIO_LIMIT and 0 < two.floor < one.floor
+    noise = max(one.ratio, two.ratio) <= RATIO_LIMIT and 0 < two.floor < one.floor
     unit = two.floor / one.floor if noise else 1.0
     return 100 * (1 - new / (old * unit)) if old > 0 else 0.0
 
