@@ -2,24 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Final
 
 import numpy as np
 
 from casadi_models import JointModel
 from identification.balance.calibration import names_of_runs, of_run, settled, within_limits
-from identification.balance.clocks import LOW_PASSED, MOST_SKEW, NEAR, carrier, places_of
+from identification.balance.clocks import (
+    HALF_A_CYCLE,
+    LOW_PASSED,
+    MOST_SKEW,
+    NEAR,
+    PRICE,
+    USUAL_HALF,
+    carrier,
+    places_of,
+)
 from identification.balance.dataset import Dataset, load_dataset
 from identification.balance.sensing import Sensing
 from identification.balance.weak import WeakRecord
 from identification.data.joint_file import Joint
 from identification.data.record import Record
+from identification.fitting.assess import assess
 from identification.fitting.first_fit import first_fit
 
+Late = list[dict[str, float]]
 ROUNDS: Final = 4
 """Rounds in which clocks are set by the fit: of a lateness of `MOST_SKEW` samples the series in the
 model misses a third, and of what is left a third again, down to :data:`NEAR`."""
+BETTER: Final = 0.1
+"""Share by which what is left over the noise must fall with another reading of a drive: as much as
+an effect must take off to be named. A fit that lacks an effect leans to whatever stands in for it.
+"""
 
 
 def dataset_of(
@@ -37,7 +54,9 @@ def dataset_of(
     Before a fit, a record tells how late a channel is by its rate beside free curves of the motion.
     That can be hidden by noise, or taken for something else; the balances together, and what the
     other records say of the joint, tell it better. But the model has a lateness as a series, which
-    holds for a part of a sample: so what the fit finds is taken off, and it is asked again.
+    holds for a part of a sample: so what the fit finds is taken off, and it is asked again. A
+    drive's reading that is late may wait or come through a low-pass, which is made good by its
+    rate and by no shift: the fit that leaves less of the training records tells.
 
     Parameters
     ----------
@@ -54,35 +73,128 @@ def dataset_of(
     InputError
         As by :func:`load_dataset` and :func:`first_fit`.
     """
-    data = load_dataset(train, held_out, joint, model, kernel=kernel, like=like)
+    load = partial(load_dataset, train, held_out, joint, model, kernel=kernel, like=like)
+    data = _in_time(load(), load, model, values)
+    read = data
+    for place in (p for p in places_of(model) if p in LOW_PASSED):
+        data = _read(place, data, load, model, values)
+    return data if data is read else _in_time(data, load, model, values)
+
+
+def _found(
+    model: JointModel, data: Dataset, values: Mapping[str, float] | None
+) -> Mapping[str, float]:
+    """Values of a fit, with the unknowns of every run."""
+    known = first_fit(model, data).values if values is None else values
+    return settled(model, data.sensing, _records(data), known)
+
+
+def _records(data: Dataset) -> tuple[WeakRecord, ...]:
+    return (*data.train, *data.held_out)
+
+
+def _in_time(
+    data: Dataset,
+    load: Callable[..., Dataset],
+    model: JointModel,
+    values: Mapping[str, float] | None,
+) -> Dataset:
+    """The records with the channels that wait shifted as the fit has them."""
     for _ in range(ROUNDS):
-        known = first_fit(model, data).values if values is None else values
-        records = (*data.train, *data.held_out)
-        found = settled(model, data.sensing, records, known)
+        records, found = _records(data), _found(model, data, values)
         if len(within_limits(model, records, found)) < len(names_of_runs(model, records)):
             # what is later than a clock may be is to be named: the other clocks make up for it
             break
         late = [_late(model, w, found) for w in records]
         if all(s == w.shifts for s, w in zip(late, records, strict=True)):
             break
-        data = load_dataset(train, held_out, joint, model, kernel=kernel, like=like, late=late)
+        data = load(late=late)
     return data
 
 
 def _late(model: JointModel, record: WeakRecord, values: Mapping[str, float]) -> dict[str, float]:
     """Times [s] by which the channels of a record are to be shifted: what stands within `NEAR`
-    stays. What is late through a low-pass is so by its rate, which no shift makes good.
+    stays.
     """
     out, dt = dict(record.shifts), record.grid.dt
     for place in places_of(model):
-        name = carrier(model, place)
-        if place in LOW_PASSED or name is None:
-            continue
-        run = of_run(name, record)
-        late = float(np.clip(values.get(run, values[name]), -MOST_SKEW * dt, MOST_SKEW * dt))
-        if abs(late - out.get(place, 0.0)) > NEAR * dt:
-            out[place] = late
+        if place not in LOW_PASSED:
+            late = _lateness(model, record, place, values)
+            if abs(late - out.get(place, 0.0)) > NEAR * dt:
+                out[place] = late
     return out
+
+
+def _lateness(
+    model: JointModel, record: WeakRecord, place: str, values: Mapping[str, float]
+) -> float:
+    """All of the lateness of a channel that the fit finds [s]."""
+    name, most = carrier(model, place), MOST_SKEW * record.grid.dt
+    if name is None:
+        return 0.0
+    return float(np.clip(values.get(of_run(name, record), values[name]), -most, most))
+
+
+def _read(
+    place: str,
+    data: Dataset,
+    load: Callable[..., Dataset],
+    model: JointModel,
+    values: Mapping[str, float] | None,
+) -> Dataset:
+    """The records with a reading shifted by all of its lateness, or by none, or by a part of the
+    cycle of its filter the other way: as the fit leaves least of the training records.
+    """
+    records, found = _records(data), _found(model, data, values)
+    whole = [_lateness(model, w, place, found) for w in records]
+    dt = records[0].grid.dt
+    if max(abs(k) for k in whole) <= NEAR * dt:
+        return data
+
+    def moved(shifts: Sequence[float]) -> Dataset:
+        late = [{**w.shifts, place: k} for w, k in zip(records, shifts, strict=True)]
+        if all(s == w.shifts for s, w in zip(late, records, strict=True)):
+            return data
+        return load(late=late)
+
+    def left(made: Dataset) -> list[tuple[int, float]]:
+        """Rows of each balance of the training records, and what is left of them over noise."""
+        error = assess(model, made, made.train, _found(model, made, values))
+        return [(len(e.residual), e.ratio) for e in error.balances.values()]
+
+    def by_rate(early: float) -> Dataset:
+        return moved([-early * dt] * len(records))
+
+    stands, best = data, min(data, by_rate(0.0), moved(whole), key=lambda made: _over(left(made)))
+    filtered = all(w.shifts.get(place, 0.0) <= 0.0 for w in _records(best))
+    if filtered and min(whole) > NEAR * dt:
+        early = by_rate(_half_cycle(lambda x: left(by_rate(x))))
+        best = min(best, early, key=lambda made: _over(left(made)))
+    return best if _over(left(best)) < (1 - BETTER) * _over(left(stands)) else stands
+
+
+def _over(left: Sequence[tuple[int, float]]) -> float:
+    """What is left over noise, in all balances."""
+    return math.prod(max(ratio, 1.0) for _, ratio in left)
+
+
+def _half_cycle(left: Callable[[float], Sequence[tuple[int, float]]]) -> float:
+    """By how much a filtered reading is early beside its rate [samples].
+
+    A low-pass of a computer weighs its last reading and the one before: its rate is that of half
+    its cycle ago. What is left falls along a parabola over a shift; what drives usually have says
+    the rest.
+    """
+    half = HALF_A_CYCLE / 2
+    none, first, second = (sum(n * r**2 for n, r in left(k * half)) for k in range(3))
+    bend, slope = (none + second - 2 * first) / 2, (4 * first - second - 3 * none) / 2
+    if bend <= 0 or slope >= 0:
+        return 0.0
+    at = min(-slope / (2 * bend), 2.0)
+    fall = -(slope * at + bend * at**2)
+    told = fall / (max(none - fall, 1e-300) / sum(n for n, _ in left(0.0)))
+    early = at * half
+    return early * told / (told + PRICE * (early / USUAL_HALF) ** 2)
 
 
 __all__ = ["dataset_of"]
