@@ -10,14 +10,18 @@ import json
 import logging
 import os
 import secrets
+import shutil
 import socket
+import sys
 import threading
+import webbrowser
 from collections import OrderedDict
 from collections.abc import AsyncIterator, Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, final
 
+import uvicorn
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect, Request
@@ -57,6 +61,8 @@ IN_MEMORY: Final = 4
 """Sessions kept in memory; older ones are read from their folder again."""
 MAX_BODY: Final = 1 << 20
 HEARTBEAT: Final = 15.0
+END: Final[dict[str, Any]] = {"end": True}
+"""News that there will be none."""
 WEB: Final = Path(__file__).parents[1] / "web"
 ASSETS: Final = Path(__file__).parents[1] / "assets"
 PAGE: Final = {
@@ -128,6 +134,24 @@ class Service:
             home.delete(self.store, identifier)
         for listener in tuple(live.listeners) if live is not None else ():
             listener({"gone": True})  # other tabs that have it open
+
+    def end(self) -> None:
+        """End every stream of news: it has no end of its own, and the server would wait for it."""
+        with self.lock:
+            open_now = [listener for live in self.lives.values() for listener in live.listeners]
+        for listener in open_now:
+            listener(END)
+
+
+@final
+class PageServer(uvicorn.Server):  # type: ignore[misc]
+    """The server of the page, which stops at once also where pages are open."""
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """End what would go on for ever, then stop."""
+        if isinstance(self.config.app, Guard):
+            self.config.app.end()
+        await super().shutdown(sockets)
 
 
 _LOG = logging.getLogger(__name__)
@@ -215,8 +239,10 @@ async def _events(request: Request, live: Live) -> Response:
                 except TimeoutError:
                     yield ": still here\n\n"
                     continue
-                while not queue.empty():
+                while snapshot is not END and not queue.empty():
                     snapshot = queue.get_nowait()
+                if snapshot is END:
+                    return
                 yield f"data: {json.dumps(snapshot)}\n\n"
         finally:
             live.listeners.discard(listener)
@@ -338,9 +364,8 @@ def create_app(
         return _json({"id": made.id})
 
     async def config(request: Request) -> Response:
-        return _json(
-            await run_in_threadpool(VIEWS["config"], None, {"max_upload": service.max_upload})
-        )
+        known = {"max_upload": service.max_upload, "sessions": home.mark_of(service.store)}
+        return _json(await run_in_threadpool(VIEWS["config"], None, known))
 
     def at(path: str, handler: Handler, *methods: str) -> Route:
         return Route(
@@ -388,7 +413,7 @@ def create_app(
         at("/stop", _stop, "POST"),
         at("/view/{view}", _view),
     ]
-    return Guard(Starlette(routes=routes), hosts or loopback_hosts(port))
+    return Guard(Starlette(routes=routes), hosts or loopback_hosts(port), service.end)
 
 
 def default_root() -> Path:
@@ -412,8 +437,6 @@ def with_files(root: Path, files: Sequence[str | Path]) -> str:
     InputError
         A file that does not exist.
     """
-    import shutil
-
     store = Store(root)
     for file in files:
         if not Path(file).is_file():
@@ -463,11 +486,6 @@ def serve(
     InputError
         The port is taken; a file cannot be used.
     """
-    import sys
-    import webbrowser
-
-    import uvicorn
-
     folder = root or default_root()
     with _listen(port) as listening:
         port = int(listening.getsockname()[1])
@@ -491,7 +509,7 @@ def serve(
         threading.Thread(target=_warm_up, daemon=True, name="warm up").start()
         if open_browser:
             threading.Timer(0.5, webbrowser.open, (address,)).start()
-        uvicorn.Server(config).run(sockets=[listening])
+        PageServer(config).run(sockets=[listening])
 
 
 def _warm_up() -> None:
@@ -518,4 +536,4 @@ def _listen(port: int) -> socket.socket:
     raise InputError(f"port {port} of 127.0.0.1 is taken; give another with --port")
 
 
-__all__ = ["create_app", "default_root", "serve"]
+__all__ = ["PageServer", "create_app", "default_root", "serve"]

@@ -342,9 +342,8 @@ class Store:
         root.mkdir(parents=True, exist_ok=True, mode=0o700)
         with contextlib.suppress(InputError):  # another server is at work with these sessions
             hold(root)
-            for folder in root.iterdir():
-                sweep(folder)
-                sweep(folder / "files")
+            for folder, _, _ in os.walk(root):  # also where an export was being built
+                sweep(Path(folder))
 
     def create(self) -> Session:
         """A new, empty session with an identifier that cannot be guessed."""

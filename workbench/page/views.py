@@ -43,6 +43,7 @@ def _config(live: Any, query: Query) -> dict[str, Any]:
     """What does not change: models, channels, effects, limits, what can be exported."""
     return {
         "max_upload": query["max_upload"],
+        "sessions": query["sessions"],
         "channels": ["time", *CHANNELS],
         "places": list(PLACE_SIDE),
         "models": {name: list(own) for name, own in MODELS.items()},

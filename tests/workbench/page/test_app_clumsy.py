@@ -4,8 +4,13 @@ pasted into an open tab, fields with nothing, too much or words in them.
 
 from __future__ import annotations
 
+import shutil
+import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -215,3 +220,68 @@ def test_a_session_deleted_in_another_tab_says_so_and_leads_home(opened: Opened)
     assert page.is_visible("nav.steps")
     assert opened.problems == []
     other.close()
+
+
+class Other(BaseHTTPRequestHandler):
+    """Answers everything in the same way, as pages of some programs do."""
+
+    def do_GET(self) -> None:
+        self.send_response(200)
+        self.send_header("content-type", "text/html")
+        self.end_headers()
+        self.wfile.write(b"<p>something else</p>")
+
+    def log_message(self, *said: Any) -> None:
+        pass
+
+
+@contextmanager
+def another_program(port: int) -> Iterator[None]:
+    """Something else that answers on a port."""
+    server = ThreadingHTTPServer(("127.0.0.1", port), Other)
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+
+def test_what_took_the_place_of_the_server_is_said_and_the_session_comes_back(
+    tmp_path: Path,
+) -> None:
+    """Nothing was deleted: the page says what answers at its address now, also where nobody clicks
+    in it, and goes on where its server is back.
+    """
+    first, second = tmp_path / "first", tmp_path / "second"
+    with launched() as chromium:
+        page = context_of(chromium).new_page()
+        with serving(first) as there:
+            port = there.port
+            fit_demo(page, there.address)
+            drawn(page, "compare")
+        with another_program(port):
+            page.wait_for_selector("#gone-again", timeout=30_000)
+            assert "This is no server of the workbench" in page.inner_text("main")
+        with serving(second, port):
+            page.click("#gone-again")
+            page.wait_for_selector("#error:not([hidden])")
+            assert "the server here has no such session" in page.inner_text("#error-text")
+        with serving(first, port):
+            page.click("#gone-again")
+            drawn(page, "ledger")
+            assert page.evaluate("app.state.steps.length") == 1
+        with serving(second, port):
+            page.wait_for_selector("#gone-again", timeout=30_000)
+            said = page.inner_text("main")
+            assert "Another server answers here" in said
+            assert "Nothing of the session is lost" in said
+            assert "deleted" not in said
+            page.click("#gone-fresh")
+            page.wait_for_selector("#demo")
+            shutil.rmtree(second / page.evaluate("app.id"))
+        with serving(second, port):
+            page.wait_for_selector("#gone-home", timeout=30_000)
+            assert "This session is not there any more" in page.inner_text("main")
