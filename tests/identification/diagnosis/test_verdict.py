@@ -35,7 +35,7 @@ def test_a_set_of_more_than_four_names_is_a_remainder_with_its_size() -> None:
     said, _, names = found.reason.partition("N.m remain that cannot be named: any of ")
     assert said
     # a gain of the drive and one of the sensor are one column here: either may lead
-    assert set(names.split(", ")[:2]) == {"motor_constant_error", "torque_sensor_gain"}
+    assert set(names.split(", ")[:2]) == {"motor constant", "gain of the torque sensor"}
     assert "would help" in found.reason
     assert "nothing is missing" not in found.reason
 
@@ -62,6 +62,9 @@ def test_a_claim_in_part_is_not_said_to_be_what_is_missing() -> None:
     assert whole.startswith("Missing: ")
     assert part.startswith("The error on held-out data falls from ")
     assert "Only part of the structure is explained by: " in part
+    names = ("current_offset", "added_spring")
+    either = verdict_of([replace(found.claims[0], effects=names, partial=True)], *args)[1]
+    assert "by: one of (offset of the current, additional spring to ground). " in either
 
 
 @pytest.mark.parametrize(
