@@ -58,7 +58,9 @@ def weak(trial: Trial) -> str:
     """Why a candidate that the blocks or the held-out records do not support is no claim."""
     first, then = trial.cv_drop_percent, trial.held_out_drop_percent
     way, other = ("lowers", "raises") if first >= 0 else ("raises", "lowers")
-    found = f"{way} the {trial.balance} balance by {abs(first):.2g} % on blocks it was not fitted to"
+    found = (
+        f"{way} the {trial.balance} balance by {abs(first):.2g} % on blocks it was not fitted to"
+    )
     if not math.isnan(then):
         same = (then >= 0) == (first >= 0)
         found += f" and {'' if same else f'{other} it '}by {abs(then):.2g} % on held-out records"

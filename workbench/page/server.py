@@ -37,6 +37,7 @@ from starlette.routing import Route
 from identification.crash import internal_error
 from identification.data.plain_text import from_json
 from identification.errors import InputError
+from identification.scratch import hold, release
 from irj_fmu.command_line import system_refusal
 from workbench.page import verbs as app_verbs
 from workbench.page.desk import home, sources, tree
@@ -53,7 +54,7 @@ from workbench.page.jobs.place import folder_of
 from workbench.page.jobs.process import warm_up
 from workbench.page.live import BusyError, Live
 from workbench.page.security import Guard, loopback_hosts
-from workbench.page.session import Store, safe_name
+from workbench.page.session import Session, Store, safe_name
 from workbench.page.uploads import MAX_UPLOAD, TooLargeError, refuse_size, stream_to
 from workbench.page.views import VIEWS, first_plot
 
@@ -100,10 +101,12 @@ class Service:
         Raises
         ------
         KeyError
+        BusyError
+            Another server has it open.
         """
         with self.lock:
             if identifier not in self.lives:
-                self.lives[identifier] = Live(self.store.open(identifier))
+                self.lives[identifier] = self._taken(self.store.open(identifier))
                 app_verbs.resume(self.lives[identifier])
             self.lives.move_to_end(identifier)
             spare = [
@@ -112,8 +115,19 @@ class Service:
                 if k != identifier and not live.job and not live.listeners and live.worker.idle
             ]
             for old in spare[: max(0, len(self.lives) - IN_MEMORY)]:
-                self.lives.pop(old).close()
+                closed = self.lives.pop(old)
+                closed.close()
+                release(closed.session.folder)
             return self.lives[identifier]
+
+    def _taken(self, session: Session) -> Live:
+        """A session of this server's own: a second one would write over what the first has done."""
+        _held(session)
+        try:
+            return Live(session)
+        except BaseException:
+            release(session.folder)
+            raise
 
     def delete(self, identifier: str) -> None:
         """Delete a session.
@@ -122,16 +136,22 @@ class Service:
         ------
         KeyError
         BusyError
-            It works.
+            It works, or another server has it open.
         """
         with self.lock:
             live = self.lives.get(identifier)
             if live is not None and live.job is not None:
                 raise BusyError(f"busy: {live.job.text}; wait for it or cancel it")
+            if live is None:
+                _held(self.store.open(identifier))
             self.lives.pop(identifier, None)
             if live is not None:
                 live.close()
-            home.delete(self.store, identifier)
+            folder = self.store.root / identifier
+            try:
+                home.delete(self.store, identifier)
+            finally:
+                release(folder)
         for listener in tuple(live.listeners) if live is not None else ():
             listener({"gone": True})  # other tabs that have it open
 
@@ -141,6 +161,15 @@ class Service:
             open_now = [listener for live in self.lives.values() for listener in live.listeners]
         for listener in open_now:
             listener(END)
+
+
+def _held(session: Session) -> None:
+    try:
+        hold(session.folder)
+    except InputError:
+        raise BusyError(
+            "another irj app has this session open; go on there, or stop that one first"
+        ) from None
 
 
 @final

@@ -12,77 +12,26 @@ import argparse
 import json
 import os
 import random
-import resource
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final, final
 
 from tests.workbench.chromium import context_of, launched
+from tests.workbench.served import Server
 
 ROOT: Final = Path(__file__).resolve().parents[3]
 LONGEST: Final = 120_000
 """What one wait may take at most [ms]."""
-SERVE: Final = (
-    "import sys; from pathlib import Path; from workbench.page.server import serve; "
-    "serve([], int(sys.argv[1]), False, root=Path(sys.argv[2]))"
-)
 DRAWN: Final = (
     "() => app.state && !app.state.job && !busy() && !app.doing.length && !app.asking && "
     "app.state.steps.every((s) => s.settled) && "
     "document.querySelector('#main').dataset.revision === String(app.state.revision)"
 )
-
-
-@final
-class Server:
-    """The page's server as a process, on one port for all its lives."""
-
-    def __init__(self, root: Path) -> None:
-        self.root = root
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            self.port = int(free.getsockname()[1])
-        self.address = f"http://127.0.0.1:{self.port}/"
-        self.start()
-
-    def start(self) -> None:
-        paths = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
-        self.process = subprocess.Popen(
-            [sys.executable, "-c", SERVE, str(self.port), str(self.root)],
-            env={**os.environ, "PYTHONPATH": paths},
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        end = time.monotonic() + LONGEST / 1000
-        while True:
-            try:
-                socket.create_connection(("127.0.0.1", self.port), 1).close()
-                return
-            except OSError:
-                assert time.monotonic() < end, "the server did not start"
-                time.sleep(0.05)
-
-    def kill(self) -> None:
-        """As the system does where the memory runs out."""
-        self.process.send_signal(signal.SIGKILL)
-        self.process.wait()
-
-    @contextmanager
-    def full_disk(self) -> Iterator[None]:
-        """No file of the server can grow."""
-        limits = resource.prlimit(self.process.pid, resource.RLIMIT_FSIZE)
-        resource.prlimit(self.process.pid, resource.RLIMIT_FSIZE, (0, limits[1]))
-        try:
-            yield
-        finally:
-            resource.prlimit(self.process.pid, resource.RLIMIT_FSIZE, limits)
 
 
 @final

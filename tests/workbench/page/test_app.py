@@ -27,8 +27,9 @@ pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 
 from identification.errors import InputError
-from tests.workbench.served import serving
+from tests.workbench.served import Server, serving
 from workbench.page.demo import demo_files
+from workbench.page.desk import home
 from workbench.page.records import decimated, guessed_role, thinned
 from workbench.page.security import CSP
 from workbench.page.server import _listen, with_files
@@ -840,3 +841,28 @@ def test_an_upload_is_answered_with_state_and_first_plot(client: Client) -> None
     unknown = json.loads(client.upload(where, "c.csv?points=300", b"a,b\n1,2\n3,4\n5,6\n")[1])
     assert unknown["plot"] is None
     assert unknown["state"]["files"][-1]["status"] == "columns"
+
+
+def test_a_session_that_another_server_has_open_is_refused_until_that_one_ends(
+    tmp_path: Path,
+) -> None:
+    """Each would write its own state over the other's: a fit made on one was lost with the next on
+    the other.
+    """
+    first, second = Server(tmp_path), Server(tmp_path)
+    try:
+        there, here = Client(first.port), Client(second.port)
+        where = there.session()
+        assert there.post(f"{where}/demo")[0] == 200
+        refused = "another irj app has this session open; go on there, or stop that one first"
+        assert here.post(f"{where}/demo") == (409, refused)
+        key = {"X-IRJ-Home": home.key_of(Store(tmp_path))}
+        listed = where.replace("session", "home")
+        status, _, said = here.raw("DELETE", listed, headers=key)
+        assert (status, said.decode()) == (409, refused)
+        first.kill()
+        assert len(here.get(where)["files"]) == 2
+        assert here.raw("DELETE", listed, headers=key)[0] == 200
+    finally:
+        first.kill()
+        second.kill()
