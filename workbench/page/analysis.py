@@ -293,6 +293,8 @@ class Analysis:
         """Take an effect out of the model: a first look, as `add`."""
         began = time.perf_counter()
         now = self.current
+        if label == HOLD_DELAY:
+            raise InputError("the delay of the drive is found in each record, and cannot go")
         try:
             model = without(now.model, label)
         except (KeyError, ValueError) as error:

@@ -63,13 +63,13 @@ def request_of(body: Mapping[str, Any]) -> Request:
     """
     numbers = {}
     for key, usual in LIMITS.items():
-        given = body.get(key)
+        given, word = body.get(key), {"position": "range", "torque": "drive torque"}.get(key, key)
         try:
             numbers[key] = usual if given in (None, "") else float(given)
         except (TypeError, ValueError):
-            raise InputError(f"plan: {key} is {given!r}; give a number") from None
+            raise InputError(f"plan: the {word} is {given!r}; give a number") from None
         if not (math.isfinite(numbers[key]) and numbers[key] > 0):
-            raise InputError(f"plan: {key} is {numbers[key]:g}; give a positive number")
+            raise InputError(f"plan: the {word} is {numbers[key]:g}; give a positive number")
     return Request(**numbers, label=str(body.get("label") or ""))
 
 

@@ -190,11 +190,21 @@ Handler = Callable[[Request, Live], Any]
 def _with_session(service: Service, handler: Handler) -> Callable[[Request], Any]:
     """Find the session; turn what went wrong into one sentence."""
 
+    async def found(request: Request) -> Response:
+        live = await run_in_threadpool(service.live, request.path_params["sid"])
+        with live.library():
+            result: Response = await handler(request, live)
+        return result
+
+    return _said(found)
+
+
+def _said(work: Callable[[Request], Any]) -> Callable[[Request], Any]:
+    """Turn what went wrong into one sentence."""
+
     async def answer(request: Request) -> Response:
         try:
-            live = await run_in_threadpool(service.live, request.path_params["sid"])
-            with live.library():
-                result: Response = await handler(request, live)
+            result: Response = await work(request)
             return result
         except KeyError:
             return PlainTextResponse("no such session; start a new one", 404)
@@ -414,20 +424,15 @@ def create_app(
     async def delete(request: Request) -> Response:
         if not home.allowed(service.store, request.headers.get("x-irj-home", "")):
             return PlainTextResponse("open the address that irj app printed", 403)
-        try:
-            await run_in_threadpool(service.delete, request.path_params["sid"])
-        except KeyError:
-            return PlainTextResponse("no such session", 404)
-        except BusyError as error:
-            return PlainTextResponse(str(error), 409)
+        await run_in_threadpool(service.delete, request.path_params["sid"])
         return _json({})
 
     routes = [
         *(Route(path, page) for path in PAGE),
-        Route("/api/config", config),
-        Route("/api/session", new, methods=["POST"]),
-        Route("/api/home", sessions),
-        Route("/api/home/{sid}", delete, methods=["DELETE"]),
+        Route("/api/config", _said(config)),
+        Route("/api/session", _said(new), methods=["POST"]),
+        Route("/api/home", _said(sessions)),
+        Route("/api/home/{sid}", _said(delete), methods=["DELETE"]),
         at("", _state),
         at("/events", _events),
         at("/files/{name}", upload, "PUT"),

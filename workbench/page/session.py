@@ -12,6 +12,7 @@ import json
 import os
 import re
 import secrets
+import shutil
 import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -348,9 +349,13 @@ class Store:
     def create(self) -> Session:
         """A new, empty session with an identifier that cannot be guessed."""
         folder = self.root / secrets.token_hex(16)
-        (folder / "files").mkdir(parents=True, mode=0o700)
-        session = Session(folder)
-        session.save(State(created=time.time()))
+        try:
+            (folder / "files").mkdir(parents=True, mode=0o700)
+            session = Session(folder)
+            session.save(State(created=time.time()))
+        except OSError:  # a full disk: without its state nothing would ever find the folder
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
         return session
 
     def open(self, identifier: str) -> Session:

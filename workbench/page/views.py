@@ -15,6 +15,7 @@ from starlette.responses import FileResponse, Response
 from casadi_models import EFFECTS
 from casadi_models.effect import PLACE_SIDE
 from casadi_models.transmission import MODELS
+from identification.balance.dataset import HOLD_DELAY
 from identification.balance.kinematic import residual_unit
 from identification.data.channels import CHANNELS
 from identification.diagnosis.lines import NORMAL_95
@@ -43,6 +44,7 @@ def _config(live: Any, query: Query) -> dict[str, Any]:
     """What does not change: models, channels, effects, limits, what can be exported."""
     return {
         "max_upload": query["max_upload"],
+        "hold": HOLD_DELAY,
         "sessions": query["sessions"],
         "channels": ["time", *CHANNELS],
         "places": list(PLACE_SIDE),

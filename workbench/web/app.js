@@ -190,7 +190,7 @@ function listen() {
 
 function usable(state) {
   const fitted = state.steps.length > 0, known = Boolean(state.joint_text);
-  return { home: true, load: true, model: true, compare: fitted, diagnose: fitted, ledger: fitted, parameters: fitted, replay: fitted, plan: known, export: known };
+  return { __proto__: null, home: true, load: true, model: true, compare: fitted, diagnose: fitted, ledger: fitted, parameters: fitted, replay: fitted, plan: known, export: known };
 }
 
 function surround() {

@@ -152,7 +152,7 @@ const views = {
   async ledger(state) {
     const [library, stairs] = await Promise.all([get("/view/library"), get(`/view/staircase?width=${Math.round(pictureWidth(560))}`)]), steps = state.steps, last = steps[steps.length - 1], before = steps.length > 1 ? steps[state.improvement ? 0 : steps.length - 2] : null; /* the whole loop is told from its start */
     const now = last.held_out.relative_error_percent, was = before && before.held_out.relative_error_percent;
-    const story = state.improvement, inside = last.effects.filter((e) => e !== "channel_delay@drive");
+    const story = state.improvement, inside = last.effects.filter((e) => e !== app.config.hold) /* found in each record: nobody added it, nobody can take it out */;
     const add = h("select", { id: "add-label", "aria-label": "Effect to add", onchange: (e) => { app.drafts.add = e.target.value; } }, library.filter((e) => !e.inside).map((e) => h("option", { value: e.label, selected: e.label === app.drafts.add }, `${e.title} (${e.place.replace(/_/g, " ")})`)));
     return [
       h("div", { class: "row between head" }, h("div", {}, heading(before ? (now < was ? `The error falls from ${digits(was)} to ${digits(now)} %` : `The error is ${digits(now)} %, from ${digits(was)} %`) : `The error is ${digits(now)} %`, "Each step is fitted to the training records and judged on records the fit did not see.")),

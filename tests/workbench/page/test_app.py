@@ -29,7 +29,7 @@ pytest.importorskip("uvicorn")
 from identification.errors import InputError
 from tests.workbench.served import Server, serving
 from workbench.page.demo import demo_files
-from workbench.page.desk import home
+from workbench.page.desk import home, sources
 from workbench.page.records import decimated, guessed_role, thinned
 from workbench.page.security import CSP
 from workbench.page.server import _listen, with_files
@@ -866,3 +866,41 @@ def test_a_session_that_another_server_has_open_is_refused_until_that_one_ends(
     finally:
         first.kill()
         second.kill()
+
+
+def test_a_full_disk_lets_the_page_open_and_says_what_cannot_be(tmp_path: Path) -> None:
+    """Who cannot see the sessions cannot delete one to make room."""
+    server = Server(tmp_path)
+    try:
+        client = Client(server.port)
+        where = client.session()
+        before = {p.name for p in tmp_path.iterdir()}
+        with server.full_disk():
+            status, said = client.post("/api/session")
+            assert status == 507
+            assert said.startswith("File too large; check the path")
+            assert {p.name for p in tmp_path.iterdir()} == before
+            key = {"X-IRJ-Home": home.key_of(Store(tmp_path))}
+            assert client.raw("GET", "/api/home", headers=key)[0] == 200
+        assert client.get(where)["files"] == []
+    finally:
+        server.kill()
+
+
+def test_nothing_is_written_where_nothing_may_be_followed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The server starts on a disk that takes no more."""
+    sources.allow(tmp_path, [tmp_path / "live.csv"])
+    monkeypatch.setattr(sources, "write_atomic", None)
+    sources.allow(tmp_path, [])
+    assert sources.allowed(tmp_path) == []
+
+
+def test_a_quota_that_is_no_number_is_one_sentence(
+    client: Client, root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("IRJ_QUOTA_GB", "viel")
+    key = {"X-IRJ-Home": home.key_of(Store(root))}
+    status, _, said = client.raw("GET", "/api/home", headers=key)
+    assert (status, said) == (422, b"IRJ_QUOTA_GB is 'viel'; give a number of gigabytes")
