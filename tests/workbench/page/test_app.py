@@ -4,6 +4,7 @@ numbers of the library.
 
 from __future__ import annotations
 
+import gzip
 import http.client
 import io
 import json
@@ -187,6 +188,16 @@ def test_every_answer_carries_the_policy(client: Client, path: str) -> None:
     scripts = next(p for p in CSP.split("; ") if p.startswith("script-src"))
     assert scripts == "script-src 'self'"
     assert "unsafe" not in CSP
+
+
+def test_the_page_is_sent_packed_and_only_once(client: Client) -> None:
+    status, headers, sent = client.raw("GET", "/app.js", headers={"Accept-Encoding": "gzip"})
+    plain = client.raw("GET", "/app.js")[2]
+    assert (status, headers["content-encoding"]) == (200, "gzip")
+    assert gzip.decompress(sent) == plain
+    assert 2 * len(sent) < len(plain)
+    again = client.raw("GET", "/app.js", headers={"If-None-Match": headers["etag"]})
+    assert (again[0], again[2]) == (304, b"")
 
 
 def test_the_page_has_nothing_inline_and_no_network() -> None:
