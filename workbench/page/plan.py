@@ -20,7 +20,7 @@ from workbench.page.analysis import Progress, clean
 from workbench.page.jobs.place import Place
 from workbench.page.records import decimated
 from workbench.page.session import State, write_atomic
-from workbench.show.words import title_of
+from workbench.show.words import run_that_shows, title_of
 
 if TYPE_CHECKING:
     from identification.planning.trajectories import Excitation
@@ -73,8 +73,8 @@ def request_of(body: Mapping[str, Any]) -> Request:
     return Request(**numbers, label=str(body.get("label") or ""))
 
 
-def open_questions(state: State) -> list[dict[str, Any]]:
-    """What the last diagnosis could not answer, and the run that would."""
+def open_questions(state: State, kind: str) -> list[dict[str, Any]]:
+    """What the last diagnosis could not answer, and the run that would on this kind of axis."""
     left = state.left_open
     out = [
         {"kind": "warning", "title": "The records themselves", "text": text, "run": ""}
@@ -108,13 +108,12 @@ def open_questions(state: State) -> list[dict[str, Any]]:
     for n in left.get("not_testable", []):
         if n["effect"] in inside:
             continue
-        effect = EFFECTS.get(n["effect"])
         out.append(
             {
                 "kind": "untested",
                 "title": n["title"],
                 "text": n["why"],
-                "run": effect.excitation if effect else "",
+                "run": run_that_shows(n["effect"], kind),
             }
         )
     return out

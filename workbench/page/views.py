@@ -171,9 +171,10 @@ def _replay(live: Live, query: Query) -> dict[str, Any]:
 
 
 def _plan(live: Live, query: Query) -> dict[str, Any]:
+    joint = live.joint_or_none()
     return {
         "last": app_plan.stored(folder_of(live)),
-        "open": app_plan.open_questions(live.state),
+        "open": app_plan.open_questions(live.state, joint.kind if joint else "rotary"),
         "limits": app_plan.LIMITS,
     }
 

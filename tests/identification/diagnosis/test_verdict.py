@@ -21,6 +21,7 @@ from identification.diagnosis.verdict import verdict_of
 from identification.errors import InputError
 from identification.fitting.engine import load_dataset, prepared_model
 from tests.identification.diagnosis.test_other_payload import FAST, JOINT, record
+from workbench.show.first_page import next_html
 from workbench.show.fragments import pattern_of
 from workbench.show.plots import report_plots
 
@@ -112,6 +113,9 @@ def test_a_linear_axis_has_no_laws_of_an_angle_and_units_of_its_own() -> None:
     found = improve(axis, joint)
     assert found.claims[0].effects[0] == "current_offset"
     assert not any(angular & set(c.effects) for c in found.claims)
+    result = found.as_json()
+    assert angular & {n["effect"] for n in result["not_testable"]}
+    assert EFFECTS["cyclic_torque"].title not in next_html(found, result), "no run shows it"
     units = {p.unit for e in EFFECTS.values() for p in e.parameters}
     assert not [u for u in units if "rad" in linear_unit(u) or "N.m" in linear_unit(u)]
 
