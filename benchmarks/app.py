@@ -290,7 +290,7 @@ CLICKS = (
     ("undo", "#undo", None),
     ("redo", "#redo", None),
     ("undo again", "#undo", None),
-    ("never tried", "#add-by-hand", HIDDEN),
+    ("by hand, after an undo", "#add-by-hand", HIDDEN),
     ("and another", "#add-by-hand", "cubic_viscous@motor"),
     ("costly memory law", "#add-by-hand", "hysteresis"),
     ("remove", "li button[aria-label^='Remove ']:enabled >> nth=-1", None),

@@ -141,10 +141,11 @@ def hold(target: Path) -> None:
         sweep(folder.parent, f".{folder.name[:100]}.")
 
 
-def release() -> None:
-    """Give all results free."""
-    while _HELD:
-        _given_back(_HELD.popitem()[1])
+def release(target: Path | None = None) -> None:
+    """Give a result free, or all of them."""
+    for place in list(_HELD) if target is None else [os.path.realpath(target)]:
+        if (lock := _HELD.pop(place, None)) is not None:
+            _given_back(lock)
 
 
 def sweep(folder: Path, start: str = "") -> None:

@@ -1,7 +1,10 @@
 """What holds for every test."""
 
+import shutil
 import signal
+import tempfile
 from collections.abc import Iterator
+from multiprocessing.util import Finalize
 
 import pytest
 
@@ -48,6 +51,19 @@ def _allowed_effects(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]
         state = tmp_path_factory.mktemp("state")
         patched.setenv("IRJ_ALLOWED_EFFECTS", str(state / "allowed-effects.txt"))
         patched.setenv("IRJ_CRASHES", str(state / "crashes"))
+        yield
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _temporary_files(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """What tests leave behind, as those do that kill a process on purpose, goes with this one."""
+    tmp_path_factory.getbasetemp()  # of pytest's own, which keeps some: outside
+    made = tempfile.mkdtemp(prefix="irj-tests-")
+    # after the folders that multiprocessing has in it, which it removes itself
+    Finalize(None, shutil.rmtree, (made, True), exitpriority=-200)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(tempfile, "tempdir", made)
+        patched.setenv("TMPDIR", made)
         yield
 
 

@@ -56,12 +56,14 @@ def key_of(label: str) -> str:
 
 def weak(trial: Trial) -> str:
     """Why a candidate that the blocks or the held-out records do not support is no claim."""
+    first, then = trial.cv_drop_percent, trial.held_out_drop_percent
+    way, other = ("lowers", "raises") if first >= 0 else ("raises", "lowers")
     found = (
-        f"lowers the {trial.balance} balance by {trial.cv_drop_percent:.2g} % on blocks it "
-        "was not fitted to"
+        f"{way} the {trial.balance} balance by {abs(first):.2g} % on blocks it was not fitted to"
     )
-    if not math.isnan(trial.held_out_drop_percent):
-        found += f" and by {trial.held_out_drop_percent:.2g} % on held-out records"
+    if not math.isnan(then):
+        same = (then >= 0) == (first >= 0)
+        found += f" and {'' if same else f'{other} it '}by {abs(then):.2g} % on held-out records"
     return f"{found} (p = {trial.p_value:.2g}): too little, or not to be told from chance"
 
 

@@ -30,10 +30,8 @@ def _remainder(claim: Claim, unit: str) -> str:
         else ""
     )
     size = f"{number(claim.contribution, 2)} {unit} remain that cannot be named"
-    return (
-        f"In the {claim.balance} balance {size}: any of {', '.join(claim.effects)} explains "
-        f"it alike.{hint}"
-    )
+    titles = ", ".join(EFFECTS[e].title for e in claim.effects)
+    return f"In the {claim.balance} balance {size}: any of {titles} explains it alike.{hint}"
 
 
 def _names(claims: Sequence[Claim]) -> str:
@@ -42,7 +40,7 @@ def _names(claims: Sequence[Claim]) -> str:
         dict.fromkeys(
             (c.like or EFFECTS[c.effects[0]].title)
             if len(c.effects) == 1
-            else "one of (" + ", ".join(c.effects) + ")"
+            else "one of (" + ", ".join(EFFECTS[e].title for e in c.effects) + ")"
             for c in claims
         )
     )

@@ -69,14 +69,17 @@ class Fmu:
         from fmpy import extract, read_model_description
 
         self.path = Path(path).resolve()
-        self._temporary: str | None = None
+        self._gone: weakref.finalize[..., Fmu] | None = None
         if not self.path.exists():
             raise InputError(f"{self.path}: there is no such FMU")
         try:
             if self.path.is_file():
-                self._temporary = tempfile.mkdtemp(prefix="irj-fmu-")
-                extract(str(self.path), self._temporary)
-            self.folder = Path(self._temporary or self.path)
+                folder = tempfile.mkdtemp(prefix="irj-fmu-")
+                self._gone = weakref.finalize(self, shutil.rmtree, folder, True)  # if never closed
+                extract(str(self.path), folder)
+                self.folder = Path(folder)
+            else:
+                self.folder = self.path
             self.description: Any = read_model_description(str(self.folder))
         except Exception as error:
             self.close()
@@ -106,9 +109,8 @@ class Fmu:
 
     def close(self) -> None:
         """Remove the extraction."""
-        if self._temporary is not None:
-            shutil.rmtree(self._temporary, ignore_errors=True)
-            self._temporary = None
+        if self._gone is not None:
+            self._gone()
 
     def __enter__(self) -> Self:
         return self

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -218,3 +220,16 @@ def test_a_fault_acts_once_on_a_table(plant: Fmu) -> None:
         np.testing.assert_array_equal(
             simulate_cs(instance, wiring, step=1e-3, stop=0.01)["plant.tau_m"], np.full(11, 3.0)
         )
+
+
+def test_an_fmu_that_nobody_closes_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = pack(tmp_path).path
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    opened = Fmu(made)
+    folder = opened.folder
+    assert folder.is_dir()
+    del opened
+    gc.collect()
+    assert not folder.exists()

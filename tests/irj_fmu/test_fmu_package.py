@@ -261,7 +261,8 @@ def test_two_fmus_and_the_host_keep_their_own_modules(tmp_path: Path) -> None:
 
     values = []
     folders = [
-        Path(extract(str(pack(tmp_path, scale, f"{scale}.fmu").path))) for scale in (3.0, 5.0)
+        Path(extract(str(pack(tmp_path, scale, f"{scale}.fmu").path), str(tmp_path / str(scale))))
+        for scale in (3.0, 5.0)
     ]
     slaves = [instance(folder) for folder in folders]
     for folder in folders:

@@ -177,9 +177,12 @@ def test_sessions_are_swept_where_no_other_server_works(tmp_path: Path) -> None:
     root = tmp_path / "sessions"
     session = Store(root).create()
     scratch.release()
+    built = session.folder / "exports" / "estimator"
+    (built / ".build-abcd1234").mkdir(parents=True)
     for place in (
         session.folder / ".state.json.0123abcd.part",
         session.files / ".r.csv.0123abcd.part",
+        built / ".build-abcd1234" / "plant.c",
     ):
         place.write_text("x")
     process = other(f"scratch.hold(Path({str(root)!r}))")
@@ -190,6 +193,7 @@ def test_sessions_are_swept_where_no_other_server_works(tmp_path: Path) -> None:
         end(process)
     assert Store(root).open(session.id).load() is not None
     assert list(root.rglob("*.part")) == []
+    assert list(built.iterdir()) == []
 
 
 def test_a_killed_export(tmp_path: Path) -> None:

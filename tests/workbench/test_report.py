@@ -38,7 +38,7 @@ from workbench.show import results as fragments_html
 from workbench.show.beside import read_result
 from workbench.show.chart import ticks
 from workbench.show.fragments import pattern_of
-from workbench.show.pictures import axis_label, place_chart
+from workbench.show.pictures import axis_label, place_chart, staircase_picture
 from workbench.show.plots import (
     Overlay,
     decimated,
@@ -47,7 +47,7 @@ from workbench.show.plots import (
     report_plots,
 )
 from workbench.show.report import json_for_html, render_report, write_report
-from workbench.show.results import floor_percent
+from workbench.show.results import effort_of, floor_percent
 from workbench.show.words import OUTCOME_WORDS, kind_of, title_of
 
 EVIL = "<script>alert('x')</script>&\"</title>"
@@ -619,3 +619,11 @@ def test_notebook_fragments(records: list[Record], improvement: Improvement) -> 
     assert "Coulomb friction" in shown["diagnosis"]
     assert "svg" in shown["comparison"]
     assert "held out &lt;i&gt;" in shown["record"]
+
+
+def test_the_staircase_of_a_linear_axis_is_one_of_forces() -> None:
+    error = {"balances": {"axis": {"unit": "N"}}}
+    assert effort_of(error) == "force"
+    assert effort_of({"balances": {"motor": {"unit": "N.m"}}}) == "torque"
+    said = staircase_picture([5.0, 1.0], 0.5, (), 640, effort_of(error))
+    assert "[% of the measured force, referred to the link]" in said

@@ -692,9 +692,7 @@ def _run(arguments: argparse.Namespace) -> int:
     _register([*arguments.effects, *arguments.own_effects])
     module = importlib.import_module(f"workbench.cli.{module_of(arguments)}")
     work = getattr(module, f"run_{arguments.verb}")
-    if arguments.module == "page":  # the server heeds signals itself
-        return int(work(arguments))
-    with terminable():
+    with terminable():  # a server heeds the signal itself, and then hands it on
         return int(work(arguments))
 
 

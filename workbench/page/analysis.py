@@ -186,7 +186,12 @@ class Analysis:
         return Fitted(kept, dict(solution.model.values))
 
     def known(self, step: StepEntry, fitted: Fitted) -> Solution:
-        """The solution of a step that was fitted in another process, on the same records."""
+        """The solution of a step that was fitted in another process, on the same records; where it
+        is here already that one, on which candidates may have been fitted ahead.
+        """
+        there = self._solved.get(_mark(step))
+        if there is not None and dict(there.values) == dict(fitted.solution["values"]):
+            return there
         model = replace(self.model_of(step.effects, step.virtual_work), values=dict(fitted.own))
         made = self._solved[_mark(step)] = Solution(model, **fitted.solution)
         return made
@@ -262,6 +267,8 @@ class Analysis:
     ) -> None:
         """Fit a candidate ahead of the click, so that `add` has it at once."""
         began, now = time.perf_counter(), self.current
+        if label in self.ahead:  # as after an undo
+            return
         model, start = self._with(label, hint)
         made = solve(model, self.data, start=start, progress=progress)
         entry = self._entry("add", label, self.data, began, made)
@@ -293,6 +300,8 @@ class Analysis:
         """Take an effect out of the model: a first look, as `add`."""
         began = time.perf_counter()
         now = self.current
+        if label == HOLD_DELAY:
+            raise InputError("the delay of the drive is found in each record, and cannot go")
         try:
             model = without(now.model, label)
         except (KeyError, ValueError) as error:

@@ -404,9 +404,10 @@ class Live(Place):
                     if done is not None:
                         self._adopt(done)
                 except OSError as problem:
+                    there = self.session.folder.is_dir()
                     error = (
-                        f"the session folder cannot be written ({problem.strerror}); free "
-                        "some space"
+                        f"the session folder cannot be written ({problem.strerror}); "
+                        f"{'free some space' if there else 'put it back where it was'}"
                     )
             self._end(error)
         self.tell()

@@ -20,7 +20,7 @@ from workbench.page.analysis import Progress, clean
 from workbench.page.jobs.place import Place
 from workbench.page.records import decimated
 from workbench.page.session import State, write_atomic
-from workbench.show.words import title_of
+from workbench.show.words import run_that_shows, title_of
 
 if TYPE_CHECKING:
     from identification.planning.trajectories import Excitation
@@ -63,18 +63,18 @@ def request_of(body: Mapping[str, Any]) -> Request:
     """
     numbers = {}
     for key, usual in LIMITS.items():
-        given = body.get(key)
+        given, word = body.get(key), {"position": "range", "torque": "drive torque"}.get(key, key)
         try:
             numbers[key] = usual if given in (None, "") else float(given)
         except (TypeError, ValueError):
-            raise InputError(f"plan: {key} is {given!r}; give a number") from None
+            raise InputError(f"plan: the {word} is {given!r}; give a number") from None
         if not (math.isfinite(numbers[key]) and numbers[key] > 0):
-            raise InputError(f"plan: {key} is {numbers[key]:g}; give a positive number")
+            raise InputError(f"plan: the {word} is {numbers[key]:g}; give a positive number")
     return Request(**numbers, label=str(body.get("label") or ""))
 
 
-def open_questions(state: State) -> list[dict[str, Any]]:
-    """What the last diagnosis could not answer, and the run that would."""
+def open_questions(state: State, kind: str) -> list[dict[str, Any]]:
+    """What the last diagnosis could not answer, and the run that would on this kind of axis."""
     left = state.left_open
     out = [
         {"kind": "warning", "title": "The records themselves", "text": text, "run": ""}
@@ -108,13 +108,12 @@ def open_questions(state: State) -> list[dict[str, Any]]:
     for n in left.get("not_testable", []):
         if n["effect"] in inside:
             continue
-        effect = EFFECTS.get(n["effect"])
         out.append(
             {
                 "kind": "untested",
                 "title": n["title"],
                 "text": n["why"],
-                "run": effect.excitation if effect else "",
+                "run": run_that_shows(n["effect"], kind),
             }
         )
     return out

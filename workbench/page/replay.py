@@ -82,15 +82,19 @@ def request_of(body: Mapping[str, Any]) -> Request:
         A value that is no number, or unknown.
     """
     numbers = {}
-    for key, least in (("first", 0.0), ("seconds", 1.0), ("at", 0.0)):
+    for key, word, least in (
+        ("first", "the begin", 0.0),
+        ("seconds", "the length", 1.0),
+        ("at", "the begin of the fault", 0.0),
+    ):
         if body.get(key) in (None, ""):
             continue
         try:
             numbers[key] = float(body[key])
         except (TypeError, ValueError):
-            raise InputError(f"replay: {key} is {body[key]!r}; give a number of seconds") from None
+            raise InputError(f"replay: {word} is {body[key]!r}; give a number of seconds") from None
         if not numbers[key] >= least or not math.isfinite(numbers[key]):
-            raise InputError(f"replay: {key} is {numbers[key]:g} s; give at least {least:g} s")
+            raise InputError(f"replay: {word} is {numbers[key]:g} s; give at least {least:g} s")
     made = Request(
         str(body.get("file", "")),
         sensor=str(body.get("sensor", READINGS[3])),

@@ -41,11 +41,16 @@ class Guard:
     app : ASGI application
     hosts : collection of str
         Values of the Host header that are served, with port.
+    end : callable, optional
+        Ends the answers that would go on for ever, before the server stops.
     """
 
-    def __init__(self, app: Application, hosts: frozenset[str]) -> None:
+    def __init__(
+        self, app: Application, hosts: frozenset[str], end: Callable[[], None] = lambda: None
+    ) -> None:
         self.app = app
         self.hosts = hosts
+        self.end = end
 
     def refusal(self, method: str, headers: dict[bytes, bytes]) -> tuple[int, str] | None:
         """Status and sentence where a request is not served."""

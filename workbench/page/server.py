@@ -5,19 +5,26 @@ in a folder.
 from __future__ import annotations
 
 import asyncio
+import gzip
+import hashlib
 import importlib
 import json
 import logging
 import os
 import secrets
+import shutil
 import socket
+import sys
 import threading
+import webbrowser
 from collections import OrderedDict
 from collections.abc import AsyncIterator, Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, Final, final
 
+import uvicorn
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect, Request
@@ -33,6 +40,7 @@ from starlette.routing import Route
 from identification.crash import internal_error
 from identification.data.plain_text import from_json
 from identification.errors import InputError
+from identification.scratch import hold, release
 from irj_fmu.command_line import system_refusal
 from workbench.page import verbs as app_verbs
 from workbench.page.desk import home, sources, tree
@@ -49,7 +57,7 @@ from workbench.page.jobs.place import folder_of
 from workbench.page.jobs.process import warm_up
 from workbench.page.live import BusyError, Live
 from workbench.page.security import Guard, loopback_hosts
-from workbench.page.session import Store, safe_name
+from workbench.page.session import Session, Store, safe_name
 from workbench.page.uploads import MAX_UPLOAD, TooLargeError, refuse_size, stream_to
 from workbench.page.views import VIEWS, first_plot
 
@@ -57,6 +65,8 @@ IN_MEMORY: Final = 4
 """Sessions kept in memory; older ones are read from their folder again."""
 MAX_BODY: Final = 1 << 20
 HEARTBEAT: Final = 15.0
+END: Final[dict[str, Any]] = {"end": True}
+"""News that there will be none."""
 WEB: Final = Path(__file__).parents[1] / "web"
 ASSETS: Final = Path(__file__).parents[1] / "assets"
 PAGE: Final = {
@@ -94,10 +104,12 @@ class Service:
         Raises
         ------
         KeyError
+        BusyError
+            Another server has it open.
         """
         with self.lock:
             if identifier not in self.lives:
-                self.lives[identifier] = Live(self.store.open(identifier))
+                self.lives[identifier] = self._taken(self.store.open(identifier))
                 app_verbs.resume(self.lives[identifier])
             self.lives.move_to_end(identifier)
             spare = [
@@ -106,8 +118,19 @@ class Service:
                 if k != identifier and not live.job and not live.listeners and live.worker.idle
             ]
             for old in spare[: max(0, len(self.lives) - IN_MEMORY)]:
-                self.lives.pop(old).close()
+                closed = self.lives.pop(old)
+                closed.close()
+                release(closed.session.folder)
             return self.lives[identifier]
+
+    def _taken(self, session: Session) -> Live:
+        """A session of this server's own: a second one would write over what the first has done."""
+        _held(session)
+        try:
+            return Live(session)
+        except BaseException:
+            release(session.folder)
+            raise
 
     def delete(self, identifier: str) -> None:
         """Delete a session.
@@ -116,18 +139,51 @@ class Service:
         ------
         KeyError
         BusyError
-            It works.
+            It works, or another server has it open.
         """
         with self.lock:
             live = self.lives.get(identifier)
             if live is not None and live.job is not None:
                 raise BusyError(f"busy: {live.job.text}; wait for it or cancel it")
+            if live is None:
+                _held(self.store.open(identifier))
             self.lives.pop(identifier, None)
             if live is not None:
                 live.close()
-            home.delete(self.store, identifier)
+            folder = self.store.root / identifier
+            try:
+                home.delete(self.store, identifier)
+            finally:
+                release(folder)
         for listener in tuple(live.listeners) if live is not None else ():
             listener({"gone": True})  # other tabs that have it open
+
+    def end(self) -> None:
+        """End every stream of news: it has no end of its own, and the server would wait for it."""
+        with self.lock:
+            open_now = [listener for live in self.lives.values() for listener in live.listeners]
+        for listener in open_now:
+            listener(END)
+
+
+def _held(session: Session) -> None:
+    try:
+        hold(session.folder)
+    except InputError:
+        raise BusyError(
+            "another irj app has this session open; go on there, or stop that one first"
+        ) from None
+
+
+@final
+class PageServer(uvicorn.Server):  # type: ignore[misc]
+    """The server of the page, which stops at once also where pages are open."""
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """End what would go on for ever, then stop."""
+        if isinstance(self.config.app, Guard):
+            self.config.app.end()
+        await super().shutdown(sockets)
 
 
 _LOG = logging.getLogger(__name__)
@@ -137,11 +193,21 @@ Handler = Callable[[Request, Live], Any]
 def _with_session(service: Service, handler: Handler) -> Callable[[Request], Any]:
     """Find the session; turn what went wrong into one sentence."""
 
+    async def found(request: Request) -> Response:
+        live = await run_in_threadpool(service.live, request.path_params["sid"])
+        with live.library():
+            result: Response = await handler(request, live)
+        return result
+
+    return _said(found)
+
+
+def _said(work: Callable[[Request], Any]) -> Callable[[Request], Any]:
+    """Turn what went wrong into one sentence."""
+
     async def answer(request: Request) -> Response:
         try:
-            live = await run_in_threadpool(service.live, request.path_params["sid"])
-            with live.library():
-                result: Response = await handler(request, live)
+            result: Response = await work(request)
             return result
         except KeyError:
             return PlainTextResponse("no such session; start a new one", 404)
@@ -215,8 +281,10 @@ async def _events(request: Request, live: Live) -> Response:
                 except TimeoutError:
                     yield ": still here\n\n"
                     continue
-                while not queue.empty():
+                while snapshot is not END and not queue.empty():
                     snapshot = queue.get_nowait()
+                if snapshot is END:
+                    return
                 yield f"data: {json.dumps(snapshot)}\n\n"
         finally:
             live.listeners.discard(listener)
@@ -306,6 +374,16 @@ async def _view(request: Request, live: Live) -> Response:
     return made if isinstance(made, Response) else _json(made)
 
 
+@cache
+def _packed(path: Path, changed: int) -> tuple[bytes, str]:
+    """A file of the page as it is sent, and what a browser knows it by, which then asks for it no
+    more: a third of it, and nothing at the second time, matter where the page comes from a
+    computer at the rig through a tunnel.
+    """
+    content = path.read_bytes()
+    return gzip.compress(content, mtime=0), f'"{hashlib.sha256(content).hexdigest()[:16]}"'
+
+
 def create_app(
     root: Path,
     *,
@@ -331,16 +409,21 @@ def create_app(
 
     async def page(request: Request) -> Response:
         path, kind = PAGE[request.url.path]
-        return FileResponse(path, media_type=kind, headers={"cache-control": "no-cache"})
+        content, mark = _packed(path, path.stat().st_mtime_ns)
+        headers = {"cache-control": "no-cache", "etag": mark, "vary": "accept-encoding"}
+        if request.headers.get("if-none-match") == mark:
+            return Response(status_code=304, headers=headers)
+        if "gzip" not in request.headers.get("accept-encoding", ""):
+            return FileResponse(path, media_type=kind, headers=headers)
+        return Response(content, media_type=kind, headers={**headers, "content-encoding": "gzip"})
 
     async def new(request: Request) -> Response:
         made = await run_in_threadpool(service.store.create)
         return _json({"id": made.id})
 
     async def config(request: Request) -> Response:
-        return _json(
-            await run_in_threadpool(VIEWS["config"], None, {"max_upload": service.max_upload})
-        )
+        known = {"max_upload": service.max_upload, "sessions": home.mark_of(service.store)}
+        return _json(await run_in_threadpool(VIEWS["config"], None, known))
 
     def at(path: str, handler: Handler, *methods: str) -> Route:
         return Route(
@@ -360,20 +443,15 @@ def create_app(
     async def delete(request: Request) -> Response:
         if not home.allowed(service.store, request.headers.get("x-irj-home", "")):
             return PlainTextResponse("open the address that irj app printed", 403)
-        try:
-            await run_in_threadpool(service.delete, request.path_params["sid"])
-        except KeyError:
-            return PlainTextResponse("no such session", 404)
-        except BusyError as error:
-            return PlainTextResponse(str(error), 409)
+        await run_in_threadpool(service.delete, request.path_params["sid"])
         return _json({})
 
     routes = [
         *(Route(path, page) for path in PAGE),
-        Route("/api/config", config),
-        Route("/api/session", new, methods=["POST"]),
-        Route("/api/home", sessions),
-        Route("/api/home/{sid}", delete, methods=["DELETE"]),
+        Route("/api/config", _said(config)),
+        Route("/api/session", _said(new), methods=["POST"]),
+        Route("/api/home", _said(sessions)),
+        Route("/api/home/{sid}", _said(delete), methods=["DELETE"]),
         at("", _state),
         at("/events", _events),
         at("/files/{name}", upload, "PUT"),
@@ -388,7 +466,7 @@ def create_app(
         at("/stop", _stop, "POST"),
         at("/view/{view}", _view),
     ]
-    return Guard(Starlette(routes=routes), hosts or loopback_hosts(port))
+    return Guard(Starlette(routes=routes), hosts or loopback_hosts(port), service.end)
 
 
 def default_root() -> Path:
@@ -412,8 +490,6 @@ def with_files(root: Path, files: Sequence[str | Path]) -> str:
     InputError
         A file that does not exist.
     """
-    import shutil
-
     store = Store(root)
     for file in files:
         if not Path(file).is_file():
@@ -463,11 +539,6 @@ def serve(
     InputError
         The port is taken; a file cannot be used.
     """
-    import sys
-    import webbrowser
-
-    import uvicorn
-
     folder = root or default_root()
     with _listen(port) as listening:
         port = int(listening.getsockname()[1])
@@ -491,7 +562,7 @@ def serve(
         threading.Thread(target=_warm_up, daemon=True, name="warm up").start()
         if open_browser:
             threading.Timer(0.5, webbrowser.open, (address,)).start()
-        uvicorn.Server(config).run(sockets=[listening])
+        PageServer(config).run(sockets=[listening])
 
 
 def _warm_up() -> None:
@@ -518,4 +589,4 @@ def _listen(port: int) -> socket.socket:
     raise InputError(f"port {port} of 127.0.0.1 is taken; give another with --port")
 
 
-__all__ = ["create_app", "default_root", "serve"]
+__all__ = ["PageServer", "create_app", "default_root", "serve"]

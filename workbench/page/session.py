@@ -12,6 +12,7 @@ import json
 import os
 import re
 import secrets
+import shutil
 import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -342,16 +343,19 @@ class Store:
         root.mkdir(parents=True, exist_ok=True, mode=0o700)
         with contextlib.suppress(InputError):  # another server is at work with these sessions
             hold(root)
-            for folder in root.iterdir():
-                sweep(folder)
-                sweep(folder / "files")
+            for folder, _, _ in os.walk(root):  # also where an export was being built
+                sweep(Path(folder))
 
     def create(self) -> Session:
         """A new, empty session with an identifier that cannot be guessed."""
         folder = self.root / secrets.token_hex(16)
-        (folder / "files").mkdir(parents=True, mode=0o700)
-        session = Session(folder)
-        session.save(State(created=time.time()))
+        try:
+            (folder / "files").mkdir(parents=True, mode=0o700)
+            session = Session(folder)
+            session.save(State(created=time.time()))
+        except OSError:  # a full disk: without its state nothing would ever find the folder
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
         return session
 
     def open(self, identifier: str) -> Session:

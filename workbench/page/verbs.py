@@ -118,8 +118,12 @@ def addable(live: Live) -> list[dict[str, Any]]:
     from casadi_models import EFFECTS
 
     inside = set(live.state.steps[-1].effects) if live.state.steps else set()
+    joint = live.joint_or_none()
+    linear = joint is not None and joint.kind == "linear"
     rows = []
     for e in EFFECTS.values():
+        if e.angular and linear:
+            continue
         for place in e.acts_on:
             label = f"{e.key}@{place}" if len(e.acts_on) > 1 else e.key
             rows.append(

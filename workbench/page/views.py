@@ -15,6 +15,7 @@ from starlette.responses import FileResponse, Response
 from casadi_models import EFFECTS
 from casadi_models.effect import PLACE_SIDE
 from casadi_models.transmission import MODELS
+from identification.balance.dataset import HOLD_DELAY
 from identification.balance.kinematic import residual_unit
 from identification.data.channels import CHANNELS
 from identification.diagnosis.lines import NORMAL_95
@@ -43,6 +44,8 @@ def _config(live: Any, query: Query) -> dict[str, Any]:
     """What does not change: models, channels, effects, limits, what can be exported."""
     return {
         "max_upload": query["max_upload"],
+        "hold": HOLD_DELAY,
+        "sessions": query["sessions"],
         "channels": ["time", *CHANNELS],
         "places": list(PLACE_SIDE),
         "models": {name: list(own) for name, own in MODELS.items()},
@@ -168,9 +171,10 @@ def _replay(live: Live, query: Query) -> dict[str, Any]:
 
 
 def _plan(live: Live, query: Query) -> dict[str, Any]:
+    joint = live.joint_or_none()
     return {
         "last": app_plan.stored(folder_of(live)),
-        "open": app_plan.open_questions(live.state),
+        "open": app_plan.open_questions(live.state, joint.kind if joint else "rotary"),
         "limits": app_plan.LIMITS,
     }
 

@@ -20,7 +20,7 @@ from workbench.show.chart import Chart, Curve, Label, svg
 from workbench.show.pictures import AT_THE_LINK, AT_THE_MOTOR, place_picture
 from workbench.show.plots import ReportPlots, decimated, explained
 from workbench.show.results import staircase_html, step_names, table, text
-from workbench.show.words import OUTCOME_WORDS, kind_of, plain_name, title_of
+from workbench.show.words import OUTCOME_WORDS, kind_of, plain_name, run_that_shows, title_of
 
 MOST_LAWS: Final = 4
 MOST_RUNS: Final = 3
@@ -177,10 +177,10 @@ def next_html(improvement: Improvement, result: Mapping[str, Any]) -> str:
     seen: dict[str, list[str]] = {}
     for n in result["not_testable"]:
         key = n["effect"]
-        if key in EFFECTS:
-            seen.setdefault(EFFECTS[key].excitation, []).append(EFFECTS[key].title)
+        if motion := run_that_shows(key, improvement.joint.kind):
+            seen.setdefault(motion, []).append(EFFECTS[key].title)
     for motion, titles in sorted(seen.items(), key=lambda p: -len(p[1])):
-        if len(runs) < MOST_RUNS - crowded and motion:
+        if len(runs) < MOST_RUNS - crowded:
             runs.append(f"<strong>{text(motion)}</strong>: would show {text(', '.join(titles))}")
     items = "".join(f"<li>{r}.</li>" for r in runs)
     return (

@@ -9,7 +9,7 @@ from identification.errors import InputError
 from workbench.show.chart import AFTER, BEFORE, HEIGHT, INK, WIDTH, sheet
 from workbench.show.pictures import place_picture, staircase_picture
 from workbench.show.plots import report_plots
-from workbench.show.results import floor_percent, stairs_of
+from workbench.show.results import effort_of, floor_percent, stairs_of
 
 _HEAD = 26
 
@@ -30,7 +30,8 @@ def improvement_picture(improvement: Improvement) -> str:
     steps = stairs_of(result)
     values = [float(s["held_out"]["relative_error_percent"]) for s in steps]
     labels = [f"+ {s['added']}" if s["added"] else "start" for s in steps]
-    stairs = staircase_picture(values, floor_percent(steps[-1]["held_out"]), labels)
+    last = steps[-1]["held_out"]
+    stairs = staircase_picture(values, floor_percent(last), labels, effort=effort_of(last))
     before, after = plots.places[0]
     telling = place_picture(before, after)
     legend = _word(WIDTH + 54, BEFORE, "◆ start model") + (

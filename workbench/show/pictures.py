@@ -148,6 +148,7 @@ def staircase_picture(
     floor: float | None,
     labels: Sequence[str] = (),
     width: int = WIDTH,
+    effort: str = "torque",
 ) -> str:
     """Held-out error after each step as a falling staircase, with the noise floor on it.
 
@@ -160,6 +161,8 @@ def staircase_picture(
     labels : sequence of str
         Under each tread, in up to `LABEL_LINES` lines; "start", "1", "2" ... by default.
     width : int
+    effort : str
+        What was measured: "force" of a linear axis.
     """
     names = list(labels) or ["start", *(str(i) for i in range(1, len(values)))]
     top = max([*values, floor or 0.0, 1e-9]) * 1.18
@@ -176,7 +179,7 @@ def staircase_picture(
     body = axes(
         frame,
         "step",
-        "error on held-out records [% of the measured torque, referred to the link]"
+        f"error on held-out records [% of the measured {effort}, referred to the link]"
         if width > WIDTH
         else "held-out error [%], referred to the link",
         x_ticks=False,

@@ -124,6 +124,11 @@ def floor_percent(error: Mapping[str, Any]) -> float | None:
     return float(error["relative_error_percent"]) * floor / size if size > 0 and floor > 0 else None
 
 
+def effort_of(error: Mapping[str, Any]) -> str:
+    """What the balances are sums of: torques, or forces of a linear axis."""
+    return "force" if any(b.get("unit") == "N" for b in error["balances"].values()) else "torque"
+
+
 def stairs_of(result: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     """The steps of the falling error: those of names, then that of learned curves, if any."""
     curved = result.get("with_curves")
@@ -178,7 +183,8 @@ def staircase_html(result: Mapping[str, Any]) -> str:
         return ""
     values = [float(s["held_out"]["relative_error_percent"]) for s in steps]
     names = [f"+ {n}" if i else n for i, n in enumerate(step_names(result))]
-    return staircase_picture(values, floor_percent(steps[-1]["held_out"]), names)
+    last = steps[-1]["held_out"]
+    return staircase_picture(values, floor_percent(last), names, effort=effort_of(last))
 
 
 def claims_html(result: Mapping[str, Any]) -> str:

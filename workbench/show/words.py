@@ -101,6 +101,12 @@ def kind_of(result: Mapping[str, Any]) -> str:
     return "found" if named else "complete"
 
 
+def run_that_shows(key: str, kind: str) -> str:
+    """The motion that an effect needs; empty where no motion of this kind of axis shows it."""
+    effect = EFFECTS.get(key)
+    return "" if effect is None or (effect.angular and kind == "linear") else effect.excitation
+
+
 def headline(result: Mapping[str, Any]) -> str:
     """The verdict of an `improve --json` result in a few words."""
     if result["verdict"] == "unexplained" and any("curve" not in c for c in result["claims"]):

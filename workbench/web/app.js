@@ -20,7 +20,7 @@ async function call(method, path, body, more) {
   const options = { method, headers: { "X-IRJ": "1", ...more } };
   if (body) { options.body = JSON.stringify(body); options.headers["Content-Type"] = "application/json"; }
   let answer;
-  try { answer = await fetch(path, options); } catch (error) { throw new Error("the server does not answer; is it still running? What was done is kept in the session folder."); }
+  try { answer = await fetch(path, options); } catch (error) { throw Object.assign(new Error("the server does not answer; is it still running? What was done is kept in the session folder."), { away: true }); }
   if (!answer.ok) throw Object.assign(new Error((await answer.text()) || `error ${answer.status}`), { gone: answer.status === 404 && app.id && path.startsWith(base()) && !path.includes("/view/") ? app.id : null });
   const type = answer.headers.get("content-type") || "";
   return type.includes("json") ? answer.json() : answer.text();
@@ -44,24 +44,50 @@ const get = (path) => call("GET", base() + path);
 const post = (path, body) => call("POST", base() + path, body || {});
 
 function fail(error) {
-  if (error.gone && error.gone === app.id) { gone(); return; }
+  if (error.gone && error.gone === app.id) { missing().catch(fail); return; }
   $("error-text").textContent = error.message || String(error);
   $("error").hidden = false;
 }
+/* The server does not know the session on the screen: the one it was opened on has lost it, or another one has taken its place at this address. */
+async function missing() {
+  const id = app.id;
+  let here = null;
+  try { here = (await call("GET", "/api/config")).sessions; } catch (error) { /* another program, or none by now */ }
+  if (app.id !== id) return;
+  const again = button("Look again", () => act(() => comeBack(id)), { kind: "primary", work: false, id: "gone-again" });
+  if (here === app.config.sessions) gone("This session is not there any more", "It was deleted in another tab or on the page of sessions, or its folder was taken away. The other sessions are as they were.");
+  else if (here) gone("Another server answers here", "The server of this session was stopped, and another one, with sessions of its own, took its place at this address. Nothing of the session is lost: records and fits are in the folder of the first server. Start that one again, and open the address it prints; or look again, where it is back here.", again);
+  else gone("This is no server of the workbench", "The server of this session was stopped, and what answers at its address now is another program. Nothing of the session is lost: start the server again, and open the address it prints; or look again, where it is back here.", again);
+}
+/* The news were refused: the session is looked for before anything is said of it. */
+async function cutOff() {
+  const id = app.id;
+  try {
+    const state = await get("");
+    if (state.id === id) { adopt(state); setTimeout(() => { if (app.id === id) listen(); }, 3000); return; }
+  } catch (error) { if (error.away) throw error; }
+  if (app.id === id) await missing();
+}
+/* To a session whose server was another one for a while. */
+async function comeBack(id) {
+  await enter(id);
+  app.view = null;
+  open(app.state.steps.length ? "ledger" : "load");
+}
 /* The session on the screen is no more: said once, with the ways on. */
-function gone() {
+function gone(title, why, first) {
   if (app.source) app.source.close();
   app.id = app.state = app.source = app.then = app.waiting = app.upload = null;
   app.token = (app.token || 0) + 1;
-  if (remembered("irj-session")) remembered("irj-session", "");
+  if (!first && remembered("irj-session")) remembered("irj-session", "");
   clearError(); surround();
   app.plots.forEach((p) => p.destroy());
   app.plots = [];
   const main = $("main");
   main.dataset.view = "gone"; main.dataset.revision = "";
-  main.replaceChildren(...heading("This session was deleted", "It was deleted in another tab or on the page of sessions; its records and fits went with it. The other sessions are as they were."),
-    h("div", { class: "row" }, button("See the sessions", () => open("home"), { kind: "primary", work: false, id: "gone-home" }), button("Start a new session", () => act(fresh), { work: false, id: "gone-fresh" })));
-  document.title = "Session deleted – Joint workbench";
+  main.replaceChildren(...heading(title, why),
+    h("div", { class: "row" }, first, button("See the sessions", () => open("home"), { kind: first ? "" : "primary", work: false, id: "gone-home" }), button("Start a new session", () => act(fresh), { work: false, id: "gone-fresh" })));
+  document.title = `${title} – Joint workbench`;
   main.focus({ preventScroll: true });
 }
 function clearError() { $("error").hidden = true; }
@@ -149,9 +175,10 @@ function listen() {
   app.source = null;
   if (document.hidden) return;
   app.source = new EventSource(base() + "/events");
+  app.source.onerror = (event) => { if (event.target.readyState === EventSource.CLOSED && event.target === app.source) cutOff().catch(fail); }; /* refused, not only out of reach */
   app.source.onmessage = (event) => {
     const news = JSON.parse(event.data);
-    if (news.gone) { gone(); return; }
+    if (news.gone) { gone("This session was deleted", "It was deleted in another tab or on the page of sessions; its records and fits went with it. The other sessions are as they were."); return; }
     if (!app.state || older(news)) return;
     const ended = app.state.job && !news.job;
     app.state.job = news.job; app.state.said = news.said; app.state.teller = news.teller;
@@ -163,7 +190,7 @@ function listen() {
 
 function usable(state) {
   const fitted = state.steps.length > 0, known = Boolean(state.joint_text);
-  return { home: true, load: true, model: true, compare: fitted, diagnose: fitted, ledger: fitted, parameters: fitted, replay: fitted, plan: known, export: known };
+  return { __proto__: null, home: true, load: true, model: true, compare: fitted, diagnose: fitted, ledger: fitted, parameters: fitted, replay: fitted, plan: known, export: known };
 }
 
 function surround() {
@@ -292,9 +319,9 @@ function remembered(key, value) {
 async function enter(id) {
   const was = { id: app.id, state: app.state, drafts: app.drafts };
   app.id = id; app.state = null; app.drafts = {};
-  try { app.state = await get(""); } catch (error) { /* the session that was open stays */
+  try { [app.state, app.config] = await Promise.all([get(""), call("GET", "/api/config")]); } catch (error) { /* the session that was open stays */
     Object.assign(app, was);
-    throw error.gone ? new Error("there is no such session any more; see Sessions for those that are kept") : error;
+    throw error.gone ? new Error("the server here has no such session; see Sessions for those that it keeps") : error;
   }
   remembered("irj-session", id);
   listen();
@@ -343,7 +370,6 @@ async function boot() {
 }
 
 async function start() {
-  app.config = await call("GET", "/api/config");
   const asked = new URLSearchParams(location.hash.slice(1));
   const known = asked.get("session") || remembered("irj-session");
   if (asked.get("home")) remembered("irj-home", asked.get("home"));

@@ -150,7 +150,7 @@ views.plan = async (state) => {
   const go = () => run("plan", { position: $("plan-position").value, speed: $("plan-speed").value, torque: $("plan-torque").value, label: $("plan-label").value });
   const now = last.limits || limits;
   const groups = [["set", "Cannot be told apart"], ["untested", "Cannot be shown by these records"], ["warning", "Weak spots of the records"]].map(([k, t]) => [t, asked.filter((o) => o.kind === k)]).filter(([, rows]) => rows.length);
-  const item = (o) => h("li", {}, h("strong", {}, o.title), `: ${askedFor(o.text, "under What is known on the Model page")}.`, o.run ? h("span", { class: "soft" }, ` What would show it: ${o.run}.`) : null);
+  const item = (o) => h("li", {}, h("strong", {}, o.title), `: ${plainly(askedFor(o.text, "under What is known on the Model page"))}.`, o.run ? h("span", { class: "soft" }, ` What would show it: ${o.run}.`) : null);
   const form = h("form", { class: "card", onsubmit: (e) => e.preventDefault(), oninput: (e) => { draft[e.target.id] = e.target.value; } }, h("h2", {}, "What the joint may do"), h("div", { class: "fields" },
     field("plan-position", "Range ± [°]", draft["plan-position"] ?? now.position, "of the link"), field("plan-speed", "Speed [°/s]", draft["plan-speed"] ?? now.speed, "of the link"), field("plan-torque", "Drive torque [N·m]", draft["plan-torque"] ?? now.torque, "on the link side"),
     choice("plan-label", "Must also show", [["", "only what is in the model"], ...labels.map((l) => [l, effectTitle(l)])], draft["plan-label"] ?? last.label ?? "", "an effect to look for", null, "long")), button("Plan a motion", go, { kind: "primary", id: "plan" }));

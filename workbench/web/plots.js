@@ -106,6 +106,11 @@ class SeriesPlot {
     context.restore();
   }
   redraw() { this.plots.forEach((p) => p.redraw(false)); }
+  /* What an axis shows, on which side, in which unit; where series of several names share it, the legend has their names. */
+  axisLabel(data, group, u) {
+    const here = group.filter((s) => s.unit === u), what = this.panels ? (group.includes(data.series[0]) ? effort() : here[0].name) : here.length === 1 ? here[0].name.replace(/_/g, " ") : "";
+    return [[what, this.side || here[0].side].filter(Boolean).join(" "), unit(u) && `[${unit(u)}]`].filter(Boolean).join(" ");
+  }
   draw(data) {
     const { of, axis } = this.colours();
     this.data = data; this.save.hidden = false;
@@ -113,7 +118,6 @@ class SeriesPlot {
     const groups = this.panels ? this.panels.map((names) => data.series.filter((s) => names.includes(s.name))).filter((g) => g.length) : [data.series];
     this.plots = groups.map((group, panel) => {
       const units = [...new Set(group.map((s) => s.unit))], last = panel === groups.length - 1;
-      const label = (u) => { const first = group.find((s) => s.unit === u), side = this.side || first.side, what = this.panels ? (group.includes(data.series[0]) ? effort() : first.name) : ""; return [[what, side].filter(Boolean).join(" "), unit(u) && `[${unit(u)}]`].filter(Boolean).join(" "); };
       const beside = group.some(noisy) ? Object.fromEntries(units.map((u) => [u, { range: (p, low, high) => uPlot.rangeNum(...reach(group, low ?? 0, high ?? 0), 0.1, true) }])) : {};
       const made = new uPlot({
         width: this.host.clientWidth || 800, height: this.height(), legend: { live: true }, cursor: { drag: { x: true, y: false, setScale: false }, sync: this.panels ? { key: "series", setSeries: false } : undefined },
@@ -122,7 +126,7 @@ class SeriesPlot {
           label: s.name.replace(/_/g, " ") + (unit(s.unit) ? ` [${unit(s.unit)}]` : ""), stroke: of(s, k), width: data.time.length < 600 ? 1.5 : 1, scale: s.unit, auto: !noisy(s),
           dash: s.name === "model" ? [6, 3] : noisy(s) ? [2, 3] : k % 2 && s.name !== "residual" ? [8, 3] : undefined, value: (u, v) => digits(v, 4), points: { show: data.full && data.time.length < 200 && !this.local && !noisy(s) },
         }; })],
-        axes: [{ ...axis, label: last ? "time [s]" : undefined, labelSize: 20, size: last ? 40 : 24 }, ...units.map((u, k) => ({ ...axis, scale: u, side: k ? 1 : 3, label: label(u), labelSize: 18, size: 58, grid: k ? { show: false } : axis.grid }))],
+        axes: [{ ...axis, label: last ? "time [s]" : undefined, labelSize: 20, size: last ? 40 : 24 }, ...units.map((u, k) => ({ ...axis, scale: u, side: k ? 1 : 3, label: this.axisLabel(data, group, u), labelSize: 18, size: 58, grid: k ? { show: false } : axis.grid }))],
         hooks: { setSelect: [(u) => this.picked(u)], drawClear: [(u) => this.shade(u)], setCursor: [(u) => { if (this.onCursor) this.onCursor(u.cursor.left < 0 ? null : u.cursor.idx); }] },
       }, [data.time, ...group.map((s) => s.values)], this.main);
       made.over.addEventListener("dblclick", () => this.show(null).catch(fail));
@@ -149,7 +153,8 @@ class SeriesPlot {
       for (const t of ticks(y0, y1, 4)) out.append(svg("path", { d: `M${L} ${Y(t)}H${W - R}`, stroke: "#cccccc", fill: "none" }), word(L - 5, Y(t) + 4, digits(t), "end"));
       for (const t of ticks(x0, x1, 8)) out.append(svg("path", { d: `M${X(t)} ${top}V${base}`, stroke: "#cccccc", fill: "none" }), word(X(t), base + 15, digits(t, 5)));
       group.forEach((s, n) => { let pen = "M"; const d = seen.map((i) => { if (s.values[i] == null) { pen = "M"; return ""; } const at = `${pen}${X(time[i]).toFixed(1)} ${Y(Math.min(y1, Math.max(y0, s.values[i]))).toFixed(1)}`; pen = "L"; return at; }).join(""); out.append(svg("path", { d, stroke: of(s, this.data.series.indexOf(s)), fill: "none", ...(noisy(s) ? { "stroke-dasharray": "2 3" } : {}) }), svg("text", { x: L + 150 * n, y: top - 6, "font-size": 11, fill: of(s, this.data.series.indexOf(s)) }, `${s.name.replace(/_/g, " ")}${unit(s.unit) ? ` [${unit(s.unit)}]` : ""}`)); });
-      out.append(word((L + W - R) / 2, base + 29, "time [s]"));
+      const across = (top + base) / 2, side = [...new Set(group.map((s) => s.unit))].map((u) => this.axisLabel(this.data, group, u)).join(", ");
+      out.append(word((L + W - R) / 2, base + 29, "time [s]"), svg("text", { x: 12, y: across, transform: `rotate(-90 12 ${across})`, "text-anchor": "middle", "font-size": 11, fill: ink }, side));
     });
     return new XMLSerializer().serializeToString(out);
   }

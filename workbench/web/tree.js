@@ -1,6 +1,6 @@
 "use strict";
 /* The tree of fits: every fit that was made, by the input it was made from; opened, named, noted, held against another. */
-const stepTitle = (s) => s.remark.name || (s.action === "start" ? "Start model" : `${s.action === "remove" ? "−" : "+"} ${s.title || s.label}`);
+const stepTitle = (s) => s.remark.name || (s.action === "start" ? "Start model" : `${s.action === "remove" ? "−" : "+"} ${(s.names || []).length > 1 ? s.names.map(effectTitle).join(" or ") : s.title || s.label}`); /* a set stays a set */
 
 /* Branches of one input as one tree: paths that begin alike share their beginning. */
 function treeOf(branches) {
@@ -57,11 +57,11 @@ function besideCard(state) {
     get(`/view/fits?a=${asked[0]}&b=${asked[1]}`).then((found) => { if (asked[0] === value(first) && asked[1] === value(second)) held.replaceChildren(fitsTable(found)); }).catch(fail);
   }
   show();
-  return h("section", { class: "card" }, h("h2", {}, "Two steps beside one another"), h("p", { class: "soft small" }, "The values that differ; – where a step has no such parameter."), h("div", { class: "row" }, first, second), held);
+  return h("section", { class: "card" }, h("h2", {}, "Two steps beside one another"), h("p", { class: "soft small" }, "The values that differ in four digits; – where a step has no such parameter."), h("div", { class: "row" }, first, second), held);
 }
 
 function fitsTable(found) {
-  const [a, b] = found.steps, changed = found.values.filter((v) => v.first !== v.second), cell = (v, of) => h("td", { class: "num", "data-label": stepTitle(of) }, v == null ? "–" : digits(v, 4));
+  const [a, b] = found.steps, shown = (v) => (v == null ? "–" : digits(v, 4)), changed = found.values.filter((v) => shown(v.first) !== shown(v.second)), cell = (v, of) => h("td", { class: "num", "data-label": stepTitle(of) }, shown(v));
   return h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Two fits compared" }, h("table", { class: "stack" }, h("caption", {}, "Two fits side by side"), h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Parameter"), h("th", { scope: "col", class: "num" }, stepTitle(a)), h("th", { scope: "col", class: "num" }, stepTitle(b)))),
     h("tbody", {}, h("tr", { class: "now" }, h("th", { scope: "row" }, "Held-out error [%]"), cell(a.error, a), cell(b.error, b)), h("tr", {}, h("th", { scope: "row" }, "Only in it"), found.only.map((o, k) => h("td", { class: "num wraps", "data-label": stepTitle(found.steps[k]) }, o.length ? o.map(effectTitle).join(", ") : "–"))),
       changed.map((v) => h("tr", {}, h("th", { scope: "row" }, words(v.name)), cell(v.first, a), cell(v.second, b))))));

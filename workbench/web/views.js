@@ -5,8 +5,9 @@ const button = (text, onclick, { kind = "", id, off, work = true, label, key } =
 const sentence = (text, end = ".") => text.charAt(0).toUpperCase() + text.slice(1) + (text.endsWith(end) ? "" : end);
 const plural = (n, one, many) => `${n.toLocaleString("en")} ${n === 1 ? one : many || one + "s"}`;
 const effectTitle = (label) => { const [key, at] = label.split("#")[0].split("@"), e = app.config.effects.find((x) => x.key === key); return (e ? e.title : key.replace(/_/g, " ")) + (at ? ` (${at.replace(/_/g, " ")})` : ""); };
-/* Channels as a person says them: their names stand in what the check says, column names in quotes stay. */
-const plainly = (text) => text.replace(/(?<!['"\w])[a-z]+(?:_[a-z]+)+(?!['"\w])/g, (name) => (app.config.channels.includes(name) ? name.replace(/_/g, " ") : name));
+/* Channels and keys of the joint file as a person says them: their names stand in what the check says, column names in quotes stay. What a file has under [columns], the page has behind a button. */
+const JOINT_KEYS = ["gear_ratio", "motor_constant", "torque_per_current", "torque_per_voltage"];
+const plainly = (text) => text.replace(/(?<!['"\w])[a-z]+(?:_[a-z]+)+(?!['"\w])/g, (name) => (app.config.channels.includes(name) || JOINT_KEYS.includes(name) ? name.replace(/_/g, " ") : name)).replace(/in \[columns\]/g, "under Columns on the Load page");
 /* What the diagnosis asks for, where the page has fields for it. */
 const askedFor = (why, where) => why.replace(/give (.*) in \[known\]/, (_, what) => `give ${what.replace(/_/g, " ")} ${where}`);
 const SEVERITY = { refuse: ["bad", "refused"], repair: ["warn", "repaired"], warn: ["warn", "check"], ok: ["good", "fine"] };
@@ -90,7 +91,7 @@ const views = {
     const draft = app.drafts.compare || (app.drafts.compare = {});
     let balance = balances.includes(draft.balance) ? draft.balance : found.worst.balance;
     forgetCharts();
-    const plot = new SeriesPlot(host, (range, points) => get(`/view/balance?balance=${balance}&points=${points}${range ? `&from=${range[0]}&to=${range[1]}` : ""}`), { title: "Measured torque, model and residual", panels: [["measured", "model"], ["residual", "noise, upper", "noise, lower"]], side: "at the link" });
+    const plot = new SeriesPlot(host, (range, points) => get(`/view/balance?balance=${balance}&points=${points}${range ? `&from=${range[0]}&to=${range[1]}` : ""}`), { title: `Measured ${effort()}, model and residual`, panels: [["measured", "model"], ["residual", "noise, upper", "noise, lower"]], side: "at the link" });
     plot.marks = () => linked.marks; linked.plot = plot;
     plot.onCursor = (index) => plot.data && cursorInCharts(plot.data)(index);
     app.plots.push(plot);
@@ -138,12 +139,12 @@ const views = {
         claim ? h("p", {}, claim.effects.length > 1 ? `These records cannot tell the ${claim.effects.length} apart.${claim.separate_by ? ` ${claim.separate_by} would.` : ""}` : `The ${claim.balance} balance says so: with it the held-out residual there falls by ${digits(claim.held_out_drop_percent, 2)} %${claim.kernel_s ? ` in rows of ${digits(claim.kernel_s, 2)} s, whose noise is lower` : ""}.`) : null,
         claim && claim.confidence ? h("p", { class: "small soft", id: "confidence" }, `By the likelihoods of whole fits: ${Object.entries(claim.confidence).map(([k, p]) => `${p > 0.99 ? "over 99" : p < 0.01 ? "under 1" : Math.round(100 * p)} % ${effectTitle(k)}`).join(", ")}.`) : null,
         h("p", { id: "reason" }, sentence(d.reason || ""))]),
-      d.warnings.map((w) => h("p", { class: "note small" }, sentence(w))),
+      d.warnings.map((w) => h("p", { class: "note small" }, sentence(plainly(w)))),
       clear.length ? h("div", { class: "two ranking" }, h("div", { class: "card" }, h("h2", {}, "Ranked effects"), h("p", { class: "soft small" }, "The bar is the fall of the residual on held-out records if the effect is added to the model as it stands. Falls do not add up: add one, then diagnose again."), h("ol", { class: "ranked" }, clear.map(row))), panel.node) : null,
       curves.length ? h("div", { class: "two ranking" }, h("div", { class: "card", id: "learned" }, h("h2", {}, "Curves without a name"), curveList(curves, panel)), clear.length ? null : panel.node) : null,
       faint.length ? h("details", { class: "card" }, h("summary", {}, h("h2", {}, `Not to be told from chance, or too small (${faint.length})`)), h("ol", { class: "ranked" }, faint.map((r, k) => row(r, k + clear.length)))) : null,
       d.refused && d.refused.length ? h("details", { class: "card", id: "refused" }, h("summary", {}, `Why not another? (${d.refused.length})`), h("ul", {}, d.refused.map((r) => h("li", {}, h("strong", {}, effectTitle(r.effect)), `: ${r.why.startsWith("with ") ? "" : "it "}${r.why.replace(/(?<=[ e])-(?=\d)/g, "−")}.`)))) : null,
-      d.not_testable.length ? h("details", { class: "card" }, h("summary", {}, `Not testable with these records (${d.not_testable.length})`), h("ul", {}, d.not_testable.map((n) => h("li", {}, h("strong", {}, n.title), `: ${n.asks && n.asks.length ? askedFor(n.why, "here") : n.why}.`, n.asks && n.asks.length ? knownAsk(n, known) : null)))) : null,
+      d.not_testable.length ? h("details", { class: "card" }, h("summary", {}, `Not testable with these records (${d.not_testable.length})`), h("ul", {}, d.not_testable.map((n) => h("li", {}, h("strong", {}, n.title), `: ${plainly(n.asks && n.asks.length ? askedFor(n.why, "here") : n.why)}.`, n.asks && n.asks.length ? knownAsk(n, known) : null)))) : null,
       glossaryCard(),
     ];
   },
@@ -151,7 +152,7 @@ const views = {
   async ledger(state) {
     const [library, stairs] = await Promise.all([get("/view/library"), get(`/view/staircase?width=${Math.round(pictureWidth(560))}`)]), steps = state.steps, last = steps[steps.length - 1], before = steps.length > 1 ? steps[state.improvement ? 0 : steps.length - 2] : null; /* the whole loop is told from its start */
     const now = last.held_out.relative_error_percent, was = before && before.held_out.relative_error_percent;
-    const story = state.improvement, inside = last.effects.filter((e) => e !== "channel_delay@drive");
+    const story = state.improvement, inside = last.effects.filter((e) => e !== app.config.hold) /* found in each record: nobody added it, nobody can take it out */;
     const add = h("select", { id: "add-label", "aria-label": "Effect to add", onchange: (e) => { app.drafts.add = e.target.value; } }, library.filter((e) => !e.inside).map((e) => h("option", { value: e.label, selected: e.label === app.drafts.add }, `${e.title} (${e.place.replace(/_/g, " ")})`)));
     return [
       h("div", { class: "row between head" }, h("div", {}, heading(before ? (now < was ? `The error falls from ${digits(was)} to ${digits(now)} %` : `The error is ${digits(now)} %, from ${digits(was)} %`) : `The error is ${digits(now)} %`, "Each step is fitted to the training records and judged on records the fit did not see.")),

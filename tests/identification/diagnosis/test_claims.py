@@ -27,6 +27,7 @@ from identification.diagnosis.claims import (
     shortened,
     simplest,
 )
+from identification.diagnosis.outcome import weak
 from identification.diagnosis.trials import Base, Trial, make_base
 from identification.fitting.engine import load_dataset, prepared_model, solve
 from tests.smooth_laws import LAWS, record
@@ -86,6 +87,18 @@ def trial(
 
 def ranking(*trials: Trial, significant: tuple[str, ...] = ()) -> Ranking:
     return Ranking(trials, frozenset(significant), (), trials)
+
+
+def test_an_error_that_rises_is_not_said_to_be_lowered_by_less_than_nothing(base: Base) -> None:
+    def said(drop: float, held: float) -> str:
+        return weak(trial(base, "coulomb", drop=drop, held=held, p=0.5))
+
+    tail = " on held-out records (p = 0.5): too little, or not to be told from chance"
+    on = " the motor balance by 0.2 % on blocks it was not fitted to and "
+    assert said(0.2, 0.1) == f"lowers{on}by 0.1 %{tail}"
+    assert said(0.2, -0.1) == f"lowers{on}raises it by 0.1 %{tail}"
+    assert said(-0.2, 0.1) == f"raises{on}lowers it by 0.1 %{tail}"
+    assert said(-0.2, -0.1) == f"raises{on}by 0.1 %{tail}"
 
 
 # --- how many discoveries -------------------------------------------------------------------------

@@ -21,6 +21,7 @@ from identification.diagnosis.verdict import verdict_of
 from identification.errors import InputError
 from identification.fitting.engine import load_dataset, prepared_model
 from tests.identification.diagnosis.test_other_payload import FAST, JOINT, record
+from workbench.show.first_page import next_html
 from workbench.show.fragments import pattern_of
 from workbench.show.plots import report_plots
 
@@ -35,7 +36,7 @@ def test_a_set_of_more_than_four_names_is_a_remainder_with_its_size() -> None:
     said, _, names = found.reason.partition("N.m remain that cannot be named: any of ")
     assert said
     # a gain of the drive and one of the sensor are one column here: either may lead
-    assert set(names.split(", ")[:2]) == {"motor_constant_error", "torque_sensor_gain"}
+    assert set(names.split(", ")[:2]) == {"motor constant", "gain of the torque sensor"}
     assert "would help" in found.reason
     assert "nothing is missing" not in found.reason
 
@@ -62,6 +63,9 @@ def test_a_claim_in_part_is_not_said_to_be_what_is_missing() -> None:
     assert whole.startswith("Missing: ")
     assert part.startswith("The error on held-out data falls from ")
     assert "Only part of the structure is explained by: " in part
+    names = ("current_offset", "added_spring")
+    either = verdict_of([replace(found.claims[0], effects=names, partial=True)], *args)[1]
+    assert "by: one of (offset of the current, additional spring to ground). " in either
 
 
 @pytest.mark.parametrize(
@@ -109,6 +113,9 @@ def test_a_linear_axis_has_no_laws_of_an_angle_and_units_of_its_own() -> None:
     found = improve(axis, joint)
     assert found.claims[0].effects[0] == "current_offset"
     assert not any(angular & set(c.effects) for c in found.claims)
+    result = found.as_json()
+    assert angular & {n["effect"] for n in result["not_testable"]}
+    assert EFFECTS["cyclic_torque"].title not in next_html(found, result), "no run shows it"
     units = {p.unit for e in EFFECTS.values() for p in e.parameters}
     assert not [u for u in units if "rad" in linear_unit(u) or "N.m" in linear_unit(u)]
 

@@ -11,6 +11,8 @@ import pytest
 
 from casadi_models import JointModel
 from casadi_models.thesis import model_2b
+from identification.data.joint_file import parse_joint
+from identification.data.typical import true_values
 from identification.errors import InputError
 from identification.planning.trajectories import (
     WORKSPACE,
@@ -33,6 +35,17 @@ def model() -> JointModel:
 @pytest.fixture(scope="module")
 def full(model: JointModel) -> Experiment:
     return Experiment(model)
+
+
+def test_no_part_of_gravity_chooses_the_motion() -> None:
+    """The cosine part of a link that hangs is zero: every motion leaves it at the same thousands of
+    percent, and the first of them would be the best.
+    """
+    table = {"gear_ratio": -160.0, "motor_constant": 0.05, "model": "hd3"}
+    joint = parse_joint({"joint": {**table, "effects": ["viscous", "coulomb", "gravity"]}}, "j")
+    model = joint.model().with_values({**true_values(joint.model(), joint), "gravity_cosine": 1e-3})
+    assert [n for n in Experiment(model).parameters if "gravity" in n] == []
+    assert "gravity_cosine" in model.linear_parameters
 
 
 def consistent(motion: Motion, jump: float) -> None:

@@ -12,77 +12,26 @@ import argparse
 import json
 import os
 import random
-import resource
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final, final
 
 from tests.workbench.chromium import context_of, launched
+from tests.workbench.served import Server
 
 ROOT: Final = Path(__file__).resolve().parents[3]
 LONGEST: Final = 120_000
 """What one wait may take at most [ms]."""
-SERVE: Final = (
-    "import sys; from pathlib import Path; from workbench.page.server import serve; "
-    "serve([], int(sys.argv[1]), False, root=Path(sys.argv[2]))"
-)
 DRAWN: Final = (
     "() => app.state && !app.state.job && !busy() && !app.doing.length && !app.asking && "
     "app.state.steps.every((s) => s.settled) && "
     "document.querySelector('#main').dataset.revision === String(app.state.revision)"
 )
-
-
-@final
-class Server:
-    """The page's server as a process, on one port for all its lives."""
-
-    def __init__(self, root: Path) -> None:
-        self.root = root
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            self.port = int(free.getsockname()[1])
-        self.address = f"http://127.0.0.1:{self.port}/"
-        self.start()
-
-    def start(self) -> None:
-        paths = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
-        self.process = subprocess.Popen(
-            [sys.executable, "-c", SERVE, str(self.port), str(self.root)],
-            env={**os.environ, "PYTHONPATH": paths},
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        end = time.monotonic() + LONGEST / 1000
-        while True:
-            try:
-                socket.create_connection(("127.0.0.1", self.port), 1).close()
-                return
-            except OSError:
-                assert time.monotonic() < end, "the server did not start"
-                time.sleep(0.05)
-
-    def kill(self) -> None:
-        """As the system does where the memory runs out."""
-        self.process.send_signal(signal.SIGKILL)
-        self.process.wait()
-
-    @contextmanager
-    def full_disk(self) -> Iterator[None]:
-        """No file of the server can grow."""
-        limits = resource.prlimit(self.process.pid, resource.RLIMIT_FSIZE)
-        resource.prlimit(self.process.pid, resource.RLIMIT_FSIZE, (0, limits[1]))
-        try:
-            yield
-        finally:
-            resource.prlimit(self.process.pid, resource.RLIMIT_FSIZE, limits)
 
 
 @final
@@ -412,6 +361,64 @@ def tab_closed_at_work(desk: Desk) -> None:
     desk.again()
 
 
+def wrong_files_at_once(desk: Desk) -> None:
+    """What a clumsy hand drops: another program's file, an empty one, half of one, a huge name."""
+    desk.go("load")
+    half = (ROOT / "workbench" / "demo" / "held_out.npz").read_bytes()[:9000]
+    files = {"manual.mat": b"%PDF-1.4" * 99, "empty.csv": b"", "half.npz": half}
+    files |= {"n" * 300 + ".mat": b"x", "größe 测量.toml": b"[joint"}
+    given = [{"name": n, "mimeType": "a/b", "buffer": b} for n, b in files.items()]
+    desk.page.set_input_files("#files", given)
+    assert desk.error()
+    desk.idle()
+    assert len(desk.page.evaluate("app.state.files")) == 2
+
+
+def renamed_at_work(desk: Desk) -> None:
+    """The new name waits for the end of the work."""
+    desk.go("model")
+    desk.page.evaluate("() => { run('diagnose', {}); }")
+    desk.page.fill("#name", 'während 😀 "x" \\ \u202e')
+    desk.page.click("#save")
+    desk.idle()
+    assert "während" in desk.page.evaluate("app.state.joint_text")
+    assert desk.page.evaluate("app.state.steps.length")
+
+
+def undone_over_a_branch_by_keys(desk: Desk) -> None:
+    desk.go("load")
+    before = desk.page.evaluate("app.state.steps.map((s) => s.id)")
+    desk.page.select_option("select[aria-label='Role of held_out.npz']", "train")
+    desk.page.wait_for_function("() => !app.state.steps.length", timeout=LONGEST)
+    desk.idle()
+    desk.page.click("h1")
+    desk.page.keyboard.press("Control+z")
+    desk.page.wait_for_function("() => app.state.steps.length", timeout=LONGEST)
+    desk.idle()
+    assert desk.page.evaluate("app.state.steps.map((s) => s.id)") == before
+
+
+def folder_moved_away_and_back(desk: Desk) -> None:
+    folder = desk.server.root / desk.id
+    away = folder.with_name("elsewhere")
+    folder.rename(away)
+    desk.add("cubic_viscous@motor")
+    assert "put it back where it was" in desk.error()
+    away.rename(folder)
+    desk.again()
+
+
+def begun_and_left_for_another_session(desk: Desk) -> None:
+    """The work goes on, and Back leads to it."""
+    desk.go("ledger")
+    desk.page.evaluate("() => { run('diagnose', {}, 'diagnose'); }")
+    desk.page.click("#fresh")
+    desk.page.wait_for_function("() => app.state && !app.state.files.length", timeout=LONGEST)
+    desk.page.go_back()
+    desk.page.wait_for_function("id => app.state && app.id === id", arg=desk.id, timeout=LONGEST)
+    desk.page.wait_for_function("() => app.state.diagnosis", timeout=LONGEST)
+
+
 MOVES: Final[tuple[Callable[[Desk], None], ...]] = (
     refused_upload,
     refused_joint,
@@ -441,6 +448,11 @@ MOVES: Final[tuple[Callable[[Desk], None], ...]] = (
     worker_killed,
     colours_and_width,
     tab_closed_at_work,
+    wrong_files_at_once,
+    renamed_at_work,
+    undone_over_a_branch_by_keys,
+    folder_moved_away_and_back,
+    begun_and_left_for_another_session,
 )
 
 

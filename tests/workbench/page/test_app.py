@@ -4,6 +4,7 @@ numbers of the library.
 
 from __future__ import annotations
 
+import gzip
 import http.client
 import io
 import json
@@ -27,8 +28,9 @@ pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 
 from identification.errors import InputError
-from tests.workbench.served import serving
+from tests.workbench.served import Server, serving
 from workbench.page.demo import demo_files
+from workbench.page.desk import home, sources
 from workbench.page.records import decimated, guessed_role, thinned
 from workbench.page.security import CSP
 from workbench.page.server import _listen, with_files
@@ -186,6 +188,16 @@ def test_every_answer_carries_the_policy(client: Client, path: str) -> None:
     scripts = next(p for p in CSP.split("; ") if p.startswith("script-src"))
     assert scripts == "script-src 'self'"
     assert "unsafe" not in CSP
+
+
+def test_the_page_is_sent_packed_and_only_once(client: Client) -> None:
+    status, headers, sent = client.raw("GET", "/app.js", headers={"Accept-Encoding": "gzip"})
+    plain = client.raw("GET", "/app.js")[2]
+    assert (status, headers["content-encoding"]) == (200, "gzip")
+    assert gzip.decompress(sent) == plain
+    assert 2 * len(sent) < len(plain)
+    again = client.raw("GET", "/app.js", headers={"If-None-Match": headers["etag"]})
+    assert (again[0], again[2]) == (304, b"")
 
 
 def test_the_page_has_nothing_inline_and_no_network() -> None:
@@ -840,3 +852,66 @@ def test_an_upload_is_answered_with_state_and_first_plot(client: Client) -> None
     unknown = json.loads(client.upload(where, "c.csv?points=300", b"a,b\n1,2\n3,4\n5,6\n")[1])
     assert unknown["plot"] is None
     assert unknown["state"]["files"][-1]["status"] == "columns"
+
+
+def test_a_session_that_another_server_has_open_is_refused_until_that_one_ends(
+    tmp_path: Path,
+) -> None:
+    """Each would write its own state over the other's: a fit made on one was lost with the next on
+    the other.
+    """
+    first, second = Server(tmp_path), Server(tmp_path)
+    try:
+        there, here = Client(first.port), Client(second.port)
+        where = there.session()
+        assert there.post(f"{where}/demo")[0] == 200
+        refused = "another irj app has this session open; go on there, or stop that one first"
+        assert here.post(f"{where}/demo") == (409, refused)
+        key = {"X-IRJ-Home": home.key_of(Store(tmp_path))}
+        listed = where.replace("session", "home")
+        status, _, said = here.raw("DELETE", listed, headers=key)
+        assert (status, said.decode()) == (409, refused)
+        first.kill()
+        assert len(here.get(where)["files"]) == 2
+        assert here.raw("DELETE", listed, headers=key)[0] == 200
+    finally:
+        first.kill()
+        second.kill()
+
+
+def test_a_full_disk_lets_the_page_open_and_says_what_cannot_be(tmp_path: Path) -> None:
+    """Who cannot see the sessions cannot delete one to make room."""
+    server = Server(tmp_path)
+    try:
+        client = Client(server.port)
+        where = client.session()
+        before = {p.name for p in tmp_path.iterdir()}
+        with server.full_disk():
+            status, said = client.post("/api/session")
+            assert status == 507
+            assert said.startswith("File too large; check the path")
+            assert {p.name for p in tmp_path.iterdir()} == before
+            key = {"X-IRJ-Home": home.key_of(Store(tmp_path))}
+            assert client.raw("GET", "/api/home", headers=key)[0] == 200
+        assert client.get(where)["files"] == []
+    finally:
+        server.kill()
+
+
+def test_nothing_is_written_where_nothing_may_be_followed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The server starts on a disk that takes no more."""
+    sources.allow(tmp_path, [tmp_path / "live.csv"])
+    monkeypatch.setattr(sources, "write_atomic", None)
+    sources.allow(tmp_path, [])
+    assert sources.allowed(tmp_path) == []
+
+
+def test_a_quota_that_is_no_number_is_one_sentence(
+    client: Client, root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("IRJ_QUOTA_GB", "viel")
+    key = {"X-IRJ-Home": home.key_of(Store(root))}
+    status, _, said = client.raw("GET", "/api/home", headers=key)
+    assert (status, said) == (422, b"IRJ_QUOTA_GB is 'viel'; give a number of gigabytes")

@@ -4,8 +4,13 @@ pasted into an open tab, fields with nothing, too much or words in them.
 
 from __future__ import annotations
 
+import shutil
+import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -175,6 +180,56 @@ def test_tabs_that_nobody_looks_at_hold_no_connection_and_miss_nothing(opened: O
     drawn(page, "compare")
 
 
+def test_names_of_one_long_word_make_no_view_wider_than_the_screen(opened: Opened) -> None:
+    page = opened.page
+    name = "n" * 200
+    for body in (
+        {"of": page.evaluate("app.state.steps[0].id"), "name": name, "note": "x" * 5000},
+        {"session": name},
+    ):
+        page.evaluate("b => post('/tree', b).then(refresh)", body)
+    try:
+        for width in (1280, 375):
+            page.set_viewport_size({"width": width, "height": 860})
+            for view in ("load", "ledger", "parameters"):
+                page.click(f"#nav-{view}")
+                drawn(page, view)
+                page.wait_for_function("() => !document.querySelector('.tree:empty')")
+                assert page.evaluate("document.documentElement.scrollWidth") <= width, view
+    finally:
+        page.set_viewport_size({"width": 1280, "height": 860})
+        step = page.evaluate("app.state.steps[0].id")
+        page.evaluate("s => post('/tree', { of: s, name: '', note: '' }).then(refresh)", step)
+        page.evaluate("() => post('/tree', { session: '' }).then(refresh)")
+
+
+def test_what_nobody_added_has_no_button_that_takes_it_out(opened: Opened) -> None:
+    """The delay of the drive's hold, which is found in each record: its button ended in an internal
+    error.
+    """
+    page = opened.page
+    page.click("#nav-ledger")
+    drawn(page, "ledger")
+    hold = page.evaluate("app.config.hold")
+    assert hold in page.evaluate("app.state.steps.at(-1).effects")
+    card = page.locator("h2:text-is('In the model now') >> xpath=..")
+    assert "viscous friction (motor)" in card.inner_text()
+    assert "delay of a channel" not in card.inner_text()
+    page.evaluate("l => { run('remove', { label: l }); }", hold)
+    page.wait_for_selector("#error:not([hidden])")
+    assert "is found in each record, and cannot go" in page.inner_text("#error-text")
+    page.click("#error-close")
+
+
+def test_an_address_with_a_view_that_is_none_shows_the_records(opened: Opened) -> None:
+    page = opened.page
+    for view in ("__proto__", "constructor", "nonsense"):
+        page.evaluate("v => { location.hash = `#session=${app.id}&view=${v}`; }", view)
+        drawn(page, "load")
+        page.click("#nav-compare")
+        drawn(page, "compare")
+
+
 def test_a_second_click_on_a_step_keeps_what_was_opened_in_it(opened: Opened) -> None:
     page = opened.page
     page.click("#nav-compare")
@@ -215,3 +270,68 @@ def test_a_session_deleted_in_another_tab_says_so_and_leads_home(opened: Opened)
     assert page.is_visible("nav.steps")
     assert opened.problems == []
     other.close()
+
+
+class Other(BaseHTTPRequestHandler):
+    """Answers everything in the same way, as pages of some programs do."""
+
+    def do_GET(self) -> None:
+        self.send_response(200)
+        self.send_header("content-type", "text/html")
+        self.end_headers()
+        self.wfile.write(b"<p>something else</p>")
+
+    def log_message(self, *said: Any) -> None:
+        pass
+
+
+@contextmanager
+def another_program(port: int) -> Iterator[None]:
+    """Something else that answers on a port."""
+    server = ThreadingHTTPServer(("127.0.0.1", port), Other)
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+
+def test_what_took_the_place_of_the_server_is_said_and_the_session_comes_back(
+    opened: Opened, tmp_path: Path
+) -> None:
+    """Nothing was deleted: the page says what answers at its address now, also where nobody clicks
+    in it, and goes on where its server is back.
+    """
+    first, second = tmp_path / "first", tmp_path / "second"
+    page = context_of(opened.context.browser).new_page()
+    with serving(first) as there:
+        port = there.port
+        fit_demo(page, there.address)
+        drawn(page, "compare")
+    with another_program(port):
+        page.wait_for_selector("#gone-again", timeout=30_000)
+        assert "This is no server of the workbench" in page.inner_text("main")
+    with serving(second, port):
+        page.click("#gone-again")
+        page.wait_for_selector("#error:not([hidden])")
+        assert "the server here has no such session" in page.inner_text("#error-text")
+    with serving(first, port):
+        page.click("#gone-again")
+        drawn(page, "ledger")
+        assert page.evaluate("app.state.steps.length") == 1
+    with serving(second, port):
+        page.wait_for_selector("#gone-again", timeout=30_000)
+        said = page.inner_text("main")
+        assert "Another server answers here" in said
+        assert "Nothing of the session is lost" in said
+        assert "deleted" not in said
+        page.click("#gone-fresh")
+        page.wait_for_selector("#demo")
+        shutil.rmtree(second / page.evaluate("app.id"))
+    with serving(second, port):
+        page.wait_for_selector("#gone-home", timeout=30_000)
+        assert "This session is not there any more" in page.inner_text("main")
+    page.context.close()

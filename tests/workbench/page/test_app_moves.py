@@ -42,6 +42,8 @@ HARDEST = (
     moves.refused_joint,  # says what is refused, and not how the work before ended
     moves.worker_killed,
     moves.killed_at_a_diagnosis,
+    moves.undone_over_a_branch_by_keys,
+    moves.folder_moved_away_and_back,
 )
 """What an engineer's machine does by itself, in every run of the tests."""
 

@@ -137,6 +137,28 @@ def test_what_was_fitted_ahead_is_there_at_once(live: Live) -> None:
     live.analysis().restore(live.state.steps[-1])
 
 
+def test_what_was_fitted_ahead_is_still_there_after_an_undo(
+    live: Live, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the process of the session, too, which is told the start model anew: the same candidates
+    were fitted again, and the next click waited for them.
+    """
+    live.worker.give_up()
+    wait(live)
+    analysis, start = live.analysis(), live.state.steps[0]
+    analysis.restore(start)
+    base = analysis.current
+    analysis.prepare("cubic_viscous@motor")
+    kept = analysis.ahead["cubic_viscous@motor"]
+    analysis.add("cubic_viscous@motor")
+    assert analysis.known(start, analysis.fitted(base)) is base
+    analysis.restore(start)
+    monkeypatch.setattr("workbench.page.analysis.solve", None)
+    analysis.prepare("cubic_viscous@motor")
+    assert analysis.ahead["cubic_viscous@motor"] is not None
+    assert analysis.ahead["cubic_viscous@motor"][1] is kept[1]
+
+
 # --- spare work and cancelling --------------------------------------------------------------------
 
 

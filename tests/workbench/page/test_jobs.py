@@ -13,6 +13,7 @@ import subprocess
 import sys
 import threading
 import time
+import urllib.request
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -367,7 +368,13 @@ def test_a_server_that_ends_in_the_middle_of_a_build_ends_the_build(tmp_path: Pa
 
 
 @posix
-def test_an_interrupted_app_ends_in_one_line_and_leaves_nothing(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("number", "answer"),
+    [(signal.SIGINT, (130, "irj: interrupted\n")), (signal.SIGTERM, (143, ""))],
+)
+def test_a_stopped_app_says_at_most_one_line_and_leaves_nothing(
+    tmp_path: Path, number: int, answer: tuple[int, str]
+) -> None:
     temporary = tmp_path / "temporary"
     temporary.mkdir()
     paths = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
@@ -383,12 +390,20 @@ def test_an_interrupted_app_ends_in_one_line_and_leaves_nothing(tmp_path: Path) 
             "IRJ_SESSIONS": str(tmp_path / "sessions"),
         },
     )
+    assert app.stdout is not None
+    address = app.stdout.readline().partition("#")[0]
     until(lambda: list(temporary.glob("irj-run-*/pymp-*")))  # other processes can be started
     time.sleep(0.5)
-    app.send_signal(signal.SIGINT)
+    new = urllib.request.Request(f"{address}api/session", method="POST", headers={"X-IRJ": "1"})
+    with urllib.request.urlopen(new) as answered:
+        session = json.load(answered)["id"]
+    news = urllib.request.urlopen(f"{address}api/session/{session}/events")  # an open page
+    assert news.readline().startswith(b"data: ")
+    app.send_signal(number)
     _, said = app.communicate(timeout=60)
-    assert (app.returncode, said) == (130, "irj: interrupted\n")
-    assert not list(temporary.glob("irj-run-*"))
+    news.close()
+    assert (app.returncode, said) == answer
+    assert list(temporary.iterdir()) == []
 
 
 def test_a_law_of_one_session_is_in_no_other_and_two_work_at_once(

@@ -39,7 +39,7 @@ from workbench.show.pictures import (
     torque_label,
 )
 from workbench.show.plots import decimated, explained, step_place
-from workbench.show.results import floor_percent
+from workbench.show.results import effort_of, floor_percent
 from workbench.show.words import CURVES, GLOSSARY, OUTCOME_WORDS, title_of
 
 Query = Mapping[str, Any]
@@ -110,7 +110,9 @@ def _staircase(live: Live, query: Query) -> dict[str, Any]:
         "names": names,
         "floor": floor,
         "stairs": {
-            "svg": staircase_picture(values, floor, names, _width(query)),
+            "svg": staircase_picture(
+                values, floor, names, _width(query), effort_of(steps[-1].held_out)
+            ),
             "csv": staircase_csv(values, floor, names),
             "frame": None,
         },
@@ -216,7 +218,9 @@ def _as_such(live: Live, query: Query) -> list[dict[str, Any]]:
         )
         out.append({"title": title, "balance": measured.balance, "chart": chart.as_json()})
 
-    floors = {b: float(e["floor"]) for b, e in live.state.steps[-1].held_out["balances"].items()}
+    error = live.state.steps[-1].held_out
+    effort = effort_of(error)
+    floors = {b: float(e["floor"]) for b, e in error["balances"].items()}
     for balance, left in residual.items():
         friction = _own(analysis, lambda t: t.effect.family == "friction", balance)
         if friction is not None and float(np.sqrt(np.nanmean(friction**2))) <= floors[balance]:
@@ -224,7 +228,7 @@ def _as_such(live: Live, query: Query) -> list[dict[str, Any]]:
         if friction is not None and "motor_velocity" in rows.axes:
             whole = place(rows, left + friction, balance, "motor_velocity")
             law = place(rows, friction, balance, "motor_velocity", like=whole)
-            put("Friction curve", "friction torque", whole, law)
+            put("Friction curve", f"friction {effort}", whole, law)
         if balance == "transmission" and "torsion" in rows.axes:
             torque = references(analysis.data, analysis.data.held_out)[balance]
             torque = torque + 0.0 * left  # rows that take no part stay out
@@ -236,7 +240,7 @@ def _as_such(live: Live, query: Query) -> list[dict[str, Any]]:
             own = periodic if periodic is not None else np.zeros(len(left))
             whole = place(rows, left + own, balance, "motor_angle")
             law = place(rows, own + 0.0 * left, balance, "motor_angle", like=whole)
-            put("Map over the motor angle", "torque", whole, law)
+            put("Map over the motor angle", effort, whole, law)
     return out
 
 

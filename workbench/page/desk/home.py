@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import hmac
 import json
 import os
@@ -43,6 +44,13 @@ def key_of(store: Store) -> str:
 def allowed(store: Store, given: str) -> bool:
     """Whether this is the key."""
     return hmac.compare_digest(given.encode(), key_of(store).encode())
+
+
+def mark_of(store: Store) -> str:
+    """What a page knows these sessions by, whichever server serves them: made of the key, which
+    cannot be found from it.
+    """
+    return hashlib.sha256(f"sessions {key_of(store)}".encode()).hexdigest()[:16]
 
 
 def quota() -> int:

@@ -31,7 +31,10 @@ def allow(root: Path, paths: Sequence[str | Path]) -> None:
         elif Path(path).is_dir():
             raise InputError(f"{path}: is a folder; give the CSV file that is being written")
     names = [str(p) if is_stream(p) else str(Path(p).absolute()) for p in paths]
-    write_atomic(root / FILE, json.dumps(names).encode())
+    if names:
+        write_atomic(root / FILE, json.dumps(names).encode())
+    else:  # writes nothing: on a full disk the page must open, so that sessions can be deleted
+        (root / FILE).unlink(missing_ok=True)
 
 
 def allowed(root: Path) -> list[str]:

@@ -313,6 +313,7 @@ def _step(s: StepEntry, state: State, *, undone: bool) -> dict[str, Any]:
         "action": s.action,
         "label": s.label,
         "title": s.title,
+        "names": list(s.names),
         "effects": list(s.effects),
         "error": s.held_out.get("relative_error_percent"),
         "undone": undone,
@@ -354,7 +355,8 @@ def _joint_words(a: Any, b: Any) -> str:
     head = [d.get("joint", {}) if isinstance(d.get("joint"), Mapping) else {} for d in (a, b)]
     keys = [k for k in dict.fromkeys([*head[0], *head[1]]) if head[0].get(k) != head[1].get(k)]
     words = [_key_words(k, head[0].get(k), head[1].get(k)) for k in keys]
-    words += [f"[{t}]" for t in dict.fromkeys([*a, *b]) if t != "joint" and a.get(t) != b.get(t)]
+    tables = [t for t in dict.fromkeys([*a, *b]) if t != "joint" and a.get(t) != b.get(t)]
+    words += ["what is known" if t == "known" else f"[{t}]" for t in tables]
     return ", ".join(words) or "another file"
 
 
