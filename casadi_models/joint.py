@@ -326,6 +326,19 @@ class JointModel:
         )
 
     @property
+    def weights(self) -> tuple[str, ...]:
+        """Names of the torques of the link's weight: the part that is all of it in a link upright
+        at zero, and that of one level there.
+        """
+        return tuple(
+            name
+            for term in self.terms
+            if any(p.role == "weight" for p in term.parameters)
+            for name, p in zip(term.names, term.parameters, strict=True)
+            if not p.is_shape
+        )
+
+    @property
     def stiffness_name(self) -> str | None:
         """Name of the linear stiffness of the transmission, None for a rigid model."""
         return next(iter(self.named("stiffness")), None)

@@ -573,8 +573,7 @@ class _Search:
     @property
     def gravity(self) -> tuple[int, ...]:
         """Places of the gravity torques."""
-        named = self.model.named("weight")
-        return tuple(i for i, n in enumerate(self.names) if n in named)
+        return tuple(i for i, n in enumerate(self.names) if n in self.model.weights)
 
     def trials(self, point: _Point) -> dict[tuple[int, ...], _Gain]:
         """What each group that is still held would bring, with its rate of false discovery

@@ -277,7 +277,7 @@ def possible_loads(model: JointModel, data: Dataset) -> tuple[float, ...]:
     """Loads that records beside the old ones may have: another payload needs a balance without
     the link."""
     free = set(data.sensing.balances) - LINK_BALANCES
-    return tuple(LOADS) if free and model.named("weight") else (1.0,)
+    return tuple(LOADS) if free and model.weights else (1.0,)
 
 
 @final
@@ -318,7 +318,7 @@ class Plant:
         """
         count = len(motion.time)
         values = dict(zip(self.model.parameter_names, self.model.value_vector(), strict=True))
-        less = {n: load * values[n] for n in self.model.named("weight")}
+        less = {n: load * values[n] for n in self.model.weights}
         if LINK_INERTIA in values:
             less[LINK_INERTIA] = max(load, 0.5) * values[LINK_INERTIA]
         if load == 1:

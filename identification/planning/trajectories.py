@@ -170,16 +170,10 @@ class Experiment:
                 "Experiment: the model has effects with internal states; leave them out"
             )
         linear = model.linear_parameters
-        taken = {
-            n
-            for term in model.terms
-            if any(p.role == "weight" for p in term.parameters)
-            for n in term.names
-        }  # with the cosine part, which is zero of a link that hangs: no share of it can be known
         chosen = (
             tuple(parameters)
             if parameters is not None
-            else tuple(n for n in linear if n not in (*model.inertias, *taken))
+            else tuple(n for n in linear if n not in (*model.inertias, *model.weights))
         )
         chosen = tuple(n for n in chosen if not (reduced and n in model.named("stiffening")))
         unknown = [n for n in chosen if n not in linear]

@@ -172,6 +172,18 @@ def test_a_payload_in_kilograms_and_metres(reference: Path, seed: int) -> None:
     assert abs(found.payload.distance - DISTANCE) < 4 * found.payload.distance_stderr < DISTANCE
 
 
+def test_a_payload_on_a_link_that_is_level_at_zero() -> None:
+    """Its weight stands in the cosine part of gravity, and was no weight there."""
+    level = {"gravity_torque": 0.0, "gravity_cosine": TRUE["gravity_torque"]}
+    heavier = {**LOADED, "gravity_torque": 0.0, "gravity_cosine": LOADED["gravity_torque"]}
+    fitted = parse_joint(tomllib.loads(fit(JOINT, record(1, level)).to_joint_file()))
+    found = changed(fitted, record(12, heavier)).payload
+    assert found is not None
+    assert found.distance is not None
+    assert found.mass == pytest.approx(MASS, rel=0.15)
+    assert found.distance == pytest.approx(DISTANCE, rel=0.1)
+
+
 def test_two_changes_at_once(reference: Path) -> None:
     found = changed(load_joint(reference), record(14, {"motor_coulomb": 26.0, "stiffness": 1.8e4}))
     assert {c.parameter for c in found.changes} == {"motor_coulomb", "stiffness"}

@@ -48,14 +48,10 @@ def with_payload(
         )
     if linear:
         return out
-    for term in model.terms:
-        if not any(p.role == "weight" for p in term.parameters):
-            continue
-        torques = [p.name for p in term.parameters if p.unit == "N.m"]
-        now = math.hypot(*(values[n] for n in torques))
-        if now > 0:
-            share = 1.0 + mass * STANDARD_GRAVITY * distance / now
-            out |= {n: share * values[n] for n in torques}
+    now = math.hypot(*(values[n] for n in model.weights))
+    if now > 0:
+        share = 1.0 + mass * STANDARD_GRAVITY * distance / now
+        out |= {n: share * values[n] for n in model.weights}
     return out
 
 
