@@ -94,13 +94,13 @@ class Follower:
         step = sampled_step(model, dt, substeps)
         size, count = step.size1_in(0), step.size1_in(2)
         x, reference = ca.MX.sym("x", size), ca.MX.sym("r", 3)
-        p, gains = ca.MX.sym("p", count), ca.MX.sym("g", 4)
+        p, gains = ca.MX.sym("p", count), ca.MX.sym("g", 5)
         drive = (
             gains[2] * reference[2]
             + gains[0] * (reference[0] - x[0])
             + gains[1] * (reference[1] - x[1])
         )
-        drive = drive - gains[3] * ca.sin(reference[0])
+        drive = drive - gains[3] * ca.sin(reference[0]) - gains[4] * ca.cos(reference[0])
         applied = ca.vertcat(drive, 0, 0)
         outputs = [x, drive, model.dynamics(x, applied, p), model.functions.outputs(x, applied, p)]
         self._sample = ca.Function(
@@ -113,8 +113,9 @@ class Follower:
         start = dict(zip(model.parameter_names, model.value_vector(), strict=True))
         inertia = sum(start[n] for n in model.inertias)
         tuned = controller or Controller()
-        weight = sum(start[n] for n in model.named("weight"))
-        self._gains = np.array([*tuned.gains(inertia), inertia, weight])
+        upright = sum(start[n] for n in model.named("weight"))
+        level = sum(start[n] for n in set(model.weights) - set(model.named("weight")))
+        self._gains = np.array([*tuned.gains(inertia), inertia, upright, level])
 
     @cached_property
     def _interpreted(self) -> WindowRun:
