@@ -70,7 +70,10 @@ def predict_function(
 
     given: drive of the sample before and of this one, 1 where the drive is read, length of the
     sample, of the step, time, temperature. Linearly implicit midpoint rule: of second order, stable
-    for any stiffness. The transition is its Cayley form, which never grows where the joint is
+    for any stiffness. Slopes are those of the middle of the step, as the slopes of its beginning
+    predict it: where a step begins inside the turn of a friction law that is narrower than the step
+    is long, the law's slope there would be taken for the whole step, and brake the joint by many
+    times its friction. The transition is its Cayley form, which never grows where the joint is
     dissipative.
     """
     a = _Layout(functions, model, free, logarithmic)
@@ -84,7 +87,9 @@ def predict_function(
     slopes = ca.jacobian(rates, a.x)
     pushed = ca.jacobian(rates, a.d)
     moved = ca.jacobian(rates, a.theta)
-    inverse = _inverse(ca.SX.eye(a.states) - h / 2 * slopes)
+    eye = ca.SX.eye(a.states)
+    halfway = a.x + h / 2 * ca.mtimes(_inverse(eye - h / 2 * slopes), rates)
+    inverse = _inverse(eye - h / 2 * ca.substitute(slopes, a.x, halfway))
     following = a.x + h * ca.mtimes(inverse, rates)
     spread = ca.vertcat(read * spread[0] + (1 - read) * unknown, spread[1:])
     lasting = ca.vertcat(read * lasting[0] + (1 - read) * unknown_lasting, lasting[1:])
@@ -92,7 +97,7 @@ def predict_function(
     count = len(free)
     kicked = h * ca.mtimes(inverse, pushed)
     transition = ca.vertcat(
-        ca.horzcat(2 * inverse - ca.SX.eye(a.states), kicked, h * ca.mtimes(inverse, moved)),
+        ca.horzcat(2 * inverse - eye, kicked, h * ca.mtimes(inverse, moved)),
         ca.horzcat(ca.SX(BALANCES, a.states), ca.diag(fade), ca.SX(BALANCES, count)),
         ca.horzcat(ca.SX(count, a.states + BALANCES), ca.SX.eye(count)),
     )

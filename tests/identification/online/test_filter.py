@@ -15,7 +15,7 @@ from casadi_models import EFFECTS, JointModel
 from casadi_models.simulate import simulate
 from casadi_models.text.typed_law import TypedLaw, register
 from identification.errors import InputError
-from identification.online.filter import JointFilter, Levels
+from identification.online.filter import LINK, JointFilter, Levels
 from identification.online.filter_step import CREEP, _inverse
 
 FloatArray = npt.NDArray[np.float64]
@@ -205,6 +205,31 @@ def test_a_side_that_turns_is_unsure_by_its_dry_friction_over_one_sample(
     deviation = dry * h * steps / values[f"{turning}_inertia"]
     assert np.sqrt(covariance[own, own]) == pytest.approx(deviation, rel=0.02)
     assert np.sqrt(covariance[other, other]) < 0.05 * deviation
+
+
+@pytest.mark.parametrize("speed", [0.0, 5e-5, -2e-4])
+def test_dry_friction_brakes_a_turn_by_no_more_than_itself(speed: float) -> None:
+    """The link turns at 10 rad/s2 at a sample inside a friction law of 0.1 mrad/s: the slope of the
+    law there holds for a hundredth of the step.
+    """
+    masses = {**MASSES, "motor_coulomb": 20.0}
+    model = JointModel.harmonic_drive(3).add("viscous").add("coulomb").with_values(masses)
+    h = 1e-3
+    dry = {"link_coulomb": 0.3, "link_smoothing_velocity": 1e-4}
+    none = {"link_coulomb": 0.0, "link_smoothing_velocity": 1e-4}
+    after = []
+    for friction in (dry, none):
+        joint = JointFilter(model.with_values(friction), h)
+        mean, covariance = np.zeros(joint.size), np.zeros((joint.size, joint.size))
+        mean[:4] = (0.21, speed, 0.21, speed)
+        mean[joint.states + LINK] = -10.0 * joint.values["link_inertia"]
+        given = [0.0, 0.0, 1.0, h, h, 0.0, 0.0]
+        p = joint.parameters(Levels(lasting=(10.0, 10.0, 10.0)))
+        after.append(float(joint.predict(mean, covariance, given, p)[0][3]))
+    with_friction, without = after
+    assert abs(without - speed) > 5e-3, "it turns"
+    most = h * dry["link_coulomb"] / joint.values["link_inertia"]
+    assert abs(with_friction - without) < 1.01 * most
 
 
 @pytest.mark.parametrize("steps", [1, 2])
