@@ -175,7 +175,7 @@ class FaultBank:
                     levels=levels,
                 )
                 late = piece.time[at:] - piece.time[0] > SETTLE
-                parts.append(statistics(course, 0, self.joint)[late])
+                parts.append(statistics(course, 0, self.joint, levels)[late])
             motor, *others = levels.disturbance
             motor = motor if flags[k, CURRENT] else levels.unknown_drive
             found.append(limits(parts, self.dt, (motor, *others)))
@@ -347,7 +347,9 @@ class _Probe:
         )
         return np.array(
             [
-                (statistics(course, k, bank.joint) / bank.tuned.limits[k])[self.begin :].max()
+                (statistics(course, k, bank.joint, bank.tuned.levels) / bank.tuned.limits[k])[
+                    self.begin :
+                ].max()
                 for k in range(len(self.states))
             ]
         )
@@ -470,7 +472,7 @@ class _Work:
         course = bank.joint.run(states, time, rows, bank.flags(len(time)), levels=tuning.levels)
         out = np.zeros((len(time), len(states)))
         for k in range(len(states)):
-            shares = statistics(course, k, bank.joint) / tuning.limits[k]
+            shares = statistics(course, k, bank.joint, tuning.levels) / tuning.limits[k]
             out[:, k] = np.nan_to_num(shares.max(axis=1), nan=np.inf)
         return out
 

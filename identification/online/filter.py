@@ -46,6 +46,8 @@ START_SPEED: Final = 1.0
 """Standard deviation of the velocities before the first reading [rad/s]."""
 AT_A_TURN: Final = 0.3
 """Share of the dry friction that is unsure while a side stands or turns."""
+KNOWN: Final = 1e-3
+"""Share of its level to which a disturbance is known at the best: readings have noise."""
 SLOW: Final = 3.0
 """Smoothing velocities below which a side counts as standing or turning."""
 MOTOR, TRANSMISSION, LINK = range(3)
@@ -428,19 +430,30 @@ class JointFilter:
             cut[0], cut[1], cut[2], cut[3], cut[4], used_drive=bool(used[0, 0, 0]), last=last
         )
 
-    def unsure_friction(self, course: Course, which: int) -> FloatArray:
+    def unsure_friction(self, course: Course, which: int, levels: Levels) -> FloatArray:
         """What the friction of motor and link may be wrong by along a filter's course, (n, 3) as
         its disturbances [N.m]: all of the dry friction while a side creeps, and
-        :data:`identification.online.filter_step.CREEP` later, when the filter has not yet seen that
-        it turns freely again.
+        :data:`identification.online.filter_step.CREEP` later. What the filter has put down to it by
+        then is in its disturbance until the filter has seen that the side turns freely again: that
+        fades by the time constant of the disturbance, and faster where readings tell it better.
         """
         speeds = course.states[which][:, [1, self.states_of_motion - 1]]
         near = np.exp(-((speeds / self.slow) ** 2))
         length = max(1, round(CREEP / self.dt))
         before = np.concatenate([np.zeros((length - 1, 2)), near])
         lately = np.lib.stride_tricks.sliding_window_view(before, length, axis=0).max(axis=2)
-        motor, link = (self.dry / AT_A_TURN * lately).T
-        return np.column_stack([motor, np.zeros(len(motor)), link])
+        now = np.zeros((len(lately), BALANCES))
+        now[:, [MOTOR, LINK]] = self.dry / AT_A_TURN * lately
+        # a Markov process of variance s2 that is known to P keeps a value that is no longer there
+        # by exp(-t (2 s2/P - 1)/lasting): its own fading and the steady filter's gain
+        own = np.square(levels.disturbance)
+        known = np.maximum(np.square(course.deviation[which]), KNOWN**2 * own)
+        rate = np.maximum(2 * own / np.maximum(known, np.finfo(float).tiny) - 1, 1)
+        fading = np.cumsum(rate * self.dt / levels.lasting, axis=0)
+        put_down = np.minimum(np.abs(course.disturbance[which]), now)
+        with np.errstate(divide="ignore"):
+            kept = np.maximum.accumulate(np.log(put_down) + fading, axis=0) - fading
+        return np.maximum(now, np.exp(kept))
 
     def expected(self, course: Course, readings: FloatArray) -> FloatArray:
         """Readings (n, 6) as the first filter of a course expects them after each sample.
