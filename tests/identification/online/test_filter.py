@@ -53,6 +53,22 @@ def test_parameters_come_from_values_wrong_by_a_third(
     assert np.abs(sigmas).max() < 3
 
 
+def test_a_stiffness_as_its_reciprocal_is_the_same_stiffness() -> None:
+    """At the start, one step later, and as an estimate."""
+    plain, other = (JointFilter(plant(), 1e-3, ["stiffness"], r) for r in ([], ["stiffness"]))
+    after = []
+    for joint in (plain, other):
+        readings = [30.0, 0.2, 0.3, 0.199, 0.31, 5.0]
+        state = joint.start(0.0, readings, levels=Levels(), deviations={"stiffness": 0.05})
+        value, spread = joint.estimate(state)["stiffness"]
+        assert value == pytest.approx(joint.values["stiffness"], rel=1e-12)
+        after.append((spread / value, joint.step(state, 1e-3, readings)[1].states[0, 0]))
+    assert other.reciprocal == (True,)
+    assert other.logarithmic == (False,)
+    assert after[0][0] == pytest.approx(0.05)
+    np.testing.assert_allclose(after[0][1], after[1][1], rtol=1e-3)
+
+
 @pytest.mark.parametrize("step", [2, 5])
 def test_coarse_samples(run: Readings, step: int) -> None:
     assert np.abs(errors(run.every(step), POSITIONS, 1e-3 * step)[0]).max() < MOST
