@@ -416,7 +416,7 @@ def _bank_event(event: dict[str, Any]) -> dict[str, Any]:
         spring = ", or the stiffness changed" if STIFFNESS in sensors else ""
         text = f"{' or '.join(names)} failed{spring}; the readings cannot tell which"
     elif STIFFNESS in sensors:
-        text += ": its stiffness"
+        text += "; its stiffness explains the readings"
     return {"time": event["time"], "fault": event["fault"], "text": text, "first": event["first"]}
 
 
