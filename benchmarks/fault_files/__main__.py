@@ -299,7 +299,7 @@ def report(results: dict[str, Any]) -> None:
     print(f"healthy: {len(said)} reports in {hours:.2f} h" + "".join(f"\n  {t}" for t in said))
     for text in CHANGES:
         told = Counter(
-            " or ".join(dict.fromkeys(t.split(" s ")[1] for t in j["changes"][text])) or "nothing"
+            " or ".join(sorted({t.split(" s ")[1] for t in j["changes"][text]})) or "nothing"
             for j in joints.values()
         )
         print(f"{text}: " + ", ".join(f"{n} {t}" for t, n in told.items()))

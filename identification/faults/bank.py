@@ -18,11 +18,18 @@ import numpy.typing as npt
 from casadi_models import JointModel
 from identification.errors import InputError
 from identification.faults.bank_levels import SETTLE, Piece, first_levels, likeliest
+from identification.faults.bank_spring import OPENED, STIFFNESS, SpringFilters, opened
 from identification.faults.bank_statistics import WINDOWS, limits, statistics
-from identification.faults.core import ABSURD, CURRENT, SENSORS
+from identification.faults.core import (
+    ABSURD,
+    CURRENT,
+    LINK_POSITION,
+    MOTOR_POSITION,
+    SENSORS,
+    TORQUE,
+)
 from identification.faults.types import FaultEvent, Verdict
-from identification.online.filter import TWIST, FilterState, JointFilter, Levels
-from identification.online.filter_step import BALANCES
+from identification.online.filter import FilterState, JointFilter, Levels
 from identification.online.pulse import Pulse
 
 FloatArray = npt.NDArray[np.float64]
@@ -42,10 +49,6 @@ HEAD: Final = 1.0
 """Seconds at the beginning in which every reading is believed."""
 FIRST: Final = 0.5
 """Seconds after which velocities are known and the calibration is found anew."""
-OPENED: Final = 0.1 * TWIST
-"""Standard deviation of the calibration there [rad]: ten times what these seconds leave wrong."""
-LINK_STATE: Final = 2
-"""The link position in the joint's state."""
 CHUNK: Final = 60.0
 """Stretches in which a record is worked on, so that hours of it need no more memory [s]."""
 GAP: Final = 0.05
@@ -60,6 +63,8 @@ ANNOUNCED: Final = 1.5
 motion need more."""
 NAMED_AT: Final = (1.0, 2.0, 4.0, 8.0, 16.0)
 """Multiples of the offset that is seen at which it is tried whether it is named."""
+AT_THE_SPRING: Final = (SENSORS[MOTOR_POSITION], SENSORS[LINK_POSITION], SENSORS[TORQUE])
+"""Sensors that a change of the stiffness may be taken for: what its law is about."""
 ONE: Final = (Verdict.SENSOR, Verdict.CURRENT_OR_FRICTION)
 """Verdicts that name one sensor."""
 CALIBRATION: Final = ("link_encoder_zero",)
@@ -136,7 +141,9 @@ class FaultBank:
         self.measured = tuple(bool(m) for m in measured)
         self.sensors = tuple(i for i in range(len(SENSORS)) if self.measured[i])
         self.dt = dt
-        self.joint = JointFilter(replace(model, calibration=CALIBRATION), dt, CALIBRATION)
+        free = replace(model, calibration=CALIBRATION)
+        self.joint = JointFilter(free, dt, CALIBRATION)
+        self.springs = SpringFilters(free, dt, CALIBRATION)
         self.tuning = tuning
 
     # --- before the run ---------------------------------------------------------------------------
@@ -175,7 +182,7 @@ class FaultBank:
                     levels=levels,
                 )
                 late = piece.time[at:] - piece.time[0] > SETTLE
-                parts.append(statistics(course, 0, self.joint)[late])
+                parts.append(statistics(course, 0, self.joint, levels)[late])
             motor, *others = levels.disturbance
             motor = motor if flags[k, CURRENT] else levels.unknown_drive
             found.append(limits(parts, self.dt, (motor, *others)))
@@ -230,7 +237,7 @@ class FaultBank:
                     low = middle
             seen, named = ANNOUNCED * high, np.inf
             for factor in NAMED_AT:
-                if all(told(p.scores(sensor, factor * seen)[1:]) == k for p in probes):
+                if all(p.names(k, factor * seen) for p in probes):
                     named = factor * seen
                     break
             out[SENSORS[sensor]] = (seen, named)
@@ -293,21 +300,27 @@ class FaultBank:
             if end > at:
                 table = np.broadcast_to(flags, (1, end - at, 6))
                 run = self.joint.run([state], time[at:end], rows[at:end], table, levels=levels)
-                state = self._opened(run.last[0], levels) if at == 0 else run.last[0]
+                state = run.last[0]
+                if at == 0:
+                    state = opened(self.joint, state, levels, OPENED)
                 at = end
         return [state] * (1 + len(self.sensors)), at
 
-    def _opened(self, state: FilterState, levels: Levels) -> FilterState:
-        """A filter whose disturbances, encoders' zero and so the link are unsure again."""
-        joint, at = self.joint, self.joint.states
-        own = slice(at, at + BALANCES)
-        mean, covariance = state.mean.copy(), state.covariance.copy()
-        mean[own] = 0.0
-        covariance[own, :] = covariance[:, own] = 0.0
-        covariance[own, own] = np.diag(np.square(levels.disturbance))
-        way = np.zeros(joint.size)
-        way[-1], way[LINK_STATE] = OPENED, -OPENED
-        return replace(state, mean=mean, covariance=covariance + np.outer(way, way))
+    def explained(
+        self, state: FilterState, time: FloatArray, rows: FloatArray
+    ) -> tuple[bool, bool]:
+        """Whether an offset of the positions explains readings after a state of the filter that
+        reads all sensors, and whether the stiffness does.
+        """
+        tuning = self.tuned
+        return self.springs.explain(
+            state,
+            time,
+            rows,
+            measured=self.measured,
+            levels=tuning.levels,
+            limits=tuning.limits[0],
+        )
 
 
 def told(worst: FloatArray) -> int | None:
@@ -338,6 +351,23 @@ class _Probe:
         self.states, self.begin = states, place - first
         self.time, self.rows = time[first : place + ahead], rows[first : place + ahead]
 
+    def names(self, k: int, offset: float) -> bool:
+        """Whether an offset of the k-th sensor is named as that, and as nothing else."""
+        bank, sensor = self.bank, self.bank.sensors[k]
+        if told(self.scores(sensor, offset)[1:]) != k:
+            return False
+        if SENSORS[sensor] not in AT_THE_SPRING:
+            return True
+        time, rows, state = self.time, self.rows.copy(), self.states[0]
+        begin, levels = self.begin, bank.tuned.levels
+        rows[begin:, sensor] += offset
+        if begin:
+            flags = bank.flags(begin)[:1]
+            state = bank.joint.run([state], time[:begin], rows[:begin], flags, levels=levels).last[
+                0
+            ]
+        return not bank.explained(state, time[begin:], rows[begin:])[1]
+
     def scores(self, sensor: int, offset: float) -> FloatArray:
         """Largest score of each filter after an offset of a sensor, (filters,)."""
         bank, rows = self.bank, self.rows.copy()
@@ -347,7 +377,9 @@ class _Probe:
         )
         return np.array(
             [
-                (statistics(course, k, bank.joint) / bank.tuned.limits[k])[self.begin :].max()
+                (statistics(course, k, bank.joint, bank.tuned.levels) / bank.tuned.limits[k])[
+                    self.begin :
+                ].max()
                 for k in range(len(self.states))
             ]
         )
@@ -419,7 +451,7 @@ class _Work:
             if gone <= alarm:
                 decided, sensor = gone, missing
             else:
-                decided, verdict, sensors = self._decide(alarm, end)
+                decided, verdict, sensors = self._decide(alarm, end, states, at)
                 self._report(alarm, decided, verdict, sensors)
                 sensor = SENSORS.index(sensors[0]) if verdict in ONE else -1
             if sensor >= 0:
@@ -470,7 +502,7 @@ class _Work:
         course = bank.joint.run(states, time, rows, bank.flags(len(time)), levels=tuning.levels)
         out = np.zeros((len(time), len(states)))
         for k in range(len(states)):
-            shares = statistics(course, k, bank.joint) / tuning.limits[k]
+            shares = statistics(course, k, bank.joint, tuning.levels) / tuning.limits[k]
             out[:, k] = np.nan_to_num(shares.max(axis=1), nan=np.inf)
         return out
 
@@ -501,17 +533,30 @@ class _Work:
         covariance[-count:, -count:] = known.covariance[-count:, -count:]
         return replace(state, mean=mean, covariance=covariance)
 
-    def _decide(self, alarm: int, last: int) -> tuple[int, Verdict, tuple[str, ...]]:
-        """Sample of the decision, verdict, sensors."""
+    def _decide(
+        self, alarm: int, last: int, states: Sequence[FilterState], at: int
+    ) -> tuple[int, Verdict, tuple[str, ...]]:
+        """Sample of the decision, verdict, sensors; with the filters at some sample before."""
         begin = int(np.searchsorted(self.time, self.time[alarm] - BEFORE))
+        changed = self._with_calibration(
+            self._advanced(states, at, alarm, 0),
+            self._advanced(states, at, max(begin, at), 0),
+        )
         names = [SENSORS[i] for i in self.bank.sensors]
-        end, innocent = alarm + 1, list(names)
+        end, innocent, spring = alarm + 1, list(names), False
         for wait in WAITS:
             end = min(int(np.searchsorted(self.time, self.time[alarm] + wait)), last)
             worst = self.scores[begin:end, 1:].max(axis=0)
             innocent = [names[i] for i in np.argsort(worst) if worst[i] < 1]
             one = told(worst)
-            if one is not None:
+            suspects, spring = innocent if one is None else [names[one]], False
+            if not suspects or not set(suspects).isdisjoint(AT_THE_SPRING):
+                part = slice(alarm, end)
+                offset, spring = self.bank.explained(changed, self.time[part], self.rows[part])
+                if spring and not offset:
+                    return end - 1, Verdict.PLANT, (STIFFNESS,)
+                innocent = suspects
+            if one is not None and not spring:
                 pair = SENSORS.index(names[one]) == CURRENT
                 verdict = Verdict.CURRENT_OR_FRICTION if pair else Verdict.SENSOR
                 return end - 1, verdict, (names[one],)
@@ -519,7 +564,7 @@ class _Work:
                 return end - 1, Verdict.PLANT, ()
             if end == last:
                 break
-        return end - 1, Verdict.ONE_OF, tuple(innocent)
+        return end - 1, Verdict.ONE_OF, (*innocent, *([STIFFNESS] if spring else []))
 
     def _await(
         self, healthy: FilterState, first: int, last: int, sensor: int

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from identification.online.filter import Course, JointFilter
+from identification.online.filter import Course, JointFilter, Levels
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -33,7 +33,7 @@ EULER: Final = 0.5772156649
 """Mean of the standard Gumbel distribution."""
 
 
-def statistics(course: Course, which: int, joint: JointFilter) -> FloatArray:
+def statistics(course: Course, which: int, joint: JointFilter, levels: Levels) -> FloatArray:
     """Energies and means of the innovations over all windows, and the disturbances, (n, count).
 
     Parameters
@@ -42,12 +42,15 @@ def statistics(course: Course, which: int, joint: JointFilter) -> FloatArray:
     which : int
         Number of the filter.
     joint : JointFilter
+    levels : Levels
+        That the course was run with.
 
     Returns
     -------
     array
         Root mean square (5 readings x 4 windows), size of the mean (the same), size of the three
-        disturbances beyond what they and the friction of a side that creeps are unsure by [N.m].
+        disturbances beyond what they and the friction of a side that creeps, or has just crept, are
+        unsure by [N.m].
         Before a window is full, what is missing counts as expected.
     """
     e = np.clip(course.innovation[which], -1e6, 1e6)
@@ -61,7 +64,7 @@ def statistics(course: Course, which: int, joint: JointFilter) -> FloatArray:
         missing = np.maximum(length - at, 0)[:, None]
         energy.append(np.sqrt(np.maximum(squares[at] - squares[before] + missing, 0.0) / length))
         mean.append(np.abs(sums[at] - sums[before]) / length)
-    unsure = UNSURE * course.deviation[which] + joint.unsure_friction(course, which)
+    unsure = UNSURE * course.deviation[which] + joint.unsure_friction(course, which, levels)
     known = np.maximum(np.abs(course.disturbance[which]) - unsure, 0.0)
     return np.concatenate([*energy, *mean, known], axis=1)
 

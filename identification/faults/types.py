@@ -25,7 +25,9 @@ class Verdict(Enum):
         "The current sensor failed or the motor's friction changed: the readings cannot tell which."
     )
     PLANT = "The joint changed, the sensors agree with each other: identify it again."
-    ONE_OF = "One of these sensors failed: the readings cannot tell which."
+    ONE_OF = (
+        "One of these failed, or changed if it is the stiffness: the readings cannot tell which."
+    )
     DEAD = "All readings stand still although the joint moved, or time has stopped."
     RECOVERED = "The sensor agrees with the estimate again; its reading is used."
 
@@ -47,7 +49,8 @@ class FaultEvent:
         Sample at which the first residual passed its limit.
     verdict : Verdict
     sensors : tuple of str
-        Sensors it is about; for a plant change the part: stiffness, link or motor.
+        Sensors it is about; for a plant change the part: stiffness, link or motor. A set that the
+        readings cannot tell apart may have the stiffness beside sensors.
     residuals : tuple of str
         Residuals that had passed their limits.
     """

@@ -23,6 +23,7 @@ from identification.online.filter_step import (
     BALANCES,
     CREEP,
     READINGS,
+    Form,
     predict_function,
     update_function,
 )
@@ -46,6 +47,8 @@ START_SPEED: Final = 1.0
 """Standard deviation of the velocities before the first reading [rad/s]."""
 AT_A_TURN: Final = 0.3
 """Share of the dry friction that is unsure while a side stands or turns."""
+KNOWN: Final = 1e-3
+"""Share of its level to which a disturbance is known at the best: readings have noise."""
 SLOW: Final = 3.0
 """Smoothing velocities below which a side counts as standing or turning."""
 MOTOR, TRANSMISSION, LINK = range(3)
@@ -173,6 +176,9 @@ class JointFilter:
         Usual sample time [s]; samples may come unevenly.
     free : sequence of str
         Parameters that are estimated too.
+    reciprocal : sequence of str
+        Those of them that stand in the state as one over their value: a stiffness that may be far
+        off, whose twist is linear in that.
 
     Attributes
     ----------
@@ -185,7 +191,13 @@ class JointFilter:
         Length of the mean.
     """
 
-    def __init__(self, model: JointModel, dt: float, free: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        model: JointModel,
+        dt: float,
+        free: Sequence[str] = (),
+        reciprocal: Sequence[str] = (),
+    ) -> None:
         unknown = sorted(set(free) - set(model.parameter_names))
         if unknown:
             raise InputError(f"filter: the model has no parameter {', '.join(unknown)}")
@@ -206,7 +218,11 @@ class JointFilter:
                 if p.low >= 0 and not p.is_shape
             ),
         }
-        self.logarithmic = tuple(n in positive and values[n] > 0 for n in self.names)
+        self.reciprocal = tuple(n in reciprocal and values[n] != 0 for n in self.names)
+        self.logarithmic = tuple(
+            n in positive and values[n] > 0 and not one_over
+            for n, one_over in zip(self.names, self.reciprocal, strict=True)
+        )
         self.substeps = max(1, int(np.ceil(dt / LONGEST_STEP - 1e-9)))
         self.values = self._followable(values)
         self.walks = np.zeros(len(self.names))
@@ -262,12 +278,20 @@ class JointFilter:
     @cached_property
     def predict(self) -> Any:
         """See :func:`identification.online.filter_step.predict_function`."""
-        return predict_function(self.functions, self.model, self.names, self.logarithmic)
+        return predict_function(self.functions, self.model, self.names, self._forms)
 
     @cached_property
     def update(self) -> Any:
         """See :func:`identification.online.filter_step.update_function`."""
-        return update_function(self.functions, self.model, self.names, self.logarithmic)
+        return update_function(self.functions, self.model, self.names, self._forms)
+
+    @property
+    def _forms(self) -> tuple[Form, ...]:
+        """How each free parameter stands in the state."""
+        pairs = zip(self.logarithmic, self.reciprocal, strict=True)
+        return tuple(
+            Form.LOGARITHM if a else Form.RECIPROCAL if b else Form.VALUE for a, b in pairs
+        )
 
     def sample_function(self, substeps: int | None = None) -> Any:
         """(state, inputs, p) -> (state after the sample, outputs), all columns.
@@ -363,6 +387,9 @@ class JointFilter:
             usual = 0.1 if log else usual
             mean[at + BALANCES + k] = np.log(given[name]) if log else given[name]
             variance[at + BALANCES + k] = spread.get(name, usual) ** 2
+            if self.reciprocal[k]:
+                mean[at + BALANCES + k] = 1 / given[name]
+                variance[at + BALANCES + k] /= given[name] ** 4
         return FilterState(mean, np.diag(variance), time - self.dt, float(readings[0]))
 
     def step(
@@ -428,19 +455,31 @@ class JointFilter:
             cut[0], cut[1], cut[2], cut[3], cut[4], used_drive=bool(used[0, 0, 0]), last=last
         )
 
-    def unsure_friction(self, course: Course, which: int) -> FloatArray:
+    def unsure_friction(self, course: Course, which: int, levels: Levels) -> FloatArray:
         """What the friction of motor and link may be wrong by along a filter's course, (n, 3) as
         its disturbances [N.m]: all of the dry friction while a side creeps, and
-        :data:`identification.online.filter_step.CREEP` later, when the filter has not yet seen that
-        it turns freely again.
+        :data:`identification.online.filter_step.CREEP` later. What the filter has put down to it by
+        then is in its disturbance until the filter has seen that the side turns freely again: that
+        fades by the time constant of the disturbance, and faster where readings tell it better.
         """
         speeds = course.states[which][:, [1, self.states_of_motion - 1]]
         near = np.exp(-((speeds / self.slow) ** 2))
         length = max(1, round(CREEP / self.dt))
         before = np.concatenate([np.zeros((length - 1, 2)), near])
         lately = np.lib.stride_tricks.sliding_window_view(before, length, axis=0).max(axis=2)
-        motor, link = (self.dry / AT_A_TURN * lately).T
-        return np.column_stack([motor, np.zeros(len(motor)), link])
+        now = np.zeros((len(lately), BALANCES))
+        now[:, [MOTOR, LINK]] = self.dry / AT_A_TURN * lately
+        # a Markov process of variance s2 that is known to P keeps a value that is no longer there
+        # by exp(-t (2 s2/P - 1)/lasting): its own fading and the steady filter's gain
+        own = np.square(levels.disturbance)
+        known = np.maximum(np.square(course.deviation[which]), KNOWN**2 * own)
+        rate = np.maximum(2 * own / np.maximum(known, np.finfo(float).tiny) - 1, 1)
+        fading = np.cumsum(rate * self.dt / levels.lasting, axis=0)
+        put_down = np.minimum(np.abs(course.disturbance[which]), now)
+        with np.errstate(divide="ignore"):
+            kept = np.maximum.accumulate(np.log(put_down) + fading, axis=0) - fading
+        unsure: FloatArray = np.maximum(now, np.exp(kept))
+        return unsure
 
     def expected(self, course: Course, readings: FloatArray) -> FloatArray:
         """Readings (n, 6) as the first filter of a course expects them after each sample.
@@ -467,6 +506,8 @@ class JointFilter:
         for k, (name, log) in enumerate(zip(self.names, self.logarithmic, strict=True)):
             mean = float(state.mean[first + k])
             spread = float(np.sqrt(max(state.covariance[first + k, first + k], 0.0)))
+            if self.reciprocal[k]:
+                mean, spread = 1 / mean, spread / mean**2
             out[name] = (
                 (float(np.exp(mean)), float(np.exp(mean)) * spread) if log else (mean, spread)
             )

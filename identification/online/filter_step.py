@@ -5,6 +5,7 @@ equations.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from enum import Enum
 from typing import Any, Final
 
 import casadi as ca
@@ -26,6 +27,20 @@ CREEP: Final = 0.1
 wrong by there lasts as long, and no record tells the law at such speeds well."""
 
 
+class Form(Enum):
+    """How a free parameter stands in a filter's state."""
+
+    VALUE = 0
+    LOGARITHM = 1
+    RECIPROCAL = 2
+
+    def value_of(self, entry: Expression) -> Expression:
+        """The parameter from its entry in the state."""
+        if self is Form.LOGARITHM:
+            return ca.exp(entry)
+        return 1 / entry if self is Form.RECIPROCAL else entry
+
+
 class _Layout:
     """Symbols of a filter's state and of what it is given."""
 
@@ -34,7 +49,7 @@ class _Layout:
         functions: JointFunctions,
         model: JointModel,
         free: Sequence[str],
-        logarithmic: Sequence[bool],
+        forms: Sequence[Form],
     ) -> None:
         self.functions = functions
         self.states = len(functions.state_names) + len(functions.memory_names)
@@ -52,8 +67,8 @@ class _Layout:
         self.slow = self.p[count + LEVELS + 2 : count + LEVELS + 4]
         self.walks = self.p[count + LEVELS + 4 :]
         values = ca.vertsplit(self.p[:count])
-        for k, (name, log) in enumerate(zip(free, logarithmic, strict=True)):
-            values[names.index(name)] = ca.exp(self.theta[k]) if log else self.theta[k]
+        for k, (name, form) in enumerate(zip(free, forms, strict=True)):
+            values[names.index(name)] = form.value_of(self.theta[k])
         self.values = ca.vertcat(*values)
 
     def joint(self, drive: Expression, when: Expression) -> tuple[Expression, Expression]:
@@ -64,16 +79,19 @@ class _Layout:
 
 
 def predict_function(
-    functions: JointFunctions, model: JointModel, free: Sequence[str], logarithmic: Sequence[bool]
+    functions: JointFunctions, model: JointModel, free: Sequence[str], forms: Sequence[Form]
 ) -> Any:
     """(mean, P, given, p) -> mean and P one step later.
 
     given: drive of the sample before and of this one, 1 where the drive is read, length of the
     sample, of the step, time, temperature. Linearly implicit midpoint rule: of second order, stable
-    for any stiffness. The transition is its Cayley form, which never grows where the joint is
+    for any stiffness. Slopes are those of the middle of the step, as the slopes of its beginning
+    predict it: where a step begins inside the turn of a friction law that is narrower than the step
+    is long, the law's slope there would be taken for the whole step, and brake the joint by many
+    times its friction. The transition is its Cayley form, which never grows where the joint is
     dissipative.
     """
-    a = _Layout(functions, model, free, logarithmic)
+    a = _Layout(functions, model, free, forms)
     given = ca.SX.sym("given", 7)
     before, now, read, sample, h = ca.vertsplit(given[:5])
     noise, spread, lasting = a.levels[5], a.levels[6:9], a.levels[9:12]
@@ -84,7 +102,9 @@ def predict_function(
     slopes = ca.jacobian(rates, a.x)
     pushed = ca.jacobian(rates, a.d)
     moved = ca.jacobian(rates, a.theta)
-    inverse = _inverse(ca.SX.eye(a.states) - h / 2 * slopes)
+    eye = ca.SX.eye(a.states)
+    halfway = a.x + h / 2 * ca.mtimes(_inverse(eye - h / 2 * slopes), rates)
+    inverse = _inverse(eye - h / 2 * ca.substitute(slopes, a.x, halfway))
     following = a.x + h * ca.mtimes(inverse, rates)
     spread = ca.vertcat(read * spread[0] + (1 - read) * unknown, spread[1:])
     lasting = ca.vertcat(read * lasting[0] + (1 - read) * unknown_lasting, lasting[1:])
@@ -92,7 +112,7 @@ def predict_function(
     count = len(free)
     kicked = h * ca.mtimes(inverse, pushed)
     transition = ca.vertcat(
-        ca.horzcat(2 * inverse - ca.SX.eye(a.states), kicked, h * ca.mtimes(inverse, moved)),
+        ca.horzcat(2 * inverse - eye, kicked, h * ca.mtimes(inverse, moved)),
         ca.horzcat(ca.SX(BALANCES, a.states), ca.diag(fade), ca.SX(BALANCES, count)),
         ca.horzcat(ca.SX(count, a.states + BALANCES), ca.SX.eye(count)),
     )
@@ -120,7 +140,7 @@ def predict_function(
 
 
 def update_function(
-    functions: JointFunctions, model: JointModel, free: Sequence[str], logarithmic: Sequence[bool]
+    functions: JointFunctions, model: JointModel, free: Sequence[str], forms: Sequence[Form]
 ) -> Any:
     """(mean, P, readings, used, p) -> mean, P, outputs of the sample.
 
@@ -129,7 +149,7 @@ def update_function(
     stays positive; an innovation beyond the limit weighs less (Huber). Outputs as in
     :meth:`identification.online.filter.JointFilter.sample_function`.
     """
-    a = _Layout(functions, model, free, logarithmic)
+    a = _Layout(functions, model, free, forms)
     readings, used = ca.SX.sym("y", READINGS), ca.SX.sym("used", READINGS + 2)
     clip = a.levels[17]
     _, expected = a.joint(used[0] * readings[0], used[READINGS:])

@@ -135,7 +135,8 @@ def judgement(
             readings[:, velocity] = change
     events = []
     for event in track.events:
-        first = SENSORS.index(event.sensors[0]) + 1 if event.sensors else 0
+        about = [n for n in event.sensors if n in SENSORS]
+        first = SENSORS.index(about[0]) + 1 if about else 0
         code = {
             Verdict.SENSOR: first,
             Verdict.DROPOUT: MISSING + first,

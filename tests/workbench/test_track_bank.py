@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from benchmarks.faults.plant import plant
+from identification.faults.types import Verdict
 from workbench.cli.main import main
+from workbench.cli.online import _bank_event
 
 
 @pytest.fixture(scope="module")
@@ -64,3 +66,26 @@ def test_the_sensor_is_named(
     assert list(result["smallest"]) == ["current", "motor_position", "link_position", "torque"]
     assert all(s["seen"] > 0 for s in result["smallest"].values())
     assert "smallest offset of a sensor" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("verdict", "about", "said"),
+    [
+        (Verdict.PLANT, (), "each other"),
+        (Verdict.PLANT, ("stiffness",), "its stiffness explains the readings"),
+        (
+            Verdict.ONE_OF,
+            ("torque", "link_position"),
+            "torque or link position failed; the readings cannot tell which",
+        ),
+        (
+            Verdict.ONE_OF,
+            ("link_position", "stiffness"),
+            "link position failed, or the stiffness changed; the readings cannot tell which",
+        ),
+    ],
+)
+def test_an_event_says_what_it_may_be(verdict: Verdict, about: tuple[str, ...], said: str) -> None:
+    code = 8 if verdict is Verdict.PLANT else 9
+    event = {"verdict": verdict, "sensors": list(about), "fault": code, "time": 2.0, "first": 1.0}
+    assert _bank_event(event)["text"].endswith(said)

@@ -406,13 +406,17 @@ def replay(
 
 def _bank_event(event: dict[str, Any]) -> dict[str, Any]:
     """An event of a bank with the words of its code."""
+    from identification.faults.bank_spring import STIFFNESS
     from identification.faults.detector import SENSORS
     from identification.faults.types import Verdict
 
-    text = fault_text(event["fault"])
+    text, sensors = fault_text(event["fault"]), event["sensors"]
     if event["verdict"] is Verdict.ONE_OF:
-        names = [READINGS[SENSORS.index(n)] for n in event["sensors"]]
-        text = f"{' or '.join(names)} failed; the readings cannot tell which"
+        names = [READINGS[SENSORS.index(n)] for n in sensors if n in SENSORS]
+        spring = ", or the stiffness changed" if STIFFNESS in sensors else ""
+        text = f"{' or '.join(names)} failed{spring}; the readings cannot tell which"
+    elif STIFFNESS in sensors:
+        text += "; its stiffness explains the readings"
     return {"time": event["time"], "fault": event["fault"], "text": text, "first": event["first"]}
 
 

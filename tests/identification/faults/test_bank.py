@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.faults.plant import DT
-from benchmarks.online_filter import Readings, plant, recorded
+from benchmarks.faults.plant import DT, reference
+from benchmarks.online_filter import NOISE, Readings, follower, plant, recorded
 from casadi_models import JointModel
 from identification.errors import InputError
 from identification.faults.bank import BankTrack, FaultBank
@@ -82,6 +82,38 @@ def test_a_payload_is_no_sensor(bank: FaultBank) -> None:
     record = recorded(34, 12.0)
     found = FaultBank(light, DT, THERE, bank.tuning).run(record.time, record.rows)
     assert {e.verdict for e in found.events} == {Verdict.PLANT}
+
+
+@pytest.mark.parametrize("seed", [41, 42])
+def test_a_stiffness_that_changes_is_no_position_sensor(bank: FaultBank, seed: int) -> None:
+    """The joint gets a fifth softer while it moves."""
+    path = reference(seed, 9.0)
+    course = np.full(len(path), bank.joint.values["stiffness"])
+    course[round(BEGIN / DT) :] *= 0.8
+    found = follower().run(path, {"stiffness": course})
+    clean = np.column_stack([found.drive, found.states, found.torque])
+    noise = np.random.default_rng(seed).normal(size=clean.shape) * NOISE
+    events = bank.run(found.time, clean + noise).events
+    assert [(e.verdict, e.sensors) for e in events] == [(Verdict.PLANT, ("stiffness",))]
+    assert BEGIN <= found.time[events[0].first] < BEGIN + 0.1
+
+
+@pytest.mark.parametrize("rests", [True, False])
+def test_at_rest_an_offset_and_a_stiffness_look_alike(bank: FaultBank, rests: bool) -> None:
+    """A link encoder that is off by 0.1 mrad; a torque that changes tells which it is."""
+    record = recorded(36, 8.0, rest=(4.0, 7.0) if rests else None)
+    begin, end = round(5.5 / DT), round(6.6 / DT)
+    rows = record.rows.copy()
+    rows[begin:, 3] += 1e-4
+    states, at = bank.begun(record.time, rows, bank.tuned.levels)
+    before = bank.joint.run(
+        states[:1],
+        record.time[at:begin],
+        rows[at:begin],
+        bank.flags(begin - at)[:1],
+        levels=bank.tuned.levels,
+    )
+    assert bank.explained(before.last[0], record.time[begin:end], rows[begin:end]) == (True, rests)
 
 
 def test_without_a_torque_sensor_it_is_never_named(unseen: Readings) -> None:

@@ -14,7 +14,7 @@ from casadi_models import JointModel
 from identification.faults import bank_levels
 from identification.faults.bank_levels import Piece, first_levels, likeliest
 from identification.faults.bank_statistics import statistics
-from identification.online.filter import AT_A_TURN, LINK, TRANSMISSION, Course, JointFilter
+from identification.online.filter import AT_A_TURN, LINK, TRANSMISSION, Course, JointFilter, Levels
 from identification.online.filter_step import CREEP
 from tests.hidden_effect.generator import DT, KM, simulate_case
 
@@ -72,12 +72,38 @@ def test_friction_of_a_side_that_creeps_is_no_sign_of_a_fault() -> None:
     lacks = np.full((1, count, 3), 0.5 * dry)
     none = np.zeros((1, count, 5))
     course = Course(none, none + 1, lacks, np.zeros((1, count, 3)), states, True, last=())
-    motor, transmission, link = statistics(course, 0, made)[:, -3:].T
+    motor, transmission, link = statistics(course, 0, made, Levels())[:, -3:].T
     late = round(CREEP / DT)
     assert np.all(motor[200 : 500 + late - 1] == 0)
     assert motor[[*range(200), *range(500 + late, count)]] == pytest.approx(0.5 * dry)
     assert transmission == pytest.approx(0.5 * dry)
     assert link == pytest.approx(0.5 * dry)
+
+
+@pytest.mark.parametrize("known", [1.0, 0.3])
+def test_what_was_put_down_to_friction_fades_as_the_filter_forgets_it(known: float) -> None:
+    """A disturbance of the link that the filter opened while the link crept, and that fades as that
+    of a steady filter does: by its time constant, and faster where it is known better than that.
+    """
+    made, _ = joint()
+    level, lasting, count, end = 0.01, 0.4, 2000, 200
+    levels = Levels(disturbance=(level, level, level), lasting=(lasting, lasting, lasting))
+    states = np.ones((1, count, 4))
+    states[0, :end, 3] = 0.1 * made.slow[1]
+    late = end - 1 + round(CREEP / DT) - 1  # the last sample that counts as creeping
+    rate = (2 / known**2 - 1) / lasting
+    lacks = np.zeros((1, count, 3))
+    lacks[0, :, LINK] = 0.5 * made.dry[1] / AT_A_TURN
+    lacks[0, late:, LINK] *= np.exp(-rate * DT * np.arange(count - late))
+    none, deviation = np.zeros((1, count, 5)), np.full((1, count, 3), known * level)
+    course = Course(none, none + 1, lacks, deviation, states, True, last=())
+    beyond = statistics(course, 0, made, levels)[:, -1]
+    assert lacks[0, late + 10, LINK] > 5 * level, "there is something to tell"
+    assert beyond == pytest.approx(0.0, abs=1e-9)
+    # what comes after that does not pass for it
+    lacks[0, late + 100 :, LINK] += 2 * level
+    again = statistics(course, 0, made, levels)[:, -1]
+    assert again[late + 100 :] == pytest.approx(max(2 - 3 * known, 0.0) * level, abs=1e-9)
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ from casadi_models import EFFECTS, JointModel
 from casadi_models.simulate import simulate
 from casadi_models.text.typed_law import TypedLaw, register
 from identification.errors import InputError
-from identification.online.filter import JointFilter, Levels
+from identification.online.filter import LINK, JointFilter, Levels
 from identification.online.filter_step import CREEP, _inverse
 
 FloatArray = npt.NDArray[np.float64]
@@ -51,6 +51,22 @@ def test_parameters_come_from_values_wrong_by_a_third(
     relative, sigmas = errors(run, used, 1e-3)
     assert np.abs(relative).max() < MOST
     assert np.abs(sigmas).max() < 3
+
+
+def test_a_stiffness_as_its_reciprocal_is_the_same_stiffness() -> None:
+    """At the start, one step later, and as an estimate."""
+    plain, other = (JointFilter(plant(), 1e-3, ["stiffness"], r) for r in ([], ["stiffness"]))
+    after = []
+    for joint in (plain, other):
+        readings = [30.0, 0.2, 0.3, 0.199, 0.31, 5.0]
+        state = joint.start(0.0, readings, levels=Levels(), deviations={"stiffness": 0.05})
+        value, spread = joint.estimate(state)["stiffness"]
+        assert value == pytest.approx(joint.values["stiffness"], rel=1e-12)
+        after.append((spread / value, joint.step(state, 1e-3, readings)[1].states[0, 0]))
+    assert other.reciprocal == (True,)
+    assert other.logarithmic == (False,)
+    assert after[0][0] == pytest.approx(0.05)
+    np.testing.assert_allclose(after[0][1], after[1][1], rtol=1e-3)
 
 
 @pytest.mark.parametrize("step", [2, 5])
@@ -205,6 +221,31 @@ def test_a_side_that_turns_is_unsure_by_its_dry_friction_over_one_sample(
     deviation = dry * h * steps / values[f"{turning}_inertia"]
     assert np.sqrt(covariance[own, own]) == pytest.approx(deviation, rel=0.02)
     assert np.sqrt(covariance[other, other]) < 0.05 * deviation
+
+
+@pytest.mark.parametrize("speed", [0.0, 5e-5, -2e-4])
+def test_dry_friction_brakes_a_turn_by_no_more_than_itself(speed: float) -> None:
+    """The link turns at 10 rad/s2 at a sample inside a friction law of 0.1 mrad/s: the slope of the
+    law there holds for a hundredth of the step.
+    """
+    masses = {**MASSES, "motor_coulomb": 20.0}
+    model = JointModel.harmonic_drive(3).add("viscous").add("coulomb").with_values(masses)
+    h = 1e-3
+    dry = {"link_coulomb": 0.3, "link_smoothing_velocity": 1e-4}
+    none = {"link_coulomb": 0.0, "link_smoothing_velocity": 1e-4}
+    after = []
+    for friction in (dry, none):
+        joint = JointFilter(model.with_values(friction), h)
+        mean, covariance = np.zeros(joint.size), np.zeros((joint.size, joint.size))
+        mean[:4] = (0.21, speed, 0.21, speed)
+        mean[joint.states + LINK] = -10.0 * joint.values["link_inertia"]
+        given = [0.0, 0.0, 1.0, h, h, 0.0, 0.0]
+        p = joint.parameters(Levels(lasting=(10.0, 10.0, 10.0)))
+        after.append(float(joint.predict(mean, covariance, given, p)[0][3]))
+    with_friction, without = after
+    assert abs(without - speed) > 5e-3, "it turns"
+    most = h * dry["link_coulomb"] / joint.values["link_inertia"]
+    assert abs(with_friction - without) < 1.01 * most
 
 
 @pytest.mark.parametrize("steps", [1, 2])
