@@ -192,8 +192,8 @@ def load_dataset(
         sensing = replace(
             sensing, temperature_origin=like.temperature_origin, longest_run=like.longest_run
         )
-    geared = seen_from_the_motor(sensing) and abs(joint.gear_ratio) != 1.0
-    length = kernel or (ONE_SIDED_KERNEL if geared else CLAIM_KERNEL)
+    alone = seen_from_the_motor(sensing, joint)
+    length = kernel or (ONE_SIDED_KERNEL if alone else CLAIM_KERNEL)
     prepared: list[WeakRecord] = []
     first, count = 0, len(train)
     again: list[Callable[..., WeakRecord]] = []
@@ -319,14 +319,15 @@ def _of_the_link(record: Record, sensing: Sensing) -> frozenset[str]:
     return masked
 
 
-def seen_from_the_motor(sensing: Sensing) -> bool:
-    """True for a joint of which only the drive side is recorded: the load hangs on a compliance
-    nobody measures, that of a gear or, on an axis without one, of its screw or belt.
+def seen_from_the_motor(sensing: Sensing, joint: Joint) -> bool:
+    """True for a geared joint of which only the drive side is recorded: the load hangs on a
+    compliance nobody measures.
     """
     return (
         sensing.balances == ("axis",)
         and sensing.moving == "motor_position"
         and not sensing.both_positions
+        and abs(joint.gear_ratio) != 1.0
     )
 
 
@@ -642,7 +643,7 @@ def prepared_model(joint: Joint, record: Record) -> JointModel:
     adapted = adapt(model, sensing, joint.known)
     if sensing.has_drive and not record.has("motor_torque") and not adapted.named("delay", "drive"):
         adapted = adapted.add(HOLD_DELAY)
-    lagging = seen_from_the_motor(sensing) and sensing.has_drive
+    lagging = seen_from_the_motor(sensing, joint) and sensing.has_drive
     # the link's own motion loads the gear, where its inertia has a name
     moved = lagging or (sensing.both_positions and adapted.inertias == SIDE_INERTIAS)
     load = "motion" if moved and not sensing.has_torque else adapted.load_from
