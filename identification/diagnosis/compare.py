@@ -20,7 +20,7 @@ from identification.diagnosis.places import Place, gather, places_of, worst_wind
 from identification.diagnosis.session import refuse_unlike
 from identification.fitting.assess import Error, assess, over_noise
 from identification.fitting.dataset import dataset_of
-from identification.fitting.engine import stack
+from identification.fitting.engine import prepared_model, stack
 from identification.fitting.fit import Fit
 from identification.representation import html_of
 
@@ -143,10 +143,9 @@ def compare(fitted: Fit, records: Record | Sequence[Record], *, linear: bool = T
         train,
         held,
         fitted.joint,
-        fitted.model,
+        prepared_model(fitted.joint, train[0]),  # whose fit sets the clocks at every door
         kernel=fitted.data.kernel,
         like=fitted.data.sensing,
-        values=fitted.solution.values,
     )
     compared = data.held_out if unseen else data.train
     bench = JointBench(fitted.joint, data, train, held, like=fitted.data.sensing)

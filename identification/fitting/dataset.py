@@ -47,7 +47,6 @@ def dataset_of(
     *,
     kernel: float | None = None,
     like: Sensing | None = None,
-    values: Mapping[str, float] | None = None,
 ) -> Dataset:
     """:func:`load_dataset`, with channels shifted by as much as the fit says that they are late.
 
@@ -65,8 +64,6 @@ def dataset_of(
     model : JointModel
     kernel, like
         See :func:`load_dataset`.
-    values : mapping of str to float, optional
-        Those of a fit that is judged; by default those of the model's first fit.
 
     Raises
     ------
@@ -74,19 +71,16 @@ def dataset_of(
         As by :func:`load_dataset` and :func:`first_fit`.
     """
     load = partial(load_dataset, train, held_out, joint, model, kernel=kernel, like=like)
-    data = _in_time(load(), load, model, values)
+    data = _in_time(load(), load, model)
     read = data
     for place in (p for p in places_of(model) if p in LOW_PASSED):
-        data = _read(place, data, load, model, values)
-    return data if data is read else _in_time(data, load, model, values)
+        data = _read(place, data, load, model)
+    return data if data is read else _in_time(data, load, model)
 
 
-def _found(
-    model: JointModel, data: Dataset, values: Mapping[str, float] | None
-) -> Mapping[str, float]:
-    """Values of a fit, with the unknowns of every run."""
-    known = first_fit(model, data).values if values is None else values
-    return settled(model, data.sensing, _records(data), known)
+def _found(model: JointModel, data: Dataset) -> Mapping[str, float]:
+    """Values of the first fit, with the unknowns of every run."""
+    return settled(model, data.sensing, _records(data), first_fit(model, data).values)
 
 
 def _records(data: Dataset) -> tuple[WeakRecord, ...]:
@@ -97,11 +91,10 @@ def _in_time(
     data: Dataset,
     load: Callable[..., Dataset],
     model: JointModel,
-    values: Mapping[str, float] | None,
 ) -> Dataset:
     """The records with the channels that wait shifted as the fit has them."""
     for _ in range(ROUNDS):
-        records, found = _records(data), _found(model, data, values)
+        records, found = _records(data), _found(model, data)
         if len(within_limits(model, records, found)) < len(names_of_runs(model, records)):
             # what is later than a clock may be is to be named: the other clocks make up for it
             break
@@ -140,12 +133,11 @@ def _read(
     data: Dataset,
     load: Callable[..., Dataset],
     model: JointModel,
-    values: Mapping[str, float] | None,
 ) -> Dataset:
     """The records with a reading shifted by all of its lateness, or by none, or by a part of the
     cycle of its filter the other way: as the fit leaves least of the training records.
     """
-    records, found = _records(data), _found(model, data, values)
+    records, found = _records(data), _found(model, data)
     whole = [_lateness(model, w, place, found) for w in records]
     dt = records[0].grid.dt
     if max(abs(k) for k in whole) <= NEAR * dt:
@@ -159,7 +151,7 @@ def _read(
 
     def left(made: Dataset) -> list[tuple[int, float]]:
         """Rows of each balance of the training records, and what is left of them over noise."""
-        error = assess(model, made, made.train, _found(model, made, values))
+        error = assess(model, made, made.train, _found(model, made))
         return [(len(e.residual), e.ratio) for e in error.balances.values()]
 
     def by_rate(early: float) -> Dataset:

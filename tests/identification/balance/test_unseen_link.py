@@ -11,18 +11,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from identification import improve, load_joint, read
+from identification import improve
 from identification.balance.balances import Balances
 from identification.balance.dataset import load_dataset, prepared_model
 from identification.data.joint_file import Joint
 from identification.data.record import Record
 from identification.errors import InputError
 from identification.fitting.engine import solve
-from identification.fitting.first_fit import first_fit
 from identification.fitting.fit import fit
 from identification.fitting.output_error import refine
 from tests.hidden_effect.generator import generate_case
-from tests.recorded_world.world import make_case, write_case
 from workbench.cli.main import improve_json
 
 MOTOR, LINK, STIFFNESS, RATIO = 4.2, 10.8, 2.2e4, 160.0
@@ -151,19 +149,3 @@ def test_friction_is_named_from_the_motor_side_alone(
     swing = math.sqrt(truth["stiffness_Nm_per_rad"] / truth["link_inertia_kg_m2"]) / (2 * math.pi)
     said = next(w for w in result["warnings"] if "the link would swing at" in w)
     assert float(said.split("swing at ")[1].split(" Hz")[0]) == pytest.approx(swing, rel=0.05)
-
-
-def test_an_axis_on_a_screw_swings_unseen_too(tmp_path: Path) -> None:
-    """An axis without a gear was rigid whatever its screw or belt: nothing explained 17 times the
-    noise, as fast steps make the slide swing.
-    """
-    case = make_case(193009, kind="single", size=1.0)
-    written = write_case(case, tmp_path, "motor")
-    joint = load_joint(written / "joint.toml")
-    assert (joint.kind, joint.gear_ratio) == ("linear", 1.0)
-    run = read(written / "train.csv", joint=joint)
-    model = prepared_model(joint, run)
-    found = first_fit(model, load_dataset([run], [], joint, model)).values
-    stiffness, slide = case.values["K"], case.values["JL"]
-    assert 1 / found["load_compliance"] == pytest.approx(stiffness, rel=0.1)
-    assert found["inertia"] * found["swinging_share"] == pytest.approx(slide, rel=0.1)
