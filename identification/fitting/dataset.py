@@ -26,10 +26,10 @@ from identification.balance.sensing import Sensing
 from identification.balance.weak import WeakRecord
 from identification.data.joint_file import Joint
 from identification.data.record import Record
+from identification.errors import InputError
 from identification.fitting.assess import assess
 from identification.fitting.first_fit import first_fit
 
-Late = list[dict[str, float]]
 ROUNDS: Final = 4
 """Rounds in which clocks are set by the fit: of a lateness of `MOST_SKEW` samples the series in the
 model misses a third, and of what is left a third again, down to :data:`NEAR`."""
@@ -68,14 +68,19 @@ def dataset_of(
     Raises
     ------
     InputError
-        As by :func:`load_dataset` and :func:`first_fit`.
+        As by :func:`load_dataset`.
     """
     load = partial(load_dataset, train, held_out, joint, model, kernel=kernel, like=like)
-    data = _in_time(load(), load, model)
-    read = data
-    for place in (p for p in places_of(model) if p in LOW_PASSED):
-        data = _read(place, data, load, model)
-    return data if data is read else _in_time(data, load, model)
+    read = load()
+    if not places_of(model):
+        return read
+    try:
+        first = data = _in_time(read, load, model)
+        for place in (p for p in places_of(model) if p in LOW_PASSED):
+            data = _read(place, data, load, model)
+        return data if data is first else _in_time(data, load, model)
+    except InputError:  # a fit that is refused is refused where it is asked for
+        return read
 
 
 def _found(model: JointModel, data: Dataset) -> Mapping[str, float]:

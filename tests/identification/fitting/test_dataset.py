@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.resources import files
 from pathlib import Path
 
 import pytest
@@ -11,10 +12,13 @@ from identification import load_joint, read
 from identification.balance.dataset import Dataset, load_dataset, prepared_model
 from identification.balance.weak import WeakRecord
 from identification.data.check.gate import passed
+from identification.errors import InputError
 from identification.fitting.assess import assess
 from identification.fitting.dataset import dataset_of
 from identification.fitting.first_fit import first_fit
 from tests.recorded_world.world import make_case, write_case
+
+DEMO = Path(str(files("workbench"))) / "demo"
 
 
 def both(folder: Path, seed: int, kind: str) -> tuple[JointModel, Dataset, Dataset]:
@@ -70,3 +74,16 @@ def test_a_filtered_drive_is_told_from_one_that_waits_by_what_the_fit_leaves(
     assert max(ratios(read_so)) > 2.4
     assert max(ratios(fitted)) < 1.2
     assert all(-0.3 < late(w, "drive") <= 0 for w in (*fitted.train, *fitted.held_out))
+
+
+def test_records_are_prepared_where_the_fit_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What no fit takes is refused by the verb that fits, and shown as it was read by the others."""
+
+    def refused(*_: object) -> None:
+        raise InputError("no fit")
+
+    monkeypatch.setattr("identification.fitting.dataset.first_fit", refused)
+    joint, run = load_joint(DEMO / "joint.toml"), read(DEMO / "train.npz")
+    model = prepared_model(joint, run)
+    made, read_so = (f([run], [], joint, model) for f in (dataset_of, load_dataset))
+    assert [w.shifts for w in made.train] == [w.shifts for w in read_so.train]
