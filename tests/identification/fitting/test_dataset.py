@@ -77,7 +77,7 @@ def test_a_filtered_drive_is_told_from_one_that_waits_by_what_the_fit_leaves(
 
 
 def test_records_are_prepared_where_the_fit_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What no fit takes is refused by the verb that fits, and shown as it was read by the others."""
+    """What no fit takes is refused by the verb that fits, and shown as it was read elsewhere."""
 
     def refused(*_: object) -> None:
         raise InputError("no fit")
