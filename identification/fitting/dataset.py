@@ -139,8 +139,8 @@ def _read(
     load: Callable[..., Dataset],
     model: JointModel,
 ) -> Dataset:
-    """The records with a reading shifted by all of its lateness, or by none, or by a part of the
-    cycle of its filter the other way: as the fit leaves least of the training records.
+    """The records with a reading shifted by a part of its lateness, or by a part of the cycle of
+    its filter the other way: as the fit leaves least of the training records.
     """
     records, found = _records(data), _found(model, data)
     whole = [_lateness(model, w, place, found) for w in records]
@@ -162,12 +162,30 @@ def _read(
     def by_rate(early: float) -> Dataset:
         return moved([-early * dt] * len(records))
 
-    stands, best = data, min(data, by_rate(0.0), moved(whole), key=lambda made: _over(left(made)))
+    def waiting(share: float) -> Dataset:
+        return moved([share * k for k in whole])
+
+    stands, best = data, data
+    steps = max(math.ceil(max(abs(k) for k in whole) / dt), 1)
+    shares = np.linspace(0.0, 1.0, steps + 1)
+    made = [waiting(float(share)) for share in shares]
+    told = [left(m) for m in made]
+    at = min(range(len(shares)), key=lambda i: _over(told[i]))
+    best = min(data, made[at], key=lambda m: _over(left(m)))
+    if 0 < at < steps:
+        below, there, above = (_squares(told[at + k]) for k in (-1, 0, 1))
+        share = (at + (below - above) / (2 * (below - 2 * there + above))) / steps
+        best = min(best, waiting(share), key=lambda m: _over(left(m)))
     filtered = all(w.shifts.get(place, 0.0) <= 0.0 for w in _records(best))
     if filtered and min(whole) > NEAR * dt:
         early = by_rate(_half_cycle(lambda x: left(by_rate(x))))
         best = min(best, early, key=lambda made: _over(left(made)))
     return best if _over(left(best)) < (1 - BETTER) * _over(left(stands)) else stands
+
+
+def _squares(left: Sequence[tuple[int, float]]) -> float:
+    """Squares of what is left over noise, summed over the rows of all balances."""
+    return sum(n * r**2 for n, r in left)
 
 
 def _over(left: Sequence[tuple[int, float]]) -> float:
@@ -183,7 +201,7 @@ def _half_cycle(left: Callable[[float], Sequence[tuple[int, float]]]) -> float:
     the rest.
     """
     half = HALF_A_CYCLE / 2
-    none, first, second = (sum(n * r**2 for n, r in left(k * half)) for k in range(3))
+    none, first, second = (_squares(left(k * half)) for k in range(3))
     bend, slope = (none + second - 2 * first) / 2, (4 * first - second - 3 * none) / 2
     if bend <= 0 or slope >= 0:
         return 0.0

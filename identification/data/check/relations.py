@@ -9,6 +9,7 @@ import numpy as np
 
 from identification.balance.noise import noise_level
 from identification.balance.sensing import CLAMPED_TRAVEL
+from identification.balance.weak import CLAIM_KERNEL, kernel
 from identification.data.check.channels import GUESSED_RATIO, span
 from identification.data.check.finding import Finding, at
 from identification.data.check.quanta import quantum
@@ -53,7 +54,9 @@ _NEAR, _MOVING = 5, 3e-4
 motion.
 """
 _OWN: Final = 0.03
-"""Share of the link's motion that must be left beside the torque for the two to be told apart."""
+"""Share of the link's motion that must be left beside what twists the joint for the two to be told
+apart.
+"""
 _FEW_VALUES: Final = 8
 """Values of a position that may stand still: a locked link whose encoder toggles."""
 _VELOCITY_TOLERANCE: Final = 0.05
@@ -312,9 +315,25 @@ def _beside_torsion(
     return Finding("warn", "gear_ratio", f"{said}: {advice}", "link_position")
 
 
+def _twisting(record: Record) -> FloatArray | None:
+    """What the twist of the joint follows, (samples,): the torque of its sensor, or without one
+    the acceleration of the link; None where neither is there.
+    """
+    if record.has("link_torque"):
+        return record["link_torque"]
+    weights = kernel(CLAIM_KERNEL, record.dt, 2)
+    link, half = record["link_position"], len(weights) // 2
+    found = np.full(len(record), np.nan)
+    for part in record.segments():
+        if part.stop - part.start >= len(weights):
+            inside = slice(part.start + half, part.stop - half)
+            found[inside] = np.correlate(link[part], weights, "valid")
+    return found if np.isfinite(found).any() else None
+
+
 def _rigid_ratio(record: Record) -> tuple[float, float, float] | None:
-    """Slope of the motor position on the link position beside the torque that twists the joint;
-    None where they cannot be told apart.
+    """Slope of the motor position on the link position beside what twists the joint; None where
+    they cannot be told apart.
 
     Returns
     -------
@@ -322,14 +341,13 @@ def _rigid_ratio(record: Record) -> tuple[float, float, float] | None:
         Doubt: what is left over the motion that counts, as a share of the ratio; correlation of the
         fit with the motor position.
     """
-    if not record.has("link_torque"):
+    twisting = _twisting(record)
+    if twisting is None:
         return None
-    columns = np.column_stack(
-        [record["link_position"], record["link_torque"], np.ones(len(record))]
-    )
+    columns = np.column_stack([record["link_position"], twisting, np.ones(len(record))])
     good = np.isfinite(columns).all(axis=1) & np.isfinite(record["motor_position"])
     sizes = np.linalg.norm(columns[good], axis=0)
-    if not sizes.all() or span(record["link_torque"]) == 0.0:
+    if not sizes.all() or span(twisting) == 0.0:
         return None
     scaled, motor = columns[good] / sizes, record["motor_position"][good]
     found, _, rank, _ = np.linalg.lstsq(scaled, motor, rcond=1e-6)
@@ -340,7 +358,10 @@ def _rigid_ratio(record: Record) -> tuple[float, float, float] | None:
         return None
     left = float(np.linalg.norm(motor - scaled @ found))
     correlation = math.sqrt(max(1.0 - (left / (motor.std() * math.sqrt(motor.size))) ** 2, 0.0))
-    return float(found[0] / sizes[0]), left / (abs(float(found[0])) * own), correlation
+    doubt = left / (abs(float(found[0])) * own)
+    if not record.has("link_torque"):
+        doubt = max(doubt, _RATIO_TOLERANCE)  # gravity twists the joint as well
+    return float(found[0] / sizes[0]), doubt, correlation
 
 
 def check_ratio(record: Record, gear_ratio: float | None) -> list[Finding]:

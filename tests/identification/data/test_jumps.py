@@ -147,6 +147,22 @@ def test_a_soft_joint_passes_where_a_torque_sensor_shows_its_torsion() -> None:
     assert found(check(made.without("link_torque"), RATIO), "gear_ratio").severity == "refuse"
 
 
+@pytest.mark.parametrize(("given", "severity"), [(9.0, "ok"), (8.0, "refuse")])
+def test_a_link_that_swings_on_a_soft_joint_shows_no_other_gear_ratio(
+    given: float, severity: str
+) -> None:
+    time = np.arange(4000) / 200.0
+    link = 0.6 * np.sin(3.0 * time) + 0.15 * np.sin(7.0 * time) + 0.05 * np.sin(11.0 * time)
+    swing = 5.4 * np.sin(3.0 * time) + 7.35 * np.sin(7.0 * time) + 6.05 * np.sin(11.0 * time)
+    made = Record.from_channels(
+        time,
+        # the spring of the link at 2.5 Hz: the motor moves less than the link times the ratio
+        {"link_position": link, "motor_position": 9.0 * (link - swing / (5.0 * np.pi) ** 2)},
+        name="bench",
+    )
+    assert found(check(made, given), "gear_ratio").severity == severity
+
+
 def test_a_locked_link_whose_encoder_toggles_is_allowed() -> None:
     rng = np.random.default_rng(1)
 
