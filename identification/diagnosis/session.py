@@ -723,7 +723,7 @@ class Session:
         as they are where no other name is next, whose work all of them do.
         """
         self.progress("fitting the names of each claim", 0.8)
-        swapped: set[str] = set()
+        swapped, spoiling = set[str](), set[str]()
         position = -1
         while position + 1 < len(standing.claims):
             position += 1
@@ -734,6 +734,7 @@ class Session:
                 base = self.bench.base(standing.now.solution)
                 ranking, stale = self.bench.ranking(base), False
             odds = self.bench.odds(claim, self._near.get(claim.label, {}), standing.now, ranking)
+            odds = None if odds is None else odds.without(spoiling)
             if odds is None or not odds.rivals:
                 continue
             self._doubted.update(odds.behind)
@@ -766,6 +767,12 @@ class Session:
             swapped.add(best.label)
             told = replace(told, effects=odds.names, label=best.label)
             made = self._replay(standing.with_claim(position, told), standing, best.solution.values)
+            worse = made_worse(standing.now.held_out, made.now.held_out)
+            if worse:  # it fits the training records better, and has learned their noise
+                spoiling.add(best.label)
+                self._refused[best.label] = worse
+                position -= 1
+                continue
             if len(made.claims) == len(standing.claims):
                 if claim.label in odds.behind:
                     self._refused[claim.label] = odds.behind[claim.label]

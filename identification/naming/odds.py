@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final, final
@@ -59,6 +59,14 @@ class Odds:
     def names(self) -> tuple[str, ...]:
         """Keys of the rivals."""
         return tuple(r.name for r in self.rivals)
+
+    def without(self, labels: Collection[str]) -> Odds:
+        """The same where the rivals of these labels cannot be: the others have their chance."""
+        rivals = tuple(r for r in self.rivals if r.label not in labels)
+        left = 1.0 - sum(self.probability[r.name] for r in self.rivals if r not in rivals)
+        kept = {r.name: self.probability[r.name] / left for r in rivals if left > 0.0}
+        nothing = self.nothing / left if left > 0.0 else 0.0
+        return Odds(rivals if kept else (), MappingProxyType(kept), self.behind, nothing)
 
     def holds(self, name: str) -> bool:
         """Whether a name may stand for its set: none is more probable by so much as to count as

@@ -861,6 +861,18 @@ def test_a_claim_has_the_names_that_whole_fits_leave(
         assert "is far behind" in found.why("cubic_viscous")
 
 
+@pytest.mark.parametrize("beside", [True, False])
+def test_a_name_that_spoils_held_out_records_takes_no_place(beside: bool, base: Base) -> None:
+    """However much more probable the training records make it: it has learned their noise."""
+    chances = {"cyclic_torque": 0.996} | ({"cubic_viscous": 0.003} if beside else {})
+    laws = {"cubic_viscous": {"p": 1.0}, "cyclic_torque": {"p": 0.1}}
+    found = ended(World(base, {"p": 24.0}, laws, chances=lambda _, now: told(now, chances, {})))
+    (claim,) = found.claims
+    assert claim.effects == ("cubic_viscous",)
+    assert claim.confidence == pytest.approx({"cubic_viscous": 0.75} if beside else {})
+    assert "held-out" in found.why("cyclic_torque")
+
+
 def test_a_claim_that_is_less_probable_than_nothing_goes_and_the_others_stay(base: Base) -> None:
     asked = []
 
