@@ -39,15 +39,29 @@ of the samples is.
 """
 
 
-def any_curve(record: WeakRecord, signal: str, kept: npt.NDArray[np.bool_]) -> FloatArray:
-    """Columns of a free curve over a signal, shape (rows, nodes): whatever law of it there is."""
-    points = record.points[signal]
+def curve_nodes(records: Sequence[WeakRecord], signal: str) -> FloatArray:
+    """Nodes (nodes,) of a free curve over a signal of these records."""
+    points = np.concatenate([w.points[signal] for w in records])
     moving = points[points != 0.0] if np.any(points) else points
     nodes = np.quantile(moving, np.linspace(0.0, 1.0, NODES))
     if signal.endswith("velocity"):
         slow = 2 * float(np.quantile(np.abs(moving), 1 / NODES)) * 0.5 ** np.arange(HALVINGS)
         nodes = np.clip([*nodes, *slow, *-slow], nodes[0], nodes[-1])
-    nodes = np.unique(nodes)
+    return np.unique(nodes)
+
+
+def any_curve(
+    record: WeakRecord,
+    signal: str,
+    kept: npt.NDArray[np.bool_],
+    nodes: FloatArray | None = None,
+) -> FloatArray:
+    """Columns of a free curve over a signal, shape (rows, nodes): whatever law of it there is.
+
+    `nodes`: those of a curve that other records have, too; else the record's own.
+    """
+    points = record.points[signal]
+    nodes = curve_nodes([record], signal) if nodes is None else nodes
     hats = [np.interp(points, nodes, unit) for unit in np.eye(len(nodes))]
     return np.column_stack([record.average(hat)[kept] for hat in hats])
 
@@ -101,4 +115,13 @@ def scaled(matrix: FloatArray) -> FloatArray:
     return np.asarray(matrix / np.maximum(np.linalg.norm(matrix, axis=0), 1e-300))
 
 
-__all__ = ["BIWEIGHT", "DEVIATION", "any_curve", "bounded", "motion_of", "rest_beside", "scaled"]
+__all__ = [
+    "BIWEIGHT",
+    "DEVIATION",
+    "any_curve",
+    "bounded",
+    "curve_nodes",
+    "motion_of",
+    "rest_beside",
+    "scaled",
+]

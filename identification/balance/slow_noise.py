@@ -23,7 +23,14 @@ from typing import Final, final
 import numpy as np
 import numpy.typing as npt
 
-from identification.balance.beside import BIWEIGHT, DEVIATION, any_curve, motion_of, rest_beside
+from identification.balance.beside import (
+    BIWEIGHT,
+    DEVIATION,
+    any_curve,
+    curve_nodes,
+    motion_of,
+    rest_beside,
+)
 from identification.balance.colour import MOST_LINES, Part, lines_in
 from identification.balance.memory import cache_of
 from identification.balance.weak import WeakRecord, differentiated_kernel
@@ -262,7 +269,8 @@ def drift_of_rest(
     """Drift of the readings of torques in what a fitted model leaves, by signal.
 
     Beside a model a drift is seen far better than beside all motion; but what the model lacks is
-    there, too. A law of the place or the speed is taken off as free curves of these; others have
+    there, too. A law of the place or the speed is taken off as free curves of these, which all records
+    have in common; others have
     the frequencies of the motion, not power that falls from octave to octave: all records together
     must say so, and the balances agree as in :func:`slow_noise_of`.
 
@@ -277,15 +285,10 @@ def drift_of_rest(
     """
     found = {}
     for key, courses in rests.items():
-        walks = []
-        for w, course in zip(records, courses, strict=True):
-            rows, length = _longest(w)
-            kept = rows & np.isfinite(course)
-            sides = [x for x in ("motor", "link") if f"{x}_position" in w.points]
-            side = sides[-1] if key == "torque" else sides[0]
-            beside = [np.ones(int(kept.sum())), *_curves(w, side, kept)]
-            rest = rest_beside(course[kept], beside, ROUNDS) if kept.any() else course[kept]
-            walks.append(_walk(_calm(rest), length))
+        walks = [
+            _walk(_calm(rest), _longest(w)[1])
+            for w, rest in zip(records, _beside_laws(records, key, courses), strict=True)
+        ]
         told = [x for x in walks if x is not None]
         if len(told) < len(walks):
             return {}
@@ -297,6 +300,32 @@ def drift_of_rest(
         )
     memory = max(_longest(w)[1] for w in records) / 3.0
     return {c: _drift(rate, memory) for c, rate in _agreed(found).items()}
+
+
+def _beside_laws(
+    records: Sequence[WeakRecord], key: str, courses: Sequence[FloatArray]
+) -> list[FloatArray]:
+    """What is left of the longest stretch of each record beside a mean of its own and free curves
+    of speed and place that all have in common: a law is the same in every record, a drift is not,
+    and over the few speeds of a sweep a curve of its own would follow it.
+    """
+    kept = [
+        _longest(w)[0] & np.isfinite(course) for w, course in zip(records, courses, strict=True)
+    ]
+    ends = np.cumsum([np.count_nonzero(k) for k in kept])
+    if not ends[-1]:
+        return [course[k] for course, k in zip(courses, kept, strict=True)]
+    sides = [s for s in ("motor", "link") if all(f"{s}_position" in w.points for w in records)]
+    side = sides[-1] if key == "torque" else sides[0]
+    number = np.repeat(np.arange(len(records)), [np.count_nonzero(k) for k in kept])
+    columns = [np.equal.outer(number, np.arange(len(records))).astype(np.float64)]
+    for what in ("velocity", "position"):
+        signal = f"{side}_{what}"
+        nodes = curve_nodes(records, signal)
+        parts = [any_curve(w, signal, k, nodes) for w, k in zip(records, kept, strict=True)]
+        columns.append(np.concatenate(parts))
+    values = np.concatenate([course[k] for course, k in zip(courses, kept, strict=True)])
+    return np.split(rest_beside(values, columns, ROUNDS), ends[:-1])
 
 
 def _drift(rate: float, memory: float) -> Part:
