@@ -55,14 +55,17 @@ def any_curve(
     signal: str,
     kept: npt.NDArray[np.bool_],
     nodes: FloatArray | None = None,
+    turning: str | None = None,
 ) -> FloatArray:
     """Columns of a free curve over a signal, shape (rows, nodes): whatever law of it there is.
 
-    `nodes`: those of a curve that other records have, too; else the record's own.
+    `nodes`: those of a curve that other records have, too; else the record's own. `turning`: the
+    signal with whose sign the curve turns its own, as friction does.
     """
     points = record.points[signal]
     nodes = curve_nodes([record], signal) if nodes is None else nodes
-    hats = [np.interp(points, nodes, unit) for unit in np.eye(len(nodes))]
+    sign = 1.0 if turning is None else np.sign(record.points[turning])
+    hats = [sign * np.interp(points, nodes, unit) for unit in np.eye(len(nodes))]
     return np.column_stack([record.average(hat)[kept] for hat in hats])
 
 

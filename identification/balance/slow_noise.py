@@ -65,6 +65,10 @@ SAME: Final = 3.0
 of a line after the window."""
 RECORDS: Final = 200
 """Spectra that a thread keeps."""
+FEWEST_PASSES: Final = 4.0
+"""Passes over a place in one direction from which a friction over it is no course in time: as many
+as reversals are asked for. A curve of a place that is passed once follows any drift.
+"""
 OCTAVES: Final = 5
 """Octaves from which a course of the power is told: three more than it has unknowns."""
 
@@ -174,8 +178,29 @@ def _lines(
     }
 
 
-def _curves(record: WeakRecord, side: str, every: npt.NDArray[np.bool_]) -> list[FloatArray]:
-    return [any_curve(record, f"{side}_{what}", every) for what in ("velocity", "position")]
+def _curves(
+    record: WeakRecord,
+    side: str,
+    kept: npt.NDArray[np.bool_],
+    like: Sequence[WeakRecord] = (),
+) -> list[FloatArray]:
+    """Free curves of what a torque follows from: speed, place, and a friction that changes with the
+    place. `like`: records that have these laws in common.
+    """
+    position, velocity = f"{side}_position", f"{side}_velocity"
+    nodes = {signal: curve_nodes(like or [record], signal) for signal in (position, velocity)}
+    curves = [any_curve(record, s, kept, nodes[s]) for s in (velocity, position)]
+    if _passes(like or [record], position) >= FEWEST_PASSES:
+        curves.append(any_curve(record, position, kept, nodes[position], velocity))
+    return curves
+
+
+def _passes(records: Sequence[WeakRecord], position: str) -> float:
+    """How often the records pass a place in one direction, on average."""
+    points = [w.points[position] for w in records]
+    way = sum(float(np.sum(np.abs(np.diff(x)))) for x in points)
+    reach = max(float(x.max()) for x in points) - min(float(x.min()) for x in points)
+    return way / (2.0 * reach) if reach > 0 else 0.0
 
 
 def _agreed(walks: Mapping[str, _Walk]) -> dict[str, float]:
@@ -319,11 +344,8 @@ def _beside_laws(
     side = sides[-1] if key == "torque" else sides[0]
     number = np.repeat(np.arange(len(records)), [np.count_nonzero(k) for k in kept])
     columns = [np.equal.outer(number, np.arange(len(records))).astype(np.float64)]
-    for what in ("velocity", "position"):
-        signal = f"{side}_{what}"
-        nodes = curve_nodes(records, signal)
-        parts = [any_curve(w, signal, k, nodes) for w, k in zip(records, kept, strict=True)]
-        columns.append(np.concatenate(parts))
+    curves = [_curves(w, side, k, records) for w, k in zip(records, kept, strict=True)]
+    columns += [np.concatenate(parts) for parts in zip(*curves, strict=True)]
     values = np.concatenate([course[k] for course, k in zip(courses, kept, strict=True)])
     return np.split(rest_beside(values, columns, ROUNDS), ends[:-1])
 
