@@ -20,7 +20,9 @@ from casadi_models.hold import CLOCKS, HOLD_DELAY, HOLD_NAME, UNKNOWNS
 from identification.balance.balances import Balances, balances_of
 from identification.balance.clocks import (
     ENCODERS,
+    LOW_PASSED,
     MOST_SKEW,
+    NEAR,
     SIGNAL,
     SURE,
     USUAL_SKEW,
@@ -71,6 +73,8 @@ class Found:
     unit : str
     bounded : bool
         True for a skew that these records hardly tell: only its band is worth a word.
+    waits : float or None
+        Part of a skew by which the channel waits, where the rest is that of a filter [unit].
     """
 
     what: str
@@ -80,6 +84,7 @@ class Found:
     stderr: float | None
     unit: str
     bounded: bool = False
+    waits: float | None = None
 
     def as_json(self) -> dict[str, Any]:
         """The shape of `improve --json`."""
@@ -90,6 +95,7 @@ class Found:
             "value": self.value,
             "stderr": self.stderr,
             "unit": self.unit,
+            "waits": self.waits,
         }
 
 
@@ -318,6 +324,16 @@ def _fitted_on_itself(
     return {of_run(n, record): x for n, x in now.items()}
 
 
+def _waits(name: str, record: WeakRecord, late: float) -> float | None:
+    """The part of a lateness by which a reading waits, as it was shifted, where it may come through
+    a filter as well; None where there is no other part [s].
+    """
+    place = CLOCKS[name].place if name in CLOCKS else ""
+    shift = max(record.shifts.get(place, 0.0), 0.0)
+    filtered = place in LOW_PASSED and late - shift > NEAR * record.grid.dt
+    return shift if filtered else None
+
+
 def calibration_found(
     model: JointModel,
     records: Sequence[WeakRecord],
@@ -332,15 +348,17 @@ def calibration_found(
             what, sensor = UNKNOWNS[name].what, UNKNOWNS[name].sensor
             own = of_run(name, w)
             error = stderr.get(own)
+            value = float(values.get(own, values[name]))
             out.append(
                 Found(
                     what,
                     sensor,
                     run,
-                    value=float(values.get(own, values[name])),
+                    value=value,
                     stderr=error,
                     unit=units[name],
                     bounded=name in CLOCKS and error is not None and error > TOLD * w.grid.dt,
+                    waits=_waits(name, w, value),
                 )
             )
     return tuple(out)

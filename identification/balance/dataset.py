@@ -197,16 +197,18 @@ def load_dataset(
     prepared: list[WeakRecord] = []
     first, count = 0, len(train)
     again: list[Callable[..., WeakRecord]] = []
-    shifts = late if told is None else [w.shifts for w in (*told.train, *told.held_out)]
+    if late is None and told is not None:
+        late = [w.shifts for w in (*told.train, *told.held_out)]
+
     for number, record in enumerate((*train, *held_out)):
         way = partial(_once, curved=model.lagging_load, late=places_of(model))
         again.append(partial(way, record, joint, sensing, length, first))
-        prepared.append(again[-1](known=None if shifts is None else shifts[number]))
+        prepared.append(again[-1](known=None if late is None else late[number]))
         first = max(first, 1 + int(prepared[-1].block.max(initial=first - 1)))
     for number, (record, made) in enumerate(zip((*train, *held_out), prepared, strict=True)):
         seen = {p: [w.filters[p] for w in prepared[:count] if p in w.filters] for p in made.filters}
         agreed = {p: as_told(seen[p], f) for p, f in made.filters.items() if seen[p]}
-        if not made.shifts.get(OF_TORQUE, 0.0) and shifts is None:
+        if not made.shifts.get(OF_TORQUE, 0.0) and late is None:
             # a record that tells nothing of it has the torque sensor of the others
             others = [w.shifts[OF_TORQUE] for w in prepared[:count] if w.shifts.get(OF_TORQUE, 0.0)]
             hidden = sensing.both_positions and others and link_hidden(made)

@@ -294,10 +294,10 @@ def drift_of_rest(
     """Drift of the readings of torques in what a fitted model leaves, by signal.
 
     Beside a model a drift is seen far better than beside all motion; but what the model lacks is
-    there, too. A law of the place or the speed is taken off as free curves of these, which all records
-    have in common; others have
-    the frequencies of the motion, not power that falls from octave to octave: all records together
-    must say so, and the balances agree as in :func:`slow_noise_of`.
+    there, too. A law of the place or the speed is taken off as free curves of these, which all
+    records have in common; others have the frequencies of the motion, not power that falls from
+    octave to octave: all records together must say so, and the balances agree as in
+    :func:`slow_noise_of`.
 
     Parameters
     ----------

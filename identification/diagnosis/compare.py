@@ -15,12 +15,10 @@ from identification.balance.excitation import rest_note
 from identification.balance.rest import rest_check, rest_warnings
 from identification.data.check.gate import gate_warnings, gated
 from identification.data.record import Record, listed
-from identification.diagnosis.bench import JointBench
 from identification.diagnosis.places import Place, gather, places_of, worst_window
-from identification.diagnosis.session import refuse_unlike
+from identification.diagnosis.session import refuse_unlike, timed_bench
 from identification.fitting.assess import Error, assess, over_noise
-from identification.fitting.dataset import dataset_of
-from identification.fitting.engine import prepared_model, stack
+from identification.fitting.engine import stack
 from identification.fitting.fit import Fit
 from identification.representation import html_of
 
@@ -139,16 +137,11 @@ def compare(fitted: Fit, records: Record | Sequence[Record], *, linear: bool = T
     # records of its own are judged as the loop judges the training records, others as it judges
     # held-out ones: one figure for one state
     train, held = (list(fitted.records), given) if unseen else (given, [])
-    data = dataset_of(
-        train,
-        held,
-        fitted.joint,
-        prepared_model(fitted.joint, train[0]),  # whose fit sets the clocks at every door
-        kernel=fitted.data.kernel,
-        like=fitted.data.sensing,
+    bench = timed_bench(  # as at every door
+        fitted.joint, train, held, kernel=fitted.data.kernel, like=fitted.data.sensing
     )
+    data = bench.data
     compared = data.held_out if unseen else data.train
-    bench = JointBench(fitted.joint, data, train, held, like=fitted.data.sensing)
     values = settled(fitted.model, data.sensing, [*data.train, *compared], fitted.solution.values)
     error = bench.judged(
         fitted.solution, assess(fitted.model, data, compared, values), held_out=unseen

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Final
 
@@ -28,11 +29,16 @@ from identification.data.joint_file import Joint
 from identification.data.record import Record
 from identification.errors import InputError
 from identification.fitting.assess import assess
+from identification.fitting.engine import Solution, carried_over
 from identification.fitting.first_fit import first_fit
 
 ROUNDS: Final = 4
 """Rounds in which clocks are set by the fit: of a lateness of `MOST_SKEW` samples the series in the
 model misses a third, and of what is left a third again, down to :data:`NEAR`."""
+CLOSER: Final = 2
+"""Parabolas that lead to the share of a lateness that is a wait: what is left changes by a factor
+ten over a sample, which is no parabola; the second is through points half as far.
+"""
 BETTER: Final = 0.1
 """Share by which what is left over the noise must fall with another reading of a drive: as much as
 an effect must take off to be named. A fit that lacks an effect leans to whatever stands in for it.
@@ -47,6 +53,7 @@ def dataset_of(
     *,
     kernel: float | None = None,
     like: Sensing | None = None,
+    beside: tuple[Solution, Sequence[Mapping[str, float]]] | None = None,
 ) -> Dataset:
     """:func:`load_dataset`, with channels shifted by as much as the fit says that they are late.
 
@@ -64,6 +71,9 @@ def dataset_of(
     model : JointModel
     kernel, like
         See :func:`load_dataset`.
+    beside : (Solution, sequence of mapping), optional
+        A fitted model that has more laws, and the shifts of the training and held-out records from
+        which the clocks are asked again with it.
 
     Raises
     ------
@@ -71,21 +81,27 @@ def dataset_of(
         As by :func:`load_dataset`.
     """
     load = partial(load_dataset, train, held_out, joint, model, kernel=kernel, like=like)
-    read = load()
+    probe = partial(load_dataset, train, (), joint, model, kernel=kernel, like=like)
+    read = load() if beside is None else load(late=beside[1])
     if not places_of(model):
         return read
     try:
-        first = data = _in_time(read, load, model)
+        fit = first_fit(model, read) if beside is None else beside[0]
+        data, fit = _in_time(read, load, fit)
+        late = shifts_of(data)
         for place in (p for p in places_of(model) if p in LOW_PASSED):
-            data = _read(place, data, load, model)
-        return data if data is first else _in_time(data, load, model)
+            late = _read(place, data, probe, fit)
+            data = data if late == shifts_of(data) else load(late=late)
+        return _in_time(data, load, fit)[0]
     except InputError:  # a fit that is refused is refused where it is asked for
         return read
 
 
-def _found(model: JointModel, data: Dataset) -> Mapping[str, float]:
-    """Values of the first fit, with the unknowns of every run."""
-    return settled(model, data.sensing, _records(data), first_fit(model, data).values)
+def shifts_of(data: Dataset) -> list[dict[str, float]]:
+    """Times by which the channels of all records are shifted [s], by place; the training records
+    first.
+    """
+    return [dict(w.shifts) for w in _records(data)]
 
 
 def _records(data: Dataset) -> tuple[WeakRecord, ...]:
@@ -93,13 +109,13 @@ def _records(data: Dataset) -> tuple[WeakRecord, ...]:
 
 
 def _in_time(
-    data: Dataset,
-    load: Callable[..., Dataset],
-    model: JointModel,
-) -> Dataset:
-    """The records with the channels that wait shifted as the fit has them."""
+    data: Dataset, load: Callable[..., Dataset], fit: Solution
+) -> tuple[Dataset, Solution]:
+    """The records with the channels that wait shifted as the fit has them, and the fit to them."""
+    model = fit.model
     for _ in range(ROUNDS):
-        records, found = _records(data), _found(model, data)
+        records, found = _records(data), _values(data, fit)
+        fit = replace(fit, values=found)
         if len(within_limits(model, records, found)) < len(names_of_runs(model, records)):
             # what is later than a clock may be is to be named: the other clocks make up for it
             break
@@ -107,7 +123,12 @@ def _in_time(
         if all(s == w.shifts for s, w in zip(late, records, strict=True)):
             break
         data = load(late=late)
-    return data
+    return data, fit
+
+
+def _values(data: Dataset, near: Solution) -> Mapping[str, float]:
+    """Values of a model on these rows, with the unknowns of every run."""
+    return settled(near.model, data.sensing, _records(data), carried_over(near, data))
 
 
 def _late(model: JointModel, record: WeakRecord, values: Mapping[str, float]) -> dict[str, float]:
@@ -134,53 +155,65 @@ def _lateness(
 
 
 def _read(
-    place: str,
-    data: Dataset,
-    load: Callable[..., Dataset],
-    model: JointModel,
-) -> Dataset:
-    """The records with a reading shifted by a part of its lateness, or by a part of the cycle of
-    its filter the other way: as the fit leaves least of the training records.
+    place: str, data: Dataset, probe: Callable[..., Dataset], fit: Solution
+) -> list[dict[str, float]]:
+    """Shifts of the records [s] with a reading shifted by a part of its lateness, or by a part of
+    the cycle of its filter the other way: as the fit leaves least of the training records.
     """
-    records, found = _records(data), _found(model, data)
-    whole = [_lateness(model, w, place, found) for w in records]
-    dt = records[0].grid.dt
+    records, found = _records(data), _values(data, fit)
+    fit = replace(fit, values=found)
+    whole = [_lateness(fit.model, w, place, found) for w in records]
+    dt, trained = records[0].grid.dt, len(data.train)
     if max(abs(k) for k in whole) <= NEAR * dt:
-        return data
+        return shifts_of(data)
+    left: dict[tuple[float, ...], tuple[tuple[int, float], ...]] = {}
 
-    def moved(shifts: Sequence[float]) -> Dataset:
-        late = [{**w.shifts, place: k} for w, k in zip(records, shifts, strict=True)]
-        if all(s == w.shifts for s, w in zip(late, records, strict=True)):
-            return data
-        return load(late=late)
+    def told(shifts: Sequence[float]) -> tuple[tuple[int, float], ...]:
+        """Rows of each balance of the training records, and what is left of them over noise, with
+        the reading of each record shifted so.
+        """
+        if tuple(shifts) not in left:
+            late = [{**w.shifts, place: k} for w, k in zip(data.train, shifts, strict=False)]
+            moved = data if late == shifts_of(data)[:trained] else probe(late=late, told=data)
+            error = assess(fit.model, moved, moved.train, _values(moved, fit))
+            left[tuple(shifts)] = tuple((len(e.residual), e.ratio) for e in error.balances.values())
+        return left[tuple(shifts)]
 
-    def left(made: Dataset) -> list[tuple[int, float]]:
-        """Rows of each balance of the training records, and what is left of them over noise."""
-        error = assess(model, made, made.train, _found(model, made))
-        return [(len(e.residual), e.ratio) for e in error.balances.values()]
+    def least() -> tuple[float, ...]:
+        return min(left, key=lambda shifts: _over(left[shifts]))
 
-    def by_rate(early: float) -> Dataset:
-        return moved([-early * dt] * len(records))
+    def early(samples: float) -> Sequence[tuple[int, float]]:
+        return told([-samples * dt] * len(records))
 
-    def waiting(share: float) -> Dataset:
-        return moved([share * k for k in whole])
-
-    stands, best = data, data
+    stands = tuple(w.shifts.get(place, 0.0) for w in records)
+    told(stands)
     steps = max(math.ceil(max(abs(k) for k in whole) / dt), 1)
-    shares = np.linspace(0.0, 1.0, steps + 1)
-    made = [waiting(float(share)) for share in shares]
-    told = [left(m) for m in made]
-    at = min(range(len(shares)), key=lambda i: _over(told[i]))
-    best = min(data, made[at], key=lambda m: _over(left(m)))
-    if 0 < at < steps:
-        below, there, above = (_squares(told[at + k]) for k in (-1, 0, 1))
-        share = (at + (below - above) / (2 * (below - 2 * there + above))) / steps
-        best = min(best, waiting(share), key=lambda m: _over(left(m)))
-    filtered = all(w.shifts.get(place, 0.0) <= 0.0 for w in _records(best))
-    if filtered and min(whole) > NEAR * dt:
-        early = by_rate(_half_cycle(lambda x: left(by_rate(x))))
-        best = min(best, early, key=lambda made: _over(left(made)))
-    return best if _over(left(best)) < (1 - BETTER) * _over(left(stands)) else stands
+    shares = {i / steps: told([i / steps * k for k in whole]) for i in range(steps + 1)}
+    for _ in range(CLOSER):
+        share = _lowest({x: _squares(y) for x, y in shares.items()})
+        shares[share] = told([share * k for k in whole])
+    if max(least()) <= 0.0 and min(whole) > NEAR * dt:
+        early(_half_cycle(early))
+    best = least()
+    kept = best if _over(left[best]) < (1 - BETTER) * _over(left[stands]) else stands
+    return [{**w.shifts, place: k} for w, k in zip(records, kept, strict=True)]
+
+
+def _lowest(points: Mapping[float, float]) -> float:
+    """Where the parabola through the lowest of these points and its neighbours is lowest; the point
+    itself at either end.
+    """
+    order = sorted(points)
+    at = order.index(min(order, key=lambda x: points[x]))
+    if not 0 < at < len(order) - 1:
+        return order[at]
+    (a, b, c), (low, mid, high) = (
+        order[at - 1 : at + 2],
+        (points[x] for x in order[at - 1 : at + 2]),
+    )
+    left, right = (mid - low) / (b - a), (high - mid) / (c - b)
+    bend = (right - left) / (c - a)
+    return (a + b - left / bend) / 2 if bend > 0 else b
 
 
 def _squares(left: Sequence[tuple[int, float]]) -> float:
@@ -212,4 +245,4 @@ def _half_cycle(left: Callable[[float], Sequence[tuple[int, float]]]) -> float:
     return early * told / (told + PRICE * (early / USUAL_HALF) ** 2)
 
 
-__all__ = ["dataset_of"]
+__all__ = ["dataset_of", "shifts_of"]

@@ -234,6 +234,24 @@ def _fitted(
     return replace(found, unidentified=(*found.unidentified, *unseen))
 
 
+def carried_over(solution: Solution, data: Dataset) -> dict[str, float]:
+    """Values of a fitted model on rows that differ little from those of its fit: its linear part is
+    followed from there, and no other valley is looked for.
+
+    Parameters
+    ----------
+    solution : Solution
+    data : Dataset
+    """
+    model, tied = solution.model, solution.values.get(LOAD_COMPLIANCE.name) == 0.0
+    held = frozenset(HANGING) if tied else frozenset[str]()
+    values, free, limits, _ = posed(model, data, solution.values, held)
+    balances = balances_of(model, data.sensing, wrt=bare(free))
+    weights = row_weights(balances, data, values, _sigmas(model, data, values), data.train)
+    before = usual(model, data.train, torque=data.sensing.has_torque)
+    return WeakForm(balances, data, values, tuple(free), weights, before).fitted(limits, NEARBY)[0]
+
+
 def unseen_by(model: JointModel, data: Dataset) -> tuple[str, ...]:
     """Inertias, stiffness and amplitudes that stand in no balance of these channels: they keep
     their values.
@@ -461,6 +479,10 @@ too wide nothing is carried, its stiffness goes to its bound, and the gap then m
 catalogue is wrong by a factor 3, a start by guess by 10."""
 
 
+NEARBY: Final = 6
+"""Steps of a fit that is carried over to rows nearly the same: as many as each start of a whole fit
+has, and it begins nearer.
+"""
 GAP_PASSES: Final = 8
 """Passes of a fit in which rows inside a gap count less: which rows these are follows from the gap,
 and each pass takes most of what is wrong of it away."""

@@ -112,8 +112,11 @@ def _taken_up(truth: Mapping[str, Any], result: Json) -> set[str]:
     law = truth["laws"].get("channel_delay")
     if law is not None:
         delay = float(law["current_delay_s"])
-        skews = (c for c in result.get("calibration", []) if c["what"] == "skew")
-        if any(abs(abs(float(c["value"])) - delay) < 0.5 * delay for c in skews):
+        skews = [c for c in result.get("calibration", []) if c["what"] == "skew"]
+        # the drive of a joint is filtered besides: what it waits is the delay
+        late = [abs(float(c["value"])) for c in skews]
+        late += [float(c["waits"]) for c in skews if c.get("waits") is not None]
+        if any(abs(x - delay) < 0.5 * delay for x in late):
             found.add("channel_delay")
     hangs = float(truth["values"].get("TG", 0.0)) > 0.0 and "gravity" not in truth["laws"]
     if hangs and truth["places"].get("cyclic_torque") == "link":

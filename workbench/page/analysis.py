@@ -25,7 +25,7 @@ from identification.diagnosis.diagnose import Diagnosis
 from identification.diagnosis.improve import HOLD_DELAY, ranked_json
 from identification.diagnosis.outcome import key_of
 from identification.diagnosis.places import Rows, gather, places_of, worst_window
-from identification.diagnosis.session import Session, with_held_out
+from identification.diagnosis.session import Session, timed_bench, with_held_out
 from identification.diagnosis.trials import Trial
 from identification.errors import InputError
 from identification.fitting.assess import Error, assess, over_noise
@@ -130,8 +130,8 @@ class Analysis:
             )
             self.note = f"{self.note}; {part}" if self.note else part
         self.start_model = prepared_model(joint, whole[0])
-        self.data = dataset_of(quick_train, quick_held, joint, self.start_model)
-        self.bench = JointBench(joint, self.data, quick_train, quick_held)
+        self.bench = timed_bench(joint, quick_train, quick_held)
+        self.data = self.bench.data
         self.solution: Solution | None = None
         self.trials: dict[str, Trial] = {}
         self._rows: Rows | None = None
@@ -400,11 +400,18 @@ class Analysis:
         )
         return out
 
+    def every_sample(self, step: StepEntry) -> Dataset:
+        """Every sample of the records, the clocks set beside the laws of a step."""
+        if self.whole:
+            return self.data
+        model = self.model_of(step.effects, step.virtual_work)
+        return dataset_of(self._train, self._held, self.joint, model)
+
     def confirm(self, step: StepEntry, progress: Progress) -> StepEntry:
         """Fit the current model to every sample, and judge it on every held-out sample."""
         began = time.perf_counter()
         progress("preparing every sample", 0.1)
-        data = dataset_of(self._train, self._held, self.joint, self.start_model)
+        data = self.every_sample(step)
         progress("fitting every sample", 0.4)
         now = self.current
         self.solution = solve(

@@ -17,7 +17,6 @@ from identification.diagnosis.outcome import key_of
 from identification.diagnosis.session import Session
 from identification.diagnosis.trials import make_base
 from identification.fitting.assess import BalanceError, Error, assess
-from identification.fitting.dataset import dataset_of
 from identification.fitting.engine import Dataset, Solution, solve
 from workbench.page.analysis import Analysis, Progress
 from workbench.page.session import StepEntry
@@ -39,11 +38,7 @@ def improvement_of(
     progress : callable
     """
     train, held = records_of(analysis, entries)
-    data = (
-        analysis.data
-        if train is analysis.quick[0]
-        else dataset_of(train, held, analysis.joint, analysis.start_model)
-    )
+    data = analysis.data if train is analysis.quick[0] else analysis.every_sample(entries[-1])
     data = replace(data, note=analysis.note)
     progress("fitting the steps", 0.1)
     steps = _steps(analysis, data, entries, judged_here=data.train is analysis.data.train)

@@ -24,7 +24,7 @@ from identification.data.formats import (
 )
 from identification.diagnosis.learned import LEARNED
 from workbench.show.pictures import bar, place_picture, staircase_picture
-from workbench.show.words import CURVES, headline
+from workbench.show.words import CURVES, filtered, headline
 from workbench.show.words import title_of as effect_title
 
 if TYPE_CHECKING:
@@ -298,7 +298,7 @@ def calibration_html(result: Mapping[str, Any], names: Sequence[str]) -> str:
             [
                 f"{text(c['what'])} of the {text(words(c['sensor']))}",
                 text(names[c["run"]]),
-                f"{c['value']:.5g} {band} {text(c['unit'])}",
+                f"{c['value']:.5g} {band} {text(c['unit'])}{text(filtered(c))}",
             ]
         )
     return (

@@ -210,9 +210,18 @@ def finding_lines(found: Improvement) -> list[str]:
             name = found.data.train_names[c.run]
             lines.append(
                 f"calibration found: {c.what} of {c.sensor} in {name} {c.value:.4g} +- "
-                f"{2 * c.stderr:.2g} {c.unit} (taken off, no physics)"
+                f"{2 * c.stderr:.2g} {c.unit}{filtered(c.as_json())} (taken off, no physics)"
             )
     return lines
+
+
+def filtered(found: Mapping[str, Any]) -> str:
+    """Which part of a lateness is that of a filter; `found` as in the data of a result."""
+    waits = found["waits"]
+    if waits is None:
+        return ""
+    rest = f"it waits {waits:.3g} {found['unit']}, the rest is" if waits else "that of"
+    return f": {rest} a filter"
 
 
 def place_lines(places: Sequence[Unexplained]) -> list[str]:

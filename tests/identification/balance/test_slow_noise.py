@@ -11,7 +11,7 @@ import numpy.typing as npt
 import pytest
 from scipy.signal import lfilter
 
-from identification import Joint, Record, fit, load_joint, read
+from identification import Record, fit
 from identification.balance.balances import balances_of
 from identification.balance.calibration import settled, values_on
 from identification.balance.dataset import load_dataset, prepared_model
@@ -19,11 +19,10 @@ from identification.balance.noise import calm_of, noise_of
 from identification.balance.stacked import drawn_floors, drifts_beside
 from identification.balance.stamps import evened
 from identification.balance.weak import filtered
-from identification.data.check.gate import passed
 from identification.fitting.fit import Fit
 from tests.identification.balance.test_clocks import motion
 from tests.identification.diagnosis.test_other_payload import DT, JOINT, PER_AMPERE, RATIO
-from tests.recorded_world.world import make_case, write_case
+from tests.identification.fitting.test_dataset import recorded
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -36,16 +35,6 @@ COURSES = 200
 def walk(rng: np.random.Generator, count: int) -> FloatArray:
     course = np.cumsum(rng.standard_normal(count))
     return np.asarray((course - course.mean()) / course.std())
-
-
-def recorded(seed: int, sensors: str, folder: Path) -> tuple[Joint, Record, Record]:
-    """A joint of the recorded world with one hidden effect, and its records."""
-    written = write_case(make_case(seed, kind="single", size=1.0), folder, sensors)
-    joint = load_joint(written / "joint.toml")
-    train, test = (
-        passed(read(written / f"{n}.csv", joint=joint), joint)[0] for n in ("train", "test")
-    )
-    return joint, train, test
 
 
 @cache
@@ -129,7 +118,7 @@ def test_what_a_model_lacks_is_no_drift(missing: float) -> None:
 
 def test_a_friction_that_changes_with_the_place_is_no_drift(tmp_path: Path) -> None:
     """It was one of 5 N.m: neither a curve over speed nor one over place turns its sign."""
-    joint, train, held_out = recorded(201006, "motor_torque", tmp_path)
+    joint, train, held_out = recorded(201006, "single", tmp_path, "motor_torque")
     data = load_dataset([train], [held_out], joint, prepared_model(joint, train))
     assert {signal: noise.drift for signal, noise in data.sources.items()} == dict.fromkeys(
         data.sources
@@ -138,7 +127,7 @@ def test_a_friction_that_changes_with_the_place_is_no_drift(tmp_path: Path) -> N
 
 def test_a_law_is_the_same_in_every_record_and_a_drift_is_not(tmp_path: Path) -> None:
     """Over the few speeds of its sweeps a curve of its own followed the drift of each record."""
-    joint, train, held_out = recorded(200020, "all", tmp_path)
+    joint, train, held_out = recorded(200020, "single", tmp_path)
     found = fit(replace(joint, effects=(*joint.effects, "gravity")), [train], held_out=[held_out])
     told = drifts_beside(found.model, found.data, found.solution.values)
     assert 0.05 < told["drive"].size < 0.2, "N.m; the held-out record wanders by .19"

@@ -356,6 +356,9 @@ def test_a_delay_may_be_told_as_skew() -> None:
     skew = {"what": "skew", "sensor": "motor_current", "run": 0, "value": -7.6e-3}
     assert score(_truth(**late), _result(calibration=[skew])).all_right
     assert not score(_truth(**late), _result(calibration=[{**skew, "value": 1e-3}])).all_right
+    filtered = {**skew, "value": 14e-3, "waits": 7.6e-3}
+    assert score(_truth(**late), _result(calibration=[filtered])).all_right
+    assert not score(_truth(**late), _result(calibration=[{**filtered, "waits": 1e-3}])).all_right
 
 
 def test_campaign_names_what_is_hidden_and_goes_on_where_it_stopped(

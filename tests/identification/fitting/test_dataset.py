@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from casadi_models import JointModel
-from identification import load_joint, read
+from identification import Joint, Record, compare, fit, improve, load_joint, read
 from identification.balance.dataset import Dataset, load_dataset, prepared_model
 from identification.balance.weak import WeakRecord
 from identification.data.check.gate import passed
@@ -21,14 +21,22 @@ from tests.recorded_world.world import make_case, write_case
 DEMO = Path(str(files("workbench"))) / "demo"
 
 
-def both(folder: Path, seed: int, kind: str) -> tuple[JointModel, Dataset, Dataset]:
-    """A joint of the recorded world: its model, its records as read, and as the fit has them."""
+def recorded(
+    seed: int, kind: str, folder: Path, sensors: str = "all"
+) -> tuple[Joint, Record, Record]:
+    """A joint of the recorded world, its training and its held-out record."""
     case = make_case(seed, kind=kind, size=None if kind == "none" else 1.0)
-    written = write_case(case, folder, "all")
+    written = write_case(case, folder, sensors)
     joint = load_joint(written / "joint.toml")
     train, test = (
         passed(read(written / f"{n}.csv", joint=joint), joint)[0] for n in ("train", "test")
     )
+    return joint, train, test
+
+
+def both(folder: Path, seed: int, kind: str) -> tuple[JointModel, Dataset, Dataset]:
+    """A joint of the recorded world: its model, its records as read, and as the fit has them."""
+    joint, train, test = recorded(seed, kind, folder)
     model = prepared_model(joint, train)
     return (
         model,
@@ -86,6 +94,26 @@ def test_a_drive_that_waits_and_is_filtered_is_shifted_by_its_wait(tmp_path: Pat
     assert left.ratio < 1.2
     for w in (*fitted.train, *fitted.held_out):
         assert late(w, "drive") == pytest.approx(1.458, abs=0.15)
+
+
+@pytest.mark.parametrize(
+    ("seed", "sensors", "name"),
+    [(201006, "encoders", "cyclic_friction"), (200002, "all", "kinematic_error")],
+)
+def test_clocks_are_asked_again_beside_what_is_missing(
+    seed: int, sensors: str, name: str, tmp_path: Path
+) -> None:
+    """The start model lacks a law of fifty and of a hundred and fifty times the noise, and its
+    clocks lean to it: a second name, and 38 times the noise, came of that.
+    """
+    joint, train, test = recorded(seed, "single", tmp_path, sensors)
+    found = improve([train], joint, [test])
+    assert [c.effects for c in found.claims] == [(name,)]
+    assert found.verdict == "complete"
+    compared = compare(fit(joint, [train]), [test], linear=False)
+    assert found.steps[0].held_out.relative_error_percent == pytest.approx(
+        compared.error.relative_error_percent, rel=1e-2
+    )
 
 
 def test_records_are_prepared_where_the_fit_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
