@@ -770,8 +770,9 @@ class Session:
             swapped.add(best.label)
             told = replace(told, effects=odds.names, label=best.label)
             made = self._replay(standing.with_claim(position, told), standing, best.solution.values)
-            worse = made_worse(standing.now.held_out, made.now.held_out)
-            if worse:  # it fits the training records better, and has learned their noise
+            there = made.steps[position : position + 2]
+            worse = made_worse(there[0].held_out, there[-1].held_out)
+            if worse:  # as of any addition: it has learned the noise of the training records
                 spoiling.add(best.label)
                 self._refused[best.label] = worse
                 position -= 1
@@ -888,7 +889,14 @@ class Session:
             return None
         held = self.bench.held_against(standing.claims, standing.now)
         wrong = {c.label: held[c.label] for c in standing.claims if c.label in held}
+        needed = {n for c in standing.claims for n in c.effect.needs}
         wrong = {label: e for label, e in wrong.items() if e.is_wrong}
+        # what another claim needs shares the work of its variable with it
+        wrong = {
+            c.label: wrong[c.label]
+            for c in standing.claims
+            if c.label in wrong and c.effects[0] not in needed
+        }
         if not wrong:
             return None
         for c in standing.claims:
@@ -1123,6 +1131,8 @@ def timed_bench(
     model = prepared_model(joint, train[0])
     ask = partial(dataset_of, train, held, joint, model, kernel=kernel, like=like)
     bench = JointBench(joint, ask(), train, held, like=like)
+    if not held:  # nothing is decided without held-out records
+        return bench
     try:
         start = bench.start()
         if not (_standing_over(bench.step(None, None, start)) and places_of(model)):

@@ -865,7 +865,7 @@ def test_a_claim_has_the_names_that_whole_fits_leave(
 def test_a_name_that_spoils_held_out_records_takes_no_place(beside: bool, base: Base) -> None:
     """However much more probable the training records make it: it has learned their noise."""
     chances = {"cyclic_torque": 0.996} | ({"cubic_viscous": 0.003} if beside else {})
-    laws = {"cubic_viscous": {"p": 1.0}, "cyclic_torque": {"p": 0.1}}
+    laws = {"cubic_viscous": {"p": 1.0}, "cyclic_torque": {"p": -0.5}}
     found = ended(World(base, {"p": 24.0}, laws, chances=lambda _, now: told(now, chances, {})))
     (claim,) = found.claims
     assert claim.effects == ("cubic_viscous",)
