@@ -929,6 +929,17 @@ def test_after_a_wrong_name_only_laws_of_its_variable_are_taken_up(base: Base) -
     assert sorted(named(found)) == ["added_spring", "asymmetric_viscous"]
 
 
+@pytest.mark.parametrize("beside", [True, False])
+def test_a_law_that_another_one_needs_is_not_held_against_its_curve(
+    beside: bool, base: Base
+) -> None:
+    """Both share the work of one variable: only alone does it miss what a curve explains."""
+    hidden = {"p": 24.0} | ({"q": 8.0} if beside else {})
+    laws = {"coulomb": {"p": 1.0}, "stribeck": {"q": 1.0}}
+    world = World(base, hidden, laws, wrong={"coulomb@motor": WRONG}, without="coulomb@motor")
+    assert named(ended(world)) == (["coulomb", "stribeck"] if beside else [])
+
+
 def test_a_diagnosis_holds_a_name_against_its_curve_only_where_nothing_else_is_left(
     base: Base,
 ) -> None:
