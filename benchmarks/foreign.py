@@ -1,6 +1,6 @@
 """Effects hidden in a plant whose model is somebody else's FMU: named or not, and how well.
 
-``python -m benchmarks.foreign [--seeds 2] [--only backlash,nothing] [--no-fit]``
+``python -m benchmarks.foreign [--seeds 2] [--only backlash,nothing] [--no-fit] [--values]``
 
 The plant is a joint with motor, gear and link; its foreign model is an FMU of the same equations
 less what is hidden, in C, without model exchange, without FMU state, its parameters fixed. Training
@@ -8,7 +8,8 @@ and held-out records are of different motions. The FMU is fitted by its outputs 
 it starts at the true values less what is hidden), then effects are looked for until nothing is left
 to name. Printed for each run: how the hidden effect is named, the largest residual over its noise
 floor before and after on held-out records, how many parameters of the FMU are within 95 % of the
-truth after the last whole fit of the outputs, the processor time and what is named.
+truth in what the loop hands back, the processor time and what is named; ``--values`` adds how far
+each parameter is from the truth, in its standard errors.
 """
 
 from __future__ import annotations
@@ -24,8 +25,7 @@ from typing import Final
 from identification.diagnosis.improvement import Improvement
 from irj_fmu.imported.correction import PREFIX
 from irj_fmu.imported.diagnose import diagnose
-from irj_fmu.imported.fit import UserFit, fit
-from irj_fmu.imported.improve import improve
+from irj_fmu.imported.improve import UserImprovement, improve
 from tests.user_fmus.make import Make, build
 from tests.user_fmus.plant import HIDDEN, OWN, foreign, recorded
 
@@ -55,6 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--first", type=int, default=1, help="first seed")
     parser.add_argument("--only", default="")
     parser.add_argument("--no-fit", action="store_true")
+    parser.add_argument("--values", action="store_true", help="errors in standard errors")
     given = parser.parse_args(arguments)
     wanted = given.only.split(",") if given.only else [NOTHING, *HIDDEN]
     print(
@@ -65,19 +66,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
         path = build("Elastic", Path(folder), Make(2, ("CoSimulation",), strict=True))
         for seed in range(given.first, given.first + given.seeds):
             for hidden in wanted:
-                _run(path, hidden, seed, fitted=not given.no_fit)
+                _run(path, hidden, seed, fitted=not given.no_fit, values=given.values)
     return 0
 
 
-def _run(path: Path, hidden: str, seed: int, *, fitted: bool) -> None:
+def _run(path: Path, hidden: str, seed: int, *, fitted: bool, values: bool) -> None:
     key = None if hidden == NOTHING else hidden
     train, held = recorded(key, TRAIN, seed), recorded(key, HELD_OUT, seed + 1000)
     begun = time.process_time()
-    inside = ""
+    off: dict[str, float] = {}
     if fitted:
         improved = improve(foreign(path), train, held, max_additions=MOST)
         found = improved.found
-        inside = _inside(fit(improved.model, train))
+        off = _off(improved)
     else:
         found = diagnose(foreign(path), train, held, most=MOST).diagnosis.found
     ratios = [
@@ -85,18 +86,20 @@ def _run(path: Path, hidden: str, seed: int, *, fitted: bool) -> None:
         for s in (found.steps[0], found.steps[-1])
     ]
     claims = "; ".join("/".join(c.effects) for c in found.claims) or found.verdict
+    inside = f"{sum(abs(x) <= SURE for x in off.values())}/{len(off)}" if fitted else ""
     print(
         f"{hidden:<20}{seed:>5}  {judged(found, hidden):<14}{ratios[0]:>8.3g}{ratios[1]:>8.3g}"
         f"{inside:>9}{time.process_time() - begun:>6.0f}  {claims}",
         flush=True,
     )
+    if values:
+        print("    " + "  ".join(f"{n} {x:+.1f}" for n, x in off.items()), flush=True)
 
 
-def _inside(found: UserFit) -> str:
-    """Parameters of the FMU that are within 95 % of the truth, of those that have an error."""
+def _off(found: UserImprovement) -> dict[str, float]:
+    """Errors of the FMU's parameters that have a standard error, in units of it."""
     errors = {n: e for n, e in found.stderr.items() if e and not n.startswith(PREFIX)}
-    near = [abs(found.values[n] - OWN[n]) <= SURE * e for n, e in errors.items()]
-    return f"{sum(near)}/{len(near)}"
+    return {n: (found.model.values[n] - OWN[n]) / e for n, e in errors.items()}
 
 
 if __name__ == "__main__":

@@ -40,6 +40,8 @@ from identification.diagnosis.trials import (
     make_base,
 )
 from identification.fitting.assess import BalanceError, Error, assess
+from identification.fitting.covariance import correlations, window_errors, windows_over
+from identification.fitting.engine import COLLINEAR as NOT_IDENTIFIED
 from identification.fitting.engine import Dataset, Solution, solve, stack
 from identification.fitting.least_squares import bounded_step
 from identification.naming.odds import Odds
@@ -88,6 +90,24 @@ class Freedom:
     step: float
     changes: tuple[Mapping[str, FloatArray], ...]
     constants: Mapping[str, float]
+
+
+@final
+@dataclass(frozen=True)
+class Whole:
+    """A whole fit of balances and FMU together.
+
+    Attributes
+    ----------
+    changes : mapping of str to float
+        By how much each parameter of the FMU moved.
+    stderr : mapping of str to float or None
+        Standard errors of these and of the parameters of the effects; None where the rows do not
+        tell the parameter, or where it stands at a bound.
+    """
+
+    changes: Mapping[str, float]
+    stderr: Mapping[str, float | None]
 
 
 def freedom(
@@ -200,7 +220,7 @@ class FmuBench:
         self._remade = remade
         self._own = frozenset(own_inertias)
         self._inside = {(t.effect.key, t.place) for t in inside}
-        self._known: dict[int, tuple[Solution, Dataset]] = {}
+        self._known: dict[int, tuple[Solution, Dataset, FloatArray]] = {}
         self._fits: dict[tuple[object, ...], Solution] = {}
 
     def start(self) -> Solution:
@@ -228,7 +248,7 @@ class FmuBench:
                 else self._at(sizes)
             )
             solution = solve(model, data, start=solution.values)
-        self._known[id(solution)] = solution, data
+        self._known[id(solution)] = solution, data, sizes
         self._fits[model.structure] = solution
         return solution
 
@@ -236,6 +256,43 @@ class FmuBench:
         """The records with the FMU's parameters where a fit of this bench has moved them."""
         known = self._known.get(id(solution))
         return known[1] if known else self.data
+
+    def changes(self, solution: Solution) -> dict[str, float]:
+        """By how much the whole fit of a solution of this bench moved each of the FMU's
+        parameters.
+        """
+        sizes = self._known[id(solution)][2]
+        return {f.name: float(x) for f, x in zip(self._free, sizes, strict=True)}
+
+    def whole(self, solution: Solution) -> Whole:
+        """What the whole fit of a solution of this bench says of the FMU's parameters and of the
+        effects beside them.
+
+        The errors are those of all of them together: an effect is known no better than the
+        parameters of the FMU that could stand in for it allow.
+        """
+        from scipy.sparse import csr_array, hstack
+
+        _, data, sizes = self._known[id(solution)]
+        base = make_base(solution, data)
+        columns = [c[: len(base.weight)] * base.weight for c in self._columns(solution, data)]
+        own = [f.name for f in self._free]
+        norms = np.array([np.linalg.norm(c) for c in columns])
+        size = np.where(norms > 0, norms, 1.0)
+        jacobian = np.column_stack([base.jacobian, *(c / s for c, s in zip(columns, size))])
+        names, scale = (*base.names, *own), np.append(base.norms, size)
+        at_edge = (x <= f.low or x >= f.high for f, x in zip(self._free, sizes, strict=True))
+        held = {n for n, e, s in zip(own, at_edge, norms, strict=True) if e or not s > 0}
+        stderr: dict[str, float | None] = dict.fromkeys(names)
+        free = np.array([i for i, n in enumerate(names) if n not in held], dtype=np.int64)
+        windows = windows_over([w.time for w in data.train])
+        tiled = csr_array(hstack([windows] * len(base.balances)))
+        found = window_errors(jacobian[:, free], base.residual, tiled)
+        spread, _ = correlations(jacobian[:, free].T @ jacobian[:, free])
+        for k, i in enumerate(free.tolist()):
+            if found is not None and spread[k] < NOT_IDENTIFIED:
+                stderr[names[i]] = float(found[k] / scale[i])
+        return Whole(self.changes(solution), stderr)
 
     def step(self, key: str | None, label: str | None, solution: Solution) -> Step:
         """The balances with their errors."""
@@ -568,4 +625,4 @@ def _plain(effect: Effect) -> bool:
     )
 
 
-__all__ = ["OUTSIDE", "FmuBench", "Freedom", "freedom", "with_nuisance", "without_steep"]
+__all__ = ["OUTSIDE", "FmuBench", "Freedom", "Whole", "freedom", "with_nuisance", "without_steep"]

@@ -31,9 +31,10 @@ def compare(model: UserModel | UserFit, records: Record | Sequence[Record]) -> U
     model = model.model if isinstance(model, UserFit) else model
     given = at_least_one(records)
     windows = model.windows(given)
-    model = model if model.coupling is not None else coupled(model, windows)
-    simulator, _ = simulator_of(model, windows)
-    solver = Solver(model, windows, simulator, noise_of(model, given), frozen=True)
+    noise = noise_of(model, given)
+    model = model if model.coupling is not None else coupled(model, windows, noise)
+    simulator, _ = simulator_of(model, windows, noise)
+    solver = Solver(model, windows, simulator, noise, frozen=True)
     if model.starts:
         solver.solve(8)
     return comparison_of(model, given, windows, solver.predicted)

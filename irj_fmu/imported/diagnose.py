@@ -4,12 +4,14 @@ unexplained.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Final, final
 
 from casadi_models import Effect, JointModel
 from casadi_models.joint import TWIST
+from identification.balance.dataset import with_effect, without
 from identification.data.check.gate import gate_warnings, gated
 from identification.data.joint_file import Joint, Known
 from identification.data.record import Record
@@ -25,7 +27,7 @@ from identification.fitting.engine import (
     load_dataset,
     prepared_model,
 )
-from irj_fmu.imported.bench import OUTSIDE, FmuBench, Freedom, freedom, without_steep
+from irj_fmu.imported.bench import OUTSIDE, FmuBench, Freedom, Whole, freedom, without_steep
 from irj_fmu.imported.compare import compare
 from irj_fmu.imported.correction import Correction, correction_of
 from irj_fmu.imported.fit import UserFit, fit
@@ -54,6 +56,11 @@ class UserDiagnosis:
     why_followed : str
         Why the FMU had to follow the measured motion, seen at the drive alone, and was not
         restarted at measured states; empty where it was.
+    wholes : tuple of Whole
+        The FMU's parameters as the whole fit of each step of the diagnosis has them.
+    apart : mapping of str to float
+        By how much these differ from the last of it where another name of a set is taken: RMS over
+        the names, which count alike.
     """
 
     model: UserModel
@@ -62,6 +69,8 @@ class UserDiagnosis:
     solution: Solution
     records: tuple[Record, ...]
     why_followed: str = ""
+    wholes: tuple[Whole, ...] = ()
+    apart: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def ranking(self) -> Ranking:
@@ -268,12 +277,52 @@ def diagnose(
     decided = session.diagnose(solution) if most is None else session.run(solution, most)
     # a claim that the restarts of both sides bear out is judged there: the outputs lack it still
     seen = not why and bool(decided.claims)
+    between = {} if why else _apart(bench, decided)
+    wholes = tuple(bench.whole(s.solution) for s in decided.steps)
+    decided = _with_errors(decided, wholes)
     found = Diagnosis(decided if seen else held_to_outputs(decided, compare(model, held)))
     say("done", 1.0)
     start = found.found.steps[0]
     return UserDiagnosis(
-        model, found, start.held_out, start.solution, tuple(at_least_one(records)), why
+        model,
+        found,
+        start.held_out,
+        start.solution,
+        tuple(at_least_one(records)),
+        why_followed=why,
+        wholes=wholes,
+        apart=between,
     )
+
+
+def _with_errors(found: Improvement, wholes: Sequence[Whole]) -> Improvement:
+    """The same result, the errors of its effects those of the whole fits: a step of a session has
+    the FMU's parameters as known.
+    """
+    steps = []
+    for step, whole in zip(found.steps, wholes, strict=True):
+        own = {n: whole.stderr.get(n, e) for n, e in step.solution.stderr.items()}
+        steps.append(replace(step, solution=replace(step.solution, stderr=own)))
+    return replace(found, steps=tuple(steps))
+
+
+def _apart(bench: FmuBench, found: Improvement) -> dict[str, float]:
+    """RMS over the names of sets by which the FMU's parameters differ from those of the first
+    names, each set by itself.
+    """
+    last = found.steps[-1].solution
+    first = bench.changes(last)
+    squares = dict.fromkeys(first, 0.0)
+    ranked = found.ranking.everything if found.ranking is not None else ()
+    tried = {t.key: t for t in reversed(ranked)}
+    for claim in found.claims:
+        others = [tried[key] for key in claim.effects[1:] if key in tried]
+        for t in others:
+            other = with_effect(without(last.model, claim.label), t.candidate.label)
+            solution = bench.fitted(other, {**last.values, **t.values})
+            for n, x in bench.changes(solution).items():
+                squares[n] += (x - first[n]) ** 2 / (1 + len(others))
+    return {n: math.sqrt(x) for n, x in squares.items()}
 
 
 def held_to_outputs(found: Improvement, outputs: UserComparison) -> Improvement:

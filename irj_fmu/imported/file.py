@@ -8,7 +8,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from types import MappingProxyType
+from typing import Any, Final
 
 from casadi_models import JointModel
 from casadi_models.term import TOTAL_INERTIA
@@ -22,9 +23,6 @@ from irj_fmu.imported.correction import PREFIX, Correction, correction_of
 from irj_fmu.imported.file_schema import BOUNDS, CHANNEL, MODEL, START
 from irj_fmu.imported.model import Mapped, UserModel, load_user_model
 from irj_fmu.imported.port import noted
-
-if TYPE_CHECKING:
-    from irj_fmu.imported.fit import UserFit
 
 _TABLES: Final = ("joint", "model", "columns", "fitted", "provenance", TABLE, LAWS)
 _ENTRY: Final = {"channels": ("variable", CHANNEL), "start": ("channel", START)}
@@ -242,15 +240,17 @@ def outside_correction(
 
 
 def user_joint_text(
-    model: UserModel, fit: UserFit | None = None, folder: Path | None = None
+    model: UserModel,
+    stderr: Mapping[str, float | None] = MappingProxyType({}),
+    folder: Path | None = None,
 ) -> str:
     """The model as the text of a joint file, with fitted values and standard errors.
 
     Parameters
     ----------
     model : UserModel
-    fit : UserFit, optional
-        Its standard errors are written.
+    stderr : mapping of str to float or None, optional
+        Standard errors that are written beside the values, in the same units.
     folder : Path, optional
         Where the file goes: an FMU beside it is named without its path.
     """
@@ -298,7 +298,7 @@ def user_joint_text(
         )
         shown |= {PREFIX + n: v for n, v in every if n not in TOTAL_INERTIA}
     for key, value in shown.items():
-        error = fit.stderr.get(key) if fit is not None else None
+        error = stderr.get(key)
         lines.append(
             f"{toml_key(key)} = {{ value = "
             f"{value:.12g}{f', stderr = {error:.6g}' if error is not None else ''} }}"

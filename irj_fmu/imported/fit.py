@@ -21,6 +21,7 @@ from identification.fitting.covariance import (
     window_errors,
     windows_over,
 )
+from identification.fitting.engine import AT_BOUND
 from identification.fitting.least_squares import least_squares, triangle_of
 from irj_fmu.host.run import FmuError
 from irj_fmu.host.signals import FloatArray
@@ -93,26 +94,10 @@ class UserFit:
     @property
     def parameters(self) -> dict[str, dict[str, Any]]:
         """Value, standard error, unit and flags of each parameter."""
-        found = {}
-        for name, value in self.values.items():
-            own = name in self.model.fmu.variables
+        found = parameter_table(self.model, self.stderr)
+        for name, row in found.items():
             partner = self.correlation.get(name)
-            unit = (
-                (self.model.fmu.variable(name).unit or "")
-                if own
-                else self.model.correction.unit(name)
-                if self.model.correction
-                else ""
-            )
-            found[name] = {
-                "value": value,
-                "stderr": self.stderr.get(name),
-                "unit": unit,
-                "at_bound": name in self.at_bound,
-                "identifiable": name not in self.unmoved and self.stderr.get(name) is not None,
-                "of": "fmu" if own else "correction",
-                "correlation": {"with": partner[0], "value": partner[1]} if partner else None,
-            }
+            row["correlation"] = {"with": partner[0], "value": partner[1]} if partner else None
         return found
 
     def as_json(self) -> dict[str, Any]:
@@ -125,6 +110,49 @@ class UserFit:
             "train": self.train.as_json(),
             "notes": list(self.model.notes),
         }
+
+
+def at_bounds(values: Mapping[str, float], bounds: Mapping[str, tuple[float, float]]) -> set[str]:
+    """Names of the values that stand at a bound."""
+    return {
+        n
+        for n, x in values.items()
+        if any(abs(x - b) <= AT_BOUND * max(abs(b), 1e-300) for b in bounds[n] if math.isfinite(b))
+    }
+
+
+def parameter_table(
+    model: UserModel, stderr: Mapping[str, float | None]
+) -> dict[str, dict[str, Any]]:
+    """Value, standard error, unit and flags of each parameter of a model.
+
+    Parameters
+    ----------
+    model : UserModel
+    stderr : mapping of str to float or None
+        In the units of the values; None where the records do not show the parameter.
+    """
+    found = {}
+    edge = at_bounds(model.values, model.bounds())
+    for name, value in model.values.items():
+        own = name in model.fmu.variables
+        unit = (
+            (model.fmu.variable(name).unit or "")
+            if own
+            else model.correction.unit(name)
+            if model.correction
+            else ""
+        )
+        found[name] = {
+            "value": value,
+            "stderr": stderr.get(name),
+            "unit": unit,
+            "at_bound": name in edge,
+            "identifiable": stderr.get(name) is not None,
+            "of": "fmu" if own else "correction",
+            "correlation": None,
+        }
+    return found
 
 
 def fit(
@@ -162,28 +190,21 @@ def fit(
     say = progress or (lambda _text, _share: None)
     windows = model.windows(given)
     say(f"taking up {model.fmu.path.name}", 0.02)
-    model, used = coupled(model, windows), 0
+    noise = noise_of(model, given)
+    model, used = coupled(model, windows, noise), 0
     for _ in range(_COUPLINGS):
-        simulator, method = simulator_of(model, windows, exact)
-        solver = Solver(model, windows, simulator, noise_of(model, given))
+        simulator, method = simulator_of(model, windows, noise, exact)
+        solver = Solver(model, windows, simulator, noise)
         used += solver.solve(iterations, say)
         fitted = model.with_values(solver.values)
-        finer = coupled(fitted, windows)
+        finer = coupled(fitted, windows, noise)
         if hold_of(finer) > _FINER * hold_of(model):
             break
         model = finer
     say("standard errors", 0.95)
     stderr, correlation = solver.errors()
-    bounds = model.bounds()
-    at_bound = tuple(
-        n
-        for n in solver.names
-        if any(
-            abs(solver.values[n] - b) <= 1e-9 * max(abs(b), 1e-300)
-            for b in bounds[n]
-            if math.isfinite(b)
-        )
-    )
+    edge = at_bounds(solver.values, model.bounds())
+    at_bound = tuple(n for n in solver.names if n in edge)
     stderr = {n: None if n in at_bound else e for n, e in stderr.items()}
     say("done", 1.0)
     return UserFit(
@@ -200,17 +221,19 @@ def fit(
 
 
 def simulator_of(
-    model: UserModel, windows: Sequence[Window], exact: bool = True
+    model: UserModel, windows: Sequence[Window], noise: FloatArray, exact: bool = True
 ) -> tuple[Simulator, str]:
-    """The best simulator that the FMU allows, and a sentence on it."""
+    """The best simulator that the FMU allows, and a sentence on it; `noise` as in
+    :class:`irj_fmu.imported.sensitivity.BlackBox`.
+    """
     if not exact:
-        return BlackBox(model, windows), "black box: difference quotients over whole runs"
+        return BlackBox(model, windows, noise), "black box: difference quotients over whole runs"
     try:
         return Exact(
             model, windows
         ), "exact derivatives through CasADi's import, checked against difference quotients"
     except (NotExact, FmuError) as error:
-        return BlackBox(model, windows), f"black box: {error}"
+        return BlackBox(model, windows, noise), f"black box: {error}"
 
 
 @final
@@ -399,4 +422,4 @@ class Solver:
         return stderr, correlation
 
 
-__all__ = ["Outputs", "Solver", "UserFit", "fit", "simulator_of"]
+__all__ = ["Outputs", "Solver", "UserFit", "fit", "parameter_table", "simulator_of"]

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, final
 
 import numpy as np
@@ -12,14 +13,17 @@ from identification.balance.excitation import few_reversals
 from identification.data.check.gate import gated
 from identification.data.record import Record
 from identification.diagnosis.claims import Claim
-from identification.diagnosis.improvement import Improvement, held_drop
+from identification.diagnosis.improvement import Improvement, Step, held_drop
 from identification.diagnosis.session import LEAST_ADDED_DROP, MAX_ADDITIONS, with_held_out
 from identification.diagnosis.verdict import verdict_of
+from irj_fmu.imported.bench import Whole
 from irj_fmu.imported.compare import compare
+from irj_fmu.imported.correction import PREFIX
 from irj_fmu.imported.diagnose import UserDiagnosis, diagnose, held_to_outputs, with_outside
-from irj_fmu.imported.fit import fit
+from irj_fmu.imported.fit import fit, parameter_table
 from irj_fmu.imported.model import UserModel, at_least_one
-from irj_fmu.imported.outputs import UserComparison
+from irj_fmu.imported.outputs import UserComparison, noise_of
+from irj_fmu.imported.port import coupled
 
 
 @final
@@ -36,16 +40,27 @@ class UserImprovement:
         Of the start model and of the model after each addition.
     outputs : tuple of UserComparison
         The same models against the held-out records.
+    stderr : mapping of str to float or None
+        Standard errors of the last model's values, in their units; None where the records do not
+        show a parameter.
     """
 
     found: Improvement
     diagnoses: tuple[UserDiagnosis, ...]
     outputs: tuple[UserComparison, ...]
+    stderr: Mapping[str, float | None] = field(default_factory=dict)
 
     @property
     def model(self) -> UserModel:
-        """The FMU with all that was added outside, fitted."""
+        """The FMU with all that was added outside, fitted: by its outputs, or, where an effect is
+        named that cannot ride outside, by what the restarts leave beside that effect.
+        """
         return self.diagnoses[-1].model
+
+    @property
+    def parameters(self) -> dict[str, dict[str, Any]]:
+        """Value, standard error, unit and flags of each parameter of the last model."""
+        return parameter_table(self.model, self.stderr)
 
     @property
     def outcome(self) -> str:
@@ -61,6 +76,7 @@ class UserImprovement:
             "fmu": self.model.fmu.path.name,
             "outputs": [o.as_json()["outputs"] for o in self.outputs],
             "values": self.model.values,
+            "stderr": dict(self.stderr),
         }
 
     def __repr__(self) -> str:
@@ -105,43 +121,46 @@ def improve(
     apart = gated(at_least_one(held_out), model.joint) if held_out else []
     train, held, note = with_held_out(given, apart)
 
-    def looked_at(now: UserModel, number: int) -> tuple[UserModel, UserComparison]:
+    def looked_at(now: UserModel, number: int) -> _Looked:
         share = number / (max_additions + 1)
-        fitted = (
-            fit(now, train, progress=lambda text, _: say(text, share)).model if now.values else now
-        )
-        return fitted, compare(fitted, held)
+        if not now.values:
+            return _Looked(now, compare(now, held), {})
+        fitted = fit(now, train, progress=lambda text, _: say(text, share))
+        return _Looked(fitted.model, compare(fitted, held), fitted.stderr)
 
-    start, outputs = looked_at(model, 0)
-    begun = diagnose(start, train, held)
+    first = looked_at(model, 0)
+    begun = diagnose(first.model, train, held)
     if not begun.why_followed:
         if begun.claims and max_additions > 1:
-            begun = diagnose(start, train, held, most=max_additions)
+            begun = diagnose(first.model, train, held, most=max_additions)
         steps = begun.diagnosis.found.steps
-        models, compared = [start], [outputs]
+        looked = [first]
         aside: list[str] = []
-        for number, (claim, step) in enumerate(
-            zip(begun.diagnosis.found.claims, steps[1:], strict=True), 1
+        for number, (claim, step, whole) in enumerate(
+            zip(begun.diagnosis.found.claims, steps[1:], begun.wholes[1:], strict=True), 1
         ):
-            joint = step.solution.model
+            joint, now = step.solution.model, looked[-1].model
             place = next(t.place for t in joint.terms if t.label == claim.label)
-            now, after = models[-1], compared[-1]
             if begun.stays(claim.effect, place):
                 aside.append(claim.effect.title)
             else:
                 say(f"adding {claim.label}", number / (max_additions + 1))
-                larger = with_outside(now, joint, claim.label, step.solution.values)
-                now, after = looked_at(larger, number)
-            models.append(now)
-            compared.append(after)
+                now = with_outside(now, joint, claim.label, step.solution.values)
+            now, errors = _as_whole(now, begun, step, whole)
+            if aside:
+                now = coupled(now, now.windows(train), noise_of(now, train))
+                looked.append(_Looked(now, compare(now, held), errors))
+            else:  # from there: the fit before made up for what was missing
+                looked.append(looked_at(now, number))
         say("done", 1.0)
         found = replace(begun.diagnosis.found, data=replace(begun.data, note=note))
         return UserImprovement(
-            _with_aside(found, compared[-1], aside),
-            tuple(replace(begun, model=m) for m in models),
-            tuple(compared),
+            _with_aside(found, looked[-1].outputs, aside),
+            tuple(replace(begun, model=n.model) for n in looked),
+            tuple(n.outputs for n in looked),
+            _with_names(looked[-1].stderr, begun.apart),
         )
-    diagnoses, compared = [begun], [outputs]
+    diagnoses, compared, stderr = [begun], [first.outputs], first.stderr
     claims: list[Claim] = []
     following = None
     while diagnoses[-1].claims:
@@ -160,21 +179,56 @@ def improve(
             )
             break
         say(f"adding {claim.label}", len(claims) / (max_additions + 1))
-        larger, after = looked_at(diagnoses[-1].add(), len(claims) + 1)
-        fall = 100 * (1 - _size(after) / _size(compared[-1]))
+        after = looked_at(diagnoses[-1].add(), len(claims) + 1)
+        fall = 100 * (1 - _size(after.outputs) / _size(compared[-1]))
         if fall < LEAST_ADDED_DROP:
             following = (
                 f"{claim.effect.title} would be the next, but lowers the held-out error "
                 f"of the outputs by {fall:.2g} % only."
             )
             break
-        diagnoses.append(diagnose(larger, train, held))
-        compared.append(after)
+        diagnoses.append(diagnose(after.model, train, held))
+        compared.append(after.outputs)
+        stderr = after.stderr
         claims.append(claim)
     say("done", 1.0)
     return UserImprovement(
-        _result(diagnoses, compared, claims, following, note), tuple(diagnoses), tuple(compared)
+        _result(diagnoses, compared, claims, following, note),
+        tuple(diagnoses),
+        tuple(compared),
+        stderr,
     )
+
+
+@final
+@dataclass(frozen=True)
+class _Looked:
+    """A fitted model, its outputs against the held-out records, standard errors of its values."""
+
+    model: UserModel
+    outputs: UserComparison
+    stderr: Mapping[str, float | None]
+
+
+def _as_whole(
+    model: UserModel, begun: UserDiagnosis, step: Step, whole: Whole
+) -> tuple[UserModel, dict[str, float | None]]:
+    """The model at the values of the whole fit of a step, and their errors.
+
+    The outputs of an FMU without an effect that cannot ride outside it are met best by parameters
+    that make up for that effect.
+    """
+    values = {n: begun.model.values[n] + change for n, change in whole.changes.items()}
+    values |= {PREFIX + n: x for n, x in step.solution.values.items() if PREFIX + n in model.values}
+    stderr = {n: whole.stderr.get(n, whole.stderr.get(n.removeprefix(PREFIX))) for n in values}
+    return model.with_values(values), stderr
+
+
+def _with_names(
+    stderr: Mapping[str, float | None], apart: Mapping[str, float]
+) -> dict[str, float | None]:
+    """Standard errors with what the other names of sets would make of the values."""
+    return {n: e and math.hypot(e, apart.get(n, 0.0)) for n, e in stderr.items()}
 
 
 def _with_aside(found: Improvement, outputs: UserComparison, aside: Sequence[str]) -> Improvement:

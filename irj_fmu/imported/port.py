@@ -11,14 +11,21 @@ from typing import Final
 import numpy as np
 
 from identification.errors import InputError
+from irj_fmu.host.run import FmuError
+from irj_fmu.host.signals import FloatArray
 from irj_fmu.imported.correction import CorrectionLaw, Port, steepest
 from irj_fmu.imported.model import DRIVES, UserModel
-from irj_fmu.imported.run import HOLD, Runner, Window
+from irj_fmu.imported.run import HOLD, RTOL, Runner, Window
 
 POSITIONS: Final = ("motor_position", "link_position")
 SHORTEST: Final = HOLD / 64
 """Shortest time for which a torque outside the FMU holds [s]: a run then takes 64 times as many
 calls, and a law that asks for less is a step rather than a slope.
+"""
+STEADY: Final = 0.15
+"""Share of an output's noise, both as RMS, that half the time between two readings of the law may
+move the output by. The error falls with the square of that time, so that a fifth of the noise is
+left of it at most: a twenty-fifth of what noise adds to the sum of squares.
 """
 _PULSE: Final = 10
 _TOO_STEEP: Final = "is so steep over velocity that its torque may hold for"
@@ -103,37 +110,75 @@ def hold_of(model: UserModel) -> float:
     return HOLD if model.coupling is None else min(max(model.coupling, SHORTEST), HOLD)
 
 
-def coupled(model: UserModel, windows: Sequence[Window]) -> UserModel:
+def coupled(
+    model: UserModel, windows: Sequence[Window], noise: FloatArray | None = None
+) -> UserModel:
     """The model with the time for which the torque outside it may hold, at its present values.
 
     A torque T(w) that is read at a velocity and held for a time H is an explicit step of the
     velocity: it stays in phase up to H = J / max|dT/dw| and turns unstable at twice that. J is the
-    inertia that the drive meets within such a time. Where the FMU's own step is longer than that a
-    note says so.
+    inertia that the drive meets within such a time. H is halved from there until that no longer
+    moves the outputs by more than a share of their noise (:data:`STEADY`): of what is left at half
+    of it, a fit would make values of the parameters. Where the FMU's own step is longer a note says
+    so.
 
     Parameters
     ----------
     model : UserModel
     windows : sequence of Window
         Where drive, position and velocity have been, and where the FMU starts.
+    noise : (outputs,) array, optional
+        Standard deviation of the noise of each output, in its unit; without it the slope alone
+        decides.
     """
     if model.correction is None:
         return model
+    found = replace(model, coupling=_by_slope(model, windows))
+    return noted(found if noise is None else _steady(found, windows, noise))
+
+
+def _by_slope(model: UserModel, windows: Sequence[Window]) -> float | None:
+    """J / max|dT/dw| [s]; None where the torque has no slope over velocity, or nothing moves."""
+    assert model.correction is not None
     port = port_of(model)
     drive = np.concatenate([w.inputs[:, port.input] for w in windows]) * port.torque
     place = np.concatenate([w.outputs[:, port.output] for w in windows]) * port.position
     fastest = max(_fastest(w, port) for w in windows)
     if not fastest > 0:
-        return model
+        return model.coupling
     speeds = fastest * np.geomspace(_SLOWEST, 1.0, _SPEEDS)
     speeds = np.concatenate([-speeds[::-1], [0.0], speeds])
     at = np.quantile(drive, [0.0, 0.5, 1.0]), np.quantile(place, np.linspace(0, 1, _PLACES))
     every = [x.ravel() for x in np.meshgrid(*at, speeds, indexing="ij")]
     slope = steepest(model.correction.model, every[0], every[1], every[2])
     inertia = _met(model, windows, port)
-    if not slope > 0 or inertia is None:
-        return noted(replace(model, coupling=None))
-    return noted(replace(model, coupling=inertia / slope))
+    return inertia / slope if slope > 0 and inertia is not None else None
+
+
+def _steady(model: UserModel, windows: Sequence[Window], noise: FloatArray) -> UserModel:
+    """The model with the longest of the halved times that leaves its outputs as they are."""
+    runner, own = model.runner(), {p.name: p.value for p in model.parameters}
+    runner.choose_substeps(windows[0], own)
+    measured = np.concatenate([w.outputs for w in windows])
+    limit = np.maximum(STEADY * noise, RTOL * np.ptp(measured, axis=0))
+
+    def outputs(now: UserModel) -> FloatArray | None:
+        law = feedback_of(now, now.values)
+        try:
+            return np.concatenate([runner.run(w, own, feedback=law) for w in windows])
+        except (FmuError, InputError):  # held for too long the torque may throw it out of reach
+            return None
+
+    now, before = model, outputs(model)
+    while hold_of(now) / 2 >= SHORTEST:
+        half = replace(now, coupling=hold_of(now) / 2)
+        after = outputs(half)
+        if before is not None and after is not None:
+            moved = np.sqrt(np.mean((after - before) ** 2, axis=0))
+            if np.all(moved <= limit):
+                break
+        now, before = half, after
+    return now
 
 
 def noted(model: UserModel) -> UserModel:

@@ -353,10 +353,14 @@ class Restart:
 
     def _sampled(self, window: Window) -> FloatArray:
         """The same at every sample: half a sample earlier than the input that is held, its noise
-        left as it is."""
+        left as it is.
+
+        A longer kernel than the noise asks for would take from a fast drive what half a sample is
+        of it, and a damper and an inertia would make up for that.
+        """
         u = window.inputs[:, self.port.input] * self.port.torque
         dt = float(np.median(np.diff(window.time)))
-        return np.asarray(u - dt / 2 * smooth_slope(u, dt))
+        return np.asarray(u - dt / 2 * self._slope(u, dt))
 
     def _answers(
         self,

@@ -11,14 +11,32 @@ import numpy as np
 
 from irj_fmu.host.signals import FloatArray
 from irj_fmu.imported.port import feedback_of
-from irj_fmu.imported.run import Runner, Window
+from irj_fmu.imported.run import SAME, Runner, Window
 
 if TYPE_CHECKING:
     from irj_fmu.imported.model import UserModel
     from irj_fmu.imported.run import Feedback
 
 STEP: Final = 1e-4
-"""Step of a difference quotient, relative to the scale of what moves."""
+"""Step of a difference quotient at most, relative to the scale of what moves: rounding and the
+errors of an FMU's solver are small beside what it moves.
+"""
+FAR: Final = 1.0
+"""RMS by which such a step may move an output, in its noise: nearer than that a fit has no need to
+know, and further a secant is no slope. A window that starts at a turn of dry friction takes another
+way within that: with start values moved by a ten-thousandth of the range, 160 times the noise, a
+fit of such windows went to and fro until its steps were used up.
+"""
+SMALLEST: Final = 1e-9
+"""Step, relative to the scale of what moves, whose answer is roughness: rounding, or another
+sequence of steps that the FMU's solver takes.
+"""
+ROOM: Final = 3.0
+"""A step that moves the outputs by so many times what is wanted is made anew: each costs a run."""
+CLEAR: Final = 100.0
+"""What a step moves is at least so many times that roughness: the slope is then right to a
+hundredth.
+"""
 
 
 class Simulator(Protocol):
@@ -41,10 +59,16 @@ class BlackBox:
     ----------
     model : UserModel
     windows : sequence of Window
+    noise : (outputs,) array
+        Standard deviation of the noise of each output, in its unit.
     """
 
-    def __init__(self, model: UserModel, windows: Sequence[Window]) -> None:
+    def __init__(self, model: UserModel, windows: Sequence[Window], noise: FloatArray) -> None:
         self.model, self.windows = model, tuple(windows)
+        size = np.ptp(np.concatenate([w.outputs for w in windows]), axis=0)
+        self.noise = np.maximum(np.maximum(noise, SAME * size), 1e-300)
+        self._shares: dict[str | int, float] = {}
+        self._least: float | None = None
         self.runner: Runner = model.runner()
         self.runner.choose_substeps(self.windows[0], {p.name: p.value for p in model.parameters})
         self.bounds = model.bounds()
@@ -66,24 +90,44 @@ class BlackBox:
     ) -> tuple[list[FloatArray], list[FloatArray]]:
         """See :class:`Simulator`."""
         base = self.simulate(values, starts)
-        columns: list[list[FloatArray]] = []
-        for name in names:
-            step = STEP * scale_of(values[name], self.bounds[name])
-            if values[name] + step > self.bounds[name][1]:
+
+        def moved_by(key: str | int, share: float) -> tuple[list[FloatArray], float]:
+            """Outputs after a step of a parameter or of a start value, and the step."""
+            if isinstance(key, int):
+                step = share * self.spread[key]
+                moved = starts.copy()
+                moved[:, key] += step
+                return self.simulate(values, moved), step
+            step = share * scale_of(values[key], self.bounds[key])
+            if values[key] + step > self.bounds[key][1]:
                 step = -step
-            columns.append(
-                _quotient(self.simulate({**values, name: values[name] + step}, starts), base, step)
-            )
-        for i in range(starts.shape[1]):
-            step = STEP * self.spread[i]
-            moved = starts.copy()
-            moved[:, i] += step
-            columns.append(_quotient(self.simulate(values, moved), base, step))
+            return self.simulate({**values, key: values[key] + step}, starts), step
+
+        keys: list[str | int] = [*names, *range(starts.shape[1])]
+        if self._least is None:
+            least = [self._far(moved_by(k, SMALLEST)[0], base) for k in keys[-1:]]
+            self._least = CLEAR * max(least, default=0.0)
+        columns: list[list[FloatArray]] = []
+        for key in keys:
+            share = self._shares.get(key, STEP)
+            moved, step = moved_by(key, share)
+            far = self._far(moved, base)
+            wanted = max(FAR, self._least)
+            if far > ROOM * wanted:
+                share *= wanted / far
+                moved, step = moved_by(key, share)
+            self._shares[key] = share
+            columns.append(_quotient(moved, base, step))
         stacked = [
             np.stack([c[w] for c in columns], axis=2) if columns else np.empty((*b.shape, 0))
             for w, b in enumerate(base)
         ]
         return base, stacked
+
+    def _far(self, moved: Sequence[FloatArray], base: Sequence[FloatArray]) -> float:
+        """RMS of a change of the outputs, in noise, of the output that moves most."""
+        change = (np.concatenate(list(moved)) - np.concatenate(list(base))) / self.noise
+        return float(np.sqrt(np.mean(change**2, axis=0)).max())
 
 
 def _quotient(

@@ -162,7 +162,7 @@ def run_fit(arguments: Namespace) -> int:
     if arguments.output:
         write_text(
             arguments.output,
-            user_joint_text(fitted.model, fitted, Path(arguments.output).resolve().parent),
+            user_joint_text(fitted.model, fitted.stderr, Path(arguments.output).resolve().parent),
         )
         print(f"joint file: {arguments.output}")
     write_json(arguments.json, {**fitted.as_json(), "warnings": warnings})
@@ -278,10 +278,11 @@ def run_improve(arguments: Namespace) -> int:
     for step, outputs in zip(found.found.steps, found.outputs, strict=True):
         print(f"{'+ ' + step.added if step.added else 'start model'}")
         _print_outputs(outputs)
+    _print_parameters(found.parameters)
     if arguments.output:
         write_text(
             arguments.output,
-            user_joint_text(found.model, folder=Path(arguments.output).resolve().parent),
+            user_joint_text(found.model, found.stderr, Path(arguments.output).resolve().parent),
         )
         print(f"joint file: {arguments.output}")
     write_picture(found.found, arguments.picture)

@@ -37,9 +37,12 @@ from irj_fmu.imported.file import (
 )
 from irj_fmu.imported.fit import fit
 from irj_fmu.imported.library import UserFmu, UserInstance
-from irj_fmu.imported.model import UserModel, load_user_model
+from irj_fmu.imported.model import UserModel, load_user_model, start_values
+from irj_fmu.imported.outputs import noise_of
 from irj_fmu.imported.port import feedback_of
+from irj_fmu.imported.sensitivity import BlackBox
 from tests.user_fmus.make import MODELS, Make, build, check
+from tests.user_fmus.plant import foreign, recorded
 
 FloatArray = npt.NDArray[np.float64]
 ME, CS = ("ModelExchange",), ("CoSimulation",)
@@ -216,6 +219,27 @@ def test_an_axis_with_noisy_starts_that_are_estimated(
     assert found.stderr["idle"] is None
     assert not found.parameters["idle"]["identifiable"]
     assert 0.85 < found.train.outputs["motor_position"].ratio < 1.15
+
+
+def test_start_values_at_a_turn_of_dry_friction_have_slopes(folder: Path) -> None:
+    """A ten-thousandth of the range throws such a window to the other side of the turn."""
+    path = fmu(folder, "Elastic", Make(2, CS, strict=True))
+    model, record = foreign(path), recorded(None, 2.0, 1)
+    windows = model.windows([record])
+    starts = start_values(windows)
+    box = BlackBox(model, windows, noise_of(model, [record]))
+    _, found = box.sensitivities(model.values, starts, [])
+    size = np.concatenate([w.outputs for w in windows]).std(axis=0)
+    for i in range(starts.shape[1]):
+        step, sides = 1e-8 * np.ptp(starts[:, i]), []
+        for sign in (1, -1):
+            moved = starts.copy()
+            moved[:, i] += sign * step
+            sides.append(box.simulate(model.values, moved))
+        for slope, up, down in zip(found, *sides, strict=True):
+            true = (up - down) / (2 * step) / size
+            off = np.abs(slope[:, :, i] / size - true).max(axis=0)
+            assert (off < 0.05 * np.abs(true).max(axis=0)).all(), model.starts[i]
 
 
 def test_a_value_that_ends_at_its_bound_is_said(folder: Path, plain: Record) -> None:

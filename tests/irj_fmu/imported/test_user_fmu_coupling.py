@@ -13,10 +13,13 @@ from irj_fmu.imported.correction import PREFIX
 from irj_fmu.imported.file import outside_correction
 from irj_fmu.imported.fit import fit
 from irj_fmu.imported.model import Mapped, UserModel
-from irj_fmu.imported.port import coupled, feedback_of, hold_of, noted
+from irj_fmu.imported.outputs import noise_of
+from irj_fmu.imported.port import STEADY, coupled, feedback_of, hold_of, noted
 from irj_fmu.imported.run import HOLD, Window, parts_of
 from tests.irj_fmu.imported.test_user_fmu import TRUTH, axis, axis_model
 from tests.user_fmus.make import Make, build
+from tests.user_fmus.plant import HIDDEN, foreign, recorded
+from tests.user_fmus.plant import TRUTH as JOINT
 
 
 @pytest.mark.parametrize("speed", [False, True])
@@ -97,6 +100,35 @@ def test_a_steep_law_is_read_as_often_as_its_slope_asks(tmp_path: Path, kind: st
 def test_a_gentle_law_keeps_the_millisecond(tmp_path: Path) -> None:
     model, window = stiff(build("Axis", tmp_path, Make(2, ("CoSimulation",))), 1e-2)
     assert hold_of(coupled(model, [window])) == HOLD
+
+
+def test_a_law_is_read_until_that_no_longer_moves_the_outputs(tmp_path: Path) -> None:
+    """Its slope allows a millisecond, and the outputs are then off by twice their noise."""
+    path = build("Elastic", tmp_path, Make(2, ("CoSimulation",), strict=True))
+    record = recorded("stribeck", 6.0, 1)
+    values = {PREFIX + n: x for n, x in HIDDEN["stribeck"][1].items()}
+    values[f"{PREFIX}motor_smoothing_velocity"] = JOINT["motor_smoothing_velocity"]
+    model = foreign(path)
+    law = outside_correction([HIDDEN["stribeck"][0]], model.joint, values, "here")
+    model = replace(model, correction=law)
+    windows, noise = model.windows([record]), noise_of(model, [record])
+
+    def outputs(coupling: float) -> npt.NDArray[np.float64]:
+        law = feedback_of(replace(model, coupling=coupling), model.values)
+        runner = model.runner()
+        own = {p.name: p.value for p in model.parameters}
+        return np.concatenate([runner.run(w, own, feedback=law) for w in windows])
+
+    fine = outputs(HOLD / 32)
+
+    def off(found: UserModel) -> float:
+        change = (outputs(hold_of(found)) - fine) / noise
+        return float(np.sqrt(np.mean(change**2, axis=0)).max())
+
+    assert off(coupled(model, windows)) > 1.0
+    found = coupled(model, windows, noise)
+    assert off(found) < 4 / 3 * STEADY
+    assert HOLD / 8 <= hold_of(found) <= HOLD / 2  # no more often than that
 
 
 def test_an_fmu_of_fixed_step_is_warned_of_and_keeps_its_step(tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ from irj_fmu.imported.fit import fit
 from irj_fmu.imported.improve import improve
 from tests.irj_fmu.imported.test_user_fmu import DRAG, FILE, axis
 from tests.user_fmus.make import Make, build
+from tests.user_fmus.plant import OWN, foreign, recorded
 from workbench.cli.main import main
 
 SCHEMA = Path(__file__).parents[2] / "data" / "improve.schema.json"
@@ -109,3 +110,33 @@ def test_a_hidden_effect_is_named_and_explained_on_the_command_line(
     assert "quadratic drag" in Path(report).read_text(encoding="utf-8").lower()
     assert load_user_joint(better).correction is not None
     assert "outputs on held-out data" in capsys.readouterr().out
+
+
+@pytest.fixture(scope="module")
+def elastic(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Co-simulation only, parameters fixed, no FMU state."""
+    return build(
+        "Elastic", tmp_path_factory.mktemp("elastic"), Make(2, ("CoSimulation",), strict=True)
+    )
+
+
+def test_what_cannot_ride_outside_is_in_the_values_all_the_same(elastic: Path) -> None:
+    """A spring at the link: fitted by its outputs without it, the FMU makes up for it with half of
+    its gravity more, 200 standard errors from the truth.
+    """
+    train, held = (recorded("added_spring", t, seed) for t, seed in ((8.0, 1), (4.0, 1001)))
+    found = improve(foreign(elastic), train, held, max_additions=1)
+    assert [c.effects for c in found.found.claims] == [("added_spring",)]
+    for name, value in OWN.items():
+        error = found.stderr[name]
+        assert error is not None, name
+        assert found.model.values[name] == pytest.approx(value, abs=3.5 * error), name
+        assert error < 0.05 * value, name
+    table = found.parameters["gravity"]
+    assert table["stderr"] == found.stderr["gravity"]
+    # the spring is known no better than gravity, which may stand in for it
+    last = found.found.steps[-1].solution
+    error = last.stderr["link_added_spring"]
+    assert error is not None
+    assert last.values["link_added_spring"] == pytest.approx(30.0, abs=3.5 * error)
+    assert error > 0.2 * (found.stderr["gravity"] or 0.0)
