@@ -54,7 +54,8 @@ class Variant:
     score : float
         On blocks that its fit did not see, those of the held-out records among them (see
         :data:`identification.variants.screen.PER_PARAMETER`), less that of the recommended one;
-        below 0 for one that lacks an effect of the joint's own model; NaN for one with learned
+        below 0 for one that lacks an effect of the joint's own model, and for one that whole fits
+        rule out; NaN for one with learned
         curves, which are chosen by a cross-validation of their own.
     tied : bool
         Recommended, or not to be told from it with every effect of the joint's own model in it.
@@ -62,6 +63,8 @@ class Variant:
         Share of resampled records on which it is the best.
     solution : Solution
         Its fit, without standard errors.
+    behind : str
+        Why whole fits of its names rule it out, whatever its score; empty where they do not.
     """
 
     name: str
@@ -75,6 +78,7 @@ class Variant:
     tied: bool
     chosen_percent: float
     solution: Solution
+    behind: str = ""
 
     def __repr__(self) -> str:
         return (
@@ -105,6 +109,7 @@ class Variant:
             "score": self.score,
             "tied": self.tied,
             "chosen_percent": self.chosen_percent,
+            "behind": self.behind,
         }
 
 
@@ -148,12 +153,13 @@ class Exploration:
     joint : Joint
     data : Dataset
     variants : tuple of Variant
-        Those that were fitted: with every effect of the joint's own model the best first, then
-        those that lack one.
+        Those that were fitted: with every effect of the joint's own model the best first, those
+        of them that whole fits rule out, then those that lack one.
     screened : int
         Variants that were scored to choose them.
     front : tuple of Variant
-        Of held-out error against parameters, the fewest parameters first.
+        Of held-out error against parameters, the fewest parameters first, of those with every
+        effect of the joint's own model.
     recommended : Variant
     ties : tuple of Variant
         Not to be told from it on these records, the best first.
@@ -265,11 +271,11 @@ class Exploration:
 
 def _listed(labels: Sequence[str]) -> str:
     """Effects in a sentence."""
-    titles = [_title(label) for label in labels]
+    titles = [title_of(label) for label in labels]
     return " and ".join([", ".join(titles[:-1]), titles[-1]]) if len(titles) > 1 else titles[0]
 
 
-def _title(label: str) -> str:
+def title_of(label: str) -> str:
     """Title of an effect, with its place where it may act in several."""
     bare, _, number = label.partition("#")
     key, _, place = bare.partition("@")
@@ -370,6 +376,11 @@ def table_of(found: Exploration, most: int = PRINTED) -> list[str]:
         found.reason,
         found.agreement,
     ]
+    lines += [
+        f"Not {v.name}, whose score is lower by {-v.score:.2g}: {v.behind}."
+        for v in found.variants
+        if v.behind and v.score < 0
+    ][:ALTERNATIVES]
     if found.spare:
         lines.append(
             f"On these records the joint's own {_listed(found.spare)} could as well be left out: "
