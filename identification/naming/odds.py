@@ -41,12 +41,16 @@ class Odds:
         Why a name fell out.
     nothing : float
         Chance that no name of the library is missing.
+    alike : tuple of Rival
+        Names that the records do not tell from the best of them, also where nothing at all does as
+        well as one of these.
     """
 
     rivals: tuple[Rival, ...]
     probability: Mapping[str, float]
     behind: Mapping[str, str]
     nothing: float = 0.0
+    alike: tuple[Rival, ...] = ()
 
     @property
     def empty(self) -> bool:
@@ -146,7 +150,8 @@ def odds_of(contest: Contest, allowance: float) -> Odds:
     allowance : float
         What the leader leaves unmodelled [nats].
     """
-    alive = {r.name for r in contest.alive(allowance) if r.name}
+    alike = tuple(r for r in contest.alive(allowance) if r.name)
+    alive = {r.name for r in alike}
     shares = contest.probability(allowance)
     chance = {r.name: float(p) for r, p in zip(contest.rivals, shares, strict=True)}
     title = EFFECTS[contest.leader.name].title if contest.leader.name else "nothing"
@@ -173,6 +178,7 @@ def odds_of(contest: Contest, allowance: float) -> Odds:
         MappingProxyType({r.name: chance[r.name] for r in left}),
         MappingProxyType(behind),
         chance.get(NOTHING, 0.0),
+        alike,
     )
 
 

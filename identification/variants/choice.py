@@ -10,8 +10,8 @@ from typing import Final, final
 import numpy as np
 import numpy.typing as npt
 
+from identification.variants.lattice import PER_EFFECT
 from identification.variants.refit import Refit
-from identification.variants.screen import PER_PARAMETER
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -22,7 +22,7 @@ SEED: Final = 14
 """Of these resamplings: the same records give the same answer."""
 TIE_QUANTILE: Final = 0.05
 """A variant ties with the best where it does better in this share of the resamplings."""
-TIE_MARGIN: Final = 0.5 * PER_PARAMETER
+TIE_MARGIN: Final = 0.5 * PER_EFFECT
 """Difference of the scores, and of the errors in them, below which variants tie however certain it
 is: 5 % of a balance's RMS, below which one effect counts as good as two elsewhere
 (:data:`identification.diagnosis.session.SAME_WITH_ONE_LESS`); what no model holds shifts the RMS of
@@ -45,10 +45,10 @@ class Judged:
     best : int
         The variant with the lowest score of those that may be recommended.
     error : (variants,) array
-        The score without the price of parameters.
+        The score without that price.
     score : (variants,) array
         Sum over balances of ln RMS of blocks that the fit did not see, held-out records among
-        them, and .10 per parameter.
+        them, and the price of its effects.
     behind : (variants,) array
         The 5 % quantile of score less that of the best, over resampled blocks: a tie up to 0.
     chosen : (variants,) array
@@ -66,19 +66,18 @@ class Judged:
     records: tuple[int, ...] = ()
 
 
-def score_of(squares: FloatArray, rows: FloatArray, parameters: FloatArray) -> FloatArray:
+def score_of(squares: FloatArray, rows: FloatArray, price: FloatArray) -> FloatArray:
     """Score of variants on some blocks.
 
     Parameters
     ----------
     squares, rows : (..., balances) arrays
         Sums over the blocks.
-    parameters : (...) array
+    price : (...) array
+        What their effects must bring (:func:`identification.variants.lattice.price_of`).
     """
     mean = np.maximum(squares, 1e-300) / np.maximum(rows, 1.0)
-    return np.asarray(
-        0.5 * np.where(rows > 0, np.log(mean), 0.0).sum(axis=-1) + PER_PARAMETER * parameters
-    )
+    return np.asarray(0.5 * np.where(rows > 0, np.log(mean), 0.0).sum(axis=-1) + price)
 
 
 def judged(
@@ -97,35 +96,33 @@ def judged(
     """
     squares = np.array([r.squares for r in refits])
     rows = np.array([r.rows for r in refits])
-    parameters = np.array([r.parameters for r in refits], dtype=np.float64)
-    error = score_of(squares.sum(axis=1), rows.sum(axis=1), 0 * parameters)
-    score = error + PER_PARAMETER * parameters
+    price = np.array([r.price for r in refits])
+    error = score_of(squares.sum(axis=1), rows.sum(axis=1), 0 * price)
+    score = error + price
     used = np.flatnonzero(rows[0].sum(axis=1) > 0)
     draws = np.random.default_rng(SEED).integers(0, len(used), (DRAWS, len(used)))
     count = np.zeros((DRAWS, squares.shape[1]))
     for k, drawn in enumerate(draws):
         count[k] = np.bincount(used[drawn], minlength=squares.shape[1])
     drawn_scores = score_of(
-        np.einsum("dk,vkb->dvb", count, squares), np.einsum("dk,vkb->dvb", count, rows), parameters
+        np.einsum("dk,vkb->dvb", count, squares), np.einsum("dk,vkb->dvb", count, rows), price
     )
     aside = np.where(open_to, 0.0, np.inf)
     best = int(np.argmin(score + aside))
     behind = np.quantile(drawn_scores - drawn_scores[:, [best]], TIE_QUANTILE, axis=0)
     chosen = np.bincount((drawn_scores + aside).argmin(axis=1), minlength=len(refits)) / DRAWS
     windows = tuple(
-        int(np.argmin(aside + _on(part, squares, rows, parameters)))
+        int(np.argmin(aside + _on(part, squares, rows, price)))
         for part in np.array_split(used, min(WINDOWS, len(used)))
         if len(part)
     )
-    alone = tuple(int(np.argmin(aside + _on(part, squares, rows, parameters))) for part in records)
+    alone = tuple(int(np.argmin(aside + _on(part, squares, rows, price))) for part in records)
     return Judged(best, error, score, behind, chosen, windows, records=alone)
 
 
-def _on(
-    blocks: IntArray, squares: FloatArray, rows: FloatArray, parameters: FloatArray
-) -> FloatArray:
+def _on(blocks: IntArray, squares: FloatArray, rows: FloatArray, price: FloatArray) -> FloatArray:
     """Scores on some of the blocks."""
-    return score_of(squares[:, blocks].sum(axis=1), rows[:, blocks].sum(axis=1), parameters)
+    return score_of(squares[:, blocks].sum(axis=1), rows[:, blocks].sum(axis=1), price)
 
 
 def tied_with_best(

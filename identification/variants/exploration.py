@@ -18,8 +18,7 @@ from identification.fitting.engine import Solution
 from identification.fitting.joint_text import joint_text
 from identification.fitting.parameters import parameter_table
 from identification.representation import html_of
-from identification.variants.lattice import added_to
-from identification.variants.screen import PER_PARAMETER
+from identification.variants.lattice import PER_EFFECT, PER_FURTHER, added_to
 
 NAME: Final = 57
 """Letters of a variant's name in the table; its lines have 100."""
@@ -53,7 +52,7 @@ class Variant:
         logarithms.
     score : float
         On blocks that its fit did not see, those of the held-out records among them (see
-        :data:`identification.variants.screen.PER_PARAMETER`), less that of the recommended one;
+        :func:`identification.variants.lattice.price_of`), less that of the recommended one;
         below 0 for one that lacks an effect of the joint's own model, and for one that whole fits
         rule out; NaN for one with learned
         curves, which are chosen by a cross-validation of their own.
@@ -158,8 +157,8 @@ class Exploration:
     screened : int
         Variants that were scored to choose them.
     front : tuple of Variant
-        Of held-out error against parameters, the fewest parameters first, of those with every
-        effect of the joint's own model.
+        Of held-out error against parameters, the fewest parameters first, of those that may be
+        recommended.
     recommended : Variant
     ties : tuple of Variant
         Not to be told from it on these records, the best first.
@@ -259,7 +258,8 @@ class Exploration:
             "spare": list(self.spare),
             "agreement": self.agreement,
             "reason": self.reason,
-            "per_parameter": PER_PARAMETER,
+            "per_effect": PER_EFFECT,
+            "per_further_parameter": PER_FURTHER,
             "not_testable": [{"effect": n.effect, "why": n.why} for n in self.not_testable],
             "not_compared": [{"model": n, "why": why} for n, why in self.apart.items()],
             "warnings": list(self.warnings),
@@ -384,6 +384,6 @@ def table_of(found: Exploration, most: int = PRINTED) -> list[str]:
     if found.spare:
         lines.append(
             f"On these records the joint's own {_listed(found.spare)} could as well be left out: "
-            "less than 10 % off a balance for a parameter."
+            "less than 10 % off a balance for each."
         )
     return lines

@@ -53,7 +53,7 @@ from identification.variants.refit import (
     refitted,
     with_size,
 )
-from identification.variants.screen import LARGEST, PER_PARAMETER, Scored, Screen
+from identification.variants.screen import LARGEST, Scored, Screen
 
 SHOWN: Final = 40
 """Variants of the screen that are fitted: on simulated joints the best after the fit was among the
@@ -263,13 +263,15 @@ class _Search:
                     continue
                 self.progress(f"names in the place of {label}", 0.95)
                 odds = self.session.named(solution, label)
-                if odds is None or not odds.rivals:
+                if odds is None or not odds.alike:
                     continue
-                for rival in odds.rivals:
+                for rival in odds.alike:
                     self._fit(rival.solution.model, rival.solution.values)
-                left = frozenset(r.label for r in odds.rivals)
+                # whether anything is missing there at all the score has told
+                left = frozenset(r.label for r in odds.alike)
+                fallen = {n: why for n, why in odds.behind.items() if n not in left}
                 self.sets[label] = left
-                self.behind.append((left, odds.behind))
+                self.behind.append((left, fallen))
             if self._best() is best:
                 break
 
@@ -371,8 +373,9 @@ class _Search:
         ]
         curve = self._curved(improvement, own)
         shown = [*variants, *([curve] if curve is not None else [])]
-        # what lacks an effect that the joint file knows of is no answer, and beats none
-        asked = [k for k, v in enumerate(shown) if not v.dropped]
+        # what lacks an effect that the joint file knows of, or has a name that whole fits rule out,
+        # is no answer, and beats none
+        asked = [k for k, v in enumerate(shown) if not v.dropped and not v.behind]
         front = front_of(
             [shown[k].parameters for k in asked], [shown[k].error_percent for k in asked]
         )
@@ -386,10 +389,8 @@ class _Search:
             gone = parts[best] - parts[k]
             came = parts[k] - parts[best]
             if len(gone) == 1 and len(came) == 1 and gone <= set(recommended.added):
-                plain = variants[k].score - PER_PARAMETER * (
-                    variants[k].parameters - recommended.parameters
-                )
-                lost = 100 * (math.exp(plain / balances) - 1)
+                rise = float(scores.error[k] - scores.error[best])
+                lost = 100 * (math.exp(rise / balances) - 1)
                 (effect,), (by,) = gone, came
                 stand_ins.append(StandIn(effect, by, lost, tied[k]))
         improved = next((variants[k] for k, m in enumerate(marks) if m == self.last), None)
