@@ -106,7 +106,7 @@ def exploration_section(found: Exploration) -> str:
         f"<figure>{front_picture(dots, front, FIGURE)}</figure>{paragraphs}"
         f"{table(head, rows, f'Tied: {tied}' if tied else 'Nothing ties with the recommended one')}"
         "<p class='note'>Score behind: sum over the balances of the logarithm of the error on "
-        "unseen blocks, .10 for each effect and .025 for each of its parameters beyond the first, "
+        "unseen blocks, .10 for each effect and .05 for each of its parameters beyond the first, "
         "less that of the recommended variant. Best in: share of resampled records in which the "
         "variant has the lowest score.</p>"
     )

@@ -120,13 +120,9 @@ def test_which_law_it_is_whole_fits_tell_and_not_the_price_of_its_parameters(
     assert found.recommended.added == ("piecewise_stiffness",)
     assert found.variants[0] is found.recommended and found.recommended.score == 0
     (behind,) = [v for v in found.variants if v.added == ("soft_windup",) and not v.dropped]
-    assert not behind.tied and behind not in found.front
+    assert behind.score < 0 and not behind.tied and behind not in found.front
     assert "nats behind piecewise" in behind.behind
-    # where its price made it the better one, a line says why it is not recommended
-    assert behind.behind not in "\n".join(table_of(found))
-    cheap = replace(behind, score=-0.1)
-    every = tuple(cheap if v is behind else v for v in found.variants)
-    assert behind.behind in "\n".join(table_of(replace(found, variants=every)))
+    assert behind.behind in "\n".join(table_of(found))
 
 
 @pytest.mark.slow
@@ -271,12 +267,12 @@ def test_every_record_and_part_of_them_has_its_best(demo: Path) -> None:
     assert sum(v["chosen_percent"] for v in found["variants"]) == pytest.approx(100)
 
 
-def test_an_effect_costs_ten_percent_of_one_balance_and_each_further_parameter_a_quarter() -> None:
+def test_an_effect_costs_ten_percent_of_one_balance_and_each_further_parameter_half_of_it() -> None:
     """A law with five parameters that takes 29 % off a balance was not recommended at ten percent
     for each.
     """
     assert price_of(1, 1) == pytest.approx(0.1)
-    assert price_of(2, 6) == pytest.approx(price_of(1, 5) + price_of(1, 1)) == pytest.approx(0.3)
+    assert price_of(2, 6) == pytest.approx(price_of(1, 5) + price_of(1, 1)) == pytest.approx(0.4)
     rows = np.array([10.0, 10.0])
     plain = score_of(np.array([10.0, 10.0]), rows, np.array(price_of(3, 3)))
     better = score_of(np.array([10.0 * math.exp(-0.2), 10.0]), rows, np.array(price_of(4, 4)))
