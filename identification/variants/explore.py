@@ -186,14 +186,25 @@ class _Search:
             progress=lambda text, part: self.progress(text, share + 0.2 * part),
         )
 
-    def _fit(self, model: JointModel, *starts: Mapping[str, float], name: str = "") -> None:
-        """Fit a variant once; one whose parts are none is passed over."""
-        mark = (frozenset(visible_labels(model)), model.inertias)
-        if mark in self.found:
+    def _fit(
+        self,
+        model: JointModel,
+        *starts: Mapping[str, float],
+        name: str = "",
+        again: bool = False,
+    ) -> None:
+        """Fit a variant once; one whose parts are none is passed over. `again`: once more from
+        other values, and what leaves less stays.
+        """
+        mark = self._mark(model)
+        there = self.found.get(mark)
+        if there is not None and not again:
             return
         refit = refitted(model, self.data, starts, self.weighting)
         added = added_to(self.start.model, model)
         if not np.all(np.isfinite(refit.held.rms)) or physical(refit, added, self.data):
+            return
+        if there is not None and not refit.cost < there.cost:
             return
         self.found[mark] = refit
         if name:
@@ -240,10 +251,15 @@ class _Search:
         return self._best() is not now
 
     def _neighbours(self) -> None:
-        """The best variant with one part less."""
-        now = self._best().solution
-        for label in droppable(now.model):
-            self._fit(without(now.model, label), now.values)
+        """The best variant with one part less, from its values: a variant that was fitted from
+        other ones may stand in a worse valley, and a part that is none would be what leads out.
+        """
+        for _ in range(ROUNDS):
+            now = self._best()
+            for label in droppable(now.solution.model):
+                self._fit(without(now.solution.model, label), now.solution.values, again=True)
+            if self._best() is now:
+                break
 
     def _named(self) -> None:
         """Whole fits of the names that may stand for each part of the best variant, as `improve`

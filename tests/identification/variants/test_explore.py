@@ -25,6 +25,7 @@ from identification.variants.choice import (
     tied_with_best,
 )
 from identification.variants.exploration import table_of
+from identification.variants.explore import _Search
 from identification.variants.lattice import assembled, nodes_of, price_of, together
 from identification.variants.refit import Weighting, held_of, refitted
 from identification.variants.screen import Screen
@@ -206,6 +207,25 @@ def test_a_law_that_only_scales_a_balance_gains_nothing() -> None:
     assert all(np.allclose(x, 1.0) for b, x in units.items() if b != "link")
     assert found.relative_error_percent < plain.relative_error_percent
     assert found.rms[at] > plain.rms[at]
+
+
+def test_a_variant_in_a_worse_valley_is_fitted_again_from_the_best() -> None:
+    """A gain that is none led the fit of two true parts out of their valley, and was recommended
+    with them.
+    """
+    found, start = session(), session().start()
+    search = _Search(found, start, read(DEMO / "train.npz"), lambda text, share: None)
+    true = start.model.add(f"{HIDDEN}@motor")
+    search._fit(start.model, start.values)
+    search._fit(true, start.values)
+    good = search._best()
+    search._fit(true.add("cubic_viscous@motor"), good.solution.values)
+    mark = search._mark(true)
+    search.found[mark] = replace(good, cost=9 * good.cost, squares=9 * good.squares)
+    assert search._best() is not search.found[mark]
+    search._neighbours()
+    assert search.found[mark].cost == pytest.approx(good.cost, rel=0.02)
+    assert search._best() is search.found[mark]
 
 
 def test_parts_that_do_not_go_together_are_never_in_one_variant() -> None:
