@@ -15,8 +15,8 @@ PER_EFFECT: Final = 0.10
 a claim asks for (:data:`identification.diagnosis.claims.MAJOR_DROP`)."""
 PER_FURTHER: Final = 0.5 * PER_EFFECT
 """The same for each of its parameters beyond the first: the 5 % of a balance below which one effect
-counts as good as two (:data:`identification.diagnosis.session.SAME_WITH_ONE_LESS`).  A quarter, and
-as much as for the first, gave fewer right variants on simulated joints."""
+counts as good as two (:data:`identification.diagnosis.session.SAME_WITH_ONE_LESS`).  As much as for
+the first gave fewer right variants on simulated joints, a quarter as many as a half."""
 
 
 def price_of(effects: int, parameters: int) -> float:
