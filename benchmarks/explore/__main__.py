@@ -1,11 +1,17 @@
 """All variants of a joint's model: how many, how long, and how near to converged fits.
 
     python -m benchmarks.explore [--seconds 40] [--rate 1000] [--sample 50] [--seed 3]
+    python -m benchmarks.explore --joints 20 [--start 81000] [--size 1] [--keep FILE]
+    python -m benchmarks.explore --planted emps
 
 A simulated joint with two hidden effects in `--seconds` at `--rate` Hz, and a second record held
 out. Printed: variants scored and fitted, processor seconds of the whole with `improve`; then, for a
 random sample of the fitted variants, how many are shown with an error within 1 % of that of a
 converged fit.
+
+With `--joints` or `--planted` instead: whether the true structure is on the front, and recommended,
+on joints of the recorded world, and on recordings of a real axis in which an effect was planted
+(:mod:`benchmarks.explore.structures`).
 """
 
 from __future__ import annotations
@@ -17,18 +23,22 @@ os.environ.update(
 )
 
 import argparse
+import sys
 import tempfile
 import time
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks.explore.structures import on_rig, structures, table
 from identification import Record, explore, load_joint, read
 from identification.data.joint_file import Joint
 from identification.variants.choice import score_of
 from identification.variants.exploration import Exploration
 from identification.variants.refit import Weighting, refitted
+from tests.recorded_world.planted import RIGS
 from workbench.cli.main import main as irj
 
 HIDDEN = ("stribeck", "kinematic_error")
@@ -91,7 +101,19 @@ def main() -> None:
     parser.add_argument("--rate", type=float, default=1000.0)
     parser.add_argument("--sample", type=int, default=50)
     parser.add_argument("--seed", type=int, default=3)
+    parser.add_argument("--joints", type=int, default=0, help="instead: joints with a known truth")
+    parser.add_argument("--start", type=int, default=81000, help="first seed of these")
+    parser.add_argument("--size", type=float, default=1.0, help="factor on what is hidden in them")
+    parser.add_argument("--planted", choices=list(RIGS), help="instead: a recorded axis")
+    parser.add_argument("--keep", type=Path, help="file of outcomes of this version: not run again")
     options = parser.parse_args()
+    if options.planted:
+        print(table(on_rig(options.planted, partial(print, file=sys.stderr, flush=True))))
+        return
+    if options.joints:
+        told = partial(print, file=sys.stderr, flush=True)
+        print(table(structures(options.joints, options.start, options.size, options.keep, told)))
+        return
     train, held = records(options.seconds, options.rate, options.seed)
     found, seconds = timed(train, load_joint(DEMO), held)
     count, close, alike, each = near(found, options.sample, options.seed)

@@ -311,13 +311,16 @@ def common_rms(before: Error, after: Error, balance: str) -> tuple[float, float]
 def judged_drop(before: Error, after: Error, balance: str) -> float:
     """Fall of a balance's RMS in percent, on one weighting: what an addition is judged by.
 
-    In a balance that is noise before and after it is in units of what noise alone leaves: a gain
-    that stands for an inertia takes the noise of an encoder away and explains nothing.
+    In a balance that is noise before and after it is in units of the noise that each model passes
+    on: a gain that stands for an inertia takes the noise of an encoder away and explains nothing.
+    A floor that is lower because the records leave less than such noise is no unit: then structure
+    was read as noise, as a fast ripple is, and the addition takes it off.
     """
     old, new = common_rms(before, after, balance)
     one, two = before.balances[balance], after.balances[balance]
-    noise = max(one.ratio, two.ratio) <= RATIO_LIMIT and 0 < two.floor < one.floor
-    unit = two.floor / one.floor if noise else 1.0
+    passed = one.floor / max(one.believed, 1e-300), two.floor / max(two.believed, 1e-300)
+    noise = max(one.ratio, two.ratio) <= RATIO_LIMIT and 0 < passed[1] < passed[0]
+    unit = passed[1] / passed[0] if noise else 1.0
     return 100 * (1 - new / (old * unit)) if old > 0 else 0.0
 
 

@@ -75,7 +75,7 @@ from identification.errors import InputError
 from identification.fitting.assess import RATIO_LIMIT
 from identification.fitting.dataset import dataset_of, shifts_of
 from identification.fitting.engine import Solution, prepared_model
-from identification.naming.odds import SCREEN
+from identification.naming.odds import SCREEN, Odds
 
 MAX_ADDITIONS: Final = 6
 SLOWER: Final = (2.0, 4.0)
@@ -195,6 +195,7 @@ class Session:
         self._located: dict[str, str] = {}
         self._near: dict[str, Mapping[str, float]] = {}
         self._asked: set[tuple[object, ...]] = set()
+        self._odds: dict[tuple[object, ...], Odds | None] = {}
         self._crowd: Claim | None = None
         self._longer: dict[tuple[object, ...], dict[str, tuple[float, float]]] = {}
 
@@ -376,6 +377,35 @@ class Session:
             first, last, standing.steps, standing.claims, following=stopped, unnamed=unnamed
         )
         return replace(found, decided=tuple(decided))
+
+    def named(self, solution: Solution, label: str) -> Odds | None:
+        """Whole fits of the names that may stand for one part of a fitted model, however it came
+        into it; None where the library tells of none there.
+
+        Parameters
+        ----------
+        solution : Solution
+        label : str
+            Of a part that no other one needs.
+        """
+        mark = (solution.model.structure, label)
+        if mark not in self._odds:
+            less = without(solution.model, label)
+            base = self.bench.base(self.bench.fitted(less, solution.values, again=True))
+            ranking = self.bench.ranking(base)
+            trial = next((t for t in ranking.everything if t.candidate.label == label), None)
+            if trial is None:
+                self._odds[mark] = None
+            else:
+                names = shortened(confusion_set(trial, ranking.everything, base), ranking)
+                claim = make_claim(trial, ranking, base, names)
+                self._odds[mark] = self.bench.odds(
+                    claim,
+                    _behind(trial, ranking),
+                    self.bench.step(None, None, solution),
+                    self.bench.ranking(self.bench.base(solution)),
+                )
+        return self._odds[mark]
 
     def finish(
         self,
@@ -738,6 +768,7 @@ class Session:
                 ranking, stale = self.bench.ranking(base), False
             odds = self.bench.odds(claim, self._near.get(claim.label, {}), standing.now, ranking)
             odds = None if odds is None else odds.without(spoiling)
+            self._odds[standing.now.solution.model.structure, claim.label] = odds
             if odds is None or not odds.rivals:
                 continue
             self._doubted.update(odds.behind)

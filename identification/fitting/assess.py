@@ -14,7 +14,13 @@ from casadi_models import JointModel
 from identification.balance.balances import balances_of
 from identification.balance.calibration import settled
 from identification.balance.kinematic import residual_unit
-from identification.balance.stacked import drift_memory, innovations, noise_rows, together
+from identification.balance.stacked import (
+    drift_memory,
+    innovations,
+    noise_believed,
+    noise_rows,
+    together,
+)
 from identification.balance.weak import WeakRecord
 from identification.fitting.engine import (
     Dataset,
@@ -72,6 +78,9 @@ class BalanceError:
         compared on one common weighting.
     left_open : tuple of str
         Parameters whose errors the ratio stands beside: what they may be is counted as noise.
+    believed : float
+        Share of the noise that the model passes on which what it leaves of the training records
+        allows; the floor is lowered by it.
     """
 
     rms: float
@@ -81,6 +90,7 @@ class BalanceError:
     residual: FloatArray = field(default_factory=lambda: np.empty(0), repr=False, compare=False)
     weight: FloatArray = field(default_factory=lambda: np.empty(0), repr=False, compare=False)
     left_open: tuple[str, ...] = field(default=(), repr=False, compare=False)
+    believed: float = field(default=1.0, repr=False, compare=False)
 
     def as_json(self) -> dict[str, Any]:
         """The shape of `improve --json`."""
@@ -165,6 +175,7 @@ def assess(
     rows = {b: taking_part(b, records) for b in balances.balances}
     residual = {b: whole[b][rows[b]] for b in whole}
     measured = {b: y[rows[b]] for b, y in references(data, records).items()}
+    believed = noise_believed(model, data, values)
     quick, drift = noise_rows(model, data, values, records)
     floor = together(quick, drift, records)
     wide = row_weights(
@@ -200,6 +211,7 @@ def assess(
             residual=residual[b],
             weight=weights[b],
             left_open=steps[b].names if b in steps else (),
+            believed=believed[b],
         )
         for b in balances.balances
     }

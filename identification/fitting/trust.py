@@ -43,6 +43,10 @@ NEAR_END: Final = 0.03
 """
 REFITS: Final = 4
 """Gauss-Newton steps of the others in such a refit."""
+DIGITS: Final = 5
+"""Of a printed value at least: more than any wide interval needs."""
+MOST_DIGITS: Final = 12
+"""The same at most: beyond them stands rounding."""
 CLASSES: Final = ("inertia", "stiffness", "friction", "shape", "other")
 
 
@@ -88,6 +92,16 @@ class Trusted:
     verdict: str
     why: str
 
+    @property
+    def digits(self) -> int:
+        """Significant digits that tell the two ends of the interval apart."""
+        if self.low is None or self.high is None:
+            return DIGITS
+        size, half = max(abs(self.low), abs(self.high)), (self.high - self.low) / 2
+        if not 0 < half < size < math.inf:
+            return DIGITS
+        return min(max(DIGITS, math.ceil(math.log10(size / half)) + 1), MOST_DIGITS)
+
     def as_json(self) -> dict[str, Any]:
         """The shape of `trust --json`."""
         return {
@@ -126,13 +140,14 @@ class Trust:
     def __str__(self) -> str:
         lines = []
         for p in self.parameters:
+            n = p.digits
             band = (
-                f"{p.low:.4g} to {p.high:.4g}"
+                f"{p.low:.{n}g} to {p.high:.{n}g}"
                 if p.low is not None and p.high is not None
                 else "no interval"
             )
             lines.append(
-                f"{p.name:<28} {p.value:.5g} {p.unit} ({band}): {p.verdict}"
+                f"{p.name:<28} {p.value:.{n}g} {p.unit} ({band}): {p.verdict}"
                 + (f"; {p.why}" if p.why else "")
             )
             if p.trade:

@@ -19,6 +19,7 @@ from identification.balance.stacked import (
     INDEPENDENT_SHARE,
     TURN_WIDTHS,
     drawn_floors,
+    noise_believed,
     rms,
     stack,
     support_of,
@@ -39,6 +40,10 @@ VALLEY_STEPS: Final = 5
 """Gauss-Newton steps from each point of a grid, to see which valley is the deepest."""
 LEAST_VARIANCE: Final = 1e-24
 """Of a row without noise [N.m squared]: what rounding leaves of torques of 1 N.m."""
+CONTRADICTED: Final = 0.9
+"""Share of what the surest rival leaves of its level of noise under which what another one leaves
+contradicts its own: rows and noise are the same for all, so that levels that read too high do so
+alike, but for the tenth to which they hold."""
 DECIDED: Final = 2.0
 """Normal deviate over blocks of a difference of log-likelihoods from which a name is behind."""
 
@@ -323,20 +328,13 @@ def _entitled(rivals: Sequence[Rival], data: Dataset) -> list[dict[str, FloatArr
     even the best of them leaves beside noise is the same torque for all. Rows that may go either
     way by a law say little against it, and as much as others against one that says which way.
     """
-    levels: list[dict[str, FloatArray]] = []
-    either: list[Mapping[str, FloatArray]] = []
-    for rival in rivals:
-        model, values = rival.solution.model, rival.solution.values
-        known = [drawn_floors(model, data, values, w) for w in data.train]
-        levels.append(
-            {
-                b: np.concatenate(
-                    [np.full(w.rows, at[b]) for w, at in zip(data.train, known, strict=True)]
-                )
-                for b in data.sensing.balances
-            }
+    levels = _believable(rivals, data)
+    either = [
+        unsure(
+            balances_of(r.solution.model, data.sensing, wrt=()), data, r.solution.values, data.train
         )
-        either.append(unsure(balances_of(model, data.sensing, wrt=()), data, values, data.train))
+        for r in rivals
+    ]
     support = support_of(data.train)
     out: list[dict[str, FloatArray]] = [{} for _ in rivals]
     for b in data.sensing.balances:
@@ -349,6 +347,30 @@ def _entitled(rivals: Sequence[Rival], data: Dataset) -> list[dict[str, FloatArr
             variance = level[b] ** 2 + beside + way[b] ** 2
             weight[b] = support / np.sqrt(np.maximum(variance, LEAST_VARIANCE))
     return out
+
+
+def _believable(rivals: Sequence[Rival], data: Dataset) -> list[dict[str, FloatArray]]:
+    """Level of noise of each row that each rival passes on, per balance.
+
+    A law whose rows leave far less than the noise it is said to pass on does not pass it on: a
+    slope that runs away where hardly a row is makes a level of thousands of N.m of some draws.  It
+    may leave what the calmest of the others may.
+    """
+    drawn, believed = [], []
+    for rival in rivals:
+        model, values = rival.solution.model, rival.solution.values
+        known = [drawn_floors(model, data, values, w) for w in data.train]
+        drawn.append(known)
+        believed.append(noise_believed(model, data, values, known))
+    levels: list[dict[str, FloatArray]] = [{} for _ in rivals]
+    for b in data.sensing.balances:
+        least = CONTRADICTED * max(x[b] for x in believed)
+        sure = [k for k, x in enumerate(believed) if x[b] >= least]
+        calm = [min(drawn[k][n][b] for k in sure) for n in range(len(data.train))]
+        for k, level in enumerate(levels):
+            own = [at[b] for at in drawn[k]] if k in sure else calm
+            level[b] = np.repeat(own, [w.rows for w in data.train])
+    return levels
 
 
 def _left(rival: Rival, data: Dataset) -> Mapping[str, FloatArray]:

@@ -41,12 +41,16 @@ class Odds:
         Why a name fell out.
     nothing : float
         Chance that no name of the library is missing.
+    alike : tuple of Rival
+        Names that the records do not tell from the best of them, also where nothing at all does as
+        well as one of these.
     """
 
     rivals: tuple[Rival, ...]
     probability: Mapping[str, float]
     behind: Mapping[str, str]
     nothing: float = 0.0
+    alike: tuple[Rival, ...] = ()
 
     @property
     def empty(self) -> bool:
@@ -66,7 +70,9 @@ class Odds:
         left = 1.0 - sum(self.probability[r.name] for r in self.rivals if r not in rivals)
         kept = {r.name: self.probability[r.name] / left for r in rivals if left > 0.0}
         nothing = self.nothing / left if left > 0.0 else 0.0
-        return Odds(rivals if kept else (), MappingProxyType(kept), self.behind, nothing)
+        alike = tuple(r for r in self.alike if r.label not in labels)
+        left_over = rivals if kept else ()
+        return Odds(left_over, MappingProxyType(kept), self.behind, nothing, alike)
 
     def holds(self, name: str) -> bool:
         """Whether a name may stand for its set: none is more probable by so much as to count as
@@ -154,7 +160,8 @@ def odds_of(contest: Contest, allowance: float) -> Odds:
     allowance : float
         What the leader leaves unmodelled [nats].
     """
-    alive = {r.name for r in contest.alive(allowance) if r.name}
+    alike = tuple(r for r in contest.alive(allowance) if r.name)
+    alive = {r.name for r in alike}
     shares = contest.probability(allowance)
     chance = {r.name: float(p) for r, p in zip(contest.rivals, shares, strict=True)}
     title = EFFECTS[contest.leader.name].title if contest.leader.name else "nothing"
@@ -181,6 +188,7 @@ def odds_of(contest: Contest, allowance: float) -> Odds:
         MappingProxyType({r.name: chance[r.name] for r in left}),
         MappingProxyType(behind),
         chance.get(NOTHING, 0.0),
+        alike,
     )
 
 

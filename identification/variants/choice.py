@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Final, final
 
 import numpy as np
 import numpy.typing as npt
 
+from identification.variants.lattice import PER_EFFECT
 from identification.variants.refit import Refit
-from identification.variants.screen import PER_PARAMETER
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -21,11 +22,12 @@ SEED: Final = 14
 """Of these resamplings: the same records give the same answer."""
 TIE_QUANTILE: Final = 0.05
 """A variant ties with the best where it does better in this share of the resamplings."""
-TIE_MARGIN: Final = 0.5 * PER_PARAMETER
-"""Difference of the scores below which variants tie however certain it is: 5 % of a balance's RMS,
-below which one effect counts as good as two elsewhere
+TIE_MARGIN: Final = 0.5 * PER_EFFECT
+"""Difference of the scores, and of the errors in them, below which variants tie however certain it
+is: 5 % of a balance's RMS, below which one effect counts as good as two elsewhere
 (:data:`identification.diagnosis.session.SAME_WITH_ONE_LESS`); what no model holds shifts the RMS of
-laws that are one column on the records by as much."""
+laws that are one column on the records by as much.  Where errors that differ by more are evened out
+by the price of parameters, the records tell the laws apart."""
 WINDOWS: Final = 4
 """Parts of the records, one after the other, in which the choice is made again."""
 FRONT_LEAST: Final = 0.01
@@ -41,10 +43,12 @@ class Judged:
     Attributes
     ----------
     best : int
-        The variant with the lowest score of those with every effect of the joint's own model.
+        The variant with the lowest score of those that may be recommended.
+    error : (variants,) array
+        The score without that price.
     score : (variants,) array
         Sum over balances of ln RMS of blocks that the fit did not see, held-out records among
-        them, and .10 per parameter.
+        them, and the price of its effects.
     behind : (variants,) array
         The 5 % quantile of score less that of the best, over resampled blocks: a tie up to 0.
     chosen : (variants,) array
@@ -54,6 +58,7 @@ class Judged:
     """
 
     best: int
+    error: FloatArray
     score: FloatArray
     behind: FloatArray
     chosen: FloatArray
@@ -61,68 +66,70 @@ class Judged:
     records: tuple[int, ...] = ()
 
 
-def score_of(squares: FloatArray, rows: FloatArray, parameters: FloatArray) -> FloatArray:
+def score_of(squares: FloatArray, rows: FloatArray, price: FloatArray) -> FloatArray:
     """Score of variants on some blocks.
 
     Parameters
     ----------
     squares, rows : (..., balances) arrays
         Sums over the blocks.
-    parameters : (...) array
+    price : (...) array
+        What their effects must bring (:func:`identification.variants.lattice.price_of`).
     """
     mean = np.maximum(squares, 1e-300) / np.maximum(rows, 1.0)
-    return np.asarray(
-        0.5 * np.where(rows > 0, np.log(mean), 0.0).sum(axis=-1) + PER_PARAMETER * parameters
-    )
+    return np.asarray(0.5 * np.where(rows > 0, np.log(mean), 0.0).sum(axis=-1) + price)
 
 
 def judged(
-    refits: Sequence[Refit], whole: Sequence[bool], records: Sequence[IntArray] = ()
+    refits: Sequence[Refit], open_to: Sequence[bool], records: Sequence[IntArray] = ()
 ) -> Judged:
     """Hold variants against each other on the same blocks.
 
     Parameters
     ----------
     refits : sequence of Refit
-    whole : sequence of bool
-        Which of them have every effect of the joint's own model: one of these is the best.
+    open_to : sequence of bool
+        Which of them may be recommended: those with every effect of the joint's own model, without
+        a name that whole fits tell from another one. One of these is the best.
     records : sequence of (blocks,) int array
         Blocks of each record.
     """
     squares = np.array([r.squares for r in refits])
     rows = np.array([r.rows for r in refits])
-    parameters = np.array([r.parameters for r in refits], dtype=np.float64)
-    score = score_of(squares.sum(axis=1), rows.sum(axis=1), parameters)
+    price = np.array([r.price for r in refits])
+    error = score_of(squares.sum(axis=1), rows.sum(axis=1), 0 * price)
+    score = error + price
     used = np.flatnonzero(rows[0].sum(axis=1) > 0)
     draws = np.random.default_rng(SEED).integers(0, len(used), (DRAWS, len(used)))
     count = np.zeros((DRAWS, squares.shape[1]))
     for k, drawn in enumerate(draws):
         count[k] = np.bincount(used[drawn], minlength=squares.shape[1])
     drawn_scores = score_of(
-        np.einsum("dk,vkb->dvb", count, squares), np.einsum("dk,vkb->dvb", count, rows), parameters
+        np.einsum("dk,vkb->dvb", count, squares), np.einsum("dk,vkb->dvb", count, rows), price
     )
-    aside = np.where(whole, 0.0, np.inf)
+    aside = np.where(open_to, 0.0, np.inf)
     best = int(np.argmin(score + aside))
     behind = np.quantile(drawn_scores - drawn_scores[:, [best]], TIE_QUANTILE, axis=0)
     chosen = np.bincount((drawn_scores + aside).argmin(axis=1), minlength=len(refits)) / DRAWS
     windows = tuple(
-        int(np.argmin(aside + _on(part, squares, rows, parameters)))
+        int(np.argmin(aside + _on(part, squares, rows, price)))
         for part in np.array_split(used, min(WINDOWS, len(used)))
         if len(part)
     )
-    alone = tuple(int(np.argmin(aside + _on(part, squares, rows, parameters))) for part in records)
-    return Judged(best, score, behind, chosen, windows, alone)
+    alone = tuple(int(np.argmin(aside + _on(part, squares, rows, price))) for part in records)
+    return Judged(best, error, score, behind, chosen, windows, records=alone)
 
 
-def _on(
-    blocks: IntArray, squares: FloatArray, rows: FloatArray, parameters: FloatArray
-) -> FloatArray:
+def _on(blocks: IntArray, squares: FloatArray, rows: FloatArray, price: FloatArray) -> FloatArray:
     """Scores on some of the blocks."""
-    return score_of(squares[:, blocks].sum(axis=1), rows[:, blocks].sum(axis=1), parameters)
+    return score_of(squares[:, blocks].sum(axis=1), rows[:, blocks].sum(axis=1), price)
 
 
 def tied_with_best(
-    scores: Judged, whole: Sequence[bool], parts: Sequence[frozenset[str]]
+    scores: Judged,
+    open_to: Sequence[bool],
+    parts: Sequence[frozenset[str]],
+    sets: Mapping[str, frozenset[str]] = MappingProxyType({}),
 ) -> list[bool]:
     """Which variants the records do not tell from the best one, itself among them.
 
@@ -131,15 +138,19 @@ def tied_with_best(
     Parameters
     ----------
     scores : Judged
-    whole : sequence of bool
-        Which variants have every effect of the joint's own model.
+    open_to : sequence of bool
+        Which variants may be recommended.
     parts : sequence of frozenset of str
         Labels of each.
+    sets : mapping of str to frozenset of str
+        For a label of the best one, those that whole fits leave for its place, however many
+        parameters they have.
     """
     behind = scores.score - scores.score[scores.best]
+    apart = np.maximum(behind, np.abs(scores.error - scores.error[scores.best]))
     alike = [
-        w and bool(q <= 0 or d <= TIE_MARGIN)
-        for w, q, d in zip(whole, scores.behind, behind, strict=True)
+        w and bool(q <= 0 or d <= TIE_MARGIN or exchanged(parts[scores.best], own, sets))
+        for w, q, d, own in zip(open_to, scores.behind, apart, parts, strict=True)
     ]
     return [
         k == scores.best
@@ -152,6 +163,18 @@ def tied_with_best(
         )
         for k in range(len(parts))
     ]
+
+
+def exchanged(
+    best: frozenset[str], other: frozenset[str], sets: Mapping[str, frozenset[str]]
+) -> bool:
+    """Whether one variant is another with names in place of names of the same sets."""
+    gone, came = best - other, other - best
+    return (
+        0 < len(gone) == len(came)
+        and all(any(c in sets.get(g, ()) for g in gone) for c in came)
+        and all(any(c in sets.get(g, ()) for c in came) for g in gone)
+    )
 
 
 def front_of(parameters: Sequence[int], error: Sequence[float]) -> list[int]:

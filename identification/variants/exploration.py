@@ -18,8 +18,7 @@ from identification.fitting.engine import Solution
 from identification.fitting.joint_text import joint_text
 from identification.fitting.parameters import parameter_table
 from identification.representation import html_of
-from identification.variants.lattice import added_to
-from identification.variants.screen import PER_PARAMETER
+from identification.variants.lattice import PER_EFFECT, PER_FURTHER, added_to
 
 NAME: Final = 57
 """Letters of a variant's name in the table; its lines have 100."""
@@ -53,8 +52,9 @@ class Variant:
         logarithms.
     score : float
         On blocks that its fit did not see, those of the held-out records among them (see
-        :data:`identification.variants.screen.PER_PARAMETER`), less that of the recommended one;
-        below 0 for one that lacks an effect of the joint's own model; NaN for one with learned
+        :func:`identification.variants.lattice.price_of`), less that of the recommended one;
+        below 0 for one that lacks an effect of the joint's own model, and for one that whole fits
+        rule out; NaN for one with learned
         curves, which are chosen by a cross-validation of their own.
     tied : bool
         Recommended, or not to be told from it with every effect of the joint's own model in it.
@@ -62,6 +62,8 @@ class Variant:
         Share of resampled records on which it is the best.
     solution : Solution
         Its fit, without standard errors.
+    behind : str
+        Why whole fits of its names rule it out, whatever its score; empty where they do not.
     """
 
     name: str
@@ -75,6 +77,7 @@ class Variant:
     tied: bool
     chosen_percent: float
     solution: Solution
+    behind: str = ""
 
     def __repr__(self) -> str:
         return (
@@ -105,6 +108,7 @@ class Variant:
             "score": self.score,
             "tied": self.tied,
             "chosen_percent": self.chosen_percent,
+            "behind": self.behind,
         }
 
 
@@ -148,12 +152,13 @@ class Exploration:
     joint : Joint
     data : Dataset
     variants : tuple of Variant
-        Those that were fitted: with every effect of the joint's own model the best first, then
-        those that lack one.
+        Those that were fitted: with every effect of the joint's own model the best first, those
+        of them that whole fits rule out, then those that lack one.
     screened : int
         Variants that were scored to choose them.
     front : tuple of Variant
-        Of held-out error against parameters, the fewest parameters first.
+        Of held-out error against parameters, the fewest parameters first, of those that may be
+        recommended.
     recommended : Variant
     ties : tuple of Variant
         Not to be told from it on these records, the best first.
@@ -253,7 +258,8 @@ class Exploration:
             "spare": list(self.spare),
             "agreement": self.agreement,
             "reason": self.reason,
-            "per_parameter": PER_PARAMETER,
+            "per_effect": PER_EFFECT,
+            "per_further_parameter": PER_FURTHER,
             "not_testable": [{"effect": n.effect, "why": n.why} for n in self.not_testable],
             "not_compared": [{"model": n, "why": why} for n, why in self.apart.items()],
             "warnings": list(self.warnings),
@@ -265,11 +271,11 @@ class Exploration:
 
 def _listed(labels: Sequence[str]) -> str:
     """Effects in a sentence."""
-    titles = [_title(label) for label in labels]
+    titles = [title_of(label) for label in labels]
     return " and ".join([", ".join(titles[:-1]), titles[-1]]) if len(titles) > 1 else titles[0]
 
 
-def _title(label: str) -> str:
+def title_of(label: str) -> str:
     """Title of an effect, with its place where it may act in several."""
     bare, _, number = label.partition("#")
     key, _, place = bare.partition("@")
@@ -370,9 +376,14 @@ def table_of(found: Exploration, most: int = PRINTED) -> list[str]:
         found.reason,
         found.agreement,
     ]
+    lines += [
+        f"Not {v.name}, whose score is lower by {-v.score:.2g}: {v.behind}."
+        for v in found.variants
+        if v.behind and v.score < 0
+    ][:ALTERNATIVES]
     if found.spare:
         lines.append(
             f"On these records the joint's own {_listed(found.spare)} could as well be left out: "
-            "less than 10 % off a balance for a parameter."
+            "less than 10 % off a balance for each."
         )
     return lines

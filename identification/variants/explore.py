@@ -28,7 +28,13 @@ from identification.diagnosis.session import Session
 from identification.errors import InputError
 from identification.fitting.engine import Solution, reweighed
 from identification.variants.choice import front_of, judged, tied_with_best
-from identification.variants.exploration import Exploration, StandIn, Variant, agreement_of
+from identification.variants.exploration import (
+    Exploration,
+    StandIn,
+    Variant,
+    agreement_of,
+    title_of,
+)
 from identification.variants.lattice import (
     Node,
     added_to,
@@ -47,7 +53,7 @@ from identification.variants.refit import (
     refitted,
     with_size,
 )
-from identification.variants.screen import LARGEST, PER_PARAMETER, Scored, Screen
+from identification.variants.screen import LARGEST, Scored, Screen
 
 SHOWN: Final = 40
 """Variants of the screen that are fitted: on simulated joints the best after the fit was among the
@@ -60,6 +66,9 @@ FIRST: Final = 3
 """Variants that are fitted to find the point about which the screen is made again."""
 ROUNDS: Final = 2
 """Expansions about a fitted variant with further parts."""
+NAMINGS: Final = 3
+"""Variants whose parts are asked for their names, one after the other, at most: where names fall
+out of the best one another is the best; a third one never was on the simulated joints."""
 FURTHER: Final = 2
 """Parts that are tried at once to find the point of expansion, and beside the best variant."""
 
@@ -118,6 +127,8 @@ class _Search:
         self.apart: dict[str, str] = {}
         self.screened = 0
         self.last: object = None
+        self.sets: dict[str, frozenset[str]] = {}
+        self.behind: list[tuple[frozenset[str], Mapping[str, str]]] = []
         self.weighting = Weighting.of(start, self.data)
 
     def result(self, improvement: Improvement) -> Exploration:
@@ -151,6 +162,7 @@ class _Search:
                 break
         self._neighbours()
         self._rungs()
+        self._named()
         self.screened = max(self.screened, len(self.found))
         return self._told(improvement, refused)
 
@@ -174,14 +186,25 @@ class _Search:
             progress=lambda text, part: self.progress(text, share + 0.2 * part),
         )
 
-    def _fit(self, model: JointModel, *starts: Mapping[str, float], name: str = "") -> None:
-        """Fit a variant once; one whose parts are none is passed over."""
-        mark = (frozenset(visible_labels(model)), model.inertias)
-        if mark in self.found:
+    def _fit(
+        self,
+        model: JointModel,
+        *starts: Mapping[str, float],
+        name: str = "",
+        again: bool = False,
+    ) -> None:
+        """Fit a variant once; one whose parts are none is passed over. `again`: once more from
+        other values, and what leaves less stays.
+        """
+        mark = self._mark(model)
+        there = self.found.get(mark)
+        if there is not None and not again:
             return
         refit = refitted(model, self.data, starts, self.weighting)
         added = added_to(self.start.model, model)
         if not np.all(np.isfinite(refit.held.rms)) or physical(refit, added, self.data):
+            return
+        if there is not None and not refit.cost < there.cost:
             return
         self.found[mark] = refit
         if name:
@@ -228,10 +251,55 @@ class _Search:
         return self._best() is not now
 
     def _neighbours(self) -> None:
-        """The best variant with one part less."""
-        now = self._best().solution
-        for label in droppable(now.model):
-            self._fit(without(now.model, label), now.values)
+        """The best variant with one part less, from its values: a variant that was fitted from
+        other ones may stand in a worse valley, and a part that is none would be what leads out.
+        """
+        for _ in range(ROUNDS):
+            now = self._best()
+            for label in droppable(now.solution.model):
+                self._fit(without(now.solution.model, label), now.solution.values, again=True)
+            if self._best() is now:
+                break
+
+    def _named(self) -> None:
+        """Whole fits of the names that may stand for each part of the best variant, as `improve`
+        asks them.
+
+        The price of a parameter asks whether something is missing. Which law it is the records may
+        tell for certain where its parameters take less than their price off.
+        """
+        for _ in range(NAMINGS):
+            best = self._best()
+            model = best.solution.model
+            added = set(added_to(self.start.model, model))
+            solution = self.session.bench.fitted(model, best.solution.values)
+            self.sets = {}
+            for label in droppable(model):
+                if label not in added:
+                    continue
+                self.progress(f"names in the place of {label}", 0.95)
+                odds = self.session.named(solution, label)
+                if odds is None or not odds.alike:
+                    continue
+                for rival in odds.alike:
+                    self._fit(rival.solution.model, rival.solution.values)
+                # whether anything is missing there at all the score has told
+                left = frozenset(r.label for r in odds.alike)
+                fallen = {n: why for n, why in odds.behind.items() if n not in left}
+                self.sets[label] = left
+                self.behind.append((left, fallen))
+            if self._best() is best:
+                break
+
+    def _why_behind(self, refit: Refit) -> str:
+        """Why a variant is out of the question for one of its names; empty where it is not."""
+        labels = set(visible_labels(refit.solution.model))
+        for left, behind in self.behind:
+            fallen = labels & behind.keys()
+            if fallen and not labels & left:
+                label = min(fallen)
+                return f"{title_of(label)} {behind[label]}"
+        return ""
 
     def _rungs(self) -> None:
         """The models by name, with the joint's own effects, where the channels show the same
@@ -279,7 +347,11 @@ class _Search:
 
     def _best(self) -> Refit:
         every = list(self.found.values())
-        return every[judged(every, [self._whole(r) for r in every]).best]
+        return every[judged(every, [self._open_to(r) for r in every]).best]
+
+    def _open_to(self, refit: Refit) -> bool:
+        """Whether a variant may be recommended."""
+        return self._whole(refit) and not self._why_behind(refit)
 
     def _whole(self, refit: Refit) -> bool:
         """Whether a variant has every effect of the joint's own model: what the joint file says is
@@ -293,10 +365,11 @@ class _Search:
         refits, marks = list(self.found.values()), list(self.found)
         own = self.found[self._mark(self.start.model)]
         whole = [self._whole(r) for r in refits]
-        scores = judged(refits, whole, blocks_of(self.data))
+        open_to = [self._open_to(r) for r in refits]
+        scores = judged(refits, open_to, blocks_of(self.data))
         best = scores.best
         parts = [frozenset(visible_labels(r.solution.model)) for r in refits]
-        tied = tied_with_best(scores, whole, parts)
+        tied = tied_with_best(scores, open_to, parts, self.sets)
         variants = [
             Variant(
                 self._name(refit, self.names.get(mark, "")),
@@ -310,13 +383,21 @@ class _Search:
                 tied=tied[k],
                 chosen_percent=100 * float(scores.chosen[k]),
                 solution=refit.solution,
+                behind=self._why_behind(refit) if whole[k] else "",
             )
             for k, (mark, refit) in enumerate(zip(marks, refits, strict=True))
         ]
         curve = self._curved(improvement, own)
         shown = [*variants, *([curve] if curve is not None else [])]
-        front = front_of([v.parameters for v in shown], [v.error_percent for v in shown])
-        order = sorted(range(len(variants)), key=lambda k: (not whole[k], scores.score[k]))
+        # what lacks an effect that the joint file knows of, or has a name that whole fits rule out,
+        # is no answer, and beats none
+        asked = [k for k, v in enumerate(shown) if not v.dropped and not v.behind]
+        front = front_of(
+            [shown[k].parameters for k in asked], [shown[k].error_percent for k in asked]
+        )
+        order = sorted(
+            range(len(variants)), key=lambda k: (not whole[k], not open_to[k], scores.score[k])
+        )
         balances = own.held.rms.size
         recommended = variants[best]
         stand_ins = []
@@ -324,10 +405,8 @@ class _Search:
             gone = parts[best] - parts[k]
             came = parts[k] - parts[best]
             if len(gone) == 1 and len(came) == 1 and gone <= set(recommended.added):
-                plain = variants[k].score - PER_PARAMETER * (
-                    variants[k].parameters - recommended.parameters
-                )
-                lost = 100 * (math.exp(plain / balances) - 1)
+                rise = float(scores.error[k] - scores.error[best])
+                lost = 100 * (math.exp(rise / balances) - 1)
                 (effect,), (by,) = gone, came
                 stand_ins.append(StandIn(effect, by, lost, tied[k]))
         improved = next((variants[k] for k, m in enumerate(marks) if m == self.last), None)
@@ -336,7 +415,7 @@ class _Search:
             self.data,
             variants=(*(variants[k] for k in order), *shown[len(variants) :]),
             screened=self.screened,
-            front=tuple(shown[k] for k in front),
+            front=tuple(shown[asked[k]] for k in front),
             recommended=recommended,
             ties=tuple(variants[k] for k in order if tied[k]),
             windows=tuple(variants[k].name for k in scores.windows),

@@ -4,11 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import final
+from typing import Final, final
 
 from casadi_models import EFFECTS, JointModel
 from identification.balance.dataset import Dataset, visible_labels, with_effect
 from identification.diagnosis.candidates import Candidate, NotTestable, offered
+
+PER_EFFECT: Final = 0.10
+"""Fall of the summed logarithms of the RMS that an effect must bring: the 10 % off one balance that
+a claim asks for (:data:`identification.diagnosis.claims.MAJOR_DROP`)."""
+PER_FURTHER: Final = 0.5 * PER_EFFECT
+"""The same for each of its parameters beyond the first: the 5 % of a balance below which one effect
+counts as good as two (:data:`identification.diagnosis.session.SAME_WITH_ONE_LESS`).  As much as for
+the first gave fewer right variants on simulated joints, a quarter as many as a half."""
+
+
+def price_of(effects: int, parameters: int) -> float:
+    """What so many effects with so many free parameters must bring, in the logarithm of the RMS."""
+    return PER_EFFECT * effects + PER_FURTHER * (parameters - effects)
 
 
 @final
@@ -41,6 +54,11 @@ class Node:
     def parameters(self) -> int:
         """Free parameters that the part adds."""
         return len(self.candidate.amplitudes) + len(self.candidate.shapes)
+
+    @property
+    def price(self) -> float:
+        """What the part must bring."""
+        return price_of(1, self.parameters)
 
 
 def nodes_of(model: JointModel, data: Dataset) -> tuple[list[Node], tuple[NotTestable, ...]]:

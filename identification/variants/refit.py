@@ -13,7 +13,7 @@ from casadi_models import JointModel
 from casadi_models.term import Term
 from identification.balance.balances import balances_of
 from identification.balance.calibration import settled
-from identification.balance.dataset import HOLD_NAME, Dataset, without
+from identification.balance.dataset import HOLD_NAME, Dataset, visible_labels, without
 from identification.balance.stacked import (
     passed_on,
     references,
@@ -24,6 +24,7 @@ from identification.balance.stacked import (
 )
 from identification.diagnosis.trials import make_base
 from identification.fitting.engine import Solution, stepped
+from identification.variants.lattice import price_of
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -129,6 +130,11 @@ class Refit:
         model = self.solution.model
         aside = {HOLD_NAME, *model.named("smoothing"), *model.calibration}
         return sum(n not in aside for n in self.solution.free)
+
+    @property
+    def price(self) -> float:
+        """What its effects must bring (:func:`identification.variants.lattice.price_of`)."""
+        return price_of(len(visible_labels(self.solution.model)), self.parameters)
 
 
 def refitted(

@@ -5,7 +5,8 @@ products of all columns, of the base and of the residual are formed once per fol
 the base is eliminated once per fold. A variant is then a small system of its own amplitudes: its
 cross-validated squares need no row of the records again.
 
-The score of a variant is ``sum over balances of ln RMS + 0.10 x free parameters``.
+The score of a variant is ``sum over balances of ln RMS`` and the price of its parts
+(:func:`identification.variants.lattice.price_of`).
 """
 
 from __future__ import annotations
@@ -27,10 +28,6 @@ from identification.variants.lattice import Node, together
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
-PER_PARAMETER: Final = 0.10
-"""Fall of the summed logarithms of the RMS that a free parameter must bring: the 10 % off one
-balance that a claim asks for (:data:`identification.diagnosis.claims.MAJOR_DROP`); from .08 to .15
-the choices on simulated joints were the same."""
 BEAM: Final = 60
 """Variants of one size that are carried on to the next: a third effect that helps only beside the
 sixty-first pair has never been best on the simulated joints."""
@@ -160,10 +157,7 @@ class Screen:
         out = np.empty(len(variants))
         for first in range(0, len(variants), AT_ONCE):
             part = variants[first : first + AT_ONCE]
-            price = [
-                sum(self.nodes[self.options[k].node].parameters for k in v) * PER_PARAMETER
-                for v in part
-            ]
+            price = [sum(self.nodes[self.options[k].node].price for k in v) for v in part]
             out[first : first + len(part)] = self._errors(self._systems(part)) + np.array(price)
         self.tried += len(variants)
         return out
@@ -318,8 +312,7 @@ class Screen:
         known = dict(zip(marks, (s.score for s in ranked), strict=True))
         for scored, mark in zip(ranked, marks, strict=True):
             earns = all(
-                known[mark - {n}] - scored.score
-                >= (EARNED - 1) * PER_PARAMETER * self.nodes[n].parameters
+                known[mark - {n}] - scored.score >= (EARNED - 1) * self.nodes[n].price
                 for n in mark
                 if mark - {n} in known
             )

@@ -101,13 +101,14 @@ def exploration_section(found: Exploration) -> str:
     return (
         f"<p>{found.screened} variants of the model were scored and {len(found.variants)} fitted. "
         "A dot is a variant: its error on records that no fit saw, against its free parameters. "
-        "The line joins those that no other beats with as few; the filled dot is recommended, "
-        "open ones tie with it, and the square is what the improve loop ends with.</p>"
+        "The line joins those that no other answer beats with as few; the filled dot is "
+        "recommended, open ones tie with it, and the square is what the improve loop ends with.</p>"
         f"<figure>{front_picture(dots, front, FIGURE)}</figure>{paragraphs}"
         f"{table(head, rows, f'Tied: {tied}' if tied else 'Nothing ties with the recommended one')}"
         "<p class='note'>Score behind: sum over the balances of the logarithm of the error on "
-        "unseen blocks and .10 for each parameter, less that of the recommended variant. Best in: "
-        "share of resampled records in which the variant has the lowest score.</p>"
+        "unseen blocks, .10 for each effect and .05 for each of its parameters beyond the first, "
+        "less that of the recommended variant. Best in: share of resampled records in which the "
+        "variant has the lowest score.</p>"
     )
 
 

@@ -34,10 +34,11 @@ def trusted_html(trust: Trust) -> str:
 
 
 def _row(p: Trusted) -> list[str]:
-    band = "–" if p.low is None or p.high is None else f"{number(p.low)} to {number(p.high)}"
+    n = p.digits
+    band = "–" if p.low is None or p.high is None else f"{number(p.low, n)} to {number(p.high, n)}"
     return [
         text(words(p.name)),
-        number(p.value),
+        number(p.value, n),
         band,
         pretty_unit(p.unit) or "–",
         ", ".join(number(v) for v in p.records) or "–",

@@ -155,7 +155,7 @@ def test_a_direction_that_one_window_alone_tells_of_does_not_spoil_the_errors_of
 
 
 def test_an_addition_is_judged_by_what_it_leaves_and_not_by_its_floor() -> None:
-    def error(size: float, floor: float) -> Error:
+    def error(size: float, floor: float, believed: float = 1.0) -> Error:
         residual = size * np.cos(np.arange(400.0))
         weight = np.full(400, 1 / floor)
         return Error(
@@ -164,7 +164,13 @@ def test_an_addition_is_judged_by_what_it_leaves_and_not_by_its_floor() -> None:
             0.0,
             {
                 "motor": BalanceError(
-                    rms(residual), floor, rms(residual) / floor, "N.m", residual, weight
+                    rms(residual),
+                    floor,
+                    rms(residual) / floor,
+                    "N.m",
+                    residual,
+                    weight,
+                    believed=believed,
                 )
             },
         )
@@ -174,6 +180,9 @@ def test_an_addition_is_judged_by_what_it_leaves_and_not_by_its_floor() -> None:
     # but what takes noise alone from a balance of noise alone explains nothing of it
     assert judged_drop(error(0.9, 1.0), error(0.6, 0.65), "motor") < 0
     assert judged_drop(error(0.9, 1.0), error(0.6, 1.0), "motor") == pytest.approx(100 / 3)
+    # a floor that is lower because less is left than such noise: a ripple was read as noise
+    assert judged_drop(error(0.9, 1.0), error(0.6, 0.65, 0.65), "motor") == pytest.approx(100 / 3)
+    assert judged_drop(error(0.9, 1.0), error(0.3, 0.4, 0.8), "motor") == pytest.approx(100 / 3)
     assert "motor" in made_worse(error(1.0, 0.01), error(1.3, 0.5))
     assert made_worse(error(0.1, 1.0), error(0.1, 1.0)) == ""
     assert made_worse(error(1.0, 0.5), error(1.05, 0.5)).startswith("the held-out error rises")

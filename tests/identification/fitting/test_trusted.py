@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
@@ -148,6 +149,11 @@ def test_the_verb_prints_a_line_for_every_parameter(
         assert p["verdict"] in ("trust", "only in combination", "not")
         if p["interval"] is not None:
             assert p["interval"][0] <= p["value"] <= p["interval"][1]
+            # "10.277 (10.28 to 10.28)" says nothing of the interval, and excludes its own value
+            shown = re.search(rf"^{p['name']} +(\S+) \S+ \((\S+) to (\S+)\)", printed, re.M)
+            assert shown is not None
+            value, low, high = map(float, shown.groups())
+            assert low < value < high
 
 
 def test_values_of_a_model_that_lacks_something_are_doubted(

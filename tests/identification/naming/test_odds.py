@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.stats import norm, wilcoxon
 
+from casadi_models import JointModel
 from identification import improve
 from identification.balance.dataset import Dataset
 from identification.data.formats import chances
@@ -17,6 +19,7 @@ from identification.data.joint_file import Joint
 from identification.diagnosis.claims import Ranking, rank
 from identification.diagnosis.trials import make_base
 from identification.fitting.engine import Solution, load_dataset, prepared_model, solve
+from identification.naming import contest as contest_module
 from identification.naming.contest import (
     FEWEST,
     Contest,
@@ -296,6 +299,24 @@ def test_what_the_leader_leaves_counts_by_its_own_scatter(
     # log-likelihood of four tenths of the rows, but for what is the same for all
     known = [0.4 * norm.logpdf(rows).sum() for rows, _, _ in found._old]
     assert found.likelihood - found.likelihood[0] == pytest.approx(np.array(known) - known[0])
+
+
+@pytest.mark.parametrize("loud", NAMES)
+def test_a_law_is_not_entitled_to_noise_that_its_rows_do_not_show(
+    loud: str, drags: Contest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A slope that runs away where hardly a row is makes a level of noise of some draws: such a
+    law was a hundred million nats ahead.  It may leave what the others may.
+    """
+
+    def drawn(model: JointModel, *given: Any) -> dict[str, float]:
+        return {b: x * (500 if model.has(loud) else 1) for b, x in quiet(model, *given).items()}
+
+    quiet = contest_module.drawn_floors
+    monkeypatch.setattr(contest_module, "drawn_floors", drawn)
+    found = Contest(drags.rivals, drags.data)
+    assert found.leader is drags.leader
+    assert found.ahead == pytest.approx(drags.ahead, rel=1e-2, abs=1e-2)
 
 
 @pytest.mark.parametrize(("deviates", "leads"), [(3.0, True), (-15.0, True), (30.0, False)])
