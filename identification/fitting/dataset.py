@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from typing import Final
 
@@ -29,7 +28,7 @@ from identification.data.joint_file import Joint
 from identification.data.record import Record
 from identification.errors import InputError
 from identification.fitting.assess import assess
-from identification.fitting.engine import Solution, carried_over
+from identification.fitting.engine import Solution, carried_over, solve
 from identification.fitting.first_fit import first_fit
 
 ROUNDS: Final = 4
@@ -85,14 +84,18 @@ def dataset_of(
     read = load() if beside is None else load(late=beside[1])
     if not places_of(model):
         return read
+
+    def fitted(data: Dataset) -> Solution:
+        if beside is None:
+            return first_fit(model, data)
+        return solve(beside[0].model, data, start=beside[0].values)
+
     try:
-        fit = first_fit(model, read) if beside is None else beside[0]
-        data, fit = _in_time(read, load, fit)
+        data, fit = _in_time(read, load, fitted)
         late = shifts_of(data)
         for place in (p for p in places_of(model) if p in LOW_PASSED):
             late = _read(place, data, probe, fit)
-            data = data if late == shifts_of(data) else load(late=late)
-        return _in_time(data, load, fit)[0]
+        return data if late == shifts_of(data) else _in_time(load(late=late), load, fitted)[0]
     except InputError:  # a fit that is refused is refused where it is asked for
         return read
 
@@ -109,13 +112,13 @@ def _records(data: Dataset) -> tuple[WeakRecord, ...]:
 
 
 def _in_time(
-    data: Dataset, load: Callable[..., Dataset], fit: Solution
+    data: Dataset, load: Callable[..., Dataset], fitted: Callable[[Dataset], Solution]
 ) -> tuple[Dataset, Solution]:
     """The records with the channels that wait shifted as the fit has them, and the fit to them."""
-    model = fit.model
+    fit = fitted(data)
     for _ in range(ROUNDS):
-        records, found = _records(data), _values(data, fit)
-        fit = replace(fit, values=found)
+        model, records = fit.model, _records(data)
+        found = settled(model, data.sensing, records, fit.values)
         if len(within_limits(model, records, found)) < len(names_of_runs(model, records)):
             # what is later than a clock may be is to be named: the other clocks make up for it
             break
@@ -123,12 +126,8 @@ def _in_time(
         if all(s == w.shifts for s, w in zip(late, records, strict=True)):
             break
         data = load(late=late)
+        fit = fitted(data)
     return data, fit
-
-
-def _values(data: Dataset, near: Solution) -> Mapping[str, float]:
-    """Values of a model on these rows, with the unknowns of every run."""
-    return settled(near.model, data.sensing, _records(data), carried_over(near, data))
 
 
 def _late(model: JointModel, record: WeakRecord, values: Mapping[str, float]) -> dict[str, float]:
@@ -160,8 +159,8 @@ def _read(
     """Shifts of the records [s] with a reading shifted by a part of its lateness, or by a part of
     the cycle of its filter the other way: as the fit leaves least of the training records.
     """
-    records, found = _records(data), _values(data, fit)
-    fit = replace(fit, values=found)
+    records = _records(data)
+    found = settled(fit.model, data.sensing, records, fit.values)
     whole = [_lateness(fit.model, w, place, found) for w in records]
     dt, trained = records[0].grid.dt, len(data.train)
     if max(abs(k) for k in whole) <= NEAR * dt:
@@ -175,7 +174,8 @@ def _read(
         if tuple(shifts) not in left:
             late = [{**w.shifts, place: k} for w, k in zip(data.train, shifts, strict=False)]
             moved = data if late == shifts_of(data)[:trained] else probe(late=late, told=data)
-            error = assess(fit.model, moved, moved.train, _values(moved, fit))
+            found = settled(fit.model, moved.sensing, moved.train, carried_over(fit, moved))
+            error = assess(fit.model, moved, moved.train, found)
             left[tuple(shifts)] = tuple((len(e.residual), e.ratio) for e in error.balances.values())
         return left[tuple(shifts)]
 
@@ -195,8 +195,9 @@ def _read(
     if max(least()) <= 0.0 and min(whole) > NEAR * dt:
         early(_half_cycle(early))
     best = least()
-    kept = best if _over(left[best]) < (1 - BETTER) * _over(left[stands]) else stands
-    return [{**w.shifts, place: k} for w, k in zip(records, kept, strict=True)]
+    if _over(left[best]) >= (1 - BETTER) * _over(left[stands]):
+        return shifts_of(data)
+    return [{**w.shifts, place: k} for w, k in zip(records, best, strict=True)]
 
 
 def _lowest(points: Mapping[float, float]) -> float:
