@@ -195,7 +195,8 @@ def _read(
     if max(least()) <= 0.0 and min(whole) > NEAR * dt:
         early(_half_cycle(early))
     best = least()
-    if _over(left[best]) >= (1 - BETTER) * _over(left[stands]):
+    moves = max(abs(b - s) for b, s in zip(best, stands, strict=True))
+    if moves <= NEAR * dt or _over(left[best]) >= (1 - BETTER) * _over(left[stands]):
         return shifts_of(data)
     return [{**w.shifts, place: k} for w, k in zip(records, best, strict=True)]
 
