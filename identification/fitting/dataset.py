@@ -92,10 +92,11 @@ def dataset_of(
 
     try:
         data, fit = _in_time(read, load, fitted)
-        late = shifts_of(data)
         for place in (p for p in places_of(model) if p in LOW_PASSED):
             late = _read(place, data, probe, fit)
-        return data if late == shifts_of(data) else _in_time(load(late=late), load, fitted)[0]
+            if late != shifts_of(data):
+                data, fit = _in_time(load(late=late), load, fitted)
+        return data
     except InputError:  # a fit that is refused is refused where it is asked for
         return read
 
