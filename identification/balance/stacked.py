@@ -595,30 +595,36 @@ def sticking_torque(model: JointModel, values: Mapping[str, float], place: str) 
 
 def _either_direction(record: WeakRecord, place: str, noise: ChannelNoise) -> npt.NDArray[np.bool_]:
     """Points at which the direction is not known: slower than the noise, nearer to a turn than
-    its kernel tells when it was, or, where the kernel is no longer than a few samples, between a
-    move one way and one the other: dry friction makes a corner of a turn, or holds the joint
-    there, and a velocity across it says nothing.
+    its kernel tells when it was, or between a move one way and one the other: dry friction makes
+    a corner of a turn, or holds the joint there, and a velocity across it says nothing.
+
+    Which way it moved, single steps between samples tell: within the kernel of a turn, and
+    everywhere where that kernel is no longer than a few samples.
     """
     grid, source = record.grid, f"{place}_position"
     velocity = record.points[f"{place}_velocity"]
     slow = np.abs(velocity) < 3 * grid.velocity_noise(source, noise)
     turns = np.diff(np.sign(velocity), append=np.sign(velocity[-1:])) != 0
     apart = grid.step * grid.dt
-    reach = max(0, whole(TURN_SHARE * (grid.pointwise[source] - TURN_KERNEL) / apart))
-    near = (
-        np.convolve(turns, np.ones(2 * reach), "same") > 0
-        if reach
-        else np.zeros(len(velocity), dtype=bool)
-    )
-    if grid.pointwise[source] < FEW_SAMPLES * grid.dt:
-        moved = np.diff(record.points[source])
-        one_step = np.zeros(grid.step + 1)
-        one_step[0], one_step[-1] = -1.0, 1.0
-        sure = 3 * noise.after(one_step, grid.dt)
-        way = np.sign(moved) * (np.abs(moved) > sure)
-        before, after = np.append(way[:1], way), np.append(way, way[-1:])
-        near |= (before != after) | (before == 0)
+    near = _within(turns, whole(TURN_SHARE * (grid.pointwise[source] - TURN_KERNEL) / apart))
+    moved = np.diff(record.points[source])
+    one_step = np.zeros(grid.step + 1)
+    one_step[0], one_step[-1] = -1.0, 1.0
+    sure = 3 * noise.after(one_step, grid.dt)
+    way = np.sign(moved) * (np.abs(moved) > sure)
+    before, after = np.append(way[:1], way), np.append(way, way[-1:])
+    corner = (before != after) | (before == 0)
+    if grid.pointwise[source] >= FEW_SAMPLES * grid.dt:
+        corner &= _within(turns, whole(grid.pointwise[source] / 2 / apart))
+    near |= corner
     return np.asarray(slow | near)
+
+
+def _within(turns: npt.NDArray[np.bool_], reach: int) -> npt.NDArray[np.bool_]:
+    """Points that are no more than so many points from a turn, which is between two of them."""
+    if reach <= 0:
+        return np.zeros(len(turns), dtype=np.bool_)
+    return np.asarray(np.convolve(turns, np.ones(2 * reach), "same") > 0)
 
 
 def rms(values: FloatArray) -> float:

@@ -185,10 +185,16 @@ class JointBench:
         self._curves: dict[tuple[object, ...], tuple[Solution, tuple[LearnedClaim, ...]]] = {}
         self._drifts: dict[tuple[int, bool], Mapping[str, Part]] = {}
         self._kernels = {**kernels, round(data.kernel, 9): data}
+        self._start: Solution | None = None
+        self._bases: dict[int, Base] = {}
+        self._rankings: dict[tuple[int, bool], tuple[Base, Ranking]] = {}
+        self._lines: dict[int, tuple[Solution, list[Line]]] = {}
 
     def start(self) -> Solution:
-        """The fit of the joint's own model."""
-        return first_fit(prepared_model(self.joint, self._train[0]), self.data)
+        """The fit of the joint's own model; made once."""
+        if self._start is None:
+            self._start = first_fit(prepared_model(self.joint, self._train[0]), self.data)
+        return self._start
 
     def fitted(
         self, model: JointModel, start: Mapping[str, float], *, again: bool = False
@@ -219,21 +225,34 @@ class JointBench:
         start there.
         """
         lines = self.lines(step)
-        self.data = replace(
-            self.data,
-            orders=orders_of(lines, self.joint),
-            other_orders=other_orders(lines, self.joint),
-        )
+        heard = orders_of(lines, self.joint), other_orders(lines, self.joint)
+        if heard != (self.data.orders, self.data.other_orders):
+            self.data = replace(self.data, orders=heard[0], other_orders=heard[1])
 
     def base(self, solution: Solution) -> Base:
-        """See :func:`identification.diagnosis.trials.make_base`."""
-        return make_base(solution, self.data)
+        """See :func:`identification.diagnosis.trials.make_base`; that of the start model is made
+        once.
+        """
+        if solution is not self._start:
+            return make_base(solution, self.data)
+        known = self._bases.get(id(self.data))
+        if known is None:
+            # the base holds its data: their identity is not given to others while it lives
+            known = self._bases[id(self.data)] = make_base(solution, self.data)
+        return known
 
     def ranking(
         self, base: Base, *, late: bool = False, progress: Progress | None = None
     ) -> Ranking:
-        """See :func:`identification.diagnosis.claims.rank`."""
-        return rank(base, late=late, progress=progress)
+        """See :func:`identification.diagnosis.claims.rank`; that of the start model, which the
+        clocks are set by as well, is made once.
+        """
+        if not any(base is known for known in self._bases.values()):
+            return rank(base, late=late, progress=progress)
+        mark = id(base), late
+        if mark not in self._rankings:
+            self._rankings[mark] = base, rank(base, late=late, progress=progress)
+        return self._rankings[mark][1]
 
     def tried(self, solution: Solution) -> list[str]:
         """Keys of the effects that the records can show beside the model."""
@@ -358,8 +377,12 @@ class JointBench:
         return {b: e.left_open for b, e in judged.items() if e.left_open}
 
     def lines(self, step: Step) -> list[Line]:
-        """See :func:`identification.diagnosis.lines.find_lines`."""
-        return find_lines(step.solution, self.data, self._train, self._held)
+        """See :func:`identification.diagnosis.lines.find_lines`; worked out once a model."""
+        mark = id(step.solution)
+        if mark not in self._lines:
+            found = find_lines(step.solution, self.data, self._train, self._held)
+            self._lines[mark] = step.solution, found
+        return self._lines[mark][1]
 
     def places(
         self, step: Step, error: Error, lines: Sequence[Line], limit: float

@@ -166,6 +166,19 @@ class _Standing:
 
 
 @final
+@dataclass(frozen=True)
+class _Decision:
+    """What was decided on a fitted model, before it is judged and told."""
+
+    standing: _Standing
+    first: Ranking
+    last: tuple[Ranking, Base] | None
+    following: str | None
+    unnamed: Claim | None
+    decided: tuple[Claim, ...]
+
+
+@final
 class Session:
     """Decides what is missing from a model that a bench can fit.
 
@@ -246,14 +259,42 @@ class Session:
         """Add what is missing from a fitted model, at most `max_additions` effects."""
         return self._run(solution, max_additions, lean=False)
 
+    def first_addition(self, solution: Solution) -> Step | None:
+        """The step that the first decision on a fitted model ends with; None where it adds
+        nothing, or the records cannot carry the question.
+
+        Raises
+        ------
+        InputError
+            Records in unlike units, with a model that fails on them.
+        """
+        start = self.bench.step(None, None, solution)
+        if self._unanswerable(start):
+            return None
+        standing = self._decide(start, 1, lean=True).standing
+        return standing.now if standing.claims else None
+
     def _run(self, solution: Solution, most: int, *, lean: bool) -> Improvement:
-        most = min(most, claim_limit(self.data))
-        standing = _Standing((self.bench.step(None, None, solution),))
-        start = standing.now
+        start = self.bench.step(None, None, solution)
         self.progress("ranking the library", 0.15)
         why = self._unanswerable(start)
         if why:
-            return self._without_answer(standing.steps, why)
+            return self._without_answer((start,), why)
+        told = self._decide(start, most, lean=lean)
+        found = self.finish(
+            told.first,
+            told.last,
+            told.standing.steps,
+            told.standing.claims,
+            following=told.following,
+            unnamed=told.unnamed,
+        )
+        return replace(found, decided=told.decided)
+
+    def _decide(self, start: Step, most: int, *, lean: bool) -> _Decision:
+        """What to add to the model of a step, at most so many effects."""
+        most = min(most, claim_limit(self.data))
+        standing, solution = _Standing((start,)), start.solution
         self.bench.listen(start)
         base = self.bench.base(solution)
         first = ranking = self.bench.ranking(
@@ -373,10 +414,7 @@ class Session:
         ):
             unnamed = None  # an addition has taken it along
         last = None if lean else (ranking, base)
-        found = self.finish(
-            first, last, standing.steps, standing.claims, following=stopped, unnamed=unnamed
-        )
-        return replace(found, decided=tuple(decided))
+        return _Decision(standing, first, last, stopped, unnamed, tuple(decided))
 
     def named(self, solution: Solution, label: str) -> Odds | None:
         """Whole fits of the names that may stand for one part of a fitted model, however it came
@@ -1168,12 +1206,13 @@ def timed_bench(
         start = bench.start()
         if not (_standing_over(bench.step(None, None, start)) and places_of(model)):
             return bench
-        first = Session(bench).diagnose(start)
+        added = Session(bench).first_addition(start)
     except InputError:  # refused by the verb that asks
         return bench
-    fuller = first.steps[-1].solution
-    named = any(carrier(fuller.model, p) != carrier(model, p) for p in places_of(model))
-    if not first.claims or first.verdict != "unexplained" or named:
+    if added is None or all(e.ratio <= RATIO_LIMIT for e in bench.ratios(added).values()):
+        return bench
+    fuller = added.solution
+    if any(carrier(fuller.model, p) != carrier(model, p) for p in places_of(model)):
         return bench  # a clock that is named is no calibration any more
     was = shifts_of(bench.data)
     data = ask(beside=(fuller, was))

@@ -388,16 +388,14 @@ def _beside(
 
 
 def _sigmas(model: JointModel, data: Dataset, values: Mapping[str, float]) -> dict[str, float]:
-    """RMS of each balance on the training rows, at least its floor."""
+    """RMS of each balance on the training rows, at least its floor.
+
+    Rows that may go either way count by how sure they are: those of a joint that stands at every
+    turn were most of the RMS, and no other row weighed anything.
+    """
     floor = floors(model, data, values)
-    if data.sensing.kinematic:
-        # rows in a gap are no equations: what they leave is no measure of the others
-        level = sure_levels(model, data, values)
-        return {b: max(level[b], floor[b], 1e-12) for b in level}
-    residual = stack(balances_of(model, data.sensing, wrt=()), data.train, values).residual
-    return {
-        b: max(rms(r[taking_part(b, data.train)]), floor[b], 1e-12) for b, r in residual.items()
-    }
+    level = sure_levels(model, data, values)
+    return {b: max(level[b], floor[b], 1e-12) for b in level}
 
 
 def _best_start(
