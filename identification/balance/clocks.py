@@ -281,6 +281,7 @@ def _filter(
     an earlier instant: all of it is to be shifted. One through a low-pass is made good by its rate,
     and nothing is left of higher order. A low-pass of a computer weighs its last reading and the
     one before: its rate is that of half its cycle ago, and so much is to be shifted the other way.
+    No filter makes a reading early, as a command is that is held for a sample: that is a shift.
 
     Rows in which the first two hardly differ say nothing, nor do those that neither meets, as those
     of slow motion whose friction is not the law's: the sum of squares that is compared is Tukey's,
@@ -295,6 +296,8 @@ def _filter(
 
     whole, alone, waiting = shifts[place], make({**shifts, place: 0.0}), make(shifts)
     dt, kept = alone.grid.dt, one_way(alone)
+    if whole < 0:
+        return Filter(whole * dt, -1.0)
     friction = any_curve(alone, "motor_velocity", kept)
 
     def rest(made: WeakRecord, *, without_far: bool = False) -> FloatArray:

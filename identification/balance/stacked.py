@@ -20,7 +20,7 @@ from identification.balance.dataset import Dataset
 from identification.balance.drawn_noise import draws_of
 from identification.balance.memory import numbers_of
 from identification.balance.slow_noise import drift_of_rest
-from identification.balance.weak import WeakRecord, whole
+from identification.balance.weak import Grid, WeakRecord, whole
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -392,10 +392,13 @@ def _sure_rms(change: FloatArray, either: FloatArray) -> float:
 def sure_levels(model: JointModel, data: Dataset, values: Mapping[str, float]) -> dict[str, float]:
     """RMS of what each balance leaves on the training rows, in which rows that may go either way
     count by how sure they are.
+
+    That of the width of a turn is not asked: it is fitted, and a law that is wide enough makes
+    every row unsure.
     """
     balances = balances_of(model, data.sensing, wrt=())
     residual = stack(balances, data.train, values).residual
-    either = unsure(balances, data, values, data.train)
+    either = _by_readings(balances, data, values, data.train)
     rows = {b: taking_part(b, data.train) for b in residual}
     return {b: _sure_rms(r[rows[b]], either[b][rows[b]]) for b, r in residual.items()}
 
@@ -482,6 +485,19 @@ def unsure(
     or be spread over a turn, and from when exactly a torque jumped between two samples [N.m].
     """
     names = balances.model.named("smoothing")
+    either = _by_readings(balances, data, values, records)
+    if not names:
+        return either
+    bare = balances_of(balances.model, data.sensing, wrt=())
+    here = stack(bare, records, values).residual
+    there = stack(bare, records, {**values, **{n: 2 * values[n] for n in names}}).residual
+    return {b: np.hypot((here[b] - there[b]) / 2, either[b]) for b in here}
+
+
+def _by_readings(
+    balances: Balances, data: Dataset, values: Mapping[str, float], records: Sequence[WeakRecord]
+) -> dict[str, FloatArray]:
+    """The part of that scatter that the readings leave open, whatever the width of a turn is."""
     either = _either_way(balances.model, data, values, records)
     either = {
         b: np.hypot(x, jumps)
@@ -493,12 +509,7 @@ def unsure(
         settled_values = settled(balances.model, data.sensing, records, values)
         flying = [balances.flight(w, values_on(balances.model, w, settled_values)) for w in records]
         either = {b: np.hypot(x, np.concatenate(flying)) for b, x in either.items()}
-    if not names:
-        return either
-    bare = balances_of(balances.model, data.sensing, wrt=())
-    here = stack(bare, records, values).residual
-    there = stack(bare, records, {**values, **{n: 2 * values[n] for n in names}}).residual
-    return {b: np.hypot((here[b] - there[b]) / 2, either[b]) for b in here}
+    return either
 
 
 def row_weights(
@@ -598,8 +609,8 @@ def _either_direction(record: WeakRecord, place: str, noise: ChannelNoise) -> np
     its kernel tells when it was, or between a move one way and one the other: dry friction makes
     a corner of a turn, or holds the joint there, and a velocity across it says nothing.
 
-    Which way it moved, single steps between samples tell: within the kernel of a turn, and
-    everywhere where that kernel is no longer than a few samples.
+    Which way it moved, steps between samples tell: within the kernel of a turn, and everywhere
+    where that kernel is no longer than a few samples.
     """
     grid, source = record.grid, f"{place}_position"
     velocity = record.points[f"{place}_velocity"]
@@ -607,17 +618,32 @@ def _either_direction(record: WeakRecord, place: str, noise: ChannelNoise) -> np
     turns = np.diff(np.sign(velocity), append=np.sign(velocity[-1:])) != 0
     apart = grid.step * grid.dt
     near = _within(turns, whole(TURN_SHARE * (grid.pointwise[source] - TURN_KERNEL) / apart))
-    moved = np.diff(record.points[source])
-    one_step = np.zeros(grid.step + 1)
-    one_step[0], one_step[-1] = -1.0, 1.0
-    sure = 3 * noise.after(one_step, grid.dt)
-    way = np.sign(moved) * (np.abs(moved) > sure)
-    before, after = np.append(way[:1], way), np.append(way, way[-1:])
-    corner = (before != after) | (before == 0)
-    if grid.pointwise[source] >= FEW_SAMPLES * grid.dt:
-        corner &= _within(turns, whole(grid.pointwise[source] / 2 / apart))
-    near |= corner
-    return np.asarray(slow | near)
+    few = grid.pointwise[source] < FEW_SAMPLES * grid.dt
+    half = 1 if few else whole(grid.pointwise[source] / 2 / apart)
+    corner = ~_one_way(record.points[source], half, grid, noise)
+    return np.asarray(slow | near | (corner if few else corner & _within(turns, half)))
+
+
+def _one_way(
+    position: FloatArray, most: int, grid: Grid, noise: ChannelNoise
+) -> npt.NDArray[np.bool_]:
+    """Points before and after which the joint surely moves the same way, over one point or more of
+    them up to `most`: noise hides a step between two samples that it does not hide of several.
+    """
+    known = np.zeros(len(position), dtype=np.bool_)
+    span = 1
+    while span <= most:
+        moved = position[span:] - position[:-span]
+        step = np.zeros(span * grid.step + 1)
+        step[0], step[-1] = -1.0, 1.0
+        way = np.sign(moved) * (np.abs(moved) > 3 * noise.after(step, grid.dt))
+        ends = np.zeros(span)
+        before, after = np.append(ends, way), np.append(way, ends)
+        if span == 1:  # of the first and the last point one side is all there is
+            before[0], after[-1] = after[0], before[-1]
+        known |= (before == after) & (before != 0)
+        span *= 2
+    return known
 
 
 def _within(turns: npt.NDArray[np.bool_], reach: int) -> npt.NDArray[np.bool_]:

@@ -190,6 +190,7 @@ class World:
                     dict.fromkeys((*c.amplitudes, *c.shapes), 1.0),
                     balance=balance,
                     gain=score,
+                    gain_there=score,
                     cv_drop_percent=fall,
                     held_out_drop_percent=fall if there else self.falls.get(key, fall),
                     p_value=math.exp(-3 * score),
