@@ -186,8 +186,8 @@ class JointBench:
         self._drifts: dict[tuple[int, bool], Mapping[str, Part]] = {}
         self._kernels = {**kernels, round(data.kernel, 9): data}
         self._start: Solution | None = None
-        self._bases: dict[int, Base] = {}
-        self._rankings: dict[tuple[int, bool], tuple[Base, Ranking]] = {}
+        self._base: Base | None = None
+        self._rankings: dict[bool, Ranking] = {}
         self._lines: dict[int, tuple[Solution, list[Line]]] = {}
 
     def start(self) -> Solution:
@@ -228,6 +228,7 @@ class JointBench:
         heard = orders_of(lines, self.joint), other_orders(lines, self.joint)
         if heard != (self.data.orders, self.data.other_orders):
             self.data = replace(self.data, orders=heard[0], other_orders=heard[1])
+            self._base, self._rankings = None, {}
 
     def base(self, solution: Solution) -> Base:
         """See :func:`identification.diagnosis.trials.make_base`; that of the start model is made
@@ -235,11 +236,9 @@ class JointBench:
         """
         if solution is not self._start:
             return make_base(solution, self.data)
-        known = self._bases.get(id(self.data))
-        if known is None:
-            # the base holds its data: their identity is not given to others while it lives
-            known = self._bases[id(self.data)] = make_base(solution, self.data)
-        return known
+        if self._base is None:
+            self._base = make_base(solution, self.data)
+        return self._base
 
     def ranking(
         self, base: Base, *, late: bool = False, progress: Progress | None = None
@@ -247,12 +246,11 @@ class JointBench:
         """See :func:`identification.diagnosis.claims.rank`; that of the start model, which the
         clocks are set by as well, is made once.
         """
-        if not any(base is known for known in self._bases.values()):
+        if base is not self._base:
             return rank(base, late=late, progress=progress)
-        mark = id(base), late
-        if mark not in self._rankings:
-            self._rankings[mark] = base, rank(base, late=late, progress=progress)
-        return self._rankings[mark][1]
+        if late not in self._rankings:
+            self._rankings[late] = rank(base, late=late, progress=progress)
+        return self._rankings[late]
 
     def tried(self, solution: Solution) -> list[str]:
         """Keys of the effects that the records can show beside the model."""

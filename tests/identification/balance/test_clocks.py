@@ -37,6 +37,8 @@ from tests.recorded_world.sensors import CHANNELS as SENSED
 from tests.recorded_world.world import RECORDS, TROUBLES, make_case, write_case
 
 DEMO = Path(__file__).resolve().parents[3] / "workbench" / "demo"
+DEMO_MOTOR_INERTIA = 4.447
+"""Of the simulated joint that the demo was recorded on, link side [kg m2]."""
 CHANNELS = ("link_position", "link_torque", "motor_current")
 
 
@@ -51,6 +53,19 @@ def late(run: Record, channel: str, samples: int) -> Record:
 def demo(channel: str, samples: int) -> Improvement:
     train, held = (late(read(DEMO / f"{n}.npz"), channel, samples) for n in ("train", "held_out"))
     return improve([train], load_joint(DEMO / "joint.toml"), [held])
+
+
+def test_a_reading_that_is_early_is_shifted_as_no_filter_makes_it_so() -> None:
+    """A command that is held counts from the middle of its sample. As the rate of the drive, half a
+    sample left three standard errors in the motor's inertia.
+    """
+    found = demo("motor_current", 0)
+    for w in found.data.train:
+        assert w.shifts["drive"] == pytest.approx(-w.grid.dt / 2, rel=0.25)
+    end = found.steps[-1].solution
+    error = end.stderr["motor_inertia"]
+    assert error is not None
+    assert abs(end.values["motor_inertia"] - DEMO_MOTOR_INERTIA) < 1.5 * error
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,10 @@ from identification import Joint, Record, compare, fit, improve, load_joint, rea
 from identification.balance.dataset import Dataset, load_dataset, prepared_model
 from identification.balance.weak import WeakRecord
 from identification.data.check.gate import passed
+from identification.diagnosis import bench
+from identification.diagnosis.claims import Ranking
+from identification.diagnosis.session import Session
+from identification.diagnosis.trials import Base
 from identification.errors import InputError
 from identification.fitting.assess import assess
 from identification.fitting.dataset import dataset_of
@@ -127,3 +131,25 @@ def test_records_are_prepared_where_the_fit_is_refused(monkeypatch: pytest.Monke
     model = prepared_model(joint, run)
     made, read_so = (f([run], [], joint, model) for f in (dataset_of, load_dataset))
     assert [w.shifts for w in made.train] == [w.shifts for w in read_so.train]
+
+
+def test_the_library_is_tried_once_on_the_start_model(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The first decision is made before the clocks are asked again; where they stay it holds."""
+    bases: list[Base] = []
+    whole = bench.rank
+
+    def counted(base: Base, **options: object) -> Ranking:
+        bases.append(base)
+        return whole(base, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(bench, "rank", counted)
+    joint, train, test = recorded(193000, "single", tmp_path)
+    session = Session.opened([train], joint, [test])
+    before = len(bases)
+    found = session.run(session.start())
+    assert [c.effects for c in found.claims] == [("cyclic_friction",)]
+    structure = found.steps[0].solution.model.structure
+    assert any(b.solution.model.structure == structure for b in bases[:before])
+    assert not any(b.solution.model.structure == structure for b in bases[before:])

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from benchmarks.next_run import record_of
 from benchmarks.trust import joint_of
+from identification import improve, load_joint, read
 from identification.balance.balances import balances_of
 from identification.balance.dataset import load_dataset, prepared_model
 from identification.fitting.engine import solve
 from identification.fitting.turns import turns_of
 from identification.fitting.weak_form import WeakForm
 from tests.hidden_effect.generator import simulate_case
+from tests.recorded_world.world import make_case, write_case
 
 
 @pytest.mark.parametrize("smoothing", [0.0, 0.002])
@@ -62,3 +66,27 @@ def test_a_record_without_a_turn_is_fitted_as_it_is() -> None:
     assert found.values["motor_inertia"] == pytest.approx(case.parameters["JM"], rel=5e-3)
     form = WeakForm(balances_of(model, data.sensing, wrt=()), data, found.values, (), found.weights)
     assert turns_of(form).columns is None
+
+
+@pytest.mark.parametrize(
+    ("seed", "kind", "sensors", "names"),
+    [
+        (208010, "single", "encoders", ["stribeck"]),
+        (208010, "single", "all", ["stribeck"]),
+        (173017, "none", "all", []),
+    ],
+)
+def test_joints_that_stand_for_a_few_samples_at_a_turn_have_no_structure_left(
+    seed: int, kind: str, sensors: str, names: list[str], tmp_path: Path
+) -> None:
+    """Rows over such stops stood at up to 117 deviations, six and fifteen times the noise of the
+    whole balance, and made the other balances' rows weigh nothing.
+    """
+    case = make_case(seed, kind=kind, size=None if kind == "none" else 1.0)
+    folder = write_case(case, tmp_path, sensors)
+    joint = load_joint(folder / "joint.toml")
+    train, test = (read(folder / f"{n}.csv", joint=joint) for n in ("train", "test"))
+    found = improve([train], joint, [test])
+    assert [n for c in found.claims for n in c.effects] == names
+    assert found.verdict == ("complete" if names else "nothing_missing")
+    assert max(e.ratio for e in found.final_ratios.values()) < 1.2
