@@ -11,6 +11,7 @@ from typing import Final, final
 
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import binary_opening
 
 from casadi_models import JointModel
 from identification.balance.balances import Balances, balances_of
@@ -42,6 +43,10 @@ FEW_SAMPLES: Final = 5
 """Samples under which a kernel of the velocity tells little more than a step from one sample to the
 next."""
 
+LONGEST_TURN: Final = 1
+"""Points of unknown direction that a turn without a stop makes: the reading next to it. Its instant
+tells the clocks, and the velocity through a kernel knows it to a part of a sample.
+"""
 SURE_JUMP: Final = 3.0
 """Standard deviations of noise from which what alternates from sample to sample is a jump."""
 NORMAL_MEDIAN: Final = 0.6745
@@ -609,8 +614,8 @@ def _either_direction(record: WeakRecord, place: str, noise: ChannelNoise) -> np
     its kernel tells when it was, or between a move one way and one the other: dry friction makes
     a corner of a turn, or holds the joint there, and a velocity across it says nothing.
 
-    Which way it moved, steps between samples tell: within the kernel of a turn, and everywhere
-    where that kernel is no longer than a few samples.
+    Which way it moved, steps between samples tell: within the kernel of a turn, where it stops
+    there, and everywhere where that kernel is no longer than a few samples.
     """
     grid, source = record.grid, f"{place}_position"
     velocity = record.points[f"{place}_velocity"]
@@ -621,7 +626,10 @@ def _either_direction(record: WeakRecord, place: str, noise: ChannelNoise) -> np
     few = grid.pointwise[source] < FEW_SAMPLES * grid.dt
     half = 1 if few else whole(grid.pointwise[source] / 2 / apart)
     corner = ~_one_way(record.points[source], half, grid, noise)
-    return np.asarray(slow | near | (corner if few else corner & _within(turns, half)))
+    if not few:
+        corner &= _within(turns, half)
+        corner = binary_opening(corner, np.ones(LONGEST_TURN + 1))
+    return np.asarray(slow | near | corner)
 
 
 def _one_way(

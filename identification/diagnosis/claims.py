@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -229,27 +228,22 @@ def rank(
     return Ranking(tuple(order), significant, tuple(untestable.values()), tuple(unique))
 
 
-def nearly(ranking: Ranking, base: Base, refused: frozenset[str]) -> list[Trial]:
-    """The best trials ahead of the first significant one that the training blocks support and that
-    only their linear form keeps from being significant: by the drop on held-out records, or by what
-    it does to another balance than their own.
-
-    A linear step lowers the squares of all balances together, as if their rows were as
-    independent: where one stands far over its noise, what the step spoils of the others is less
-    than that, and yet more likely than its fall.
+def nearly(ranking: Ranking, base: Base, refused: frozenset[str]) -> Trial | None:
+    """Best trial that the training blocks support and that only its linearised held-out drop
+    keeps from being significant.
     """
-    sure = FALSE_DISCOVERY / max(len(ranking.everything), 1)
-    ahead = itertools.takewhile(
-        lambda t: t.candidate.label not in ranking.significant, ranking.everything
-    )
-    return [
-        t
-        for t in ahead
-        if t.candidate.label not in refused
-        and t.p_value <= sure
-        and not math.isnan(t.held_out_drop_percent)
-        and _major(replace(t, held_out_drop_percent=math.nan, gain=max(t.gain, t.gain_there)), base)
-    ][:LARGEST_SET]
+    for t in ranking.everything:
+        if t.candidate.label in ranking.significant:
+            return None
+        if t.candidate.label in refused or t.p_value > FALSE_DISCOVERY / max(
+            len(ranking.everything), 1
+        ):
+            continue
+        if not math.isnan(t.held_out_drop_percent) and _major(
+            replace(t, held_out_drop_percent=math.nan), base
+        ):
+            return t
+    return None
 
 
 def unproved(ranking: Ranking, base: Base, refused: frozenset[str]) -> list[Trial]:

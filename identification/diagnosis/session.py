@@ -599,42 +599,38 @@ class Session:
         )
 
     def _confirmed(self, ranking: Ranking, base: Base, now: Step) -> Ranking:
-        """Candidates that fail in their linear form only are judged by whole fits."""
-        near = nearly(ranking, base, frozenset(self._refused))
-        if not near:
+        """A candidate that fails on held-out records in its linear form only is judged by a
+        whole fit.
+        """
+        trial = nearly(ranking, base, frozenset(self._refused))
+        if trial is None:
             return ranking if ranking.significant else self._shown_elsewhere(ranking, base, now)
-        passed: dict[str, float] = {}
-        for t in near:
-            drop = held_drop(now.held_out, self.bench.added(t, now).held_out, t.balance)
-            if drop >= HELD_OUT_DROP:
-                passed[t.candidate.label] = drop
-                continue
+        label = trial.candidate.label
+        drop = held_drop(now.held_out, self.bench.added(trial, now).held_out, trial.balance)
+        if drop < HELD_OUT_DROP:
             lowered = (
-                f"lowers the {t.balance} balance by {drop:.2g} % on held-out records "
+                f"lowers the {trial.balance} balance by {drop:.2g} % on held-out records "
                 "after the whole fit"
             )
-            self._doubted[t.candidate.label] = f"{lowered} ({HELD_OUT_DROP:g} % asked)"
-        if not passed:
+            self._doubted[label] = f"{lowered} ({HELD_OUT_DROP:g} % asked)"
             return ranking
+        passed = replace(trial, held_out_drop_percent=drop)
         # what the linear form says of the others on held-out records is no more worth than what it
-        # said of these
-        balances = {t.balance for t in near if t.candidate.label in passed}
+        # said of this one
         others = {
             t.candidate.label
             for t in ranking.everything
-            if t.balance in balances and t.held_out_drop_percent < 0
+            if t.balance == trial.balance and t.held_out_drop_percent < 0
         }
         renewed = tuple(
-            replace(t, held_out_drop_percent=passed[t.candidate.label])
-            if t.candidate.label in passed
+            passed
+            if t.candidate.label == label
             else replace(t, held_out_drop_percent=math.nan)
             if t.candidate.label in others
             else t
             for t in ranking.everything
         )
-        return replace(
-            ranking, everything=renewed, significant=ranking.significant | frozenset(passed)
-        )
+        return replace(ranking, everything=renewed, significant=ranking.significant | {label})
 
     def _shown_elsewhere(self, ranking: Ranking, base: Base, now: Step) -> Ranking:
         """The ranking with the names that the training records hardly need and that held-out ones

@@ -378,8 +378,6 @@ class Trial:
         Balance where it helps most.
     gain : float
         Cross-validated log-likelihood gain [nats], in units of what noise alone leaves.
-    gain_there : float
-        The part of it that is of that balance.
     cv_drop_percent, held_out_drop_percent : float
         Fall of the RMS in the affected balance.
     p_value : float
@@ -403,7 +401,6 @@ class Trial:
     values: Mapping[str, float]
     balance: str
     gain: float
-    gain_there: float
     cv_drop_percent: float
     held_out_drop_percent: float
     p_value: float
@@ -570,7 +567,6 @@ def _score(
     if told["cv_drop_percent"] >= MINOR_DROP:
         # where it does not help, it need not be paid for
         unit[where] = _unit(candidate, base, values, delta)[where]
-    quiet = _told(base, sse1 / unit**2)
     held = _held_out_drop(
         candidate, base, balances=balances, shapes=shapes, delta=delta, size=size, where=where
     )
@@ -582,7 +578,7 @@ def _score(
         outside=inside,
         contribution=float(np.sqrt(np.mean((raw[base.balance == where] @ amplitude) ** 2))),
         unit=float(unit[where]),
-        **{**told, **{n: quiet[n] for n in ("gain", "gain_there")}},
+        **{**told, "gain": _told(base, sse1 / unit**2)["gain"]},
     )
 
 
@@ -651,7 +647,6 @@ def _told(base: Base, sse1: FloatArray) -> dict[str, Any]:
     return {
         "balance": base.balances[where],
         "gain": float(gains.sum()),
-        "gain_there": float(gains[where]),
         "cv_drop_percent": drop,
         "block_score": ((sse0 - sse1) / (2 * variance) * base.share).sum(axis=1),
         "rms": np.sqrt(per_balance1 / rows_in),

@@ -190,7 +190,6 @@ class World:
                     dict.fromkeys((*c.amplitudes, *c.shapes), 1.0),
                     balance=balance,
                     gain=score,
-                    gain_there=score,
                     cv_drop_percent=fall,
                     held_out_drop_percent=fall if there else self.falls.get(key, fall),
                     p_value=math.exp(-3 * score),
@@ -466,7 +465,7 @@ def test_a_fall_that_only_the_linear_form_misses_is_believed_from_the_whole_fit(
         falls={"cyclic_torque": 1.0, "added_spring": -5.0, "quadratic_drag": 0.5},
     )
     (claim,) = ended(world).claims
-    assert claim.effects == ("cyclic_torque",), "a whole fit leaves 11 % more of the other"
+    assert claim.effects == ("cyclic_torque", "added_spring")
     assert claim.held_out_drop_percent == pytest.approx(80.0)
 
 
