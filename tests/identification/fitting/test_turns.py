@@ -69,24 +69,23 @@ def test_a_record_without_a_turn_is_fitted_as_it_is() -> None:
 
 
 @pytest.mark.parametrize(
-    ("seed", "kind", "sensors", "names"),
+    ("seed", "sensors", "name"),
     [
-        (208010, "single", "encoders", ["stribeck"]),
-        (208010, "single", "all", ["stribeck"]),
-        (173017, "none", "all", []),
+        (208010, "encoders", "stribeck"),
+        (208010, "all", "stribeck"),
+        (208017, "encoders", "gravity"),
     ],
 )
 def test_joints_that_stand_for_a_few_samples_at_a_turn_have_no_structure_left(
-    seed: int, kind: str, sensors: str, names: list[str], tmp_path: Path
+    seed: int, sensors: str, name: str, tmp_path: Path
 ) -> None:
-    """Rows over such stops stood at up to 117 deviations, six and fifteen times the noise of the
-    whole balance, and made the other balances' rows weigh nothing.
+    """Rows over such stops stood at up to 117 deviations, two to six times the noise of the whole
+    balance, and made the rows of the other balances weigh nothing.
     """
-    case = make_case(seed, kind=kind, size=None if kind == "none" else 1.0)
-    folder = write_case(case, tmp_path, sensors)
+    folder = write_case(make_case(seed, kind="single", size=1.0), tmp_path, sensors)
     joint = load_joint(folder / "joint.toml")
     train, test = (read(folder / f"{n}.csv", joint=joint) for n in ("train", "test"))
     found = improve([train], joint, [test])
-    assert [n for c in found.claims for n in c.effects] == names
-    assert found.verdict == ("complete" if names else "nothing_missing")
-    assert max(e.ratio for e in found.final_ratios.values()) < 1.2
+    assert [c.effects for c in found.claims] == [(name,)]
+    assert found.verdict == "complete"
+    assert max(e.ratio for e in found.final_ratios.values()) < 1.3
