@@ -12,10 +12,12 @@ from ..signals import Expression, LocalSignals
 def _stops(
     z: tuple[Expression, ...], step: Expression, s: LocalSignals, p: SimpleNamespace
 ) -> tuple[Expression, ...]:
-    """Stop operators: each follows the torsion until it slips."""
+    """Stop operators: each follows the torsion until it slips; the widths of three in a geometric
+    series follow a loop of any bend closely.
+    """
     return tuple(
-        ca.fmin(ca.fmax(state + step / (width * p.hysteresis_width), -1), 1)
-        for state, width in zip(z, (1, 3, 9), strict=True)
+        ca.fmin(ca.fmax(state + step / (p.hysteresis_spread**k * p.hysteresis_width), -1), 1)
+        for k, state in enumerate(z)
     )
 
 
@@ -37,13 +39,24 @@ def _stops(
         shape(
             "hysteresis_width",
             "rad",
-            "torsion over which the short element turns round; the others 3 and 9 times",
+            "torsion over which the short element turns round",
             (0.005, 0.015, 0.04, 0.09),
             "torsion",
             start=1e-4,
             low=1e-12,
             high=10.0,
             typical=1e-4,
+        ),
+        shape(
+            "hysteresis_spread",
+            "1",
+            "over how many times the torsion of one element the next one turns round",
+            (3.0,),
+            "absolute",
+            start=3.0,
+            low=1.5,
+            high=5.0,
+            typical=3.0,
         ),
     ),
     contains=("coulomb",),

@@ -55,6 +55,7 @@ NAMED = {
     "backlash_stiffness_loss": 1.2e4,
     "soft_windup_width": 4e-4,
     "hysteresis_width": 3e-4,
+    "hysteresis_spread": 3.0,
     "motor_smoothing_velocity": 0.02,
     "link_smoothing_velocity": 0.02,
     "kinematic_error_order": 2.0,

@@ -783,15 +783,16 @@ def test_a_shape_of_a_law_with_memory_has_the_slope_of_its_rows(elastic: Base) -
     """By a one-sided step of a hundredth: the law has kinks, which smaller ones would resolve."""
     model = elastic.solution.model.add("hysteresis")
     values = {**elastic.solution.values}
-    values |= {"hysteresis_width": 1e-4} | {f"hysteresis_torque_{k}": 2.0 for k in (1, 2, 3)}
-    free = ("hysteresis_width", "hysteresis_torque_1")
+    values |= {"hysteresis_width": 1e-4, "hysteresis_spread": 3.0}
+    values |= {f"hysteresis_torque_{k}": 2.0 for k in (1, 2, 3)}
+    free = ("hysteresis_width", "hysteresis_spread", "hysteresis_torque_1")
     balances = balances_of(model, elastic.data.sensing, wrt=free)
     ones = dict.fromkeys(balances.balances, 1.0)
     problem = WeakForm(balances, elastic.data, values, free, ones)
     x = np.array([values[n] for n in free])
     slope = problem.jacobian(x)
-    for k, size in enumerate((0.01 * x[0], 1e-3)):
-        step = np.eye(2)[k] * size
+    for k, size in enumerate((0.01 * x[0], 0.01 * x[1], 1e-3)):
+        step = np.eye(3)[k] * size
         numeric = (problem.residual(x + step) - problem.residual(x)) / size
         assert np.linalg.norm(numeric) > 0
         assert slope[:, k] == pytest.approx(numeric, rel=1e-6, abs=1e-6 * np.abs(numeric).max())
