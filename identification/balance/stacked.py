@@ -43,6 +43,11 @@ FEW_SAMPLES: Final = 5
 """Samples under which a kernel of the velocity tells little more than a step from one sample to the
 next."""
 
+MOST_SAMPLES: Final = 10
+"""Samples of a kernel of the velocity up to which steps between samples tell a stop. A kernel is as
+long as the noise asks for: that of a step is (10/3)^1.5, six times, what such a kernel leaves of
+it, and with 20 samples seventeen times: then noise hides all that is shorter than the kernel.
+"""
 LONGEST_TURN: Final = 1
 """Points of unknown direction that a turn without a stop makes: the reading next to it. Its instant
 tells the clocks, and the velocity through a kernel knows it to a part of a sample.
@@ -615,7 +620,8 @@ def _either_direction(record: WeakRecord, place: str, noise: ChannelNoise) -> np
     a corner of a turn, or holds the joint there, and a velocity across it says nothing.
 
     Which way it moved, steps between samples tell: within the kernel of a turn, where it stops
-    there, and everywhere where that kernel is no longer than a few samples.
+    there, and everywhere where that kernel is no longer than a few samples. Noise that asks for a
+    long kernel hides them.
     """
     grid, source = record.grid, f"{place}_position"
     velocity = record.points[f"{place}_velocity"]
@@ -629,7 +635,8 @@ def _either_direction(record: WeakRecord, place: str, noise: ChannelNoise) -> np
     if not few:
         corner &= _within(turns, half)
         corner = binary_opening(corner, np.ones(LONGEST_TURN + 1))
-    return np.asarray(slow | near | corner)
+    told = grid.pointwise[source] <= MOST_SAMPLES * grid.dt
+    return np.asarray(slow | near | corner) if told else np.asarray(slow | near)
 
 
 def _one_way(
