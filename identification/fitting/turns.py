@@ -1,21 +1,24 @@
-"""The instants at which dry friction changes its sign, as unknowns of their own.
+"""Friction about the instants at which it changes its sign, as unknowns of their own.
 
 A velocity comes from a kernel, and around a turn the acceleration jumps by what dry friction does:
 the instant of the turn is some milliseconds wrong, always to the same side.  Such an error is even
 in time about the turn, as an acceleration is and the laws of friction are not, so least squares
-made an inertia of it.  An unknown instant for each turn takes it: rows and columns lose what
-friction that changes its sign some milliseconds sooner or later would give them.
+made an inertia of it.  At each point about a turn the friction may be that of either direction: an
+unknown of its own takes it.  One for each turn would not do: what is wrong stands some milliseconds
+beside the turn, and where the kernel is steep that is another column.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Final, final
 
 import numpy as np
 import numpy.typing as npt
 
-from identification.balance.stacked import TURN_SHARE, sticking_torque
+from identification.balance.balances import balances_of
+from identification.balance.stacked import TURN_SHARE, rms, stack, sticking_torque, taking_part
 from identification.balance.weak import RESTING_SIDES, WeakRecord, whole
 from identification.fitting.weak_form import WeakForm
 
@@ -26,27 +29,33 @@ ONE_TURN: Final = 0.5
 """Share of a kernel within which changes of sign are one turn: noise about a slow one makes
 several, and rows do not tell them apart.
 """
+EITHER: Final = math.sqrt(2.0)
+"""RMS of what the friction at a point about a turn is off by, in its level: nothing or twice the
+level, the one as likely as the other."""
+FEWEST_QUIET: Final = 100
+"""Rows that no turn touches from which their RMS is known to a tenth: four rows to a kernel, of
+which two fifths are independent."""
 
 
 @final
 @dataclass(frozen=True)
 class Turns:
-    """What unknown instants of the turns may add to the weighted rows of a problem.
+    """What unknown friction about the turns may add to the weighted rows of a problem.
 
     Attributes
     ----------
-    columns : (rows, turns) sparse array or None
-        In units of what the error of an instant usually adds; None where nothing turns under dry
-        friction.
+    columns : (rows, points) sparse array or None
+        What friction that may act either way adds at one point, in the noise of its balance; None
+        where nothing turns under dry friction.
     factors : object or None
-        Their normal matrix with that of the usual errors, factorised.
+        Their normal matrix with that of friction which may act either way, factorised.
     """
 
     columns: Any = None
     factors: Any = None
 
     def without(self, rows: FloatArray) -> FloatArray:
-        """Weighted rows (rows,) or columns (rows, p) less what these instants explain."""
+        """Weighted rows (rows,) or columns (rows, p) less what this friction explains."""
         if self.columns is None:
             return rows
         explained = self.columns @ self.factors.solve(np.asarray(self.columns.T @ rows))
@@ -77,7 +86,7 @@ def turns_of(problem: WeakForm) -> Turns:
     rows, columns, values, count = [], [], [], 0
     for balance, first, record, side in parts:
         name = problem.balances.balances[balance]
-        found = (record.averaging @ (levels[side] * _at_turns(record, side))).tocoo()
+        found = (record.averaging @ (EITHER * levels[side] * _at_turns(record, side))).tocoo()
         row, column = found.coords
         own = slice(first, first + record.rows)
         weight = np.broadcast_to(problem.weights[name], (problem.rows,))[own] * record.taking(name)
@@ -87,10 +96,32 @@ def turns_of(problem: WeakForm) -> Turns:
         count += found.shape[1]
     if not count:
         return Turns()
+    row, value = np.concatenate(rows), np.concatenate(values)
+    noise = _noise_beside(problem, row[value != 0])
     total = len(problem.balances.balances) * problem.rows + len(problem.prior)
     return _factorised(
-        np.concatenate(rows), np.concatenate(columns), np.concatenate(values), (total, count)
+        row, np.concatenate(columns), value / noise[row // problem.rows], (total, count)
     )
+
+
+def _noise_beside(problem: WeakForm, touched: IntArray) -> FloatArray:
+    """RMS of the weighted rows of each balance that no turn touches, (balances,).
+
+    The turns themselves are most of what a balance leaves where it turns, so that the weights take
+    noise for several times what it is: by them each row would tell next to nothing of a turn.
+    """
+    bare_ones = balances_of(problem.balances.model, problem.data.sensing, wrt=())
+    left = stack(bare_ones, problem.data.train, problem.values).residual
+    apart = np.ones(len(problem.balances.balances) * problem.rows, dtype=np.bool_)
+    apart[touched] = False
+    out = np.ones(len(problem.balances.balances))
+    for k, b in enumerate(problem.balances.balances):
+        own = apart[k * problem.rows : (k + 1) * problem.rows]
+        own = own & taking_part(b, problem.data.train)
+        level = rms((left[b] * problem.weights[b])[own])
+        if own.sum() >= FEWEST_QUIET and level > 0:
+            out[k] = level
+    return out
 
 
 def _first_rows(problem: WeakForm) -> list[int]:
@@ -100,8 +131,8 @@ def _first_rows(problem: WeakForm) -> list[int]:
 
 
 def _at_turns(record: WeakRecord, side: str) -> Any:
-    """Sparse (points, turns): what one standard error of its instant adds to a friction of 1 at the
-    points of a turn; over a slow one the friction may have acted either way.
+    """Sparse (points, unknowns), a 1 for every point about a turn: from its first change of sign to
+    its last, and as much before and after as its instant may be wrong.
     """
     from scipy.sparse import csc_array
 
@@ -109,15 +140,15 @@ def _at_turns(record: WeakRecord, side: str) -> Any:
     grid = record.grid
     spacing = grid.step * grid.dt
     apart = max(1, whole(ONE_TURN * grid.length / spacing))
+    late = math.ceil(TURN_SHARE * grid.pointwise[f"{side}_position"] / spacing)
     at = np.flatnonzero(np.diff(np.sign(speed)) != 0)
     turns = np.split(at, np.flatnonzero(np.diff(at) > apart) + 1) if len(at) else []
-    points = [np.arange(t[0], t[-1] + 2) for t in turns]
-    count = np.array([len(p) for p in points], dtype=np.int64)
-    where = np.concatenate([*points, np.empty(0, dtype=np.int64)])
-    which = np.repeat(np.arange(len(points)), count)
-    late = TURN_SHARE * grid.pointwise[f"{side}_position"] / spacing
-    size = 1 + 2 * late / np.maximum(count, 1)
-    return csc_array((size[which], (where, which)), shape=(len(speed), len(points)))
+    about = np.zeros(len(speed), dtype=np.bool_)
+    for t in turns:
+        about[max(t[0] - late, 0) : t[-1] + 2 + late] = True
+    where = np.flatnonzero(about)
+    ones = (np.ones(len(where)), (where, np.arange(len(where))))
+    return csc_array(ones, shape=(len(speed), len(where)))
 
 
 def _factorised(
