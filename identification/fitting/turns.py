@@ -29,9 +29,6 @@ ONE_TURN: Final = 0.5
 """Share of a kernel within which changes of sign are one turn: noise about a slow one makes
 several, and rows do not tell them apart.
 """
-EITHER: Final = math.sqrt(2.0)
-"""RMS of what the friction at a point about a turn is off by, in its level: nothing or twice the
-level, the one as likely as the other."""
 FEWEST_QUIET: Final = 100
 """Rows that no turn touches from which their RMS is known to a tenth: four rows to a kernel, of
 which two fifths are independent."""
@@ -45,10 +42,10 @@ class Turns:
     Attributes
     ----------
     columns : (rows, points) sparse array or None
-        What friction that may act either way adds at one point, in the noise of its balance; None
-        where nothing turns under dry friction.
+        What the friction at one point is usually off by, in the noise of its balance; None where
+        nothing turns under dry friction.
     factors : object or None
-        Their normal matrix with that of friction which may act either way, factorised.
+        Their normal matrix with that of the usual errors, factorised.
     """
 
     columns: Any = None
@@ -86,7 +83,7 @@ def turns_of(problem: WeakForm) -> Turns:
     rows, columns, values, count = [], [], [], 0
     for balance, first, record, side in parts:
         name = problem.balances.balances[balance]
-        found = (record.averaging @ (EITHER * levels[side] * _at_turns(record, side))).tocoo()
+        found = (record.averaging @ (levels[side] * _at_turns(record, side))).tocoo()
         row, column = found.coords
         own = slice(first, first + record.rows)
         weight = np.broadcast_to(problem.weights[name], (problem.rows,))[own] * record.taking(name)
@@ -131,24 +128,32 @@ def _first_rows(problem: WeakForm) -> list[int]:
 
 
 def _at_turns(record: WeakRecord, side: str) -> Any:
-    """Sparse (points, unknowns), a 1 for every point about a turn: from its first change of sign to
-    its last, and as much before and after as its instant may be wrong.
+    """Sparse (points, unknowns): RMS of what the friction at each point about a turn is off by, in
+    its level: twice the level where the instant of the turn lies beyond the point.
+
+    The velocity is that of a kernel, so that its change of sign is no farther from the true one
+    than half of that.
     """
     from scipy.sparse import csc_array
+    from scipy.special import ndtr
 
     speed = record.points[f"{side}_velocity"]
     grid = record.grid
     spacing = grid.step * grid.dt
+    kernel = grid.pointwise[f"{side}_position"] / spacing
     apart = max(1, whole(ONE_TURN * grid.length / spacing))
-    late = math.ceil(TURN_SHARE * grid.pointwise[f"{side}_position"] / spacing)
     at = np.flatnonzero(np.diff(np.sign(speed)) != 0)
-    turns = np.split(at, np.flatnonzero(np.diff(at) > apart) + 1) if len(at) else []
-    about = np.zeros(len(speed), dtype=np.bool_)
-    for t in turns:
-        about[max(t[0] - late, 0) : t[-1] + 2 + late] = True
-    where = np.flatnonzero(about)
-    ones = (np.ones(len(where)), (where, np.arange(len(where))))
-    return csc_array(ones, shape=(len(speed), len(where)))
+    crossing = at + np.abs(speed[at]) / np.abs(speed[at + 1] - speed[at])
+    ends = np.flatnonzero(np.diff(at) > apart) + 1
+    off = np.zeros(len(speed))
+    for x in np.split(crossing, ends) if len(at) else ():
+        first = max(math.ceil(x[0] - kernel / 2), 0)
+        points = np.arange(first, min(math.floor(x[-1] + kernel / 2), len(speed) - 1) + 1)
+        away = np.maximum(np.maximum(x[0] - points, points - x[-1]), 0.0)
+        off[points] = np.maximum(off[points], 2 * np.sqrt(ndtr(-away / (TURN_SHARE * kernel))))
+    where = np.flatnonzero(off)
+    placed = (off[where], (where, np.arange(len(where))))
+    return csc_array(placed, shape=(len(speed), len(where)))
 
 
 def _factorised(
