@@ -59,6 +59,24 @@ class Turns:
         return np.asarray(rows - explained, dtype=np.float64)
 
 
+@final
+@dataclass(frozen=True)
+class WithoutTurns:
+    """The rows of a problem less what friction about its turns explains; a
+    :class:`identification.fitting.least_squares.Problem`."""
+
+    problem: WeakForm
+    turns: Turns
+
+    def residual(self, x: FloatArray) -> FloatArray:
+        """Weighted rows, (rows,)."""
+        return self.turns.without(self.problem.residual(x))
+
+    def jacobian(self, x: FloatArray) -> FloatArray:
+        """Their derivative, (rows, free)."""
+        return self.turns.without(self.problem.jacobian(x))
+
+
 def turns_of(problem: WeakForm) -> Turns:
     """The turns of a problem's training records under the dry friction of its values.
 
@@ -171,4 +189,4 @@ def _factorised(
     return Turns(columns, splu(csc_matrix(normal)))
 
 
-__all__ = ["Turns", "turns_of"]
+__all__ = ["Turns", "WithoutTurns", "turns_of"]

@@ -10,6 +10,7 @@ from benchmarks.trust import joint_of
 from identification.balance.balances import balances_of
 from identification.balance.dataset import load_dataset, prepared_model
 from identification.fitting.engine import solve
+from identification.fitting.trust import trust
 from identification.fitting.turns import Turns, turns_of
 from identification.fitting.weak_form import WeakForm
 from tests.hidden_effect.generator import simulate_case
@@ -107,6 +108,24 @@ def test_motors_under_set_valued_friction_have_no_bias_of_their_inertia() -> Non
         assert error is not None
         off.append((found.values["motor_inertia"] - case.parameters["JM"]) / error)
     assert abs(np.mean(off)) < 2 / np.sqrt(len(off))
+
+
+def test_the_profile_of_a_shape_knows_no_more_of_the_turns_than_its_error() -> None:
+    """With the rows at the turns in it the interval of this velocity ended one error below its
+    value and nearly five above."""
+    case = simulate_case("stribeck", 300_000, overrides={"CURVE": 1.0}, records=("train", "train2"))
+    records = [record_of(t, n, "same") for n, t in case.measured.items()]
+    joint = joint_of(case, ("stribeck@motor",))
+    model = prepared_model(joint, records[0])
+    data = load_dataset(records, [], joint, model)
+    judged = {p.name: p for p in trust(solve(model, data), data).parameters}
+    p = judged["motor_stribeck_velocity"]
+    assert p.low is not None
+    assert p.high is not None
+    assert p.stderr is not None
+    assert 1.4 < (p.value - p.low) / p.stderr < 2.7
+    assert 1.4 < (p.high - p.value) / p.stderr < 2.7
+    assert p.low < case.parameters["M_VS"] < p.high
 
 
 def test_a_record_without_a_turn_is_fitted_as_it_is() -> None:
