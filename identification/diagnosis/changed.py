@@ -43,11 +43,8 @@ from identification.fitting.covariance import (
 )
 from identification.fitting.dataset import dataset_of
 from identification.fitting.engine import Solution, solve, stack
-from identification.fitting.errors_in_variables.equations import (
-    noise_products,
-    unbiased,
-    whole_without,
-)
+from identification.fitting.errors_in_variables.equations import unbiased
+from identification.fitting.errors_in_variables.products import noise_products, whole_without
 from identification.fitting.start_values import bounds_of
 from identification.fitting.weak_form import WeakForm
 

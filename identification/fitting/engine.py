@@ -34,7 +34,8 @@ from identification.balance.stacked import (
 from identification.errors import InputError
 from identification.fitting.covariance import correlations
 from identification.fitting.errors_in_variables.bands import Bands
-from identification.fitting.errors_in_variables.equations import Unbiased, unbiased
+from identification.fitting.errors_in_variables.equations import unbiased
+from identification.fitting.errors_in_variables.products import Unbiased
 from identification.fitting.start_values import bounds_of, starts
 from identification.fitting.turns import turns_of
 from identification.fitting.weak_form import WeakForm
@@ -228,7 +229,7 @@ def _fitted(
     share = _independent(balances, data, values)
     before = _beside(known_before, share)
     problem = WeakForm(balances, data, values, tuple(free), weights, before)
-    without = unbiased(problem, limits)
+    without = unbiased(problem, limits, share)
     problem = replace(problem, values=without.values)
     found = _with_errors(problem, limits, sigma, used, without=without, share=share)
     return replace(found, unidentified=(*found.unidentified, *unseen))

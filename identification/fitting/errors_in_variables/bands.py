@@ -19,8 +19,8 @@ from identification.fitting.covariance import (
     window_errors,
     windows_over,
 )
-from identification.fitting.errors_in_variables.equations import Unbiased, whole_without
 from identification.fitting.errors_in_variables.instruments import mixed
+from identification.fitting.errors_in_variables.products import Unbiased, whole_without
 from identification.fitting.turns import Turns
 from identification.fitting.weak_form import WeakForm
 

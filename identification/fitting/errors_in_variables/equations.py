@@ -12,30 +12,38 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Final, final
+from typing import Final, final
 
 import numpy as np
 import numpy.typing as npt
 
 from identification.balance.balances import balances_of
 from identification.balance.colour import LEVEL_ERROR
-from identification.balance.drawn_noise import draws_of
 from identification.balance.stacked import (
     INDEPENDENT_SHARE,
     SURE_ERRORS,
-    Stacked,
     drawn_floors,
     noise_believed,
     stack,
 )
-from identification.balance.weak import WeakRecord
-from identification.fitting.covariance import cores
+from identification.fitting.covariance import RANK
+from identification.fitting.errors_in_variables.bands import Bands
 from identification.fitting.errors_in_variables.instruments import (
     Instruments,
     can_be_met,
-    from_others,
     instruments_of,
     mixed,
+)
+from identification.fitting.errors_in_variables.products import (
+    MOST_NOISE,
+    DrawnRows,
+    NoiseProducts,
+    Unbiased,
+    drawn_rows,
+    no_noise,
+    noise_products,
+    shares,
+    whole_without,
 )
 from identification.fitting.turns import Turns, turns_of
 from identification.fitting.weak_form import WeakForm
@@ -43,10 +51,6 @@ from identification.fitting.weak_form import WeakForm
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
-MOST_NOISE: Final = 0.9
-"""Largest share of the information on a direction that may be noise: the draws know it within 3 %,
-and what is left must stand clear of that.
-"""
 MOST_MET: Final = 0.999
 """The same where the columns of other sensors tell what is left: that is known as well as the sums
 over some thousand rows."""
@@ -59,188 +63,9 @@ STEPS: Final = 3
 """Newton steps from the least squares: the products change little with the parameters."""
 
 
-@final
-@dataclass(frozen=True)
-class NoiseProducts:
-    """What noise adds to the normal equations of each balance.
-
-    Attributes
-    ----------
-    gram : mapping of str to (p, p) array
-        To the products of the weighted columns with those that meet them.
-    score : mapping of str to (p,) array
-        To their products with the weighted residual.
-    """
-
-    gram: Mapping[str, FloatArray]
-    score: Mapping[str, FloatArray]
-
-    @property
-    def whole(self) -> tuple[FloatArray, FloatArray]:
-        """Both over all balances."""
-        grams, scores = np.array(list(self.gram.values())), np.array(list(self.score.values()))
-        return np.asarray(grams.sum(axis=0)), np.asarray(scores.sum(axis=0))
-
-    def of(self, index: IntArray, mix: FloatArray) -> NoiseProducts:
-        """Those of some of the columns, met by combinations of theirs (columns, columns)."""
-        grams = {b: mix.T @ g[np.ix_(index, index)] for b, g in self.gram.items()}
-        return NoiseProducts(
-            {b: (g + g.T) / 2 for b, g in grams.items()},
-            {b: mix.T @ x[index] for b, x in self.score.items()},
-        )
-
-    def by_window(
-        self,
-        weights: Mapping[str, FloatArray],
-        windows: Any,
-        taking: Mapping[str, npt.NDArray[np.bool_]],
-    ) -> tuple[FloatArray, FloatArray]:
-        """What falls to the core of each window of the first, (windows, p, p), and to the window of
-        the second, (windows, p): by the squares of the weights of their rows that take part.
-
-        Parameters
-        ----------
-        weights : mapping of str to (rows,) array
-        windows : (windows, rows) sparse array
-            Of :func:`identification.fitting.covariance.windows_over`.
-        taking : mapping of str to (rows,) bool array
-        """
-        squares = {b: w**2 * taking[b] for b, w in weights.items()}
-        share = {b: w / max(float(w.sum()), 1e-300) for b, w in squares.items()}
-        core = cores(windows)
-        return (
-            np.asarray(sum((core @ share[b])[:, None, None] * g for b, g in self.gram.items())),
-            np.asarray(sum((windows @ share[b])[:, None] * x for b, x in self.score.items())),
-        )
-
-
-DrawnRows = list[list[tuple[Stacked, Stacked]]]
-"""For each training record and draw: rows without and with the drawn noise."""
-
-
-def drawn_rows(problem: WeakForm) -> DrawnRows:
-    """Rows and columns of a problem as noise is drawn, at its values."""
-    balances, data = problem.balances, problem.data
-
-    def rows(record: WeakRecord) -> Stacked:
-        return stack(balances, [record], problem.values, problem.free)
-
-    return [
-        [(rows(draw.calm), rows(draw.noisy)) for draw in draws_of(record, data.sources)]
-        for record in data.train
-    ]
-
-
-def noise_products(
-    problem: WeakForm,
-    met: frozenset[str] = frozenset(),
-    own: DrawnRows | None = None,
-    believed: Mapping[str, float] | None = None,
-) -> NoiseProducts:
-    """What noise adds to the normal equations at the values of a problem.
-
-    Shapes and smoothing velocities bend the columns, where first order does not hold: they are left
-    as they are.
-
-    Parameters
-    ----------
-    problem : WeakForm
-    met : frozenset of str
-        Balances whose columns are met by those of the other sensors
-        (:mod:`identification.fitting.errors_in_variables.instruments`): what noise makes of one,
-        times what it makes of the other.
-    own : list, optional
-        Of :func:`drawn_rows`, where they are known.
-    believed : mapping of str to float, optional
-        Of :func:`identification.balance.stacked.noise_believed`, where it is known.
-    """
-    balances, data, free = problem.balances, problem.data, problem.free
-    model, count = balances.model, len(free)
-    straight = ~problem.bent
-    gram = {b: np.zeros((count, count)) for b in balances.balances}
-    score = {b: np.zeros(count) for b in balances.balances}
-    believed = believed or noise_believed(model, data, problem.values)
-    first, own = 0, own or drawn_rows(problem)
-    for record, pairs in zip(data.train, own, strict=True):
-        rows = slice(first, first + record.rows)
-        first = rows.stop
-        drawn = draws_of(record, data.sources)
-        for draw, (calm, noisy) in zip(drawn, pairs, strict=True):
-            theirs = (
-                [
-                    stack(balances, [from_others(problem, w, record)], problem.values, free)
-                    for w in (draw.calm, draw.noisy)
-                ]
-                if met
-                else [calm, noisy]
-            )
-            for b in balances.balances:
-                weight = np.broadcast_to(problem.weights[b], (problem.rows,))[rows]
-                squares = weight**2 * record.taking(b)
-                # pieces of a long record stand for all of it
-                whole = np.sum(squares) / max(float(np.sum(squares[draw.rows])), 1e-300)
-                weight = weight[draw.rows] * (believed[b] * np.sqrt(whole / len(drawn)))
-                moved = (noisy.jacobian[b] - calm.jacobian[b]) * weight[:, None] * straight
-                by = moved
-                if b in met:
-                    by = (theirs[1].jacobian[b] - theirs[0].jacobian[b]) * weight[:, None]
-                    by = by * straight
-                gram[b] += by.T @ moved
-                score[b] += by.T @ ((noisy.residual[b] - calm.residual[b]) * weight)
-    return NoiseProducts(gram, score)
-
-
-def no_noise(problem: WeakForm) -> NoiseProducts:
-    """Products of a problem from whose rows nothing is taken off."""
-    size, names = len(problem.free), problem.balances.balances
-    return NoiseProducts(
-        {b: np.zeros((size, size)) for b in names}, {b: np.zeros(size) for b in names}
-    )
-
-
-def whole_without(whole: FloatArray, noise: FloatArray) -> FloatArray:
-    """A normal matrix without what noise adds to it, as far as that is certain.
-
-    Parameters
-    ----------
-    whole, noise : (p, p) array
-        Columns scaled alike; `whole` positive definite but for rounding.
-    """
-    share, left = _shares(whole, noise)
-    return np.asarray(left * (1 - np.clip(share, 0.0, MOST_NOISE)) @ left.T, dtype=np.float64)
-
-
-def _shares(whole: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Share of noise in directions that are independent in both matrices, and the directions:
-    columns whose products add up to `whole`."""
-    value, vector = np.linalg.eigh(whole)
-    kept = value > 1e-12 * value[-1]
-    root = vector[:, kept] * np.sqrt(value[kept])
-    white = vector[:, kept] / np.sqrt(value[kept])
-    share, direction = np.linalg.eigh(white.T @ noise @ white)
-    return share, np.asarray(root @ direction, dtype=np.float64)
-
-
-@final
-@dataclass(frozen=True)
-class Unbiased:
-    """A fit without what noise of the signals does to it.
-
-    Attributes
-    ----------
-    values : mapping of str to float
-    noise : NoiseProducts
-        What noise adds to the normal equations there.
-    instruments : Instruments or None
-        The columns that meet those of some balances; None where each meets itself.
-    """
-
-    values: Mapping[str, float]
-    noise: NoiseProducts
-    instruments: Instruments | None = None
-
-
-def unbiased(problem: WeakForm, limits: Mapping[str, tuple[float, float]]) -> Unbiased:
+def unbiased(
+    problem: WeakForm, limits: Mapping[str, tuple[float, float]], share: float = 1.0
+) -> Unbiased:
     """Values at which the normal equations hold without the noise, inside the limits, and what
     noise adds there.
 
@@ -258,6 +83,8 @@ def unbiased(problem: WeakForm, limits: Mapping[str, tuple[float, float]]) -> Un
         At the least-squares fit.
     limits : mapping of str to (low, high)
         Shapes that stand at one stay there; what noise alone pushed to one leaves it.
+    share : float
+        Share of the rows that count as independent beside what is known beforehand.
     """
     bounds = (
         np.array([limits[n][0] for n in problem.free]),
@@ -271,7 +98,7 @@ def unbiased(problem: WeakForm, limits: Mapping[str, tuple[float, float]]) -> Un
         return Unbiased(dict(problem.values), no_noise(problem))
     start = _Equations.at(problem, turns_of(problem))
     began = start.rows @ start.rows
-    better = _worth_it(start, moves)
+    better = _worth_it(start, bounds, moves, share)
     for equations in dict.fromkeys((better, start)):
         for moving in (moves, moves & ~problem.bent):
             found = equations.solved(bounds, moving)
@@ -283,16 +110,24 @@ def unbiased(problem: WeakForm, limits: Mapping[str, tuple[float, float]]) -> Un
     return Unbiased(dict(problem.values), no_noise(problem))
 
 
-def _worth_it(start: _Equations, moves: npt.NDArray[np.bool_]) -> _Equations:
+def _worth_it(
+    start: _Equations,
+    limits: tuple[FloatArray, FloatArray],
+    moves: npt.NDArray[np.bool_],
+    share: float,
+) -> _Equations:
     """The same with the columns of the other sensors in the balances in which a noise level that is
-    off moves a parameter by more than its error, and by more than where these meet them.
+    off moves a parameter by more than the error it has with these, and by more than where these
+    meet them: at the values that they tell, as noise that made an inertia zero moves nothing there.
     """
     able = can_be_met(start.problem)
-    own = {b: start.unsure(b, moves) for b in able}
-    if all(size <= 1 for size in own.values()):
+    if not able:
         return start
     theirs = start.met(able)
-    worth = frozenset(b for b, size in own.items() if size > 1 and theirs.unsure(b, moves) < size)
+    step = theirs.step(theirs.rows, (limits[0] - theirs.x, limits[1] - theirs.x), moves)
+    errors = theirs.errors(step, moves, share)
+    own, other = ({b: x.unsure(b, step, moves, errors) for b in able} for x in (start, theirs))
+    worth = frozenset(b for b, size in own.items() if size > 1 and other[b] < size)
     return theirs if worth == able else start.met(worth)
 
 
@@ -437,19 +272,43 @@ class _Equations:
         own, by = columns
         return mixed(own[:, moved], None if by is None else by[:, moved])
 
-    def unsure(self, balance: str, moves: npt.NDArray[np.bool_]) -> float:
-        """Most that a parameter would move, in its errors, were the noise of one balance off by
-        :data:`LEVEL_ERROR`.
+    def errors(self, step: FloatArray, moves: npt.NDArray[np.bool_], share: float) -> FloatArray:
+        """Standard errors of the parameters (free,) after a step, as a fit states them; infinite
+        for those that do not move.
+
+        White rows would not do: noise of an acceleration has no slow part, and an inertia is up to
+        fifteen times surer than they say.
+        """
+        problem = self.problem.moved(self.x + step)
+        without = Unbiased(problem.values, self.noise, self.instruments)
+        bands = Bands(problem, without, self.turns, share)
+        out, moved = np.full(len(moves), np.inf), np.flatnonzero(moves & (bands.norms > 0))
+        if not len(moved):
+            return out
+        part = bands.of(moved)
+        size = part.errors
+        if size is None:  # too few windows
+            inverse = np.linalg.pinv(part.whole, rcond=RANK, hermitian=True)
+            size = np.sqrt(np.maximum(np.diag(inverse), 0.0) / INDEPENDENT_SHARE)
+        out[moved] = size / bands.norms[moved]
+        return out
+
+    def unsure(
+        self, balance: str, step: FloatArray, moves: npt.NDArray[np.bool_], errors: FloatArray
+    ) -> float:
+        """Most that a parameter would move, in these errors (free,), were the noise of one balance
+        off by :data:`LEVEL_ERROR` at the values after a step (free,).
         """
         seen = self.columns
         moved = np.flatnonzero(moves & (np.linalg.norm(seen[0], axis=0) > 0))
         if not len(moved):
             return 0.0
         size, whole, _ = self._system(seen, self.rows, moved)
-        pulled = self.noise.of(moved, self._mix(seen, moved)).score[balance]
+        noise = self.noise.of(moved, self._mix(seen, moved))
+        pulled = noise.score[balance] + noise.gram[balance] @ step[moved]
         inverse = np.linalg.pinv(whole, rcond=1e-12, hermitian=True)
-        error = np.sqrt(np.maximum(np.diag(inverse), 1e-300) / INDEPENDENT_SHARE)
-        return float(np.max(np.abs(inverse @ (LEVEL_ERROR * pulled / size)) / error))
+        shift = np.abs(inverse @ (LEVEL_ERROR * pulled / size)) / size
+        return float(np.max(shift / np.maximum(errors[moved], 1e-300)))
 
     def largest_share(self, moves: npt.NDArray[np.bool_]) -> float:
         """Largest share of the information on a direction that is noise: of the squares at the true
@@ -461,9 +320,9 @@ class _Equations:
             return 0.0
         size, left, _ = self._system(seen, self.rows, moved)
         whole = seen[0][:, moved].T @ seen[0][:, moved] / np.outer(size, size)
-        share = _shares(whole, whole - left)[0]
+        share = shares(whole, whole - left)[0]
         most = MOST_NOISE if self.instruments is None else MOST_MET
         return float(min(max(share.max(), SURE_STEP), most))
 
 
-__all__ = ["NoiseProducts", "Unbiased", "no_noise", "noise_products", "unbiased", "whole_without"]
+__all__ = ["unbiased"]

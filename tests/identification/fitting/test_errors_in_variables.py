@@ -10,9 +10,12 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
+from benchmarks.next_run import record_of
+from benchmarks.trust import joint_of, one_way
 from identification import Joint, Record, fit, load_joint, read
 from identification.balance.balances import balances_of
 from identification.balance.calibration import of_run
+from identification.balance.colour import white
 from identification.balance.dataset import load_dataset, prepared_model
 from identification.balance.drawn_noise import LONGEST
 from identification.balance.excitation import attenuation
@@ -22,14 +25,16 @@ from identification.fitting.covariance import (
     window_errors,
     windows_over,
 )
+from identification.fitting.engine import solve
 from identification.fitting.errors_in_variables.bands import cut_square
-from identification.fitting.errors_in_variables.equations import (
+from identification.fitting.errors_in_variables.instruments import can_be_met, instruments_of, mixed
+from identification.fitting.errors_in_variables.products import (
     MOST_NOISE,
     NoiseProducts,
     whole_without,
 )
-from identification.fitting.errors_in_variables.instruments import can_be_met, instruments_of, mixed
 from identification.fitting.weak_form import WeakForm
+from tests.hidden_effect.generator import simulate_case
 from tests.recorded_world._engine import library
 from tests.recorded_world.world import make_case, write_case
 
@@ -204,6 +209,35 @@ def test_motor_and_torque_sensor_tell_of_a_link_whose_encoder_is_noise(
     error = found.solution.stderr["link_inertia"]
     assert error is not None
     assert error < 0.1 * true["link_inertia"]
+
+
+def test_a_level_of_noise_that_is_a_little_off_moves_no_inertia() -> None:
+    """The link's own noise takes ten standard errors off its inertia, and a level is not read to a
+    tenth of that. By white errors, which are ten times the stated ones here, the columns of the
+    others were not worth it, and these levels moved the inertia by six standard errors."""
+    case = simulate_case(
+        None,
+        412_003,
+        overrides={"CURVE": 1.0},
+        records=("train", "train2"),
+        references=one_way(412_003),
+    )
+    records = [record_of(t, n, "same") for n, t in case.measured.items()]
+    joint = joint_of(case)
+    model = prepared_model(joint, records[0])
+    data = load_dataset(records, [], joint, model)
+    found = []
+    for factor in (0.85, 1.0, 1.15):
+        colours = {**data.colours, "link_position": white(factor * data.noise["link_position"])}
+        noise = {**data.noise, "link_position": factor * data.noise["link_position"]}
+        solution = solve(model, replace(data, noise=noise, colours=colours))
+        error = solution.stderr["link_inertia"]
+        assert error is not None
+        off = solution.values["link_inertia"] - case.parameters["JL"]
+        assert abs(off) < 3 * error, factor
+        assert error < 2.5e-4 * case.parameters["JL"]
+        found.append(off / error)
+    assert np.ptp(found) < 1.5
 
 
 def test_columns_of_others_hold_the_motion_of_the_link_and_not_its_noise() -> None:
