@@ -13,10 +13,11 @@ from identification.data.record import Record
 from identification.errors import InputError
 from irj_fmu.imported.diagnose import diagnose
 from irj_fmu.imported.restart import Restart
-from tests.irj_fmu.imported.test_user_fmu import DRAG, axis, axis_model
-from tests.irj_fmu.imported.test_user_fmu import TRUTH as AXIS
+from tests.irj_fmu.imported.test_user_fmu import DRAG, axis_model
 from tests.user_fmus.make import Make, build, check
 from tests.user_fmus.plant import OWN, TRUTH, foreign, recorded
+from tests.user_fmus.records import TRUTH as AXIS
+from tests.user_fmus.records import axis
 
 
 @pytest.fixture(scope="module")
