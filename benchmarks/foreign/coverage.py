@@ -86,9 +86,10 @@ def _fitted(path: Path, law: str, seed: int, seconds: float) -> dict[str, float]
     off = {n: (found.values[n] - truth[n]) / e if (e := found.stderr[n]) else np.inf for n in truth}
     over = max(e.ratio for e in found.train.outputs.values())
     unsettled = "" if found.settled else "!"
+    seconds = time.process_time() - begun
     print(
         f"{law:<15}{seed:>4}{found.iterations:>4} steps{unsettled}  "
-        f"{1e3 * hold_of(found.model):.3g} ms  {over:.1f} x  {time.process_time() - begun:>4.0f} s  "
+        f"{1e3 * hold_of(found.model):.3g} ms  {over:.1f} x  {seconds:>4.0f} s  "
         + "  ".join(f"{n.removeprefix(PREFIX)} {x:+.1f}" for n, x in off.items()),
         flush=True,
     )

@@ -39,6 +39,7 @@ _P, _D, _U, _I, _B = ctypes.c_void_p, ctypes.c_double, ctypes.c_size_t, ctypes.c
 _LOG3: Final = ctypes.CFUNCTYPE(None, _P, _I, ctypes.c_char_p, ctypes.c_char_p)
 _EVENT2: Final = 48  # bytes of fmi2EventInfo: five booleans and a double, with room to spare
 _SETTLE: Final = 100
+STATUS: Final = {2: "discard", 3: "error", 4: "fatal", 5: "pending"}
 
 
 @final
@@ -458,11 +459,32 @@ class UserInstance:
             self._through(self._set, block, "take")
 
     def _through(self, call: Any, block: Block, what: str) -> None:
+        if self._passed(call, block):
+            return
+        # one by one they tell which of them it is
+        alone = [n for n in block.names if not self._passed(call, self._filled(n, block))]
+        named = ", ".join(
+            f"{n} ({v.causality} of variability {v.variability})"
+            for n, v in ((n, self.fmu.variable(n)) for n in alone or block.names)
+        )
+        hint = "; a start, a parameter or an input must be one that can be set"
+        raise FmuError(
+            f"{self.fmu.path.name}: refuses to {what} {named}{self._last()}"
+            f"{hint if what == 'take' else ''}"
+        )
+
+    def _passed(self, call: Any, block: Block) -> bool:
         more = () if self.version == 2 else (len(block.values) if block.count else 0,)
-        if call(self._component, block.references, block.count, block.values, *more) > 1:
-            raise FmuError(
-                f"{self.fmu.path.name}: refuses to {what} {', '.join(block.names)}{self._last()}"
-            )
+        return bool(call(self._component, block.references, block.count, block.values, *more) < 2)
+
+    def _filled(self, name: str, block: Block) -> Block:
+        """A block of one of the names of another one, with its value."""
+        alone = self.block([name])
+        if alone.whole is None:
+            alone.array[0] = block.array[block.names.index(name)]
+        else:
+            self._passed(self._get, alone)
+        return alone
 
     def assign(self, values: Mapping[str, Number]) -> None:
         """Set variables of any numeric type by name, before or during initialization."""
@@ -578,8 +600,9 @@ class UserInstance:
             status = self._step(*(self._component, time, step, True, a, a + 8, a + 16, a + 24))
         if status > 1:
             raise FmuError(
-                f"{self.fmu.path.name}: doStep failed with status {status} at t = {time:g} "
-                f"s{self._last()}"
+                f"{self.fmu.path.name}: doStep failed with status {status} "
+                f"({STATUS.get(status, 'unknown')}) at t = {time:g} s{self._last()}; check start "
+                "values, parameters and their bounds: it takes no step from there"
             )
 
     def close(self) -> None:

@@ -302,8 +302,9 @@ def _mapped(
         return Mapped(channel, variable)
     if not same_dimension(given, own):
         raise InputError(
-            f"{fmu.path.name}: {variable} is in {unit}, channel {channel} in {wanted}; give "
-            f"({variable!r}, scale) to convert"
+            f"{fmu.path.name}: {variable} is in {unit}, channel {channel} in {wanted}; map another "
+            f'variable, or convert: {channel} = {{ variable = "{variable}", scale = S }} with S in '
+            f"{unit} per {wanted}"
         )
     factor = own.factor / given.factor
     if factor != 1.0:

@@ -198,10 +198,10 @@ class Runner:
                     stepper, at, now + (i + 1) * (end - now) / parts if i + 1 < parts else end, x
                 )
         if not np.isfinite(table).all():
-            bad = outs.names[int(np.argmin(np.isfinite(table).all(axis=0)))]
+            row, column = np.argwhere(~np.isfinite(table))[0]
             raise InputError(
-                f"{self.fmu.path.name}: output {bad!r} is not finite; check start values and "
-                "parameters"
+                f"{self.fmu.path.name}: output {outs.names[column]!r} is not finite from t = "
+                f"{times[row]:g} s on; check start values, parameters and their bounds"
             )
         return table
 
