@@ -9,7 +9,7 @@ of the fit, up to a twentieth from the truth. Printed for each fit: the steps, t
 the torque outside is held, the largest error of an output over its noise floor, the processor time
 and how far each value is from the truth in its standard errors; at the end, for each law and each
 parameter, the share inside 95 % with its own standard error (by seeds: the values of a fit lean on
-each other) and the RMS of these distances.
+each other) and the RMS of these distances. Ctrl-C ends it early with what there is.
 """
 
 from __future__ import annotations
@@ -55,9 +55,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     found: dict[str, list[dict[str, float]]] = {law: [] for law in wanted}
     with tempfile.TemporaryDirectory() as folder:
         path = build("Elastic", Path(folder), Make(2, ("CoSimulation",), strict=True))
-        for law in wanted:
-            for seed in range(given.first, given.first + given.seeds):
-                found[law].append(_fitted(path, law, seed, given.seconds))
+        try:
+            for law in wanted:
+                for seed in range(given.first, given.first + given.seeds):
+                    found[law].append(_fitted(path, law, seed, given.seconds))
+        except KeyboardInterrupt:
+            print("ended early:")
+    found = {law: seeds for law, seeds in found.items() if seeds}
     for law, seeds in found.items():
         _summed(law, seeds)
     _summed("all", [s for seeds in found.values() for s in seeds], short=True)
