@@ -4,6 +4,7 @@ runs; every guess is written beside what it decides.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,7 +31,7 @@ WINDOW: Final = 0.5
 """Stretches that are simulated from their own starts [s]: the small error of a start grows no
 further."""
 SHORT: Final = 1e-3
-"""Sample time of the runs that tell what a variable does [s]."""
+"""Sample time of the runs that tell what a variable does [s]; an FMU of fixed step has its own."""
 PUSHES: Final = (1e-3, 1e-1, 10.0, 1000.0)
 """What is added to a variable to see what it does, in its unit, the smallest that tells: dry
 friction stops a velocity that is too small within a sample."""
@@ -87,10 +88,11 @@ def first_joint(path: str | Path, record: Record, joint: Joint | None = None) ->
     inputs = {v.name for v in named["input"]}
     outputs = {c: m for c, m in draft.channels.items() if m[0] not in inputs}
     if not outputs:
-        there = ", ".join(v.name for v in named["output"]) or "none"
+        there = ", ".join(f"{v.name} in {v.unit}" if v.unit else v.name for v in named["output"])
         raise InputError(
-            f"{fmu.path.name}: no output goes with a channel of {record.name} (outputs: {there}; "
-            f"channels: {', '.join(record.channels)}); write [model.channels] by hand"
+            f"{fmu.path.name}: no output goes with a channel of {record.name} (outputs: "
+            f"{there or 'none'}; channels: {', '.join(record.channels)}); write "
+            "[model.channels] by hand"
         )
     _starts(draft, fmu, kind, outputs, [*named["local"], *named["parameter"]])
     _parameters(draft, named["parameter"])
@@ -145,9 +147,13 @@ def _channels(
                 other = taken.get(channel) or draft.channels[channel][0]
                 draft.notes.append(f"{variable.name}: could be {channel} in place of {other}")
                 continue
-            scale *= _units(variable.unit, channel_unit(wanted, record.kind))
+            factor, said = _units(variable.unit, channel_unit(wanted, record.kind))
+            if factor is None:
+                draft.notes.append(f"{variable.name}: looks like {channel}, but {said}")
+                continue
+            scale *= factor
             taken[channel] = variable.name
-            reason = f"{reason}; {how}" if how else reason
+            reason = "; ".join(filter(None, (reason, how, said)))
             draft.channels[channel] = (variable.name, scale, reason)
     draft.notes += [f"{n}: says nothing that tells its channel" for n in left]
 
@@ -175,15 +181,20 @@ def _through(
     return channel, ratio if side == "motor" else 1 / ratio, "the other side, by the gear ratio"
 
 
-def _units(unit: str | None, wanted: str) -> float:
-    """Variable / channel by their units; 1 where the FMU states none."""
+def _units(unit: str | None, wanted: str) -> tuple[float | None, str]:
+    """Variable / channel by their units and what is unsure of it; 1 where the FMU states none, None
+    where it states one of another quantity.
+    """
     if not unit:
-        return 1.0
+        degrees = f"; {math.degrees(1):.10g} where it has degrees" if wanted == "rad" else ""
+        return 1.0, f"CHECK: the FMU states no unit, taken as {wanted}{degrees}"
     try:
         given, own = base_unit(unit), base_unit(wanted)
     except InputError:
-        return 1.0
-    return own.factor / given.factor if same_dimension(given, own) else 1.0
+        return 1.0, f"CHECK the scale: its unit {unit!r} is not known, taken as {wanted}"
+    if not same_dimension(given, own):
+        return None, f"it is in {unit} and the channel in {wanted}; map it with a scale if it is"
+    return own.factor / given.factor, ""
 
 
 def _starts(
@@ -208,7 +219,7 @@ def _starts(
                 change = _change(fmu, kind, v.name, (float(v.start), push), names)
             except (FmuError, InputError):
                 break  # it cannot be set: no start value
-            told = _told(change, push)
+            told = _told(change, push, fmu.grain(kind) or SHORT)
             if told is None:
                 continue
             number, slope, steady = told
@@ -220,7 +231,7 @@ def _starts(
                     "moves that position steadily",
                 )
             if channel not in [c for c, _, _ in draft.starts.values()]:
-                draft.starts[v.name] = (channel, kept, f"moves that position {how}")
+                draft.starts[v.name] = (channel, kept, how)
             break
     # a velocity is the rate of the position that is started, in its unit
     positions = {c: k for c, k, _ in draft.starts.values()}
@@ -230,7 +241,7 @@ def _starts(
             draft.starts[name] = (channel, whole, how)
 
 
-def _told(change: FloatArray, push: float) -> tuple[int, float, bool] | None:
+def _told(change: FloatArray, push: float, step: float) -> tuple[int, float, bool] | None:
     """Which position a push moves, by how much for each unit of it (or in each second), and whether
     steadily; None where it is no start value.
     """
@@ -243,7 +254,7 @@ def _told(change: FloatArray, push: float) -> tuple[int, float, bool] | None:
         return number, round(float(at[0]) / push, 9), False
     straight = abs(at[2] - 2 * at[1]) < ALIKE * abs(at[2])
     if abs(at[0]) < ALIKE * abs(at[1]) and straight:
-        return number, float(at[1]) / (push * SHORT), True
+        return number, float(at[1]) / (push * step), True
     return None
 
 
@@ -253,7 +264,7 @@ def _change(
     """What a push (value, push) of a variable changes in outputs over two samples, (3, outputs)."""
     value, push = given
     runner = Runner(fmu, kind, inputs=(), outputs=outputs, starts=(name,), settings={})
-    time = SHORT * np.arange(3.0)
+    time = (fmu.grain(kind) or SHORT) * np.arange(3.0)
     none = np.empty((3, 0))
     runs = [
         runner.run(Window(time, none, none, np.array([value + more])), {}) for more in (0.0, push)

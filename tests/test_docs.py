@@ -15,8 +15,9 @@ import pytest
 
 from casadi_models import EFFECTS
 from tests.documents import blocks, given, not_run, not_shown, run, same
-from tests.irj_fmu.imported.test_user_fmu import DRAG, axis
+from tests.irj_fmu.imported.test_user_fmu import DRAG
 from tests.user_fmus.make import Make, build
+from tests.user_fmus.records import axis
 from workbench.cli.main import parser
 
 ROOT: Final = Path(__file__).resolve().parents[1]

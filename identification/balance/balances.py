@@ -423,7 +423,25 @@ class Memory:
                 both[_NAMES.index(name)] = values
             where = where.copy()
             where[self._of_torsion] = self.coordinates(count, both, p)[self._of_torsion]
-        out = np.zeros((self._states, count))
+        out = self._followed(data, where, matrix, p)
+        if not data.doubts or not len(self._of_torsion):
+            return out
+
+        def along(track: Mapping[str, FloatArray]) -> FloatArray:
+            both, there = matrix.copy(), where.copy()
+            for name, values in track.items():
+                both[_NAMES.index(name)] = values
+            there[self._of_torsion] = self.coordinates(count, both, p)[self._of_torsion]
+            return self._followed(data, there, matrix, p)
+
+        calm, *shaken = data.doubts
+        return out + along(calm) - sum(along(track) for track in shaken) / len(shaken)
+
+    def _followed(
+        self, data: WeakRecord, where: FloatArray, matrix: FloatArray, p: FloatArray
+    ) -> FloatArray:
+        """States along coordinates (coordinates, points), every segment by itself."""
+        out = np.zeros((self._states, where.shape[1]))
         for first, last in zip(data.starts[:-1], data.starts[1:], strict=True):
             out[:, first:last] = self.follow(
                 where[:, first:last], matrix[:, first:last], p, data.grid.dt * data.grid.step

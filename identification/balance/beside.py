@@ -101,7 +101,7 @@ def rest_beside(
         scale = DEVIATION * float(np.median(np.abs(rest)))
         if not scale:
             return rest
-        weight = np.minimum(1.0, LINEAR * scale / np.maximum(np.abs(rest), 1e-300))
+        weight = LINEAR * scale / np.maximum(np.abs(rest), max(LINEAR * scale, 1e-300))
     for _ in range(rounds if without_far else 0):
         rest = beside(np.maximum(1.0 - (rest / (BIWEIGHT * scale)) ** 2, 0.0) ** 2)
     return rest

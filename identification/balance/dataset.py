@@ -25,6 +25,7 @@ from identification.balance.clocks import (
 )
 from identification.balance.colour import ChannelNoise, Part, white
 from identification.balance.contacts import TOLD_BY, restored
+from identification.balance.drawn_noise import doubts_of
 from identification.balance.memory import cache_of
 from identification.balance.noise import noise_of
 from identification.balance.sensing import Sensing, adapt, check_alike, sense, signals_of
@@ -290,7 +291,7 @@ def _once(
         made = weak_record(
             record, joint, sensing, length, first_block, curved=curved, late=late, known=known
         )
-        tables = (made.averaged, made.points, made.smooth, made.curved, made.paired)
+        tables = (made.averaged, made.points, made.smooth, made.curved, made.paired, *made.doubts)
         return replace(made, name=run_name(record)), sum(
             x.size for table in tables for x in table.values()
         )
@@ -389,7 +390,11 @@ def weak_record(
                 f"few for a kernel of {length:.3g} s; give a longer record"
                 f"{' with fewer gaps' if parted else ''}"
             )
-        made = replace(made, shifts={p: k * record.dt for p, k in shifts.items()})
+        made = replace(
+            made,
+            shifts={p: k * record.dt for p, k in shifts.items()},
+            doubts=doubts_of(made.grid, moved, noise),
+        )
         last.append((dict(shifts), made))
         return made
 
@@ -453,6 +458,7 @@ def _with_rests(made: WeakRecord, noise: Mapping[str, ChannelNoise]) -> WeakReco
     out: dict[str, FloatArray] = {}
     stills: list[FloatArray] = []
     smooth, paired = dict(made.smooth), dict(made.paired)
+    doubts = tuple(dict(d) for d in made.doubts)
     for side in ("motor", "link"):
         source = f"{side}_position"
         if source not in noise:
@@ -461,7 +467,7 @@ def _with_rests(made: WeakRecord, noise: Mapping[str, ChannelNoise]) -> WeakReco
         slow = np.abs(made.points[f"{side}_velocity"]) <= still_speed
         shortest = max(1, whole(made.grid.pointwise[source] / (made.grid.step * made.grid.dt)))
         still = np.zeros(len(slow))
-        tables = [t for t in (smooth, paired) if source in t]
+        tables = [t for t in (smooth, paired, *doubts) if source in t]
         for t in tables:
             t[source] = t[source].copy()
         for first, last in zip(made.starts[:-1], made.starts[1:], strict=True):
@@ -479,7 +485,7 @@ def _with_rests(made: WeakRecord, noise: Mapping[str, ChannelNoise]) -> WeakReco
         both = stills[0] * stills[1]
         if both.any() and any(noise[c].step > 0 for c in PAIR):
             out[HELD_READINGS] = made.average(both)
-    return replace(made, rest=out, smooth=smooth, paired=paired)
+    return replace(made, rest=out, smooth=smooth, paired=paired, doubts=doubts)
 
 
 def _loudness(noise: ChannelNoise) -> float:

@@ -285,6 +285,9 @@ class WeakRecord:
     paired : mapping of str to (points,) array
         Both positions smoothed by one kernel: input of memory operators of the torsion, which is
         small beside either. Empty where each has its own.
+    doubts : tuple of mapping of str to (points,) array
+        The same three times: smooth, and with drawn noise added to that and taken off it; what
+        noise does to laws with memory of the torsion. Empty where that is not known.
     time : (rows,) array
         Centre of each row [s].
     block : (rows,) int array
@@ -329,6 +332,7 @@ class WeakRecord:
     name: str = ""
     shifts: Mapping[str, float] = field(default_factory=dict)
     paired: Mapping[str, FloatArray] = field(default_factory=dict)
+    doubts: tuple[Mapping[str, FloatArray], ...] = ()
     bridging: Mapping[str, FloatArray] = field(default_factory=dict)
     filters: Mapping[str, Filter] = field(default_factory=dict)
 

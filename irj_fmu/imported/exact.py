@@ -100,6 +100,10 @@ def _suitable(model: UserModel) -> None:
         raise NotExact("it promises no directional derivatives")
     if model.correction is not None:
         raise NotExact("a correction rides outside it")
+    if model.fmu.once("me"):
+        raise NotExact("a process may hold one instance of it only")
+    if model.fmu.elements:
+        raise NotExact("it has arrays")
     other = [m.variable for m in model.starts if m.variable not in model.fmu.states]
     if other:
         raise NotExact(f"{', '.join(other)} starts it and is no state")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final, final
 
 import numpy as np
@@ -35,15 +35,27 @@ from irj_fmu.imported.sensitivity import BlackBox, Simulator, scale_of
 Progress = Callable[[str, float], None]
 _MOVED: Final = 1e-9
 """A column smaller than this share of the output's own size moves nothing."""
-_ENOUGH: Final = 1e-5
-"""Relative fall of the sum of squares that ends a pass: every step costs a run of the FMU for
-each parameter.
+ENOUGH: Final = 0.02
+"""Fall of the sum of squares, in units of one sample's noise, that is not worth a step: it moves no
+parameter by more than a seventh (its root) of what white noise makes of it.
+"""
+ROUGH: Final = 0.1
+"""Relative fall of the sum of squares that is not worth a step with the weights of the residual
+that a fit began with: they are off by as much as it falls, and new ones tell more.
+"""
+LIKE: Final = 0.1
+"""Change of the logarithm of a weight within which it is the same: it moves a value by less than a
+tenth of its error.
 """
 _SPREAD: Final = 1e5
 """Standard deviation, in units of what a column alone would have, beyond which a parameter
 cannot be told from others.
 """
 
+_USED_UP: Final = (
+    "steps were used up before the fit came to rest: values and errors are those on the way; begin "
+    "nearer to them, or leave parameters out that the record hardly shows"
+)
 _COUPLINGS: Final = 3
 """Times the fit begins anew with a shorter coupling, as the law outside the FMU got steeper."""
 _FINER: Final = 0.7
@@ -69,6 +81,10 @@ class UserFit:
         Largest correlation with another parameter: (name, value).
     method : str
         How derivatives were made, and why not exactly.
+    iterations : int
+        Steps taken.
+    settled : bool
+        False where these were used up before the fit came to rest.
     train : UserComparison
     """
 
@@ -81,6 +97,7 @@ class UserFit:
     iterations: int
     train: UserComparison
     records: tuple[Record, ...]
+    settled: bool = True
 
     def __repr__(self) -> str:
         fmu = self.model.fmu.path.name
@@ -106,6 +123,7 @@ class UserFit:
             "fmu": self.model.fmu.path.name,
             "method": self.method,
             "iterations": self.iterations,
+            "settled": self.settled,
             "parameters": self.parameters,
             "train": self.train.as_json(),
             "notes": list(self.model.notes),
@@ -159,7 +177,7 @@ def fit(
     model: UserModel,
     records: Record | Sequence[Record],
     *,
-    iterations: int = 25,
+    iterations: int = 40,
     exact: bool = True,
     progress: Progress | None = None,
 ) -> UserFit:
@@ -206,6 +224,10 @@ def fit(
     edge = at_bounds(solver.values, model.bounds())
     at_bound = tuple(n for n in solver.names if n in edge)
     stderr = {n: None if n in at_bound else e for n, e in stderr.items()}
+    kept = tuple(n for n in fitted.notes if _USED_UP not in n)
+    if not solver.settled:
+        kept = (*kept, f"{model.fmu.path.name}: its {used} {_USED_UP}")
+    fitted = replace(fitted, notes=kept)
     say("done", 1.0)
     return UserFit(
         fitted,
@@ -217,6 +239,7 @@ def fit(
         iterations=used,
         train=comparison_of(fitted, given, windows, solver.predicted),
         records=tuple(given),
+        settled=solver.settled,
     )
 
 
@@ -323,6 +346,8 @@ class Solver:
         Parameters that move an output.
     starts : (windows, starts) array
     predicted : list of (n, outputs) array
+    settled : bool
+        The steps came to rest; False where they were used up before.
     """
 
     def __init__(
@@ -343,6 +368,7 @@ class Solver:
         self.noise = np.maximum(noise, 1e-9 * self.size)
         self.sigma = self.size.copy()
         self.predicted = simulator.simulate(self.values, self.starts)
+        self.settled = False
         self.names = self._moving()
 
     def _moving(self) -> list[str]:
@@ -364,25 +390,40 @@ class Solver:
         return np.array([self.values[n] for n in self.names])
 
     def solve(self, iterations: int, say: Progress = lambda _text, _share: None) -> int:
-        """Iterate to the end; the number of steps."""
-        used = 0
-        for last in (False, True):
+        """Iterate to the end; the number of steps.
+
+        Each output counts by its residual or, where that is less, by its noise. As long as these
+        weights fall with the fit its minimum is that of other weights, and steps towards it would
+        be steps elsewhere.
+        """
+        used, fine = 0, False
+        before: FloatArray | None = None
+        while used < iterations:
             residual = np.concatenate(
                 [w.outputs - y for w, y in zip(self.windows, self.predicted, strict=True)]
             )
-            self.sigma = np.maximum(self.noise, np.sqrt(np.mean(residual**2, axis=0)))
-            if last and len(self.names) < len(self.values):
+            sigma = np.maximum(self.noise, np.sqrt(np.mean(residual**2, axis=0)))
+            kept = before is not None and bool(np.all(np.abs(np.log(sigma / before)) < LIKE))
+            if kept and fine:
+                self.settled = True
+                break
+            fine, self.sigma, before = kept, sigma, sigma
+            if fine and len(self.names) < len(self.values):
                 self.names = self._moving()
-            before = used
+            begun = used
 
-            def tell(step: int, before: int = before) -> None:
-                say(f"fitting, step {before + step}", 0.95 - 0.9 * 0.85 ** (before + step))
+            def tell(step: int, begun: int = begun) -> None:
+                say(f"fitting, step {begun + step}", 0.95 - 0.9 * 0.85 ** (begun + step))
 
             problem = self._problem(tell)
             box = [self.bounds[n][0] for n in self.names], [self.bounds[n][1] for n in self.names]
-            left = max(1, iterations - used) if last else iterations
             found = least_squares(
-                problem, self._x(), box, local=self.starts, iterations=left, tolerance=_ENOUGH
+                problem,
+                self._x(),
+                box,
+                local=self.starts,
+                iterations=iterations - used,
+                tolerance=ENOUGH / residual.size if fine else ROUGH,
             )
             used += found.iterations
             self.values, self.starts = problem.at(found.x), found.local

@@ -7,6 +7,7 @@ exchange.
 
 from __future__ import annotations
 
+import copy
 import ctypes
 import shutil
 import tempfile
@@ -18,6 +19,7 @@ from pathlib import Path
 from typing import Any, Final, Literal, Self, final
 
 import numpy as np
+import numpy.typing as npt
 
 from identification.errors import InputError
 from irj_fmu.host.fmu import FmuError, Number, callbacks, near_names
@@ -25,6 +27,7 @@ from irj_fmu.host.last_free import freer
 from irj_fmu.host.signals import FloatArray
 
 Kind = Literal["me", "cs"]
+IntArray = npt.NDArray[np.int64]
 _REALS: Final = ("Real", "Float64")
 _WHOLE: Final = {
     "Integer": ctypes.c_int,
@@ -36,6 +39,7 @@ _P, _D, _U, _I, _B = ctypes.c_void_p, ctypes.c_double, ctypes.c_size_t, ctypes.c
 _LOG3: Final = ctypes.CFUNCTYPE(None, _P, _I, ctypes.c_char_p, ctypes.c_char_p)
 _EVENT2: Final = 48  # bytes of fmi2EventInfo: five booleans and a double, with room to spare
 _SETTLE: Final = 100
+STATUS: Final = {2: "discard", 3: "error", 4: "fatal", 5: "pending"}
 
 
 @final
@@ -55,7 +59,9 @@ class UserFmu:
     version : int
         2 or 3.
     states : tuple of str
-        Continuous states, in the order in which the FMU gives them.
+        Continuous states, in the order in which the FMU gives them; those of an array by element.
+    elements : dict
+        Elements of arrays (FMI 3.0) by name, as ``A[1,2]``: the array's name and the place in it.
 
     Raises
     ------
@@ -94,27 +100,44 @@ class UserFmu:
             )
         self.version = int(self.description.fmiVersion[0])
         self.variables: dict[str, Any] = {v.name: v for v in self.description.modelVariables}
+        self.elements: dict[str, tuple[str, int]] = {}
+        self._scalars: dict[str, tuple[str, ...]] = {}
+        for array in [v for v in self.variables.values() if v.shape and v.type in _REALS]:
+            scalars = _elements(array)
+            self._scalars[array.name] = tuple(scalars)
+            self.elements |= {n: (array.name, i) for i, n in enumerate(scalars)}
+            self.variables |= {n: v for n, v in scalars.items() if n not in self.variables}
         slopes = [d.variable for d in self.description.derivatives]
         self.states: tuple[str, ...] = tuple(
-            v.derivative.name for v in slopes if v.derivative is not None
+            name
+            for v in slopes
+            if v.derivative is not None
+            for name in self.scalars(v.derivative.name)
         )
+        self._only: weakref.ref[UserInstance] | None = None
 
     def kinds(self) -> tuple[Kind, ...]:
         """What the FMU can do: model exchange first, where it has no state events."""
         found: list[Kind] = []
-        events = self.description.numberOfEventIndicators or len(self.description.eventIndicators)
+        events = self.has_state_events
         if self.description.modelExchange is not None and not events:
             found.append("me")
         if self.description.coSimulation is not None:
             found.append("cs")
         if not found:
             what = (
-                "model exchange with state events only"
+                "model exchange with state events only, which runs here do not follow"
                 if events
                 else "neither model exchange nor co-simulation"
             )
             raise InputError(f"{self.path.name}: has {what}; export it for co-simulation")
         return tuple(found)
+
+    @property
+    def has_state_events(self) -> bool:
+        """True where its model exchange jumps at events, which runs here do not look for."""
+        own = self.description
+        return bool(own.numberOfEventIndicators or len(own.eventIndicators))
 
     def grain(self, kind: Kind) -> float | None:
         """The fixed step of a co-simulation, of which it takes whole multiples only [s]; None where
@@ -127,6 +150,26 @@ class UserFmu:
         if fixed is None and not own.canHandleVariableCommunicationStepSize:
             fixed = getattr(self.description.defaultExperiment, "stepSize", None)
         return float(fixed) if fixed is not None and float(fixed) > 0 else None
+
+    def once(self, kind: Kind) -> bool:
+        """True where a process may hold one instance only."""
+        own = self.description
+        part = own.modelExchange if kind == "me" else own.coSimulation
+        return bool(part is not None and part.canBeInstantiatedOnlyOncePerProcess)
+
+    def opened(self, kind: Kind) -> UserInstance:
+        """An instance for runs one after the other: the living one where there may be one only."""
+        if not self.once(kind):
+            return UserInstance(self, kind)
+        found = self._only() if self._only is not None else None
+        if found is None:
+            found = UserInstance(self, kind)
+            self._only = weakref.ref(found)
+        return found
+
+    def scalars(self, name: str) -> tuple[str, ...]:
+        """Names of the elements of an array; of a scalar its own."""
+        return self._scalars.get(name, (name,))
 
     def promises_derivatives(self) -> bool:
         """True where model exchange is said to give directional derivatives."""
@@ -151,7 +194,13 @@ class UserFmu:
     def real(self, name: str) -> Any:
         """The same for a scalar of type Real or Float64."""
         found = self.variable(name)
-        if found.type not in _REALS or found.dimensions:
+        if found.type in _REALS and found.shape:
+            own = self.scalars(name)
+            raise InputError(
+                f"{self.path.name}: variable {name!r} is an array; name one element of it, "
+                + (f"{own[0]} to {own[-1]}" if len(own) > 1 else own[0])
+            )
+        if found.type not in _REALS:
             raise InputError(
                 f"{self.path.name}: variable {name!r} is no real scalar ({found.type}) and "
                 "cannot be a signal or a fitted parameter"
@@ -173,6 +222,25 @@ class Block:
     references: Any
     values: Any
     array: FloatArray
+    count: int
+    """References of a call: an array is one."""
+    whole: FloatArray | None = None
+    """Where arrays are among them, the values of the call; the block's own are some of these."""
+    places: IntArray | None = None
+
+
+def _elements(array: Any) -> dict[str, Any]:
+    """Description of each element of an array by name, counted from 1, row by row."""
+    starts = str(array.start).split() if array.start is not None else []
+    out = {}
+    for place, index in enumerate(np.ndindex(*array.shape)):
+        scalar = copy.copy(array)
+        scalar.name = f"{array.name}[{','.join(str(i + 1) for i in index)}]"
+        scalar.shape, scalar.dimensions = (), []
+        # one start value stands for all of them
+        scalar.start = starts[place if len(starts) > 1 else 0] if starts else None
+        out[scalar.name] = scalar
+    return out
 
 
 @final
@@ -351,32 +419,72 @@ class UserInstance:
     def block(self, names: Iterable[str]) -> Block:
         """Reals to be read or written together."""
         names = tuple(names)
-        references = (ctypes.c_uint * max(len(names), 1))(
-            *(self.fmu.real(n).valueReference for n in names)
+        reals = [self.fmu.real(n) for n in names]
+        if not any(n in self.fmu.elements for n in names):
+            references = (ctypes.c_uint * max(len(names), 1))(*(v.valueReference for v in reals))
+            values = (_D * max(len(names), 1))()
+            own = np.ctypeslib.as_array(values)[: len(names)]
+            return Block(names, references, values, own, len(names))
+        # an array goes through a call as a whole, however few of its elements are wanted
+        owners = [self.fmu.elements.get(n, (n, 0)) for n in names]
+        first: dict[str, int] = {}
+        size = 0
+        for name, _ in owners:
+            if name not in first:
+                first[name] = size
+                size += len(self.fmu.scalars(name))
+        references = (ctypes.c_uint * len(first))(
+            *(self.fmu.variable(n).valueReference for n in first)
         )
-        values = (_D * max(len(names), 1))()
-        return Block(names, references, values, np.ctypeslib.as_array(values)[: len(names)])
+        values = (_D * size)()
+        places = np.array([first[n] + at for n, at in owners], dtype=np.int64)
+        whole = np.ctypeslib.as_array(values)
+        own = np.zeros(len(names))
+        return Block(names, references, values, own, len(first), whole=whole, places=places)
 
     def read(self, block: Block) -> FloatArray:
         """Fill a block from the FMU; its array is returned and reused."""
-        n = len(block.names)
-        if n:
-            more = () if self.version == 2 else (n,)
-            if self._get(self._component, block.references, n, block.values, *more) > 1:
-                raise FmuError(
-                    f"{self.fmu.path.name}: refuses to give {', '.join(block.names)}{self._last()}"
-                )
+        if block.count:
+            self._through(self._get, block, "give")
+            if block.whole is not None:
+                block.array[:] = block.whole[block.places]
         return block.array
 
     def write(self, block: Block) -> None:
         """Set the FMU's variables from a block's array."""
-        n = len(block.names)
-        if n:
-            more = () if self.version == 2 else (n,)
-            if self._set(self._component, block.references, n, block.values, *more) > 1:
-                raise FmuError(
-                    f"{self.fmu.path.name}: refuses to take {', '.join(block.names)}{self._last()}"
-                )
+        if block.count:
+            if block.whole is not None:  # the other elements stay as they are
+                self._through(self._get, block, "give")
+                block.whole[block.places] = block.array
+            self._through(self._set, block, "take")
+
+    def _through(self, call: Any, block: Block, what: str) -> None:
+        if self._passed(call, block):
+            return
+        # one by one they tell which of them it is
+        alone = [n for n in block.names if not self._passed(call, self._filled(n, block))]
+        named = ", ".join(
+            f"{n} ({v.causality} of variability {v.variability})"
+            for n, v in ((n, self.fmu.variable(n)) for n in alone or block.names)
+        )
+        hint = "; a start, a parameter or an input must be one that can be set"
+        raise FmuError(
+            f"{self.fmu.path.name}: refuses to {what} {named}{self._last()}"
+            f"{hint if what == 'take' else ''}"
+        )
+
+    def _passed(self, call: Any, block: Block) -> bool:
+        more = () if self.version == 2 else (len(block.values) if block.count else 0,)
+        return bool(call(self._component, block.references, block.count, block.values, *more) < 2)
+
+    def _filled(self, name: str, block: Block) -> Block:
+        """A block of one of the names of another one, with its value."""
+        alone = self.block([name])
+        if alone.whole is None:
+            alone.array[0] = block.array[block.names.index(name)]
+        else:
+            self._passed(self._get, alone)
+        return alone
 
     def assign(self, values: Mapping[str, Number]) -> None:
         """Set variables of any numeric type by name, before or during initialization."""
@@ -492,8 +600,9 @@ class UserInstance:
             status = self._step(*(self._component, time, step, True, a, a + 8, a + 16, a + 24))
         if status > 1:
             raise FmuError(
-                f"{self.fmu.path.name}: doStep failed with status {status} at t = {time:g} "
-                f"s{self._last()}"
+                f"{self.fmu.path.name}: doStep failed with status {status} "
+                f"({STATUS.get(status, 'unknown')}) at t = {time:g} s{self._last()}; check start "
+                "values, parameters and their bounds: it takes no step from there"
             )
 
     def close(self) -> None:

@@ -261,8 +261,14 @@ def load_user_model(
         )
     ways = fmu.kinds()
     if kind is not None and kind not in ways:
+        events = kind == "me" and fmu.description.modelExchange is not None
+        why = (
+            " (its model exchange has state events, which runs here do not follow)"
+            if events
+            else ""
+        )
         raise InputError(
-            f"{fmu.path.name}: kind = {kind!r} is not possible; it has {', '.join(ways)}"
+            f"{fmu.path.name}: kind = {kind!r} is not possible{why}; it has {', '.join(ways)}"
         )
     starts, constants = _starts(fmu, start or {}, mapped, notes)
     notes += _idle(fmu, inputs, {*constants, *(m.variable for m in starts)})
@@ -296,8 +302,9 @@ def _mapped(
         return Mapped(channel, variable)
     if not same_dimension(given, own):
         raise InputError(
-            f"{fmu.path.name}: {variable} is in {unit}, channel {channel} in {wanted}; give "
-            f"({variable!r}, scale) to convert"
+            f"{fmu.path.name}: {variable} is in {unit}, channel {channel} in {wanted}; map another "
+            f'variable, or convert: {channel} = {{ variable = "{variable}", scale = S }} with S in '
+            f"{unit} per {wanted}"
         )
     factor = own.factor / given.factor
     if factor != 1.0:

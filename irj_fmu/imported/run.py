@@ -15,7 +15,7 @@ from identification.errors import InputError
 from irj_fmu.host.exchange import Stepper
 from irj_fmu.host.run import Number
 from irj_fmu.host.signals import FloatArray
-from irj_fmu.imported.library import Kind, UserFmu, UserInstance
+from irj_fmu.imported.library import Kind, UserFmu
 
 RTOL: Final = 1e-8
 ATOL: Final = 1e-10
@@ -25,6 +25,9 @@ an output.
 """
 SUBSTEPS: Final = (1, 2, 4, 8)
 _TRIED: Final = 2000
+STRAY: Final = 0.1
+"""Share of an FMU's fixed step by which a stamp may miss the grid of such steps: stamps are written
+with three digits of it or more, and a step that does not divide the sample misses by more."""
 HOLD: Final = 1e-3
 """Longest time for which what is fed back holds, where its slope asks for nothing shorter [s]."""
 
@@ -108,9 +111,11 @@ class Runner:
         settings: Mapping[str, Number],
     ) -> None:
         self.fmu, self.kind, self.starts, self.settings = fmu, kind, tuple(starts), dict(settings)
-        self.instance = UserInstance(fmu, kind)
+        self.instance = fmu.opened(kind)
         self._inputs, self._outputs = self.instance.block(inputs), self.instance.block(outputs)
         self.substeps = 0
+        self._grain = fmu.grain(kind)
+        self._begun, self._taken = 0.0, 0
 
     def choose_substeps(self, window: Window, values: Mapping[str, float]) -> None:
         """Take fixed steps where few of them agree with steps of controlled length: they cost a
@@ -157,6 +162,7 @@ class Runner:
             zip(self.starts, (window.start if start is None else start).tolist(), strict=True)
         )
         times = window.time.tolist()
+        self._begun, self._taken = times[0], 0
         instance.begin(times[0], {**self.settings, **values, **own})
         ins.array[:] = window.inputs[0]
         instance.write(ins)
@@ -183,7 +189,7 @@ class Runner:
             if feedback is None:
                 x = self._advance(stepper, now, end, x)
                 continue
-            parts = parts_of(end - now, feedback.hold, self.fmu.grain(self.kind))
+            parts = parts_of(end - now, feedback.hold, self._grain)
             for i in range(parts):
                 at = now + i * (end - now) / parts
                 ins.array[:] = held + feedback(k, at, held, instance.read(outs) if i else table[k])
@@ -192,10 +198,10 @@ class Runner:
                     stepper, at, now + (i + 1) * (end - now) / parts if i + 1 < parts else end, x
                 )
         if not np.isfinite(table).all():
-            bad = outs.names[int(np.argmin(np.isfinite(table).all(axis=0)))]
+            row, column = np.argwhere(~np.isfinite(table))[0]
             raise InputError(
-                f"{self.fmu.path.name}: output {bad!r} is not finite; check start values and "
-                "parameters"
+                f"{self.fmu.path.name}: output {outs.names[column]!r} is not finite from t = "
+                f"{times[row]:g} s on; check start values, parameters and their bounds"
             )
         return table
 
@@ -205,7 +211,10 @@ class Runner:
         """From one time to the next, inputs held: state of a model-exchange FMU."""
         instance = self.instance
         if stepper is None:
-            instance.do_step(now, end - now)
+            if self._grain is None:
+                instance.do_step(now, end - now)
+            else:
+                self._whole_steps(end, self._grain)
             return x
         slope = instance.slope
         if not instance.size:
@@ -223,6 +232,21 @@ class Runner:
         slope(end, x)
         instance.accept(end, x)
         return x
+
+    def _whole_steps(self, end: float, grain: float) -> None:
+        """Steps of an FMU that takes one length only, up to the one nearest to a time: stamps of a
+        record stray from the grid of such steps, which it follows to rounding.
+        """
+        last = round((end - self._begun) / grain)
+        if last <= self._taken or abs(end - self._begun - last * grain) > STRAY * grain:
+            raise InputError(
+                f"{self.fmu.path.name}: its fixed step of {1e3 * grain:.6g} ms does not divide the "
+                f"time between samples (t = {end:g} s); export it with a step that does, or "
+                "resample the record"
+            )
+        while self._taken < last:
+            self.instance.do_step(self._begun + self._taken * grain, grain)
+            self._taken += 1
 
 
 def parts_of(length: float, hold: float, grain: float | None) -> int:

@@ -4,6 +4,9 @@
 #include "fmi2Functions.h"
 #include "models.h"
 #define M ((Model *)c)
+#ifdef ONCE
+static int living; /* its memory is static, as of a model that was exported for one instance */
+#endif
 
 const char *fmi2GetTypesPlatform(void) { return fmi2TypesPlatform; }
 const char *fmi2GetVersion(void) { return fmi2Version; }
@@ -11,13 +14,22 @@ fmi2Status fmi2SetDebugLogging(fmi2Component c, fmi2Boolean on, size_t n, const 
 fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String guid, fmi2String at, const fmi2CallbackFunctions *f, fmi2Boolean v, fmi2Boolean l) {
     Model *m = calloc(1, sizeof(Model));
     if (strcmp(guid, GUID)) { free(m); return NULL; }
+#ifdef ONCE
+    if (living) { free(m); return NULL; }
+    living = 1;
+#endif
     model_start(m);
     return m;
 }
-void fmi2FreeInstance(fmi2Component c) { free(c); }
+void fmi2FreeInstance(fmi2Component c) {
+#ifdef ONCE
+    living = 0;
+#endif
+    free(c);
+}
 fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean d, fmi2Real tol, fmi2Real start, fmi2Boolean s, fmi2Real stop) { M->time = start; return fmi2OK; }
 fmi2Status fmi2EnterInitializationMode(fmi2Component c) { return fmi2OK; }
-fmi2Status fmi2ExitInitializationMode(fmi2Component c) { M->initializing = 0; return fmi2OK; }
+fmi2Status fmi2ExitInitializationMode(fmi2Component c) { M->initializing = 0; BEGIN(M) return fmi2OK; }
 fmi2Status fmi2Terminate(fmi2Component c) { return fmi2OK; }
 fmi2Status fmi2Reset(fmi2Component c) { model_start(M); return fmi2OK; }
 fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference vr[], size_t n, fmi2Real v[]) {
@@ -63,6 +75,9 @@ fmi2Status fmi2DoStep(fmi2Component c, fmi2Real t, fmi2Real h, fmi2Boolean n) {
     if (fabs(h - STEP) > 1e-9) return fmi2Error;
 #endif
     model_advance(M, h);
+#ifdef NOT_A_NUMBER
+    if (t > NOT_A_NUMBER) for (int i = 0; i < NX; i++) M->x[i] = NAN;
+#endif
     return fmi2OK;
 }
 fmi2Status fmi2CancelStep(fmi2Component c) { return fmi2Error; }

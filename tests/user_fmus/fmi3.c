@@ -18,7 +18,7 @@ fmi3Instance fmi3InstantiateCoSimulation(fmi3String name, fmi3String token, fmi3
     const fmi3ValueReference r[], size_t n, fmi3InstanceEnvironment e, fmi3LogMessageCallback f, fmi3IntermediateUpdateCallback g) { return made(token); }
 void fmi3FreeInstance(fmi3Instance c) { free(c); }
 fmi3Status fmi3EnterInitializationMode(fmi3Instance c, fmi3Boolean d, fmi3Float64 tol, fmi3Float64 start, fmi3Boolean s, fmi3Float64 stop) { M->time = start; return fmi3OK; }
-fmi3Status fmi3ExitInitializationMode(fmi3Instance c) { M->initializing = 0; return fmi3OK; }
+fmi3Status fmi3ExitInitializationMode(fmi3Instance c) { M->initializing = 0; BEGIN(M) return fmi3OK; }
 fmi3Status fmi3EnterEventMode(fmi3Instance c) { return fmi3OK; }
 fmi3Status fmi3Terminate(fmi3Instance c) { return fmi3OK; }
 fmi3Status fmi3Reset(fmi3Instance c) { model_start(M); return fmi3OK; }

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import zipfile
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, final
 
@@ -28,6 +28,8 @@ class Shape:
     parameters: tuple[str, ...]
     outputs: tuple[str, ...]
     inputs: tuple[str, ...] = ()
+    hidden: bool = False
+    """Its states are no variables of the description."""
 
 
 MODELS: Final = {
@@ -46,6 +48,15 @@ MODELS: Final = {
         ("motor_inertia", "link_inertia", "stiffness", "damping", "viscous", "coulomb", "gravity"),
         ("motor_angle", "motor_speed", "link_angle", "link_speed", "gear_torque"),
         ("torque",),
+    ),
+    "BouncingBall": Shape("BOUNCING_BALL", ("h", "v"), ("g", "e"), ("height", "speed")),
+    "Servo": Shape(
+        "SERVO",
+        ("q", "w"),
+        ("inertia", "viscous", "coulomb", "gravity", "angle_0", "speed_0"),
+        ("angle", "speed"),
+        ("torque",),
+        hidden=True,
     ),
 }
 START: Final = {
@@ -66,6 +77,12 @@ START: Final = {
     "link_inertia": 11.0,
     "stiffness": 2.0e4,
     "damping": 25.0,
+    "h": 1.0,
+    "v": 0.0,
+    "g": 9.81,
+    "e": 0.7,
+    "angle_0": 0.0,
+    "speed_0": 0.0,
 }
 OWN_START: Final = {"Elastic": {"viscous": 2.0e-3, "coulomb": 0.15, "gravity": 55.0}}
 """Start values that a model has otherwise."""
@@ -94,11 +111,15 @@ class Make:
         The library's directional derivatives are 1 % off.
     units : tuple of (variable, unit)
     events : int
-        Event indicators in the description (FMI 2).
+        Event indicators in the description.
     fails : int
         Status of the steps from a tenth of a second on (FMI 2); 0 for none that fails.
     step : float
         The only step that it takes [s] (FMI 2); 0 for any.
+    once : bool
+        A second instance beside a living one is refused (FMI 2).
+    breaks : float
+        Time from which on its states are no numbers [s] (FMI 2); 0 for never.
     """
 
     version: int = 2
@@ -112,12 +133,16 @@ class Make:
     events: int = 0
     fails: int = 0
     step: float = 0.0
+    once: bool = False
+    breaks: float = 0.0
 
 
 def build(name: str, folder: Path, make: Make | None = None) -> Path:
     """Compile and pack one test FMU, once per folder."""
     make = make or Make()
     shape = MODELS[name]
+    if shape.hidden:
+        make = replace(make, kinds=("CoSimulation",))
     tag = f"{name}{make.version}_{zlib.crc32(repr(make).encode()):08x}"
     out = folder / f"{tag}.fmu"
     if out.exists():
@@ -126,26 +151,82 @@ def build(name: str, folder: Path, make: Make | None = None) -> Path:
     flags = ["-shared", "-fPIC", "-O2", "-w", f"-DMODEL_{shape.macro}", f'-DGUID="{tag}"']
     flags += [f"-DFAILS={make.fails}"] if make.fails else []
     flags += [f"-DSTEP={make.step!r}"] if make.step else []
+    flags += ["-DONCE"] if make.once else []
+    flags += [f"-DNOT_A_NUMBER={make.breaks!r}"] if make.breaks else []
     flags += [*(["-DSTRICT"] if make.strict else []), *(["-DWRONG"] if make.wrong else [])]
-    subprocess.run(
-        [
-            "gcc",
-            *flags,
-            f"-I{HEADERS}",
-            f"-I{HERE}",
-            str(HERE / f"fmi{make.version}.c"),
-            "-o",
-            str(library),
-            "-lm",
-        ],
-        check=True,
-        capture_output=True,
-    )
+    _compile(HERE / f"fmi{make.version}.c", library, flags)
     place = "linux64" if make.version == 2 else "x86_64-linux"
     text = (_two if make.version == 2 else _three)(name, tag, shape, make)
+    return _packed(out, text, library, f"binaries/{place}/{name}.so")
+
+
+def build_state_space(folder: Path, kinds: tuple[str, ...]) -> Path:
+    """An FMU of FMI 3.0 whose inputs, parameters, states and outputs are arrays."""
+    tag = f"StateSpace3_{zlib.crc32(repr(kinds).encode()):08x}"
+    out, library = folder / f"{tag}.fmu", folder / f"{tag}.so"
+    if not out.exists():
+        _compile(
+            HERE / "statespace.c", library, ["-shared", "-fPIC", "-O2", "-w", f'-DGUID="{tag}"']
+        )
+        _packed(out, _arrays(tag, kinds), library, "binaries/x86_64-linux/StateSpace.so")
+    return out
+
+
+def _arrays(tag: str, kinds: tuple[str, ...]) -> str:
+    """Its description: the sizes are structural parameters."""
+    sizes = {1: ("m", 1), 2: ("n", 2), 3: ("r", 2)}
+    rows = [
+        ("x", 4, "local", "continuous", "calculated", "2", None, ""),
+        ("der(x)", 5, "local", "continuous", "calculated", "2", None, ' derivative="4"'),
+        ("u", 6, "input", "continuous", "", "1", "0", ""),
+        ("A", 7, "parameter", "fixed", "exact", "22", "0 1 -4 -0.5", ""),
+        ("B", 8, "parameter", "fixed", "exact", "21", "0 1", ""),
+        ("C", 9, "parameter", "fixed", "exact", "32", "1 0 0 1", ""),
+        ("y", 10, "output", "continuous", "calculated", "3", None, ""),
+        ("x0", 11, "parameter", "fixed", "exact", "2", "0 0", ""),
+    ]
+    text = [
+        f'<fmiModelDescription fmiVersion="3.0" modelName="StateSpace" instantiationToken="{tag}">',
+        *(f'<{k} modelIdentifier="StateSpace"/>' for k in kinds),
+        '<ModelVariables><Float64 name="time" valueReference="0" causality="independent" '
+        'variability="continuous"/>',
+        *(
+            f'<UInt64 name="{n}" valueReference="{vr}" causality="structuralParameter" '
+            f'variability="fixed" start="{size}"/>'
+            for vr, (n, size) in sizes.items()
+        ),
+    ]
+    for name, vr, causality, variability, initial, sides, start, more in rows:
+        about = _attributes(
+            {
+                "name": name,
+                "valueReference": str(vr),
+                "causality": causality,
+                "variability": variability,
+                "initial": initial or None,
+                "start": start,
+            }
+        )
+        spans = "".join(f'<Dimension valueReference="{k}"/>' for k in sides)
+        text.append(f"<Float64 {about}{more}>{spans}</Float64>")
+    text.append(
+        '</ModelVariables><ModelStructure><Output valueReference="10"/>'
+        '<ContinuousStateDerivative valueReference="5"/><InitialUnknown valueReference="4"/>'
+        '<InitialUnknown valueReference="5"/><InitialUnknown valueReference="10"/>'
+        "</ModelStructure></fmiModelDescription>"
+    )
+    return '<?xml version="1.0" encoding="UTF-8"?>\n' + "\n".join(text)
+
+
+def _compile(source: Path, library: Path, flags: list[str]) -> None:
+    command = ["gcc", *flags, f"-I{HEADERS}", f"-I{HERE}", str(source), "-o", str(library), "-lm"]
+    subprocess.run(command, check=True, capture_output=True)
+
+
+def _packed(out: Path, description: str, library: Path, place: str) -> Path:
     with zipfile.ZipFile(out, "w") as archive:
-        archive.writestr("modelDescription.xml", text)
-        archive.write(library, f"binaries/{place}/{name}.so")
+        archive.writestr("modelDescription.xml", description)
+        archive.write(library, place)
     library.unlink()
     return out
 
@@ -165,6 +246,7 @@ def _rows(
         (f"der({n})", o["derivatives"] + i, "local", "continuous", "calculated", None, i)
         for i, n in enumerate(shape.states)
     ]
+    rows = [] if shape.hidden else rows
     rows += [
         (n, o["inputs"] + i, "input", "continuous", "", 0.0, None)
         for i, n in enumerate(shape.inputs)
@@ -193,7 +275,8 @@ def _two(name: str, guid: str, shape: Shape, make: Make) -> str:
     ]
     lines += [
         f'<{k} modelIdentifier="{name}" providesDirectionalDerivative="{promise}" '
-        f'canHandleVariableCommunicationStepSize="{str(not make.step).lower()}"/>'
+        f'canHandleVariableCommunicationStepSize="{str(not make.step).lower()}" '
+        f'canBeInstantiatedOnlyOncePerProcess="{str(make.once).lower()}"/>'
         if k == "CoSimulation"
         else f'<{k} modelIdentifier="{name}" providesDirectionalDerivative="{promise}"/>'
         for k in reversed(make.kinds)
@@ -226,15 +309,14 @@ def _two(name: str, guid: str, shape: Shape, make: Make) -> str:
         lines.append(f"<ScalarVariable {about}><Real {inner}/></ScalarVariable>")
     index = {row[0]: i for i, row in enumerate(rows, 1)}
     outputs = "".join(f'<Unknown index="{index[n]}"/>' for n in shape.outputs)
-    slopes = "".join(f'<Unknown index="{index[f"der({n})"]}"/>' for n in shape.states)
+    derivatives = [f"der({n})" for n in shape.states if not shape.hidden]
+    slopes = "".join(f'<Unknown index="{index[n]}"/>' for n in derivatives)
     unknowns = "".join(
-        f'<Unknown index="{i}"/>'
-        for i in sorted(index[n] for n in (*shape.outputs, *(f"der({s})" for s in shape.states)))
+        f'<Unknown index="{i}"/>' for i in sorted(index[n] for n in (*shape.outputs, *derivatives))
     )
-    lines.append(
-        f"</ModelVariables><ModelStructure><Outputs>{outputs}</Outputs><Derivatives>{slopes}"
-        "</Derivatives>"
-    )
+    if slopes:
+        slopes = f"<Derivatives>{slopes}</Derivatives>"
+    lines.append(f"</ModelVariables><ModelStructure><Outputs>{outputs}</Outputs>{slopes}")
     lines.append(
         f"<InitialUnknowns>{unknowns}</InitialUnknowns></ModelStructure></fmiModelDescription>"
     )
@@ -268,18 +350,20 @@ def _three(name: str, token: str, shape: Shape, make: Make) -> str:
             }
         )
         lines.append(f"<Float64 {about}/>")
-    own = [OFFSET["states"] + i for i in range(len(shape.states))] + [
-        OFFSET["inputs"] + i for i in range(len(shape.inputs))
-    ]
+    own = [OFFSET["states"] + i for i in range(0 if shape.hidden else len(shape.states))]
+    own += [OFFSET["inputs"] + i for i in range(len(shape.inputs))]
     depends = f' dependencies="{" ".join(map(str, own))}"' if make.dependencies else ""
     outputs = [OFFSET["outputs"] + i for i in range(len(shape.outputs))]
-    slopes = [OFFSET["derivatives"] + i for i in range(len(shape.states))]
+    slopes = [OFFSET["derivatives"] + i for i in range(0 if shape.hidden else len(shape.states))]
     structure = "".join(f'<Output valueReference="{v}"{depends}/>' for v in outputs)
     structure += "".join(
         f'<ContinuousStateDerivative valueReference="{v}"{depends}/>' for v in slopes
     )
     structure += "".join(
         f'<InitialUnknown valueReference="{v}"{depends}/>' for v in (*outputs, *slopes)
+    )
+    structure += "".join(
+        f'<EventIndicator valueReference="{OFFSET["states"] + i}"/>' for i in range(make.events)
     )
     lines.append(
         f"</ModelVariables><ModelStructure>{structure}</ModelStructure></fmiModelDescription>"

@@ -46,6 +46,31 @@ static void model_y(const cplx *x, const cplx *u, const cplx *p, cplx *y) {
     y[4] = spring(x, p);
 }
 
+#elif defined MODEL_BOUNCING_BALL /* height and speed, free fall; the bounce is a state event */
+#define NX 2
+#define NU 0
+#define NP 2
+#define NY 2
+static const double start_x[NX] = {1.0, 0.0}, start_p[NP] = {9.81, 0.7}, start_u[1] = {0.0};
+static void model_f(const cplx *x, const cplx *u, const cplx *p, cplx *dx) { dx[0] = x[1]; dx[1] = -p[0]; }
+static void model_y(const cplx *x, const cplx *u, const cplx *p, cplx *y) { y[0] = x[0]; y[1] = x[1]; }
+#define EVENT(m) if ((m)->x[0] < 0 && (m)->x[1] < 0) { (m)->x[0] = 0; (m)->x[1] *= -(m)->p[1]; }
+
+#elif defined MODEL_SERVO /* the axis below in degrees, its states hidden: start values are parameters */
+#define NX 2
+#define NU 1
+#define NP 6
+#define NY 2
+#define DEGREE 0.017453292519943295
+static const double start_x[NX] = {0, 0}, start_u[NU] = {0.0};
+static const double start_p[NP] = {2.0, 1.0, 1.0, 5.0, 0.0, 0.0};
+static void model_f(const cplx *x, const cplx *u, const cplx *p, cplx *dx) {
+    dx[0] = x[1];
+    dx[1] = (u[0] - p[1] * x[1] - p[2] * ctanh(x[1] / 0.01) - p[3] * csin(x[0])) / p[0];
+}
+static void model_y(const cplx *x, const cplx *u, const cplx *p, cplx *y) { y[0] = x[0] / DEGREE; y[1] = x[1] / DEGREE; }
+#define BEGIN(m) { (m)->x[0] = (m)->p[4] * DEGREE; (m)->x[1] = (m)->p[5] * DEGREE; }
+
 #else /* an axis: inertia, viscous and Coulomb friction, gravity; and a parameter that acts on nothing */
 #define NX 2
 #define NU 1
@@ -57,6 +82,13 @@ static void model_f(const cplx *x, const cplx *u, const cplx *p, cplx *dx) {
     dx[1] = (u[0] - p[1] * x[1] - p[2] * ctanh(x[1] / 0.01) - p[3] * csin(x[0])) / p[0];
 }
 static void model_y(const cplx *x, const cplx *u, const cplx *p, cplx *y) { y[0] = x[0]; y[1] = x[1]; }
+#endif
+
+#ifndef EVENT
+#define EVENT(m)
+#endif
+#ifndef BEGIN
+#define BEGIN(m)
 #endif
 
 /* value references: states, derivatives, inputs, parameters, outputs */
@@ -99,6 +131,7 @@ static void model_advance(Model *m, double h) {
             model_eval(x, m->u, m->p, k[stage], 0);
         }
         for (int i = 0; i < NX; i++) m->x[i] += s / 6 * (k[0][i] + 2 * k[1][i] + 2 * k[2][i] + k[3][i]);
+        EVENT(m)
     }
     m->time += h;
 }

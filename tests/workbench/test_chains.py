@@ -22,8 +22,9 @@ import pytest
 
 from casadi_models import EFFECTS
 from tests.identification.data.test_own_effects import KEY, OWN
-from tests.irj_fmu.imported.test_user_fmu import FILE, axis
+from tests.irj_fmu.imported.test_user_fmu import FILE
 from tests.user_fmus.make import Make, build
+from tests.user_fmus.records import axis
 
 pytest.importorskip("starlette")
 

@@ -122,6 +122,13 @@ def _unmapped(record: Record, model: UserModel) -> list[str]:
     ]
 
 
+def _new_notes(before: UserModel, after: UserModel) -> None:
+    """Say what came to be known on the way from one model to another."""
+    for note in after.notes:
+        if note not in before.notes:
+            print(f"irj: {note}", file=sys.stderr)
+
+
 @_one_line
 def run_check(arguments: Namespace) -> int:
     """`irj check REC --joint J` with an FMU as the model: the gate, and whether the mapped
@@ -147,9 +154,7 @@ def run_fit(arguments: Namespace) -> int:
 
     model, records, warnings = _open(arguments)
     fitted = fit(model, records, progress=progress_bar)
-    for note in fitted.model.notes:
-        if note not in model.notes:
-            print(f"irj: {note}", file=sys.stderr)
+    _new_notes(model, fitted.model)
     print(fitted.method)
     _print_outputs(fitted.train)
     _print_parameters(fitted.parameters)
@@ -179,7 +184,9 @@ def run_compare(arguments: Namespace) -> int:
 
     model, records, warnings = _open(arguments)
     if arguments.fit_records:
+        before = model
         model = fit(model, _records(arguments.fit_records, model)[0], progress=progress_bar).model
+        _new_notes(before, model)
     found = compare(model, records)
     _print_outputs(found)
     print(f"  fails most from {found.worst_window[0]:.4g} s to {found.worst_window[1]:.4g} s")
@@ -197,7 +204,9 @@ def run_diagnose(arguments: Namespace) -> int:
     model, records, _ = _open(arguments)
     held, _ = _records(arguments.held_out, model)
     if model.parameters:
+        before = model
         model = fit(model, records, progress=progress_bar).model
+        _new_notes(before, model)
     found = diagnose(model, records, held, progress=progress_bar)
     said = gate_warnings([*records, *held])
     for text in found.diagnosis.warnings:
@@ -241,6 +250,7 @@ def _improved(arguments: Namespace, report: str | None, most: int) -> UserImprov
     model, records, _ = _open(arguments)
     held, _ = _records(arguments.held_out, model)
     found = improve(model, records, held, max_additions=most, progress=progress_bar)
+    _new_notes(model, found.model)
     said = gate_warnings([*records, *held])
     for text in found.found.warnings:
         if text not in said:

@@ -43,11 +43,11 @@ from irj_fmu.imported.port import feedback_of
 from irj_fmu.imported.sensitivity import BlackBox
 from tests.user_fmus.make import MODELS, Make, build, check
 from tests.user_fmus.plant import foreign, recorded
+from tests.user_fmus.records import TRUTH, axis, dahlquist, van_der_pol
 
 FloatArray = npt.NDArray[np.float64]
 ME, CS = ("ModelExchange",), ("CoSimulation",)
 EVERY = [(version, kinds) for version in (2, 3) for kinds in (ME, CS)]
-TRUTH = {"inertia": 2.5, "viscous": 0.7, "coulomb": 1.6, "gravity": 6.0}
 DRAG = 0.15
 
 
@@ -58,81 +58,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def fmu(folder: Path, name: str, make: Make | None = None) -> Path:
     return build(name, folder, make)
-
-
-def van_der_pol(mu: float, noise: float = 1e-3) -> Record:
-    from scipy.integrate import solve_ivp
-
-    t = np.arange(0, 8, 0.02)
-    x = solve_ivp(
-        lambda _t, x: [x[1], mu * (1 - x[0] ** 2) * x[1] - x[0]],
-        (0, 8),
-        [2, 0],
-        "DOP853",
-        t,
-        rtol=1e-11,
-        atol=1e-12,
-    ).y
-    x = x + noise * np.random.default_rng(0).standard_normal(x.shape)
-    return Record.from_channels(
-        t, {"motor_position": x[0], "motor_velocity": x[1]}, name="van der Pol"
-    )
-
-
-def dahlquist(k: float, noise: float = 1e-4) -> Record:
-    t = np.arange(0, 4, 0.01)
-    return Record.from_channels(
-        t,
-        {
-            "motor_position": np.exp(-k * t)
-            + noise * np.random.default_rng(1).standard_normal(len(t))
-        },
-        name="Dahlquist",
-    )
-
-
-def swing(t: FloatArray) -> FloatArray:
-    return np.asarray(
-        0.8 * np.sin(1.9 * t) + 0.3 * np.sin(6.9 * t + 1) - 0.3 * np.sin(1) + 0.15 * np.sin(0.7 * t)
-    )
-
-
-def axis(
-    hidden: Callable[[float, float], float] = lambda _q, _w: 0.0,
-    seconds: float = 8.0,
-    h: float = 2e-3,
-    noise: float = 1e-5,
-    seed: int = 2,
-    motion: Callable[[FloatArray], FloatArray] = swing,
-) -> Record:
-    """An axis under a controller, integrated here: its torque is held between samples."""
-    t = h * np.arange(round(seconds / h))
-    reference, rate = motion(t), np.gradient(motion(t), h)
-
-    def slope(q: float, w: float, u: float) -> tuple[float, float]:
-        resist = (
-            TRUTH["viscous"] * w
-            + TRUTH["coulomb"] * math.tanh(w / 0.01)
-            + TRUTH["gravity"] * math.sin(q)
-        )
-        return w, (u - resist - hidden(q, w)) / TRUTH["inertia"]
-
-    q, w = 0.0, float(rate[0])
-    rows, s = np.empty((len(t), 2)), h / 4
-    for k in range(len(t)):
-        u = 400 * (reference[k] - q) + 60 * (rate[k] - w)
-        rows[k] = q, u
-        for _ in range(4):
-            a = slope(q, w, u)
-            b = slope(q + s / 2 * a[0], w + s / 2 * a[1], u)
-            c = slope(q + s / 2 * b[0], w + s / 2 * b[1], u)
-            d = slope(q + s * c[0], w + s * c[1], u)
-            q += s / 6 * (a[0] + 2 * b[0] + 2 * c[0] + d[0])
-            w += s / 6 * (a[1] + 2 * b[1] + 2 * c[1] + d[1])
-    read = rows[:, 0] + noise * np.random.default_rng(seed).standard_normal(len(t))
-    return Record.from_channels(
-        t, {"motor_position": read, "motor_torque": rows[:, 1]}, name="axis"
-    )
 
 
 CHANNELS = {"motor_torque": "torque", "motor_position": "angle"}

@@ -16,10 +16,11 @@ from irj_fmu.imported.model import Mapped, UserModel
 from irj_fmu.imported.outputs import noise_of
 from irj_fmu.imported.port import STEADY, coupled, feedback_of, hold_of, noted
 from irj_fmu.imported.run import HOLD, Window, parts_of
-from tests.irj_fmu.imported.test_user_fmu import TRUTH, axis, axis_model
+from tests.irj_fmu.imported.test_user_fmu import axis_model
 from tests.user_fmus.make import Make, build
 from tests.user_fmus.plant import HIDDEN, foreign, recorded
 from tests.user_fmus.plant import TRUTH as JOINT
+from tests.user_fmus.records import TRUTH, axis
 
 
 @pytest.mark.parametrize("speed", [False, True])

@@ -15,9 +15,10 @@ from irj_fmu.first_joint import first_joint
 from irj_fmu.imported.compare import compare
 from irj_fmu.imported.file import load_user_joint
 from irj_fmu.imported.fit import fit
-from tests.irj_fmu.imported.test_user_fmu import START, TRUTH, axis
+from tests.irj_fmu.imported.test_user_fmu import START
 from tests.user_fmus.make import Make, build
 from tests.user_fmus.plant import foreign, recorded
+from tests.user_fmus.records import TRUTH, axis
 from workbench.cli.main import main
 
 

@@ -18,9 +18,10 @@ from irj_fmu.imported.diagnose import diagnose
 from irj_fmu.imported.file import load_user_joint
 from irj_fmu.imported.fit import fit
 from irj_fmu.imported.improve import improve
-from tests.irj_fmu.imported.test_user_fmu import DRAG, FILE, axis
+from tests.irj_fmu.imported.test_user_fmu import DRAG, FILE
 from tests.user_fmus.make import Make, build
 from tests.user_fmus.plant import OWN, foreign, recorded
+from tests.user_fmus.records import axis
 from workbench.cli.main import main
 
 SCHEMA = Path(__file__).parents[2] / "data" / "improve.schema.json"

@@ -12,8 +12,9 @@ import pytest
 
 from irj_fmu.imported.file import load_user_joint
 from irj_fmu.imported.fit import fit
-from tests.irj_fmu.imported.test_user_fmu import FILE, axis
+from tests.irj_fmu.imported.test_user_fmu import FILE
 from tests.user_fmus.make import Make, build
+from tests.user_fmus.records import axis
 from workbench.cli.main import main
 
 

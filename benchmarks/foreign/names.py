@@ -1,6 +1,6 @@
 """Effects hidden in a plant whose model is somebody else's FMU: named or not, and how well.
 
-``python -m benchmarks.foreign [--seeds 2] [--only backlash,nothing] [--no-fit] [--values]``
+``python -m benchmarks.foreign [names] [--seeds 2] [--only backlash,nothing] [--no-fit] [--values]``
 
 The plant is a joint with motor, gear and link; its foreign model is an FMU of the same equations
 less what is hidden, in C, without model exchange, without FMU state, its parameters fixed. Training
@@ -15,7 +15,6 @@ each parameter is from the truth, in its standard errors.
 from __future__ import annotations
 
 import argparse
-import sys
 import tempfile
 import time
 from collections.abc import Sequence
@@ -100,7 +99,3 @@ def _off(found: UserImprovement) -> dict[str, float]:
     """Errors of the FMU's parameters that have a standard error, in units of it."""
     errors = {n: e for n, e in found.stderr.items() if e and not n.startswith(PREFIX)}
     return {n: (found.model.values[n] - OWN[n]) / e for n, e in errors.items()}
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,0 +1,1 @@
+"""Foreign FMUs as models of joints, measured; see :mod:`benchmarks.foreign.__main__`."""

@@ -1,0 +1,25 @@
+"""Figures of foreign FMUs: ``python -m benchmarks.foreign [names | makes | coverage] [-h] ...``.
+
+``names`` (the default) hides effects in the plant and asks for their names, ``makes`` fits
+FMUs of other makes in processes of their own, ``coverage`` fits laws outside the FMU over many
+seeds and counts the true values inside the intervals.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Final
+
+from benchmarks.foreign import coverage, makes, names
+
+TABLES: Final = {"names": names.main, "makes": makes.main, "coverage": coverage.main}
+
+
+def main(arguments: list[str]) -> int:
+    """Print the table that the first argument asks for."""
+    given = arguments[0] if arguments and arguments[0] in TABLES else "names"
+    return TABLES[given](arguments[1:] if arguments[:1] == [given] else arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
