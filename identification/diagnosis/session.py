@@ -749,8 +749,8 @@ class Session:
             # at a turn, which every long row has, the RMS is none of the law's
             whole = found.steps[-1].solution
             bare = bench.fitted(now.model, whole.values, again=True)
-            before, after = (bench.step(None, None, s).held_out for s in (bare, whole))
-            if judged_drop(before, after, found.claims[0].balance) < MAJOR_DROP:
+            errors = [bench.step(None, None, s).held_out for s in (bare, whole)]
+            if judged_drop(errors[0], errors[1], found.claims[0].balance) < MAJOR_DROP:
                 continue
             claim = replace(found.claims[0], kernel=bench.data.kernel, partial=False)
             model = with_effect(now.model, claim.label)

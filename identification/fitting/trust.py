@@ -21,10 +21,9 @@ from identification.data.formats import words
 from identification.fitting.covariance import NORMAL, correlations
 from identification.fitting.engine import Solution
 from identification.fitting.information import eliminated, form_of, white_errors
-from identification.fitting.least_squares import least_squares
 from identification.fitting.start_values import bounds_of
-from identification.fitting.turns import WithoutTurns, turns_of
-from identification.fitting.weak_form import ENOUGH, WeakForm
+from identification.fitting.turns import turns_of
+from identification.fitting.weak_form import WeakForm
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -202,13 +201,11 @@ class _Judge:
         stacked = self.form.stacked(x)
         names = self.form.balances.balances
         weights = solution.weights
-        self.turns = turns_of(self.form)
-        self.j = self.turns.without(
+        turns = turns_of(self.form)
+        self.j = turns.without(
             np.concatenate([stacked.jacobian[b] * weights[b][:, None] for b in names])
         )
-        self.r = self.turns.without(
-            np.concatenate([stacked.residual[b] * weights[b] for b in names])
-        )
+        self.r = turns.without(np.concatenate([stacked.residual[b] * weights[b] for b in names]))
         self.plain = np.concatenate([stacked.jacobian[b] for b in names])
         self.block = np.tile(stacked.block, len(names))
         self.record = np.tile(
@@ -386,8 +383,7 @@ class _Judge:
         return ends[0], ends[1]
 
     def _refitted(self, name: str, value: float) -> float:
-        """Weighted sum of squares with one parameter held and all others fitted, friction about the
-        turns among them: the errors that it is held against do not know it either."""
+        """Weighted sum of squares with one parameter held and all others fitted."""
         free = tuple(n for n in self.form.free if n != name)
         form = WeakForm(
             balances_of(self.model, self.data.sensing, wrt=bare(free)),
@@ -396,15 +392,9 @@ class _Judge:
             free,
             self.solution.weights,
         )
-        found = least_squares(
-            WithoutTurns(form, self.turns),
-            [form.values[n] for n in free],
-            ([self.limits[n][0] for n in free], [self.limits[n][1] for n in free]),
-            logarithmic=form.logarithmic,
-            iterations=REFITS,
-            tolerance=ENOUGH,
-        )
-        return found.cost
+        fitted, _ = form.fitted(self.limits, REFITS)
+        left = form.residual(np.array([fitted[n] for n in free]))
+        return float(left @ left)
 
 
 def _unknown(p: Parameter, model: JointModel, value: float) -> Trusted:

@@ -1,24 +1,21 @@
-"""Friction about the instants at which it changes its sign, as unknowns of their own.
+"""The instants at which dry friction changes its sign, as unknowns of their own.
 
 A velocity comes from a kernel, and around a turn the acceleration jumps by what dry friction does:
 the instant of the turn is some milliseconds wrong, always to the same side.  Such an error is even
 in time about the turn, as an acceleration is and the laws of friction are not, so least squares
-made an inertia of it.  At each point about a turn the friction may be that of either direction: an
-unknown of its own takes it.  One for each turn would not do: what is wrong stands some milliseconds
-beside the turn, and where the kernel is steep that is another column.
+made an inertia of it.  An unknown instant for each turn takes it: rows and columns lose what
+friction that changes its sign some milliseconds sooner or later would give them.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any, Final, final
 
 import numpy as np
 import numpy.typing as npt
 
-from identification.balance.balances import balances_of
-from identification.balance.stacked import TURN_SHARE, rms, stack, sticking_torque, taking_part
+from identification.balance.stacked import TURN_SHARE, sticking_torque
 from identification.balance.weak import RESTING_SIDES, WeakRecord, whole
 from identification.fitting.weak_form import WeakForm
 
@@ -29,21 +26,18 @@ ONE_TURN: Final = 0.5
 """Share of a kernel within which changes of sign are one turn: noise about a slow one makes
 several, and rows do not tell them apart.
 """
-FEWEST_QUIET: Final = 100
-"""Rows that no turn touches from which their RMS is known to a tenth: four rows to a kernel, of
-which two fifths are independent."""
 
 
 @final
 @dataclass(frozen=True)
 class Turns:
-    """What unknown friction about the turns may add to the weighted rows of a problem.
+    """What unknown instants of the turns may add to the weighted rows of a problem.
 
     Attributes
     ----------
-    columns : (rows, points) sparse array or None
-        What the friction at one point is usually off by, in the noise of its balance; None where
-        nothing turns under dry friction.
+    columns : (rows, turns) sparse array or None
+        In units of what the error of an instant usually adds; None where nothing turns under dry
+        friction.
     factors : object or None
         Their normal matrix with that of the usual errors, factorised.
     """
@@ -52,29 +46,11 @@ class Turns:
     factors: Any = None
 
     def without(self, rows: FloatArray) -> FloatArray:
-        """Weighted rows (rows,) or columns (rows, p) less what this friction explains."""
+        """Weighted rows (rows,) or columns (rows, p) less what these instants explain."""
         if self.columns is None:
             return rows
         explained = self.columns @ self.factors.solve(np.asarray(self.columns.T @ rows))
         return np.asarray(rows - explained, dtype=np.float64)
-
-
-@final
-@dataclass(frozen=True)
-class WithoutTurns:
-    """The rows of a problem less what friction about its turns explains; a
-    :class:`identification.fitting.least_squares.Problem`."""
-
-    problem: WeakForm
-    turns: Turns
-
-    def residual(self, x: FloatArray) -> FloatArray:
-        """Weighted rows, (rows,)."""
-        return self.turns.without(self.problem.residual(x))
-
-    def jacobian(self, x: FloatArray) -> FloatArray:
-        """Their derivative, (rows, free)."""
-        return self.turns.without(self.problem.jacobian(x))
 
 
 def turns_of(problem: WeakForm) -> Turns:
@@ -111,32 +87,10 @@ def turns_of(problem: WeakForm) -> Turns:
         count += found.shape[1]
     if not count:
         return Turns()
-    row, value = np.concatenate(rows), np.concatenate(values)
-    noise = _noise_beside(problem, row[value != 0])
     total = len(problem.balances.balances) * problem.rows + len(problem.prior)
     return _factorised(
-        row, np.concatenate(columns), value / noise[row // problem.rows], (total, count)
+        np.concatenate(rows), np.concatenate(columns), np.concatenate(values), (total, count)
     )
-
-
-def _noise_beside(problem: WeakForm, touched: IntArray) -> FloatArray:
-    """RMS of the weighted rows of each balance that no turn touches, (balances,).
-
-    The turns themselves are most of what a balance leaves where it turns, so that the weights take
-    noise for several times what it is: by them each row would tell next to nothing of a turn.
-    """
-    bare_ones = balances_of(problem.balances.model, problem.data.sensing, wrt=())
-    left = stack(bare_ones, problem.data.train, problem.values).residual
-    apart = np.ones(len(problem.balances.balances) * problem.rows, dtype=np.bool_)
-    apart[touched] = False
-    out = np.ones(len(problem.balances.balances))
-    for k, b in enumerate(problem.balances.balances):
-        own = apart[k * problem.rows : (k + 1) * problem.rows]
-        own = own & taking_part(b, problem.data.train)
-        level = rms((left[b] * problem.weights[b])[own])
-        if own.sum() >= FEWEST_QUIET and level > 0:
-            out[k] = level
-    return out
 
 
 def _first_rows(problem: WeakForm) -> list[int]:
@@ -146,32 +100,24 @@ def _first_rows(problem: WeakForm) -> list[int]:
 
 
 def _at_turns(record: WeakRecord, side: str) -> Any:
-    """Sparse (points, unknowns): RMS of what the friction at each point about a turn is off by, in
-    its level: twice the level where the instant of the turn lies beyond the point.
-
-    The velocity is that of a kernel, so that its change of sign is no farther from the true one
-    than half of that.
+    """Sparse (points, turns): what one standard error of its instant adds to a friction of 1 at the
+    points of a turn; over a slow one the friction may have acted either way.
     """
     from scipy.sparse import csc_array
-    from scipy.special import ndtr
 
     speed = record.points[f"{side}_velocity"]
     grid = record.grid
     spacing = grid.step * grid.dt
-    kernel = grid.pointwise[f"{side}_position"] / spacing
     apart = max(1, whole(ONE_TURN * grid.length / spacing))
     at = np.flatnonzero(np.diff(np.sign(speed)) != 0)
-    crossing = at + np.abs(speed[at]) / np.abs(speed[at + 1] - speed[at])
-    ends = np.flatnonzero(np.diff(at) > apart) + 1
-    off = np.zeros(len(speed))
-    for x in np.split(crossing, ends) if len(at) else ():
-        first = max(math.ceil(x[0] - kernel / 2), 0)
-        points = np.arange(first, min(math.floor(x[-1] + kernel / 2), len(speed) - 1) + 1)
-        away = np.maximum(np.maximum(x[0] - points, points - x[-1]), 0.0)
-        off[points] = np.maximum(off[points], 2 * np.sqrt(ndtr(-away / (TURN_SHARE * kernel))))
-    where = np.flatnonzero(off)
-    placed = (off[where], (where, np.arange(len(where))))
-    return csc_array(placed, shape=(len(speed), len(where)))
+    turns = np.split(at, np.flatnonzero(np.diff(at) > apart) + 1) if len(at) else []
+    points = [np.arange(t[0], t[-1] + 2) for t in turns]
+    count = np.array([len(p) for p in points], dtype=np.int64)
+    where = np.concatenate([*points, np.empty(0, dtype=np.int64)])
+    which = np.repeat(np.arange(len(points)), count)
+    late = TURN_SHARE * grid.pointwise[f"{side}_position"] / spacing
+    size = 1 + 2 * late / np.maximum(count, 1)
+    return csc_array((size[which], (where, which)), shape=(len(speed), len(points)))
 
 
 def _factorised(
@@ -189,4 +135,4 @@ def _factorised(
     return Turns(columns, splu(csc_matrix(normal)))
 
 
-__all__ = ["Turns", "WithoutTurns", "turns_of"]
+__all__ = ["Turns", "turns_of"]

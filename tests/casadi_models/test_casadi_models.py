@@ -593,7 +593,7 @@ def test_time_derivative_follows_the_chain_rule() -> None:
 
 
 def test_elements_of_a_hysteresis_fill_at_the_rate_of_the_torsion() -> None:
-    """Over one, three and nine widths as the elements stand, in rates, in a step and in the linear model."""
+    """Over one, three and nine widths, in rates, in a step and in the linear model."""
     model = model_2b().add("hysteresis")
     width = 0.01
     model = model.with_values(

@@ -13,8 +13,7 @@ from identification import improve, load_joint, read
 from identification.balance.balances import balances_of
 from identification.balance.dataset import load_dataset, prepared_model
 from identification.fitting.engine import solve
-from identification.fitting.trust import trust
-from identification.fitting.turns import Turns, turns_of
+from identification.fitting.turns import turns_of
 from identification.fitting.weak_form import WeakForm
 from tests.hidden_effect.generator import simulate_case
 from tests.recorded_world.world import make_case, write_case
@@ -40,8 +39,9 @@ def test_a_turn_of_dry_friction_is_no_inertia(smoothing: float) -> None:
     rows = WeakForm(balances_of(model, data.sensing, wrt=()), data, found.values, (), found.weights)
     turns = turns_of(rows)
     left = rows.residual(np.empty(0))
-    # nothing is invented: what is left is shorter, and the same where no turn is in reach
-    assert np.linalg.norm(turns.without(left)) < np.linalg.norm(left)
+    # nothing is invented: what is left is shorter, a turn a second is no large share of it, and
+    # where no turn is in reach it is the same
+    assert 0.5 * np.linalg.norm(left) < np.linalg.norm(turns.without(left)) < np.linalg.norm(left)
     touched = np.asarray(abs(turns.columns).sum(axis=1)).ravel() > 0
     assert 0 < touched.mean() < 0.3
     np.testing.assert_array_equal(turns.without(left)[~touched], left[~touched])
@@ -57,45 +57,9 @@ def test_a_turn_of_dry_friction_is_no_inertia(smoothing: float) -> None:
     assert still.without(left) is left
 
 
-def late(shift: int) -> tuple[Turns, np.ndarray, np.ndarray]:
-    """Turns of a fit, what friction that changed its sign so many samples earlier than its velocity
-    adds to the rows, and the column of the motor's inertia."""
-    case = simulate_case(None, 50_001, overrides={"CURVE": 1.0}, records=("train",))
-    record = record_of(case.measured["train"], "train", "same")
-    joint = joint_of(case)
-    model = prepared_model(joint, record)
-    data = load_dataset([record], [], joint, model)
-    found = solve(model, data)
-    free = ("motor_inertia",)
-    form = WeakForm(
-        balances_of(model, data.sensing, wrt=free), data, found.values, free, found.weights
-    )
-    (made,) = data.train
-    way = np.sign(made.points["motor_velocity"])
-    earlier = np.concatenate([way[shift:], way[-1:].repeat(shift)])
-    wrong = np.zeros(len(form.balances.balances) * form.rows)
-    at = form.balances.balances.index("motor") * form.rows
-    own = slice(at, at + form.rows)
-    off = found.values["motor_coulomb"] * made.average(earlier - way)
-    wrong[own] = off * form.weights["motor"] * made.taking("motor")
-    column = form.jacobian(np.array([found.values["motor_inertia"]]))[:, 0]
-    return turns_of(form), wrong, column
-
-
-def test_friction_that_turned_some_samples_sooner_moves_no_inertia() -> None:
-    """With one unknown for each turn, at the turn itself, more stayed than here is allowed: where
-    the kernel is steep, some milliseconds beside are another column."""
-    turns, wrong, column = late(2)
-    moved = column @ wrong / (column @ column)
-    apart = turns.without(column)
-    left = apart @ turns.without(wrong) / (apart @ apart)
-    assert abs(moved) > 0
-    assert abs(left) < 0.03 * abs(moved)
-
-
 def test_motors_under_set_valued_friction_have_no_bias_of_their_inertia() -> None:
-    """With the turns in units of what they leave themselves, each told next to nothing of its
-    unknown, and the mean of these was one and a half standard errors."""
+    """With the rows at turns in the RMS by which rows are weighed, each told next to nothing of its
+    instant, and the mean of these was one and a half standard errors."""
     off = []
     for seed in range(300_000, 300_006):
         case = simulate_case(
@@ -112,24 +76,6 @@ def test_motors_under_set_valued_friction_have_no_bias_of_their_inertia() -> Non
         assert error is not None
         off.append((found.values["motor_inertia"] - case.parameters["JM"]) / error)
     assert abs(np.mean(off)) < 2 / np.sqrt(len(off))
-
-
-def test_the_profile_of_a_shape_knows_no_more_of_the_turns_than_its_error() -> None:
-    """With the rows at the turns in it the interval of this velocity ended one error below its
-    value and nearly five above."""
-    case = simulate_case("stribeck", 300_000, overrides={"CURVE": 1.0}, records=("train", "train2"))
-    records = [record_of(t, n, "same") for n, t in case.measured.items()]
-    joint = joint_of(case, ("stribeck@motor",))
-    model = prepared_model(joint, records[0])
-    data = load_dataset(records, [], joint, model)
-    judged = {p.name: p for p in trust(solve(model, data), data).parameters}
-    p = judged["motor_stribeck_velocity"]
-    assert p.low is not None
-    assert p.high is not None
-    assert p.stderr is not None
-    assert 1.4 < (p.value - p.low) / p.stderr < 2.7
-    assert 1.4 < (p.high - p.value) / p.stderr < 2.7
-    assert p.low < case.parameters["M_VS"] < p.high
 
 
 def test_a_record_without_a_turn_is_fitted_as_it_is() -> None:
