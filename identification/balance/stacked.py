@@ -11,7 +11,6 @@ from typing import Final, final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import binary_opening
 
 from casadi_models import JointModel
 from identification.balance.balances import Balances, balances_of
@@ -21,7 +20,7 @@ from identification.balance.dataset import Dataset
 from identification.balance.drawn_noise import draws_of
 from identification.balance.memory import numbers_of
 from identification.balance.slow_noise import drift_of_rest
-from identification.balance.weak import Grid, WeakRecord, whole
+from identification.balance.weak import WeakRecord, whole
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -43,15 +42,6 @@ FEW_SAMPLES: Final = 5
 """Samples under which a kernel of the velocity tells little more than a step from one sample to the
 next."""
 
-MOST_SAMPLES: Final = 10
-"""Samples of a kernel of the velocity up to which steps between samples tell a stop. A kernel is as
-long as the noise asks for: that of a step is (10/3)^1.5, six times, what such a kernel leaves of
-it, and with 20 samples seventeen times: then noise hides all that is shorter than the kernel.
-"""
-LONGEST_TURN: Final = 1
-"""Points of unknown direction that a turn without a stop makes: the reading next to it. Its instant
-tells the clocks, and the velocity through a kernel knows it to a part of a sample.
-"""
 SURE_JUMP: Final = 3.0
 """Standard deviations of noise from which what alternates from sample to sample is a jump."""
 NORMAL_MEDIAN: Final = 0.6745
@@ -402,13 +392,10 @@ def _sure_rms(change: FloatArray, either: FloatArray) -> float:
 def sure_levels(model: JointModel, data: Dataset, values: Mapping[str, float]) -> dict[str, float]:
     """RMS of what each balance leaves on the training rows, in which rows that may go either way
     count by how sure they are.
-
-    That of the width of a turn is not asked: it is fitted, and a law that is wide enough makes
-    every row unsure.
     """
     balances = balances_of(model, data.sensing, wrt=())
     residual = stack(balances, data.train, values).residual
-    either = _by_readings(balances, data, values, data.train)
+    either = unsure(balances, data, values, data.train)
     rows = {b: taking_part(b, data.train) for b in residual}
     return {b: _sure_rms(r[rows[b]], either[b][rows[b]]) for b, r in residual.items()}
 
@@ -495,19 +482,6 @@ def unsure(
     or be spread over a turn, and from when exactly a torque jumped between two samples [N.m].
     """
     names = balances.model.named("smoothing")
-    either = _by_readings(balances, data, values, records)
-    if not names:
-        return either
-    bare = balances_of(balances.model, data.sensing, wrt=())
-    here = stack(bare, records, values).residual
-    there = stack(bare, records, {**values, **{n: 2 * values[n] for n in names}}).residual
-    return {b: np.hypot((here[b] - there[b]) / 2, either[b]) for b in here}
-
-
-def _by_readings(
-    balances: Balances, data: Dataset, values: Mapping[str, float], records: Sequence[WeakRecord]
-) -> dict[str, FloatArray]:
-    """The part of that scatter that the readings leave open, whatever the width of a turn is."""
     either = _either_way(balances.model, data, values, records)
     either = {
         b: np.hypot(x, jumps)
@@ -519,7 +493,12 @@ def _by_readings(
         settled_values = settled(balances.model, data.sensing, records, values)
         flying = [balances.flight(w, values_on(balances.model, w, settled_values)) for w in records]
         either = {b: np.hypot(x, np.concatenate(flying)) for b, x in either.items()}
-    return either
+    if not names:
+        return either
+    bare = balances_of(balances.model, data.sensing, wrt=())
+    here = stack(bare, records, values).residual
+    there = stack(bare, records, {**values, **{n: 2 * values[n] for n in names}}).residual
+    return {b: np.hypot((here[b] - there[b]) / 2, either[b]) for b in here}
 
 
 def row_weights(
@@ -616,56 +595,30 @@ def sticking_torque(model: JointModel, values: Mapping[str, float], place: str) 
 
 def _either_direction(record: WeakRecord, place: str, noise: ChannelNoise) -> npt.NDArray[np.bool_]:
     """Points at which the direction is not known: slower than the noise, nearer to a turn than
-    its kernel tells when it was, or between a move one way and one the other: dry friction makes
-    a corner of a turn, or holds the joint there, and a velocity across it says nothing.
-
-    Which way it moved, steps between samples tell: within the kernel of a turn, where it stops
-    there, and everywhere where that kernel is no longer than a few samples. Noise that asks for a
-    long kernel hides them.
+    its kernel tells when it was, or, where the kernel is no longer than a few samples, between a
+    move one way and one the other: dry friction makes a corner of a turn, or holds the joint
+    there, and a velocity across it says nothing.
     """
     grid, source = record.grid, f"{place}_position"
     velocity = record.points[f"{place}_velocity"]
     slow = np.abs(velocity) < 3 * grid.velocity_noise(source, noise)
     turns = np.diff(np.sign(velocity), append=np.sign(velocity[-1:])) != 0
     apart = grid.step * grid.dt
-    near = _within(turns, whole(TURN_SHARE * (grid.pointwise[source] - TURN_KERNEL) / apart))
-    few = grid.pointwise[source] < FEW_SAMPLES * grid.dt
-    half = 1 if few else whole(grid.pointwise[source] / 2 / apart)
-    corner = ~_one_way(record.points[source], half, grid, noise)
-    if not few:
-        corner &= _within(turns, half)
-        corner = binary_opening(corner, np.ones(LONGEST_TURN + 1))
-    told = grid.pointwise[source] <= MOST_SAMPLES * grid.dt
-    return np.asarray(slow | near | corner) if told else np.asarray(slow | near)
-
-
-def _one_way(
-    position: FloatArray, most: int, grid: Grid, noise: ChannelNoise
-) -> npt.NDArray[np.bool_]:
-    """Points before and after which the joint surely moves the same way, over one point or more of
-    them up to `most`: noise hides a step between two samples that it does not hide of several.
-    """
-    known = np.zeros(len(position), dtype=np.bool_)
-    span = 1
-    while span <= most:
-        moved = position[span:] - position[:-span]
-        step = np.zeros(span * grid.step + 1)
-        step[0], step[-1] = -1.0, 1.0
-        way = np.sign(moved) * (np.abs(moved) > 3 * noise.after(step, grid.dt))
-        ends = np.zeros(span)
-        before, after = np.append(ends, way), np.append(way, ends)
-        if span == 1:  # of the first and the last point one side is all there is
-            before[0], after[-1] = after[0], before[-1]
-        known |= (before == after) & (before != 0)
-        span *= 2
-    return known
-
-
-def _within(turns: npt.NDArray[np.bool_], reach: int) -> npt.NDArray[np.bool_]:
-    """Points that are no more than so many points from a turn, which is between two of them."""
-    if reach <= 0:
-        return np.zeros(len(turns), dtype=np.bool_)
-    return np.asarray(np.convolve(turns, np.ones(2 * reach), "same") > 0)
+    reach = max(0, whole(TURN_SHARE * (grid.pointwise[source] - TURN_KERNEL) / apart))
+    near = (
+        np.convolve(turns, np.ones(2 * reach), "same") > 0
+        if reach
+        else np.zeros(len(velocity), dtype=bool)
+    )
+    if grid.pointwise[source] < FEW_SAMPLES * grid.dt:
+        moved = np.diff(record.points[source])
+        one_step = np.zeros(grid.step + 1)
+        one_step[0], one_step[-1] = -1.0, 1.0
+        sure = 3 * noise.after(one_step, grid.dt)
+        way = np.sign(moved) * (np.abs(moved) > sure)
+        before, after = np.append(way[:1], way), np.append(way, way[-1:])
+        near |= (before != after) | (before == 0)
+    return np.asarray(slow | near)
 
 
 def rms(values: FloatArray) -> float:

@@ -186,14 +186,16 @@ class JointBench:
         self._drifts: dict[tuple[int, bool], Mapping[str, Part]] = {}
         self._kernels = {**kernels, round(data.kernel, 9): data}
         self._start: Solution | None = None
+        self._started = data.train
         self._base: Base | None = None
         self._rankings: dict[bool, Ranking] = {}
         self._lines: dict[int, tuple[Solution, list[Line]]] = {}
 
     def start(self) -> Solution:
-        """The fit of the joint's own model; made once."""
-        if self._start is None:
+        """The fit of the joint's own model; made once of the same rows."""
+        if self._start is None or self._started is not self.data.train:
             self._start = first_fit(prepared_model(self.joint, self._train[0]), self.data)
+            self._started, self._base, self._rankings = self.data.train, None, {}
         return self._start
 
     def fitted(

@@ -214,7 +214,7 @@ def _fitted(
     for number in range(GAP_PASSES if balances.has_gap else 2):
         tell("first pass" if number == 0 else "second pass", 0.2 + 0.35 * min(number, 1))
         began = values
-        sigma = _sigmas(model, data, values, near=number > 0)
+        sigma = _sigmas(model, data, values)
         weights = row_weights(balances, data, values, sigma, data.train)
         before = _beside(known_before, _independent(balances, data, values))
         values, used = WeakForm(balances, data, values, tuple(free), weights, before).fitted(
@@ -388,23 +388,17 @@ def _beside(
     return {n: (middle, size * math.sqrt(share)) for n, (middle, size) in known.items()}
 
 
-def _sigmas(
-    model: JointModel, data: Dataset, values: Mapping[str, float], *, near: bool = True
-) -> dict[str, float]:
-    """RMS of each balance on the training rows, at least its floor.
-
-    Rows that may go either way count by how sure they are: those of a joint that stands at every
-    turn were most of the RMS, and no other row weighed anything. Not `near` a fit that holds only
-    for a gap, where most rows are none: else which rows are sure of little hangs on values that
-    are yet to be found, and a fit got rid of the rows that it did not meet.
-    """
+def _sigmas(model: JointModel, data: Dataset, values: Mapping[str, float]) -> dict[str, float]:
+    """RMS of each balance on the training rows, at least its floor."""
     floor = floors(model, data, values)
-    if near or data.sensing.kinematic:
+    if data.sensing.kinematic:
+        # rows in a gap are no equations: what they leave is no measure of the others
         level = sure_levels(model, data, values)
-    else:
-        residual = stack(balances_of(model, data.sensing, wrt=()), data.train, values).residual
-        level = {b: rms(r[taking_part(b, data.train)]) for b, r in residual.items()}
-    return {b: max(level[b], floor[b], 1e-12) for b in level}
+        return {b: max(level[b], floor[b], 1e-12) for b in level}
+    residual = stack(balances_of(model, data.sensing, wrt=()), data.train, values).residual
+    return {
+        b: max(rms(r[taking_part(b, data.train)]), floor[b], 1e-12) for b, r in residual.items()
+    }
 
 
 def _best_start(
@@ -464,30 +458,18 @@ def _best_start(
         weights = {b: np.ones(len(row)) for b, row in weights.items()}
         free = [n for n in free if bare([n])[0] not in CLOCKS and n not in smooth]
     bare_ones = balances_of(balances.model, data.sensing, wrt=())
-    sizes = [
-        n
-        for t in shaped
-        for n, p in zip(t.names, t.effect.parameters, strict=True)
-        if not p.is_shape and n in free
-    ]
-    found: list[tuple[float, dict[str, float]]] = []
+    best: tuple[float, dict[str, float]] | None = None
     for trial in trials:
         fitted, _ = WeakForm(balances, data, trial, tuple(free), weights).fitted(limits, 6)
         residual = stack(bare_ones, data.train, fitted).residual
         cost = sum(float(np.sum((residual[b] * weights[b]) ** 2)) for b in residual)
-        found.append((cost, fitted))
-    # a law that is wide at a turn and as much higher is the same to rows that hardly see the turn
-    least = min(cost for cost, _ in found)
-    alike = [v for cost, v in found if cost <= (1 + SAME_START) * least]
-    return min(alike, key=lambda v: sum(abs(v[n]) for n in sizes))
+        if best is None or cost < best[0]:
+            best = (cost, fitted)
+    return best[1] if best is not None else values
 
 
 SMOOTHING_SHARES: Final = (0.003, 0.01)
 """Smoothing velocities from which laws of low speed are fitted, as shares of the record's speed."""
-SAME_START: Final = 0.01
-"""Share of the squares by which starts must differ to be told apart: few steps and rows weighed at
-one of them say no more.
-"""
 FLAT: Final = 1e-3
 """Smoothing velocity, in the same, under which no row tells its size: a turn is over between two of
 the points at which friction is evaluated.

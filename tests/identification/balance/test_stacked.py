@@ -157,31 +157,6 @@ def test_a_move_between_two_samples_tells_a_direction_from_three_deviations_of_a
     assert np.all(_either_direction(made, "motor", white(noise)) != known)
 
 
-def test_a_stop_that_is_shorter_than_the_kernel_of_the_velocity_has_no_direction() -> None:
-    """The kernel rounds it off to a turn like any other, and dry friction was of a sure sign in
-    half of it; a turn without a stop is known but for a step or two.
-    """
-    dt, far, stop, noise = 0.002, 100, 4, 1e-6
-    slow_down = 0.5 * 5.0 * (dt * np.arange(far, 0, -1)) ** 2
-
-    def unknown(samples: int, noise: float) -> npt.NDArray[np.intp]:
-        there = np.concatenate([-slow_down, np.zeros(samples), -slow_down[::-1]])
-        made = prepare(
-            dt * np.arange(len(there)),
-            {"motor_position": there},
-            (slice(0, len(there)),),
-            pointwise=0.014,
-        )
-        assert made.grid.step == 1
-        return np.flatnonzero(_either_direction(made, "motor", white(noise)))
-
-    assert {*range(far, far + stop)} <= {*unknown(stop, noise)}
-    assert len(unknown(stop, noise)) <= stop + 2
-    assert len(unknown(1, noise)) <= 3
-    # noise that hides single steps does not hide several: no more than the kernel is unknown
-    assert len(unknown(stop, 30 * noise)) <= 8
-
-
 @pytest.mark.parametrize("seconds", [3.0, 8.0, 40.0])
 def test_the_floor_of_white_noise_is_that_of_its_average_however_short_a_record_is(
     seconds: float,
