@@ -157,10 +157,21 @@ def shape(
     high: float,
     role: Role = "",
     typical: Typical = None,
+    added: bool = False,
 ) -> Parameter:
     """A shape parameter: enters nonlinearly, searched on a grid of fractions of a signal's
     range.
     """
     return Parameter(
-        name, unit, start, low, high, meaning, grid=grid, scale=scale, role=role, typical=typical
+        name,
+        unit,
+        start,
+        low,
+        high,
+        meaning,
+        grid=grid,
+        scale=scale,
+        role=role,
+        typical=typical,
+        added=added,
     )

@@ -54,9 +54,12 @@ def _stops(
             (3.0,),
             "absolute",
             start=3.0,
+            # nearer ones are one element to a record; with 5 the long one is 25 times as wide as
+            # the short one: a spring over all of the motion in which that shows
             low=1.5,
             high=5.0,
             typical=3.0,
+            added=True,
         ),
     ),
     contains=("coulomb",),

@@ -745,13 +745,6 @@ class Session:
                 or found.claims[0].held_out_drop_percent < MAJOR_DROP
             ):
                 continue
-            # the fit of these rows may have ended in a worse valley, which any addition leaves, and
-            # at a turn, which every long row has, the RMS is none of the law's
-            whole = found.steps[-1].solution
-            bare = bench.fitted(now.model, whole.values, again=True)
-            errors = [bench.step(None, None, s).held_out for s in (bare, whole)]
-            if judged_drop(errors[0], errors[1], found.claims[0].balance) < MAJOR_DROP:
-                continue
             claim = replace(found.claims[0], kernel=bench.data.kernel, partial=False)
             model = with_effect(now.model, claim.label)
             start = {**now.values, **found.steps[-1].solution.values}

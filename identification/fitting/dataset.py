@@ -164,8 +164,7 @@ def _read(
     found = settled(fit.model, data.sensing, records, fit.values)
     whole = [_lateness(fit.model, w, place, found) for w in records]
     dt, trained = records[0].grid.dt, len(data.train)
-    stands = tuple(w.shifts.get(place, 0.0) for w in records)
-    if max(abs(k) for k in (*whole, *stands)) <= NEAR * dt:
+    if max(abs(k) for k in whole) <= NEAR * dt:
         return shifts_of(data)
     left: dict[tuple[float, ...], tuple[tuple[int, float], ...]] = {}
 
@@ -187,6 +186,7 @@ def _read(
     def early(samples: float) -> Sequence[tuple[int, float]]:
         return told([-samples * dt] * len(records))
 
+    stands = tuple(w.shifts.get(place, 0.0) for w in records)
     told(stands)
     steps = max(math.ceil(max(abs(k) for k in whole) / dt), 1)
     shares = {i / steps: told([i / steps * k for k in whole]) for i in range(steps + 1)}

@@ -25,3 +25,14 @@ def test_it_is_no_value_where_the_effect_was_not_fitted_or_has_one() -> None:
     assert bare.fitted == {}
     given = {**OLD["fitted"], "gravity_cosine": {"value": -3.0}}
     assert parse_joint({**OLD, "fitted": given}).fitted["gravity_cosine"] == -3.0
+
+
+def test_the_elements_of_an_older_hysteresis_stand_as_they_did() -> None:
+    """Their widths were 1, 3 and 9 times the first: a fit of that time is still all known."""
+    effects = ["structural_damping", "hysteresis"]
+    fitted = {f"hysteresis_torque_{k}": {"value": 2.0} for k in (1, 2, 3)}
+    fitted["hysteresis_width"] = {"value": 1e-4}
+    joint = parse_joint(
+        {"joint": {**OLD["joint"], "model": "hd3", "effects": effects}, "fitted": fitted}
+    )
+    assert joint.fitted["hysteresis_spread"] == 3.0
