@@ -290,6 +290,8 @@ def test_every_view_fits_a_phone_and_passes_axe(served: Served, browser: Browser
             assert page.evaluate("document.documentElement.scrollWidth") <= width, (
                 f"{view} is wider than {width} pixels"
             )
+            if view == "parameters":
+                page.evaluate(WIDEST_VALUES)
             assert cut_or_tiny(page) == [], f"{view} at {width} pixels"
     page.click("#nav-ledger")
     browser.idle("ledger")
@@ -306,6 +308,9 @@ def test_every_view_fits_a_phone_and_passes_axe(served: Served, browser: Browser
     assert wrong == []
 
 
+WIDEST_VALUES = """document.querySelectorAll('.slide input:not([type])').forEach((f) => {
+  f.value = '-0.000619076'; })"""
+"""The last digit of a fit, and with it the width of its field, differ from one machine to the next."""
 LOWEST = 9
 """Height of a letter's line under which a label is not read on a phone [px]."""
 
