@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Final, final
 
 import numpy as np
@@ -21,6 +22,7 @@ from identification.balance.stacked import (
     noise_rows,
     together,
 )
+from identification.balance.turns import Turns, turns_of
 from identification.balance.weak import WeakRecord
 from identification.fitting.engine import (
     Dataset,
@@ -159,6 +161,25 @@ def relative_error_percent(
     return 100 * float(np.linalg.norm(r)) / (float(np.linalg.norm(y)) or 1e-300)
 
 
+def _powers(
+    rows: Mapping[str, FloatArray],
+    weights: Mapping[str, FloatArray],
+    taking: Mapping[str, npt.NDArray[np.bool_]],
+    turning: Callable[[Mapping[str, FloatArray]], Turns],
+) -> dict[str, float]:
+    """Mean square of weighted rows, (rows,) by balance, in a covariance that holds the unknown
+    instants of the turns.
+    """
+    turns = turning(weights)
+    flat = np.concatenate(list(rows.values()))
+    power = flat * turns.without(flat)
+    parts = np.split(power, np.cumsum([len(r) for r in rows.values()])[:-1])
+    return {
+        b: max(float(part.sum()), 0.0) / max(int(taking[b].sum()), 1)
+        for (b, part) in zip(rows, parts, strict=True)
+    }
+
+
 def assess(
     model: JointModel,
     data: Dataset,
@@ -184,21 +205,30 @@ def assess(
     weights = {b: w[rows[b]] for b, w in wide.items()}
     steps = left_open.steps(data, records, values, wide) if left_open is not None else {}
     beside = {b: whole[b] + steps[b].moved if b in steps else whole[b] for b in whole}
+    turning = partial(turns_of, balances, records, values)
     prices = {b: steps[b].price / max(int(rows[b].sum()), 1) if b in steps else 0.0 for b in whole}
-    ratios = {b: math.hypot(rms(beside[b][rows[b]] * weights[b]), prices[b] ** 0.5) for b in whole}
+    over = {b: np.where(rows[b], beside[b] * wide[b], 0.0) for b in balances.balances}
+    powers = _powers(over, wide, rows, turning)
+    ratios = {b: math.sqrt(powers[b] + prices[b]) for b in whole}
     if memory := drift_memory(data):
-        for b, ratio in ratios.items():
-            share = rms(drift[b][rows[b]] * weights[b]) ** 2
-            scatter = np.sqrt(np.maximum(wide[b] ** -2.0 - drift[b] ** 2, quick[b] ** 2))
-            course = innovations(
+        scatter = {
+            b: np.sqrt(np.maximum(wide[b] ** -2.0 - drift[b] ** 2, quick[b] ** 2)) for b in whole
+        }
+        courses = {
+            b: innovations(
                 np.where(rows[b], beside[b], 0.0),
-                np.where(rows[b], scatter, math.inf),
+                np.where(rows[b], scatter[b], math.inf),
                 drift[b],
                 memory=memory,
                 records=records,
             )
+            for b in balances.balances
+        }
+        powers = _powers(courses, {b: 1 / x for b, x in scatter.items()}, rows, turning)
+        for b, ratio in ratios.items():
+            share = rms(drift[b][rows[b]] * weights[b]) ** 2
             ratios[b] = max(
-                math.hypot(rms(course[rows[b]]), prices[b] ** 0.5),
+                math.sqrt(powers[b] + prices[b]),
                 ratio / math.sqrt(1 + min(share, 1.0) * (WALK - 1)),
             )
     floor = {b: f[rows[b]] for b, f in floor.items()}

@@ -37,7 +37,6 @@ from identification.fitting.errors_in_variables.bands import Bands
 from identification.fitting.errors_in_variables.equations import unbiased
 from identification.fitting.errors_in_variables.products import Unbiased
 from identification.fitting.start_values import bounds_of, starts
-from identification.fitting.turns import turns_of
 from identification.fitting.weak_form import WeakForm
 
 __all__ = [
@@ -526,7 +525,7 @@ def _with_errors(
     """
     balances, values, free = problem.balances, problem.values, problem.free
     weights = {b: np.asarray(w, dtype=np.float64) for b, w in problem.weights.items()}
-    bands = Bands(problem, without, turns_of(problem), share)
+    bands = Bands(problem, without, problem.turns, share)
     norms = bands.norms
     smoothing = balances.model.named("smoothing")
     at_bound = _at_bound(balances.model, values, free, limits)

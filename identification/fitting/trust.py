@@ -22,7 +22,6 @@ from identification.fitting.covariance import NORMAL, correlations
 from identification.fitting.engine import Solution
 from identification.fitting.information import eliminated, form_of, white_errors
 from identification.fitting.start_values import bounds_of
-from identification.fitting.turns import turns_of
 from identification.fitting.weak_form import WeakForm
 
 FloatArray = npt.NDArray[np.float64]
@@ -201,7 +200,7 @@ class _Judge:
         stacked = self.form.stacked(x)
         names = self.form.balances.balances
         weights = solution.weights
-        turns = turns_of(self.form)
+        turns = self.form.turns
         self.j = turns.without(
             np.concatenate([stacked.jacobian[b] * weights[b][:, None] for b in names])
         )

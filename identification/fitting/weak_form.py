@@ -18,6 +18,7 @@ from identification.balance.calibration import bare
 from identification.balance.clocks import one_way
 from identification.balance.dataset import Dataset
 from identification.balance.stacked import Stacked, stack
+from identification.balance.turns import Turns, turns_of
 from identification.fitting.least_squares import least_squares
 
 FloatArray = npt.NDArray[np.float64]
@@ -108,6 +109,15 @@ class WeakForm:
     def clocks(self) -> npt.NDArray[np.bool_]:
         """Which of the free parameters are skews of clocks."""
         return np.array([bare([n])[0] in CLOCKS for n in self.free], dtype=bool)
+
+    @cached_property
+    def turns(self) -> Turns:
+        """What unknown instants of the turns may add to the rows, at the values of the problem."""
+        weights = {
+            b: np.broadcast_to(np.asarray(w, dtype=np.float64), (self.rows,))
+            for b, w in self.weights.items()
+        }
+        return turns_of(self.balances, self.data.train, self.values, weights, len(self.prior))
 
     @cached_property
     def bent(self) -> npt.NDArray[np.bool_]:

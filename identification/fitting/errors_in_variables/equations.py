@@ -45,7 +45,7 @@ from identification.fitting.errors_in_variables.products import (
     shares,
     whole_without,
 )
-from identification.fitting.turns import Turns, turns_of
+from identification.balance.turns import Turns
 from identification.fitting.weak_form import WeakForm
 
 FloatArray = npt.NDArray[np.float64]
@@ -96,7 +96,7 @@ def unbiased(
         # noise about where a load turns makes the twist jump by the whole gap: no small error, and
         # what it adds to products is none of a straight line. Such rows count less already
         return Unbiased(dict(problem.values), no_noise(problem))
-    start = _Equations.at(problem, turns_of(problem))
+    start = _Equations.at(problem, problem.turns)
     began = start.rows @ start.rows
     better = _worth_it(start, bounds, moves, share)
     for equations in dict.fromkeys((better, start)):

@@ -10,7 +10,6 @@ from benchmarks.trust import joint_of
 from identification.balance.balances import balances_of
 from identification.balance.dataset import load_dataset, prepared_model
 from identification.fitting.engine import solve
-from identification.fitting.turns import turns_of
 from identification.fitting.weak_form import WeakForm
 from tests.hidden_effect.generator import simulate_case
 
@@ -33,19 +32,17 @@ def test_a_turn_of_dry_friction_is_no_inertia(smoothing: float) -> None:
     assert found.values["motor_inertia"] == pytest.approx(case.parameters["JM"], rel=8e-4)
     assert found.values["motor_viscous"] == pytest.approx(case.parameters["M_B"], rel=8e-4)
     rows = WeakForm(balances_of(model, data.sensing, wrt=()), data, found.values, (), found.weights)
-    turns = turns_of(rows)
+    turns = rows.turns
     left = rows.residual(np.empty(0))
     # nothing is invented: what is left is shorter, and a turn a second is no large share of it
     assert 0.5 * np.linalg.norm(left) < np.linalg.norm(turns.without(left)) < np.linalg.norm(left)
-    still = turns_of(
-        WeakForm(
-            rows.balances,
-            data,
-            {**found.values, "motor_coulomb": 0.0, "link_coulomb": 0.0},
-            (),
-            found.weights,
-        )
-    )
+    still = WeakForm(
+        rows.balances,
+        data,
+        {**found.values, "motor_coulomb": 0.0, "link_coulomb": 0.0},
+        (),
+        found.weights,
+    ).turns
     assert still.without(left) is left
 
 
@@ -61,4 +58,4 @@ def test_a_record_without_a_turn_is_fitted_as_it_is() -> None:
     found = solve(model, data)
     assert found.values["motor_inertia"] == pytest.approx(case.parameters["JM"], rel=5e-3)
     form = WeakForm(balances_of(model, data.sensing, wrt=()), data, found.values, (), found.weights)
-    assert turns_of(form).columns is None
+    assert form.turns.columns is None

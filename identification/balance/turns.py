@@ -9,15 +9,16 @@ friction that changes its sign some milliseconds sooner or later would give them
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, final
 
 import numpy as np
 import numpy.typing as npt
 
+from identification.balance.balances import Balances
 from identification.balance.stacked import TURN_SHARE, sticking_torque
 from identification.balance.weak import RESTING_SIDES, WeakRecord, whole
-from identification.fitting.weak_form import WeakForm
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -53,50 +54,61 @@ class Turns:
         return np.asarray(rows - explained, dtype=np.float64)
 
 
-def turns_of(problem: WeakForm) -> Turns:
-    """The turns of a problem's training records under the dry friction of its values.
+def turns_of(
+    balances: Balances,
+    records: Sequence[WeakRecord],
+    values: Mapping[str, float],
+    weights: Mapping[str, FloatArray],
+    more: int = 0,
+) -> Turns:
+    """The turns of records under the dry friction of a model's values.
 
     A law with memory says itself what happens at a turn; inside a gap nothing is told of it.
+
+    Parameters
+    ----------
+    balances : Balances
+    records : sequence of WeakRecord
+    values : mapping of str to float
+    weights : mapping of str to (rows,) array
+        1/deviation of each row, by balance.
+    more : int
+        Rows that follow those of the balances and know nothing of a turn.
     """
-    model = problem.balances.model
+    model = balances.model
     remembers = {t.place for t in model.terms if t.effect.memory is not None}
     levels = {
         side: level
         for side in ("motor", "link")
-        if side not in remembers and (level := sticking_torque(model, problem.values, side))
+        if side not in remembers and (level := sticking_torque(model, values, side))
     }
-    if not levels or problem.balances.has_gap:
+    if not levels or balances.has_gap:
         return Turns()
+    ends = np.cumsum([0, *(w.rows for w in records)])
+    each = int(ends[-1])
     parts = [
         (balance, first, record, side)
-        for balance in range(len(problem.balances.balances))
-        for first, record in zip(_first_rows(problem), problem.data.train, strict=True)
-        for side in RESTING_SIDES.get(problem.balances.balances[balance], ())
+        for balance in range(len(balances.balances))
+        for first, record in zip(ends.tolist(), records, strict=False)
+        for side in RESTING_SIDES.get(balances.balances[balance], ())
         if side in levels and f"{side}_velocity" in record.points
     ]
-    rows, columns, values, count = [], [], [], 0
+    rows, columns, values_, count = [], [], [], 0
     for balance, first, record, side in parts:
-        name = problem.balances.balances[balance]
+        name = balances.balances[balance]
         found = (record.averaging @ (levels[side] * _at_turns(record, side))).tocoo()
         row, column = found.coords
-        own = slice(first, first + record.rows)
-        weight = np.broadcast_to(problem.weights[name], (problem.rows,))[own] * record.taking(name)
-        rows.append(balance * problem.rows + first + row)
+        weight = weights[name][first : first + record.rows] * record.taking(name)
+        rows.append(balance * each + first + row)
         columns.append(count + column)
-        values.append(found.data * weight[row])
+        values_.append(found.data * weight[row])
         count += found.shape[1]
     if not count:
         return Turns()
-    total = len(problem.balances.balances) * problem.rows + len(problem.prior)
+    total = len(balances.balances) * each + more
     return _factorised(
-        np.concatenate(rows), np.concatenate(columns), np.concatenate(values), (total, count)
+        np.concatenate(rows), np.concatenate(columns), np.concatenate(values_), (total, count)
     )
-
-
-def _first_rows(problem: WeakForm) -> list[int]:
-    """First row of each training record."""
-    counts = [w.rows for w in problem.data.train]
-    return [sum(counts[:k]) for k in range(len(counts))]
 
 
 def _at_turns(record: WeakRecord, side: str) -> Any:
