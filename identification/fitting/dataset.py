@@ -53,6 +53,7 @@ def dataset_of(
     kernel: float | None = None,
     like: Sensing | None = None,
     beside: tuple[Solution, Sequence[Mapping[str, float]]] | None = None,
+    alone: bool = False,
 ) -> Dataset:
     """:func:`load_dataset`, with channels shifted by as much as the fit says that they are late.
 
@@ -73,6 +74,9 @@ def dataset_of(
     beside : (Solution, sequence of mapping), optional
         A fitted model that has more laws, and the shifts of the training and held-out records from
         which the clocks are asked again with it.
+    alone : bool
+        Whether how a drive is read is left as each record alone has it, beside free coefficients of
+        all that it follows from.
 
     Raises
     ------
@@ -92,7 +96,7 @@ def dataset_of(
 
     try:
         data, fit = _in_time(read, load, fitted)
-        for place in (p for p in places_of(model) if p in LOW_PASSED):
+        for place in (p for p in places_of(model) if p in LOW_PASSED and not alone):
             late = _read(place, data, probe, fit)
             if late != shifts_of(data):
                 data, fit = _in_time(load(late=late), load, fitted)
@@ -242,10 +246,12 @@ def _half_cycle(left: Callable[[float], Sequence[tuple[int, float]]]) -> float:
     if bend <= 0 or slope >= 0:
         return 0.0
     at = min(-slope / (2 * bend), 2.0)
-    fall = -(slope * at + bend * at**2)
-    told = fall / (max(none - fall, 1e-300) / sum(n for n, _ in left(0.0)))
+    rows = sum(n for n, _ in left(0.0))
+    # three points far from least are no parabola: one through them may fall below what noise leaves
+    rest = max(none + slope * at + bend * at**2, min(none, float(rows)))
+    told = (none - rest) / (rest / rows)
     early = at * half
     return early * told / (told + PRICE * (early / USUAL_HALF) ** 2)
 
 
-__all__ = ["dataset_of", "shifts_of"]
+__all__ = ["BETTER", "dataset_of", "shifts_of"]

@@ -115,8 +115,9 @@ def main(argv: list[str] | None = None) -> int:
             sys.stderr.write("time is up; start again with the same --json to go on\n")
             break
         job = Job(failed.seed, failed.sensors, limit=options.limit, seconds=options.seconds)
-        if job.case().kind != failed.kind:  # the campaign asked for its kind
-            job = replace(job, kind=failed.kind)
+        drawn = job.case()
+        if (drawn.kind, drawn.size) != (failed.kind, failed.size):  # the campaign asked for these
+            job = replace(job, kind=failed.kind, size=failed.size)
         for cause, shows, answer in causes(job):
             row: dict[str, object] = {
                 "case": name,

@@ -153,3 +153,13 @@ def test_the_library_is_tried_once_on_the_start_model(
     structure = found.steps[0].solution.model.structure
     assert any(b.solution.model.structure == structure for b in bases[:before])
     assert not any(b.solution.model.structure == structure for b in bases[before:])
+
+
+@pytest.mark.parametrize("ratios", [(5.27, 6.27, 20.5), (1.0, 1.0, 1.0), (5.0, 2.0, 5.0)])
+def test_half_a_cycle_is_a_number_where_three_points_are_no_parabola(
+    ratios: tuple[float, float, float],
+) -> None:
+    """The first made an internal error of an answer: a parabola fell below nothing."""
+    half = HALF_A_CYCLE / 2
+    early = _half_cycle(lambda samples: [(1932, ratios[round(samples / half)])])
+    assert 0.0 <= early <= 2 * half
