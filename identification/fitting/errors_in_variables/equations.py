@@ -26,6 +26,7 @@ from identification.balance.stacked import (
     noise_believed,
     stack,
 )
+from identification.balance.turns import Turns
 from identification.fitting.covariance import RANK
 from identification.fitting.errors_in_variables.bands import Bands
 from identification.fitting.errors_in_variables.instruments import (
@@ -45,7 +46,6 @@ from identification.fitting.errors_in_variables.products import (
     shares,
     whole_without,
 )
-from identification.balance.turns import Turns
 from identification.fitting.weak_form import WeakForm
 
 FloatArray = npt.NDArray[np.float64]

@@ -9,6 +9,7 @@ import pytest
 
 from casadi_models import JointModel
 from identification import Joint, Record, compare, fit, improve, load_joint, read
+from identification.balance.clocks import HALF_A_CYCLE
 from identification.balance.dataset import Dataset, load_dataset, prepared_model
 from identification.balance.weak import WeakRecord
 from identification.data.check.gate import passed
@@ -18,7 +19,7 @@ from identification.diagnosis.session import Session
 from identification.diagnosis.trials import Base
 from identification.errors import InputError
 from identification.fitting.assess import assess
-from identification.fitting.dataset import dataset_of
+from identification.fitting.dataset import _half_cycle, dataset_of
 from identification.fitting.first_fit import first_fit
 from tests.recorded_world.world import make_case, write_case
 
@@ -83,7 +84,7 @@ def test_a_filtered_drive_is_told_from_one_that_waits_by_what_the_fit_leaves(
             for part in (data.train, data.held_out)
         ]
 
-    assert max(ratios(read_so)) > 2.4
+    assert max(ratios(read_so)) > 2.0
     assert max(ratios(fitted)) < 1.2
     assert all(-0.3 < late(w, "drive") <= 0 for w in (*fitted.train, *fitted.held_out))
 
@@ -163,3 +164,23 @@ def test_half_a_cycle_is_a_number_where_three_points_are_no_parabola(
     half = HALF_A_CYCLE / 2
     early = _half_cycle(lambda samples: [(1932, ratios[round(samples / half)])])
     assert 0.0 <= early <= 2 * half
+
+
+@pytest.mark.parametrize("seed", [173007, 173017])
+def test_a_stick_shorter_than_a_kernel_is_no_structure(seed: int, tmp_path: Path) -> None:
+    """Light joints at 1 kHz, nothing hidden: they stand for a millisecond at each turn, and a tenth
+    of the rows then held nine tenths of what was left, 4.3 and 5.4 times the noise.
+    """
+    joint, train, test = recorded(seed, "none", tmp_path)
+    made = Session.opened([train], joint, [test]).bench
+    assert max(e.ratio for e in made.ratios(made.step(None, None, made.start())).values()) < 1.5
+
+
+def test_a_missing_scale_bends_no_clock(tmp_path: Path) -> None:
+    """A drive through a low-pass, and a motor constant that is off: half of the lateness as a wait
+    fits best where the scale is missing, and beside that no name was found.
+    """
+    joint, train, test = recorded(220009, "single", tmp_path, "motor_torque")
+    found = improve([train], joint, [test])
+    assert found.verdict == "complete"
+    assert "motor_constant_error" in {e.partition("@")[0] for c in found.claims for e in c.effects}
