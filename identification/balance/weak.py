@@ -389,7 +389,10 @@ class WeakRecord:
             ]
             for i, one in enumerate(names):
                 for j, other in enumerate(names[: i + 1]):
-                    out[one, other] = self.grid.correlate(power, kernels[i] * kernels[j])
+                    inner = len(kernels[j])  # those of higher derivatives may be longer
+                    outside = (len(kernels[i]) - inner) // 2
+                    same = kernels[i][outside : outside + inner]
+                    out[one, other] = self.grid.correlate(power, same * kernels[j])
         return out
 
     @property
