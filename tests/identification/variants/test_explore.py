@@ -25,7 +25,8 @@ from identification.variants.choice import (
     tied_with_best,
 )
 from identification.variants.exploration import table_of
-from identification.variants.explore import _Search
+from identification.variants.explore import Search
+from identification.variants.ground import JointGround
 from identification.variants.lattice import assembled, nodes_of, price_of, together
 from identification.variants.refit import Weighting, held_of, refitted
 from identification.variants.screen import Screen
@@ -214,7 +215,8 @@ def test_a_variant_in_a_worse_valley_is_fitted_again_from_the_best() -> None:
     with them.
     """
     found, start = session(), session().start()
-    search = _Search(found, start, read(DEMO / "train.npz"), lambda text, share: None)
+    ground = JointGround(found, read(DEMO / "train.npz"))
+    search = Search(ground, start, lambda text, share: None)
     true = start.model.add(f"{HIDDEN}@motor")
     search._fit(start.model, start.values)
     search._fit(true, start.values)
