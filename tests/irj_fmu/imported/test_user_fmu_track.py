@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from identification.data.record import Record
-from identification.errors import InputError
 from identification.faults.bank_statistics import over_windows
 from identification.faults.types import Verdict
 from irj_fmu.imported.file import load_user_joint, user_joint_text
@@ -179,10 +178,3 @@ def test_records_that_do_not_go_together_are_refused(
     assert "sampled every 0.002 s" in line and "resample" in line
     line = refused(place, capsys, "track", str(place / "lame.npz"), *given)
     assert "has no link_torque" in line
-
-
-def test_no_output_that_is_recorded_is_refused(path: Path) -> None:
-    with pytest.raises(InputError, match="no channel is mapped to an output"):
-        from irj_fmu.imported.model import load_user_model
-
-        load_user_model(path, {"motor_torque": "torque"})
