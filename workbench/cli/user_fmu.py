@@ -57,6 +57,11 @@ def module_of(arguments: Namespace) -> str:
         )
     if not isinstance(path, str) or not _has_model(path):
         return str(arguments.module)
+    if arguments.verb == "batch":
+        raise InputError(
+            f"{path}: `irj batch` takes a study file: write [[joint]] and below it joint = "
+            '"FILE" and records = ["FILE"], and run irj batch STUDY.toml (docs/batch.md)'
+        )
     if arguments.verb not in VERBS:
         raise InputError(
             f"{path}: its model is an FMU; `irj {arguments.verb}` does not take one, only "

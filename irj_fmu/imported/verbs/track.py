@@ -42,6 +42,7 @@ STEPS: Final = 8
 """Gauss-Newton steps of the start values, as `compare` takes."""
 UNREAD: Final = 1e6
 """Standard deviations of a channel that counts for nothing, in units of its own spread."""
+SPEEDS: Final = ("motor_velocity", "link_velocity")
 POINTS: Final = 400
 """Points of the residuals' course that are kept per record."""
 
@@ -258,18 +259,21 @@ class Watch:
         self, simulator: Simulator, windows: Sequence[Window], sigma: FloatArray
     ) -> FloatArray:
         """Outputs along the windows from the start values that their readings tell."""
-        problem = Outputs(windows, simulator, self.model.values, (), sigma)
-        starts = start_values(windows)
+        values, starts = self.model.values, start_values(windows)
         if self.model.starts:
-            starts = least_squares(
-                problem,
-                np.empty(0),
-                (np.empty(0), np.empty(0)),
-                local=starts,
-                iterations=STEPS,
-                tolerance=ENOUGH / sum(w.outputs.size for w in windows),
-            ).local
-        return np.concatenate(simulator.simulate(problem.values, starts))
+            problem = Outputs(windows, simulator, values, (), sigma)
+            starts, cost = _settled(problem, starts)
+            rows = np.array([w.outputs.size for w in windows])
+            for other in other_starts(self.model, windows):
+                # windows that their own readings do not settle
+                left = cost > RATIO_LIMIT**2 * rows
+                if not left.any():
+                    break
+                begun = np.where(left[:, None], other, starts)
+                found, less = _settled(problem, begun)
+                starts = np.where((less < cost)[:, None], found, starts)
+                cost = np.minimum(less, cost)
+        return np.concatenate(simulator.simulate(values, starts))
 
     def _alarms(
         self, time: FloatArray, scores: dict[int | None, FloatArray], dt: float
@@ -304,6 +308,44 @@ class Watch:
             if not innocent:
                 return end, Verdict.PLANT, drive
         return end, Verdict.ONE_OF, tuple(innocent)
+
+
+def _settled(problem: Outputs, starts: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Start values of the windows by their own readings, and the sum of squares of each."""
+    none = np.empty(0)
+    found = least_squares(
+        problem,
+        none,
+        (none, none),
+        local=starts,
+        iterations=STEPS,
+        tolerance=ENOUGH / sum(w.outputs.size for w in problem.windows),
+    ).local
+    return found, problem.costs(none, found)
+
+
+def other_starts(model: UserModel, windows: Sequence[Window]) -> list[FloatArray]:
+    """Start values with other velocities, (windows, starts) each.
+
+    Where a window begins at a turn, the slope of the noisy positions may have the other sign: dry
+    friction then holds the motor, and no step of its velocity moves an output. The velocity of the
+    other side, and none at all, begin on the right side of the turn.
+    """
+    own = start_values(windows)
+    speeds = {m.channel: k for k, m in enumerate(model.starts) if m.channel in SPEEDS}
+    out = []
+    if len(speeds) == 2:
+        motor, link = (model.starts[speeds[c]].scale for c in SPEEDS)
+        factor = model.joint.gear_ratio * motor / link
+        for one, other, by in ((*SPEEDS, factor), (*SPEEDS[::-1], 1 / factor)):
+            moved = own.copy()
+            moved[:, speeds[one]] = by * own[:, speeds[other]]
+            out.append(moved)
+    for share in (0.0, -1.0):
+        moved = own.copy()
+        moved[:, list(speeds.values())] *= share
+        out.append(moved)
+    return out if speeds else []
 
 
 def _cut(model: UserModel) -> UserModel:

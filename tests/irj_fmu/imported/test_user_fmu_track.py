@@ -50,6 +50,15 @@ def test_a_healthy_record_is_silent(watch: Watch, seed: int) -> None:
     assert found.ratios == pytest.approx(dict.fromkeys(found.channels, 1.0), abs=0.05)
 
 
+def test_a_window_that_begins_at_a_turn_is_no_fault(watch: Watch) -> None:
+    """The slope of the noisy positions has the wrong sign there, dry friction holds the motor, and
+    no step led away: a healthy record stood at 46 times its noise.
+    """
+    found = watch.run(recorded(None, 8.0, 4).window(0, 2))
+    assert found.alarms == ()
+    assert found.ratios == pytest.approx(dict.fromkeys(found.channels, 1.0), abs=0.1)
+
+
 @pytest.mark.parametrize(
     ("channel", "size"),
     [("motor_position", 2e-3), ("link_position", 2e-5), ("link_torque", 0.5)],
