@@ -30,7 +30,7 @@ from irj_fmu.imported.fit import ENOUGH, Outputs, UserFit, simulator_of
 from irj_fmu.imported.model import UserModel, at_least_one, start_values
 from irj_fmu.imported.outputs import noise_of
 from irj_fmu.imported.port import coupled
-from irj_fmu.imported.run import Window
+from irj_fmu.imported.run import RTOL, Window
 from irj_fmu.imported.sensitivity import Simulator
 
 BoolArray = npt.NDArray[np.bool_]
@@ -180,9 +180,9 @@ class Watch:
         if not given:
             return
         courses = [self._courses(r, f"healthy record {r.name}") for r in given]
-        for key in courses[0]:
+        for key, course in courses[0].items():
             parts = [over_windows(c[key], r.dt) for c, r in zip(courses, given, strict=True)]
-            self._limits[key] = limits(parts, given[0].dt, (), parts[0].shape[1] // 8)
+            self._limits[key] = limits(parts, given[0].dt, (), course.shape[1])
         self._dt = given[0].dt
 
     def run(self, record: Record) -> UserTrack:
@@ -199,9 +199,7 @@ class Watch:
                 f"{self._dt:.4g} s; give records with one sample time, or irj resample them"
             )
         courses = self._courses(record, record.name)
-        scores = {
-            k: self._score(k, over_windows(c, record.dt), record.dt) for k, c in courses.items()
-        }
+        scores = {k: self._score(k, c, record.dt) for k, c in courses.items()}
         whole = courses[None]
         windows = self.model.windows([record])
         time = np.concatenate([w.time for w in windows])
@@ -222,13 +220,18 @@ class Watch:
     # --- inside -----------------------------------------------------------------------------------
 
     def _levels(self, record: Record) -> FloatArray:
-        return self._noise if self._noise is not None else noise_of(self.model, [record])
+        """Standard deviations of the outputs; of a channel without noise what runs of the FMU
+        differ by.
+        """
+        known = self._noise if self._noise is not None else noise_of(self.model, [record])
+        spans = [abs(m.scale) * float(np.ptp(record[m.channel])) for m in self.model.outputs]
+        return np.maximum(np.maximum(known, RTOL * np.array(spans)), 1e-300)
 
-    def _score(self, key: int | None, found: FloatArray, dt: float) -> FloatArray:
+    def _score(self, key: int | None, course: FloatArray, dt: float) -> FloatArray:
         """Largest statistic over its limit, (n,)."""
-        known = self._limits.get(key)
+        found, known = over_windows(course, dt), self._limits.get(key)
         if known is None:
-            known = RATIO_LIMIT * floors(dt, (), found.shape[1] // 8)
+            known = RATIO_LIMIT * floors(dt, (), course.shape[1])
         return np.asarray((found / known).max(axis=1), dtype=np.float64)
 
     def _courses(self, record: Record, name: str) -> dict[int | None, FloatArray]:
@@ -236,7 +239,7 @@ class Watch:
         and of those that leave out one.
         """
         windows = self.model.windows([record])
-        noise = np.maximum(self._levels(record), 1e-300)
+        noise = self._levels(record)
         model = self.model
         if model.coupling is None:
             model = coupled(model, windows, noise)
