@@ -18,12 +18,11 @@ from identification.diagnosis.improve import improve
 from identification.errors import InputError
 from identification.fitting.fit import fit
 from identification.variants.explore import explore
+from irj_fmu.batch.found import Found
 from irj_fmu.command_line import finite
 from irj_fmu.host.fmu import FmuError
 
 File = tuple[str, bytes]
-Found = tuple[dict[str, Any], Mapping[str, Any], str, dict[str, Any]]
-"""Figures, parameters, text of the joint file, the whole as `--json` gives it."""
 
 
 @final

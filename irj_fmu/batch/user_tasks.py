@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
 from identification.data.check.gate import gated
 from identification.data.joint_file import Joint
 from identification.data.record import Record
+from irj_fmu.batch.found import Found
 from irj_fmu.imported.compare import compare
 from irj_fmu.imported.file import load_user_joint, user_joint_text
 from irj_fmu.imported.fit import fit, parameter_table
@@ -19,10 +20,7 @@ from irj_fmu.imported.model import UserModel
 from irj_fmu.imported.outputs import UserComparison
 from irj_fmu.imported.verbs.explore import explore
 
-if TYPE_CHECKING:
-    from irj_fmu.batch.fit_worker import Found
-
-    Task = Callable[[UserModel, Sequence[Record], Sequence[Record], str], Found]
+Task = Callable[[UserModel, Sequence[Record], Sequence[Record], str], Found]
 
 
 def _fit(model: UserModel, train: Sequence[Record], held: Sequence[Record], known: str) -> Found:

@@ -210,10 +210,10 @@ class Watch:
             record,
             self.channels,
             time,
-            whole * noise,
-            scores[None],
-            dict(zip(self.channels, ratios.tolist(), strict=True)),
-            tuple(self._alarms(time, scores, record.dt)),
+            residuals=whole * noise,
+            scores=scores[None],
+            ratios=dict(zip(self.channels, ratios.tolist(), strict=True)),
+            alarms=tuple(self._alarms(time, scores, record.dt)),
             calibrated=bool(self._limits),
         )
 
