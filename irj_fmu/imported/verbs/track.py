@@ -43,6 +43,9 @@ STEPS: Final = 8
 UNREAD: Final = 1e6
 """Standard deviations of a channel that counts for nothing, in units of its own spread."""
 SPEEDS: Final = ("motor_velocity", "link_velocity")
+TURN: Final = 0.05
+"""Share of a record's largest start velocity below which a window begins near a turn: slopes of
+encoders are a hundredth of it wrong, and one window in thirty begins there."""
 POINTS: Final = 400
 """Points of the residuals' course that are kept per record."""
 
@@ -267,9 +270,10 @@ class Watch:
             problem = Outputs(windows, simulator, values, (), sigma)
             starts, cost = _settled(problem, starts)
             rows = np.array([w.outputs.size for w in windows])
-            for other in other_starts(self.model, windows):
-                # windows that their own readings do not settle
-                left = cost > RATIO_LIMIT**2 * rows
+            turns, others = other_starts(self.model, windows)
+            for other in others:
+                # windows that their own readings do not settle; a fault leaves all of them so
+                left = (cost > RATIO_LIMIT**2 * rows) & turns
                 if not left.any():
                     break
                 begun = np.where(left[:, None], other, starts)
@@ -327,28 +331,35 @@ def _settled(problem: Outputs, starts: FloatArray) -> tuple[FloatArray, FloatArr
     return found, problem.costs(none, found)
 
 
-def other_starts(model: UserModel, windows: Sequence[Window]) -> list[FloatArray]:
-    """Start values with other velocities, (windows, starts) each.
+def other_starts(model: UserModel, windows: Sequence[Window]) -> tuple[BoolArray, list[FloatArray]]:
+    """Windows that begin near a turn, (windows,), and start values with other velocities, (windows,
+    starts) each.
 
-    Where a window begins at a turn, the slope of the noisy positions may have the other sign: dry
-    friction then holds the motor, and no step of its velocity moves an output. The velocity of the
-    other side, and none at all, begin on the right side of the turn.
+    There the slope of noisy positions may have the other sign: dry friction then holds the motor,
+    and no step of its velocity moves an output. The velocity of the other side, or none and its
+    opposite where there is no other side, begin on the right side of the turn.
     """
     own = start_values(windows)
-    speeds = {m.channel: k for k, m in enumerate(model.starts) if m.channel in SPEEDS}
+    speeds = [k for k, m in enumerate(model.starts) if m.channel in SPEEDS]
+    if not speeds:
+        return np.zeros(len(windows), dtype=bool), []
+    size = np.abs(own[:, speeds])
+    turns = (size < TURN * size.max(axis=0, initial=0.0)).any(axis=1)
     out = []
     if len(speeds) == 2:
-        motor, link = (model.starts[speeds[c]].scale for c in SPEEDS)
-        factor = model.joint.gear_ratio * motor / link
-        for one, other, by in ((*SPEEDS, factor), (*SPEEDS[::-1], 1 / factor)):
+        side = {model.starts[k].channel: k for k in speeds}
+        motor, link = (side[c] for c in SPEEDS)
+        factor = model.joint.gear_ratio * model.starts[motor].scale / model.starts[link].scale
+        for to, of, by in ((motor, link, factor), (link, motor, 1 / factor)):
             moved = own.copy()
-            moved[:, speeds[one]] = by * own[:, speeds[other]]
+            moved[:, to] = by * own[:, of]
             out.append(moved)
+        return turns, out
     for share in (0.0, -1.0):
         moved = own.copy()
-        moved[:, list(speeds.values())] *= share
+        moved[:, speeds] *= share
         out.append(moved)
-    return out if speeds else []
+    return turns, out
 
 
 def _cut(model: UserModel) -> UserModel:

@@ -211,3 +211,15 @@ def test_a_table_that_cannot_be_believed_is_refused_in_a_line(case: str) -> None
         parse_joint(tables, "j.toml")
     assert said in str(caught.value)
     assert str(caught.value).startswith("j.toml: ") and "\n" not in str(caught.value)
+
+
+def test_a_fit_by_the_outputs_writes_none(tmp_path: Path) -> None:
+    """Its errors are those of other rows: a table of the balances would stand beside them."""
+    record = tmp_path / "short.npz"
+    with np.load(DEMO / "train.npz") as archive:
+        np.savez(record, **{n: archive[n][:2500] for n in archive.files})
+    out = tmp_path / "refined.toml"
+    given = ["fit", str(record), "--joint", str(DEMO / "joint.toml"), "-o", str(out)]
+    assert main([*given, "--refine"]) == 0
+    assert load_joint(out).correlation == Correlation()
+    assert load_joint(out).errors
