@@ -10,7 +10,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from identification.data.record import Record
+from identification.diagnosis.improvement import Improvement
 from identification.errors import InputError
+from identification.fitting.trust import Trust
 from identification.variants.exploration import Exploration, table_of
 from identification.variants.explore import explore
 from irj_fmu.command_line import check_folder, finite, keep_inputs, replace_files
@@ -42,7 +44,8 @@ def run_explore(arguments: Namespace) -> int:
     progress_bar("done", 1.0)
     print_warnings(found.warnings, [*records, *held])
     print_exploration(found)
-    delivered(arguments, found, found.as_json(), [*records, *held], found.to_joint_file)
+    every = [*records, *held]
+    delivered(arguments, found, found.as_json(), every, found.to_joint_file, judge=trusted)
     return 0
 
 
@@ -65,6 +68,8 @@ def delivered(
     data: Any,
     records: Sequence[Record],
     joint_text: Callable[[], str],
+    *,
+    judge: Callable[[Improvement], Trust | None] = lambda _found: None,
 ) -> None:
     """Write the files that were asked for: variants, picture, joint file, JSON and report.
 
@@ -77,6 +82,8 @@ def delivered(
     records : sequence of Record
     joint_text : callable
         Text of the joint file of the recommended variant.
+    judge : callable
+        Which number of the loop the report trusts; by default it does not say.
     """
     if arguments.out:
         made = (
@@ -101,7 +108,7 @@ def delivered(
             arguments.report,
             records=records,
             command=arguments.command,
-            trust=trusted(found.improvement),
+            trust=judge(found.improvement),
             exploration=found,
         )
         print(f"report: {made_report}")

@@ -49,8 +49,8 @@ def _of_file(joint: Joint, arguments: Namespace) -> int:
     found = trusted_file(joint)
     if not joint.correlation.names:
         print(
-            f"irj: {arguments.joint}: does not say how its standard errors go together; what trades "
-            "with what needs the records, or a new fit (irj fit -o)",
+            f"irj: {arguments.joint}: does not say how its standard errors go together; what "
+            "trades with what needs the records, or a new fit (irj fit -o)",
             file=sys.stderr,
         )
     print("from the joint file alone; 95 % intervals in brackets")

@@ -109,6 +109,12 @@ def test_a_joint_of_one_side_is_explored(tmp_path: Path) -> None:
     joint.write_text(FILE.format(fmu="axis.fmu"))
     record = axis(lambda _q, w: 0.15 * w * abs(w), seconds=10.0, h=4e-3)
     found = explore(load_user_joint(joint), record.window(0, 6), record.window(6, 10))
+    for name, part in (("a", record.window(0, 6)), ("b", record.window(6, 10))):
+        write_record(part, tmp_path / f"{name}.npz")
+    given = [str(tmp_path / "a.npz"), "--held-out", str(tmp_path / "b.npz")]
+    report = tmp_path / "r.html"
+    assert main(["explore", *given, "--joint", str(joint), "--report", str(report)]) == 0
+    assert "quadratic drag" in report.read_text(encoding="utf-8").lower()
     labels = [v.added for v in found.found.ties]
     assert any("quadratic_drag" in "".join(added) for added in labels)
     assert any("quadratic_drag" in "".join(v.added) for v in found.found.front)
