@@ -29,7 +29,7 @@ PAGES: Final = {  # blocks that are not run
     "docs/linear.md": 0,
     "docs/extending.md": 0,
     "docs/batch.md": 1,
-    "docs/user-fmu.md": 0,
+    "docs/user-fmu.md": 2,
     "docs/workbench.md": 1,
 }
 

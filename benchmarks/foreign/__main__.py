@@ -1,8 +1,10 @@
-"""Figures of foreign FMUs: ``python -m benchmarks.foreign [names | makes | coverage] [-h] ...``.
+"""Figures of foreign FMUs: ``python -m benchmarks.foreign [names | variants | watch | makes |
+coverage] [-h] ...``.
 
-``names`` (the default) hides effects in the plant and asks for their names, ``makes`` fits
-FMUs of other makes in processes of their own, ``coverage`` fits laws outside the FMU over many
-seeds and counts the true values inside the intervals.
+``names`` (the default) hides effects in the plant and asks for their names, ``variants`` asks
+`explore` for them, ``watch`` puts sensors wrong under `track`, ``makes`` fits FMUs of other makes
+in processes of their own, ``coverage`` fits laws outside the FMU over many seeds and counts the
+true values inside the intervals.
 """
 
 from __future__ import annotations
@@ -10,9 +12,15 @@ from __future__ import annotations
 import sys
 from typing import Final
 
-from benchmarks.foreign import coverage, makes, names
+from benchmarks.foreign import coverage, makes, names, variants, watch
 
-TABLES: Final = {"names": names.main, "makes": makes.main, "coverage": coverage.main}
+TABLES: Final = {
+    "names": names.main,
+    "variants": variants.main,
+    "watch": watch.main,
+    "makes": makes.main,
+    "coverage": coverage.main,
+}
 
 
 def main(arguments: list[str]) -> int:

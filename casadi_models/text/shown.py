@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
 from types import MappingProxyType
@@ -274,6 +274,9 @@ def shown(
     model: Solvable,
     language: Language = "text",
     errors: Mapping[str, float] = MappingProxyType({}),
+    *,
+    fitted: Collection[str] | None = None,
+    trades: Sequence[str] = (),
 ) -> str:
     """The joint's equations and values.
 
@@ -283,24 +286,33 @@ def shown(
     language : {"text", "latex", "sympy"}
     errors : mapping
         Standard errors of the values, by parameter name.
+    fitted : collection of str, optional
+        Parameters that a fit has found: the others are said to have start values. By default
+        nothing is said of where the values come from.
+    trades : sequence of str
+        Which of them go together, a sentence each; below the values of a text.
     """
     equations = readable(shown_equations(model))
+    values = values_of(model, errors, fitted)
     if language == "latex":
-        return _latex(equations, values_of(model, errors))
-    return (
-        _sympy(equations, model, errors) if language == "sympy" else _text(equations, model, errors)
-    )
+        return _latex(equations, values, _heading(values))
+    if language == "sympy":
+        return _sympy(equations, model, values)
+    return _text(equations, model, values, trades)
 
 
-def values_of(model: Solvable, errors: Mapping[str, float]) -> list[dict[str, Any]]:
+def values_of(
+    model: Solvable, errors: Mapping[str, float], fitted: Collection[str] | None = None
+) -> list[dict[str, Any]]:
     """Name, value, standard error (None where there is none), unit, side and meaning of every
-    parameter.
+    parameter, and whether it was fitted (None where `fitted` does not say).
     """
     return [
         {
             "name": p.name,
             "value": v,
             "stderr": errors.get(p.name),
+            "fitted": None if fitted is None else p.name in fitted,
             "unit": p.unit,
             "side": p.side,
             "meaning": p.meaning,
@@ -309,8 +321,19 @@ def values_of(model: Solvable, errors: Mapping[str, float]) -> list[dict[str, An
     ]
 
 
+def _heading(values: Sequence[Mapping[str, Any]]) -> str:
+    """What the values are."""
+    if values and all(v["fitted"] is False for v in values):
+        return "start values: nothing is fitted yet"
+    told = any(v["stderr"] is not None for v in values)
+    return "values +- standard error" if told else "values"
+
+
 def _text(
-    equations: Sequence[ReadableEquation], model: Solvable, errors: Mapping[str, float]
+    equations: Sequence[ReadableEquation],
+    model: Solvable,
+    values: Sequence[Mapping[str, Any]],
+    trades: Sequence[str],
 ) -> str:
     lines = [
         f"{model.name}: gear ratio {model.gear_ratio:g}; all quantities are referred to the "
@@ -326,13 +349,17 @@ def _text(
             lines += _broken(f"    {head} {body}", source)
         for symbol, definition in where:
             lines += _broken(f"    with {written(symbol)} = {written(definition)}", "")
-    lines += ["", "values +- standard error"]
-    for v in values_of(model, errors):
+    heading = _heading(values)
+    lines += ["", heading]
+    for v in values:
         error = f" +- {v['stderr']:.2g}" if v["stderr"] is not None else ""
+        start = " (start value)" if v["fitted"] is False and not heading.startswith("start") else ""
         lines.append(
-            f"  {v['name']} = {v['value']:.6g}{error} {v['unit']}".ljust(_WIDTH)
+            f"  {v['name']} = {v['value']:.6g}{error} {v['unit']}{start}".ljust(_WIDTH)
             + f"  # {v['meaning']}"
         )
+    if trades:
+        lines += ["", "errors that go together", *(f"  {text}" for text in trades)]
     return "\n".join(lines) + "\n"
 
 
@@ -367,7 +394,9 @@ def _summands(text: str) -> list[str]:
     return [text[i:j].rstrip() for i, j in zip(cuts, cuts[1:], strict=False)]
 
 
-def _latex(equations: Sequence[ReadableEquation], values: Sequence[Mapping[str, Any]]) -> str:
+def _latex(
+    equations: Sequence[ReadableEquation], values: Sequence[Mapping[str, Any]], heading: str
+) -> str:
     rows = []
     for e, where in ((r.equation, r.where) for r in equations):
         left = written(e.left, "latex", LATEX_SIGNALS)
@@ -384,6 +413,8 @@ def _latex(equations: Sequence[ReadableEquation], values: Sequence[Mapping[str, 
         + (rf"\;{_latex_unit(v['unit'])}" if v["unit"] != "1" else "")
         for v in values
     ]
+    if heading.startswith("start"):
+        table.insert(0, rf"  &\text{{{heading}}}")
     blocks = [
         r"\begin{aligned}" + "\n" + " \\\\\n".join(part) + "\n" + r"\end{aligned}"
         for part in (rows, table)
@@ -401,7 +432,7 @@ def _latex_unit(unit: str) -> str:
 
 
 def _sympy(
-    equations: Sequence[ReadableEquation], model: Solvable, errors: Mapping[str, float]
+    equations: Sequence[ReadableEquation], model: Solvable, values: Sequence[Mapping[str, Any]]
 ) -> str:
     """Python code that defines the symbols, one ``Eq`` for each equation, ``values`` and
     ``errors``.
@@ -429,13 +460,13 @@ def _sympy(
             f'equations["{e.key}"] = Eq('
             f"{written(e.left, 'sympy')}, {right or '0'}, evaluate=False)",
         ]
-    lines.append("values = {")
-    for v in values_of(model, errors):
+    lines += [f"# {_heading(values)}", "values = {"]
+    for v in values:
         lines.append(f"    {v['name']}: {v['value']!r},  # {v['unit']}")
     lines += [
         "}",
         "errors = {",
-        *(f"    {n}: {v!r}," for n, v in errors.items() if n in names),
+        *(f"    {v['name']}: {v['stderr']!r}," for v in values if v["stderr"] is not None),
         "}",
     ]
     return "\n".join(lines) + "\n"

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, final
+
+import numpy as np
+import numpy.typing as npt
 
 from casadi_models import JointModel, hold
 from casadi_models.term import INERTIAS
 from casadi_models.text.typed_law import TypedLaw
 from identification.data.joint_schema import (
     CALIBRATION,
+    CORRELATION,
     FITTED,
     JOINT,
     KNOWN,
@@ -22,7 +26,7 @@ from identification.data.joint_schema import (
 )
 from identification.data.own_effects import TABLE, load_remembered, remembered
 from identification.data.plain_text import from_toml, toml_key, toml_value
-from identification.data.schema import Schema, meant
+from identification.data.schema import Schema, finite, meant
 from identification.data.typed_laws import LAWS, hold_laws, law_lines, read_laws
 from identification.data.units import base_unit, same_dimension
 from identification.errors import InputError
@@ -31,7 +35,14 @@ LARGEST_RATIO: Final = 1e75
 """Its fourth power, that of cubic friction between motor side and link, is still a number."""
 LARGEST_VALUE: Final = 1e75
 """Of a parameter: times a signal that is as large, and squared, it is still a number."""
-_TABLES: Final = ("joint", "known", "columns", "fitted", "calibration", "provenance", TABLE, LAWS)
+_TABLES: Final = (
+    *("joint", "known", "columns", "fitted", "correlation", "calibration", "provenance"),
+    *(TABLE, LAWS),
+)
+DECIMALS: Final = 9
+"""Of a correlation in a file: two parameters that are told apart at all
+(:data:`identification.fitting.engine.COLLINEAR`) stay so, and a file of twenty parameters holds
+3 kB of them."""
 
 
 @final
@@ -42,6 +53,83 @@ class Known:
     value: float | None = None
     low: float | None = None
     high: float | None = None
+
+
+@final
+@dataclass(frozen=True)
+class Correlation:
+    """How the standard errors of fitted values go together.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Parameters; others are independent of all.
+    triangle : tuple of tuple of float
+        Row k: correlations of parameter k + 1 with those before it.
+    """
+
+    names: tuple[str, ...] = ()
+    triangle: tuple[tuple[float, ...], ...] = ()
+
+    @classmethod
+    def of(cls, names: Sequence[str], matrix: npt.NDArray[np.float64]) -> Correlation:
+        """From a matrix (p, p), whose diagonal is not looked at, as a file holds it."""
+        rows = np.round(np.clip(matrix, -1.0, 1.0), DECIMALS).tolist()
+        # a correlation of less than a file holds has no sign
+        triangle = tuple(tuple(x + 0.0 for x in rows[k][:k]) for k in range(1, len(names)))
+        return cls(tuple(names), triangle)
+
+    @classmethod
+    def read(cls, table: Mapping[str, Any], fitted: Collection[str], source: str) -> Correlation:
+        """From the table of a joint file.
+
+        Raises
+        ------
+        InputError
+            A parameter without a fitted value or twice, a triangle of another shape, a number that
+            is no correlation.
+        """
+        if not table:
+            return cls()
+        where = f"{source}: [correlation]"
+        given = CORRELATION.read(table, where)
+        names, rows = given["parameters"], given["triangle"]
+        for name in names:
+            if name not in fitted or names.count(name) > 1:
+                why = "is there twice" if name in fitted else "has no value in [fitted]"
+                raise InputError(f"{where}: {name} {why}; take the table out or fit again")
+        shapes = isinstance(rows, list) and all(isinstance(row, list) for row in rows)
+        if not shapes or [len(row) for row in rows] != list(range(1, max(len(names), 1))):
+            raise InputError(
+                f"{where}: triangle must have {max(len(names) - 1, 0)} rows of 1, 2, ... numbers; "
+                "take the table out or fit again"
+            )
+        found = tuple(tuple(finite(x, f"{where} triangle") for x in row) for row in rows)
+        wrong = next((x for row in found for x in row if abs(x) > 1), None)
+        if wrong is not None:
+            raise InputError(
+                f"{where}: {wrong:g} is no correlation; take the table out or fit again"
+            )
+        return cls(names, found)
+
+    def lines(self) -> list[str]:
+        """The table of a joint file; nothing where fewer than two parameters are told."""
+        if len(self.names) < 2:
+            return []
+        rows = [f"    {toml_value(row)}," for row in self.triangle]
+        head = CORRELATION["parameters"].text(self.names)
+        return ["[correlation]", head, "triangle = [", *rows, "]"]
+
+    def matrix(self, names: Sequence[str]) -> npt.NDArray[np.float64]:
+        """Correlations of some parameters, (p, p): 1 on the diagonal, 0 for what is not told."""
+        own = {n: k for k, n in enumerate(self.names)}
+        out = np.eye(len(names))
+        for i, a in enumerate(names):
+            for j, b in enumerate(names[:i]):
+                if a in own and b in own:
+                    low, high = sorted((own[a], own[b]))
+                    out[i, j] = out[j, i] = self.triangle[high - 1][low]
+        return out
 
 
 @final
@@ -63,6 +151,8 @@ class Joint:
         By parameter name; fitted values come from a fit written back.
     errors : mapping
         Standard errors of fitted values, where the file has them.
+    correlation : Correlation
+        How these go together; empty where the file does not say.
     columns : mapping or None
         Column map of the record files.
     orders : tuple of float
@@ -93,6 +183,7 @@ class Joint:
     pitch: float | None = None
     sample_time: float | None = None
     laws: Mapping[str, TypedLaw] = field(default_factory=dict)
+    correlation: Correlation = Correlation()
 
     def model(self) -> JointModel:
         """The joint model with its effects (values of a fit written back included).
@@ -210,6 +301,7 @@ def parse_joint(data: Mapping[str, Any], source: str = "joint") -> Joint:
         fitted={k: v["value"] for k, v in fitted.items()},
         errors={k: v["stderr"] for k, v in fitted.items() if v["stderr"] is not None},
         laws=read_laws(data.get(LAWS, {}), kind, source),
+        correlation=Correlation.read(data.get("correlation", {}), fitted, source),
     )
     load_remembered(data.get(TABLE, {}), source)
     model = joint.model()
@@ -388,12 +480,14 @@ def toml_text(
     provenance: Mapping[str, Any] | None = None,
     calibration: Mapping[str, Mapping[str, Any]] | None = None,
     outside: Sequence[str] = (),
+    *,
+    correlation: Correlation | None = None,
 ) -> str:
     """The joint as the text of a joint file, with fitted values, standard errors, what the sensors
     were off by, and provenance.
 
     The calibration is a note: another record has its own. Labels of effects `outside` of a user's
-    FMU have their files remembered too.
+    FMU have their files remembered too. The correlation is that of the standard errors.
     """
     head = {
         "name": joint.name,
@@ -418,6 +512,8 @@ def toml_text(
         lines += ["", *column_lines(joint.columns)]
     if parameters:
         lines += ["", "[fitted]", *_entries(FITTED, parameters)]
+    if parameters and correlation is not None and (told := correlation.lines()):
+        lines += ["", *told]
     if calibration:
         lines += ["", "[calibration]", *_entries(CALIBRATION, calibration)]
     origin = {"sample_time": joint.sample_time, **(provenance or {})}

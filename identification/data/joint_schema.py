@@ -166,6 +166,23 @@ FITTED: Final = Schema(
     ),
 )
 
+CORRELATION: Final = Schema(
+    "[correlation]",
+    "Written by a fit: how the standard errors of [fitted] go together. Row k of the triangle "
+    "holds the correlations of parameter k + 1 with those before it. Without the table they count "
+    "as independent.",
+    (
+        Key("parameters", "names", "parameters of [fitted]", required=True),
+        Key(
+            "triangle",
+            "any",
+            "correlations, between -1 and 1",
+            form="list of lists of numbers",
+            required=True,
+        ),
+    ),
+)
+
 CALIBRATION: Final = Schema(
     "[calibration] SENSOR AND RECORD",
     "Written by a fit: what a sensor was off by in a record. A note; another record has its own.",
@@ -201,6 +218,7 @@ PAGES: Final = (
     LAW,
     OWN_EFFECTS,
     FITTED,
+    CORRELATION,
     CALIBRATION,
     PROVENANCE,
 )
@@ -209,6 +227,7 @@ PAGES: Final = (
 __all__ = [
     "CALIBRATION",
     "COLUMN",
+    "CORRELATION",
     "FITTED",
     "JOINT",
     "KNOWN",

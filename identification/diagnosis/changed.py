@@ -513,6 +513,14 @@ class _Search:
         return np.where(np.isfinite(self.spread), self.spread, self.unsure)
 
     @cached_property
+    def together(self) -> FloatArray:
+        """Correlations of these errors, (p, p): those of the reference; what is taken from the
+        refit is independent of them.
+        """
+        own = [n if np.isfinite(e) else "" for n, e in zip(self.names, self.spread, strict=True)]
+        return self.reference.correlation.matrix(own)
+
+    @cached_property
     def windows(self) -> Any:
         """Windows of time over the rows of a balance, from which errors are stated."""
         return windows_over([w.time for w in self.data.train])
@@ -877,6 +885,7 @@ class _Point:
 
         Three parts: the scatter between windows of time; the standard error of the reference value;
         and those of the values that are held, as far as an error there would have moved this one.
+        The latter two go together as the reference file says.
         In other coordinates, x = `turned` @ new, where these are given.
         """
         free = self.search.free(moved)
@@ -890,17 +899,20 @@ class _Point:
         scores = (whole[:, :-1, -1] + whole[:, :-1, :-1] @ step)[:, free]
         grams = core[:, :-1, :-1]
         normal = self._normal(total, noise, free)
-        pulled = -inverse(normal) @ (total - noise)[np.ix_(free, held)] * errors[held]
+        # what errors of the reference and of held values do to each change, (free, p)
+        pulled = np.zeros((len(free), len(self.x)))
+        pulled[:, held] = -inverse(normal) @ (total - noise)[np.ix_(free, held)] * errors[held]
         own = np.where(np.isin(free, moved), self.search.spread[free], 0.0)
+        pulled[np.arange(len(free)), free] = -own
         grams = grams[:, free][:, :, free]
         if turned is not None:
             back = np.linalg.inv(turned)
             grams, scores = np.einsum("ia,bij,jc->bac", turned, grams, turned), scores @ turned
             pulled, normal = back @ pulled, turned.T @ normal @ turned
-            own = np.sqrt((back**2) @ own**2)
         windows = errors_of_windows(grams, scores, normal, self.search.independent)
         found = np.zeros(len(free)) if windows is None else windows
-        return np.asarray(np.sqrt(found**2 + own**2 + np.sum(pulled**2, axis=1)))
+        told = np.einsum("fi,ij,fj->f", pulled, self.search.together, pulled)
+        return np.asarray(np.sqrt(found**2 + np.maximum(told, 0.0)))
 
     def errors(self, moved: Sequence[int]) -> FloatArray:
         """Standard errors of the changes by place, (p,); infinite for what is held."""

@@ -15,6 +15,7 @@ from casadi_models import EFFECTS, Effect, JointModel
 from casadi_models.table import Table
 from identification.balance.dataset import Dataset
 from identification.balance.stacked import references, sticking_torque
+from identification.data.joint_file import Correlation
 from identification.diagnosis.candidates import Candidate
 from identification.diagnosis.claims import Claim
 from identification.diagnosis.curve import (
@@ -215,6 +216,7 @@ def with_curves(solution: Solution, learned: Sequence[LearnedClaim]) -> Solution
         values=values,
         stderr=dict.fromkeys(values),
         correlation={},
+        together=Correlation(),
         unidentified=(),
     )
 

@@ -53,20 +53,39 @@ def statistics(course: Course, which: int, joint: JointFilter, levels: Levels) -
         unsure by [N.m].
         Before a window is full, what is missing counts as expected.
     """
-    e = np.clip(course.innovation[which], -1e6, 1e6)
-    rows = len(e)
-    squares = np.concatenate([np.zeros((1, 5)), np.cumsum(e**2, axis=0)])
-    sums = np.concatenate([np.zeros((1, 5)), np.cumsum(e, axis=0)])
+    windows = over_windows(course.innovation[which], joint.dt)
+    unsure = UNSURE * course.deviation[which] + joint.unsure_friction(course, which, levels)
+    known = np.maximum(np.abs(course.disturbance[which]) - unsure, 0.0)
+    return np.concatenate([windows, known], axis=1)
+
+
+def over_windows(innovations: FloatArray, dt: float) -> FloatArray:
+    """Root mean square and size of the mean of innovations over all windows.
+
+    Parameters
+    ----------
+    innovations : (n, readings) array
+        In standard deviations.
+    dt : float
+        Sample time [s].
+
+    Returns
+    -------
+    (n, 2 x windows x readings) array
+        Before a window is full, what is missing counts as expected.
+    """
+    e = np.clip(innovations, -1e6, 1e6)
+    rows, readings = e.shape
+    squares = np.concatenate([np.zeros((1, readings)), np.cumsum(e**2, axis=0)])
+    sums = np.concatenate([np.zeros((1, readings)), np.cumsum(e, axis=0)])
     energy, mean = [], []
-    for length in lengths(joint.dt):
+    for length in lengths(dt):
         at = np.arange(1, rows + 1)
         before = np.maximum(at - length, 0)
         missing = np.maximum(length - at, 0)[:, None]
         energy.append(np.sqrt(np.maximum(squares[at] - squares[before] + missing, 0.0) / length))
         mean.append(np.abs(sums[at] - sums[before]) / length)
-    unsure = UNSURE * course.deviation[which] + joint.unsure_friction(course, which, levels)
-    known = np.maximum(np.abs(course.disturbance[which]) - unsure, 0.0)
-    return np.concatenate([*energy, *mean, known], axis=1)
+    return np.concatenate([*energy, *mean], axis=1)
 
 
 def lengths(dt: float) -> list[int]:
@@ -74,19 +93,21 @@ def lengths(dt: float) -> list[int]:
     return [max(1, round(w / dt)) for w in WINDOWS]
 
 
-def floors(dt: float, disturbance: Sequence[float]) -> FloatArray:
+def floors(dt: float, disturbance: Sequence[float], readings: int = 5) -> FloatArray:
     """Limits that noise alone would need, one per statistic; levels of the disturbances [N.m]."""
     out: list[float] = []
     for n in lengths(dt):
-        out += [math.sqrt(1 + SIGMAS * math.sqrt(2 / n) + SIGMAS**2 / n)] * 5
+        out += [math.sqrt(1 + SIGMAS * math.sqrt(2 / n) + SIGMAS**2 / n)] * readings
     for n in lengths(dt):
-        out += [SIGMAS / math.sqrt(n)] * 5
+        out += [SIGMAS / math.sqrt(n)] * readings
     return np.array([*out, *((SIGMAS - UNSURE) * d for d in disturbance)])
 
 
-def limits(healthy: Sequence[FloatArray], dt: float, disturbance: Sequence[float]) -> FloatArray:
+def limits(
+    healthy: Sequence[FloatArray], dt: float, disturbance: Sequence[float], readings: int = 5
+) -> FloatArray:
     """Limits of all statistics from those of healthy stretches, each (n, count), and from the
-    levels of the three disturbances [N.m].
+    levels of the disturbances [N.m].
 
     The larger of :data:`LARGEST` times the largest value and of the Gumbel quantile of the largest
     values of blocks, times :data:`MARGIN`.
@@ -103,5 +124,5 @@ def limits(healthy: Sequence[FloatArray], dt: float, disturbance: Sequence[float
     rare = -math.log(-math.log1p(-ALARMS * BLOCK / 3600.0))
     quantile = np.mean(blocks, axis=0) + (rare - EULER) * scale
     found = MARGIN * np.maximum(LARGEST * blocks.max(axis=0), quantile)
-    kept: FloatArray = np.maximum(found, floors(dt, disturbance))
+    kept: FloatArray = np.maximum(found, floors(dt, disturbance, readings))
     return kept

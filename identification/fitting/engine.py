@@ -17,7 +17,13 @@ from casadi_models.hold import CLOCKS
 from casadi_models.term import HANGING, LOAD_COMPLIANCE
 from identification.balance.balances import Balances, balances_of
 from identification.balance.calibration import bare, is_of_run, names_of_runs, usual
-from identification.balance.dataset import Dataset, load_dataset, prepared_model, weak_record
+from identification.balance.dataset import (
+    HOLD_NAME,
+    Dataset,
+    load_dataset,
+    prepared_model,
+    weak_record,
+)
 from identification.balance.kinematic import held_scale
 from identification.balance.noise import effective_share
 from identification.balance.stacked import (
@@ -31,6 +37,7 @@ from identification.balance.stacked import (
     sure_levels,
     taking_part,
 )
+from identification.data.joint_file import Correlation
 from identification.errors import InputError
 from identification.fitting.covariance import correlations
 from identification.fitting.errors_in_variables.bands import Bands
@@ -80,6 +87,8 @@ class Solution:
     at_bound, unidentified : tuple of str
     correlation : mapping
         Largest correlation of each parameter with another one: (name, value).
+    together : Correlation
+        Of all that have a standard error, nuisances and what belongs to one run left out.
     """
 
     model: JointModel
@@ -92,6 +101,7 @@ class Solution:
     unidentified: tuple[str, ...] = ()
     correlation: Mapping[str, tuple[str, float]] = field(default_factory=dict)
     iterations: int = 0
+    together: Correlation = Correlation()
 
     def __repr__(self) -> str:
         return (
@@ -565,6 +575,16 @@ def _with_errors(
                 unidentified.append(free[i])
     kept = dict(values)
     model = balances.model
+    apart = {*smoothing, HOLD_NAME, *model.calibration}
+    told = [
+        k
+        for k, i in enumerate(index.tolist())
+        if stderr[free[i]] is not None and not is_of_run(free[i]) and free[i] not in apart
+    ]
+    together = Correlation()
+    if told:
+        names = [free[index[k]] for k in told]
+        together = Correlation.of(names, corr[np.ix_(told, told)])
     for n in model.calibration:
         kept[n] = float(np.mean([kept[k] for k in free if is_of_run(k) and k.startswith(f"{n}[")]))
     own = {n: x for n, x in kept.items() if not is_of_run(n)}
@@ -579,4 +599,5 @@ def _with_errors(
         unidentified=tuple(unidentified),
         correlation=correlation,
         iterations=used,
+        together=together,
     )

@@ -31,4 +31,4 @@ def joint_text(joint: Joint, solution: Solution, data: Dataset) -> str:
         "sample_time": min(w.grid.dt for w in data.train),
         "version": VERSION,
     }
-    return toml_text(whole, fitted, origin, calibration)
+    return toml_text(whole, fitted, origin, calibration, correlation=solution.together)

@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from identification.balance.calibration import is_of_run, without_calibration
 from identification.balance.dataset import HOLD_NAME, run_name
+from identification.data.joint_file import Correlation
 from identification.data.record import Record, listed
 from identification.errors import InputError
 from identification.fitting.assess import assess
@@ -370,6 +371,7 @@ def _refined(
         model=model,
         values=dict(values),
         stderr={**old.stderr, **stderr},
+        together=Correlation(),  # theirs is that of the balances' rows
         weights=weights,
         at_bound=bound,
         iterations=used,

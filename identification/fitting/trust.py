@@ -18,6 +18,8 @@ from identification.balance.calibration import bare
 from identification.balance.dataset import HOLD_NAME, Dataset
 from identification.balance.stacked import INDEPENDENT_SHARE, references
 from identification.data.formats import words
+from identification.data.joint_file import Joint
+from identification.errors import InputError
 from identification.fitting.covariance import NORMAL, correlations
 from identification.fitting.engine import Solution
 from identification.fitting.information import eliminated, form_of, white_errors
@@ -69,9 +71,9 @@ class Trusted:
         The parameter it trades with.
     trade : str
         How, in words; empty without a partner.
-    prediction_percent : float
+    prediction_percent : float or None
         Change of the predicted torque over half the interval, in percent of the measured one, all
-        others adapted.
+        others adapted; None without records.
     verdict : {"trust", "only in combination", "not"}
     why : str
     """
@@ -87,7 +89,7 @@ class Trusted:
     windows: tuple[float | None, ...]
     partner: str | None
     trade: str
-    prediction_percent: float
+    prediction_percent: float | None
     verdict: str
     why: str
 
@@ -295,27 +297,15 @@ class _Judge:
 
     def _partner(self, k: int) -> tuple[str | None, float]:
         """The parameter with the largest correlation, and that correlation."""
-        seen = [i for i, n in enumerate(self.moving) if n not in self.nuisance and i != k]
-        if not seen:
-            return None, 0.0
-        i = max(seen, key=lambda i: abs(self.together[k, i]))
-        rho = float(self.together[k, i])
-        return (self.moving[i], rho) if abs(rho) >= WORTH_SAYING else (None, rho)
+        seen = {n: i for i, n in enumerate(self.moving) if n not in self.nuisance and i != k}
+        return _partner_of({n: float(self.together[k, i]) for n, i in seen.items()})
 
     def _trade(self, name: str, partner: str, error: float, rho: float) -> str:
         """One standard error up, and what its partner does then."""
-        i = self.moving.index(partner)
-        k = self.moving.index(name)
-        other = float(self.solution.values[partner])
+        i, k = self.moving.index(partner), self.moving.index(name)
         moves = rho * float(self.white[i]) * error / float(self.white[k])
-        value = float(self.solution.values[name])
-        if not value or not other:
-            return f"{words(name)} trades with {words(partner)} (correlation {rho:.2f})"
-        up = (moves > 0) == (other > 0)
-        return (
-            f"{words(name)} goes up {100 * error / abs(value):.2g} % where {words(partner)} goes "
-            f"{'up' if up else 'down'} {100 * abs(moves / other):.2g} %"
-        )
+        values = self.solution.values
+        return _traded((name, values[name], error), (partner, values[partner], moves), rho)
 
     def _prediction(self, k: int, shift: float) -> float:
         """Change of the prediction where one parameter moves and all others adapt."""
@@ -335,18 +325,7 @@ class _Judge:
             low, high = (g * self.data.ranges[p.scale] for g in (p.grid[0], p.grid[-1]))
             if not low / 2 <= value <= 2 * high:
                 return "not", f"extrapolated: the motion's {p.scale} does not reach it"
-        if share * NORMAL >= 1:
-            tied = abs(rho) >= TIED
-            return (
-                ("only in combination", "its interval contains zero")
-                if tied
-                else ("not", "its interval contains zero")
-            )
-        if p.name in self.solution.unidentified:
-            return "only in combination", "not identifiable by itself"
-        if share > KNOWN and abs(rho) >= TIED:
-            return "only in combination", "known to less than 10 % and tied to another"
-        return "trust", ""
+        return _by_error(share, rho, identified=p.name not in self.solution.unidentified)
 
     def _profiled(self, name: str, error: float, wider: float) -> tuple[float, float]:
         """Ends of the 95 % interval by refits of all others: where the sum of squares, in units of
@@ -396,6 +375,96 @@ class _Judge:
         return float(left @ left)
 
 
+def trusted_file(joint: Joint) -> Trust:
+    """Judge every fitted value of a joint file by what stands in the file: its standard errors and
+    how they go together. Windows, profiles and the prediction need the records.
+
+    Parameters
+    ----------
+    joint : Joint
+
+    Raises
+    ------
+    InputError
+        A file without fitted values that have standard errors.
+    """
+    model = joint.model()
+    if not joint.errors:
+        raise InputError(
+            f"{joint.source or joint.name}: has no fitted values with standard errors; give the "
+            "records too, or fit it first (irj fit -o)"
+        )
+    nuisance = {*model.named("smoothing"), HOLD_NAME, *model.calibration}
+    told = [p for p in model.parameters if p.name in joint.fitted and p.name not in nuisance]
+    names = [p.name for p in told]
+    together = joint.correlation.matrix(names)
+    known = {p.name: p for p in told}
+    out = []
+    for k, p in enumerate(told):
+        value, error = float(joint.fitted[p.name]), joint.errors.get(p.name)
+        bare_one = replace(_unknown(p, model, value), prediction_percent=None)
+        if error is None:
+            out.append(replace(bare_one, why="the file has no standard error of it"))
+            continue
+        others = {n: float(together[k, i]) for i, n in enumerate(names) if i != k}
+        partner, rho = _partner_of(others)
+        share = error / abs(value) if value else math.inf
+        verdict, why = _by_error(share, rho, identified=True)
+        trade = ""
+        if partner is not None:
+            moves = rho * joint.errors.get(partner, 0.0)
+            trade = _traded((p.name, value, error), (partner, joint.fitted[partner], moves), rho)
+        low, high = known[p.name].low, known[p.name].high
+        out.append(
+            replace(
+                bare_one,
+                stderr=error,
+                low=max(value - NORMAL * error, low),
+                high=min(value + NORMAL * error, high),
+                partner=partner,
+                trade=trade,
+                verdict=verdict,
+                why=why,
+            )
+        )
+    return Trust(tuple(out))
+
+
+def _partner_of(others: Mapping[str, float]) -> tuple[str | None, float]:
+    """Of correlations with others the largest, with its name where it is worth saying."""
+    if not others:
+        return None, 0.0
+    name = max(others, key=lambda n: abs(others[n]))
+    rho = others[name]
+    return (name, rho) if abs(rho) >= WORTH_SAYING else (None, rho)
+
+
+def _traded(one: tuple[str, float, float], other: tuple[str, float, float], rho: float) -> str:
+    """What a partner does where a parameter goes up by its standard error, in words; name, value
+    and change of each.
+    """
+    (name, value, error), (partner, beside, moves) = one, other
+    if not value or not beside:
+        return f"{words(name)} trades with {words(partner)} (correlation {rho:.2f})"
+    up = (moves > 0) == (beside > 0)
+    return (
+        f"{words(name)} goes up {100 * error / abs(value):.2g} % where {words(partner)} goes "
+        f"{'up' if up else 'down'} {100 * abs(moves / beside):.2g} %"
+    )
+
+
+def _by_error(share: float, rho: float, *, identified: bool) -> tuple[str, str]:
+    """Verdict and reason by standard error over value and the largest correlation."""
+    if share * NORMAL >= 1:
+        tied = "only in combination" if abs(rho) >= TIED else "not"
+        return tied, "its interval contains zero"
+    if not identified:
+        return "only in combination", "not identifiable by itself"
+    if share > KNOWN and abs(rho) >= TIED:
+        return "only in combination", "known to less than 10 % and tied to another"
+    return "trust", ""
+
+
 def _unknown(p: Parameter, model: JointModel, value: float) -> Trusted:
     """A parameter of which nothing is known but its value."""
     return Trusted(
@@ -416,4 +485,4 @@ def _unknown(p: Parameter, model: JointModel, value: float) -> Trusted:
     )
 
 
-__all__ = ["CLASSES", "Trust", "Trusted", "kind_of", "trust"]
+__all__ = ["CLASSES", "Trust", "Trusted", "kind_of", "trust", "trusted_file"]

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, final
 
@@ -208,6 +209,11 @@ class Exploration:
         return _reason(self)
 
     @property
+    def alike(self) -> str:
+        """What ties with the recommended variant, in words; empty where nothing does."""
+        return _alike(self)
+
+    @property
     def warnings(self) -> tuple[str, ...]:
         """What to doubt about records and start model."""
         return self.improvement.warnings
@@ -297,13 +303,66 @@ def _difference(v: Variant) -> str:
 def _reason(found: Exploration) -> str:
     best = found.recommended
     said = f"Recommended: the joint's model {_difference(best)}"
-    others = [v for v in found.ties if v is not best]
-    if not others:
+    if not found.alike:
         return f"{said}; nothing else that was fitted ties with it."
-    more = len(others) - ALTERNATIVES
-    names = "; ".join(_difference(v) for v in others[:ALTERNATIVES])
-    rest = f"; and {more} more" if more > 0 else ""
-    return f"{said}. These records do not tell it from: {names}{rest}."
+    return f"{said}. These records do not tell it from: {found.alike}."
+
+
+def sets_of_ties(
+    best: Sequence[str], ties: Collection[frozenset[str]]
+) -> tuple[tuple[str, ...], ...]:
+    """Sets of labels, one for each label of the best variant, so that every choice of one of each
+    is a tie; empty where fewer than two of them leave a choice.
+
+    Two places with two names each make four variants that tie: one name of each set is what a
+    reader has to settle, not which of four models it is.
+
+    Parameters
+    ----------
+    best : sequence of str
+        Labels that the recommended variant adds.
+    ties : collection of frozenset of str
+        Labels that each variant adds which ties, the best one among them.
+    """
+    whole = frozenset(best)
+    sets = [
+        (
+            label,
+            *sorted(
+                other
+                for tie in ties
+                if len(tie) == len(whole) and whole - tie == {label}
+                for other in tie - whole
+            ),
+        )
+        for label in best
+    ]
+    if sum(len(s) > 1 for s in sets) < 2:
+        return ()
+    known = set(ties)
+    made = {frozenset(chosen) for chosen in itertools.product(*sets)}
+    return tuple(sets) if made <= known else ()
+
+
+def _alike(found: Exploration) -> str:
+    """What ties with the recommended variant, in words."""
+    best = found.recommended
+    ties = [v for v in found.ties if not v.dropped]
+    sets = sets_of_ties(best.added, [frozenset(v.added) for v in ties])
+    made = {frozenset(chosen) for chosen in itertools.product(*sets)} if sets else set()
+    others = [
+        v for v in found.ties if v is not best and (v.dropped or frozenset(v.added) not in made)
+    ]
+    said = []
+    if sets:
+        choices = [f"one of ({', '.join(map(title_of, s))})" for s in sets if len(s) > 1]
+        sure = [s[0] for s in sets if len(s) == 1]
+        beside = f" beside {_listed(sure)}" if sure else ""
+        said.append(f"any other choice of {' and '.join(choices)}{beside}")
+    most = ALTERNATIVES - len(said)
+    said += [_difference(v) for v in others[:most]]
+    more = len(others) - most
+    return "; ".join(said) + (f"; and {more} more" if more > 0 else "")
 
 
 def agreement_of(

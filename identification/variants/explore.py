@@ -35,13 +35,12 @@ from identification.variants.exploration import (
     agreement_of,
     title_of,
 )
+from identification.variants.ground import Ground, JointGround
 from identification.variants.lattice import (
     Node,
     added_to,
     assembled,
-    droppable,
     missing_from,
-    nodes_of,
 )
 from identification.variants.refit import (
     Held,
@@ -50,7 +49,6 @@ from identification.variants.refit import (
     blocks_of,
     held_of,
     physical,
-    refitted,
     with_size,
 )
 from identification.variants.screen import LARGEST, Scored, Screen
@@ -98,30 +96,37 @@ def explore(
     InputError
         Unusable records or joint, in one line; records that cannot carry the question.
     """
-    session = Session.opened(records, joint, held_out, progress=_part(progress, 0.0, 0.3))
+    session = Session.opened(records, joint, held_out, progress=part_of(progress, 0.0, 0.3))
     start = session.start()
     improvement = session.run(start)
     if improvement.ranking is None:
         raise InputError(improvement.reason)
-    return _Search(session, start, listed(records)[0], _part(progress, 0.3, 0.7)).result(
-        improvement
-    )
+    ground = JointGround(session, listed(records)[0])
+    return Search(ground, start, part_of(progress, 0.3, 0.7)).result(improvement)
 
 
-def _part(progress: Progress | None, low: float, span: float) -> Progress:
+def part_of(progress: Progress | None, low: float, span: float) -> Progress:
+    """A progress that moves over a part of another one's."""
     told: Progress = progress or (lambda text, share: None)
     return lambda text, share: told(text, low + span * share)
 
 
 @final
-class _Search:
-    """The fitted variants of one search, each once."""
+class Search:
+    """The fitted variants of one search, each once.
 
-    def __init__(
-        self, session: Session, start: Solution, record: Record, progress: Progress
-    ) -> None:
-        self.session, self.start, self.record = session, start, record
-        self.data, self.progress = session.data, progress
+    Parameters
+    ----------
+    ground : Ground
+    start : Solution
+        The fit of the model as it stands.
+    progress : callable
+        ``progress(text, share)``.
+    """
+
+    def __init__(self, ground: Ground, start: Solution, progress: Progress) -> None:
+        self.ground, self.session, self.start = ground, ground.session, start
+        self.data, self.progress = ground.data_of(start), progress
         self.names: dict[object, str] = {}
         self.found: dict[object, Refit] = {}
         self.apart: dict[str, str] = {}
@@ -133,7 +138,7 @@ class _Search:
 
     def result(self, improvement: Improvement) -> Exploration:
         """The whole search."""
-        nodes, refused = nodes_of(self.start.model, self.data)
+        nodes, refused = self.ground.nodes(self.start.model)
         last = improvement.steps[-1].solution
         last = replace(last, model=with_size(last, added_to(self.start.model, last.model)))
         self.last = self._mark(last.model)
@@ -148,8 +153,9 @@ class _Search:
         screen = first
         if best.solution.model.structure != self.start.model.structure:
             # once more about the best, on its weights: what was fitted so far is fitted again
-            like = reweighed(best.solution, self.data)
-            self.weighting = Weighting.of(like, self.data)
+            data = self.ground.data_of(best.solution)
+            like = reweighed(best.solution, data)
+            self.weighting = Weighting.of(like, data)
             self.found.clear()
             screen = self._screen(
                 _restricted(self.start, like), nodes, _shapes(like), 0.3, laws=laws
@@ -177,7 +183,7 @@ class _Search:
         *,
         laws: dict[tuple[str, bool | None], Balances] | None = None,
     ) -> Screen:
-        base = self.session.bench.base(solution)
+        base = self.ground.base(solution)
         return Screen(
             base,
             nodes,
@@ -200,7 +206,7 @@ class _Search:
         there = self.found.get(mark)
         if there is not None and not again:
             return
-        refit = refitted(model, self.data, starts, self.weighting)
+        refit = self.ground.refitted(model, starts, self.weighting)
         added = added_to(self.start.model, model)
         if not np.all(np.isfinite(refit.held.rms)) or physical(refit, added, self.data):
             return
@@ -243,7 +249,7 @@ class _Search:
     def _grown(self) -> bool:
         """Whether parts beside the best variant make a better one."""
         now = self._best()
-        nodes, _ = nodes_of(now.solution.model, self.data)
+        nodes, _ = self.ground.nodes(now.solution.model)
         screen = self._screen(now.solution, nodes, {}, 0.8)
         ranked = [s for s in screen.search(FURTHER) if s.options]
         for scored in itertools.islice((s for s in ranked if screen.real(s.options)), FIRST):
@@ -256,7 +262,7 @@ class _Search:
         """
         for _ in range(ROUNDS):
             now = self._best()
-            for label in droppable(now.solution.model):
+            for label in self.ground.droppable(now.solution.model):
                 self._fit(without(now.solution.model, label), now.solution.values, again=True)
             if self._best() is now:
                 break
@@ -274,7 +280,7 @@ class _Search:
             added = set(added_to(self.start.model, model))
             solution = self.session.bench.fitted(model, best.solution.values)
             self.sets = {}
-            for label in droppable(model):
+            for label in self.ground.droppable(model):
                 if label not in added:
                     continue
                 self.progress(f"names in the place of {label}", 0.95)
@@ -308,6 +314,9 @@ class _Search:
         joint = self.session.joint
         sensing = self.data.sensing
         own = visible_labels(self.start.model)
+        record = self.ground.ladder
+        if record is None:
+            return
         for name in MODELS:
             model = JointModel.by_name(
                 name, joint.gear_ratio, kind=joint.kind, effects=joint.effects
@@ -315,7 +324,7 @@ class _Search:
             if set(visible_labels(model)) == set(own):
                 continue
             try:
-                shows = set(sense(self.record, model).balances)
+                shows = set(sense(record, model).balances)
             except InputError as error:
                 self.apart[name] = str(error)
                 continue

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, final
 
 from casadi_models import EFFECTS, JointModel
 from identification.balance.dataset import Dataset, visible_labels, with_effect
 from identification.diagnosis.candidates import Candidate, NotTestable, offered
+
+Offer = Callable[[JointModel], tuple[list[Candidate], list[NotTestable]]]
 
 PER_EFFECT: Final = 0.10
 """Fall of the summed logarithms of the RMS that an effect must bring: the 10 % off one balance that
@@ -61,14 +63,25 @@ class Node:
         return price_of(1, self.parameters)
 
 
-def nodes_of(model: JointModel, data: Dataset) -> tuple[list[Node], tuple[NotTestable, ...]]:
+def nodes_of(
+    model: JointModel, data: Dataset, offer: Offer | None = None
+) -> tuple[list[Node], tuple[NotTestable, ...]]:
     """All parts that the records can show beside a model, and what they cannot show.
 
     Beside what a diagnosis would try on the model itself there is what it would try once another
     part is in it: laws that refine a law, and a second line beside a first one.
+
+    Parameters
+    ----------
+    model : JointModel
+    data : Dataset
+    offer : callable, optional
+        What a diagnosis would try on a model, and what the records cannot show; by default
+        :func:`identification.diagnosis.candidates.offered` on `data`.
     """
+    offer = offer or (lambda bigger: offered(bigger, data))
     parents = {n for e in EFFECTS.values() for n in e.needs}
-    first, refused = offered(model, data)
+    first, refused = offer(model)
     found = [Node(c) for c in first]
     seen = {(n.label, n.form) for n in found}
     waiting = list(found)
@@ -79,7 +92,7 @@ def nodes_of(model: JointModel, data: Dataset) -> tuple[list[Node], tuple[NotTes
         again = node.candidate.effect.periodic and not node.beside
         if not (opens or again):
             continue
-        for candidate in offered(node.candidate.model, data)[0]:
+        for candidate in offer(node.candidate.model)[0]:
             new = Node(candidate, node.label)
             if (new.label, new.form) in seen:
                 continue

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final, final
 
@@ -22,7 +22,7 @@ from identification.balance.stacked import (
     stack,
     taking_part,
 )
-from identification.diagnosis.trials import make_base
+from identification.diagnosis.trials import Base, make_base
 from identification.fitting.engine import Solution, stepped
 from identification.variants.lattice import price_of
 
@@ -150,10 +150,32 @@ def refitted(
         (stepped(model, data, s, weighting.like, iterations=steps) for s in starts),
         key=lambda f: f[1],
     )
-    solution, cost = found
+    return refit_of(*found, data, weighting, lambda fitted: make_base(fitted, data))
+
+
+def refit_of(
+    solution: Solution,
+    cost: float,
+    data: Dataset,
+    weighting: Weighting,
+    base_of: Callable[[Solution], Base],
+) -> Refit:
+    """A fitted variant with the errors by which it is held against others.
+
+    Parameters
+    ----------
+    solution : Solution
+    cost : float
+        Weighted sum of squares of the training rows.
+    data : Dataset
+        The records as the fit has them.
+    weighting : Weighting
+    base_of : callable
+        Rows of a fit, with all that a fold must find anew.
+    """
     units = weighting.units(solution, data)
     own = {b: w / units[b][: len(w)] for b, w in solution.weights.items()}
-    base = make_base(replace(solution, weights=own), data)
+    base = base_of(replace(solution, weights=own))
     seen = held_of(solution, data, weighting)
     return Refit(
         solution,

@@ -191,7 +191,8 @@ class Screen:
 
     def start_of(self, variant: Sequence[int]) -> dict[str, float]:
         """Values from which a fit of a variant starts: the base moved along, shapes from the grid,
-        amplitudes to first order.
+        amplitudes to first order. Of what the base has beside the values of its model, as the
+        parameters of a user's FMU, it is the change.
         """
         base, found = self.base, self._scale
         own = base.inward.shape[1]
@@ -200,7 +201,7 @@ class Screen:
         moved = found.back[:, index] @ a + found.back[:, -1]
         values = dict(base.solution.values)
         for n, d in zip(base.names, (moved / base.norms).tolist(), strict=True):
-            values[n] = values[n] + d
+            values[n] = values.get(n, 0.0) + d
         at = own
         for k in variant:
             option = self.options[k]

@@ -6,6 +6,7 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, final
 
@@ -17,7 +18,9 @@ from identification.diagnosis.improve import improve
 from identification.errors import InputError
 from identification.fitting.fit import fit
 from identification.variants.explore import explore
+from irj_fmu.batch.found import Found
 from irj_fmu.command_line import finite
+from irj_fmu.host.fmu import FmuError
 
 File = tuple[str, bytes]
 
@@ -34,6 +37,8 @@ class Parcel:
     joint : (str, bytes)
         Name and content.
     records, held_out, own_effects : tuple of (str, bytes)
+    fmu : (str, bytes) or None
+        Whole path and content of the FMU that the joint file names as its model.
     """
 
     task: str
@@ -42,6 +47,7 @@ class Parcel:
     records: tuple[File, ...]
     held_out: tuple[File, ...] = ()
     own_effects: tuple[File, ...] = ()
+    fmu: File | None = None
 
 
 @final
@@ -88,9 +94,8 @@ def answered(parcel: Parcel) -> Answer:
     begin = time.perf_counter()
     try:
         with tempfile.TemporaryDirectory(prefix="irj-fit-") as folder:
-            joint, train, held = _unpacked(parcel, Path(folder))
-            found = _TASKS[parcel.task](joint, train, held)
-    except InputError as error:
+            found = _done(parcel, Path(folder))
+    except (InputError, FmuError) as error:
         return Answer(reason=" ".join(str(error).split()), seconds=time.perf_counter() - begin)
     except Exception as error:  # one job's failure, whatever it is, must not end the others
         text = f"{type(error).__name__}: {' '.join(str(error).split())}"
@@ -106,15 +111,22 @@ def answered(parcel: Parcel) -> Answer:
     )
 
 
-def _unpacked(parcel: Parcel, folder: Path) -> tuple[Joint, list[Record], list[Record]]:
-    """Joint and records from the files of a parcel."""
+def _done(parcel: Parcel, folder: Path) -> Found:
+    """The task of a parcel, its files in a folder."""
     there = {f.code for f in EFFECTS.files}
     for name, code in parcel.own_effects:
         if code not in there:
             EFFECTS.load_code(folder / name, code)
     place = folder / parcel.joint[0]
     place.write_bytes(parcel.joint[1])
-    joint = load_joint(place)
+    task: Callable[[list[Record], list[Record]], Found]
+    if parcel.fmu is None:
+        joint = load_joint(place)
+        task = partial(_TASKS[parcel.task], joint)
+    else:
+        from irj_fmu.batch.user_tasks import user_task
+
+        joint, task = user_task(parcel.task, place, parcel.fmu)
 
     def opened(files: Sequence[File], part: str) -> list[Record]:
         out = []
@@ -128,10 +140,7 @@ def _unpacked(parcel: Parcel, folder: Path) -> tuple[Joint, list[Record], list[R
                 raise InputError(str(error).replace(f"{path.parent}/", "")) from None
         return out
 
-    return joint, opened(parcel.records, "train"), opened(parcel.held_out, "held")
-
-
-Found = tuple[dict[str, Any], Mapping[str, Any], str, dict[str, Any]]
+    return task(opened(parcel.records, "train"), opened(parcel.held_out, "held"))
 
 
 def _fit(joint: Joint, train: list[Record], held: list[Record]) -> Found:

@@ -37,6 +37,7 @@ from irj_fmu.batch.fit_worker import Answer, Parcel, answered
 from irj_fmu.batch.study_schema import FIT_JOINT, FIT_STUDY
 from irj_fmu.batch.worker import enter
 from irj_fmu.command_line import finite, replace_file
+from irj_fmu.imported.file_schema import fmu_of
 
 SUMMARY: Final = "summary.csv"
 PARAMETERS: Final = "parameters.csv"
@@ -55,12 +56,15 @@ class Job:
     name : str
     joint : Path
     records, held_out : tuple of Path
+    fmu : Path or None
+        The FMU that the joint file names as its model.
     """
 
     name: str
     joint: Path
     records: tuple[Path, ...]
     held_out: tuple[Path, ...] = ()
+    fmu: Path | None = None
 
 
 @final
@@ -84,7 +88,11 @@ class FitStudy:
     @property
     def inputs(self) -> tuple[Path, ...]:
         """Every file that it reads."""
-        files = (p for j in self.jobs for p in (j.joint, *j.records, *j.held_out))
+        files = (
+            p
+            for j in self.jobs
+            for p in (j.joint, *([] if j.fmu is None else [j.fmu]), *j.records, *j.held_out)
+        )
         return tuple(dict.fromkeys((self.source, *files)))
 
 
@@ -174,11 +182,17 @@ def _jobs(entry: Any, number: int, source: Path) -> Iterator[Job]:
         )
     name = given["name"] or Path(file).stem
     joint = source.parent / file
+    fmu = fmu_of(joint)
+    if fmu is not None and not fmu.is_file():
+        raise InputError(
+            f"{where}: {joint}: [model] fmu: there is no file {fmu}; give its path, relative to "
+            "the joint file"
+        )
     if not given["each"]:
-        yield Job(name, joint, records, held)
+        yield Job(name, joint, records, held, fmu)
         return
     for record in records:
-        yield Job(f"{name} {record.stem}", joint, (record,), held)
+        yield Job(f"{name} {record.stem}", joint, (record,), held, fmu)
 
 
 def _files(entry: Mapping[str, Any], key: str, where: str, folder: Path) -> tuple[Path, ...]:
@@ -215,6 +229,7 @@ def parcel_of(study: FitStudy, job: Job) -> Parcel:
         records=content(job.records),
         held_out=content(job.held_out),
         own_effects=own,
+        fmu=None if job.fmu is None else (str(job.fmu.resolve()), job.fmu.read_bytes()),
     )
 
 
@@ -227,6 +242,7 @@ def fingerprint(parcel: Parcel) -> str:
         ("", b"held out"),
         *parcel.held_out,
         *parcel.own_effects,
+        *([] if parcel.fmu is None else [parcel.fmu]),
     )
     for name, content in files:
         found.update(f"\n{name} {len(content)}\n".encode())

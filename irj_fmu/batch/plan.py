@@ -17,8 +17,10 @@ from irj_fmu.batch.checks import Value
 from irj_fmu.batch.fleet import Batch
 from irj_fmu.batch.fleet import check as check_batch
 from irj_fmu.batch.study import ModelEntry, Study
+from irj_fmu.batch.user_plant import UserPlant, user_plant
 from irj_fmu.host.run import Fmu
 from irj_fmu.host.signals import Table
+from irj_fmu.imported.file_schema import fmu_of
 
 CHANNELS: Final = {
     "i_m": "motor_current",
@@ -54,6 +56,7 @@ class _Model:
     entry: ModelEntry
     fmu: Path
     joint: Joint | None
+    user: UserPlant | None = None
 
 
 def plan(study: Study, folder: Path, say: Say = lambda _text: None) -> list[Planned]:
@@ -79,7 +82,8 @@ def plan(study: Study, folder: Path, say: Say = lambda _text: None) -> list[Plan
     """
     models = [_made(entry, study, folder) for entry in study.models]
     for model in models:
-        if model.joint is not None and not model.joint.fitted and model.entry.kind == "plant":
+        built = None if model.user is not None else model.joint
+        if built is not None and not built.fitted and model.entry.kind == "plant":
             say(f"{model.entry.path}: has no fitted values; its plant starts from usual ones")
     runs: list[tuple[str, Record] | None] = [
         run for path in study.files for run in _read(path, study, models, say)
@@ -116,7 +120,8 @@ def _made(entry: ModelEntry, study: Study, folder: Path) -> _Model:
                 f"{where}: there is no FMU {entry.path}; paths are relative to the study file"
             )
         return _Model(entry, entry.path, None)
-    joint = _changed(load_joint(entry.path), entry, where)
+    of_user = fmu_of(entry.path) is not None
+    joint = None if of_user else _changed(load_joint(entry.path), entry, where)
     name = f"model-{study.models.index(entry) + 1}"
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -125,6 +130,9 @@ def _made(entry: ModelEntry, study: Study, folder: Path) -> _Model:
             f"{folder}: cannot be made ({error.strerror}); choose a writable folder with --out"
         ) from None
     try:
+        if joint is None:
+            found = user_plant(entry, folder / f"{name}.fmu")
+            return _Model(entry, found.fmu, found.model.joint, found)
         return _Model(
             entry,
             _plant(joint, entry, folder / f"{name}.fmu")
@@ -226,15 +234,20 @@ def _planned(model: _Model, run: tuple[str, Record] | None, study: Study) -> Pla
         )
         fixed: dict[str, Value] = {}
         inputs: dict[str, Table] = {}
-        if record is not None:
+        if model.user is not None:
+            fixed |= model.user.start(record, state=study.start_state)
+        elif record is not None:
             fixed |= _start_state(model, record, fmu) if study.start_state else {}
             if model.entry.kind == "estimator" and abs(step - 1e-3) > 1e-9:
                 fixed["sample_time"] = step
+        if model.user is not None and record is not None:
+            inputs |= model.user.fed(record)
         for name, variable in fmu.variables.items():
             if variable.causality == "input":
                 inputs |= _fed(name, study, record, where)
         if (
             record is not None
+            and model.user is None
             and not model.entry.motion
             and not any(
                 isinstance(study.inputs.get(n, ""), str) and not n.startswith("valid.")
@@ -245,6 +258,8 @@ def _planned(model: _Model, run: tuple[str, Record] | None, study: Study) -> Pla
                 f'{where}: no input is fed by the records; write [inputs] with input = "channel"'
             )
         measured = {} if record is None else _measured(names, study, record, fmu, where)
+        if model.user is not None and record is not None:
+            measured = {**model.user.measured(record, tuple(names)), **measured}
     if study.stop is None and record is None:
         raise InputError(f"{study.source}: [study] has no stop; give the length in s")
     stop = study.stop or float(record.time[-1] - record.time[0] if record is not None else 0.0)

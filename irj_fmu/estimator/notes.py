@@ -30,7 +30,11 @@ def estimator_notes(joint: Joint, options: OnlineOptions) -> tuple[Note, ...]:
         if not has
     ]
     return (
-        Note("Equations", shown(joint.model(), errors=joint.errors), verbatim=True),
+        Note(
+            "Equations",
+            shown(joint.model(), errors=joint.errors, fitted=joint.fitted),
+            verbatim=True,
+        ),
         Note(
             "Faults and health",
             f"{FAULT_TEXT}.\n\nOutput health: {_HEALTH}.\n\n"

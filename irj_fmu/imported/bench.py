@@ -42,7 +42,7 @@ from identification.diagnosis.trials import (
 from identification.fitting.assess import BalanceError, Error, assess
 from identification.fitting.covariance import correlations, window_errors, windows_over
 from identification.fitting.engine import COLLINEAR as NOT_IDENTIFIED
-from identification.fitting.engine import Dataset, Solution, solve, stack
+from identification.fitting.engine import Dataset, Solution, solve, stack, stepped
 from identification.fitting.least_squares import bounded_step
 from identification.naming.odds import Odds
 from irj_fmu.host.signals import FloatArray
@@ -53,6 +53,13 @@ if TYPE_CHECKING:
 MOST_ROUNDS: Final = 12
 """Steps of a whole fit in which the parameters of the FMU follow, at most: a fit by the outputs
 that lacked a loop of the gear had the damping at three times its value, and six took it back."""
+FOLLOWING: Final = 2
+"""Steps of the FMU's parameters beside those of a variant: about the point where the whole fit of
+the best names ended the first one is nearly all of it, and the second brings the error of the
+variants to that of their whole fits (`tests/irj_fmu/imported/test_user_fmu_explore.py`)."""
+NUISANCE: Final = "fmu."
+"""Before the name of a parameter of the FMU beside those of the joint that is left: both have a
+stiffness."""
 OUTSIDE: Final = ("friction", "torque")
 """Families of effects that can ride outside an FMU as a torque."""
 
@@ -252,6 +259,44 @@ class FmuBench:
         self._fits[model.structure] = solution
         return solution
 
+    def stepped(
+        self, model: JointModel, start: Mapping[str, float], like: Solution, *, iterations: int
+    ) -> tuple[Solution, float]:
+        """A few steps of a fit on the weighting of another one, the FMU's parameters moved along as
+        far as that is linear: what is held against many others needs no run of the FMU.
+
+        Parameters
+        ----------
+        model : JointModel
+        start : mapping of str to float
+            Values to start from; under :data:`NUISANCE` and the name of a parameter of the FMU its
+            change.
+        like : Solution
+            Whose weights count.
+        iterations : int
+
+        Returns
+        -------
+        (Solution, float)
+            As :func:`identification.fitting.engine.stepped`.
+        """
+        changes = [start.get(NUISANCE + f.name, 0.0) for f in self._free]
+        sizes = np.array(
+            [min(max(x, f.low), f.high) for x, f in zip(changes, self._free, strict=True)]
+        )
+        data = self._at(sizes)
+        solution, cost = stepped(model, data, start, like, iterations=iterations)
+        for _ in range(FOLLOWING if self._free else 0):
+            moved, certain = self._moved(solution, data, sizes)
+            after = self._at(moved)
+            found, less = stepped(model, after, solution.values, like, iterations=iterations)
+            if less < cost:
+                solution, cost, data, sizes = found, less, after, moved
+            if not certain or not less < cost:
+                break
+        self._known[id(solution)] = solution, data, sizes
+        return solution, cost
+
     def data_of(self, solution: Solution) -> Dataset:
         """The records with the FMU's parameters where a fit of this bench has moved them."""
         known = self._known.get(id(solution))
@@ -312,10 +357,13 @@ class FmuBench:
 
     def base(self, solution: Solution) -> Base:
         """Rows of the balances, with the FMU's parameters as nuisance."""
-        data = self.data_of(solution)
-        return with_nuisance(
-            make_base(solution, data), self._columns(solution, data), [f.name for f in self._free]
-        )
+        return self.based(solution, self.data_of(solution))
+
+    def based(self, solution: Solution, data: Dataset) -> Base:
+        """The same of a model with values on records that this bench has moved."""
+        columns = self._columns(solution, data)
+        names = [NUISANCE + f.name for f in self._free]
+        return with_nuisance(make_base(solution, data), columns, names)
 
     def ranking(
         self, base: Base, *, late: bool = False, progress: Progress | None = None
@@ -327,8 +375,20 @@ class FmuBench:
 
     def tried(self, solution: Solution) -> list[str]:
         """Keys of the effects that the FMU can lack."""
-        every = [*offered(solution.model, self.data)[0], *_extra(solution.model, self.data)]
-        return [c.effect.key for c in every if self._why_not(c) is None]
+        return [c.effect.key for c in self.offered(solution.model)[0]]
+
+    def offered(self, model: JointModel) -> tuple[list[Candidate], list[NotTestable]]:
+        """The effects that the FMU can lack beside those of a model of what is left, and the
+        others with the reason.
+        """
+        there, refused = offered(model, self.data)
+        every = [*there, *_extra(model, self.data)]
+        reasons = [self._why_not(c) for c in every]
+        kept = [c for c, why in zip(every, reasons, strict=True) if why is None]
+        told = {c.effect.key: why for c, why in zip(every, reasons, strict=True) if why}
+        known = {c.effect.key for c in kept}
+        gone = [NotTestable(key, why) for key, why in told.items() if key not in known]
+        return kept, [*refused, *gone]
 
     def ratios(self, step: Step) -> dict[str, BalanceError]:
         """Of every balance, at the kernel of the claims."""

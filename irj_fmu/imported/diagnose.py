@@ -136,18 +136,23 @@ class UserDiagnosis:
 
     def stays(self, effect: Effect, place: str) -> str:
         """Why an effect cannot ride outside the FMU; empty where it can."""
-        if effect.family not in OUTSIDE:
-            return "acts inside the gear or at a sensor; only a torque at the drive rides outside"
-        driven = port_of(self.model).output
-        side = self.model.outputs[driven].channel.partition("_")[0]
-        both = {"motor_position", "link_position"} <= {m.channel for m in self.model.outputs}
-        if both and place not in (side, "drive"):
-            return f"acts at the {place}; only a torque at the drive rides outside"
-        return ""
+        return stays(self.model, effect, place)
 
     def refit(self, label: str | None = None) -> UserFit:
         """Add the effect and fit FMU and effect together by the error of the outputs."""
         return fit(self.add(label), self.records)
+
+
+def stays(model: UserModel, effect: Effect, place: str) -> str:
+    """Why an effect at a place cannot ride outside an FMU; empty where it can."""
+    if effect.family not in OUTSIDE:
+        return "acts inside the gear or at a sensor; only a torque at the drive rides outside"
+    driven = port_of(model).output
+    side = model.outputs[driven].channel.partition("_")[0]
+    both = {"motor_position", "link_position"} <= {m.channel for m in model.outputs}
+    if both and place not in (side, "drive"):
+        return f"acts at the {place}; only a torque at the drive rides outside"
+    return ""
 
 
 def with_outside(
@@ -181,29 +186,44 @@ def _starts(model: JointModel) -> dict[str, float]:
     return dict(zip(model.parameter_names, model.value_vector(), strict=True))
 
 
-def diagnose(
-    model: UserModel | UserFit,
+@final
+@dataclass(frozen=True)
+class LaidOpen:
+    """What a user's FMU leaves in records, ready to be judged.
+
+    Attributes
+    ----------
+    model : UserModel
+    bench : FmuBench
+    session : Session
+        On that bench.
+    train, held_out : tuple of Record
+        Through the gate; a part of the records where none were held out.
+    why_followed : str
+        See :class:`UserDiagnosis`.
+    """
+
+    model: UserModel
+    bench: FmuBench
+    session: Session
+    train: tuple[Record, ...]
+    held_out: tuple[Record, ...]
+    why_followed: str = ""
+
+
+def laid_open(
+    model: UserModel,
     records: Record | Sequence[Record],
     held_out: Record | Sequence[Record] = (),
     *,
-    most: int | None = None,
     progress: Callable[[str, float], None] | None = None,
-) -> UserDiagnosis:
-    """Rank the effect library on the correction torque that a user's FMU needs.
-
-    The effects that the joint file names (``effects = [...]``) count as part of the FMU and are not
-    proposed; each fitted parameter of the FMU is a nuisance, so that an effect is named only for
-    what no other value of it explains.
+) -> LaidOpen:
+    """Run an FMU along records, once as it is and once for each of its parameters.
 
     Parameters
     ----------
-    model : UserModel or UserFit
-        Fitted, with a drive channel mapped to an input and a position to an output.
-    records : Record or sequence of Record
-    held_out : Record or sequence of Record
-        Records the fit did not see; without them blocks of the records are held out.
-    most : int, optional
-        Look for so many effects, each beside those before it; by default for the first one.
+    model : UserModel
+    records, held_out : Record or sequence of Record
     progress : callable, optional
         ``progress(text, share)``.
 
@@ -215,7 +235,6 @@ def diagnose(
         Where the FMU refuses a call.
     """
     say = progress or (lambda _text, _share: None)
-    model = model.model if isinstance(model, UserFit) else model
     given = gated(at_least_one(records), model.joint)
     apart = gated(at_least_one(held_out), model.joint) if held_out else []
     train, held, note = with_held_out(given, apart)
@@ -273,6 +292,45 @@ def diagnose(
     session = Session(
         bench, lambda text, share: say(text, 0.75 + 0.25 * share), gate_warnings([*given, *apart])
     )
+    return LaidOpen(model, bench, session, tuple(train), tuple(held), why_followed=why)
+
+
+def diagnose(
+    model: UserModel | UserFit,
+    records: Record | Sequence[Record],
+    held_out: Record | Sequence[Record] = (),
+    *,
+    most: int | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> UserDiagnosis:
+    """Rank the effect library on the correction torque that a user's FMU needs.
+
+    The effects that the joint file names (``effects = [...]``) count as part of the FMU and are not
+    proposed; each fitted parameter of the FMU is a nuisance, so that an effect is named only for
+    what no other value of it explains.
+
+    Parameters
+    ----------
+    model : UserModel or UserFit
+        Fitted, with a drive channel mapped to an input and a position to an output.
+    records : Record or sequence of Record
+    held_out : Record or sequence of Record
+        Records the fit did not see; without them blocks of the records are held out.
+    most : int, optional
+        Look for so many effects, each beside those before it; by default for the first one.
+    progress : callable, optional
+        ``progress(text, share)``.
+
+    Raises
+    ------
+    InputError
+        Unusable records or channels.
+    FmuError
+        Where the FMU refuses a call.
+    """
+    model = model.model if isinstance(model, UserFit) else model
+    opened = laid_open(model, records, held_out, progress=progress)
+    bench, session, why = opened.bench, opened.session, opened.why_followed
     solution = session.start()
     decided = session.diagnose(solution) if most is None else session.run(solution, most)
     # a claim that the restarts of both sides bear out is judged there: the outputs lack it still
@@ -280,8 +338,11 @@ def diagnose(
     between = {} if why else _apart(bench, decided)
     wholes = tuple(bench.whole(s.solution) for s in decided.steps)
     decided = _with_errors(decided, wholes)
-    found = Diagnosis(decided if seen else held_to_outputs(decided, compare(model, held)))
-    say("done", 1.0)
+    found = Diagnosis(
+        decided if seen else held_to_outputs(decided, compare(model, opened.held_out))
+    )
+    if progress is not None:
+        progress("done", 1.0)
     start = found.found.steps[0]
     return UserDiagnosis(
         model,
@@ -377,4 +438,13 @@ def _outside_joint(joint: Joint, left: Restart | Following) -> Joint:
     )
 
 
-__all__ = ["Correction", "UserDiagnosis", "diagnose", "held_to_outputs", "with_outside"]
+__all__ = [
+    "Correction",
+    "LaidOpen",
+    "UserDiagnosis",
+    "diagnose",
+    "held_to_outputs",
+    "laid_open",
+    "stays",
+    "with_outside",
+]

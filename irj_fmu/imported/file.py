@@ -38,12 +38,14 @@ def is_user_joint(path: str | Path) -> bool:
         return False
 
 
-def load_user_joint(path: str | Path) -> UserModel:
+def load_user_joint(path: str | Path, fmu: str | Path | None = None) -> UserModel:
     """Read a joint file whose model is a user's FMU.
 
     Parameters
     ----------
     path : str or Path
+    fmu : str or Path, optional
+        Where the FMU lies, in place of what the file says.
 
     Raises
     ------
@@ -80,7 +82,7 @@ def load_user_joint(path: str | Path) -> UserModel:
         )
     rest = {k: v for k, v in data.items() if k in ("joint", "columns", TABLE, LAWS)}
     joint = parse_joint({**rest, "joint": {**rest.get("joint", {}), "model": "hd1"}}, str(path))
-    fmu = path.parent / table["fmu"]
+    place = path.parent / table["fmu"] if fmu is None else Path(fmu)
     fitted = {str(k): _value(v, f"{path}: [fitted] {k}") for k, v in data.get("fitted", {}).items()}
     channels, bounds, start = (
         _pairs(table, "channels", path),
@@ -93,7 +95,7 @@ def load_user_joint(path: str | Path) -> UserModel:
     )
     try:
         model = load_user_model(
-            fmu,
+            place,
             channels,
             bounds,
             start=start,
@@ -243,6 +245,8 @@ def user_joint_text(
     model: UserModel,
     stderr: Mapping[str, float | None] = MappingProxyType({}),
     folder: Path | None = None,
+    *,
+    named: str = "",
 ) -> str:
     """The model as the text of a joint file, with fitted values and standard errors.
 
@@ -253,6 +257,8 @@ def user_joint_text(
         Standard errors that are written beside the values, in the same units.
     folder : Path, optional
         Where the file goes: an FMU beside it is named without its path.
+    named : str, optional
+        What the file calls the FMU, where that is not where it lies.
     """
     head = toml_text(
         replace(model.joint, model_name="hd1", known={}, fitted={}),
@@ -260,7 +266,8 @@ def user_joint_text(
     )
     body = "\n".join(line for line in head.splitlines() if not line.startswith("model = "))
     path = model.fmu.path
-    name = path.name if folder is not None and path.parent == folder.resolve() else str(path)
+    beside = folder is not None and path.parent == folder.resolve()
+    name = named or (path.name if beside else str(path))
     lines = [
         "[model]",
         f"fmu = {toml_string(name)}",

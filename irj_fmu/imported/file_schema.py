@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Final
 
+from identification.data.plain_text import from_toml
 from identification.data.schema import Key, Schema
 
 MODEL: Final = Schema(
@@ -75,5 +77,18 @@ START: Final = Schema(
 
 PAGES: Final = (MODEL, CHANNEL, BOUNDS, START)
 """The tables in the order of the reference page."""
+
+
+def fmu_of(path: str | Path) -> Path | None:
+    """The FMU that a joint file names as its model; None for a joint model, and for a file that
+    cannot be read, which is left to others to refuse.
+    """
+    path = Path(path)
+    try:
+        table = from_toml(path.read_text(encoding="utf-8-sig"), str(path))
+        return path.parent / str(table["model"]["fmu"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
 
 __all__ = ["BOUNDS", "CHANNEL", "MODEL", "PAGES", "START"]

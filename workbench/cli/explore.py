@@ -5,10 +5,14 @@ from __future__ import annotations
 import io
 import json
 from argparse import Namespace
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
+from identification.data.record import Record
+from identification.diagnosis.improvement import Improvement
 from identification.errors import InputError
+from identification.fitting.trust import Trust
 from identification.variants.exploration import Exploration, table_of
 from identification.variants.explore import explore
 from irj_fmu.command_line import check_folder, finite, keep_inputs, replace_files
@@ -24,41 +28,76 @@ from workbench.cli.files import (
 from workbench.cli.loop import print_warnings, training, trusted
 from workbench.show.front import exploration_picture
 
+FILES: Final = ("variants.parquet", "explore.json", "explore.svg")
+"""What `--out` writes."""
+
 
 def run_explore(arguments: Namespace) -> int:
     """`irj explore`."""
-    distinct(
-        training=arguments.records,
-        other_payload=arguments.other_payload,
-        held_out=arguments.held_out,
-    )
-    names = ("variants.parquet", "explore.json", "explore.svg")
-    paths = [*arguments.records, *arguments.other_payload, *arguments.held_out]
-    if arguments.out:
-        _writable(Path(arguments.out))
-        keep_inputs([Path(arguments.out) / n for n in names], [*paths, arguments.joint])
+    begun(arguments)
     joint = open_joint(arguments.joint)
     records, _ = training(arguments.records, arguments.other_payload, joint)
     held, _ = open_records(arguments.held_out, joint)
+    paths = [*arguments.records, *arguments.other_payload, *arguments.held_out]
     alike(paths, [*records, *held], joint)
     found = explore(records, joint, held, progress=progress_bar)
     progress_bar("done", 1.0)
     print_warnings(found.warnings, [*records, *held])
     print_exploration(found)
-    data = found.as_json()
+    every = [*records, *held]
+    delivered(arguments, found, found.as_json(), every, found.to_joint_file, judge=trusted)
+    return 0
+
+
+def begun(arguments: Namespace) -> None:
+    """Refuse what cannot be done before any work is."""
+    distinct(
+        training=arguments.records,
+        other_payload=arguments.other_payload,
+        held_out=arguments.held_out,
+    )
+    if arguments.out:
+        paths = [*arguments.records, *arguments.other_payload, *arguments.held_out]
+        _writable(Path(arguments.out))
+        keep_inputs([Path(arguments.out) / n for n in FILES], [*paths, arguments.joint])
+
+
+def delivered(
+    arguments: Namespace,
+    found: Exploration,
+    data: Any,
+    records: Sequence[Record],
+    joint_text: Callable[[], str],
+    *,
+    judge: Callable[[Improvement], Trust | None] = lambda _found: None,
+) -> None:
+    """Write the files that were asked for: variants, picture, joint file, JSON and report.
+
+    Parameters
+    ----------
+    arguments : Namespace
+    found : Exploration
+    data : JSON
+        Of `--json`.
+    records : sequence of Record
+    joint_text : callable
+        Text of the joint file of the recommended variant.
+    judge : callable
+        Which number of the loop the report trusts; by default it does not say.
+    """
     if arguments.out:
         made = (
             parquet(found),
             (json.dumps(finite(data), indent=1, allow_nan=False) + "\n").encode(),
             exploration_picture(found).encode(),
         )
-        for path in replace_files(Path(arguments.out), dict(zip(names, made, strict=True))):
+        for path in replace_files(Path(arguments.out), dict(zip(FILES, made, strict=True))):
             print(path)
     if arguments.picture:
         write_text(arguments.picture, exploration_picture(found))
         print(f"picture: {arguments.picture}")
     if arguments.output:
-        write_text(arguments.output, found.to_joint_file())
+        write_text(arguments.output, joint_text())
         print(f"joint file: {arguments.output}")
     write_json(arguments.json, data)
     if arguments.report:
@@ -67,13 +106,12 @@ def run_explore(arguments: Namespace) -> int:
         made_report = write_report(
             found.improvement,
             arguments.report,
-            records=[*records, *held],
+            records=records,
             command=arguments.command,
-            trust=trusted(found.improvement),
+            trust=judge(found.improvement),
             exploration=found,
         )
         print(f"report: {made_report}")
-    return 0
 
 
 def _writable(folder: Path) -> None:

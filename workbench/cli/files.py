@@ -14,11 +14,11 @@ from identification.balance.sensing import Sensing, check_alike
 from identification.data.check.gate import needed, passed
 from identification.data.joint_edit import with_effects
 from identification.data.joint_file import Joint, load_joint, toml_text
-from identification.data.plain_text import from_toml
 from identification.data.read import read
 from identification.data.record import Record
 from identification.errors import InputError
 from irj_fmu.command_line import check_output, is_special, progress_bar, replace_file, write_json
+from irj_fmu.imported.file_schema import fmu_of
 
 
 def open_joint(path: str) -> Joint:
@@ -111,7 +111,8 @@ def check_outputs(arguments: Namespace) -> None:
     """
     inputs = [path for name in READ for path in _listed(arguments, name)]
     joint = getattr(arguments, "joint", None)
-    inputs += _fmu_of(joint)
+    fmu = fmu_of(joint) if joint else None
+    inputs += [] if fmu is None else [str(fmu)]
     named: dict[str, str] = {}
     for option in OUTPUTS:
         path = getattr(arguments, option, None)
@@ -125,15 +126,6 @@ def check_outputs(arguments: Namespace) -> None:
         named[str(target)] = option
         if option == "picture" and target.suffix.lower() in RASTERS:
             raise InputError(f"{path}: a picture is written as SVG; name it {target.stem}.svg")
-
-
-def _fmu_of(joint: object) -> list[str]:
-    """The FMU that a joint file names as its model."""
-    try:
-        table = from_toml(Path(str(joint)).read_text(encoding="utf-8-sig"), str(joint))
-        return [str(Path(str(joint)).parent / str(table["model"]["fmu"]))]
-    except (OSError, ValueError, KeyError, TypeError):
-        return []
 
 
 def distinct(**groups: Sequence[str]) -> None:

@@ -528,10 +528,11 @@ def parser() -> OneLineParser:
     trusted = verb(
         "trust",
         "trust",
-        "which number of a fit to trust: intervals, windows, what it trades with",
-        records=True,
+        "which number of a fit to trust: intervals, windows, what it trades with; without records "
+        "by what the joint file says",
         joint=True,
     )
+    trusted.add_argument("records", nargs="*", metavar="REC", help="record files")
     other_payload(trusted)
     plain = verb(
         "linear",

@@ -14,6 +14,7 @@ from casadi_models.text.compensation import friction_compensation
 from casadi_models.text.shown import shown, shown_equations, values_of
 from casadi_models.text.written import LANGUAGES, written
 from identification.errors import InputError
+from identification.fitting.trust import trusted_file
 from workbench.cli.files import open_joint, write_json, write_text
 
 SPEEDS: Final = 40
@@ -32,7 +33,16 @@ def run_show(arguments: Namespace) -> int:
     model = joint.model()
     if arguments.compensation:
         return _compensation(model, arguments)
-    text = shown(model, arguments.format, joint.errors)
+    told = trusted_file(joint).parameters if joint.errors else ()
+    # of a pair each says the same the other way round
+    pairs = {frozenset((p.name, p.partner or "")): p.trade for p in reversed(told) if p.trade}
+    text = shown(
+        model,
+        arguments.format,
+        joint.errors,
+        fitted=joint.fitted,
+        trades=tuple(reversed(pairs.values())),
+    )
     if arguments.output:
         write_text(arguments.output, text)
         print(arguments.output)
@@ -53,7 +63,14 @@ def run_show(arguments: Namespace) -> int:
         ]
         write_json(
             arguments.json,
-            {"joint": joint.name, "equations": equations, "values": values_of(model, joint.errors)},
+            {
+                "joint": joint.name,
+                "equations": equations,
+                "values": values_of(model, joint.errors, joint.fitted),
+                "trades": [
+                    {"name": p.name, "with": p.partner, "trade": p.trade} for p in told if p.trade
+                ],
+            },
         )
     return 0
 

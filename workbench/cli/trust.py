@@ -5,17 +5,21 @@ from __future__ import annotations
 import sys
 from argparse import Namespace
 
+from identification.data.joint_file import Joint
+from identification.errors import InputError
 from identification.fitting.assess import RATIO_LIMIT
 from identification.fitting.fit import fit
-from identification.fitting.trust import trust
+from identification.fitting.trust import trust, trusted_file
 from workbench.cli.files import alike, distinct, open_joint, write_json
 from workbench.cli.loop import training
 
 
 def run_trust(arguments: Namespace) -> int:
-    """`irj trust REC... --joint J`."""
+    """`irj trust [REC...] --joint J`: without records what the file itself says."""
     distinct(training=arguments.records, other_payload=arguments.other_payload)
     joint = open_joint(arguments.joint)
+    if not arguments.records:
+        return _of_file(joint, arguments)
     records, warnings = training(arguments.records, arguments.other_payload, joint)
     alike([*arguments.records, *arguments.other_payload], records, joint)
     fitted = fit(joint, records)
@@ -35,4 +39,21 @@ def run_trust(arguments: Namespace) -> int:
         arguments.json,
         {"records": list(fitted.data.train_names), "trust": found.as_json(), "warnings": warnings},
     )
+    return 0
+
+
+def _of_file(joint: Joint, arguments: Namespace) -> int:
+    """By the standard errors and correlations that the file holds."""
+    if arguments.other_payload:
+        raise InputError("trust: --other-payload goes with records; give those, too")
+    found = trusted_file(joint)
+    if not joint.correlation.names:
+        print(
+            f"irj: {arguments.joint}: does not say how its standard errors go together; what "
+            "trades with what needs the records, or a new fit (irj fit -o)",
+            file=sys.stderr,
+        )
+    print("from the joint file alone; 95 % intervals in brackets")
+    print(found)
+    write_json(arguments.json, {"records": [], "trust": found.as_json(), "warnings": []})
     return 0

@@ -28,11 +28,17 @@ if TYPE_CHECKING:
     from irj_fmu.imported.model import UserModel
     from irj_fmu.imported.outputs import UserComparison
 
-VERBS: Final = ("check", "fit", "compare", "diagnose", "improve", "report", "add", "export")
+VERBS: Final = {
+    **dict.fromkeys(
+        ("check", "fit", "compare", "diagnose", "improve", "report", "add", "export"), "user_fmu"
+    ),
+    **dict.fromkeys(("explore", "track"), "foreign"),
+}
+"""Verbs that take an FMU as the model, and the module that runs each then."""
 
 
 def module_of(arguments: Namespace) -> str:
-    """The module that runs a verb: this one where the joint file's model is an FMU.
+    """The module that runs a verb: another one where the joint file's model is an FMU.
 
     Raises
     ------
@@ -51,12 +57,17 @@ def module_of(arguments: Namespace) -> str:
         )
     if not isinstance(path, str) or not _has_model(path):
         return str(arguments.module)
+    if arguments.verb == "batch":
+        raise InputError(
+            f"{path}: `irj batch` takes a study file: write [[joint]] and below it joint = "
+            '"FILE" and records = ["FILE"], and run irj batch STUDY.toml (docs/batch.md)'
+        )
     if arguments.verb not in VERBS:
         raise InputError(
             f"{path}: its model is an FMU; `irj {arguments.verb}` does not take one, only "
             f"{', '.join(VERBS)} do"
         )
-    return "user_fmu"
+    return VERBS[arguments.verb]
 
 
 def _has_model(path: str) -> bool:
@@ -71,7 +82,7 @@ def _has_model(path: str) -> bool:
     )
 
 
-def _one_line(run: Callable[[Namespace], int]) -> Callable[[Namespace], int]:
+def one_line(run: Callable[[Namespace], int]) -> Callable[[Namespace], int]:
     """What an FMU refuses is unusable input: one line, exit 2."""
 
     @wraps(run)
@@ -86,7 +97,7 @@ def _one_line(run: Callable[[Namespace], int]) -> Callable[[Namespace], int]:
     return guarded
 
 
-def _open(arguments: Namespace) -> tuple[UserModel, list[Record], list[str]]:
+def open_model(arguments: Namespace) -> tuple[UserModel, list[Record], list[str]]:
     from irj_fmu.imported.file import load_user_joint
 
     for option in ("other_payload", "refine"):
@@ -98,11 +109,11 @@ def _open(arguments: Namespace) -> tuple[UserModel, list[Record], list[str]]:
     model = load_user_joint(arguments.joint)
     for note in model.notes:
         print(f"irj: {note}", file=sys.stderr)
-    records, warnings = _records(arguments.records, model)
+    records, warnings = open_mapped(arguments.records, model)
     return model, records, warnings
 
 
-def _records(paths: Sequence[str], model: UserModel) -> tuple[list[Record], list[str]]:
+def open_mapped(paths: Sequence[str], model: UserModel) -> tuple[list[Record], list[str]]:
     """Records that hold every channel which the joint file maps."""
     records, warnings = open_records(paths, model.joint)
     for path, record in zip(paths, records, strict=True):
@@ -122,14 +133,14 @@ def _unmapped(record: Record, model: UserModel) -> list[str]:
     ]
 
 
-def _new_notes(before: UserModel, after: UserModel) -> None:
+def new_notes(before: UserModel, after: UserModel) -> None:
     """Say what came to be known on the way from one model to another."""
     for note in after.notes:
         if note not in before.notes:
             print(f"irj: {note}", file=sys.stderr)
 
 
-@_one_line
+@one_line
 def run_check(arguments: Namespace) -> int:
     """`irj check REC --joint J` with an FMU as the model: the gate, and whether the mapped
     channels are there.
@@ -146,15 +157,15 @@ def run_check(arguments: Namespace) -> int:
     )
 
 
-@_one_line
+@one_line
 def run_fit(arguments: Namespace) -> int:
     """`irj fit REC --joint J` with an FMU as the model."""
     from irj_fmu.imported.file import user_joint_text
     from irj_fmu.imported.fit import fit
 
-    model, records, warnings = _open(arguments)
+    model, records, warnings = open_model(arguments)
     fitted = fit(model, records, progress=progress_bar)
-    _new_notes(model, fitted.model)
+    new_notes(model, fitted.model)
     print(fitted.method)
     _print_outputs(fitted.train)
     _print_parameters(fitted.parameters)
@@ -174,7 +185,7 @@ def run_fit(arguments: Namespace) -> int:
     return 0
 
 
-@_one_line
+@one_line
 def run_compare(arguments: Namespace) -> int:
     """`irj compare REC --joint J` with an FMU as the model: as it is, or fitted to other
     records first.
@@ -182,11 +193,13 @@ def run_compare(arguments: Namespace) -> int:
     from irj_fmu.imported.compare import compare
     from irj_fmu.imported.fit import fit
 
-    model, records, warnings = _open(arguments)
+    model, records, warnings = open_model(arguments)
     if arguments.fit_records:
         before = model
-        model = fit(model, _records(arguments.fit_records, model)[0], progress=progress_bar).model
-        _new_notes(before, model)
+        model = fit(
+            model, open_mapped(arguments.fit_records, model)[0], progress=progress_bar
+        ).model
+        new_notes(before, model)
     found = compare(model, records)
     _print_outputs(found)
     print(f"  fails most from {found.worst_window[0]:.4g} s to {found.worst_window[1]:.4g} s")
@@ -194,19 +207,19 @@ def run_compare(arguments: Namespace) -> int:
     return 0
 
 
-@_one_line
+@one_line
 def run_diagnose(arguments: Namespace) -> int:
     """`irj diagnose REC --joint J` with an FMU as the model."""
     from irj_fmu.imported.diagnose import diagnose
     from irj_fmu.imported.fit import fit
 
     distinct(training=arguments.records, held_out=arguments.held_out)
-    model, records, _ = _open(arguments)
-    held, _ = _records(arguments.held_out, model)
+    model, records, _ = open_model(arguments)
+    held, _ = open_mapped(arguments.held_out, model)
     if model.parameters:
         before = model
         model = fit(model, records, progress=progress_bar).model
-        _new_notes(before, model)
+        new_notes(before, model)
     found = diagnose(model, records, held, progress=progress_bar)
     said = gate_warnings([*records, *held])
     for text in found.diagnosis.warnings:
@@ -247,10 +260,10 @@ def _improved(arguments: Namespace, report: str | None, most: int) -> UserImprov
 
     distinct(training=arguments.records, held_out=arguments.held_out)
     beside = results_beside(getattr(arguments, "beside", []))
-    model, records, _ = _open(arguments)
-    held, _ = _records(arguments.held_out, model)
+    model, records, _ = open_model(arguments)
+    held, _ = open_mapped(arguments.held_out, model)
     found = improve(model, records, held, max_additions=most, progress=progress_bar)
-    _new_notes(model, found.model)
+    new_notes(model, found.model)
     said = gate_warnings([*records, *held])
     for text in found.found.warnings:
         if text not in said:
@@ -272,7 +285,7 @@ def _improved(arguments: Namespace, report: str | None, most: int) -> UserImprov
     return found
 
 
-@_one_line
+@one_line
 def run_improve(arguments: Namespace) -> int:
     """`irj improve REC --joint J` with an FMU as the model: effects are added outside it."""
     from irj_fmu.imported.file import user_joint_text
@@ -300,7 +313,7 @@ def run_improve(arguments: Namespace) -> int:
     return 0
 
 
-@_one_line
+@one_line
 def run_report(arguments: Namespace) -> int:
     """`irj report REC --joint J` with an FMU as the model."""
     from identification.diagnosis.session import MAX_ADDITIONS
@@ -326,7 +339,7 @@ def _offer(found: UserDiagnosis, arguments: Namespace) -> None:
     print(f"joint file: {output}, with {found.claims[0].label} outside; fit it next")
 
 
-@_one_line
+@one_line
 def run_add(arguments: Namespace) -> int:
     """`irj add KEY --joint J -o J2`: the effect rides outside the FMU."""
     from irj_fmu.imported.correction import PREFIX
@@ -389,7 +402,7 @@ def export_parser() -> OneLineParser:
     return made
 
 
-@_one_line
+@one_line
 def run_export(arguments: Namespace) -> int:
     """`irj export [corrected|pair|ssp] --joint J`: FMU and correction as one FMU, in C or with
     Python, or as a system.

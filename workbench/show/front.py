@@ -90,7 +90,7 @@ def exploration_section(found: Exploration) -> str:
         for k, v in enumerate(_numbered(found), 1)
     ]
     head = ("dot", "variant", "parameters", "held-out error", "score behind", "best in", "note")
-    tied = ", ".join(text(v.name) for v in found.ties if v is not found.recommended)
+    tied = text(found.alike)
     said = [found.reason, found.agreement]
     said += [
         f"{s.by} stands in for {s.effect}: the records do not tell them apart."

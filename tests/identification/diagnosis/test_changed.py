@@ -10,15 +10,16 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from casadi_models import JointModel
 from identification import Joint, Record, fit, load_joint
-from identification.data.joint_file import parse_joint
+from identification.data.joint_file import Correlation, parse_joint
 from identification.data.prepare import STANDARD_GRAVITY
-from identification.diagnosis.changed import changed, discovery_rates
+from identification.diagnosis.changed import _prepared, changed, discovery_rates
 from identification.errors import InputError
 from identification.planning.follow import Controller, Follower
 from tests.recorded_world import planted
@@ -96,6 +97,33 @@ def test_standard_errors_of_a_fit_come_back_from_its_file(reference: Path) -> No
         assert (name in read_back.errors) == (p["stderr"] is not None)
         if p["stderr"] is not None:
             assert read_back.errors[name] == pytest.approx(p["stderr"], rel=1e-5)
+
+
+def test_errors_of_the_reference_go_together_as_its_file_says(reference: Path) -> None:
+    """A change with everything else held: what an error of each reference value makes of it, by
+    moving that value, and their correlations give its error.
+    """
+    joint = load_joint(reference)
+    search = _prepared(joint, [record(5, {"motor_coulomb": 26.0})], lambda _text, _share: None)
+    place = search.names.index("motor_coulomb")
+    moved = (place,)
+
+    def size(at: Any) -> float:
+        return float(at.fitted(moved, at.start).sizes(moved)[place])
+
+    pulls = np.zeros(len(search.names))
+    for k, name in enumerate(search.names):
+        if np.isfinite(search.spread[k]):
+            values = {**search.form.values, name: search.start[k] + search.spread[k]}
+            other = replace(search, form=replace(search.form, values=values))
+            pulls[k] = size(other) - size(search)
+    plain = replace(search, reference=replace(joint, correlation=Correlation()))
+    together, apart = (
+        float(s.fitted(moved, s.start).errors(moved)[place]) for s in (search, plain)
+    )
+    expected = pulls @ search.together @ pulls - pulls @ pulls
+    assert together**2 - apart**2 == pytest.approx(expected, rel=0.05)
+    assert abs(together / apart - 1) > 0.02  # it matters
 
 
 @pytest.mark.parametrize("seed", range(2, 7))

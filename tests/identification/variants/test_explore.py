@@ -24,15 +24,16 @@ from identification.variants.choice import (
     score_of,
     tied_with_best,
 )
-from identification.variants.exploration import table_of
-from identification.variants.explore import _Search
+from identification.variants.exploration import sets_of_ties, table_of
+from identification.variants.explore import Search
+from identification.variants.ground import JointGround
 from identification.variants.lattice import assembled, nodes_of, price_of, together
 from identification.variants.refit import Weighting, held_of, refitted
 from identification.variants.screen import Screen
 from tests.hidden_effect.generator import generate_case
 from tests.recorded_world.world import make_case, write_case
 from workbench.cli.main import main
-from workbench.show.front import exploration_picture
+from workbench.show.front import exploration_picture, exploration_section
 
 DEMO = Path(str(files("workbench"))) / "demo"
 SHARE = 0.2
@@ -134,10 +135,16 @@ def test_both_of_two_hidden_effects_are_recommended(tmp_path: Path) -> None:
     assert len(found.ties) <= 3
 
 
+@pytest.fixture(scope="module")
+def clean(tmp_path_factory: pytest.TempPathFactory) -> Exploration:
+    """Of records that hide nothing."""
+    return explored(None, 8102, tmp_path_factory.mktemp("clean") / "none")
+
+
 def test_where_nothing_is_hidden_the_joint_as_it_stands_is_recommended_or_tied(
-    tmp_path: Path,
+    clean: Exploration,
 ) -> None:
-    found = explored(None, 8102, tmp_path / "none")
+    found = clean
     assert found.start.tied
     assert len(repr(found).splitlines()) <= 25
     assert max(len(line) for line in repr(found).splitlines()[:-2]) <= 100
@@ -214,7 +221,8 @@ def test_a_variant_in_a_worse_valley_is_fitted_again_from_the_best() -> None:
     with them.
     """
     found, start = session(), session().start()
-    search = _Search(found, start, read(DEMO / "train.npz"), lambda text, share: None)
+    ground = JointGround(found, read(DEMO / "train.npz"))
+    search = Search(ground, start, lambda text, share: None)
     true = start.model.add(f"{HIDDEN}@motor")
     search._fit(start.model, start.values)
     search._fit(true, start.values)
@@ -374,3 +382,40 @@ def test_records_that_cannot_carry_the_question_are_refused_in_a_sentence() -> N
     joint = load_joint(DEMO / "joint.toml")
     with pytest.raises(InputError):
         explore(record.window(0.0, 0.4), joint)
+
+
+def test_ties_of_two_sets_are_told_as_sets() -> None:
+    """Two places with two names each are four variants: a reader has two questions, not four
+    models.
+    """
+    a, b, c, d, e = "stribeck@motor", "lugre@motor", "added_spring@link", "gravity", "backlash"
+    four = {frozenset(x) for x in ((a, c), (a, d), (b, c), (b, d))}
+    assert sets_of_ties((a, c), four) == ((a, b), (c, d))
+    assert sets_of_ties((a, c), four | {frozenset({a})}) == ((a, b), (c, d))
+    assert sets_of_ties((a, c), four - {frozenset({b, d})}) == ()  # not every choice
+    assert sets_of_ties((a, c), {frozenset({a, c}), frozenset({b, c})}) == ()  # one question
+    beside = {x | {e} for x in four}
+    assert sets_of_ties((a, c, e), beside) == ((a, b), (c, d), (e,))
+
+
+def test_the_sentence_of_two_sets_is_the_same_at_every_door(clean: Exploration) -> None:
+    start = clean.start
+    names = (("quadratic_drag@motor", "cubic_viscous@motor"), ("added_spring@link", "gravity"))
+    made = [
+        replace(start, added=(one, two), tied=True, name=f"+ {one} + {two}")
+        for one in names[0]
+        for two in names[1]
+    ]
+    told = replace(clean, recommended=made[0], ties=tuple(made), variants=(*made, start))
+    said = "any other choice of one of (quadratic drag (motor), cubic viscous friction (motor))"
+    assert (
+        said in told.reason and " and one of (additional spring to ground (link), " in told.reason
+    )
+    assert told.reason.count("cubic viscous") == 1
+    assert told.reason in "\n".join(table_of(told))
+    assert told.as_json()["reason"] == told.reason
+    assert f"Tied: {told.alike}" in exploration_section(told)
+    alone = replace(told, ties=(made[0],))
+    assert alone.alike == "" and "nothing else that was fitted ties" in alone.reason
+    two = replace(told, ties=(made[0], made[2]))
+    assert two.alike == "with cubic viscous friction (motor) and additional spring to ground (link)"

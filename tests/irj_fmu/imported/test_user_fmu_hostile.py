@@ -53,7 +53,9 @@ def refused(place: Path, capsys: pytest.CaptureFixture[str], *arguments: str) ->
 
 
 @pytest.mark.parametrize("case", BROKEN)
-@pytest.mark.parametrize("verb", ["fit", "compare", "diagnose", "improve", "report"])
+@pytest.mark.parametrize(
+    "verb", ["fit", "compare", "diagnose", "improve", "report", "explore", "track"]
+)
 def test_an_fmu_that_breaks_on_the_way(
     place: Path, capsys: pytest.CaptureFixture[str], case: str, verb: str
 ) -> None:
@@ -67,24 +69,30 @@ def test_an_fmu_that_breaks_on_the_way(
         "--json",
         str(place / "j.json"),
     ]
-    if verb in ("diagnose", "improve", "report"):
+    if verb in ("diagnose", "improve", "report", "explore"):
         words += ["--held-out", str(place / "lauf 2.npz")]
     if verb == "improve":
         words += ["--report", str(place / "r.html"), "--picture", str(place / "p.svg")]
-    if verb != "compare":
+    if verb not in ("compare", "track"):
         words += ["-o", str(place / ("r.html" if verb == "report" else "o.toml"))]
     said = refused(place, capsys, *words)
     assert said.startswith(f"irj: achse ö.fmu: {why}")
     assert "check start values, parameters and their bounds" in said
 
 
-@pytest.mark.parametrize("verb", ["explore", "track", "batch"])
+@pytest.mark.parametrize("verb", ["trust", "next", "twostep"])
 def test_what_does_not_take_an_fmu_says_what_does(
     place: Path, capsys: pytest.CaptureFixture[str], verb: str
 ) -> None:
     joint = placed(place, Make(2, CS))
     said = refused(place, capsys, verb, str(place / "lauf 1.npz"), "--joint", str(joint))
     assert f"its model is an FMU; `irj {verb}` does not take one, only check, fit" in said
+
+
+def test_a_batch_is_a_study_and_says_so(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    joint = placed(place, Make(2, CS))
+    said = refused(place, capsys, "batch", str(place / "lauf 1.npz"), "--joint", str(joint))
+    assert "takes a study file" in said and "[[joint]]" in said
 
 
 def test_the_one_that_cannot_be_set_is_named(
