@@ -310,7 +310,7 @@ def test_every_view_fits_a_phone_and_passes_axe(served: Served, browser: Browser
 
 WIDEST_VALUES = """document.querySelectorAll('.slide input:not([type])').forEach((f) => {
   f.value = '-0.000619076'; })"""
-"""The last digit of a fit, and with it the width of its field, differ from one machine to the next."""
+"""The last digit of a fit, and with it the width of its field, differ from machine to machine."""
 LOWEST = 9
 """Height of a letter's line under which a label is not read on a phone [px]."""
 
