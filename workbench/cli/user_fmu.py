@@ -98,6 +98,13 @@ def one_line(run: Callable[[Namespace], int]) -> Callable[[Namespace], int]:
 
 
 def open_model(arguments: Namespace) -> tuple[UserModel, list[Record], list[str]]:
+    """The model of `--joint`, its notes printed; records that hold what it maps, and warnings.
+
+    Raises
+    ------
+    InputError
+        An option that does not work with an FMU, a file or a record that cannot be used.
+    """
     from irj_fmu.imported.file import load_user_joint
 
     for option in ("other_payload", "refine"):
