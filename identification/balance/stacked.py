@@ -479,18 +479,14 @@ def unsure(
     balances: Balances, data: Dataset, values: Mapping[str, float], records: Sequence[WeakRecord]
 ) -> dict[str, FloatArray]:
     """Scatter of each row from where exactly friction changes its sign, which may act either way
-    or be spread over a turn, from when exactly a torque jumped between two samples, and from what
-    bridges of lost samples are off by [N.m].
+    or be spread over a turn, and from when exactly a torque jumped between two samples [N.m].
     """
     names = balances.model.named("smoothing")
     either = _either_way(balances.model, data, values, records)
     either = {
-        b: np.sqrt(x**2 + jumps**2 + bridges**2)
-        for (b, x), jumps, bridges in zip(
-            either.items(),
-            _between_samples(balances, data, values, records),
-            _across_bridges(balances, data, values, records),
-            strict=True,
+        b: np.hypot(x, jumps)
+        for (b, x), jumps in zip(
+            either.items(), _between_samples(balances, data, values, records), strict=True
         )
     }
     if data.sensing.kinematic:
@@ -588,27 +584,6 @@ def _between_samples(
                 )
             )
             parts.append(np.sqrt(np.maximum(told**2 - (SURE_JUMP * noise) ** 2, 0.0) / 3))
-        out.append(np.concatenate(parts) if parts else np.empty(0))
-    return out
-
-
-def _across_bridges(
-    balances: Balances, data: Dataset, values: Mapping[str, float], records: Sequence[WeakRecord]
-) -> list[FloatArray]:
-    """Scatter of the rows of each balance of the sensing from bridges of lost samples [N.m]: a
-    cubic is off where a motion has a corner, and nowhere else.
-    """
-    slopes = balances_of(balances.model, data.sensing, wrt=()).slopes(values)
-    out = []
-    for b in data.sensing.balances:
-        parts = []
-        for w in records:
-            power = np.zeros(w.rows)
-            for (one, other), product in w.bridged.items():
-                twice = 1.0 if one == other else 2.0
-                by = slopes[b].get(one, 0.0) * slopes[b].get(other, 0.0)
-                power = power + twice * by * product
-            parts.append(np.sqrt(np.maximum(power, 0.0)))
         out.append(np.concatenate(parts) if parts else np.empty(0))
     return out
 

@@ -368,33 +368,6 @@ class WeakRecord:
         ]
         return np.repeat(np.arange(len(counts)), counts)
 
-    @cached_property
-    def bridged(self) -> Mapping[tuple[str, str], FloatArray]:
-        """Covariances by which bridged samples may move the averages of two signals of a channel,
-        (rows,) each, of the pairs of signals; empty where no bridge is off.
-
-        A bridge is off to one side over all of its samples.
-        """
-        out: dict[tuple[str, str], FloatArray] = {}
-        for channel, deviation in self.bridging.items():
-            if not np.any(deviation):
-                continue
-            ends = np.flatnonzero(np.diff(deviation > 0, prepend=False, append=False))
-            power = deviation**2
-            for first, end in zip(ends[::2].tolist(), ends[1::2].tolist(), strict=True):
-                power[first:end] *= end - first
-            names = POSITION_CHAINS[channel]
-            kernels = [
-                differentiated_kernel(self.grid.length, self.grid.dt, n) for n in range(len(names))
-            ]
-            for i, one in enumerate(names):
-                for j, other in enumerate(names[: i + 1]):
-                    inner = len(kernels[j])  # those of higher derivatives may be longer
-                    outside = (len(kernels[i]) - inner) // 2
-                    same = kernels[i][outside : outside + inner]
-                    out[one, other] = self.grid.correlate(power, same * kernels[j])
-        return out
-
     @property
     def begins(self) -> npt.NDArray[np.bool_]:
         """Rows that begin a stretch after another one, shape (rows,): no curve is drawn up to

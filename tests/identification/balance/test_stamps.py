@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import math
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,6 @@ import pytest
 from identification import Joint, Record, fit, load_joint, read
 from identification.balance.calibration import is_of_run
 from identification.balance.stamps import bridge_errors, bridged, evened, longest_hole, slots_of
-from identification.balance.weak import POSITION_CHAINS, prepare
 from identification.data.check.checks import check, gate, repair
 from identification.diagnosis.places import running_time
 from tests.hidden_effect.generator import generate_case
@@ -247,31 +245,3 @@ def test_what_a_bridge_is_off_by_is_known_where_it_is_more_than_noise(seed: int)
             assert 0.6 < size < 1.5
         else:
             assert np.mean(told[~there] > 0) < 0.03
-
-
-@pytest.mark.parametrize("dt", [5e-3, 1e-2])
-@pytest.mark.parametrize("signal", ["drive", "motor_position"])
-def test_rows_know_by_how_much_their_bridges_may_move_them(signal: str, dt: float) -> None:
-    """Averages of a motion with corners over bridged samples, less those over all: of the size that
-    each row states, and nothing where nothing is stated.
-    """
-    rng = np.random.default_rng(3)
-    n, level = 60_000, 2e-5
-    t = np.arange(n) * dt
-    corners = np.abs((t / 0.31) % 2 - 1)
-    corners = np.convolve(corners, np.hanning(9) / np.hanning(9).sum(), "same")
-    there = rng.random(n) > 0.1
-    there[[0, -1]] = True
-    whole = corners + level * rng.standard_normal(n)
-    where = np.where(there, np.cumsum(there) - 1, -1)
-    filled = bridged(t[there], whole[there, None], t, where)[:, 0]
-    segments = (slice(0, n),)
-    made, true = (prepare(t, {signal: x}, segments) for x in (filled, whole))
-    made = replace(made, bridging={signal: bridge_errors(filled, there, segments, level)})
-    for name in POSITION_CHAINS[signal][:3]:
-        told = np.sqrt(made.bridged[name, name])
-        off = made.averaged[name] - true.averaged[name]
-        loud = told > 3 * np.std(off[told == 0])
-        assert 0.6 < np.sqrt(np.mean(off[loud] ** 2) / np.mean(told[loud] ** 2)) < 1.5
-        assert np.max(np.abs(off[loud]) / told[loud]) < 8
-        assert np.sqrt(np.mean(off[told == 0] ** 2)) < 0.2 * np.sqrt(np.mean(off[loud] ** 2))
