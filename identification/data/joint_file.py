@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, final
@@ -22,7 +22,7 @@ from identification.data.joint_schema import (
 )
 from identification.data.own_effects import TABLE, load_remembered, remembered
 from identification.data.plain_text import from_toml, toml_key, toml_value
-from identification.data.schema import Schema, meant
+from identification.data.schema import Schema, finite, meant, refuse_unknown
 from identification.data.typed_laws import LAWS, hold_laws, law_lines, read_laws
 from identification.data.units import base_unit, same_dimension
 from identification.errors import InputError
@@ -63,6 +63,8 @@ class Joint:
         By parameter name; fitted values come from a fit written back.
     errors : mapping
         Standard errors of fitted values, where the file has them.
+    correlations : mapping of str to mapping
+        Correlations of these errors, each pair at one of its two names.
     columns : mapping or None
         Column map of the record files.
     orders : tuple of float
@@ -86,6 +88,7 @@ class Joint:
     known: Mapping[str, Known] = field(default_factory=dict)
     fitted: Mapping[str, float] = field(default_factory=dict)
     errors: Mapping[str, float] = field(default_factory=dict)
+    correlations: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     columns: Mapping[str, Any] | None = None
     virtual_work: bool = True
     source: str = ""
@@ -209,6 +212,11 @@ def parse_joint(data: Mapping[str, Any], source: str = "joint") -> Joint:
         source=source,
         fitted={k: v["value"] for k, v in fitted.items()},
         errors={k: v["stderr"] for k, v in fitted.items() if v["stderr"] is not None},
+        correlations={
+            k: _correlations(k, v["correlations"], fitted, source)
+            for k, v in fitted.items()
+            if v["correlations"] is not None
+        },
         laws=read_laws(data.get(LAWS, {}), kind, source),
     )
     load_remembered(data.get(TABLE, {}), source)
@@ -373,6 +381,18 @@ def _fitted(name: str, entry: Any, source: str) -> dict[str, Any]:
         )
     _check_size(abs(given["value"]), f"{source}: [fitted] {name}")
     return given
+
+
+def _correlations(name: str, entry: Any, fitted: Collection[str], source: str) -> dict[str, float]:
+    where = f"{source}: [fitted] {name}: correlations"
+    if not isinstance(entry, Mapping):
+        raise InputError(f"{where} must be a table of numbers, as {{ motor_viscous = -0.8 }}")
+    refuse_unknown(entry, fitted, where)
+    out = {other: finite(value, f"{where}: {other}") for other, value in entry.items()}
+    for other, value in out.items():
+        if not -1 <= value <= 1:
+            raise InputError(f"{where}: {other} = {value:g} lies outside -1 to 1; fit again")
+    return out
 
 
 def _check_size(value: float, where: str) -> None:

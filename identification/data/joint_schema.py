@@ -163,6 +163,14 @@ FITTED: Final = Schema(
         Key("stderr", "number", "its standard error", unit="SI", digits=6),
         Key("unit", "text", "its SI unit, for the reader"),
         Key("side", "text", "side on which the parameter acts, for the reader"),
+        Key(
+            "correlations",
+            "any",
+            "correlations of its error with those of others, each pair once; `irj changed` takes "
+            "errors without them as independent",
+            form="`{ motor_viscous = -0.8 }`",
+            unit="1",
+        ),
     ),
 )
 

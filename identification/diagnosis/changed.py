@@ -362,6 +362,7 @@ def _prepared(reference: Joint, records: Sequence[Record], tell: Progress) -> _S
         form=form,
         spread=_prior(reference, model, values),
         unsure=_unsure(refit, data, names),
+        tied=_tied_errors(reference, names, max(float(ratios.max()), 1.0) ** -2),
         inexact=inexact,
         shares=shares,
         refitted=error,
@@ -464,6 +465,21 @@ def _unsure(refit: Solution, data: Dataset, names: Sequence[str]) -> FloatArray:
     return np.array(out)
 
 
+def _tied_errors(reference: Joint, names: Sequence[str], noise: float) -> FloatArray:
+    """Correlations of the errors of the reference, (p, p); those that its file does not tell, and
+    those of what is taken from the refit, are none.
+
+    `noise`: share of the squares that the model leaves which is noise. What else it leaves is
+    error of the model, which makes others on another motion: there nothing cancels.
+    """
+    out, place = np.eye(len(names)), {n: i for i, n in enumerate(names)}
+    for one, pairs in reference.correlations.items():
+        for other, value in pairs.items():
+            if one in place and other in place:
+                out[place[one], place[other]] = out[place[other], place[one]] = noise * value
+    return out
+
+
 @final
 @dataclass(frozen=True)
 class _Search:
@@ -477,6 +493,8 @@ class _Search:
         Standard error of each reference value; not a number for a nuisance.
     unsure : (p,) array
         Standard error of each value of the refit, not a number where it has none.
+    tied : (p, p) array
+        Correlations of the errors of the reference.
     inexact : (balances,) array
         Squares that the model leaves over the noise with every parameter fitted anew.
     shares : (balances,) array
@@ -492,6 +510,7 @@ class _Search:
     form: WeakForm
     spread: FloatArray
     unsure: FloatArray
+    tied: FloatArray
     inexact: FloatArray
     shares: FloatArray
     refitted: Error
@@ -877,7 +896,9 @@ class _Point:
 
         Three parts: the scatter between windows of time; the standard error of the reference value;
         and those of the values that are held, as far as an error there would have moved this one.
-        In other coordinates, x = `turned` @ new, where these are given.
+        The last two belong together: a friction that the reference's fit took for viscous was
+        missing in its dry one, and on a motion alike both errors cancel.  In other coordinates,
+        x = `turned` @ new, where these are given.
         """
         free = self.search.free(moved)
         if not free:
@@ -890,17 +911,18 @@ class _Point:
         scores = (whole[:, :-1, -1] + whole[:, :-1, :-1] @ step)[:, free]
         grams = core[:, :-1, :-1]
         normal = self._normal(total, noise, free)
-        pulled = -inverse(normal) @ (total - noise)[np.ix_(free, held)] * errors[held]
-        own = np.where(np.isin(free, moved), self.search.spread[free], 0.0)
+        pulled = inverse(normal) @ (total - noise)[np.ix_(free, held)] * errors[held]
+        reference = np.hstack([np.diag(errors[free]), pulled])
+        tied = self.search.tied[np.ix_([*free, *held], [*free, *held])]
         grams = grams[:, free][:, :, free]
         if turned is not None:
             back = np.linalg.inv(turned)
             grams, scores = np.einsum("ia,bij,jc->bac", turned, grams, turned), scores @ turned
-            pulled, normal = back @ pulled, turned.T @ normal @ turned
-            own = np.sqrt((back**2) @ own**2)
+            reference, normal = back @ reference, turned.T @ normal @ turned
         windows = errors_of_windows(grams, scores, normal, self.search.independent)
         found = np.zeros(len(free)) if windows is None else windows
-        return np.asarray(np.sqrt(found**2 + own**2 + np.sum(pulled**2, axis=1)))
+        known = np.maximum(np.einsum("ia,ab,ib->i", reference, tied, reference), 0.0)
+        return np.asarray(np.sqrt(found**2 + known))
 
     def errors(self, moved: Sequence[int]) -> FloatArray:
         """Standard errors of the changes by place, (p,); infinite for what is held."""

@@ -81,6 +81,9 @@ class Solution:
     at_bound, unidentified : tuple of str
     correlation : mapping
         Largest correlation of each parameter with another one: (name, value).
+    tied : mapping of str to mapping
+        Correlations of the standard errors, each pair at the later of its two names: two errors
+        that lie against each other leave the sum of what their columns make surer than either.
     """
 
     model: JointModel
@@ -93,6 +96,7 @@ class Solution:
     unidentified: tuple[str, ...] = ()
     correlation: Mapping[str, tuple[str, float]] = field(default_factory=dict)
     iterations: int = 0
+    tied: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return (
@@ -533,6 +537,7 @@ def _with_errors(
     usable = np.array([norm > 0 and n not in at_bound for n, norm in zip(free, norms, strict=True)])
     stderr: dict[str, float | None] = dict.fromkeys(values)
     correlation: dict[str, tuple[str, float]] = {}
+    tied: dict[str, dict[str, float]] = {}
     unidentified = [
         n for n, norm in zip(free, norms, strict=True) if norm <= 0 and n not in smoothing
     ]
@@ -548,13 +553,15 @@ def _with_errors(
             if n in at_bound and norms[k] > 0 and not problem.bent[k] and not problem.clocks[k]
         ]
         high = [values[free[k]] >= limits[free[k]][1] for k in held]
-        wider = np.zeros(len(index)) if size is None else bands.beside(index, held, high)
+        whole = None
+        if part.covariance is not None:
+            whole = part.covariance + bands.beside(index, held, high)
+            whole /= np.outer(norms[index], norms[index])
+            tied = _tied([free[i] for i in index.tolist()], whole)
         spread, corr = correlations(part.gram)
         corr[:, [is_of_run(free[i]) for i in index.tolist()]] = 0.0
         for k, i in enumerate(index.tolist()):
-            stderr[free[i]] = (
-                None if size is None else math.hypot(float(size[k]), float(wider[k] / norms[i]))
-            )
+            stderr[free[i]] = None if whole is None else math.sqrt(float(whole[k, k]))
             other = int(np.argmax(np.abs(corr[k])))
             correlation[free[i]] = (free[int(index[other])], float(corr[k, other]))
             weak = size is not None and values[free[i]] != 0 and size[k] > abs(values[free[i]])
@@ -580,4 +587,17 @@ def _with_errors(
         unidentified=tuple(unidentified),
         correlation=correlation,
         iterations=used,
+        tied=tied,
     )
+
+
+def _tied(names: Sequence[str], covariance: FloatArray) -> dict[str, dict[str, float]]:
+    """Correlations of errors, each pair once; the calibration of single runs left out."""
+    size = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    together = covariance / np.outer(size, size)
+    kept = [k for k, n in enumerate(names) if not is_of_run(n)]
+    return {
+        names[k]: {names[m]: float(together[k, m]) for m in kept[:i]}
+        for i, k in enumerate(kept)
+        if i
+    }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Final
 
 from identification.balance.calibration import Found, calibration_found
 from identification.balance.dataset import HOLD_DELAY, Dataset
@@ -10,6 +11,10 @@ from identification.data.joint_file import Joint, toml_text
 from identification.fitting.engine import Solution
 from identification.fitting.parameters import parameter_table
 from identification.version import VERSION
+
+DIGITS: Final = 6
+"""Decimals of a correlation: two errors that all but cancel are then still known to a hundredth of
+either, as `stderr` is to six digits."""
 
 
 def calibration_of(solution: Solution, data: Dataset) -> tuple[Found, ...]:
@@ -20,7 +25,12 @@ def calibration_of(solution: Solution, data: Dataset) -> tuple[Found, ...]:
 def joint_text(joint: Joint, solution: Solution, data: Dataset) -> str:
     """A joint file with fitted values, standard errors and provenance."""
     labels = tuple(label for label in solution.model.effects if label != HOLD_DELAY)
-    fitted = {n: p for n, p in parameter_table(solution, data).items() if n in solution.values}
+    table = parameter_table(solution, data)
+    fitted = {n: p for n, p in table.items() if n in solution.values}
+    told = {n for n, p in fitted.items() if p["stderr"] is not None}
+    for n in told & set(solution.tied):
+        pairs = {m: round(x, DIGITS) for m, x in solution.tied[n].items() if m in told}
+        fitted[n] = {**fitted[n], "correlations": pairs or None}
     whole = replace(joint, effects=labels, virtual_work=solution.model.virtual_work)
     calibration = {
         f"{c.what} of {c.sensor} in {data.train_names[c.run]}": c.as_json()

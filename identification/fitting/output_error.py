@@ -370,6 +370,7 @@ def _refined(
         model=model,
         values=dict(values),
         stderr={**old.stderr, **stderr},
+        tied={},  # of other errors
         weights=weights,
         at_bound=bound,
         iterations=used,

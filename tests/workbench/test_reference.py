@@ -112,14 +112,25 @@ def test_what_is_written_is_what_is_read() -> None:
         sample_time=2.5e-3,
         columns={"motor_current": {"column": "iq", "unit": "mA", "sign": -1}},
     )
-    fitted = {"motor_viscous": {"value": 3.0, "stderr": 0.1, "unit": "N.m.s/rad", "side": "link"}}
+    fitted = {
+        "motor_viscous": {"value": 3.0, "stderr": 0.1, "unit": "N.m.s/rad", "side": "link"},
+        "motor_coulomb": {
+            "value": 2.0,
+            "stderr": 0.2,
+            "unit": "N.m",
+            "side": "link",
+            "correlations": {"motor_viscous": -0.8},
+        },
+    }
     found = {"zero": {"value": 1e-3, "stderr": None, "unit": "rad", "what": "zero"}}
     text = toml_text(joint, fitted, {"records": "a, b", "version": "1"}, found)
     tables = from_toml(text, "text")
     again = parse_joint(tables, joint.source)
-    assert replace(again, fitted={}, errors={}) == replace(joint, fitted={}, errors={})
+    plain = {"fitted": {}, "errors": {}, "correlations": {}}
+    assert replace(again, **plain) == replace(joint, **plain)
     assert again.fitted["motor_viscous"] == 3.0
-    assert again.errors == {"motor_viscous": 0.1}
+    assert again.errors == {"motor_viscous": 0.1, "motor_coulomb": 0.2}
+    assert again.correlations == {"motor_coulomb": {"motor_viscous": -0.8}}
     assert set(tables["calibration"]["zero"]) == {"value", "unit"}
     assert tables["provenance"] == {"records": "a, b", "sample_time": 2.5e-3, "version": "1"}
 
@@ -145,9 +156,28 @@ ERRORS: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "choice": ({"joint": {"kind": "round"}}, "kind = 'round' is not known; use one of rotary,"),
     "number": ({"joint": {"gear_ratio": True}}, "gear_ratio = True is not a finite number"),
+    "tied": (
+        {
+            "joint": {},
+            "fitted": {"link_inertia": {"value": 1.0, "correlations": {"motor_inertia": 0.5}}},
+        },
+        "[fitted] link_inertia: correlations has an unknown key 'motor_inertia'; known: ",
+    ),
+    "beyond": (
+        {
+            "joint": {},
+            "fitted": {"link_inertia": {"value": 1.0, "correlations": {"link_inertia": 1.5}}},
+        },
+        "[fitted] link_inertia: correlations: link_inertia = 1.5 lies outside -1 to 1",
+    ),
+    "pairs": (
+        {"joint": {}, "fitted": {"link_inertia": {"value": 1.0, "correlations": 0.5}}},
+        "[fitted] link_inertia: correlations must be a table of numbers",
+    ),
     "fitted": (
         {"joint": {}, "fitted": {"link_inertia": {"value": 1.0, "stder": 1.0}}},
-        "[fitted] link_inertia has an unknown key 'stder'; known: side, stderr, unit, value; did "
+        "[fitted] link_inertia has an unknown key 'stder'; known: correlations, side, stderr, "
+        "unit, value; did "
         "you mean 'stderr'?",
     ),
     "known": (

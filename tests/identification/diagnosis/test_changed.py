@@ -98,6 +98,50 @@ def test_standard_errors_of_a_fit_come_back_from_its_file(reference: Path) -> No
             assert read_back.errors[name] == pytest.approx(p["stderr"], rel=1e-5)
 
 
+def test_correlations_of_errors_come_back_from_the_file(reference: Path) -> None:
+    found, told = fit(JOINT, record(1)).solution, load_joint(reference).correlations
+    pairs = {(n, m): x for n, with_ in told.items() for m, x in with_.items()}
+    names = [n for n in load_joint(reference).errors if n in found.stderr]
+    assert len(pairs) == len(names) * (len(names) - 1) / 2
+    for (n, m), x in pairs.items():
+        assert x == pytest.approx(found.tied[n][m], abs=1e-6)
+    # more viscous friction and less dry friction explain a motion about alike
+    assert pairs["motor_coulomb", "motor_viscous"] < -0.5
+
+
+AXIS = Joint(name="axis", model_name="hd1", effects=("viscous", "coulomb"))
+
+
+def sweep(seed: int, gain: float = 1.0) -> Record:
+    """30 s to and fro at nearly one speed, where viscous and dry friction are nearly one column."""
+    rng, dt = np.random.default_rng(seed), 4e-3
+    t = np.arange(0.0, 30.0, dt)
+    rate, phase = 0.5 * np.pi * rng.uniform(0.95, 1.05), rng.uniform(0.0, 6.0)
+    slow = 1 + 0.2 * np.sin(0.44 * t + phase)
+    velocity = 0.5 * np.tanh(3 * np.sin(rate * t)) * slow
+    torque = 8 * np.gradient(velocity, dt) + 60 * velocity + 40 * np.tanh(velocity / 2e-3)
+    return Record.from_channels(
+        t,
+        {
+            "motor_torque": torque / gain + 4.0 * rng.standard_normal(len(t)),
+            "motor_position": np.cumsum(velocity) * dt + 1e-6 * rng.standard_normal(len(t)),
+        },
+        name=f"sweep {seed}",
+    )
+
+
+def test_errors_of_a_reference_that_lie_against_each_other_cancel() -> None:
+    """Each friction is known to .6 %, their sum to .1 %: so is a gain, which scales both."""
+    healthy = parse_joint(tomllib.loads(fit(AXIS, sweep(1)).to_joint_file()))
+    off = []
+    for seed in range(2, 8):
+        found = changed(healthy, sweep(seed, gain=0.97)).changes
+        assert [c.parameter for c in found] == ["motor_constant_error"]
+        off.append((found[0].after + 0.03) / found[0].stderr)
+    # the stated error is that of the scatter about the truth: without correlations .17
+    assert 0.4 < float(np.sqrt(np.mean(np.square(off)))) < 1.5
+
+
 @pytest.mark.parametrize("seed", range(2, 7))
 def test_nothing_changed_on_new_motion(reference: Path, seed: int) -> None:
     found = changed(load_joint(reference), record(seed))
