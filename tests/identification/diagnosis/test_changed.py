@@ -142,6 +142,55 @@ def test_errors_of_a_reference_that_lie_against_each_other_cancel() -> None:
     assert 0.4 < float(np.sqrt(np.mean(np.square(off)))) < 1.5
 
 
+def cycle(seed: int, *, start: float = 0.0, coulomb: float = 40.0, rate: float = 1.1) -> Record:
+    """20 s of an axis that repeats a motion, with torques that no law of the model has: cogging, a
+    rope that pulls and a jerk at each turn.
+    """
+    rng, dt = np.random.default_rng(seed), 4e-3
+    t = np.arange(0.0, 20.0, dt)
+    place = np.mod(t + start, 10.0)  # of the motion, which takes 10 s
+    velocity = 0.5 * np.sin(rate * np.pi * place / 5) + 0.3 * np.sin(0.4 * np.pi * place)
+    angle = np.cumsum(velocity) * dt
+    angle += 0.5 * 5 / (rate * np.pi) * (1 - np.cos(rate * np.pi * place[0] / 5))
+    angle += 0.3 / (0.4 * np.pi) * (1 - np.cos(0.4 * np.pi * place[0]))
+    strange = 9 * np.sin(23 * angle) + 7 * np.abs(angle) + 9 * np.exp(-((velocity / 0.08) ** 2))
+    torque = 8 * np.gradient(velocity, dt) + 30 * velocity + strange
+    torque += coulomb * np.tanh(velocity / 2e-3) + 2.0 * rng.standard_normal(len(t))
+    position = angle + 1e-6 * rng.standard_normal(len(t))
+    channels = {"motor_torque": torque, "motor_position": position}
+    return Record.from_channels(t, channels, name=f"cycle {seed}")
+
+
+def test_on_the_same_motion_the_errors_of_the_model_are_no_veil() -> None:
+    """Dry friction 8 % higher, beside a model that leaves thirteen times the noise: alone it is not
+    seen, and what the model lacks is taken for an offset where the record begins elsewhere.
+    """
+    healthy = cycle(1, rate=1.0)
+    reference = parse_joint(tomllib.loads(fit(AXIS, healthy).to_joint_file()))
+    now = cycle(2, start=3.7, coulomb=43.2, rate=1.0)
+    alone = changed(reference, now)
+    assert [c.parameter for c in alone.changes] == ["current_offset"]
+    assert alone.least["motor_coulomb"] > 3.2
+    beside = changed(reference, now, healthy=healthy)
+    assert beside.alike == ("cycle 1",)
+    (change,) = beside.changes
+    assert change.parameter == "motor_coulomb"
+    assert change.after - change.before == pytest.approx(3.2, abs=3 * change.stderr)
+    assert change.stderr < 0.4
+    still = changed(reference, cycle(3, start=5.1, rate=1.0), healthy=healthy)
+    assert still.changes == ()
+    assert still.least["motor_coulomb"] < alone.least["motor_coulomb"]
+
+
+def test_another_motion_has_other_errors() -> None:
+    """Healthy records that move otherwise change nothing of the answer."""
+    reference = parse_joint(tomllib.loads(fit(AXIS, cycle(1, rate=1.0)).to_joint_file()))
+    other, now = sweep(4), cycle(2, coulomb=60.0, rate=1.0)
+    alone, beside = changed(reference, now), changed(reference, now, healthy=other)
+    assert beside.alike == ()
+    assert beside.as_json() == alone.as_json()
+
+
 @pytest.mark.parametrize("seed", range(2, 7))
 def test_nothing_changed_on_new_motion(reference: Path, seed: int) -> None:
     found = changed(load_joint(reference), record(seed))
