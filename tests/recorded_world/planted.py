@@ -29,6 +29,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.signal import savgol_filter
 
+from identification.balance.weak import CLAIM_KERNEL, differentiated_kernel
 from tests.recorded_world.campaign import ENTRY, load_entry, time_limit
 
 if TYPE_CHECKING:
@@ -419,6 +420,9 @@ def _new(
             or "no claim"
         )
         said = f"{sets}. {result['verdict']}, {left:.1f} %, {time.process_time() - began:.0f} s"
+        told = [x["least"] for x in result["refused"] if x["effect"] in right and "least" in x]
+        unseen = bool(law and told and not found) and min(told) > _size(rig, train, law, size)
+        said += ", too small to be seen" if unseen else ""
         outcomes.append(
             Outcome(
                 rig=rig.name,
@@ -429,9 +433,19 @@ def _new(
                 alone=alone,
                 wrong=wrong,
                 said=said,
+                unseen=unseen,
             )
         )
     return outcomes
+
+
+def _size(
+    rig: Rig, tables: list[Table], law: Callable[[Rig, Motion, float], FloatArray], size: float
+) -> float:
+    """RMS of what a law adds to the drive's torque, averaged as the rows of a balance are."""
+    row = differentiated_kernel(CLAIM_KERNEL, rig.step, 0)
+    added = [np.convolve(law(rig, motion(rig, t), size), row, "same") for t in tables]
+    return float(np.sqrt(np.mean(np.concatenate(added) ** 2)))
 
 
 def _verb(*words: str) -> tuple[int, str]:
