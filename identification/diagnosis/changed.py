@@ -25,7 +25,8 @@ from identification.balance.balances import balances_of
 from identification.balance.calibration import names_of_runs, of_run
 from identification.balance.dataset import HOLD_NAME, Dataset, prepared_model
 from identification.balance.noise import effective_share
-from identification.balance.stacked import taking_part
+from identification.balance.stacked import stack, taking_part
+from identification.balance.weak import WeakRecord
 from identification.data.joint_file import Joint
 from identification.data.prepare import STANDARD_GRAVITY
 from identification.data.record import Record, listed
@@ -34,6 +35,7 @@ from identification.diagnosis.claims import FALSE_DISCOVERY, GAIN, LARGEST_SET
 from identification.errors import InputError
 from identification.fitting.assess import RATIO_LIMIT, Error, assess
 from identification.fitting.covariance import (
+    BLOCK,
     FEWEST_BLOCKS,
     cores,
     errors_of_windows,
@@ -42,7 +44,7 @@ from identification.fitting.covariance import (
     windows_over,
 )
 from identification.fitting.dataset import dataset_of
-from identification.fitting.engine import Solution, solve, stack
+from identification.fitting.engine import Solution, solve
 from identification.fitting.errors_in_variables.equations import unbiased
 from identification.fitting.errors_in_variables.products import noise_products, whole_without
 from identification.fitting.start_values import bounds_of
@@ -75,8 +77,17 @@ HELD: Final = 1e-6
 file's figures go.
 """
 LEAST_TOLD: Final = 0.05
-"""Share of a value from which the smallest change that could be seen is printed: the viscous
-friction of EMPS differs by as much between its two recordings.
+"""Share of a value from which the smallest change that could be seen is printed, and from which a
+change between two records of the same motion is named: the viscous friction of EMPS differs by as
+much between its two recordings, and what warmth does is certain there and no fault.
+"""
+LEAST_ALIKE: Final = 0.5
+"""Share of a stretch for which a healthy one must last, at a lag, to be asked whether its motion is
+the same: less of it is alike by chance, as any start and stop is.
+"""
+CLOSER: Final = 20
+"""Parts of the distance of two rows at which the lag of a motion alike is looked for: what is left
+of it is a few hundredths of the kernel.
 """
 STEPS: Final = 12
 """Steps of one refit at most: it starts next to its end."""
@@ -181,6 +192,8 @@ class Changes:
     least : mapping of str to float
         Of each parameter that stayed, gain and offset of the sensors with them: about the smallest
         change that would have been named, either way, in its unit. A smaller one may be there.
+    alike : tuple of str
+        Healthy records whose motion was the same: what the model leaves in both was no change.
     """
 
     joint: Joint
@@ -196,6 +209,7 @@ class Changes:
     payload_note: str = ""
     minor: tuple[Change, ...] = ()
     least: Mapping[str, float] = field(default_factory=dict)
+    alike: tuple[str, ...] = ()
 
     @property
     def unexplained(self) -> tuple[str, ...]:
@@ -214,6 +228,7 @@ class Changes:
             "unchanged": list(self.unchanged),
             "untestable": list(self.untestable),
             "records": list(self.records),
+            "alike": list(self.alike),
             "before": self.before.as_json(),
             "after": self.after.as_json(),
             "refitted": self.refitted.as_json(),
@@ -225,6 +240,11 @@ class Changes:
         return "\n".join(self._lines())
 
     def _lines(self) -> Iterable[str]:
+        if self.alike:
+            yield (
+                f"the motion is that of {', '.join(self.alike)}: what the model leaves there, too, "
+                "is taken off"
+            )
         for word, group in (("changed", self.changes), ("small but certain", self.minor)):
             for c in group:
                 share = f" ({100 * (c.after / c.before - 1):+.1f} %)" if c.before else ""
@@ -276,7 +296,11 @@ class Changes:
 
 
 def changed(
-    reference: Joint, records: Record | Sequence[Record], *, progress: Progress | None = None
+    reference: Joint,
+    records: Record | Sequence[Record],
+    *,
+    healthy: Record | Sequence[Record] = (),
+    progress: Progress | None = None,
 ) -> Changes:
     """Name the parameters of a fitted joint that moved.
 
@@ -286,6 +310,10 @@ def changed(
         A joint file written by a fit, with its values and standard errors.
     records : Record or sequence of Record
         New records, with the channels of those of the fit.
+    healthy : Record or sequence of Record, optional
+        Records of the joint as it was fitted. Where one moves as the new ones do, what the model
+        leaves in it is taken off what it leaves in them: the errors of a model are the same on the
+        same motion, and smaller changes are seen beside them.
     progress : callable, optional
         ``progress(text, share)``.
 
@@ -305,13 +333,18 @@ def changed(
     """
     given = listed(records)
     tell = progress or (lambda text, share: None)
-    search = _prepared(reference, given, tell)
+    search = _prepared(reference, given, tell, listed(healthy))
     moved = search.chosen(tell)
     tell("sizes and bands", 0.9)
     return _result(search, moved, tuple(r.name for r in given))
 
 
-def _prepared(reference: Joint, records: Sequence[Record], tell: Progress) -> _Search:
+def _prepared(
+    reference: Joint,
+    records: Sequence[Record],
+    tell: Progress,
+    healthy: Sequence[Record] = (),
+) -> _Search:
     """The structure of the reference on the new records, with the calibration of its sensors as
     what may have changed too.
     """
@@ -353,7 +386,20 @@ def _prepared(reference: Joint, records: Sequence[Record], tell: Progress) -> _S
     form = WeakForm(balances, data, values, names, weights)
     ratios = np.array([error.balances[b].ratio for b in balances.balances])
     noise = squares / np.maximum(ratios, 1.0) ** 2
-    inexact = np.maximum(_left(form, refit) - noise, 0.0)
+    inexact = np.maximum(_squares(_left(form, refit)) - noise, 0.0)
+    alike = None
+    if healthy:
+        tell("looking for the same motion", 0.15)
+        then = dataset_of(healthy, [], free, plain, kernel=data.kernel, like=data.sensing)
+        alike = _alike(form, then.train, then.train_names)
+    if alike is not None and (beside := _beside(form, alike, refit, shares)) is not None:
+        share = np.array([np.mean(told) for told in alike.told.values()])
+        # both recordings have their own noise
+        noise *= 2 * share * beside[1] / shares
+        form, shares = beside
+        inexact = np.maximum(_squares(_left(form, refit)) - noise, 0.0)
+    else:
+        alike = None
     return _Search(
         reference,
         model,
@@ -362,9 +408,11 @@ def _prepared(reference: Joint, records: Sequence[Record], tell: Progress) -> _S
         form=form,
         spread=_prior(reference, model, values),
         unsure=_unsure(refit, data, names),
+        tied=_tied_errors(reference, names, max(float(ratios.max()), 1.0) ** -2),
         inexact=inexact,
         shares=shares,
         refitted=error,
+        alike=alike,
     )
 
 
@@ -407,9 +455,14 @@ def _shared(refit: Solution, data: Dataset) -> tuple[dict[str, FloatArray], Floa
     return weights, np.array(squares), np.array(shares)
 
 
-def _left(form: WeakForm, refit: Solution) -> FloatArray:
-    """Squares that are left in each balance with every parameter fitted anew, gain and offset of
-    the sensors among them: they may have changed too, and a change is no error of the model.
+def _squares(rows: Mapping[str, FloatArray]) -> FloatArray:
+    """Sum of squares of each balance."""
+    return np.array([float(r @ r) for r in rows.values()])
+
+
+def _left(form: WeakForm, refit: Solution) -> dict[str, FloatArray]:
+    """Weighted rows that are left of each balance with every parameter fitted anew, gain and offset
+    of the sensors among them: they may have changed too, and a change is no error of the model.
 
     One linear step from the refit, which has no sensor's gain and offset: they enter nearly so.
     A gain is a mixture of the others where it scales all of them; the step is the shortest.
@@ -420,15 +473,162 @@ def _left(form: WeakForm, refit: Solution) -> FloatArray:
     stacked = form.stacked(x)
     columns, rows, sizes = [], [], []
     for b in form.balances.balances:
-        taking, weight = stacked.taking[b], np.asarray(form.weights[b])
+        weight = np.asarray(form.weights[b])
+        taking = stacked.taking[b] & (weight > 0)
         columns.append((stacked.jacobian[b] * weight[:, None])[taking][:, moves])
         rows.append((stacked.residual[b] * weight)[taking])
         sizes.append(len(rows[-1]))
     jacobian, residual = np.vstack(columns), np.concatenate(rows)
     scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
     step = np.linalg.lstsq(jacobian / scale, -residual, rcond=1e-9)[0]
-    after = (residual + jacobian / scale @ step) ** 2
-    return np.array([float(p.sum()) for p in np.split(after, np.cumsum(sizes)[:-1])])
+    after = np.split(residual + jacobian / scale @ step, np.cumsum(sizes)[:-1])
+    return dict(zip(form.balances.balances, after, strict=True))
+
+
+@final
+@dataclass(frozen=True)
+class _Alike:
+    """What healthy records leave where they moved as the new ones do, row by row of these.
+
+    Attributes
+    ----------
+    left : mapping of str to (rows,) array
+        Residual of each balance at the values of the reference; zero where there is none.
+    columns : mapping of str to (rows, p) array
+        Derivatives of that by the parameters.
+    told : mapping of str to (rows,) bool array
+        Rows for which there is one.
+    records : tuple of str
+        Names of these healthy records.
+    """
+
+    left: Mapping[str, FloatArray]
+    columns: Mapping[str, FloatArray]
+    told: Mapping[str, npt.NDArray[np.bool_]]
+    records: tuple[str, ...]
+
+
+def _alike(form: WeakForm, then: Sequence[WeakRecord], records: Sequence[str]) -> _Alike | None:
+    """For each stretch of the new records the healthy stretch, and the lag, at which the joint
+    moved most like it; None where none lasts long enough. `records`: names of the healthy ones.
+    """
+    there = stack(form.balances, then, form.values, form.free)
+    now = form.data.train
+    taking = {b: taking_part(b, now) for b in form.balances.balances}
+    left = {b: np.zeros(form.rows) for b in taking}
+    columns = {b: np.zeros((form.rows, len(form.free))) for b in taking}
+    told = {b: np.zeros(form.rows, dtype=np.bool_) for b in taking}
+    names: dict[str, None] = {}
+    theirs = [(n, s) for n, each in zip(records, _stretches(then), strict=True) for s in each]
+    for own in (s for stretches in _stretches(now) for s in stretches):
+        fits = [(*found, name, s) for name, s in theirs if (found := _lag(own, s)) is not None]
+        if not fits:
+            continue
+        _, lag, name, other = min(fits, key=lambda f: f[0])
+        names.setdefault(name)
+        place = np.searchsorted(other.time, own.time - lag) - 1
+        inside = (place >= 0) & (place + 1 < len(other.time))
+        place = np.clip(place, 0, len(other.time) - 2)
+        part = (own.time - lag - other.time[place]) / np.diff(other.time)[place]
+        low, high = other.rows[place], other.rows[place + 1]
+        for b in taking:
+            sure = inside & taking[b][own.rows] & there.taking[b][low] & there.taking[b][high]
+            told[b][own.rows] = sure
+            for out, of in ((left[b], there.residual[b]), (columns[b], there.jacobian[b])):
+                p = part.reshape(-1, *[1] * (of.ndim - 1))
+                whole = of[low] * (1 - p) + of[high] * p
+                out[own.rows] = np.where(sure.reshape(p.shape), whole, 0.0)
+    return _Alike(left, columns, told, tuple(names)) if names else None
+
+
+@final
+@dataclass(frozen=True)
+class _Stretch:
+    """A course without a gap: its rows among all, their times [s], and the motion in units of its
+    RMS in the record, (rows, 2).
+    """
+
+    rows: IntArray
+    time: FloatArray
+    motion: FloatArray
+
+
+def _stretches(records: Sequence[WeakRecord]) -> list[list[_Stretch]]:
+    """The stretches of each record that are longer than a block."""
+    out, first = [], 0
+    for w in records:
+        side = "motor" if "motor_position" in w.averaged else "link"
+        motion = np.column_stack([w.averaged[f"{side}_{s}"] for s in ("position", "velocity")])
+        parts = [np.flatnonzero(w.stretch == k) for k in range(int(w.stretch.max()) + 1)]
+        out.append(
+            [
+                _Stretch(first + p, w.time[p], motion[p])
+                for p in parts
+                if len(p) and w.time[p[-1]] - w.time[p[0]] > BLOCK
+            ]
+        )
+        first += w.rows
+    return out
+
+
+def _lag(now: _Stretch, then: _Stretch) -> tuple[float, float] | None:
+    """How unlike the motions of two stretches are at the best lag, and that lag [s]: mean square of
+    their difference in units of the motion's own variance; None where they overlap too little.
+    """
+    from scipy.signal import correlate
+
+    step = float(np.median(np.diff(now.time)))
+    size = np.maximum(np.std(now.motion, axis=0), 1e-300)
+    middle = now.motion.mean(axis=0)
+    one = (now.motion - middle) / size
+    grid = np.arange(then.time[0], then.time[-1], step)
+
+    def there(times: FloatArray) -> FloatArray:
+        return np.column_stack(
+            [np.interp(times, then.time, x) for x in ((then.motion - middle) / size).T]
+        )
+
+    two = there(grid)
+    ones = np.ones(len(one)), np.ones(len(two))
+    rows = np.round(correlate(*ones))
+    squares = correlate((one**2).sum(axis=1), ones[1]) + correlate(ones[0], (two**2).sum(axis=1))
+    crossed = sum(correlate(a, b) for a, b in zip(one.T, two.T, strict=True))
+    unlike = np.where(
+        rows >= LEAST_ALIKE * len(one), (squares - 2 * crossed) / np.maximum(rows, 1.0), np.inf
+    )
+    best = int(np.argmin(unlike))
+    if not np.isfinite(unlike[best]):
+        return None
+    coarse = now.time[0] - grid[0] + (best - (len(two) - 1)) * step
+
+    def at(lag: float) -> tuple[float, float]:
+        times = now.time - lag
+        inside = (times >= then.time[0]) & (times <= then.time[-1])
+        return float(np.mean((one[inside] - there(times[inside])) ** 2)), lag
+
+    return min(at(coarse + step * k / CLOSER) for k in range(-CLOSER, CLOSER + 1))
+
+
+def _beside(
+    form: WeakForm, alike: _Alike, refit: Solution, shares: FloatArray
+) -> tuple[WeakForm, FloatArray] | None:
+    """The rows less what healthy records leave on the same motion, and the share of them that count
+    as independent; None where they leave more, with every parameter fitted anew, than without:
+    then the motion is another one, and so are the errors of the model.
+    """
+    names = form.balances.balances
+    weights = {b: np.asarray(form.weights[b]) * alike.told[b] for b in names}
+    plain = replace(form, weights=weights)
+    less = replace(plain, left=alike.left)
+    rest = _left(less, refit)
+    few = min(len(r) for r in rest.values()) <= len(form.free)
+    if few or _squares(rest).sum() >= _squares(_left(plain, refit)).sum():
+        return None
+    own = np.array([effective_share(r) for r in rest.values()])
+    scale = np.sqrt(own / shares)
+    return replace(
+        less, weights={b: weights[b] * k for b, k in zip(names, scale, strict=True)}
+    ), own
 
 
 def _nuisances(model: JointModel) -> tuple[str, ...]:
@@ -464,6 +664,17 @@ def _unsure(refit: Solution, data: Dataset, names: Sequence[str]) -> FloatArray:
     return np.array(out)
 
 
+def _tied_errors(reference: Joint, names: Sequence[str], noise: float) -> FloatArray:
+    """Correlations of the errors of the reference, (p, p); those that its file does not tell, and
+    those of what is taken from the refit, are none.
+
+    `noise`: share of the squares that the model leaves which is noise. What else it leaves is
+    error of the model, which makes others on another motion: there nothing cancels.
+    """
+    told = reference.correlation.matrix(names)
+    return np.asarray(np.where(np.eye(len(names), dtype=bool), 1.0, noise * told))
+
+
 @final
 @dataclass(frozen=True)
 class _Search:
@@ -477,12 +688,16 @@ class _Search:
         Standard error of each reference value; not a number for a nuisance.
     unsure : (p,) array
         Standard error of each value of the refit, not a number where it has none.
+    tied : (p, p) array
+        Correlations of the errors of the reference.
     inexact : (balances,) array
         Squares that the model leaves over the noise with every parameter fitted anew.
     shares : (balances,) array
         Share of the rows that count as independent.
     refitted : Error
         Of that fit.
+    alike : _Alike or None
+        What healthy records leave on the same motion; it is taken off the rows of the form.
     """
 
     reference: Joint
@@ -492,9 +707,11 @@ class _Search:
     form: WeakForm
     spread: FloatArray
     unsure: FloatArray
+    tied: FloatArray
     inexact: FloatArray
     shares: FloatArray
     refitted: Error
+    alike: _Alike | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -513,22 +730,25 @@ class _Search:
         return np.where(np.isfinite(self.spread), self.spread, self.unsure)
 
     @cached_property
-    def together(self) -> FloatArray:
-        """Correlations of these errors, (p, p): those of the reference; what is taken from the
-        refit is independent of them.
-        """
-        own = [n if np.isfinite(e) else "" for n, e in zip(self.names, self.spread, strict=True)]
-        return self.reference.correlation.matrix(own)
-
-    @cached_property
     def windows(self) -> Any:
         """Windows of time over the rows of a balance, from which errors are stated."""
-        return windows_over([w.time for w in self.data.train])
+        windows = windows_over([w.time for w in self.data.train])
+        told = np.any([np.asarray(w) > 0 for w in self.form.weights.values()], axis=0)
+        return windows.multiply(told[None, :]).tocsr()
 
     @cached_property
     def independent(self) -> float:
         """Number of independent windows that these count as."""
         return independent(self.windows)
+
+    @cached_property
+    def usual(self) -> FloatArray:
+        """What each parameter differs by from one record to the next, (p,): asked for where the
+        errors of the model do not hide it.
+        """
+        units = [p.unit for p in self.model.parameters]
+        size = np.where((self.start == 0) & np.equal(units, "1"), 1.0, np.abs(self.start))
+        return np.asarray(LEAST_TOLD * size * (self.alike is not None))
 
     @cached_property
     def _limits(self) -> dict[str, tuple[float, float]]:
@@ -640,7 +860,8 @@ class _Gain:
     fall_percent : float
         Largest fall of a balance's RMS.
     beyond : bool
-        True where it takes more out of a balance than the model's own error leaves in it.
+        True where it takes more out of a balance than the model's own error leaves in it, and is
+        more than a joint differs by from one record to the next.
     p_value, q : float
         Chance of a change of this size, the smallest of the parameters'; rate of false discovery
         among all that were tried.
@@ -787,6 +1008,19 @@ class _Point:
         full = np.concatenate(list(self.columns.values()))
         return full.T @ full, np.asarray(np.sum(list(self.added.values()), axis=0))
 
+    @cached_property
+    def _crossed(self) -> FloatArray:
+        """Products of the columns with those of the healthy rows on the same motion, (p, p): what
+        the calibration of these took is their own.
+        """
+        alike, form = self.search.alike, self.search.form
+        out = np.zeros((len(self.x), len(self.x)))
+        if alike is None:
+            return out
+        for b, full in self.columns.items():
+            out += full[:, :-1].T @ (alike.columns[b] * np.asarray(form.weights[b])[:, None])
+        return np.where(np.isfinite(self.search.spread), out, 0.0)
+
     def squares(self, moved: Sequence[int]) -> FloatArray:
         """Sum of squares of each block and balance under the step that the other folds give,
         (blocks, balances).
@@ -818,8 +1052,11 @@ class _Point:
     def _counts(self) -> FloatArray:
         """Independent rows of each balance, of those that belong to a block."""
         inside = self.block >= 0
-        train = self.search.data.train
-        rows = [float(np.sum(taking_part(b, train) & inside)) for b in self.columns]
+        train, weights = self.search.data.train, self.search.form.weights
+        rows = [
+            float(np.sum(taking_part(b, train) & inside & (np.asarray(weights[b]) > 0)))
+            for b in self.columns
+        ]
         return np.array(rows) * self.search.shares
 
     def gain(self, group: Sequence[int]) -> _Gain:
@@ -836,6 +1073,7 @@ class _Point:
         new = [i for i in group if i not in self.moved]
         p = min(_two_sided(sizes[i] / errors[i]) for i in new) if new else 1.0
         beyond = bool(np.any(before - after.sum(axis=0) > self.search.inexact))
+        beyond &= not new or any(abs(sizes[i]) >= self.search.usual[i] for i in new)
         return _Gain(nats, block, fall, beyond, p)
 
     def least(self, place: int) -> float:
@@ -858,7 +1096,8 @@ class _Point:
             math.sqrt(float(np.min(most[shows] / per[shows])))
             for most in (self.search.inexact, fall * left)
         )
-        return float(max(sure, beyond, falls, math.sqrt(GAIN / nats)))
+        usual = float(self.search.usual[place])
+        return float(max(sure, beyond, falls, usual, math.sqrt(GAIN / nats)))
 
     def _per_square(self, place: int, free: Sequence[int]) -> FloatArray:
         """Squares in each balance that a change of one unit makes, after all else that is free has
@@ -885,8 +1124,9 @@ class _Point:
 
         Three parts: the scatter between windows of time; the standard error of the reference value;
         and those of the values that are held, as far as an error there would have moved this one.
-        The latter two go together as the reference file says.
-        In other coordinates, x = `turned` @ new, where these are given.
+        The last two belong together: a friction that the reference's fit took for viscous was
+        missing in its dry one, and on a motion alike both errors cancel.  In other coordinates,
+        x = `turned` @ new, where these are given.
         """
         free = self.search.free(moved)
         if not free:
@@ -899,20 +1139,23 @@ class _Point:
         scores = (whole[:, :-1, -1] + whole[:, :-1, :-1] @ step)[:, free]
         grams = core[:, :-1, :-1]
         normal = self._normal(total, noise, free)
-        # what errors of the reference and of held values do to each change, (free, p)
-        pulled = np.zeros((len(free), len(self.x)))
-        pulled[:, held] = -inverse(normal) @ (total - noise)[np.ix_(free, held)] * errors[held]
-        own = np.where(np.isin(free, moved), self.search.spread[free], 0.0)
-        pulled[np.arange(len(free)), free] = -own
+        known = [*free, *held]
+        pulled = inverse(normal) @ (total - noise)[np.ix_(free, held)]
+        moves = np.hstack([np.eye(len(free)), pulled])
+        if self.search.alike is not None:
+            # an error of the reference is in the rows of the healthy records, too
+            moves -= inverse(normal) @ self._crossed[np.ix_(free, known)]
+        reference = moves * errors[known]
+        tied = self.search.tied[np.ix_(known, known)]
         grams = grams[:, free][:, :, free]
         if turned is not None:
             back = np.linalg.inv(turned)
             grams, scores = np.einsum("ia,bij,jc->bac", turned, grams, turned), scores @ turned
-            pulled, normal = back @ pulled, turned.T @ normal @ turned
+            reference, normal = back @ reference, turned.T @ normal @ turned
         windows = errors_of_windows(grams, scores, normal, self.search.independent)
         found = np.zeros(len(free)) if windows is None else windows
-        told = np.einsum("fi,ij,fj->f", pulled, self.search.together, pulled)
-        return np.asarray(np.sqrt(found**2 + np.maximum(told, 0.0)))
+        before = np.maximum(np.einsum("ia,ab,ib->i", reference, tied, reference), 0.0)
+        return np.asarray(np.sqrt(found**2 + before))
 
     def errors(self, moved: Sequence[int]) -> FloatArray:
         """Standard errors of the changes by place, (p,); infinite for what is held."""
@@ -998,6 +1241,7 @@ def _result(search: _Search, point: _Point, records: tuple[str, ...]) -> Changes
         payload_note=note,
         minor=_minor(search, point, rates),
         least={n: v for n, v in least.items() if math.isfinite(v)},
+        alike=search.alike.records if search.alike is not None else (),
     )
 
 

@@ -142,12 +142,16 @@ class Claim:
 @final
 @dataclass(frozen=True)
 class Ranking:
-    """All candidates tried on one base, best first; one entry per effect."""
+    """All candidates tried on one base, best first; one entry per effect.
+
+    `least`: by key, about the smallest contribution that would be named (:func:`least_seen`).
+    """
 
     trials: tuple[Trial, ...]
     significant: frozenset[str]
     not_testable: tuple[NotTestable, ...]
     everything: tuple[Trial, ...] = field(default=())
+    least: Mapping[str, float] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return (
@@ -225,7 +229,14 @@ def rank(
         t.candidate.label for t in unique if t.candidate.label in passed and _major(t, base)
     )
     order = sorted(seen.values(), key=lambda t: (t.candidate.label not in significant, -t.score))
-    return Ranking(tuple(order), significant, tuple(untestable.values()), tuple(unique))
+    least = {t.key: least_seen(t, base, len(unique)) for t in order}
+    return Ranking(
+        tuple(order),
+        significant,
+        tuple(untestable.values()),
+        tuple(unique),
+        least={key: size for key, size in least.items() if math.isfinite(size)},
+    )
 
 
 def nearly(ranking: Ranking, base: Base, refused: frozenset[str]) -> Trial | None:
@@ -271,6 +282,24 @@ def least_drop(trial: Trial, base: Base) -> float:
         return COMMON_DROP
     unseen = base.solution.model.load_compliance(base.solution.values) > 0
     return UNSEEN_DROP if unseen else MAJOR_DROP
+
+
+def least_seen(trial: Trial, base: Base, tried: int) -> float:
+    """About the smallest RMS of an effect's torque in its balance that these records would name
+    [N.m], of the shape of its trial: the tests that a name must pass are turned round. It must
+    be certain among all that are tried, and lower what is left by enough. Infinite where the
+    trial says nothing of it.
+    """
+    from scipy.special import stdtrit
+
+    blocks = int(np.count_nonzero(base.numbers.sum(axis=1)))
+    if trial.alone <= 0 or blocks < 2 or trial.effect.is_delay or trial.effect.stage == "late":
+        return math.inf
+    kept = trial.unit * (1 - least_drop(trial, base) / 100)
+    left = float(trial.rms[base.balances.index(trial.balance)])
+    falls = left * math.sqrt(kept**-2 - 1) / trial.alone
+    sure = trial.error * float(stdtrit(blocks - 1, 1 - FALSE_DISCOVERY / (2 * max(tried, 1))))
+    return max(falls, sure)
 
 
 def _discoveries(trials: Sequence[Trial]) -> set[str]:

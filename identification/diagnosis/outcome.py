@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, final
+from typing import Any, Final, final
 
 from casadi_models import EFFECTS
-from identification.data.formats import words
+from identification.balance.kinematic import residual_unit
+from identification.data.formats import number, words
 from identification.diagnosis.candidates import NotTestable
 from identification.diagnosis.claims import Claim, Ranking
 from identification.diagnosis.trials import Trial
@@ -31,14 +32,28 @@ class Refusal:
         Its key.
     why : str
         One clause, as "falls by 2 % after the whole fit (5 % asked)".
+    least : float or None
+        About the smallest RMS of its torque that these records would name [unit]; a smaller one may
+        be there. None where its trial does not tell.
+    unit : str
     """
 
     effect: str
     why: str
+    least: float | None = None
+    unit: str = ""
 
-    def as_json(self) -> dict[str, str]:
+    @property
+    def unseen(self) -> str:
+        """A clause on what may be there unseen; empty where that is not told."""
+        if self.least is None:
+            return ""
+        return f"; less than about {number(self.least, 2)} {self.unit} RMS of it would not be seen"
+
+    def as_json(self) -> dict[str, Any]:
         """The shape of `improve --json`."""
-        return {"effect": self.effect, "why": self.why}
+        told = {} if self.least is None else {"least": self.least, "unit": self.unit}
+        return {"effect": self.effect, "why": self.why, **told}
 
 
 def outcome_of(verdict: str, claims: Sequence[Claim]) -> str:
@@ -72,6 +87,7 @@ def refusals(
     recorded: Mapping[str, str],
     claims: Sequence[Claim],
     offered: Sequence[str] = (),
+    kind: str = "rotary",
 ) -> tuple[Refusal, ...]:
     """Every candidate that was tried and not named, with the reason, each key once.
 
@@ -84,9 +100,12 @@ def refusals(
     claims : sequence of Claim
     offered : sequence of str
         Keys that were tried; those without a trial helped in no physical direction.
+    kind : str
+        Of the joint.
     """
     named = {key for claim in claims for key in claim.effects}
     out = {key_of(label): why for label, why in recorded.items()}
+    told: dict[str, tuple[float, str]] = {}
     for trial in ranking.trials if ranking else ():
         if trial.key in out:
             continue
@@ -99,11 +118,15 @@ def refusals(
             )
         else:
             out[trial.key] = weak(trial)
+            if ranking is not None and trial.key in ranking.least:
+                told[trial.key] = ranking.least[trial.key], residual_unit(trial.balance, kind)
     untestable = {n.effect for n in ranking.not_testable} if ranking else set()
     for key in offered:
         if key not in untestable:
             out.setdefault(key, "lowers no error with any physical value")
-    return tuple(Refusal(key, why) for key, why in out.items() if key not in named)
+    return tuple(
+        Refusal(key, why, *told.get(key, ())) for key, why in out.items() if key not in named
+    )
 
 
 def known_key(key: str) -> str:
@@ -160,7 +183,7 @@ def why_not(
     for refusal in refused:
         if refusal.effect == wanted:
             whole = refusal.why.startswith(("with ", "the "))
-            return f"{title} is not named: {'' if whole else 'it '}{refusal.why}."
+            return f"{title} is not named: {'' if whole else 'it '}{refusal.why}{refusal.unseen}."
     for item in not_testable:
         if item.effect == wanted:
             return f"{title} is not testable with these records: {item.why}."

@@ -547,6 +547,7 @@ class Session:
                 {**self._doubted, **self._refused},
                 judged,
                 self.bench.tried(steps[0].solution),
+                self.joint.kind,
             ),
             learned=learned,
             carried=kept,

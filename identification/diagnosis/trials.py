@@ -395,6 +395,11 @@ class Trial:
         ranking [nats].
     unit : float
         What noise alone leaves of its balance, over what it leaves under the base; at most 1.
+    alone : float
+        What an RMS of 1 N.m of it leaves in its balance beside all that the base may follow it
+        with, RMS in sigmas of the base [1/N.m].
+    error : float
+        Standard error of that contribution, over blocks [N.m].
     """
 
     candidate: Candidate
@@ -410,6 +415,8 @@ class Trial:
     contribution: float
     score: float
     unit: float = 1.0
+    alone: float = 0.0
+    error: float = math.inf
 
     def beyond_noise(self, drop_percent: float) -> float:
         """A fall of the RMS [%] in units of what noise alone leaves."""
@@ -570,14 +577,19 @@ def _score(
     held = _held_out_drop(
         candidate, base, balances=balances, shapes=shapes, delta=delta, size=size, where=where
     )
+    contribution = float(np.sqrt(np.mean((raw[base.balance == where] @ amplitude) ** 2)))
+    beside = _beside_base(added, base, delta)
+    alone, error = _visible(beside, delta[own:], base.balance == where, contribution)
     return Trial(
         candidate,
         values,
         held_out_drop_percent=held,
-        p_value=_wald(added, base, delta),
+        p_value=_wald(beside, delta[own:]),
         outside=inside,
-        contribution=float(np.sqrt(np.mean((raw[base.balance == where] @ amplitude) ** 2))),
+        contribution=contribution,
         unit=float(unit[where]),
+        alone=alone,
+        error=error,
         **{**told, "gain": _told(base, sse1 / unit**2)["gain"]},
     )
 
@@ -748,8 +760,13 @@ def _held_out_drop(
     return 100 * (1 - math.sqrt(float(after @ after) / max(float(before @ before), 1e-300)))
 
 
-def _wald(added: FloatArray, base: Base, delta: FloatArray) -> float:
-    """p-value of the amplitudes, scores clustered by block."""
+def _beside_base(
+    added: FloatArray, base: Base, delta: FloatArray
+) -> tuple[FloatArray, FloatArray] | None:
+    """Columns of the amplitudes that are not zero, (n, active), less what the base may follow them
+    with, and their products with the residual within each block, (blocks, active); None where the
+    blocks are too few for them.
+    """
     p, own = base.parts
     q = base.orthonormal
     moving = base.inward[:, delta[p:own] > 0]
@@ -758,12 +775,41 @@ def _wald(added: FloatArray, base: Base, delta: FloatArray) -> float:
     active = np.flatnonzero(delta[own:])
     blocks = int(np.count_nonzero(base.numbers.sum(axis=1)))
     if not len(active) or blocks <= len(active) + 1:
-        return 1.0
+        return None
     c = added - q @ (q.T @ added)
     c = c[:, active]
     residual = (
         base.residual + base.jacobian @ delta[:p] + base.inward @ delta[p:own] + added @ delta[own:]
     )
     begins = base.firsts[np.flatnonzero(np.diff(base.block[base.order[base.firsts]], prepend=-1))]
-    scores = np.add.reduceat((c * residual[:, None])[base.order], begins, axis=0)
-    return wald(c.T @ c, scores, delta[own:][active])
+    return c, np.add.reduceat((c * residual[:, None])[base.order], begins, axis=0)
+
+
+def _wald(beside: tuple[FloatArray, FloatArray] | None, amplitudes: FloatArray) -> float:
+    """p-value of the amplitudes, scores clustered by block."""
+    if beside is None:
+        return 1.0
+    c, scores = beside
+    return wald(c.T @ c, scores, amplitudes[amplitudes != 0])
+
+
+def _visible(
+    beside: tuple[FloatArray, FloatArray] | None,
+    amplitudes: FloatArray,
+    here: npt.NDArray[np.bool_],
+    contribution: float,
+) -> tuple[float, float]:
+    """`alone` and `error` of a trial: of all its amplitudes together, in their proportions.
+
+    `here`: rows of its balance.
+    """
+    if beside is None or not contribution > 0:
+        return 0.0, math.inf
+    c, scores = beside
+    size = amplitudes[amplitudes != 0] / contribution  # for 1 N.m
+    column, score, blocks = c @ size, scores @ size, len(scores)
+    gram = float(column @ column)
+    if not gram > 0:
+        return 0.0, math.inf
+    error = math.sqrt(float(score @ score) * blocks / (blocks - 1)) / gram
+    return float(np.sqrt(np.mean(column[here] ** 2))), error

@@ -145,7 +145,12 @@ def windows_over(times: Sequence[FloatArray]) -> Any:
     return csr_array(block_diag(parts))
 
 
-def window_errors(
+def window_errors(jacobian: FloatArray, residual: FloatArray, windows: Any) -> FloatArray | None:
+    """Standard error of each parameter, (p,): see :func:`window_covariance`."""
+    return _deviations(window_covariance(jacobian, residual, windows))
+
+
+def window_covariance(
     jacobian: FloatArray,
     residual: FloatArray,
     windows: Any,
@@ -153,8 +158,8 @@ def window_errors(
     whole: FloatArray | None = None,
     met_by: FloatArray | None = None,
 ) -> FloatArray | None:
-    """Standard error of each parameter of a least-squares fit whose rows depend on each other
-    within windows of time.
+    """Covariance of the parameters of a least-squares fit whose rows depend on each other within
+    windows of time.
 
     Parameters
     ----------
@@ -176,7 +181,7 @@ def window_errors(
 
     Returns
     -------
-    (p,) array, or None with fewer than `FEWEST_BLOCKS` independent windows.
+    (p, p) array, or None with fewer than `FEWEST_BLOCKS` independent windows.
     """
     by = jacobian if met_by is None else met_by
     scores = windows @ (by * residual[:, None])
@@ -186,7 +191,7 @@ def window_errors(
     if noise is not None:
         grams, scores = grams - noise[0], scores - noise[1]
     total = by.T @ by if whole is None else whole
-    return errors_of_windows(grams, scores, total, independent(windows))
+    return covariance_of_windows(grams, scores, total, independent(windows))
 
 
 def independent(windows: Any) -> float:
@@ -205,6 +210,17 @@ def cores(windows: Any) -> Any:
 
 
 def errors_of_windows(
+    grams: FloatArray, scores: FloatArray, whole: FloatArray, count: float
+) -> FloatArray | None:
+    """Standard error of each parameter, (p,): see :func:`covariance_of_windows`."""
+    return _deviations(covariance_of_windows(grams, scores, whole, count))
+
+
+def _deviations(covariance: FloatArray | None) -> FloatArray | None:
+    return None if covariance is None else np.sqrt(np.maximum(np.diag(covariance), 0.0))
+
+
+def covariance_of_windows(
     grams: FloatArray, scores: FloatArray, whole: FloatArray, count: float
 ) -> FloatArray | None:
     """The same from what each window holds of the normal equations.
@@ -227,7 +243,7 @@ def errors_of_windows(
 
     Returns
     -------
-    (p,) array, or None with fewer than `FEWEST_BLOCKS` independent windows.
+    (p, p) array, or None with fewer than `FEWEST_BLOCKS` independent windows.
     """
     from scipy.special import stdtrit
 
@@ -256,14 +272,12 @@ def errors_of_windows(
         shifts[b] = np.where(own > HALF, shifts[b], shift)
     covariance = shifts.T @ shifts * (count - 1) / count
     wider = float(stdtrit(count - 1, 0.975)) / NORMAL
-    return np.asarray(
-        np.sqrt(np.maximum(np.diag(covariance), 0.0)) * wider / size, dtype=np.float64
-    )
+    return np.asarray(covariance * wider**2 / np.outer(size, size), dtype=np.float64)
 
 
-def known_errors(whole: FloatArray, prior: FloatArray) -> FloatArray:
-    """Standard error that what is known beforehand leaves in each parameter: blocks of time do not
-    tell of it.
+def known_covariance(whole: FloatArray, prior: FloatArray) -> FloatArray:
+    """Covariance, (p, p), that what is known beforehand leaves in the parameters: blocks of time
+    do not tell of it.
 
     Parameters
     ----------
@@ -272,10 +286,8 @@ def known_errors(whole: FloatArray, prior: FloatArray) -> FloatArray:
     prior : (k, p) array
         Those of the prior.
     """
-    if not len(prior):
-        return np.zeros(len(whole))
-    inverse = np.linalg.pinv(whole, rcond=RANK, hermitian=True)
-    return np.asarray(np.linalg.norm(prior @ inverse, axis=0), dtype=np.float64)
+    moved = prior @ np.linalg.pinv(whole, rcond=RANK, hermitian=True)
+    return np.asarray(moved.T @ moved, dtype=np.float64)
 
 
 def follows(scores: FloatArray, sizes: FloatArray, alpha: float) -> bool:

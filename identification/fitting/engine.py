@@ -547,7 +547,7 @@ def _with_errors(
     ]
     # without stiffness the link would fall off: the twist follows no torque of these records
     unidentified += [n for n in balances.model.named("stiffness") if n in at_bound]
-    index = np.flatnonzero(usable)
+    index, whole = np.flatnonzero(usable), None
     if len(index):
         part = bands.of(index)
         size = None if part.errors is None else part.errors / norms[index]
@@ -557,13 +557,13 @@ def _with_errors(
             if n in at_bound and norms[k] > 0 and not problem.bent[k] and not problem.clocks[k]
         ]
         high = [values[free[k]] >= limits[free[k]][1] for k in held]
-        wider = np.zeros(len(index)) if size is None else bands.beside(index, held, high)
+        if part.covariance is not None:
+            whole = part.covariance + bands.beside(index, held, high)
+            whole /= np.outer(norms[index], norms[index])
         spread, corr = correlations(part.gram)
         corr[:, [is_of_run(free[i]) for i in index.tolist()]] = 0.0
         for k, i in enumerate(index.tolist()):
-            stderr[free[i]] = (
-                None if size is None else math.hypot(float(size[k]), float(wider[k] / norms[i]))
-            )
+            stderr[free[i]] = None if whole is None else math.sqrt(float(whole[k, k]))
             other = int(np.argmax(np.abs(corr[k])))
             correlation[free[i]] = (free[int(index[other])], float(corr[k, other]))
             weak = size is not None and values[free[i]] != 0 and size[k] > abs(values[free[i]])
@@ -582,9 +582,10 @@ def _with_errors(
         if stderr[free[i]] is not None and not is_of_run(free[i]) and free[i] not in apart
     ]
     together = Correlation()
-    if told:
+    if whole is not None:
+        sizes = np.sqrt(np.diag(whole))
         names = [free[index[k]] for k in told]
-        together = Correlation.of(names, corr[np.ix_(told, told)])
+        together = Correlation.of(names, (whole / np.outer(sizes, sizes))[np.ix_(told, told)])
     for n in model.calibration:
         kept[n] = float(np.mean([kept[k] for k in free if is_of_run(k) and k.startswith(f"{n}[")]))
     own = {n: x for n, x in kept.items() if not is_of_run(n)}

@@ -63,6 +63,9 @@ class WeakForm:
         1/sigma of each balance, or of each of its rows.
     usual : mapping of str to (float, float)
         Middle and standard deviation of parameters that are known beforehand: a row each.
+    left : mapping of str to (rows,) array
+        What is taken off the residual of each balance, because it is there without a cause in the
+        parameters; nothing where it is empty.
     """
 
     balances: Balances
@@ -71,6 +74,7 @@ class WeakForm:
     free: tuple[str, ...]
     weights: Mapping[str, float | FloatArray]
     usual: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    left: Mapping[str, FloatArray] = field(default_factory=dict)
 
     @cached_property
     def prior(self) -> FloatArray:
@@ -156,11 +160,14 @@ class WeakForm:
             moved = stack(self._bare, self.data.train, {**values, n: values[n] + step}).residual
             for b in jacobian:
                 jacobian[b][:, self.free.index(n)] = (moved[b] - found.residual[b]) / step
-        return Stacked(found.residual, jacobian, found.block, found.taking)
+        return Stacked(self._beside(found.residual), jacobian, found.block, found.taking)
+
+    def _beside(self, residual: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+        return {b: r - self.left[b] if b in self.left else r for b, r in residual.items()}
 
     def residual(self, x: FloatArray) -> FloatArray:
         """Weighted rows, one balance after the other, then those of the prior."""
-        rows = stack(self._bare, self.data.train, self.at(x)).residual
+        rows = self._beside(stack(self._bare, self.data.train, self.at(x)).residual)
         return np.concatenate(
             [*(rows[b] * self.weights[b] for b in self.balances.balances), self.surprise(x)]
         )

@@ -2,7 +2,8 @@
 
 The motion stays as it was recorded; the drive is given the torque that the planted law would have
 asked for. Laws that the plain joint file lacks are to be named by ``improve``; parameters that
-moved are to be named by ``changed``, against a joint file fitted on the plain recordings.
+moved are to be named by ``changed``, against a joint file fitted on the plain recordings, which
+are given as healthy ones.
 
 ``python -m tests.recorded_world.planted --rigs emps --sizes 1 0.3``
 
@@ -28,6 +29,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.signal import savgol_filter
 
+from identification.balance.weak import CLAIM_KERNEL, differentiated_kernel
 from tests.recorded_world.campaign import ENTRY, load_entry, time_limit
 
 if TYPE_CHECKING:
@@ -418,6 +420,9 @@ def _new(
             or "no claim"
         )
         said = f"{sets}. {result['verdict']}, {left:.1f} %, {time.process_time() - began:.0f} s"
+        told = [x["least"] for x in result["refused"] if x["effect"] in right and "least" in x]
+        unseen = bool(law and told and not found) and min(told) > _size(rig, train, law, size)
+        said += ", too small to be seen" if unseen else ""
         outcomes.append(
             Outcome(
                 rig=rig.name,
@@ -428,9 +433,19 @@ def _new(
                 alone=alone,
                 wrong=wrong,
                 said=said,
+                unseen=unseen,
             )
         )
     return outcomes
+
+
+def _size(
+    rig: Rig, tables: list[Table], law: Callable[[Rig, Motion, float], FloatArray], size: float
+) -> float:
+    """RMS of what a law adds to the drive's torque, averaged as the rows of a balance are."""
+    row = differentiated_kernel(CLAIM_KERNEL, rig.step, 0)
+    added = [np.convolve(law(rig, motion(rig, t), size), row, "same") for t in tables]
+    return float(np.sqrt(np.mean(np.concatenate(added) ** 2)))
 
 
 def _verb(*words: str) -> tuple[int, str]:
@@ -459,13 +474,15 @@ def _changed(rig: Rig, effects: list[str], sizes: list[float], folder: Path) -> 
         why = f"no reference: {text.splitlines()[-1]}"
         return [_refused(rig, "", 0.0, "changed", why)]
     outcomes = []
+    usual: frozenset[str] = frozenset()
     for effect, size in [("", 0.0), *((e, s) for e in effects for s in sizes)]:
         law, right = CHANGED[effect] if effect else (None, frozenset[str]())
         # the records that were not fitted: a change is found on new motion
         given = [plant(rig, t, law, size) for t in held] if law else held
         files = write(given, folder / f"{rig.name}-changed-{effect}-{size:g}", "now")
         out = folder / "changed.json"
-        code, text = _verb("changed", str(reference), *map(str, files), "--json", str(out))
+        before = ("--healthy", *map(str, healthy))
+        code, text = _verb("changed", str(reference), *map(str, files), *before, "--json", str(out))
         if code == 2:
             last = next((x for x in reversed(text.splitlines()) if x.strip()), "no answer")
             why = last.partition(" (choose")[0]
@@ -474,7 +491,10 @@ def _changed(rig: Rig, effects: list[str], sizes: list[float], folder: Path) -> 
         answer = json.loads(out.read_text(encoding="utf-8"))
         moved, least = answer["changed"], answer["least"]
         sets = [(str(c["parameter"]), *map(str, c.get("tied_with", ()))) for c in moved]
-        wrong = tuple("|".join(names) for names in sets if not set(names) & right)
+        # what differs between the recordings without any hand is no wrong name
+        if not effect:
+            usual = frozenset(str(c["parameter"]) for c in moved)
+        wrong = tuple("|".join(n) for n in sets if effect and not set(n) & (right | usual))
         good = any(set(names) & right for names in sets)
         said = ", ".join("|".join(names) for names in sets) or "nothing changed"
         told = [least[n] for n in right if n in least]
@@ -520,7 +540,10 @@ def table(outcomes: list[Outcome]) -> str:
                 f"with a wrong unmarked name {bad} of {len(asked)}"
             )
             if unseen := sum(o.unseen for o in asked):
-                text[-1] += f"; said to be too small to be seen {unseen}"
+                seen = sum(o.right and not o.unseen for o in asked)
+                text[-1] += (
+                    f"; said to be too small to be seen {unseen}, of the others named {seen}"
+                )
     return "\n".join(text) + "\n"
 
 

@@ -21,7 +21,7 @@ from identification.data.channels import DECLARED, KINDS, TIME, channel_unit
 from identification.data.column import Column
 from identification.data.columns import parse_map
 from identification.data.formula import parse_formula
-from identification.data.joint_file import Known, parse_joint, toml_text
+from identification.data.joint_file import Correlation, Known, parse_joint, toml_text
 from identification.data.plain_text import from_toml
 from identification.data.schema import Key, Schema
 from identification.errors import InputError
@@ -112,14 +112,22 @@ def test_what_is_written_is_what_is_read() -> None:
         sample_time=2.5e-3,
         columns={"motor_current": {"column": "iq", "unit": "mA", "sign": -1}},
     )
-    fitted = {"motor_viscous": {"value": 3.0, "stderr": 0.1, "unit": "N.m.s/rad", "side": "link"}}
+    fitted = {
+        "motor_viscous": {"value": 3.0, "stderr": 0.1, "unit": "N.m.s/rad", "side": "link"},
+        "motor_coulomb": {"value": 2.0, "stderr": 0.2, "unit": "N.m", "side": "link"},
+    }
     found = {"zero": {"value": 1e-3, "stderr": None, "unit": "rad", "what": "zero"}}
-    text = toml_text(joint, fitted, {"records": "a, b", "version": "1"}, found)
+    tied = Correlation(("motor_viscous", "motor_coulomb"), ((-0.8,),))
+    origin = {"records": "a, b", "version": "1"}
+    text = toml_text(joint, fitted, origin, found, correlation=tied)
     tables = from_toml(text, "text")
     again = parse_joint(tables, joint.source)
-    assert replace(again, fitted={}, errors={}) == replace(joint, fitted={}, errors={})
+    assert replace(again, fitted={}, errors={}, correlation=Correlation()) == replace(
+        joint, fitted={}, errors={}
+    )
     assert again.fitted["motor_viscous"] == 3.0
-    assert again.errors == {"motor_viscous": 0.1}
+    assert again.errors == {"motor_viscous": 0.1, "motor_coulomb": 0.2}
+    assert again.correlation == tied
     assert set(tables["calibration"]["zero"]) == {"value", "unit"}
     assert tables["provenance"] == {"records": "a, b", "sample_time": 2.5e-3, "version": "1"}
 

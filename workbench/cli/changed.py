@@ -16,14 +16,18 @@ def run_changed(arguments: Namespace) -> int:
     reference = open_joint(arguments.reference)
     records, warnings = open_records(arguments.records, reference)
     alike(arguments.records, records, reference)
-    found = compared(reference, records)
+    healthy, more = open_records(arguments.healthy, reference)
+    warnings += more
+    found = compared(reference, records, healthy)
     write_json(arguments.json, {**found.as_json(), "warnings": warnings})
     return 0
 
 
-def compared(reference: Joint, records: Sequence[Record]) -> Changes:
+def compared(
+    reference: Joint, records: Sequence[Record], healthy: Sequence[Record] = ()
+) -> Changes:
     """What moved, printed."""
-    found = changed(reference, records, progress=progress_bar)
+    found = changed(reference, records, healthy=healthy, progress=progress_bar)
     progress_bar("done", 1.0)
     print(found)
     return found

@@ -318,6 +318,14 @@ def parser() -> OneLineParser:
     moved = verb("changed", "changed", "which parameters of a fitted joint moved, by how much")
     moved.add_argument("reference", metavar="REFERENCE", help="joint file written by a fit")
     moved.add_argument("records", nargs="+", metavar="REC", help="record files")
+    moved.add_argument(
+        "--healthy",
+        nargs="+",
+        action="extend",
+        metavar="REC",
+        default=[],
+        help="records of the joint as it was fitted: on the same motion smaller changes are seen",
+    )
     report = verb(
         "report", "loop", "the improve loop, written as one HTML file", records=True, joint=True
     )

@@ -17,7 +17,7 @@ import pytest
 
 from casadi_models import JointModel
 from identification import Joint, Record, fit, load_joint
-from identification.data.joint_file import Correlation, parse_joint
+from identification.data.joint_file import parse_joint
 from identification.data.prepare import STANDARD_GRAVITY
 from identification.diagnosis.changed import _prepared, changed, discovery_rates
 from identification.errors import InputError
@@ -117,13 +117,103 @@ def test_errors_of_the_reference_go_together_as_its_file_says(reference: Path) -
             values = {**search.form.values, name: search.start[k] + search.spread[k]}
             other = replace(search, form=replace(search.form, values=values))
             pulls[k] = size(other) - size(search)
-    plain = replace(search, reference=replace(joint, correlation=Correlation()))
+    plain = replace(search, tied=np.eye(len(search.names)))
     together, apart = (
         float(s.fitted(moved, s.start).errors(moved)[place]) for s in (search, plain)
     )
-    expected = pulls @ search.together @ pulls - pulls @ pulls
+    expected = pulls @ search.tied @ pulls - pulls @ pulls
     assert together**2 - apart**2 == pytest.approx(expected, rel=0.05)
     assert abs(together / apart - 1) > 0.02  # it matters
+
+
+def test_correlations_of_errors_come_back_from_the_file(reference: Path) -> None:
+    found, told = fit(JOINT, record(1)).solution, load_joint(reference).correlation
+    assert told == found.together
+    assert set(told.names) == {n for n, e in load_joint(reference).errors.items() if e is not None}
+    # more viscous friction and less dry friction explain a motion about alike
+    assert told.matrix(("motor_coulomb", "motor_viscous"))[0, 1] < -0.5
+
+
+AXIS = Joint(name="axis", model_name="hd1", effects=("viscous", "coulomb"))
+
+
+def sweep(seed: int, gain: float = 1.0) -> Record:
+    """30 s to and fro at nearly one speed, where viscous and dry friction are nearly one column."""
+    rng, dt = np.random.default_rng(seed), 4e-3
+    t = np.arange(0.0, 30.0, dt)
+    rate, phase = 0.5 * np.pi * rng.uniform(0.95, 1.05), rng.uniform(0.0, 6.0)
+    slow = 1 + 0.2 * np.sin(0.44 * t + phase)
+    velocity = 0.5 * np.tanh(3 * np.sin(rate * t)) * slow
+    torque = 8 * np.gradient(velocity, dt) + 60 * velocity + 40 * np.tanh(velocity / 2e-3)
+    return Record.from_channels(
+        t,
+        {
+            "motor_torque": torque / gain + 4.0 * rng.standard_normal(len(t)),
+            "motor_position": np.cumsum(velocity) * dt + 1e-6 * rng.standard_normal(len(t)),
+        },
+        name=f"sweep {seed}",
+    )
+
+
+def test_errors_of_a_reference_that_lie_against_each_other_cancel() -> None:
+    """Each friction is known to .6 %, their sum to .1 %: so is a gain, which scales both."""
+    healthy = parse_joint(tomllib.loads(fit(AXIS, sweep(1)).to_joint_file()))
+    off = []
+    for seed in range(2, 8):
+        found = changed(healthy, sweep(seed, gain=0.97)).changes
+        assert [c.parameter for c in found] == ["motor_constant_error"]
+        off.append((found[0].after + 0.03) / found[0].stderr)
+    # the stated error is that of the scatter about the truth: without correlations .17
+    assert 0.4 < float(np.sqrt(np.mean(np.square(off)))) < 1.5
+
+
+def cycle(seed: int, *, start: float = 0.0, coulomb: float = 40.0, rate: float = 1.1) -> Record:
+    """20 s of an axis that repeats a motion, with torques that no law of the model has: cogging, a
+    rope that pulls and a jerk at each turn.
+    """
+    rng, dt = np.random.default_rng(seed), 4e-3
+    t = np.arange(0.0, 20.0, dt)
+    place = np.mod(t + start, 10.0)  # of the motion, which takes 10 s
+    velocity = 0.5 * np.sin(rate * np.pi * place / 5) + 0.3 * np.sin(0.4 * np.pi * place)
+    angle = np.cumsum(velocity) * dt
+    angle += 0.5 * 5 / (rate * np.pi) * (1 - np.cos(rate * np.pi * place[0] / 5))
+    angle += 0.3 / (0.4 * np.pi) * (1 - np.cos(0.4 * np.pi * place[0]))
+    strange = 9 * np.sin(23 * angle) + 7 * np.abs(angle) + 9 * np.exp(-((velocity / 0.08) ** 2))
+    torque = 8 * np.gradient(velocity, dt) + 30 * velocity + strange
+    torque += coulomb * np.tanh(velocity / 2e-3) + 2.0 * rng.standard_normal(len(t))
+    position = angle + 1e-6 * rng.standard_normal(len(t))
+    channels = {"motor_torque": torque, "motor_position": position}
+    return Record.from_channels(t, channels, name=f"cycle {seed}")
+
+
+def test_on_the_same_motion_the_errors_of_the_model_are_no_veil() -> None:
+    """Dry friction 8 % higher, beside a model that leaves thirteen times the noise: alone it is not
+    seen, and what the model lacks is taken for an offset where the record begins elsewhere.
+    """
+    healthy = cycle(1, rate=1.0)
+    reference = parse_joint(tomllib.loads(fit(AXIS, healthy).to_joint_file()))
+    now = cycle(2, start=3.7, coulomb=43.2, rate=1.0)
+    alone = changed(reference, now)
+    assert [c.parameter for c in alone.changes] == ["current_offset"]
+    assert alone.least["motor_coulomb"] > 3.2
+    beside = changed(reference, now, healthy=healthy)
+    assert beside.alike == ("cycle 1",)
+    (change,) = beside.changes
+    assert change.parameter == "motor_coulomb"
+    assert change.after - change.before == pytest.approx(3.2, abs=3 * change.stderr)
+    assert change.stderr < 0.4
+    still = changed(reference, cycle(3, start=5.1, rate=1.0), healthy=healthy)
+    assert still.changes == ()
+    assert still.least["motor_coulomb"] < alone.least["motor_coulomb"]
+
+
+def test_another_motion_has_other_errors() -> None:
+    """Healthy records that move otherwise change nothing of the answer."""
+    reference = parse_joint(tomllib.loads(fit(AXIS, cycle(1, rate=1.0)).to_joint_file()))
+    other, now = sweep(4), cycle(2, coulomb=60.0, rate=1.0)
+    alone, beside = changed(reference, now), changed(reference, now, healthy=other)
+    assert beside.alike == ()
+    assert beside.as_json() == alone.as_json()
 
 
 @pytest.mark.parametrize("seed", range(2, 7))

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from casadi_models import EFFECTS
+from identification import Record, diagnose, fit
 from identification.balance.dataset import HOLD_DELAY, HOLD_NAME
 from identification.data.joint_file import Joint
 from identification.diagnosis.candidates import Candidate, NotTestable, offered
@@ -27,6 +28,7 @@ from identification.diagnosis.claims import (
     shortened,
     simplest,
 )
+from identification.diagnosis.improvement import Improvement
 from identification.diagnosis.outcome import weak
 from identification.diagnosis.trials import Base, Trial, make_base
 from identification.fitting.engine import load_dataset, prepared_model, solve
@@ -99,6 +101,47 @@ def test_an_error_that_rises_is_not_said_to_be_lowered_by_less_than_nothing(base
     assert said(0.2, -0.1) == f"lowers{on}raises it by 0.1 %{tail}"
     assert said(-0.2, 0.1) == f"raises{on}lowers it by 0.1 %{tail}"
     assert said(-0.2, -0.1) == f"raises{on}by 0.1 %{tail}"
+
+
+AXIS = Joint(name="axis", model_name="hd1", effects=("viscous", "coulomb"))
+
+
+def swings(seed: int, spring: float = 0.0) -> Record:
+    """40 s of an axis that swings about its middle at three rates; `spring` [N.m] RMS."""
+    rng, dt = np.random.default_rng(seed), 4e-3
+    t = np.arange(0.0, 40.0, dt)
+    size, rate = np.array([0.5, 0.3, 0.2]), np.array([1.9, 4.7, 0.6])
+    angle = np.outer(t, rate) + np.array([0.0, 1.0, 0.0])
+    velocity, bend = np.sin(angle) @ size, np.cos(angle) @ (size * rate)
+    position = -np.cos(angle) @ (size / rate)
+    torque = 8 * bend + 30 * velocity + 40 * np.tanh(velocity / 2e-3)
+    torque += spring * position / np.std(position) + 4.0 * rng.standard_normal(len(t))
+    noise = 1e-6 * rng.standard_normal(len(t))
+    channels = {"motor_torque": torque, "motor_position": position + noise}
+    return Record.from_channels(t, channels, name=f"swings {seed}")
+
+
+def test_nothing_missing_has_a_size() -> None:
+    """What is told as the least that would be seen: one and a half times as much is named, and half
+    of it is not, and is said to be possible.
+    """
+
+    def found(spring: float) -> Improvement:
+        return diagnose(fit(AXIS, swings(1, spring)), swings(2, spring)).found
+
+    plain = found(0.0)
+    (told,) = (r for r in plain.refused if r.effect == "added_spring")
+    assert plain.verdict == "nothing_missing"
+    assert told.least is not None
+    assert told.unit == "N.m"
+    assert told.as_json()["least"] == told.least
+    named = [e for c in found(1.5 * told.least).claims for e in c.effects]
+    assert "added_spring" in named
+    half = found(0.5 * told.least)
+    assert not half.claims
+    assert "N.m RMS of it would not be seen." in half.why("added_spring")
+    # a delay has another kind of size
+    assert all(r.least is None for r in plain.refused if EFFECTS[r.effect].is_delay)
 
 
 # --- how many discoveries -------------------------------------------------------------------------
