@@ -1,10 +1,10 @@
 """Figures of foreign FMUs: ``python -m benchmarks.foreign [names | variants | watch | makes |
-coverage] [-h] ...``.
+coverage | held] [-h] ...``.
 
 ``names`` (the default) hides effects in the plant and asks for their names, ``variants`` asks
 `explore` for them, ``watch`` puts sensors wrong under `track`, ``makes`` fits FMUs of other makes
 in processes of their own, ``coverage`` fits laws outside the FMU over many seeds and counts the
-true values inside the intervals.
+true values inside the intervals, ``held`` shows what a held torque does to a fit of the library.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 import sys
 from typing import Final
 
-from benchmarks.foreign import coverage, makes, names, variants, watch
+from benchmarks.foreign import coverage, held, makes, names, variants, watch
 
 TABLES: Final = {
     "names": names.main,
@@ -20,6 +20,7 @@ TABLES: Final = {
     "watch": watch.main,
     "makes": makes.main,
     "coverage": coverage.main,
+    "held": held.main,
 }
 
 
