@@ -14,6 +14,7 @@ from identification.balance.clocks import MOST_SKEW, carrier
 from identification.data.formats import chances
 from identification.diagnosis.candidates import Candidate, NotTestable, offered
 from identification.diagnosis.trials import MINOR_DROP, Base, Trial, try_candidate
+from identification.fitting.covariance import errors_above
 
 MAJOR_DROP: Final = 10.0
 """Cross-validated fall of a balance's RMS that a claim must bring [%]. Chosen on simulated joints
@@ -290,15 +291,13 @@ def least_seen(trial: Trial, base: Base, tried: int) -> float:
     be certain among all that are tried, and lower what is left by enough. Infinite where the
     trial says nothing of it.
     """
-    from scipy.special import stdtrit
-
     blocks = int(np.count_nonzero(base.numbers.sum(axis=1)))
     if trial.alone <= 0 or blocks < 2 or trial.effect.is_delay or trial.effect.stage == "late":
         return math.inf
     kept = trial.unit * (1 - least_drop(trial, base) / 100)
     left = float(trial.rms[base.balances.index(trial.balance)])
     falls = left * math.sqrt(kept**-2 - 1) / trial.alone
-    sure = trial.error * float(stdtrit(blocks - 1, 1 - FALSE_DISCOVERY / (2 * max(tried, 1))))
+    sure = trial.error * errors_above(blocks, FALSE_DISCOVERY / (2 * max(tried, 1)))
     return max(falls, sure)
 
 

@@ -22,7 +22,6 @@ from identification.balance.stacked import (
     noise_rows,
     together,
 )
-from identification.balance.turns import Turns, turns_of
 from identification.balance.weak import WeakRecord
 from identification.fitting.engine import (
     Dataset,
@@ -33,6 +32,7 @@ from identification.fitting.engine import (
     taking_part,
 )
 from identification.fitting.left_open import LeftOpen
+from identification.fitting.turns import Turns, turns_of
 
 FloatArray = npt.NDArray[np.float64]
 

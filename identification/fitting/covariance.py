@@ -245,8 +245,6 @@ def covariance_of_windows(
     -------
     (p, p) array, or None with fewer than `FEWEST_BLOCKS` independent windows.
     """
-    from scipy.special import stdtrit
-
     if count < FEWEST_BLOCKS:
         return None
     size = np.sqrt(np.maximum(np.diag(whole), 0.0))
@@ -271,7 +269,7 @@ def covariance_of_windows(
         own = np.sum((white @ direction[:, alone]) ** 2, axis=1) / spread
         shifts[b] = np.where(own > HALF, shifts[b], shift)
     covariance = shifts.T @ shifts * (count - 1) / count
-    wider = float(stdtrit(count - 1, 0.975)) / NORMAL
+    wider = errors_above(count, 0.025) / NORMAL
     return np.asarray(covariance * wider**2 / np.outer(size, size), dtype=np.float64)
 
 
@@ -290,6 +288,15 @@ def known_covariance(whole: FloatArray, prior: FloatArray) -> FloatArray:
     return np.asarray(moved.T @ moved, dtype=np.float64)
 
 
+def errors_above(count: float, chance: float) -> float:
+    """Standard errors, told by so many blocks, that a value exceeds with this chance by noise alone
+    (Student's t).
+    """
+    from scipy.special import stdtrit
+
+    return float(stdtrit(count - 1, 1 - chance))
+
+
 def follows(scores: FloatArray, sizes: FloatArray, alpha: float) -> bool:
     """True where the slope over one column is positive in most blocks: one-sided t over blocks.
 
@@ -305,8 +312,6 @@ def follows(scores: FloatArray, sizes: FloatArray, alpha: float) -> bool:
     bool
         False with fewer than three blocks, or where the column is zero.
     """
-    from scipy.special import stdtrit
-
     count, total = len(sizes), float(sizes.sum())
     if count < 3 or total <= 0:
         return False
@@ -314,7 +319,7 @@ def follows(scores: FloatArray, sizes: FloatArray, alpha: float) -> bool:
     spread = math.sqrt(float(np.sum((scores - slope * sizes) ** 2)) * count / (count - 1)) / total
     if spread == 0:
         return slope > 0
-    return slope / spread > float(stdtrit(count - 1, 1 - alpha))
+    return slope / spread > errors_above(count, alpha)
 
 
 def process_errors(

@@ -18,8 +18,8 @@ from identification.balance.calibration import bare
 from identification.balance.clocks import one_way
 from identification.balance.dataset import Dataset
 from identification.balance.stacked import Stacked, stack
-from identification.balance.turns import Turns, turns_of
 from identification.fitting.least_squares import least_squares
+from identification.fitting.turns import Turns, turns_of
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -13,7 +13,6 @@ import numpy as np
 import numpy.typing as npt
 
 from identification.balance.stacked import taking_part
-from identification.balance.turns import Turns
 from identification.fitting.covariance import (
     RANK,
     known_covariance,
@@ -22,6 +21,7 @@ from identification.fitting.covariance import (
 )
 from identification.fitting.errors_in_variables.instruments import mixed
 from identification.fitting.errors_in_variables.products import Unbiased, whole_without
+from identification.fitting.turns import Turns
 from identification.fitting.weak_form import WeakForm
 
 FloatArray = npt.NDArray[np.float64]

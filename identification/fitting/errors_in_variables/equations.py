@@ -26,7 +26,6 @@ from identification.balance.stacked import (
     noise_believed,
     stack,
 )
-from identification.balance.turns import Turns
 from identification.fitting.covariance import RANK
 from identification.fitting.errors_in_variables.bands import Bands
 from identification.fitting.errors_in_variables.instruments import (
@@ -46,6 +45,7 @@ from identification.fitting.errors_in_variables.products import (
     shares,
     whole_without,
 )
+from identification.fitting.turns import Turns
 from identification.fitting.weak_form import WeakForm
 
 FloatArray = npt.NDArray[np.float64]
