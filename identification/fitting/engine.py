@@ -583,9 +583,8 @@ def _with_errors(
     ]
     together = Correlation()
     if whole is not None:
-        sizes = np.sqrt(np.diag(whole))
         names = [free[index[k]] for k in told]
-        together = Correlation.of(names, (whole / np.outer(sizes, sizes))[np.ix_(told, told)])
+        together = Correlation.of(names, corr[np.ix_(told, told)])
     for n in model.calibration:
         kept[n] = float(np.mean([kept[k] for k in free if is_of_run(k) and k.startswith(f"{n}[")]))
     own = {n: x for n, x in kept.items() if not is_of_run(n)}
