@@ -23,7 +23,6 @@ from identification.balance.clocks import (
 )
 from identification.balance.dataset import Dataset, load_dataset
 from identification.balance.sensing import Sensing
-from identification.balance.stacked import INDEPENDENT_SHARE
 from identification.balance.weak import WeakRecord
 from identification.data.joint_file import Joint
 from identification.data.record import Record
@@ -43,9 +42,6 @@ BETTER: Final = 0.1
 """Share by which what is left over the noise must fall with another reading of a drive: as much as
 an effect must take off to be named. A fit that lacks an effect leans to whatever stands in for it.
 """
-
-SURE: Final = 10.0
-"""Nats that make one of two readings of a drive sure: odds of 20 000 to one."""
 
 
 def dataset_of(
@@ -205,8 +201,7 @@ def _read(
         early(_half_cycle(early))
     best = least()
     moves = max(abs(b - s) for b, s in zip(best, stands, strict=True))
-    falls = _over(left[best]) < (1 - BETTER) * _over(left[stands])
-    if moves <= NEAR * dt or not (falls or _clears(left[best], left[stands])):
+    if moves <= NEAR * dt or _over(left[best]) >= (1 - BETTER) * _over(left[stands]):
         return shifts_of(data)
     return [{**w.shifts, place: k} for w, k in zip(records, best, strict=True)]
 
@@ -236,15 +231,6 @@ def _squares(left: Sequence[tuple[int, float]]) -> float:
 def _over(left: Sequence[tuple[int, float]]) -> float:
     """What is left over noise, in all balances."""
     return math.prod(max(ratio, 1.0) for _, ratio in left)
-
-
-def _clears(left: Sequence[tuple[int, float]], stands: Sequence[tuple[int, float]]) -> bool:
-    """Whether what stands over the noise is gone with another reading, and surely so: then nothing
-    is missing that the fit could lean to.
-    """
-    over = [sum(n * max(r**2 - 1, 0.0) for n, r in x) for x in (left, stands)]
-    fall = INDEPENDENT_SHARE / 2 * (_squares(stands) - _squares(left))
-    return over[0] <= BETTER * over[1] and fall > SURE
 
 
 def _half_cycle(left: Callable[[float], Sequence[tuple[int, float]]]) -> float:

@@ -507,8 +507,8 @@ def test_commands_with_an_fmu_as_the_model(
     ):
         with pytest.raises(InputError, match=line):
             irj("export", *words, "--joint", final, "--out", str(tmp_path))
-    with pytest.raises(InputError, match="irj track"):
-        irj("track", train, "--joint", final)
+    with pytest.raises(InputError, match="--inject"):
+        irj("track", train, "--joint", final, "--inject", "bias:motor_position:0.1:1")
 
 
 def test_a_typed_law_rides_outside_an_fmu(folder: Path, dragged: Record, tmp_path: Path) -> None:
