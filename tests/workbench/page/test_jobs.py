@@ -299,6 +299,16 @@ def test_the_server_stands_on_the_very_model_that_the_process_fitted(live: Live)
     assert live.analysis().solution is solution
 
 
+def test_work_that_fits_nothing_leaves_the_fitted_model_known(live: Live) -> None:
+    """A server that prepared its records more slowly than the process diagnosed fitted again, and
+    stood beside the step by some of its last digits.
+    """
+    run(live, "fit")
+    run(live, "diagnose")
+    live.forget()
+    assert live.analysis().current.values == live.state.steps[-1].values
+
+
 SERVING = """
 import sys, time
 from pathlib import Path

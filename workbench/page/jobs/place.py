@@ -73,9 +73,14 @@ class Place:
         self.fitted_elsewhere(fitted)
 
     def fitted_elsewhere(self, fitted: Fitted | None) -> None:
-        """Stand on the last step of the state, whose fitted model may come from another process."""
+        """Stand on the last step of the state, whose fitted model may come from another process;
+        None where that fitted nothing: what is known stays known, as long as it is of that step.
+        """
         last = self.state.steps[-1] if self.state.steps else None
-        self._fitted = (last, fitted) if last is not None and fitted is not None else None
+        if last is None:
+            self._fitted = None
+        elif fitted is not None:
+            self._fitted = (last, fitted)
         if self._analysis is not None:
             self._stand(self._analysis)
 
