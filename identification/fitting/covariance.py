@@ -145,12 +145,7 @@ def windows_over(times: Sequence[FloatArray]) -> Any:
     return csr_array(block_diag(parts))
 
 
-def window_errors(jacobian: FloatArray, residual: FloatArray, windows: Any) -> FloatArray | None:
-    """Standard error of each parameter, (p,): see :func:`window_covariance`."""
-    return _deviations(window_covariance(jacobian, residual, windows))
-
-
-def window_covariance(
+def window_errors(
     jacobian: FloatArray,
     residual: FloatArray,
     windows: Any,
@@ -158,8 +153,8 @@ def window_covariance(
     whole: FloatArray | None = None,
     met_by: FloatArray | None = None,
 ) -> FloatArray | None:
-    """Covariance of the parameters of a least-squares fit whose rows depend on each other within
-    windows of time.
+    """Standard error of each parameter of a least-squares fit whose rows depend on each other
+    within windows of time.
 
     Parameters
     ----------
@@ -181,7 +176,7 @@ def window_covariance(
 
     Returns
     -------
-    (p, p) array, or None with fewer than `FEWEST_BLOCKS` independent windows.
+    (p,) array, or None with fewer than `FEWEST_BLOCKS` independent windows.
     """
     by = jacobian if met_by is None else met_by
     scores = windows @ (by * residual[:, None])
@@ -191,7 +186,7 @@ def window_covariance(
     if noise is not None:
         grams, scores = grams - noise[0], scores - noise[1]
     total = by.T @ by if whole is None else whole
-    return covariance_of_windows(grams, scores, total, independent(windows))
+    return errors_of_windows(grams, scores, total, independent(windows))
 
 
 def independent(windows: Any) -> float:
@@ -210,17 +205,6 @@ def cores(windows: Any) -> Any:
 
 
 def errors_of_windows(
-    grams: FloatArray, scores: FloatArray, whole: FloatArray, count: float
-) -> FloatArray | None:
-    """Standard error of each parameter, (p,): see :func:`covariance_of_windows`."""
-    return _deviations(covariance_of_windows(grams, scores, whole, count))
-
-
-def _deviations(covariance: FloatArray | None) -> FloatArray | None:
-    return None if covariance is None else np.sqrt(np.maximum(np.diag(covariance), 0.0))
-
-
-def covariance_of_windows(
     grams: FloatArray, scores: FloatArray, whole: FloatArray, count: float
 ) -> FloatArray | None:
     """The same from what each window holds of the normal equations.
@@ -243,7 +227,7 @@ def covariance_of_windows(
 
     Returns
     -------
-    (p, p) array, or None with fewer than `FEWEST_BLOCKS` independent windows.
+    (p,) array, or None with fewer than `FEWEST_BLOCKS` independent windows.
     """
     if count < FEWEST_BLOCKS:
         return None
@@ -270,12 +254,14 @@ def covariance_of_windows(
         shifts[b] = np.where(own > HALF, shifts[b], shift)
     covariance = shifts.T @ shifts * (count - 1) / count
     wider = errors_above(count, 0.025) / NORMAL
-    return np.asarray(covariance * wider**2 / np.outer(size, size), dtype=np.float64)
+    return np.asarray(
+        np.sqrt(np.maximum(np.diag(covariance), 0.0)) * wider / size, dtype=np.float64
+    )
 
 
-def known_covariance(whole: FloatArray, prior: FloatArray) -> FloatArray:
-    """Covariance, (p, p), that what is known beforehand leaves in the parameters: blocks of time
-    do not tell of it.
+def known_errors(whole: FloatArray, prior: FloatArray) -> FloatArray:
+    """Standard error that what is known beforehand leaves in each parameter: blocks of time do not
+    tell of it.
 
     Parameters
     ----------
@@ -284,8 +270,10 @@ def known_covariance(whole: FloatArray, prior: FloatArray) -> FloatArray:
     prior : (k, p) array
         Those of the prior.
     """
-    moved = prior @ np.linalg.pinv(whole, rcond=RANK, hermitian=True)
-    return np.asarray(moved.T @ moved, dtype=np.float64)
+    if not len(prior):
+        return np.zeros(len(whole))
+    inverse = np.linalg.pinv(whole, rcond=RANK, hermitian=True)
+    return np.asarray(np.linalg.norm(prior @ inverse, axis=0), dtype=np.float64)
 
 
 def errors_above(count: float, chance: float) -> float:

@@ -547,7 +547,8 @@ def _with_errors(
     ]
     # without stiffness the link would fall off: the twist follows no torque of these records
     unidentified += [n for n in balances.model.named("stiffness") if n in at_bound]
-    index, whole = np.flatnonzero(usable), None
+    index = np.flatnonzero(usable)
+    together = Correlation()
     if len(index):
         part = bands.of(index)
         size = None if part.errors is None else part.errors / norms[index]
@@ -557,13 +558,13 @@ def _with_errors(
             if n in at_bound and norms[k] > 0 and not problem.bent[k] and not problem.clocks[k]
         ]
         high = [values[free[k]] >= limits[free[k]][1] for k in held]
-        if part.covariance is not None:
-            whole = part.covariance + bands.beside(index, held, high)
-            whole /= np.outer(norms[index], norms[index])
+        wider = np.zeros(len(index)) if size is None else bands.beside(index, held, high)
         spread, corr = correlations(part.gram)
         corr[:, [is_of_run(free[i]) for i in index.tolist()]] = 0.0
         for k, i in enumerate(index.tolist()):
-            stderr[free[i]] = None if whole is None else math.sqrt(float(whole[k, k]))
+            stderr[free[i]] = (
+                None if size is None else math.hypot(float(size[k]), float(wider[k] / norms[i]))
+            )
             other = int(np.argmax(np.abs(corr[k])))
             correlation[free[i]] = (free[int(index[other])], float(corr[k, other]))
             weak = size is not None and values[free[i]] != 0 and size[k] > abs(values[free[i]])
@@ -573,18 +574,13 @@ def _with_errors(
                 and not is_of_run(free[i])
             ):
                 unidentified.append(free[i])
+        if size is not None:
+            apart = {*smoothing, HOLD_NAME, *balances.model.calibration}
+            told = [k for k, i in enumerate(index.tolist()) if bare([free[i]])[0] not in apart]
+            names = [free[index[k]] for k in told]
+            together = Correlation.of(names, corr[np.ix_(told, told)])
     kept = dict(values)
     model = balances.model
-    apart = {*smoothing, HOLD_NAME, *model.calibration}
-    told = [
-        k
-        for k, i in enumerate(index.tolist())
-        if stderr[free[i]] is not None and not is_of_run(free[i]) and free[i] not in apart
-    ]
-    together = Correlation()
-    if whole is not None:
-        names = [free[index[k]] for k in told]
-        together = Correlation.of(names, corr[np.ix_(told, told)])
     for n in model.calibration:
         kept[n] = float(np.mean([kept[k] for k in free if is_of_run(k) and k.startswith(f"{n}[")]))
     own = {n: x for n, x in kept.items() if not is_of_run(n)}

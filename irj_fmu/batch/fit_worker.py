@@ -18,7 +18,7 @@ from identification.diagnosis.improve import improve
 from identification.errors import InputError
 from identification.fitting.fit import fit
 from identification.variants.explore import explore
-from irj_fmu.batch.found import Found
+from irj_fmu.batch.found import Found, explored
 from irj_fmu.command_line import finite
 from irj_fmu.host.fmu import FmuError
 
@@ -166,16 +166,7 @@ def _improve(joint: Joint, train: list[Record], held: list[Record]) -> Found:
 
 def _explore(joint: Joint, train: list[Record], held: list[Record]) -> Found:
     found = explore(train, joint, held)
-    best = found.recommended
-    figures = {
-        "start_error_percent": found.start.relative_error_percent,
-        "end_error_percent": best.relative_error_percent,
-        "recommended": " ".join(best.added),
-        "ties": len(found.ties),
-        "improve": " ".join(found.improvement.added),
-        "chosen_percent": best.chosen_percent,
-    }
-    return figures, found.parameters, found.to_joint_file(), found.as_json()
+    return explored(found), found.parameters, found.to_joint_file(), found.as_json()
 
 
 _TASKS: Final[Mapping[str, Callable[[Joint, list[Record], list[Record]], Found]]] = {

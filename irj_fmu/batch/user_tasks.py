@@ -11,7 +11,7 @@ import numpy as np
 from identification.data.check.gate import gated
 from identification.data.joint_file import Joint
 from identification.data.record import Record
-from irj_fmu.batch.found import Found
+from irj_fmu.batch.found import Found, explored
 from irj_fmu.imported.compare import compare
 from irj_fmu.imported.file import load_user_joint, user_joint_text
 from irj_fmu.imported.fit import fit, parameter_table
@@ -53,18 +53,13 @@ def _explore(
     model: UserModel, train: Sequence[Record], held: Sequence[Record], known: str
 ) -> Found:
     told = explore(model, train, held)
-    found = told.found
-    best = found.recommended
-    figures = {
-        "start_error_percent": found.start.relative_error_percent,
-        "end_error_percent": best.relative_error_percent,
-        "recommended": " ".join(best.added),
-        "ties": len(found.ties),
-        "improve": " ".join(found.improvement.added),
-        "chosen_percent": best.chosen_percent,
-    }
     table = parameter_table(told.model, {})
-    return figures, _with_side(table), user_joint_text(told.model, named=known), told.as_json()
+    return (
+        explored(told.found),
+        _with_side(table),
+        user_joint_text(told.model, named=known),
+        told.as_json(),
+    )
 
 
 def _error(outputs: UserComparison) -> float:

@@ -15,8 +15,8 @@ import numpy.typing as npt
 from identification.balance.stacked import taking_part
 from identification.fitting.covariance import (
     RANK,
-    known_covariance,
-    window_covariance,
+    known_errors,
+    window_errors,
     windows_over,
 )
 from identification.fitting.errors_in_variables.instruments import mixed
@@ -39,7 +39,7 @@ class Part:
 
     Attributes
     ----------
-    covariance : (p, p) array or None
+    errors : (p,) array or None
         None with too few windows.
     gram, whole : (p, p) array
         Normal matrix, and without what noise adds to it.
@@ -47,15 +47,10 @@ class Part:
         What is left of the normal equations, noise taken off.
     """
 
-    covariance: FloatArray | None
+    errors: FloatArray | None
     gram: FloatArray
     whole: FloatArray
     score: FloatArray
-
-    @property
-    def errors(self) -> FloatArray | None:
-        """Standard errors, (p,); None with too few windows."""
-        return None if self.covariance is None else np.sqrt(np.diag(self.covariance))
 
 
 @final
@@ -131,15 +126,16 @@ class Bands:
             {b: taking_part(b, problem.data.train) for b in problem.balances.balances},
         )
         apart = (grams / unit, scores / norms)
-        covariance = window_covariance(scaled, self._rows, tiled, apart, whole, meeting)
-        if covariance is not None:
+        errors = window_errors(scaled, self._rows, tiled, apart, whole, meeting)
+        if errors is not None:
             # rows of the prior were made heavier by the share; they scatter as the prior does
-            covariance += known_covariance(whole, problem.prior[:, index] / norms) / self.share
-        return Part(covariance, gram, whole, meeting.T @ self._rows - pulled / norms)
+            unsure = known_errors(whole, problem.prior[:, index] / norms) / math.sqrt(self.share)
+            errors = np.hypot(errors, unsure)
+        return Part(errors, gram, whole, meeting.T @ self._rows - pulled / norms)
 
     def beside(self, index: IntArray, bound: Sequence[int], upper: Sequence[bool]) -> FloatArray:
-        """Further covariance of the parameters of these columns from others that stand at a bound,
-        (p, p): the truth of such a one lies somewhere inside, and they would lie elsewhere then.
+        """Further error of the parameters of these columns from others that stand at a bound,
+        (p,): the truth of such a one lies somewhere inside, and they would lie elsewhere then.
 
         Its distance from the bound is a normal variable that is cut off there: of its mean square,
         each takes what its slope against that parameter makes.
@@ -152,7 +148,7 @@ class Bands:
         upper : sequence of bool
             Whether each stands at its upper bound.
         """
-        out = np.zeros((len(index), len(index)))
+        out = np.zeros(len(index))
         for i, high in zip(bound, upper, strict=True):
             part = self.of(np.append(index, i))
             if part.errors is None or not np.isfinite(part.errors[-1]):
@@ -163,7 +159,7 @@ class Bands:
                 continue
             middle = -float(inverse[-1] @ part.score) * (-1.0 if high else 1.0)
             slope = inverse[:-1, -1] / inverse[-1, -1]
-            out += np.outer(slope, slope) * cut_square(middle, error)
+            out = np.hypot(out, slope * math.sqrt(cut_square(middle, error)))
         return out
 
 
