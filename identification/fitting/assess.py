@@ -212,7 +212,10 @@ def assess(
     ratios = {b: math.sqrt(powers[b] + prices[b]) for b in whole}
     if memory := drift_memory(data):
         scatter = {
-            b: np.sqrt(np.maximum(wide[b] ** -2.0 - drift[b] ** 2, quick[b] ** 2)) for b in whole
+            b: np.sqrt(
+                np.maximum(wide[b] ** -2.0 - drift[b] ** 2, np.maximum(quick[b], 1e-12) ** 2)
+            )
+            for b in whole
         }
         courses = {
             b: innovations(
