@@ -180,10 +180,20 @@ class PageServer(uvicorn.Server):  # type: ignore[misc]
     """The server of the page, which stops at once also where pages are open."""
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """End what would go on for ever, then stop."""
+        """End what would go on for ever, then stop; no connection outlives the server.
+
+        The parent tells the connections that it knows. One that is accepted while it does so would
+        stay open without a reader: a browser that asks on it waits for ever.
+        """
         if isinstance(self.config.app, Guard):
             self.config.app.end()
+        for server in self.servers:
+            server.close()
+        await asyncio.sleep(0.05)  # what is accepted already becomes a connection that is told
         await super().shutdown(sockets)
+        for connection in list(self.server_state.connections):
+            connection.transport.abort()
+        await asyncio.sleep(0)
 
 
 _LOG = logging.getLogger(__name__)

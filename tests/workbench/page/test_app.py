@@ -915,3 +915,42 @@ def test_a_quota_that_is_no_number_is_one_sentence(
     key = {"X-IRJ-Home": home.key_of(Store(root))}
     status, _, said = client.raw("GET", "/api/home", headers=key)
     assert (status, said) == (422, b"IRJ_QUOTA_GB is 'viel'; give a number of gigabytes")
+
+
+def test_no_connection_outlives_its_server(tmp_path: Path) -> None:
+    """Nor one that came while it stopped: a browser asked on such a one and waited for ever."""
+    for _ in range(6):
+        held: list[socket.socket] = []
+
+        def connect(port: int, held: list[socket.socket] = held) -> None:
+            while True:
+                caller = socket.socket()
+                try:
+                    caller.connect(("127.0.0.1", port))
+                except OSError:
+                    caller.close()
+                    return
+                held.append(caller)
+                time.sleep(5e-4)
+
+        with serving(tmp_path) as there:
+            callers = [threading.Thread(target=connect, args=(there.port,)) for _ in range(2)]
+            for thread in callers:
+                thread.start()
+            time.sleep(0.2)
+        for thread in callers:
+            thread.join(30)
+        assert len(held) > 20
+        assert all(_ended(caller) for caller in held)
+
+
+def _ended(caller: socket.socket) -> bool:
+    """The other side has closed the connection."""
+    with caller:
+        caller.settimeout(1)
+        try:
+            return caller.recv(1) == b""
+        except TimeoutError:
+            return False
+        except OSError:
+            return True
