@@ -185,6 +185,17 @@ class Joint:
     laws: Mapping[str, TypedLaw] = field(default_factory=dict)
     correlation: Correlation = Correlation()
 
+    @property
+    def turns_per_unit(self) -> float:
+        """Motor turns per unit of an order: one per turn; one over the pitch per metre; 0 where
+        nothing says how far a linear axis moves per turn.
+        """
+        if self.kind != "linear":
+            return 1.0
+        if self.pitch is not None:
+            return 1.0 / self.pitch
+        return abs(self.gear_ratio) / (2 * math.pi) if abs(self.gear_ratio) != 1.0 else 0.0
+
     def model(self) -> JointModel:
         """The joint model with its effects (values of a fit written back included).
 

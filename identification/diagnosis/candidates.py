@@ -194,6 +194,11 @@ def offered(
 
 def _no_line(data: Dataset) -> str:
     """Why what repeats with the position is no candidate on these records."""
+    if not data.joint.turns_per_unit:
+        return (
+            "its order is one of the motor turn, and nothing says how far the axis moves per turn; "
+            "give [known] pitch in the joint file"
+        )
     if data.joint.kind == "linear":
         return "no line of its order stands out of what the model leaves over the position"
     return "needs two turns of the motor, or a line of its order in what the model leaves"

@@ -61,6 +61,7 @@ __all__ = [
     "named_orders",
     "orders_of",
     "other_orders",
+    "without_turn",
 ]
 
 FloatArray = npt.NDArray[np.float64]
@@ -178,19 +179,21 @@ def named_orders(joint: Joint) -> tuple[float, ...]:
     """Orders that have a name: of the motor turn, of the pitch of a linear axis, and those the
     joint file gives.
     """
-    turn = turns_per_unit(joint)
+    turn = joint.turns_per_unit
     return (*(h * turn for h in MOTOR_ORDERS if turn), *joint.orders)
 
 
-def turns_per_unit(joint: Joint) -> float:
-    """Motor turns per unit of an order: one per turn; one over the pitch per metre; 0 where no
-    pitch is known.
-    """
-    if joint.kind != "linear":
-        return 1.0
-    if joint.pitch is not None:
-        return 1.0 / joint.pitch
-    return abs(joint.gear_ratio) / (2 * math.pi) if abs(joint.gear_ratio) != 1.0 else 0.0
+def without_turn(lines: Sequence[Line], joint: Joint) -> tuple[str, ...]:
+    """What would name the lines of a linear axis of whose motor nobody knows the turn."""
+    nameless = [line for line in lines if not line.effects]
+    if joint.turns_per_unit or not nameless:
+        return ()
+    periods = " and ".join(f"{1e3 / line.order:.3g} mm" for line in nameless)
+    return (
+        f"something repeats every {periods}, and nothing says how far the axis moves per turn of "
+        "its motor: with [known] pitch (the lead of a screw) in the joint file it gets a name "
+        "where the two agree",
+    )
 
 
 def _angle_factor(joint: Joint) -> float:
@@ -573,7 +576,7 @@ def find_lines(
     ]
     seen: list[tuple[_Tracked, Peak]] = []
     for one in tracked:
-        lowest = LOWEST_ORDER * turns_per_unit(data.joint)
+        lowest = LOWEST_ORDER * data.joint.turns_per_unit
         found = peaks(
             one.train,
             highest_order(one.train, one.dt),

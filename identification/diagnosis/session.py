@@ -57,6 +57,7 @@ from identification.diagnosis.improvement import (
     spoilt,
 )
 from identification.diagnosis.learned import LearnedClaim, marked, variable_of
+from identification.diagnosis.lines import without_turn
 from identification.diagnosis.locate import Unexplained, spectral_peak
 from identification.diagnosis.outcome import refusals
 from identification.diagnosis.rival_table import is_absorbed
@@ -536,6 +537,7 @@ class Session:
                 *open_notes(self.bench.left_open(end)),
                 *self._about_temperature(judged),
                 *([scale] if (scale := self._scale(solution)) else []),
+                *without_turn(lines, self.joint),
                 *unseen(solution),
                 *without_link(solution),
                 *without_motor(self.data),

@@ -37,6 +37,7 @@ from identification.diagnosis.lines import (
     line_models,
     named_orders,
     orders_of,
+    without_turn,
 )
 from identification.diagnosis.order_tracking import (
     ALPHA,
@@ -648,3 +649,18 @@ def test_the_order_of_a_named_line_is_where_its_effect_starts() -> None:
     # one turn of the screw per pitch: the law counts periods per radian of an angle that is the
     # position itself
     assert orders_of([line], axis)["torque_ripple"] == pytest.approx([200 * np.pi], rel=0.01)
+
+
+def test_a_line_without_a_name_says_what_would_give_it_one() -> None:
+    """The travel per motor turn, where an axis has one that the joint file does not say."""
+    named = next(r.right for r in judged() if r.case.linear and r.right is not None)
+    line = replace(named, order=198.4, effects=())
+    axis = Joint("axis", "linear", model_name="hd1")
+    (said,) = without_turn([line, named], axis)
+    assert "every 5.04 mm" in said
+    assert "[known] pitch" in said
+    assert without_turn([named], replace(axis, pitch=0.01)) == ()
+    assert without_turn([line], replace(axis, pitch=0.01)) == ()
+    assert without_turn([line], replace(axis, gear_ratio=200 * np.pi)) == ()
+    assert without_turn([line], Joint(gear_ratio=100.0)) == ()
+    assert without_turn([replace(line, effects=("torque_ripple",))], axis) == ()
