@@ -73,7 +73,8 @@ class BalanceError:
     ratio : float
         RMS of residual over noise, row by row: 1 where only noise is left. Where a measured torque
         drifts, of what the drift does not foretell; and no less than what is left over the most
-        that one course of it may do.
+        that one course of it may do. The instants of turns are unknowns of it, so it may be
+        smaller than `rms` over `floor`.
     unit : str
     residual, weight : (rows,) array
         Residual of each row [unit] and 1 over the scatter that noise allows it: two models are
