@@ -73,8 +73,8 @@ GLOSSARY: Final[Mapping[str, str]] = {
     "noise.",
     "noise floor": "the residual that measurement noise alone would leave in a complete model.",
     "÷ noise": "residual over the noise floor of its balance, row by row; 1 × cannot be improved. "
-    "What the instant of a turn, a drift or a value that stays open may add counts as noise here and "
-    "not in the floor, so it may be smaller than the quotient of the two.",
+    "What the instant of a turn, a drift or a value that stays open may add counts as noise here "
+    "and not in the floor, so it may be smaller than the quotient of the two.",
     "fit": "100 % less the share of the torque's variation about its mean that is not explained.",
     "VAF": "variance accounted for: 100 % less the share of the torque's variance that is not "
     "explained.",
